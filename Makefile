@@ -1,0 +1,38 @@
+# Two commands matter: `make demo` and `make test`. Both set everything up on a machine with python3.11+ and make.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: demo test lint types bench soak clean
+.DELETE_ON_ERROR:
+
+$(STAMP): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "brushloop needs python3.11 or newer; set PYTHON=..."; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+demo: $(STAMP)  ## collect, calibrate and validate a short session on the loopback rig
+	$(BIN)/brushloop demo
+
+test: lint types  ## lint, layers, types, and the tests
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+
+types: $(STAMP)
+	$(BIN)/pyright
+
+bench: $(STAMP)  ## every bench, one JSON object a line
+	$(BIN)/python -m bench --json
+
+soak: $(STAMP)  ## long kill and load loops
+	$(BIN)/python -m pytest -m soak --timeout 3600
+
+clean:
+	rm -rf $(VENV) demo-run .pytest_cache .ruff_cache .hypothesis .import_linter_cache
