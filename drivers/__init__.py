@@ -1,0 +1,1 @@
+"""Hardware behind small protocols: samples, clock, errors, limits, and one module or folder per device."""

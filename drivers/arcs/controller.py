@@ -1,0 +1,103 @@
+"""The controller's calls with types: what goes over one connection, and what the answers mean."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from drivers.arcs.codes import (
+    CONDITION_AND_REMEDY,
+    MOVING_ALLOWED,
+    UNKNOWN_CONDITION,
+    ReturnCode,
+    RobotMode,
+    SafetyMode,
+    refusal,
+)
+from drivers.arcs.rpc import DEVICE, RpcConnection
+from drivers.errors import MotionRefused, ProtocolViolation, RobotNotSafe
+from drivers.geometry import from_wire, to_wire
+from drivers.samples import Pose
+
+
+class Controller:
+    """One connection and the name of the robot behind it. Every method may raise what `RpcConnection.call` raises."""
+
+    def __init__(self, connection: RpcConnection) -> None:
+        self.connection = connection
+        self.robot = ""
+
+    async def ask(self, method: str, **params: object) -> Any:
+        """The answer of a method of the robot's, unchecked."""
+        return await self.connection.call(f"{self.robot}.{method}", params)
+
+    async def robot_names(self) -> list[str]:
+        """At least one name. Raises `ProtocolViolation`."""
+        names = await self.connection.call("getRobotNames")
+        if not isinstance(names, list) or not names:
+            raise ProtocolViolation(DEVICE, "getRobotNames", f"expected a list of names, got {names!r}")
+        return [str(name) for name in names]  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
+
+    async def set_tcp_offset(self, offset_mm: tuple[float, float, float]) -> None:
+        """Flange to brush tip. Raises `MotionRefused`: with another offset every height would be wrong."""
+        x, y, z = (v / 1e3 for v in offset_mm)
+        accepted("setTcpOffset", await self.ask("RobotConfig.setTcpOffset", offset=[x, y, z, 0.0, 0.0, 0.0]))
+
+    async def pose(self) -> Pose:
+        """Where the tip is. Raises `ProtocolViolation`."""
+        values = await self.ask("RobotState.getTcpPose")
+        try:
+            return from_wire([float(v) for v in values])
+        except (TypeError, ValueError) as error:
+            raise ProtocolViolation(DEVICE, "getTcpPose", str(error)) from None
+
+    async def mode(self) -> RobotMode:
+        """The robot mode. Raises `ProtocolViolation` for a word that is none."""
+        mode = await self.ask("RobotState.getRobotModeType")
+        try:
+            return RobotMode(mode)
+        except ValueError:
+            raise ProtocolViolation(DEVICE, "getRobotModeType", f"unknown mode {mode!r}") from None
+
+    async def require_safe(self, op: str) -> None:
+        """Raise `RobotNotSafe`, with condition and remedy, unless the safety mode allows motion."""
+        mode = str(await self.ask("RobotState.getSafetyModeType"))
+        if mode not in MOVING_ALLOWED:
+            known = mode in set(SafetyMode)
+            condition, remedy = (
+                CONDITION_AND_REMEDY.get(SafetyMode(mode), UNKNOWN_CONDITION) if known else UNKNOWN_CONDITION
+            )
+            raise RobotNotSafe(DEVICE, op, mode, condition, remedy)
+
+    async def move_line(self, target: Pose, speed_mm_s: float, acc_mm_s2: float) -> None:
+        """Queue a straight line. Raises `RobotNotSafe` or `MotionRefused`; already there is fine."""
+        code = await self.ask(
+            "MotionControl.moveLine",
+            pose=to_wire(target),
+            a=acc_mm_s2 / 1e3,
+            v=speed_mm_s / 1e3,
+            blend_radius=0.0,
+            duration=0.0,
+        )
+        if code not in (ReturnCode.OK, ReturnCode.REQUEST_IGNORED):
+            await self.require_safe("moveLine")
+        accepted("moveLine", code)
+
+    async def at_rest(self) -> bool:
+        """True when the queue is empty and the arm is steady."""
+        return await self.ask("MotionControl.getExecId") == -1 and await self.ask("RobotState.isSteady") is True
+
+    async def halt(self, acc_m_s2: float) -> None:
+        """Decelerate along the path, then drop whatever is queued, the second also where the first fails."""
+        try:
+            await self.ask("MotionControl.stopLine", acc=acc_m_s2, acc_rot=acc_m_s2)
+        finally:
+            await self.connection.call("RuntimeMachine.abort")
+
+
+def accepted(op: str, code: object) -> None:
+    """Raise `MotionRefused` for a return code that is neither success nor `already there`."""
+    if not isinstance(code, int):
+        raise ProtocolViolation(DEVICE, op, f"expected a return code, got {code!r}")
+    if code not in (ReturnCode.OK, ReturnCode.REQUEST_IGNORED):
+        name, remedy = refusal(code)
+        raise MotionRefused(DEVICE, op, code, name, remedy)

@@ -1,0 +1,65 @@
+"""SOF frames of ARCS: `53 4F 46`, a flag byte, a big-endian length, a payload.
+
+| flag | length | who sends it |
+|---|---|---|
+| 0x01 | uint32 | the vendor's RPC client, always; this driver too |
+| 0x00 | uint16 | the vendor's RTDE client |
+"""
+
+from __future__ import annotations
+
+import struct
+
+from drivers.errors import ProtocolViolation
+
+MAGIC = b"SOF"
+FLAG_LONG = 0x01
+FLAG_SHORT = 0x00
+MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
+"""Far above any reply of a controller; a hostile length must not make the host allocate gigabytes."""
+
+
+def encode(payload: bytes) -> bytes:
+    """One frame with a 32-bit length. Raises ValueError above `MAX_PAYLOAD_BYTES`."""
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        raise ValueError(f"payload of {len(payload)} bytes exceeds {MAX_PAYLOAD_BYTES}")
+    return MAGIC + bytes([FLAG_LONG]) + struct.pack(">I", len(payload)) + payload
+
+
+class FrameDecoder:
+    """Turns a byte stream, cut anywhere, into payloads."""
+
+    def __init__(self, device: str = "arcs") -> None:
+        self._device = device
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Payloads completed by `data`, in order. Raises `ProtocolViolation` where the stream is not SOF."""
+        self._buffer += data
+        payloads: list[bytes] = []
+        while (payload := self._next()) is not None:
+            payloads.append(payload)
+        return payloads
+
+    def _next(self) -> bytes | None:
+        buffer = self._buffer
+        if not MAGIC.startswith(bytes(buffer[:3])):
+            raise ProtocolViolation(self._device, "decode", f"expected SOF, got {bytes(buffer[:8])!r}")
+        if len(buffer) < 4:
+            return None
+        match buffer[3]:
+            case 0x01:
+                head, size = 8, struct.unpack_from(">I", buffer, 4)[0] if len(buffer) >= 8 else None
+            case 0x00:
+                head, size = 6, struct.unpack_from(">H", buffer, 4)[0] if len(buffer) >= 6 else None
+            case flag:
+                raise ProtocolViolation(self._device, "decode", f"unknown SOF flag {flag:#04x}")
+        if size is None:
+            return None
+        if size > MAX_PAYLOAD_BYTES:
+            raise ProtocolViolation(self._device, "decode", f"frame of {size} bytes exceeds {MAX_PAYLOAD_BYTES}")
+        if len(buffer) < head + size:
+            return None
+        payload = bytes(buffer[head : head + size])
+        del buffer[: head + size]
+        return payload

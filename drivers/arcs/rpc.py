@@ -1,0 +1,160 @@
+"""One JSON-RPC connection to an ARCS controller: SOF frames, named params, one request outstanding at a time."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import secrets
+import string
+from collections.abc import Mapping
+from typing import Any
+
+from drivers.arcs.frames import FrameDecoder, encode
+from drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, RpcError
+
+DEVICE = "robot"
+SDK_INTERFACE_VERSION = "0.24.0"
+# What the vendor's client 0.24.1 sends for the factory account; its obfuscation of other passwords is not known.
+FACTORY_LOGIN_TOKEN = "3353545435353664345433434443435463466335333566235443434253142434333426365553"
+_ID_ALPHABET = string.ascii_letters + string.digits
+
+
+def request_id() -> str:
+    """An id of the vendor client's shape: 8-4-4 characters."""
+    raw = "".join(secrets.choice(_ID_ALPHABET) for _ in range(16))
+    return f"{raw[:8]}-{raw[8:12]}-{raw[12:]}"
+
+
+def encode_request(ident: str, method: str, params: Mapping[str, object] | None) -> bytes:
+    """Compact JSON with sorted keys; `params` is left out where there are none, as the vendor's client does."""
+    body: dict[str, object] = {"id": ident, "jsonrpc": "2.0", "method": method}
+    if params:
+        body["params"] = dict(params)
+    return json.dumps(body, separators=(",", ":"), sort_keys=True).encode()
+
+
+class RpcConnection:
+    """A socket with one caller at a time; late replies to calls that timed out are dropped."""
+
+    def __init__(self, host: str, port: int, *, timeout_s: float = 1.0) -> None:
+        self.host = host
+        self.port = port
+        self._timeout_s = timeout_s
+        self._lock = asyncio.Lock()
+        self._writer: asyncio.StreamWriter | None = None
+        self._reader_task: asyncio.Task[None] | None = None
+        self._pending: tuple[str, str, asyncio.Future[Any]] | None = None
+        self._lost: str | None = None
+
+    @property
+    def lost(self) -> bool:
+        """True from the moment the peer went away until `close` or a successful `open`."""
+        return self._lost is not None
+
+    async def open(self) -> None:
+        """Connect. Raises `ConnectionLost` (refused) or `DeviceTimeout`."""
+        try:
+            async with asyncio.timeout(self._timeout_s):
+                reader, writer = await asyncio.open_connection(self.host, self.port)
+        except TimeoutError:
+            self._lost = f"{self.host}:{self.port} did not answer"
+            raise DeviceTimeout(DEVICE, "connect", self._lost) from None
+        except OSError as error:
+            self._lost = f"{self.host}:{self.port}: {error.strerror or error}"
+            raise ConnectionLost(DEVICE, "connect", self._lost) from None
+        self._writer = writer
+        self._lost = None
+        self._reader_task = asyncio.create_task(self._read(reader), name=f"rpc {self.host}:{self.port}")
+
+    async def login(self) -> None:
+        """Send the login frame of the factory account and wait for any reply."""
+        token = f"__login__\naubo\n{FACTORY_LOGIN_TOKEN}\n{SDK_INTERFACE_VERSION}\n"
+        await self._exchange("", "login", token.encode())
+
+    async def call(self, method: str, params: Mapping[str, object] | None = None) -> Any:
+        """The result of `method`. Raises `RpcError`, `DeviceTimeout`, `ConnectionLost`, `ProtocolViolation`."""
+        ident = request_id()
+        return await self._exchange(ident, method, encode_request(ident, method, params))
+
+    async def reopen(self) -> None:
+        """Close, connect and log in again. Raises what `open` and `login` raise."""
+        await self.close()
+        await self.open()
+        await self.login()
+
+    async def close(self) -> None:
+        """End the reader, close the socket; a call that still waits gets `NotConnected`."""
+        reader, self._reader_task = self._reader_task, None
+        writer, self._writer = self._writer, None
+        if reader is not None:
+            reader.cancel()
+            await asyncio.wait([reader])
+        if writer is not None:
+            writer.close()
+            with contextlib.suppress(OSError):
+                await writer.wait_closed()
+        self._lost = None
+        if self._pending is not None and not self._pending[2].done():
+            self._pending[2].set_exception(NotConnected(DEVICE, self._pending[1], "closed while waiting"))
+
+    async def _exchange(self, ident: str, op: str, payload: bytes) -> Any:
+        async with self._lock:
+            if self._lost is not None:
+                raise ConnectionLost(DEVICE, op, self._lost)
+            if self._writer is None:
+                raise NotConnected(DEVICE, op, "not connected")
+            future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+            self._pending = (ident, op, future)
+            try:
+                # No drain: requests are small, and a socket that cannot be written to fails the reader.
+                self._writer.write(encode(payload))
+                async with asyncio.timeout(self._timeout_s):
+                    return await future
+            except TimeoutError:
+                raise DeviceTimeout(DEVICE, op, f"no reply in {self._timeout_s:g} s") from None
+            finally:
+                self._pending = None
+
+    async def _read(self, reader: asyncio.StreamReader) -> None:
+        decoder = FrameDecoder(DEVICE)
+        try:
+            while data := await reader.read(65536):
+                for payload in decoder.feed(data):
+                    self._deliver(payload)
+            self._fail("the controller closed the connection")
+        except ProtocolViolation as error:
+            # Out of step with the stream: nothing after this can be trusted.
+            self._fail(error.what)
+        except OSError as error:
+            self._fail(error.strerror or str(error))
+
+    def _deliver(self, payload: bytes) -> None:
+        if self._pending is None:
+            return
+        ident, op, future = self._pending
+        if future.done():
+            return
+        if not ident:  # the login reply is not JSON, and its content carries no meaning
+            future.set_result(payload)
+            return
+        try:
+            reply = json.loads(payload)
+        except (ValueError, RecursionError):
+            future.set_exception(ProtocolViolation(DEVICE, op, f"reply is not JSON: {payload[:40]!r}"))
+            return
+        if not isinstance(reply, dict) or reply.get("id") != ident:  # pyright: ignore[reportUnknownMemberType]
+            return
+        answer: dict[str, Any] = reply  # pyright: ignore[reportUnknownVariableType]
+        match answer.get("error"):
+            case {"code": int(code), "message": str(message)}:
+                future.set_exception(RpcError(DEVICE, op, code, message))
+            case None if "result" in answer:
+                future.set_result(answer["result"])
+            case other:
+                future.set_exception(ProtocolViolation(DEVICE, op, f"neither result nor error: {other!r}"))
+
+    def _fail(self, why: str) -> None:
+        self._lost = why
+        if self._pending is not None and not self._pending[2].done():
+            self._pending[2].set_exception(ConnectionLost(DEVICE, self._pending[1], why))

@@ -1,0 +1,90 @@
+"""Waiting for the arm: until it is powered, until it has settled. Each poll looks at safety first."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from dataclasses import dataclass
+
+from drivers.arcs.codes import RobotMode
+from drivers.arcs.controller import Controller
+from drivers.arcs.rpc import DEVICE
+from drivers.errors import DeviceError, DeviceTimeout, MotionFailed
+from drivers.geometry import distance
+from drivers.samples import Pose
+
+RESTS_ELSEWHERE_S = 1.0
+"""An accepted move may not have started yet; an arm that rests elsewhere for so long will not start."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerance:
+    """How near is there."""
+
+    position_mm: float
+    rotation_deg: float
+
+
+async def until_mode(controller: Controller, wanted: set[RobotMode], *, timeout_s: float, poll_s: float) -> None:
+    """Return once the robot mode is one of `wanted`. Raises `RobotNotSafe`, `DeviceTimeout`."""
+    try:
+        async with asyncio.timeout(timeout_s):
+            while await controller.mode() not in wanted:
+                await controller.require_safe("power on")
+                await asyncio.sleep(poll_s)
+    except DeviceError:
+        raise
+    except TimeoutError:
+        raise DeviceTimeout(
+            DEVICE,
+            "power on",
+            f"mode {await controller.mode()} did not become {' or '.join(sorted(wanted))}",
+            remedy="Look at the pendant: a confirmation may be waiting there.",
+        ) from None
+
+
+async def until_settled(
+    controller: Controller, target: Pose, tolerance: Tolerance, *, planned_s: float, poll_s: float
+) -> None:
+    """Return once the queue is empty, the arm steady and the pose within tolerance.
+
+    Raises `RobotNotSafe`, or `MotionFailed` where the arm rests elsewhere or twice the planned time has gone.
+    """
+    loop = asyncio.get_running_loop()
+    allowed_s = 2.0 * planned_s + 3.0
+    deadline = loop.time() + allowed_s
+    idle_since: float | None = None
+    while True:
+        await controller.require_safe("moveLine")
+        steady = await controller.at_rest()
+        off_mm, off_deg = distance(await controller.pose(), target)
+        now = loop.time()
+        if steady and off_mm <= tolerance.position_mm and off_deg <= tolerance.rotation_deg:
+            return
+        idle_since = (idle_since or now) if steady else None
+        if idle_since is not None and now - idle_since > RESTS_ELSEWHERE_S:
+            raise _not_arrived(f"rests {off_mm:.2f} mm and {off_deg:.2f} deg from the target")
+        if now > deadline:
+            raise _not_arrived(f"not settled after {allowed_s:.1f} s, {off_mm:.2f} mm to go")
+        await asyncio.sleep(poll_s)
+
+
+def planned_s(start: Pose, target: Pose, speed_mm_s: float, acc_mm_s2: float) -> float:
+    """An upper estimate of the move: the line at speed plus one ramp, or the turn at half a radian per second.
+
+    Where the tip stays within a millimetre, ARCS reads m/s as rad/s.
+    """
+    translation_mm, rotation_deg = distance(start, target)
+    ramp_s = speed_mm_s / acc_mm_s2
+    turn_s = math.radians(rotation_deg) / (speed_mm_s / 1e3) if translation_mm < 1.0 else rotation_deg / 30.0
+    return max(translation_mm / speed_mm_s, turn_s) + ramp_s
+
+
+def _not_arrived(what: str) -> MotionFailed:
+    return MotionFailed(
+        DEVICE,
+        "moveLine",
+        what,
+        condition="The arm was told to stop.",
+        remedy="Check on the pendant whether the target is within reach.",
+    )

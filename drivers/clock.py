@@ -1,0 +1,28 @@
+"""The host clock: wall-clock nanoseconds that never step backwards within a process."""
+
+from __future__ import annotations
+
+import time
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """Anything that tells nanoseconds since the epoch, monotonically."""
+
+    def now_ns(self) -> int:
+        """Nanoseconds since 1970-01-01 UTC; never less than the value returned before."""
+        ...
+
+
+class HostClock:
+    """Wall time read once, then carried forward by the monotonic clock.
+
+    An NTP step or an operator who sets the clock in mid-session must not reorder a recording.
+    """
+
+    def __init__(self) -> None:
+        self._offset_ns = time.time_ns() - time.monotonic_ns()
+
+    def now_ns(self) -> int:
+        """Nanoseconds since the epoch as of the start of this clock, plus monotonic time since."""
+        return self._offset_ns + time.monotonic_ns()

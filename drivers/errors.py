@@ -1,0 +1,110 @@
+"""Errors of devices. Each says which device, in which operation, in what condition it is left, and what to do.
+
+DeviceError
+ +-- NotConnected           never connected, or closed
+ +-- ConnectionLost         the peer went away in mid-operation
+ +-- DeviceTimeout          no answer in time
+ |    +-- Stale             the newest sample is too old to act on
+ +-- ProtocolViolation      bytes that the wire format does not allow
+ +-- WrongGeneration        the cabinet runs software that this driver does not speak
+ +-- RpcError               the controller answered with an error object
+ +-- LimitExceeded          refused before anything moved
+ +-- MotionError
+      +-- MotionRefused     the controller did not accept the command
+      +-- MotionFailed      accepted, but the arm did not arrive
+      +-- RobotNotSafe      protective, safeguard or emergency stop, violation or fault
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class DeviceError(Exception):
+    """A device failed: `condition` is the physical state it leaves, `remedy` what the operator must do."""
+
+    exit_code: ClassVar[int] = 4
+
+    def __init__(self, device: str, op: str, what: str, *, condition: str = "", remedy: str = "") -> None:
+        self.device = device
+        self.op = op
+        self.what = what
+        self.condition = condition
+        self.remedy = remedy
+        super().__init__(" ".join(part for part in (f"{device}: {op}: {what}.", condition, remedy) if part))
+
+
+class NotConnected(DeviceError):
+    """The device was used before `connect` or after `close`."""
+
+
+class ConnectionLost(DeviceError, ConnectionError):
+    """The peer closed the connection or the cable went."""
+
+
+class DeviceTimeout(DeviceError, TimeoutError):
+    """The device did not answer in time."""
+
+
+class Stale(DeviceTimeout):
+    """The newest sample is older than allowed; `age_ms` says by how much."""
+
+    def __init__(self, device: str, age_ms: float, limit_ms: float) -> None:
+        self.age_ms = age_ms
+        super().__init__(device, "latest", f"newest sample is {age_ms:.0f} ms old, limit {limit_ms:.0f} ms")
+
+
+class ProtocolViolation(DeviceError, ValueError):
+    """The peer sent bytes that the wire format does not allow."""
+
+
+class WrongGeneration(DeviceError):
+    """The cabinet answers, but runs the older AUBOPE software."""
+
+
+class RpcError(DeviceError):
+    """The controller answered with a JSON-RPC error object."""
+
+    def __init__(self, device: str, op: str, code: int, message: str) -> None:
+        self.code = code
+        super().__init__(device, op, f"controller answered error {code}: {message}")
+
+
+class LimitExceeded(DeviceError, ValueError):
+    """A target lies outside the configured limits; nothing has moved."""
+
+    def __init__(self, device: str, field: str, value: float, low: float, high: float, unit: str) -> None:
+        self.field = field
+        self.value = value
+        self.low = low
+        self.high = high
+        super().__init__(
+            device,
+            "check",
+            f"{field} = {value:.3f} {unit} is outside [{low:.3f}, {high:.3f}] {unit}",
+            condition="Nothing has moved.",
+        )
+
+
+class MotionError(DeviceError):
+    """A motion did not happen as asked."""
+
+
+class MotionRefused(MotionError):
+    """The controller refused the command; `code` is its return code."""
+
+    def __init__(self, device: str, op: str, code: int, name: str, remedy: str) -> None:
+        self.code = code
+        super().__init__(device, op, f"refused with {code} ({name})", condition="The arm has not moved.", remedy=remedy)
+
+
+class MotionFailed(MotionError):
+    """The command was accepted but the arm did not arrive within tolerance and time."""
+
+
+class RobotNotSafe(MotionError):
+    """The safety mode forbids motion; `mode` is the controller's own word for it."""
+
+    def __init__(self, device: str, op: str, mode: str, condition: str, remedy: str) -> None:
+        self.mode = mode
+        super().__init__(device, op, f"safety mode is {mode}", condition=condition, remedy=remedy)

@@ -1,0 +1,86 @@
+"""The device protocols: what a rig is made of, seen from the engine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+from drivers.samples import Frame, Identity, Pose, PoseSample, Stamp
+
+
+@runtime_checkable
+class Robot(Protocol):
+    """An arm with a brush. All poses are of the brush tip, in the base frame."""
+
+    async def connect(self) -> Identity:
+        """Open the connections, learn who answers, start telemetry; powers nothing."""
+        ...
+
+    async def enable(self) -> None:
+        """Bring the arm to the state in which it can move; moves nothing."""
+        ...
+
+    async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
+        """Move the tip in a straight line; returns when the arm has settled within tolerance."""
+        ...
+
+    async def stop(self) -> None:
+        """Stop now. Idempotent, from any state, never queued behind a slow call. Not an emergency stop."""
+        ...
+
+    def latest(self) -> PoseSample:
+        """The newest pose; never blocks. Raises `Stale` when it is too old to act on."""
+        ...
+
+    def listen(self, on_sample: Callable[[PoseSample], None] | None) -> None:
+        """Hand every pose sample to `on_sample`, in the event loop; None ends it."""
+        ...
+
+    def check(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
+        """Raise `LimitExceeded` where the target leaves the workspace box, floor, tilt cone or speed cap."""
+        ...
+
+    async def close(self) -> None:
+        """Stop, then close the connections. The arm stays where it is, powered."""
+        ...
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """A camera that looks at the sheet."""
+
+    async def connect(self) -> Identity:
+        """Open the stream and wait for the first frame."""
+        ...
+
+    async def fresh(self, after: Stamp) -> Frame:
+        """The first frame exposed after `after`, never an older buffered one. Raises `DeviceTimeout`."""
+        ...
+
+    async def close(self) -> None:
+        """Release the camera; joins the grabber thread."""
+        ...
+
+
+class ForceSensor(Protocol):
+    """A force sensor between flange and brush; optional in a rig."""
+
+    def latest_n(self) -> tuple[float, float, float]:
+        """The newest force in N; never blocks. Raises `Stale`."""
+        ...
+
+    async def bias(self, seconds: float) -> None:
+        """Average for `seconds` with nothing touching, and subtract that from now on."""
+        ...
+
+
+class Ink(Protocol):
+    """An ink station; optional in a rig."""
+
+    async def dose(self, volume_ml: float) -> None:
+        """Add ink to the well."""
+        ...
+
+    async def level(self) -> float:
+        """Fill level of the well, 0 to 1."""
+        ...

@@ -1,0 +1,73 @@
+"""What devices hand over: frozen samples, each with the time it was taken and its place in the sequence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Stamp:
+    """When a sample was taken: `host_ns` when the host received it, `device_ns` by the device's clock if it has one."""
+
+    host_ns: int
+    device_ns: int | None = None
+    seq: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """A tool pose in the robot's base frame: position in mm, orientation as a unit quaternion (x, y, z, w)."""
+
+    x_mm: float
+    y_mm: float
+    z_mm: float
+    qx: float
+    qy: float
+    qz: float
+    qw: float
+
+    @property
+    def position_mm(self) -> tuple[float, float, float]:
+        """(x, y, z) in mm."""
+        return (self.x_mm, self.y_mm, self.z_mm)
+
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """(x, y, z, w), unit length."""
+        return (self.qx, self.qy, self.qz, self.qw)
+
+
+@dataclass(frozen=True, slots=True)
+class PoseSample:
+    """A pose that the robot reported."""
+
+    stamp: Stamp
+    pose: Pose
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """An image as the camera gave it: (h, w) uint8 gray or (h, w, 3) uint8 BGR.
+
+    `stamp.host_ns` is the arrival; `exposed_after_ns` is the earliest time at which it can have been exposed.
+    """
+
+    stamp: Stamp
+    exposed_after_ns: int
+    image: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who answered: goes into the header of every recording, so that a number can be traced to its source."""
+
+    device: str
+    model: str
+    firmware: str
+    simulated: bool
+    """True only where the device itself says that it is the loopback rig; never taken from configuration."""
