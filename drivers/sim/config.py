@@ -1,0 +1,71 @@
+"""What the loopback rig is: its truth, which the software under test may only find out by measuring."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from drivers.sim.brush import BrushSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Where the sheet, the board and the ink well lie. The paper frame is right-handed, z up, in mm."""
+
+    origin_mm: tuple[float, float] = (460.0, -110.0)
+    """Lower left corner of the sheet in the robot's base frame."""
+    yaw_deg: float = 90.0
+    """From base x to paper x. Not zero, so that a forgotten rotation shows at once."""
+    paper_z_mm: float = 120.0
+    sheet_mm: tuple[float, float] = (244.0, 172.0)
+    board_origin_mm: tuple[float, float] = (-34.0, -34.0)
+    """Lower left corner of the ChArUco board, in the paper frame. The sheet lies on it, so that corners are seen all
+    round: a plane fitted to a strip at one side would be extrapolated over the whole sheet."""
+    board_squares: tuple[int, int] = (26, 20)
+    board_square_mm: float = 12.0
+    board_marker_mm: float = 9.0
+    board_dictionary: str = "DICT_5X5_1000"
+    well_mm: tuple[float, float] = (305.0, 20.0)
+    """Centre of the ink well, in the paper frame."""
+    well_radius_mm: float = 15.0
+    ink_level_mm: float = 10.0
+    """Ink surface above the paper plane."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """The camera: where it looks and how well. Lens distortion is left for a later rig; perspective is here."""
+
+    width_px: int = 2048
+    height_px: int = 1536
+    px_per_mm: float = 6.25
+    keystone: float = 0.012
+    """Relative change of scale from one edge of the image to the other."""
+    turn_deg: float = 0.6
+    centre_mm: tuple[float, float] = (122.0, 86.0)
+    """The point of the paper plane in the middle of the image, in the paper frame."""
+    noise: float = 2.0
+    """Standard deviation in gray levels."""
+    shade: float = 0.18
+    """Fall-off of the light toward one corner."""
+    blur_px: float = 0.7
+    fps: float = 8.0
+    jpeg_quality: int = 95
+    stamp_strip: bool = False
+    """Draw the host time into the top rows, for tests of `fresh(after)`."""
+
+
+@dataclass(frozen=True, slots=True)
+class SimConfig:
+    """One loopback rig."""
+
+    seed: int = 1
+    rate: float = 1.0
+    """Simulated seconds per real second."""
+    arcs_port: int = 0
+    """0 lets the system choose."""
+    camera_port: int = 0
+    home_mm: tuple[float, float, float] = (250.0, -230.0, 260.0)
+    """Where the tip rests when the rig starts, in the base frame."""
+    brush: BrushSpec = field(default_factory=BrushSpec)
+    table: Table = field(default_factory=Table)
+    view: View = field(default_factory=View)

@@ -1,0 +1,72 @@
+"""The `rig.toml` of the loopback rig: what an operator would have taught, small errors included."""
+
+from __future__ import annotations
+
+from drivers.sim.config import SimConfig
+
+TAUGHT_TOUCH_ERROR_MM = 0.03
+"""Nobody teaches a touch height exactly."""
+
+
+def rig_toml(config: SimConfig, host: str, arcs_port: int, camera_port: int) -> str:
+    """TOML text; addresses as served."""
+    table, view, brush = config.table, config.view, config.brush
+    touch_z_mm = table.paper_z_mm + TAUGHT_TOUCH_ERROR_MM
+    return f"""\
+# The loopback rig, seed {config.seed}. Simulated: nothing measured on it is a result on paper.
+name = "loopback rig"
+
+[robot]
+kind = "aubo-arcs"
+host = "{host}"
+port = {arcs_port}
+tcp_offset_mm = [0.0, 0.0, 180.0]
+
+[robot.limits]
+x_mm = [200.0, 640.0]
+y_mm = [-260.0, 260.0]
+z_mm = [95.0, 400.0]
+tilt_deg = 15.0
+speed_mm_s = 250.0
+acc_mm_s2 = 1000.0
+
+[camera]
+kind = "opencv"
+source = "http://{host}:{camera_port}/stream.mjpg"
+latency_ms = 250.0
+lens = "simulated, {view.px_per_mm:g} px/mm, no distortion"
+
+[brush]
+name = "simulated bristle bundle, seed {brush.seed}"
+radius_mm = {brush.radius_mm}
+length_mm = {brush.length_mm}
+max_depth_mm = 22.0
+
+[paper]
+name = "simulated Xuan paper"
+origin_mm = [{table.origin_mm[0]}, {table.origin_mm[1]}]
+yaw_deg = {table.yaw_deg}
+touch_z_mm = {touch_z_mm:.3f}
+size_mm = [{table.sheet_mm[0]}, {table.sheet_mm[1]}]
+cell_mm = [40.0, 24.0]
+touch_point_mm = [2.0, 2.0]
+
+[ink]
+name = "simulated ink"
+well_mm = [{table.well_mm[0]}, {table.well_mm[1]}]
+dip_z_mm = {table.paper_z_mm + table.ink_level_mm - 8.0}
+
+[board]
+squares = [{table.board_squares[0]}, {table.board_squares[1]}]
+square_mm = {table.board_square_mm}
+marker_mm = {table.board_marker_mm}
+dictionary = "{table.board_dictionary}"
+origin_mm = [{table.board_origin_mm[0]}, {table.board_origin_mm[1]}]
+
+[motion]
+safe_z_mm = {table.paper_z_mm + 60.0}
+park_mm = [{config.home_mm[0]}, {config.home_mm[1]}, {config.home_mm[2]}]
+travel_speed_mm_s = 200.0
+press_speed_mm_s = 20.0
+acc_mm_s2 = 800.0
+"""

@@ -1,0 +1,63 @@
+"""What the loopback servers share: a listener, its clients, and an end that leaves nothing behind."""
+
+from __future__ import annotations
+
+import abc
+import asyncio
+import contextlib
+
+from drivers.errors import ProtocolViolation
+
+
+class LoopbackServer(abc.ABC):
+    """A TCP server whose clients are tasks; `converse` speaks to one of them."""
+
+    def __init__(self) -> None:
+        self._server: asyncio.Server | None = None
+        self._clients: set[asyncio.Task[None]] = set()
+        self.port = 0
+
+    @abc.abstractmethod
+    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Speak to one client until it goes away; may raise what its going away raises."""
+
+    async def start(self, host: str, port: int) -> None:
+        """Listen; `port` 0 lets the system choose, `self.port` tells."""
+        self._server = await asyncio.start_server(self._serve, host, port)
+        self.port = self._server.sockets[0].getsockname()[1]
+
+    async def stop(self) -> None:
+        """Close the listener and every client."""
+        if self._server is not None:
+            self._server.close()
+            self.drop_clients()
+            await asyncio.gather(*self._clients, return_exceptions=True)
+            await self._server.wait_closed()
+
+    def drop_clients(self) -> None:
+        """Close every connection from the server's side (also a fault that tests script)."""
+        for task in list(self._clients):
+            task.cancel()
+
+    @property
+    def clients(self) -> int:
+        """How many are connected."""
+        return len(self._clients)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._clients.add(task)
+        try:
+            await self.converse(reader, writer)
+        except (ConnectionError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+            pass  # the client went away
+        except ProtocolViolation:
+            pass  # it does not speak the protocol
+        except asyncio.CancelledError:
+            pass  # `stop`: the streams module would report a cancelled handler as an error
+        finally:
+            self._clients.discard(task)
+            writer.close()
+            with contextlib.suppress(ConnectionError, asyncio.CancelledError):
+                await writer.wait_closed()

@@ -1,0 +1,210 @@
+"""The backbone of the simulated brush: a tapered planar elastica pressed on a rigid plane with friction.
+
+Everything here is in mm, N and radians. The plane of bending holds x (the ferrule leans toward +x) and z (up,
+paper at 0). The spine is a chain of equal rigid links with torsion springs; its unknowns are the link angles
+`phi`, measured from straight down and positive toward -x. Quasi-static loading minimises, per load step,
+bending plus squash plus the lagged smoothed-Coulomb potential of incremental potential contact (Li et al.,
+ACM TOG 39(4), 2020), by damped Newton.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+LOAD_STEP_MM = 0.5
+"""Largest descent per load step; friction makes the result depend on the path, so this is part of the rig."""
+
+SLIP_SMOOTHING_MM = 0.02
+"""Slip at which friction reaches 0.7 of its Coulomb value; Newton needs the corner rounded."""
+
+HARD_CORE = 0.8
+"""Squash, as a fraction of the local radius, beyond which the packed hairs turn stiff."""
+
+PACKED_N_PER_MM2 = 1.0
+"""Stiffness of the packed bundle: force per mm of length and mm of further squash."""
+
+UPRIGHT_SMOOTHING = 0.01
+"""Rounds the kink of |sin phi| so that an upright spine may fall to either side."""
+
+MENISCUS_MM = 0.8
+"""Gap over which a meniscus still bridges bundle and paper."""
+
+MAX_NEWTON = 60
+ANGLE_TOLERANCE_RAD = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """Mechanical description of a free bundle cut into n links, ordered from the ferrule to the tip."""
+
+    link_mm: float
+    radius_mm: Vector
+    """(n,) free radius at the far end of each link."""
+    joint_n_mm: Vector
+    """(n,) torsion stiffness of the joint at the near end of each link, N mm / rad."""
+    rest_bend_rad: Vector
+    """(n,) rest angle of each joint: the natural set of the bundle."""
+    squash_n_per_mm2: float
+    """Force per mm of length and per mm of squash."""
+    suction_n_per_mm2: float
+    """Peak capillary stress over the bundle's diameter, for sections just clear of the paper."""
+    friction: float
+
+
+@dataclass(frozen=True, slots=True)
+class SpineShape:
+    """A spine in equilibrium; node j is the far end of link j."""
+
+    x_mm: Vector
+    """(n,) node positions along the paper."""
+    z_mm: Vector
+    """(n,) heights of the bundle's centre line above the paper."""
+    phi_rad: Vector
+    """(n,) link angles from straight down, positive toward -x."""
+    squash_mm: Vector
+    """(n,) how far the free cross-section would reach below the paper; negative where it is clear of it."""
+    normal_n: Vector
+    """(n,) contact force on each node, upward, without the pull of the menisci."""
+
+
+def press_spine(bundle: Bundle, depth_mm: float, tilt_rad: float) -> tuple[SpineShape, ...]:
+    """The spine after each load step of a descent by `depth_mm`, tilted by `tilt_rad`; the last is final.
+
+    At zero touch the tip of the unloaded bundle is at x = z = 0; the bundle tilts about it, then the ferrule
+    moves down.
+    """
+    phi = tilt_rad + np.cumsum(bundle.rest_bend_rad)
+    clamp_x = bundle.link_mm * float(np.sin(phi).sum())
+    clamp_z = bundle.link_mm * float(np.cos(phi).sum())
+    x = clamp_x - bundle.link_mm * np.cumsum(np.sin(phi))
+    normal = np.zeros_like(phi)
+    path: list[SpineShape] = []
+    steps = max(1, int(np.ceil(depth_mm / LOAD_STEP_MM)))
+    for lowered in np.linspace(0.0, depth_mm, steps + 1)[1:]:
+        step = _LoadStep(bundle, tilt_rad, clamp_x, clamp_z - float(lowered), x, normal)
+        phi = step.solve(phi)
+        path.append(step.shape(phi))
+        x, normal = path[-1].x_mm, path[-1].normal_n
+    return tuple(path)
+
+
+@dataclass(frozen=True, slots=True)
+class _LoadStep:
+    """The energy of one load step, given node positions and contact forces at the end of the last."""
+
+    bundle: Bundle
+    tilt_rad: float
+    clamp_x: float
+    clamp_z: float
+    last_x: Vector
+    last_normal: Vector
+
+    def solve(self, phi: Vector) -> Vector:
+        """Minimise the energy from `phi` by Newton with a backtracking line search; stops at `MAX_NEWTON`."""
+        energy, gradient, hessian = self.derivatives(phi)
+        for _ in range(MAX_NEWTON):
+            move = -np.linalg.solve(hessian, gradient)
+            move *= min(1.0, 0.3 / max(float(np.abs(move).max()), 1e-12))
+            slope = float(gradient @ move)
+            scale = 1.0
+            while self.energy(phi + scale * move) > energy + 1e-4 * scale * slope and scale > 1e-3:
+                scale *= 0.5
+            phi = phi + scale * move
+            if scale * float(np.abs(move).max()) < ANGLE_TOLERANCE_RAD:
+                break
+            energy, gradient, hessian = self.derivatives(phi)
+        return phi
+
+    def shape(self, phi: Vector) -> SpineShape:
+        """Positions, squash and contact forces that belong to the angles `phi`."""
+        x, z = self._nodes(phi)
+        squash = self.bundle.radius_mm * _broadside(phi) - z
+        return SpineShape(x, z, phi, squash, np.maximum(0.0, self._contact(squash)[1]))
+
+    def energy(self, phi: Vector) -> float:
+        """Bending, squash and lagged friction energy in N mm."""
+        x, z = self._nodes(phi)
+        bend = self._bend(phi)
+        squash = self.bundle.radius_mm * _broadside(phi) - z
+        slid = np.hypot(x - self.last_x, SLIP_SMOOTHING_MM)
+        stored = 0.5 * self.bundle.joint_n_mm @ bend**2 + self._contact(squash)[0].sum()
+        return float(stored + self.bundle.friction * self.last_normal @ slid)
+
+    def derivatives(self, phi: Vector) -> tuple[float, Vector, Vector]:
+        """Energy, its gradient (n,) and a Hessian (n, n) rid of concave terms if need be."""
+        b, ds, n = self.bundle, self.bundle.link_mm, phi.size
+        x, z = self._nodes(phi)
+        sin, cos = np.sin(phi), np.cos(phi)
+        bend = self._bend(phi)
+        broad = _broadside(phi)
+        squash = b.radius_mm * broad - z
+        stored, normal, stiffness = self._contact(squash)
+        slip = x - self.last_x
+        slid = np.hypot(slip, SLIP_SMOOTHING_MM)
+        limit = b.friction * self.last_normal
+        drag = limit * slip / slid
+        drag_stiffness = limit * SLIP_SMOOTHING_MM**2 / slid**3
+
+        # rows: nodes, columns: angles; a node moves with every link above it, and `sink` is d(squash)
+        lower = ds * np.tri(n)
+        along = -lower * cos
+        sink = -lower * sin + np.diag(b.radius_mm * sin * cos / broad)
+
+        torque = b.joint_n_mm * bend
+        gradient = torque - np.append(torque[1:], 0.0) + sink.T @ normal + along.T @ drag
+        below_normal = np.cumsum(normal[::-1])[::-1]
+        below_drag = np.cumsum(drag[::-1])[::-1]
+        section_curve = (cos**2 - sin**2) / broad - (sin * cos) ** 2 / broad**3
+        curve = ds * (sin * below_drag - cos * below_normal) + b.radius_mm * section_curve * normal
+        hessian = sink.T @ (np.maximum(stiffness, 0.0)[:, None] * sink)
+        hessian += along.T @ (drag_stiffness[:, None] * along)
+        spring = b.joint_n_mm
+        diagonal = np.diag_indices(n)
+        hessian[diagonal] += spring + np.append(spring[1:], 0.0)
+        above = np.arange(n - 1)
+        hessian[above, above + 1] -= spring[1:]
+        hessian[above + 1, above] -= spring[1:]
+        hessian[diagonal] += curve
+        if not _is_convex(hessian):
+            hessian[diagonal] -= np.minimum(curve, 0.0)
+        total = float(0.5 * torque @ bend + stored.sum() + b.friction * self.last_normal @ slid)
+        return total, gradient, hessian
+
+    def _nodes(self, phi: Vector) -> tuple[Vector, Vector]:
+        ds = self.bundle.link_mm
+        return self.clamp_x - ds * np.cumsum(np.sin(phi)), self.clamp_z - ds * np.cumsum(np.cos(phi))
+
+    def _bend(self, phi: Vector) -> Vector:
+        return np.diff(phi, prepend=self.tilt_rad) - self.bundle.rest_bend_rad
+
+    def _contact(self, squash: Vector) -> tuple[Vector, Vector, Vector]:
+        """Energy, force and stiffness (n,): soft, then packed, and pulled down when just clear."""
+        soft = self.bundle.squash_n_per_mm2 * self.bundle.link_mm
+        hard = PACKED_N_PER_MM2 * self.bundle.link_mm
+        inside = np.maximum(0.0, squash)
+        over = np.maximum(0.0, squash - HARD_CORE * self.bundle.radius_mm)
+        # the pull is a parabola over the meniscus, 0 at touch and at its end, so that Newton sees no jump
+        gap = np.clip(-squash / MENISCUS_MM, 0.0, 1.0)
+        pull = 8.0 * self.bundle.suction_n_per_mm2 * self.bundle.radius_mm * self.bundle.link_mm
+        energy = 0.5 * soft * inside**2 + 0.5 * hard * over**2
+        energy += pull * MENISCUS_MM * (gap**2 / 2.0 - gap**3 / 3.0)
+        force = soft * inside + hard * over - pull * gap * (1.0 - gap)
+        stiffness = soft * (squash > 0.0) + hard * (over > 0.0)
+        stiffness += pull / MENISCUS_MM * (1.0 - 2.0 * gap) * ((gap > 0.0) & (gap < 1.0))
+        return energy, force, stiffness
+
+
+def _broadside(phi: Vector) -> Vector:
+    """|sin phi|, rounded where the spine is upright: how much of the local radius points at the paper."""
+    return np.hypot(np.sin(phi), UPRIGHT_SMOOTHING)
+
+
+def _is_convex(hessian: NDArray[np.float64]) -> bool:
+    try:
+        np.linalg.cholesky(hessian)
+    except np.linalg.LinAlgError:
+        return False
+    return True
