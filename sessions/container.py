@@ -1,0 +1,166 @@
+"""Reading MCAP files that a crash, a bad disk or a stranger may have changed.
+
+The mcap library believes the lengths that a file states, and meets damage with a dozen kinds of error. Here lengths
+are bounded before anything is read, the index is checked by its CRC, and damage is a `SessionDamaged` naming the file.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
+from mcap.reader import FOOTER_SIZE, SeekingReader
+from mcap.records import Attachment, Channel, ChunkIndex, Message, Metadata, Schema
+from mcap.summary import Summary
+from mcap.writer import MCAP0_MAGIC
+
+from sessions.errors import InputError, SessionDamaged, in_one_line
+
+MAX_RECORD_BYTES = 512 * 1024 * 1024
+"""A chunk holds 256 KiB and then one message more: the largest image allowed, with room to spare."""
+UNREADABLE = (
+    McapError,
+    struct.error,
+    zstandard.ZstdError,
+    ValueError,
+    RuntimeError,
+    LookupError,
+    ArithmeticError,
+    EOFError,
+    OSError,
+    MemoryError,
+)
+"""Everything that mcap, zstd and the system were seen to raise for damaged files."""
+
+_T = TypeVar("_T")
+
+
+def messages(path: Path, topics: list[str] | None = None) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    """Messages in order of log time, every CRC checked. Raises `SessionDamaged`."""
+    return _guarded(path, lambda file: _messages(file, topics))
+
+
+def metadata(path: Path) -> Iterator[Metadata]:
+    """Metadata records. Raises `SessionDamaged`."""
+    return _guarded(path, lambda file: _indexed(file)[0].iter_metadata())
+
+
+def attachments(path: Path) -> Iterator[Attachment]:
+    """Attached files, byte for byte. Raises `SessionDamaged`."""
+    return _guarded(path, _attachments)
+
+
+def indexed_counts(path: Path) -> dict[str, int]:
+    """Messages by topic as the index tells, without reading them. Raises `SessionDamaged`."""
+    return next(_guarded(path, _indexed_counts))
+
+
+class _BoundedFile(io.BufferedReader):
+    """Asks for no more than the file holds, whatever length a damaged record states."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self.size = os.fstat(self.fileno()).st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        left = max(self.size - self.tell(), 0)
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+
+def _guarded(path: Path, read: Callable[[_BoundedFile], Iterator[_T]]) -> Iterator[_T]:
+    """Only the library's own steps are guarded: an exception of the code between two items is not the file's."""
+    try:
+        file = _BoundedFile(path)
+    except OSError as error:
+        raise InputError(path, f"cannot open: {in_one_line(error)}") from None
+    with file:
+        if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+            raise InputError(path, "is not an MCAP file")
+        file.seek(0)
+        items: Iterator[_T] | None = None
+        while True:
+            try:
+                items = items or read(file)
+                item = next(items)
+            except StopIteration:
+                return
+            except UNREADABLE as error:
+                raise SessionDamaged(path, f"cannot read: {in_one_line(error)}") from None
+            yield item
+
+
+def _indexed(file: _BoundedFile) -> tuple[SeekingReader, Summary]:
+    reader = SeekingReader(file, validate_crcs=True, record_size_limit=MAX_RECORD_BYTES)
+    _check_summary_crc(file)
+    summary = reader.get_summary()
+    if summary is None or summary.statistics is None:
+        raise McapError("has no index: it was not finished")
+    return reader, summary
+
+
+def _check_summary_crc(file: _BoundedFile) -> None:
+    """The index says which chunks hold which topic: unchecked, one wrong bit would hide strokes in silence."""
+    footer_at = file.size - FOOTER_SIZE - len(MCAP0_MAGIC)
+    file.seek(footer_at)
+    _opcode, _length, summary_start, _offsets, expected = struct.unpack("<BQQQI", file.read(FOOTER_SIZE))
+    if file.read() != MCAP0_MAGIC or not 0 < summary_start <= footer_at:
+        raise McapError("has no index: it was not finished, or is cut short")
+    file.seek(summary_start)
+    crc, left = 0, file.size - len(MCAP0_MAGIC) - 4 - summary_start
+    while left > 0:
+        piece = file.read(min(left, 1 << 20))
+        crc, left = zlib.crc32(piece, crc), left - len(piece)
+    if crc != expected:
+        raise McapError("the index does not match its CRC")
+
+
+def _messages(file: _BoundedFile, topics: list[str] | None) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    reader, summary = _indexed(file)
+    if not summary.chunk_indexes:
+        if summary.statistics is None or summary.statistics.message_count:
+            raise McapError("has messages outside chunks, which no CRC protects")
+        return
+    for index in summary.chunk_indexes:
+        _check_chunk(file, index)
+    yield from reader.iter_messages(topics)
+
+
+def _check_chunk(file: _BoundedFile, index: ChunkIndex) -> None:
+    """Refuse a chunk that would unpack to more than `MAX_RECORD_BYTES`, whichever of its three lengths says so."""
+    file.seek(index.chunk_start_offset + 1 + 8 + 8 + 8)
+    stream = ReadDataStream(file)
+    size = stream.read8()
+    stream.read4()
+    compression = stream.read_prefixed_string()
+    size = max(size, stream.read8())
+    if compression == "zstd":
+        size = max(size, zstandard.frame_content_size(stream.read(18)))
+    elif compression:
+        raise McapError(f"chunk compressed by {compression!r}, allowed: zstd or none")
+    if size > MAX_RECORD_BYTES:
+        raise McapError(f"chunk of {size} bytes exceeds {MAX_RECORD_BYTES}")
+
+
+def _attachments(file: _BoundedFile) -> Iterator[Attachment]:
+    reader, summary = _indexed(file)
+    for index, attachment in zip(summary.attachment_indexes, reader.iter_attachments(), strict=True):
+        again = RecordBuilder()
+        attachment.write(again)
+        file.seek(index.offset)
+        if file.read(index.length) != again.end():  # the reader skips the CRC of an attachment
+            raise McapError(f"attachment {attachment.name!r} does not match its CRC")
+        yield attachment
+
+
+def _indexed_counts(file: _BoundedFile) -> Iterator[dict[str, int]]:
+    _reader, summary = _indexed(file)
+    counts = summary.statistics.channel_message_counts if summary.statistics else {}
+    yield {summary.channels[channel_id].topic: count for channel_id, count in counts.items()}

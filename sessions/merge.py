@@ -1,0 +1,85 @@
+"""Close a session: copy every finished segment into one MCAP, read it back, and only then give it its name."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from pathlib import Path
+
+from mcap.writer import CompressionType, Writer
+
+from sessions.container import messages
+from sessions.errors import SessionDamaged, SessionError, in_one_line
+from sessions.journal import fsync_folder
+from sessions.schemas import Header
+from sessions.writer import CHUNK_BYTES, HEADER_METADATA, file_sha256, header_metadata
+
+
+def merge(segments: list[Path], final: Path, header: Header, attachments: list[Path], expected: dict[str, int]) -> None:
+    """Merge in the order given; the file gets its name once it reads back with CRCs checked and `expected` counts.
+
+    `attachments` (the configuration) travel inside, so that the merged file is all that need be
+    shared. Raises `SessionDamaged` naming the segment that cannot be read, or the counts that do not agree.
+    """
+    part = final.with_name(final.name + ".part")
+    try:
+        part.unlink(missing_ok=True)  # only ever a copy of segments that are still there
+        _write(segments, part, header, attachments)
+        counts = count_messages(part)
+        if counts != expected:
+            raise SessionDamaged(part, f"holds {counts}, but the journal says {expected}")
+        part.rename(final)
+        fsync_folder(final.parent)
+    except OSError as error:
+        raise SessionError(part, f"cannot write: {in_one_line(error)}") from error
+
+
+def count_messages(path: Path) -> dict[str, int]:
+    """Messages by topic, every chunk's CRC checked. Raises `SessionDamaged`."""
+    return dict(Counter(channel.topic for _schema, channel, _message in messages(path)))
+
+
+def verify(path: Path, sha256: str) -> None:
+    """Raise `SessionDamaged` unless the file is byte for byte what was recorded."""
+    if not path.is_file():
+        raise SessionDamaged(path, "is missing, though the journal says it was finished")
+    try:
+        digest = file_sha256(path)
+    except OSError as error:
+        raise SessionDamaged(path, f"cannot read: {in_one_line(error)}") from None
+    if digest != sha256:
+        raise SessionDamaged(path, "has changed since it was recorded (sha256 differs from the journal)")
+
+
+def _write(segments: list[Path], part: Path, header: Header, attachments: list[Path]) -> None:
+    with part.open("xb") as file:
+        writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        writer.start(profile="", library=header.software)
+        writer.add_metadata(HEADER_METADATA, header_metadata(header))
+        channels: dict[tuple[str, str], int] = {}
+        for path in attachments:
+            writer.add_attachment(0, 0, path.name, "application/toml", path.read_bytes())
+        for segment in segments:
+            _copy(segment, writer, channels)
+        writer.finish()
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _copy(segment: Path, writer: Writer, channels: dict[tuple[str, str], int]) -> None:
+    for schema, channel, message in messages(segment):
+        ident = (channel.topic, schema.name if schema else "")
+        if ident not in channels:
+            schema_id = (
+                writer.register_schema(name=schema.name, encoding=schema.encoding, data=schema.data) if schema else 0
+            )
+            channels[ident] = writer.register_channel(
+                topic=channel.topic, message_encoding=channel.message_encoding, schema_id=schema_id
+            )
+        writer.add_message(
+            channel_id=channels[ident],
+            log_time=message.log_time,
+            publish_time=message.publish_time,
+            sequence=message.sequence,
+            data=message.data,
+        )

@@ -1,0 +1,143 @@
+"""Reading a recording: the header, the strokes with their stills, one at a time, in flat memory."""
+
+from __future__ import annotations
+
+import json
+from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from google.protobuf.message import DecodeError
+from pydantic import ValidationError
+
+from sessions import container
+from sessions.errors import InputError, SessionDamaged, in_one_line
+from sessions.journal import JOURNAL_NAME, is_open, replay
+from sessions.messages import decode_gray
+from sessions.schemas import Event, Header, StepEvent, Stroke, Topic
+from sessions.writer import HEADER_METADATA, file_sha256
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+MAX_ATTACHMENT_BYTES = 1024 * 1024
+STILLS_KEPT = 8
+"""A stroke refers to a still shortly before it; more would hold a session in memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    """A stroke and the still that shows it."""
+
+    stroke: Stroke
+    still_png: bytes
+    where: str
+
+    def image(self) -> NDArray[np.uint8]:
+        """(h, w) uint8 gray. Raises `SessionDamaged` naming the stroke."""
+        return decode_gray(self.still_png, self.where)
+
+
+class Recording:
+    """One finished recording, opened by its folder or its MCAP file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = _find_mcap(path)
+        self.header = _read_header(self.path)
+
+    @property
+    def sha256(self) -> str:
+        """Digest of the MCAP file, for provenance."""
+        return file_sha256(self.path)
+
+    def attachment(self, name: str) -> bytes:
+        """A file that travels inside the recording (`rig.toml`). Raises `InputError` where there is none."""
+        for attachment in container.attachments(self.path):
+            if attachment.name == name and len(attachment.data) <= MAX_ATTACHMENT_BYTES:
+                return attachment.data
+        raise InputError(self.path, f"holds no {name} of at most {MAX_ATTACHMENT_BYTES} bytes")
+
+    def strokes(self) -> int:
+        """How many strokes the index tells, without reading one."""
+        return container.indexed_counts(self.path).get(Topic.STROKE, 0)
+
+    def captures(self) -> Iterator[Capture]:
+        """Every stroke in order of capture. Raises `SessionDamaged`."""
+        stills: OrderedDict[int, bytes] = OrderedDict()
+        for topic, sequence, data in self._messages([Topic.STILL, Topic.STROKE]):
+            if topic == Topic.STILL:
+                stills[sequence] = _still(self.path, data)
+                while len(stills) > STILLS_KEPT:
+                    stills.popitem(last=False)
+                continue
+            stroke = _event(self.path, Stroke, data)
+            if stroke.still not in stills:
+                raise SessionDamaged(self.path, f"stroke {stroke.stroke_id} names still {stroke.still}, not there")
+            yield Capture(stroke, stills[stroke.still], f"{self.path} stroke {stroke.stroke_id}")
+
+    def stills_of(self, kind: str) -> Iterator[bytes]:
+        """The stills taken in steps of this kind (`board`), encoded."""
+        current = ""
+        for topic, _sequence, data in self._messages([Topic.STEP, Topic.STILL]):
+            if topic == Topic.STEP:
+                event = _event(self.path, StepEvent, data)
+                current = event.kind if event.phase == "begin" else ""
+            elif current == kind:
+                yield _still(self.path, data)
+
+    def _messages(self, topics: list[Topic]) -> Iterator[tuple[str, int, bytes]]:
+        for _schema, channel, message in container.messages(self.path, [str(topic) for topic in topics]):
+            yield channel.topic, message.sequence, message.data
+
+
+def _find_mcap(path: Path) -> Path:
+    if path.is_file():
+        return path
+    if not path.is_dir():
+        raise InputError(path, "no such session: give a session's folder or its .mcap file")
+    merged = path / f"{path.resolve().name}.mcap"
+    if (path / JOURNAL_NAME).is_file() and is_open(replay(path / JOURNAL_NAME)):
+        raise InputError(path, "is still open: run the same `brushloop collect` again to finish it")
+    if not merged.is_file():
+        raise InputError(path, f"holds no {merged.name}")
+    return merged
+
+
+def _read_header(path: Path) -> Header:
+    for record in container.metadata(path):
+        if record.name == HEADER_METADATA:
+            try:
+                values: dict[str, Any] = {name: json.loads(text) for name, text in record.metadata.items()}
+                return Header.model_validate(values, strict=False)
+            except ValidationError as error:
+                raise SessionDamaged(path, _first_error(Header, error)) from None
+            except (ValueError, RecursionError) as error:
+                raise SessionDamaged(path, f"header cannot be read: {in_one_line(error)}") from None
+    raise InputError(path, "is an MCAP file, but not one of brushloop's: it has no header")
+
+
+def _still(path: Path, data: bytes) -> bytes:
+    try:
+        return CompressedImage.FromString(data).data
+    except DecodeError as error:
+        raise SessionDamaged(path, f"a still cannot be read: {in_one_line(error)}") from None
+
+
+_E = TypeVar("_E", Stroke, StepEvent)
+
+
+def _event(path: Path, kind: type[_E], data: bytes) -> _E:
+    try:
+        return kind.model_validate_json(data)
+    except ValidationError as error:
+        raise SessionDamaged(path, _first_error(kind, error)) from None
+
+
+def _first_error(kind: type[Event], error: ValidationError) -> str:
+    first = error.errors()[0]
+    field = ".".join(str(part) for part in first["loc"])
+    return " ".join(f"{kind.__name__}.{field}: {first['msg']}".split())
