@@ -1,0 +1,177 @@
+"""The simple shapes that CCD-BSM is compared with: ellipse, circle and line, each derived from the CCD-BSM
+mark.
+
+Every baseline takes its sizes from the mark of the same (H, alpha) and stands on the mark's bounding box in
+the frame of `model.coverage`, so a score between two models shows their shape and not a shift. The sources do
+not define them; each function states the definition chosen and its alternatives, because a score depends on
+them strongly.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from model.ccdbsm import CcdBsm
+from model.profile import column, disc_integral, safe_sqrt
+
+Diameter = Literal["length", "width", "area"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ellipse:
+    """B ellipses with axes along x and y: centre on the x axis and semi-axes in mm, all (B,); a `Profile`."""
+
+    centre_mm: Tensor
+    semi_x_mm: Tensor
+    semi_y_mm: Tensor
+
+    @property
+    def x_min_mm(self) -> Tensor:
+        """The end on the tip side, (B,)."""
+        return self.centre_mm - self.semi_x_mm
+
+    @property
+    def x_max_mm(self) -> Tensor:
+        """The end on the heel side, (B,)."""
+        return self.centre_mm + self.semi_x_mm
+
+    @property
+    def width_mm(self) -> Tensor:
+        """The whole axis along y, (B,)."""
+        return 2 * self.semi_y_mm
+
+    @property
+    def area_mm2(self) -> Tensor:
+        """pi times the product of the semi-axes, (B,)."""
+        return math.pi * self.semi_x_mm * self.semi_y_mm
+
+    def half_width(self, x_mm: Tensor) -> Tensor:
+        """The half width at x, (B, N) -> (B, N) mm; zero outside."""
+        u = self._fraction(x_mm)
+        return column(self.semi_y_mm) * safe_sqrt((1 - u) * (1 + u))
+
+    def area_to(self, x_mm: Tensor) -> Tensor:
+        """The integral of the half width up to x, (B, N) -> (B, N) mm^2."""
+        scale = column(self.semi_x_mm * self.semi_y_mm)
+        return scale * (disc_integral(self._fraction(x_mm)) + 0.25 * math.pi)
+
+    def level(self, a_mm: Tensor) -> tuple[Tensor, Tensor]:
+        """The ends of {x : half width >= a}, (B, N) -> two (B, N) mm."""
+        ratio = (a_mm / column(self.semi_y_mm)).clamp(0, 1)
+        reach = column(self.semi_x_mm) * safe_sqrt((1 - ratio) * (1 + ratio))
+        return column(self.centre_mm) - reach, column(self.centre_mm) + reach
+
+    def _fraction(self, x_mm: Tensor) -> Tensor:
+        return ((x_mm - column(self.centre_mm)) / column(self.semi_x_mm)).clamp(-1, 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Capsule:
+    """B capsules: segments of half length `reach` dilated by discs of `radius`, mm, all (B,); a `Profile`.
+
+    The segment lies along x (`reach_x_mm`) or across it (`reach_y_mm`); the other reach is zero.
+    """
+
+    centre_mm: Tensor
+    radius_mm: Tensor
+    reach_x_mm: Tensor
+    reach_y_mm: Tensor
+
+    @property
+    def x_min_mm(self) -> Tensor:
+        """The end on the tip side, (B,)."""
+        return self.centre_mm - self.reach_x_mm - self.radius_mm
+
+    @property
+    def x_max_mm(self) -> Tensor:
+        """The end on the heel side, (B,)."""
+        return self.centre_mm + self.reach_x_mm + self.radius_mm
+
+    @property
+    def width_mm(self) -> Tensor:
+        """The whole extent along y, (B,)."""
+        return 2 * (self.radius_mm + self.reach_y_mm)
+
+    @property
+    def area_mm2(self) -> Tensor:
+        """A disc and a rectangle, (B,)."""
+        return self.radius_mm * (math.pi * self.radius_mm + 4 * (self.reach_x_mm + self.reach_y_mm))
+
+    def half_width(self, x_mm: Tensor) -> Tensor:
+        """The half width at x, (B, N) -> (B, N) mm; zero outside."""
+        offset = (x_mm - column(self.centre_mm)).abs()
+        u = ((offset - column(self.reach_x_mm)) / column(self.radius_mm)).clamp(0, 1)
+        inside = offset <= column(self.reach_x_mm + self.radius_mm)
+        cap = column(self.radius_mm) * safe_sqrt((1 - u) * (1 + u))
+        return torch.where(inside, cap + column(self.reach_y_mm), torch.zeros_like(cap))
+
+    def area_to(self, x_mm: Tensor) -> Tensor:
+        """The integral of the half width up to x, (B, N) -> (B, N) mm^2."""
+        radius, reach = column(self.radius_mm), column(self.reach_x_mm)
+        end = reach + radius
+        offset = torch.clamp(x_mm - column(self.centre_mm), -end, end)
+        straight = torch.clamp(offset, -reach, reach)
+        # Beyond the straight part the rest of the offset lies in one of the two half discs.
+        caps = radius**2 * (disc_integral(((offset - straight) / radius).clamp(-1, 1)) + 0.25 * math.pi)
+        return caps + radius * (straight + reach) + column(self.reach_y_mm) * (offset + end)
+
+    def level(self, a_mm: Tensor) -> tuple[Tensor, Tensor]:
+        """The ends of {x : half width >= a}, (B, N) -> two (B, N) mm."""
+        radius = column(self.radius_mm)
+        above = a_mm - column(self.reach_y_mm)
+        ratio = (above / radius).clamp(0, 1)
+        # At the very top the whole segment is level; above it the set is empty.
+        segment = torch.where(above <= radius, column(self.reach_x_mm).expand_as(above), torch.zeros_like(above))
+        reach = segment + radius * safe_sqrt((1 - ratio) * (1 + ratio))
+        return column(self.centre_mm) - reach, column(self.centre_mm) + reach
+
+
+def ellipse(mark: CcdBsm) -> Ellipse:
+    """The bounding ellipse: the mark's length and width, centred on its bounding box.
+
+    Alternatives not taken: the ellipse of equal area on the same length (narrower than the mark), and the
+    ellipse of equal centroid and second moments.
+    """
+    return Ellipse(centre_mm=_centre(mark), semi_x_mm=0.5 * mark.length_mm, semi_y_mm=0.5 * mark.width_mm)
+
+
+def circle(mark: CcdBsm, diameter: Diameter = "length") -> Ellipse:
+    """The circle whose diameter is the mark's length, centred on its bounding box.
+
+    `diameter` offers the alternatives: "width" (the mark's width) and "area" (the mark's area). Raises
+    ValueError for another word.
+    """
+    if diameter == "length":
+        radius = 0.5 * mark.length_mm
+    elif diameter == "width":
+        radius = 0.5 * mark.width_mm
+    elif diameter == "area":
+        radius = (mark.area_mm2 / math.pi).sqrt()
+    else:
+        raise ValueError(f"diameter = {diameter!r}: expected 'length', 'width' or 'area'")
+    return Ellipse(centre_mm=_centre(mark), semi_x_mm=radius, semi_y_mm=radius)
+
+
+def line(mark: CcdBsm) -> Capsule:
+    """The capsule with the mark's length and width, round ends included in the length.
+
+    A mark wider than long (a stubby brush) gives the capsule that lies across. Alternatives not taken: the
+    rectangle of that length and width (butt ends), and round ends added beyond the length.
+    """
+    half_length, half_width = 0.5 * mark.length_mm, 0.5 * mark.width_mm
+    radius = torch.minimum(half_length, half_width)
+    return Capsule(
+        centre_mm=_centre(mark),
+        radius_mm=radius,
+        reach_x_mm=half_length - radius,
+        reach_y_mm=half_width - radius,
+    )
+
+
+def _centre(mark: CcdBsm) -> Tensor:
+    return 0.5 * (mark.x_min_mm + mark.x_max_mm)

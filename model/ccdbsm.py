@@ -1,0 +1,184 @@
+"""CCD-BSM, the composite-curve-dilation brush stroke model: the mark of one press in closed form.
+
+A cone of radius R and length L is pressed to depth H at tilt alpha. The paper plane cuts the cone; half of
+that section and two parabolas that meet at the tip form the basic graphic, which is dilated across its axis
+by lambda (Eq. 1).
+
+    O3A    = H (tan alpha - tan(alpha - theta))         (Eq. 2)
+    O3C    = H R / (L cos alpha)                        (Eq. 3)
+    O4O3   = H / cos(alpha - theta) + O3A               (Eq. 4)
+    theta  = atan(R / L)                                (Eq. 5)
+
+The paper writes Eq. 2 and 4 with H / tan(90 deg - alpha); the tangent form is the same number without a
+division by an infinite tangent at alpha = 0. O3A is the distance from the brush axis to the tip-side wall of
+the cone, although Eq. 1 draws it on the heel side; this is kept as published.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from model.profile import column, disc_integral, safe_sqrt
+
+
+class DomainError(ValueError):
+    """A parameter outside the domain; carries its `name`, the first bad `value` and the `allowed` range."""
+
+    def __init__(self, name: str, value: float, allowed: str, hint: str = "") -> None:
+        super().__init__(f"{name} = {value:g} is outside {allowed}" + (f"; {hint}" if hint else ""))
+        self.name = name
+        self.value = value
+        self.allowed = allowed
+
+
+@dataclass(frozen=True, slots=True)
+class Brush:
+    """The hair bundle as a cone: largest radius R and length L, mm; both must be positive, else DomainError.
+
+    Floats, or (B,) tensors where a gradient with respect to the brush itself is wanted.
+    """
+
+    radius_mm: float | Tensor = 6.0
+    length_mm: float | Tensor = 48.0
+
+    def __post_init__(self) -> None:
+        for name, value in (("radius_mm", self.radius_mm), ("length_mm", self.length_mm)):
+            _require_positive(name, value)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CcdBsm:
+    """A batch of B marks: the basic lengths of Eq. 2-4 in mm and the dilation lambda, all (B,); a `Profile`.
+
+    Eq. 1: w = lambda O3C sqrt(1 - x^2 / O3A^2) for 0 <= x <= O3A, and lambda O3C (1 - x^2 / O4O3^2) for
+    -O4O3 <= x < 0.
+    """
+
+    o3a_mm: Tensor
+    o3c_mm: Tensor
+    o4o3_mm: Tensor
+    lam: Tensor
+
+    @property
+    def x_min_mm(self) -> Tensor:
+        """The tip, -O4O3, (B,)."""
+        return -self.o4o3_mm
+
+    @property
+    def x_max_mm(self) -> Tensor:
+        """The end of the heel, O3A, (B,)."""
+        return self.o3a_mm
+
+    @property
+    def half_width_mm(self) -> Tensor:
+        """The greatest half width, lambda O3C, at x = 0, (B,)."""
+        return self.lam * self.o3c_mm
+
+    @property
+    def width_mm(self) -> Tensor:
+        """The greatest width, 2 lambda O3C, (B,)."""
+        return 2 * self.half_width_mm
+
+    @property
+    def length_mm(self) -> Tensor:
+        """The whole length, O3A + O4O3, (B,)."""
+        return self.o3a_mm + self.o4o3_mm
+
+    @property
+    def area_mm2(self) -> Tensor:
+        """The area enclosed by Eq. 1, lambda O3C (pi/2 O3A + 4/3 O4O3), (B,)."""
+        return self.half_width_mm * (0.5 * math.pi * self.o3a_mm + 4 / 3 * self.o4o3_mm)
+
+    def half_width(self, x_mm: Tensor) -> Tensor:
+        """Eq. 1 at x, (B, N) -> (B, N) mm; zero outside the mark."""
+        heel, tip = self._fractions(x_mm)
+        # With the other side's fraction clamped to 0, its factor is 1: one product covers both sides.
+        return column(self.half_width_mm) * safe_sqrt((1 - heel) * (1 + heel)) * (1 - tip) * (1 + tip)
+
+    def area_to(self, x_mm: Tensor) -> Tensor:
+        """The integral of Eq. 1 from the tip to x, (B, N) -> (B, N) mm^2."""
+        heel, tip = self._fractions(x_mm)
+        tip_part = column(self.o4o3_mm) * (tip - tip**3 / 3 + 2 / 3)
+        return column(self.half_width_mm) * (tip_part + column(self.o3a_mm) * disc_integral(heel))
+
+    def level(self, a_mm: Tensor) -> tuple[Tensor, Tensor]:
+        """Eq. 1 solved for x on both sides: the ends of {x : w(x) >= a}, (B, N) -> two (B, N) mm."""
+        ratio = (a_mm / column(self.half_width_mm)).clamp(0, 1)
+        left = -column(self.o4o3_mm) * safe_sqrt(1 - ratio)
+        return left, column(self.o3a_mm) * safe_sqrt((1 - ratio) * (1 + ratio))
+
+    def _fractions(self, x_mm: Tensor) -> tuple[Tensor, Tensor]:
+        """x / O3A clamped to [0, 1] and x / O4O3 clamped to [-1, 0]."""
+        return (x_mm / column(self.o3a_mm)).clamp(0, 1), (x_mm / column(self.o4o3_mm)).clamp(-1, 0)
+
+
+def ccdbsm(
+    brush: Brush,
+    height_mm: float | Tensor,
+    tilt_deg: float | Tensor,
+    lam: float | Tensor = math.pi,
+    *,
+    dtype: torch.dtype | None = None,
+) -> CcdBsm:
+    """The CCD-BSM mark (Eq. 1-5) of presses to depth H at tilt alpha; scalars or (B,) tensors, broadcast to
+    one (B,).
+
+    The dtype is `dtype`, else that of the floating-point tensors given, else float64. lambda = pi keeps the
+    area of each cross-section. Raises DomainError unless alpha >= 0, alpha + theta < 90 deg, 0 < H <= L cos
+    alpha, lambda > 0.
+    """
+    _require_positive("lam", lam)
+    height, tilt, radius, length, dilation = _as_batch(
+        height_mm, tilt_deg, brush.radius_mm, brush.length_mm, lam, dtype=dtype
+    )
+    alpha = torch.deg2rad(tilt)
+    theta = torch.atan(radius / length)
+    _check_domain(height.detach(), tilt.detach(), theta.detach(), length.detach())
+    o3a = height * (torch.tan(alpha) - torch.tan(alpha - theta))
+    o3c = height * radius / (length * torch.cos(alpha))
+    o4o3 = height / torch.cos(alpha - theta) + o3a
+    return CcdBsm(o3a_mm=o3a, o3c_mm=o3c, o4o3_mm=o4o3, lam=dilation)
+
+
+def _as_batch(*values: float | Tensor, dtype: torch.dtype | None) -> tuple[Tensor, ...]:
+    """All values as (B,) tensors of one floating dtype on the device of the first tensor."""
+    tensors = [value for value in values if isinstance(value, Tensor)]
+    if dtype is None:
+        floating = [tensor.dtype for tensor in tensors if tensor.is_floating_point()]
+        dtype = floating[0] if floating else torch.float64
+        for other in floating[1:]:
+            dtype = torch.promote_types(dtype, other)
+    device = tensors[0].device if tensors else None
+    batch = [torch.as_tensor(value, dtype=dtype, device=device) for value in values]
+    if any(tensor.ndim > 1 for tensor in batch):
+        raise ValueError(f"stroke parameters are scalars or (B,), got shapes {[tuple(t.shape) for t in batch]}")
+    return torch.broadcast_tensors(*(torch.atleast_1d(tensor) for tensor in batch))
+
+
+def _check_domain(height: Tensor, tilt: Tensor, theta: Tensor, length: Tensor) -> None:
+    """Raise DomainError for the first press outside the domain; NaN is outside."""
+    limit_deg = 90 - torch.rad2deg(theta)
+    bad = ~((tilt >= 0) & (tilt < limit_deg))
+    if bad.any():
+        index = int(bad.nonzero()[0])
+        negative = "a negative tilt is |alpha| with the heading + 180 deg"
+        hint = negative if tilt[index] < 0 else "alpha + atan(R / L) stays below 90 deg"
+        raise DomainError("tilt_deg", float(tilt[index]), f"[0, {float(limit_deg[index]):g}) deg", hint)
+    deepest = length * torch.cos(torch.deg2rad(tilt))
+    bad = ~((height > 0) & (height <= deepest))
+    if bad.any():
+        index = int(bad.nonzero()[0])
+        allowed = f"(0, {float(deepest[index]):g}] mm"
+        raise DomainError("height_mm", float(height[index]), allowed, "H is at most L cos(alpha)")
+
+
+def _require_positive(name: str, value: float | Tensor) -> None:
+    """Raise DomainError unless every element is positive and finite."""
+    values = torch.as_tensor(value).detach().reshape(-1)
+    bad = ~((values > 0) & torch.isfinite(values))
+    if bad.any():
+        raise DomainError(name, float(values[bad][0]), "(0, inf)")

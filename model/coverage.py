@@ -1,0 +1,96 @@
+"""Exact area coverage of axis-aligned shapes: the share of each pixel that ink covers, without sampling.
+
+Frame (the one definition in this project; other modules refer to it):
+  - x runs along the stroke axis in mm; +x is the belly and heel, the direction that the ferrule leans to;
+  - the tip lies at x = -O4O3, the end of the heel at x = +O3A;
+  - y points to the left of +x, so a quarter turn counter-clockwise takes x to y;
+  - the origin is O3, where the brush axis meets the paper.
+Image: square, 128 x 128 pixels of 0.2 mm (25.6 mm) unless said otherwise; the column grows with +x, the row
+with -y. Pixel (i, j) is the square between row edges i, i + 1 and column edges j, j + 1. Where the origin
+lies in the image is given as (mm from the left edge, mm from the top edge).
+
+Why this is exact: for a half width w let G(x, a) be the integral up to x of min(w(t), a) dt for a >= 0, and
+odd in a. The ink below height y in a column is an integral of w clipped at y, so the ink in a pixel is the
+mixed second difference of G over the pixel's corners. With {w >= a} = [l, r] and F the integral of w,
+    G(x, a) = F(x) - clamp(F(x), F(l), F(r)) + a clamp(x, l, r) + a term that depends on a only,
+and the last term drops out of the difference. l and r depend on the row only, F(x) on the column only, so the
+square roots and arc tangents are evaluated on lines and the grid itself costs clamps, products and
+differences.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from model.profile import Profile, column
+
+SIZE_PX = 128
+PX_MM = 0.2
+_CHUNK = 4  # images walked at a time, so that their corner grids stay in cache: three times the throughput
+
+
+def coverage(
+    profile: Profile,
+    origin_mm: Tensor | tuple[float, float],
+    *,
+    size_px: int = SIZE_PX,
+    px_mm: float = PX_MM,
+) -> Tensor:
+    """The covered share of every pixel, (B, size_px, size_px) in [0, 1], for B axis-aligned shapes.
+
+    `origin_mm` is the origin's place in the image, (x from the left edge, y from the top edge): one pair for
+    all, or (B, 2). Whatever lies outside the image is cut off. dtype and device are the profile's.
+    Differentiable in the profile's parameters and the origin. Raises ValueError for a size or shape that
+    makes no image. In float32 the error stays below 1e-3 for marks that fit the default image.
+    """
+    _check_raster(size_px, px_mm)
+    like = profile.x_min_mm
+    origin = torch.as_tensor(origin_mm, dtype=like.dtype, device=like.device)
+    if origin.shape not in ((2,), (like.shape[0], 2)):
+        raise ValueError(f"origin_mm has shape {tuple(origin.shape)}, expected (2,) or ({like.shape[0]}, 2)")
+    origin = origin.expand(like.shape[0], 2)
+    # Lines in double precision whatever the image's: areas of 200 mm^2 are subtracted to shares of a pixel.
+    edges = torch.arange(size_px + 1, dtype=torch.float64, device=like.device) * px_mm
+    x = edges - column(origin[:, 0])
+    y = column(origin[:, 1]) - edges
+    sign = torch.where(y < 0, -torch.ones_like(y), torch.ones_like(y))
+    a = sign * y  # |y|, but with the derivative at y = 0 that the odd extension of G needs
+    left, right = profile.level(a)
+    middle = column(0.25 * profile.area_mm2)  # counted from the middle, areas are half as large: one bit more
+    area, area_left, area_right = (profile.area_to(at) - middle for at in (x, left, right))
+    x, a, left, right, area, area_left, area_right, per_pixel = (
+        line.to(like.dtype) for line in (x, a, left, right, area, area_left, area_right, sign / px_mm**2)
+    )
+    area_steps = area[:, None, 1:] - area[:, None, :-1]
+    images = torch.empty((len(x), size_px, size_px), dtype=x.dtype, device=x.device)
+    for k in range(0, len(x), _CHUNK):
+        part = slice(k, k + _CHUNK)
+        # Both clamps stop at the same corners, so where w < a the areas cancel to exactly zero.
+        outside = area_steps[part] - _clamped_steps(area[part], area_left[part], area_right[part])
+        # In place, because fresh memory costs more than the sums; autograd keeps what it needs.
+        inside = _clamped_steps(x[part], left[part], right[part]).mul_(column(a[part]))
+        strips = outside.add_(inside).mul_(column(per_pixel[part]))
+        # Rounding leaves values such as -1e-12 and 1 + 1e-12; the exact result has none outside [0, 1].
+        images[part] = (strips[:, :-1] - strips[:, 1:]).clamp_(0, 1)
+    return images
+
+
+def centred_origin(profile: Profile, *, size_px: int = SIZE_PX, px_mm: float = PX_MM) -> Tensor:
+    """The `origin_mm` that puts each shape's bounding box in the middle of the image, (B, 2)."""
+    _check_raster(size_px, px_mm)
+    middle = torch.full_like(profile.x_min_mm, 0.5 * size_px * px_mm)
+    return torch.stack((middle - 0.5 * (profile.x_min_mm + profile.x_max_mm), middle), dim=-1)
+
+
+def _clamped_steps(value: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """The growth of clamp(value, low, high) between column edges: (C, W + 1), (C, V + 1) -> (C, V + 1, W)."""
+    # Twice as fast as torch.clamp with three broadcast tensors.
+    clamped = torch.minimum(torch.maximum(value[:, None, :], column(low)), column(high))
+    return clamped[:, :, 1:] - clamped[:, :, :-1]
+
+
+def _check_raster(size_px: int, px_mm: float) -> None:
+    """Raise ValueError unless the raster has pixels of a positive size."""
+    if size_px < 1 or not px_mm > 0:
+        raise ValueError(f"size_px = {size_px}, px_mm = {px_mm:g}: both must be positive")
