@@ -1,0 +1,1 @@
+"""Turns captures into numbers: scale, preprocessing, similarity, validation, report."""

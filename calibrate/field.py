@@ -1,0 +1,95 @@
+"""The 128 x 128 images that are compared, and how a captured stroke gets onto them.
+
+Two alignment protocols: `mm` keeps millimetres and the zero-touch anchor; `size-normalised` scales each image to one
+length and then takes the best shift. The second is how the paper's spread comes about; the first is the honest one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.preprocess import Prepared
+
+Image = NDArray[np.float32]
+SIZE_PX = 128
+NORMAL_LENGTH_PX = 100
+BEST_SHIFT_PX = 6
+
+
+class Alignment(StrEnum):
+    """How captured and simulated images are laid over each other."""
+
+    MM = "mm"
+    SIZE_NORMALISED = "size-normalised"
+
+
+class Tone(StrEnum):
+    """What a pixel holds."""
+
+    BINARY = "binary"
+    GRAY = "gray"
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """The millimetre field. 0.3 mm/px (38.4 mm) holds an anchored stroke of any cell of the grid; 0.2 does not."""
+
+    mm_per_px: float = 0.3
+    anchor_share: tuple[float, float] = (0.76, 0.5)
+    """Where the zero-touch point lies, as a share of the field from the left and from the top."""
+
+    @property
+    def side_mm(self) -> float:
+        """Width and height."""
+        return SIZE_PX * self.mm_per_px
+
+    @property
+    def anchor_mm(self) -> tuple[float, float]:
+        """The zero-touch point from the left and from the top."""
+        return self.anchor_share[0] * self.side_mm, self.anchor_share[1] * self.side_mm
+
+    def window_mm(self, anchor: tuple[float, float]) -> tuple[float, float, float, float]:
+        """(x, y, width, height) in the paper frame of the field around an anchor there (y upward)."""
+        left, top = self.anchor_mm
+        return anchor[0] - left, anchor[1] - (self.side_mm - top), self.side_mm, self.side_mm
+
+
+def captured_mm(prepared: Prepared, tone: Tone) -> Image:
+    """(128, 128) of a capture that was rectified to the field."""
+    side = (SIZE_PX, SIZE_PX)
+    source = prepared.soft if tone is Tone.GRAY else prepared.mask.astype(np.float32)
+    return to_tone(cast("Image", cv2.resize(source, side, interpolation=cv2.INTER_AREA)), tone)
+
+
+def captured_normalised(prepared: Prepared, tone: Tone) -> Image:
+    """(128, 128) with the stroke's length scaled to 100 px and its bounding box in the middle."""
+    rows, columns = np.flatnonzero(prepared.mask.any(axis=1)), np.flatnonzero(prepared.mask.any(axis=0))
+    source = prepared.soft if tone is Tone.GRAY else prepared.mask.astype(np.float32)
+    crop = source[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    scale = NORMAL_LENGTH_PX / crop.shape[1]
+    size = (NORMAL_LENGTH_PX, min(SIZE_PX, max(1, round(crop.shape[0] * scale))))
+    small = cv2.resize(crop, size, interpolation=cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR)
+    image = np.zeros((SIZE_PX, SIZE_PX), np.float32)
+    top, left = (SIZE_PX - size[1]) // 2, (SIZE_PX - size[0]) // 2
+    image[top : top + size[1], left : left + size[0]] = small
+    return to_tone(image, tone)
+
+
+def to_tone(coverage: Image, tone: Tone) -> Image:
+    """Coverage as it is, or whether a pixel is mostly ink."""
+    return coverage if tone is Tone.GRAY else (coverage > 0.5).astype(np.float32)
+
+
+def best_shift(moving: Image, fixed: Image) -> Image:
+    """`moving` shifted by at most 6 px each way so that its overlap with `fixed` is largest."""
+    reach = BEST_SHIFT_PX
+    padded = np.pad(moving, reach)
+    overlap = cv2.matchTemplate(padded, fixed, cv2.TM_CCORR)
+    row, column = np.unravel_index(int(np.argmax(overlap)), overlap.shape)
+    return padded[row : row + SIZE_PX, column : column + SIZE_PX]

@@ -1,0 +1,149 @@
+"""Scale and plane from a ChArUco board in view: image pixels to millimetres on the paper, with an interval."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from calibrate.errors import CalibrationError
+
+Floats = NDArray[np.float64]
+MIN_CORNERS = 8
+BOOTSTRAP_DRAWS = 200
+OUTLIER_PX = 1.0
+OUTLIER_MEDIANS = 6.0
+MOST_OUTLIERS = 0.1
+WORST_RMS_PX = 1.0
+"""Above this the board was not flat, not seen sharply, or is not the board of the configuration."""
+
+
+class BoardSpec(BaseModel):
+    """A ChArUco board in the plane of the paper, in view of the camera."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    squares: tuple[Annotated[int, Field(ge=2, le=50)], Annotated[int, Field(ge=2, le=50)]]
+    """Columns and rows of squares."""
+    square_mm: Annotated[float, Field(gt=0.0, le=1000.0)]
+    marker_mm: Annotated[float, Field(gt=0.0, le=1000.0)]
+    dictionary: Annotated[str, Field(pattern=r"^DICT_[0-9A-Z_]+$")] = "DICT_5X5_1000"
+    origin_mm: tuple[Annotated[float, Field(allow_inf_nan=False)], Annotated[float, Field(allow_inf_nan=False)]]
+    """Lower left corner of the board, in the paper frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlaneFit:
+    """The paper plane as the camera sees it."""
+
+    image_to_paper: Floats
+    """(3, 3) homography: pixels (centres on integers) to mm in the paper frame."""
+    mm_per_px: float
+    """pix2len at the middle of the board."""
+    interval_mm_per_px: tuple[float, float]
+    """95 %, by bootstrap over corners: it holds the noise of corners, not an error of the printed board."""
+    rms_px: float
+    corners: int
+    dropped: int
+    """Corners left out because they do not lie on the plane of the others, as under the edge of a sheet."""
+
+
+def find_corners(image: NDArray[np.uint8], spec: BoardSpec, where: str) -> tuple[Floats, Floats]:
+    """((n, 2) pixels, (n, 2) mm in the paper frame) of the board's inner corners. Raises `CalibrationError`."""
+    board = _board(spec, where)
+    # Sub-pixel corners matter: the scale's error is the corner error over the board's length.
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    detector = cv2.aruco.CharucoDetector(board)
+    detector.setDetectorParameters(parameters)
+    pixels, ids, _, _ = detector.detectBoard(image)
+    found = 0 if ids is None else len(ids)  # pyright: ignore[reportUnnecessaryComparison]
+    if found < MIN_CORNERS:
+        total = (spec.squares[0] - 1) * (spec.squares[1] - 1)
+        raise CalibrationError(where, f"{found} of {total} board corners found, at least {MIN_CORNERS} are needed")
+    on_board = np.asarray(board.getChessboardCorners(), np.float64)[np.ravel(ids).astype(np.int64), :2]
+    height_mm = spec.squares[1] * spec.square_mm
+    # The board counts y downward from its upper left corner; the paper frame counts it upward.
+    paper = np.column_stack([spec.origin_mm[0] + on_board[:, 0], spec.origin_mm[1] + height_mm - on_board[:, 1]])
+    return np.asarray(pixels, np.float64).reshape(-1, 2), paper
+
+
+def fit_plane(pixels: Floats, paper_mm: Floats, where: str, seed: int = 0) -> PlaneFit:
+    """Homography by least squares over all corners but outliers; scale at their middle, bootstrapped.
+
+    Raises `CalibrationError` where more than a tenth are outliers or the residual is above `WORST_RMS_PX`: a wrong or
+    bent board.
+    """
+    kept = _inliers(pixels, paper_mm, where)
+    dropped = len(pixels) - int(kept.sum())
+    if dropped > MOST_OUTLIERS * len(pixels):
+        raise CalibrationError(where, f"{dropped} of {len(pixels)} board corners do not lie on one plane")
+    pixels, paper_mm = pixels[kept], paper_mm[kept]
+    image_to_paper = _homography(pixels, paper_mm, where)
+    rms_px = float(np.sqrt((_residuals_px(image_to_paper, pixels, paper_mm) ** 2).mean()))
+    if rms_px > WORST_RMS_PX:
+        raise CalibrationError(where, f"board residual {rms_px:.2f} px exceeds {WORST_RMS_PX} px: is it this board?")
+    middle = pixels.mean(axis=0)
+    rng = np.random.default_rng(seed)
+    draws: list[float] = []
+    for _ in range(BOOTSTRAP_DRAWS):
+        chosen = rng.integers(0, len(pixels), len(pixels))
+        if len(np.unique(chosen)) >= MIN_CORNERS // 2 + 1:
+            draws.append(local_scale(_homography(pixels[chosen], paper_mm[chosen], where), middle))
+    low, high = (float(v) for v in np.quantile(draws, [0.025, 0.975]))
+    return PlaneFit(image_to_paper, local_scale(image_to_paper, middle), (low, high), rms_px, len(pixels), dropped)
+
+
+def local_scale(image_to_paper: Floats, pixel: Floats) -> float:
+    """mm per pixel at a pixel: square root of the area of its image on the paper."""
+    step = 0.5
+    corners = pixel + step * np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+    left, right, up, down = apply(image_to_paper, corners)
+    across, along = right - left, down - up
+    return float(np.sqrt(abs(across[0] * along[1] - across[1] * along[0])))
+
+
+def apply(homography: Floats, points: Floats) -> Floats:
+    """(n, 2) points through a (3, 3) homography."""
+    mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
+    return mapped[:, :2] / mapped[:, 2:]
+
+
+def _inliers(pixels: Floats, paper_mm: Floats, where: str) -> NDArray[np.bool_]:
+    # The median of squares ignores up to half of the corners; ChArUco rarely misnames more than one.
+    robust, _ = cv2.findHomography(pixels, paper_mm, cv2.LMEDS)
+    if robust is None or not np.all(np.isfinite(robust)):  # pyright: ignore[reportUnnecessaryComparison]
+        raise CalibrationError(where, "the board's corners lie on a line: no plane can be had from them")
+    residuals = _residuals_px(np.asarray(robust, np.float64), pixels, paper_mm)
+    return residuals <= max(OUTLIER_PX, OUTLIER_MEDIANS * float(np.median(residuals)))
+
+
+def _residuals_px(image_to_paper: Floats, pixels: Floats, paper_mm: Floats) -> Floats:
+    back = apply(np.asarray(np.linalg.inv(image_to_paper), np.float64), paper_mm)
+    return np.linalg.norm(back - pixels, axis=1)
+
+
+def _homography(pixels: Floats, paper_mm: Floats, where: str) -> Floats:
+    found, _ = cv2.findHomography(pixels, paper_mm, 0)
+    if found is None or not np.all(np.isfinite(found)):  # pyright: ignore[reportUnnecessaryComparison]
+        raise CalibrationError(where, "the board's corners lie on a line: no plane can be had from them")
+    return np.asarray(found, np.float64)
+
+
+def _board(spec: BoardSpec, where: str) -> cv2.aruco.CharucoBoard:
+    number = getattr(cv2.aruco, spec.dictionary, None)
+    if not isinstance(number, int):
+        raise CalibrationError(where, f"board.dictionary = {spec.dictionary!r} is not one of OpenCV's DICT_*")
+    if spec.marker_mm >= spec.square_mm:
+        raise CalibrationError(
+            where, f"board.marker_mm = {spec.marker_mm} must be less than board.square_mm = {spec.square_mm}"
+        )
+    dictionary = cv2.aruco.getPredefinedDictionary(number)
+    try:
+        return cv2.aruco.CharucoBoard(spec.squares, spec.square_mm, spec.marker_mm, dictionary)
+    except cv2.error as error:
+        raise CalibrationError(where, f"the board cannot be made: {error}") from None
