@@ -1,0 +1,49 @@
+"""`brushloop collect`: runs a protocol, with the Textual screen or with a progress bar."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def collect(
+    config: Annotated[Path, typer.Option(help="The rig: addresses, frames, limits.")],
+    protocol: Annotated[Path, typer.Option(help="What to do: depths, tilts, repeats.")],
+    out: Annotated[Path, typer.Option(help="Folder that holds sessions.")] = Path("sessions"),
+    new: Annotated[bool, typer.Option("--new", help="Start a new session though one is open.")] = False,
+    fresh_sheet: Annotated[bool, typer.Option("--fresh-sheet", help="A fresh sheet is in.")] = False,
+    arm: Annotated[bool, typer.Option("--arm", help="Let real hardware move.")] = False,
+    tui: Annotated[
+        bool | None, typer.Option("--tui/--no-tui", help="Screen; by default where there is a terminal.")
+    ] = None,
+) -> None:
+    """Collect strokes. Ctrl-C stops the arm; the same command goes on where it stopped."""
+    import sys
+
+    from collect.config import load_protocol, load_rig
+    from collect.engine import Engine
+    from collect.opening import Opening, find_resumable, open_store
+    from collect.plan import check_plan
+    from drivers.clock import HostClock
+
+    opening = Opening(out, config, protocol, new, fresh_sheet, arm)
+    rig_config, protocol_config = load_rig(config), load_protocol(protocol)
+    check_plan(config, protocol, rig_config, protocol_config)
+    resume = find_resumable(opening)
+    clock = HostClock()
+    engine = Engine(
+        rig_config,
+        protocol_config,
+        lambda rig: open_store(opening, resume, rig, rig_config, protocol_config, clock),
+        clock,
+    )
+    if tui if tui is not None else sys.stdin.isatty() and sys.stdout.isatty():
+        from collect.tui.app import run_screen
+
+        run_screen(engine)
+    else:
+        from collect.headless import run_headless
+
+        run_headless(engine)

@@ -1,0 +1,204 @@
+"""`rig.toml` and `protocol.toml`: frozen, complete, refused with one line that names file, field and range.
+
+Any value can be overridden from the environment: `BRUSHLOOP_ROBOT__HOST=192.0.2.7` sets `[robot] host`.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict
+
+from calibrate.scale import BoardSpec
+from collect.errors import ConfigError
+
+MAX_CONFIG_BYTES = 1024 * 1024
+
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Range = tuple[Finite, Finite]
+
+
+class Config(BaseModel):
+    """Base: frozen, extra keys refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class LimitsConfig(Config):
+    """Where the brush tip may ever be, in the robot's base frame."""
+
+    x_mm: Range
+    y_mm: Range
+    z_mm: Range
+    """The lower end is the floor: paper height less the deepest press."""
+    tilt_deg: Annotated[float, Field(gt=0.0, le=30.0)] = 15.0
+    speed_mm_s: Annotated[float, Field(gt=0.0, le=500.0)] = 250.0
+    acc_mm_s2: Annotated[float, Field(gt=0.0, le=5000.0)] = 1000.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> LimitsConfig:
+        for name in ("x_mm", "y_mm", "z_mm"):
+            low, high = getattr(self, name)
+            if low >= high:
+                raise ValueError(f"{name} = [{low}, {high}]: the first must be less than the second")
+        return self
+
+
+class RobotConfig(Config):
+    """The arm."""
+
+    kind: Literal["aubo-arcs"]
+    host: str = Field(min_length=1)
+    port: int = Field(30004, ge=1, le=65535)
+    tcp_offset_mm: tuple[Finite, Finite, Finite]
+    """Flange to brush tip."""
+    limits: LimitsConfig
+
+
+class CameraConfig(Config):
+    """The camera that looks at the sheet."""
+
+    kind: Literal["opencv"]
+    source: str = Field(min_length=1)
+    """Stream URL, file, or device number."""
+    latency_ms: Annotated[float, Field(ge=0.0, le=10_000.0)] = 250.0
+    """Longest time from exposure to arrival; frames that may be older than a request are not used for it."""
+    timeout_s: Annotated[float, Field(gt=0.0, le=120.0)] = 10.0
+    lens: str = ""
+
+
+class BrushConfig(Config):
+    """The brush that is mounted."""
+
+    name: str
+    radius_mm: Annotated[float, Field(gt=0.0, le=50.0)] = 6.0
+    length_mm: Annotated[float, Field(gt=0.0, le=200.0)] = 48.0
+    max_depth_mm: Annotated[float, Field(gt=0.0, le=100.0)] = 22.0
+    """Deepest press that this brush survives."""
+
+
+class PaperConfig(Config):
+    """The sheet and where it lies. The paper frame is right-handed, z up, origin at the lower left corner."""
+
+    name: str = "Xuan paper"
+    origin_mm: tuple[Finite, Finite]
+    """Lower left corner in the base frame."""
+    yaw_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
+    """From base x to paper x."""
+    touch_z_mm: Finite
+    """Height in the base frame at which the tip of the vertical brush just touches: taught by the operator."""
+    size_mm: tuple[Positive, Positive]
+    cell_mm: tuple[Positive, Positive] = (40.0, 24.0)
+    """Width and height of the patch for one press."""
+    touch_point_mm: tuple[Finite, Finite] = (4.0, 4.0)
+    """Where the taught height is visited at the start of each run, in the paper frame; off every cell's ink."""
+
+
+class InkConfig(Config):
+    """The ink well."""
+
+    name: str = "ink"
+    well_mm: tuple[Finite, Finite]
+    """Centre, in the paper frame."""
+    dip_z_mm: Finite
+    """Height of the tip at the bottom of a dip, in the base frame."""
+
+
+class MotionConfig(Config):
+    """Heights and speeds."""
+
+    safe_z_mm: Finite
+    """Travel height in the base frame."""
+    park_mm: tuple[Finite, Finite, Finite]
+    """Where the arm waits, out of the camera's view, in the base frame."""
+    travel_speed_mm_s: Annotated[float, Field(gt=0.0, le=500.0)] = 150.0
+    press_speed_mm_s: Annotated[float, Field(gt=0.0, le=100.0)] = 20.0
+    acc_mm_s2: Annotated[float, Field(gt=0.0, le=5000.0)] = 500.0
+
+
+class RigConfig(BaseSettings):
+    """Everything about the rig: `rig.toml`, with the environment on top."""
+
+    model_config = SettingsConfigDict(frozen=True, extra="forbid", env_prefix="BRUSHLOOP_", env_nested_delimiter="__")
+
+    name: str
+    robot: RobotConfig
+    camera: CameraConfig
+    brush: BrushConfig
+    paper: PaperConfig
+    ink: InkConfig
+    board: BoardSpec
+    motion: MotionConfig
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """The environment wins over the file; nothing else is read."""
+        return env_settings, init_settings
+
+
+class GridConfig(Config):
+    """The paper's grid: every depth at every tilt, `repeats` times, in an order shuffled by `seed`."""
+
+    kind: Literal["grid"]
+    heights_mm: Annotated[list[Positive], Field(min_length=1, max_length=100)]
+    tilts_deg: Annotated[list[Annotated[float, Field(ge=0.0, le=30.0)]], Field(min_length=1, max_length=100)]
+    repeats: Annotated[int, Field(ge=1, le=1000)] = 10
+    seed: Annotated[int, Field(ge=0)] = 1
+    dwell_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.2
+    """Time at full depth."""
+
+    @model_validator(mode="after")
+    def _distinct(self) -> GridConfig:
+        for name in ("heights_mm", "tilts_deg"):
+            values = getattr(self, name)
+            if len(set(values)) != len(values):
+                raise ValueError(f"{name} has the same value twice: {values}")
+        return self
+
+
+_M = TypeVar("_M", bound=BaseModel)
+
+
+def load_rig(path: Path) -> RigConfig:
+    """Read `rig.toml`, with overrides from the environment. Raises `ConfigError`."""
+    return _validate(path, RigConfig, _read_toml(path))
+
+
+def load_protocol(path: Path) -> GridConfig:
+    """Read `protocol.toml`. Raises `ConfigError`."""
+    return _validate(path, GridConfig, _read_toml(path))
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > MAX_CONFIG_BYTES:
+            raise ConfigError(path, "", f"is larger than {MAX_CONFIG_BYTES} bytes")
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(path, "", "no such file") from None
+    except OSError as error:
+        raise ConfigError(path, "", error.strerror or str(error)) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(path, "", f"is not TOML: {error}") from None
+
+
+def _validate(path: Path, kind: type[_M], values: dict[str, Any]) -> _M:
+    try:
+        return kind(**values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"])
+        given = f" (given: {first['input']!r})" if first["type"] not in ("missing", "value_error") else ""
+        more = f"; and {error.error_count() - 1} more" if error.error_count() > 1 else ""
+        raise ConfigError(path, field, first["msg"] + given + more) from None

@@ -1,0 +1,101 @@
+"""The demo: the real commands, in order, against the loopback rig in a process of its own.
+
+Everything lies under one folder. Killed anywhere and started again, it goes on where it stopped: the rig's process
+outlives the demo by a minute, as a real sheet of paper would.
+"""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from collect.config import RigConfig, load_rig
+from collect.errors import CollectAborted
+
+HEIGHTS_MM = [11.0, 13.0, 15.0, 17.0, 20.0]
+TILTS_DEG = [0.0, 5.0, 10.0]
+START_S = 60.0
+IDLE_EXIT_S = 60.0
+
+
+def run_demo(out: Path, repeats: int, rate: float, seed: int) -> None:
+    """Collect, calibrate, validate under `out`; prints the path of the report and of the MCAP at the end."""
+    out.mkdir(parents=True, exist_ok=True)
+    rig_toml, protocol_toml, sessions = out / "rig.toml", out / "protocol.toml", out / "sessions"
+    protocol = (
+        f'kind = "grid"\nheights_mm = {HEIGHTS_MM}\ntilts_deg = {TILTS_DEG}\nrepeats = {repeats}\nseed = {seed}\n'
+    )
+    if not protocol_toml.exists() or protocol_toml.read_text(encoding="utf-8") != protocol:
+        protocol_toml.write_text(protocol, encoding="utf-8")
+    rig = _serving(rig_toml, rate, seed)
+    try:
+        _run("collect", "--config", rig_toml, "--protocol", protocol_toml, "--out", sessions, "--no-tui")
+    finally:
+        if rig is not None and rig.poll() is not None:
+            sys.stderr.write(f"the loopback rig ended with {rig.returncode}; see {out / 'rig.log'}\n")
+    session = max(sessions.iterdir(), key=lambda path: path.stat().st_mtime_ns)
+    _run("calibrate", session)
+    _run("validate", session)
+    if rig is not None:
+        rig.terminate()
+        rig.wait()
+    sys.stdout.write(
+        f"\nReport: {session / 'validation' / 'report.html'}\nMCAP:   {session / f'{session.name}.mcap'}\n"
+    )
+
+
+def _serving(rig_toml: Path, rate: float, seed: int) -> subprocess.Popen[bytes] | None:
+    """The rig of an earlier demo where it still serves, else a new one on the same ports."""
+    arcs_port, camera_port = _free_port(), _free_port()
+    if rig_toml.exists():
+        known = load_rig(rig_toml)
+        arcs_port, camera_port = known.robot.port, _camera_port(known)
+        if _listens(arcs_port) and _listens(camera_port):
+            return None
+    log = (rig_toml.parent / "rig.log").open("ab")
+    command = [sys.executable, "-m", "brushloop", "sim", "--write-rig", str(rig_toml), "--rate", str(rate)]
+    command += ["--seed", str(seed), "--arcs-port", str(arcs_port), "--camera-port", str(camera_port)]
+    # In a session of its own: Ctrl-C at the demo must not pull the paper away from under the arm.
+    with log:
+        process = subprocess.Popen(
+            [*command, "--idle-exit", str(IDLE_EXIT_S)],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+        )
+    deadline = time.monotonic() + START_S
+    while not (_listens(arcs_port) and _listens(camera_port) and rig_toml.exists()):
+        if process.poll() is not None or time.monotonic() > deadline:
+            raise CollectAborted(f"the loopback rig did not start; see {rig_toml.parent / 'rig.log'}")
+        time.sleep(0.1)
+    return process
+
+
+def _run(*arguments: str | Path) -> None:
+    words = [str(argument) for argument in arguments]
+    sys.stdout.write(f"$ brushloop {' '.join(words)}\n")
+    sys.stdout.flush()
+    code = subprocess.run([sys.executable, "-m", "brushloop", *words], check=False).returncode
+    if code != 0:
+        # The command has said why; the demo ends with its exit code.
+        sys.exit(code)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.settimeout(1.0)
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def _camera_port(rig: RigConfig) -> int:
+    return int(rig.camera.source.split(":")[2].split("/")[0])

@@ -1,0 +1,52 @@
+"""Errors of a collection.
+
+ConfigError            a file of the user cannot be used: file, field, allowed range
+StepError              a step failed in a way that is understood; says what it leaves and what comes next
+ +-- StepVoid          the press was cut: its paper cell is burnt, do it again on a new one
+ +-- SheetFull         no free cell is left on the sheet
+CollectAborted         the session stopped before its protocol was finished; it can be resumed
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+
+class ConfigError(Exception):
+    """A configuration cannot be used; nothing was connected and nothing moved."""
+
+    exit_code: ClassVar[int] = 2
+
+    def __init__(self, path: Path | str, field: str, what: str) -> None:
+        self.path = str(path)
+        self.field = field
+        self.what = what
+        super().__init__(f"{path}: {field}: {what}" if field else f"{path}: {what}")
+
+
+class StepError(Exception):
+    """A step failed in a defined way. The arm is at safe height, or stopped and said so."""
+
+    exit_code: ClassVar[int] = 4
+
+
+class StepVoid(StepError):
+    """A press did not go as asked. Leaves ink where it should not count: never press that cell again."""
+
+
+class SheetFull(StepError):
+    """No free cell on this sheet. Leaves the arm parked; a fresh sheet must go in before the next press."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        super().__init__(
+            f"all {capacity} cells of the sheet are used. "
+            "Put a fresh sheet in, then run the same command with --fresh-sheet."
+        )
+
+
+class CollectAborted(Exception):
+    """Stopped before the end; the same command goes on from here."""
+
+    exit_code: ClassVar[int] = 4

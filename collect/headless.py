@@ -1,0 +1,96 @@
+"""Collection without a screen: a progress bar with an ETA, and signals that stop the arm."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from collect.snapshot import EngineView, Snapshot
+
+REFRESH_S = 0.1
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class RunnableEngine(EngineView, Protocol):
+    """An engine that can be started and waited for."""
+
+    def start(self) -> None:
+        """Begin."""
+        ...
+
+    @property
+    def finished(self) -> bool:
+        """True once the run is over."""
+        ...
+
+    def join(self) -> None:
+        """Wait for the end; raises what ended the run."""
+        ...
+
+
+def run_headless(engine: RunnableEngine) -> None:
+    """Run to the end; raises what ended the run."""
+    console = Console(stderr=True)
+    shown = 0
+    with (
+        stopping_signals(engine),
+        Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[eta]}"),
+            console=console,
+        ) as progress,
+    ):
+        task = progress.add_task("connect", total=None, eta="")
+        engine.start()
+        while True:
+            over = engine.finished
+            now = engine.snapshot()
+            for line in now.messages[max(shown - now.messages_before, 0) :]:
+                progress.console.print(line, markup=False, highlight=False)
+            shown = now.messages_before + len(now.messages)
+            progress.update(
+                task,
+                description=f"{now.state}: {now.step}",
+                completed=now.strokes_done,
+                total=now.strokes_planned,
+                eta=eta_text(now),
+            )
+            if over:
+                break
+            time.sleep(REFRESH_S)
+    engine.join()
+
+
+def eta_text(now: Snapshot) -> str:
+    """`ETA 12:05`, or nothing while no stroke has been timed."""
+    if now.eta_s is None:
+        return ""
+    minutes, seconds = divmod(round(now.eta_s), 60)
+    return f"ETA {minutes}:{seconds:02d}"
+
+
+@contextmanager
+def stopping_signals(engine: EngineView) -> Generator[None]:
+    """SIGINT, SIGTERM and SIGHUP stop the arm at once; the run then ends by itself."""
+
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        # Not from the handler itself: it may have interrupted a holder of the engine's lock.
+        threading.Thread(target=engine.stop, name="stop key").start()
+
+    before = {number: signal.signal(number, on_signal) for number in STOP_SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

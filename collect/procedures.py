@@ -1,0 +1,175 @@
+"""What the arm does in each step. Every procedure begins and ends at safe height."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from dataclasses import dataclass
+
+from collect.config import RigConfig
+from collect.errors import StepVoid
+from collect.rig import Rig
+from collect.sheet import Cell, to_base
+from drivers.geometry import brush_pose, lean
+from drivers.limits import Limits
+from drivers.samples import Frame, Pose, Stamp
+
+CLEARANCE_MM = 8.0
+"""Height above the paper at which the fast approach ends."""
+TOUCH_TOLERANCE_MM = 0.1
+"""How far the arm may rest from the taught height at zero touch."""
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """A target and how fast to go there."""
+
+    target: Pose
+    speed_mm_s: float
+
+
+class Procedures:
+    """The moves of each step kind, from a rig's configuration; and their execution on its devices."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self._config = rig.config
+
+    async def retreat(self) -> None:
+        """Lift along the tool axis to safe height, then park. A killed process may have left the brush down."""
+        here = self._rig.robot.latest().pose
+        for move in retreat_moves(self._config, here):
+            await self._go(move)
+
+    async def zero_touch(self) -> float:
+        """Visit the taught touch height at the touch point; returns the height at which the arm rests, in mm.
+
+        This confirms that the arm reaches the height that the operator taught. It does not measure the paper.
+        """
+        *down, up = zero_touch_moves(self._config)
+        for move in down:
+            await self._go(move)
+        rests_mm = (await self._pose_now()).z_mm
+        off_mm = rests_mm - self._config.paper.touch_z_mm
+        if abs(off_mm) > TOUCH_TOLERANCE_MM:
+            raise StepVoid(f"zero touch rests {off_mm:+.3f} mm from the taught height; limit {TOUCH_TOLERANCE_MM} mm")
+        await self._go(up)
+        return rests_mm
+
+    async def dip(self) -> None:
+        """Into the well and out again."""
+        for move in dip_moves(self._config):
+            await self._go(move)
+
+    async def press(self, cell: Cell, height_mm: float, tilt_deg: float, dwell_s: float) -> float:
+        """Press once; returns the depth reached below the taught height, in mm."""
+        before, after = press_moves(self._config, cell, height_mm, tilt_deg)
+        for move in before:
+            await self._go(move)
+        await asyncio.sleep(dwell_s)
+        depth_mm = self._config.paper.touch_z_mm - (await self._pose_now()).z_mm
+        for move in after:
+            await self._go(move)
+        return depth_mm
+
+    async def capture(self) -> Frame:
+        """Park, then the first frame exposed after the arm had settled there."""
+        for move in park_moves(self._config):
+            await self._go(move)
+        return await self._rig.camera.fresh(Stamp(self._rig.clock.now_ns()))
+
+    async def _pose_now(self) -> Pose:
+        called_ns = self._rig.clock.now_ns()
+        while (sample := self._rig.robot.latest()).stamp.host_ns < called_ns:
+            await asyncio.sleep(0.005)
+        return sample.pose
+
+    async def _go(self, move: Move) -> None:
+        motion = self._config.motion
+        await self._rig.robot.move(move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=motion.acc_mm_s2)
+
+
+def retreat_moves(config: RigConfig, here: Pose) -> list[Move]:
+    """From anywhere: along the tool axis up to safe height if below it, upright, then to the park position."""
+    motion = config.motion
+    moves: list[Move] = []
+    x_mm, y_mm = here.x_mm, here.y_mm
+    if here.z_mm < motion.safe_z_mm:
+        tilt_deg, heading_deg = lean(here)
+        rise_mm = motion.safe_z_mm - here.z_mm
+        out_mm = rise_mm * math.tan(math.radians(tilt_deg))
+        x_mm += out_mm * math.cos(math.radians(heading_deg))
+        y_mm += out_mm * math.sin(math.radians(heading_deg))
+        qx, qy, qz, qw = here.quaternion
+        moves.append(Move(Pose(x_mm, y_mm, motion.safe_z_mm, qx, qy, qz, qw), motion.press_speed_mm_s))
+        moves.append(Move(_upright(config, x_mm, y_mm, motion.safe_z_mm), motion.travel_speed_mm_s))
+    return moves + park_moves(config)
+
+
+def park_moves(config: RigConfig) -> list[Move]:
+    """To the place where the arm waits, out of the camera's view."""
+    return [Move(_upright(config, *config.motion.park_mm), config.motion.travel_speed_mm_s)]
+
+
+def zero_touch_moves(config: RigConfig) -> list[Move]:
+    """Over the touch point, down to clearance, slowly to the taught height, and up."""
+    motion, touch_mm = config.motion, config.paper.touch_z_mm
+    x_mm, y_mm = to_base(config.paper, *config.paper.touch_point_mm)
+    return [
+        Move(_upright(config, x_mm, y_mm, motion.safe_z_mm), motion.travel_speed_mm_s),
+        Move(_upright(config, x_mm, y_mm, touch_mm + CLEARANCE_MM), motion.travel_speed_mm_s),
+        Move(_upright(config, x_mm, y_mm, touch_mm), motion.press_speed_mm_s / 4),
+        Move(_upright(config, x_mm, y_mm, motion.safe_z_mm), motion.travel_speed_mm_s),
+    ]
+
+
+def dip_moves(config: RigConfig) -> list[Move]:
+    """Over the well, down into the ink, and up slowly."""
+    motion = config.motion
+    x_mm, y_mm = to_base(config.paper, *config.ink.well_mm)
+    above = _upright(config, x_mm, y_mm, motion.safe_z_mm)
+    return [
+        Move(above, motion.travel_speed_mm_s),
+        Move(_upright(config, x_mm, y_mm, config.ink.dip_z_mm), motion.press_speed_mm_s),
+        Move(above, motion.press_speed_mm_s),
+    ]
+
+
+def press_moves(config: RigConfig, cell: Cell, height_mm: float, tilt_deg: float) -> tuple[list[Move], list[Move]]:
+    """(down to depth, up again): over the cell, tilt about the tip at clearance, touch height, descend H.
+
+    Tilting about the tip just above the paper instead of on it leaves the same pose at touch and no smear.
+    """
+    motion, touch_mm = config.motion, config.paper.touch_z_mm
+    x_mm, y_mm = to_base(config.paper, *cell.anchor_mm)
+
+    def pose(z_mm: float, tilt: float) -> Pose:
+        return brush_pose(x_mm, y_mm, z_mm, heading_deg=config.paper.yaw_deg, tilt_deg=tilt)
+
+    down = [
+        Move(pose(motion.safe_z_mm, 0.0), motion.travel_speed_mm_s),
+        Move(pose(touch_mm + CLEARANCE_MM, 0.0), motion.travel_speed_mm_s),
+        Move(pose(touch_mm + CLEARANCE_MM, tilt_deg), motion.press_speed_mm_s),
+        Move(pose(touch_mm, tilt_deg), motion.press_speed_mm_s),
+        Move(pose(touch_mm - height_mm, tilt_deg), motion.press_speed_mm_s),
+    ]
+    up = [
+        Move(pose(touch_mm + CLEARANCE_MM, tilt_deg), motion.press_speed_mm_s),
+        Move(pose(motion.safe_z_mm, 0.0), motion.travel_speed_mm_s),
+    ]
+    return down, up
+
+
+def check_all(config: RigConfig, limits: Limits, cells: list[Cell], presses: set[tuple[float, float]]) -> None:
+    """Check every pose that a protocol can ask for, before the first motion. Raises `LimitExceeded`."""
+    moves = park_moves(config) + zero_touch_moves(config) + dip_moves(config)
+    for cell in cells:
+        for height_mm, tilt_deg in presses:
+            down, up = press_moves(config, cell, height_mm, tilt_deg)
+            moves += down + up
+    for move in moves:
+        limits.check("robot", move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=config.motion.acc_mm_s2)
+
+
+def _upright(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Pose:
+    return brush_pose(x_mm, y_mm, z_mm, heading_deg=config.paper.yaw_deg)

@@ -1,0 +1,85 @@
+"""The devices of a rig, made from its configuration, connected observers first and closed in reverse."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import tempfile
+from collections.abc import AsyncGenerator, Generator
+from dataclasses import dataclass
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from collect.config import RigConfig
+from collect.errors import ConfigError
+from drivers.arcs.robot import ArcsOptions, AuboArcs
+from drivers.camera import CameraOptions, OpenCvCamera
+from drivers.clock import Clock
+from drivers.limits import Limits
+from drivers.protocols import Camera, Robot
+from drivers.samples import Identity
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """Connected devices and who they say they are."""
+
+    config: RigConfig
+    clock: Clock
+    robot: Robot
+    camera: Camera
+    robot_identity: Identity
+    camera_identity: Identity
+
+
+def limits_of(config: RigConfig) -> Limits:
+    """The limits of `rig.toml`; the floor is never below what the brush survives."""
+    box = config.robot.limits
+    floor = max(box.z_mm[0], config.paper.touch_z_mm - config.brush.max_depth_mm)
+    return Limits(box.x_mm, box.y_mm, (floor, box.z_mm[1]), box.tilt_deg, box.speed_mm_s, box.acc_mm_s2)
+
+
+def make_robot(config: RigConfig, clock: Clock) -> AuboArcs:
+    """The arm's driver, not yet connected."""
+    robot = config.robot
+    return AuboArcs(ArcsOptions(robot.host, robot.port, robot.tcp_offset_mm), limits_of(config), clock)
+
+
+def make_camera(config: RigConfig, clock: Clock) -> OpenCvCamera:
+    """The camera's driver, not yet connected."""
+    camera = config.camera
+    return OpenCvCamera(CameraOptions(camera.source, camera.latency_ms, camera.timeout_s), clock)
+
+
+@contextlib.contextmanager
+def sole_driver(config: RigConfig) -> Generator[None]:
+    """Hold the arm at this address against other processes of this machine."""
+    address = f"{config.robot.host}:{config.robot.port}"
+    name = f"brushloop-{hashlib.sha256(address.encode()).hexdigest()[:16]}.lock"
+    lock = FileLock(Path(tempfile.gettempdir()) / name, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise ConfigError("rig.toml", "robot", f"another brushloop is driving the arm at {address}") from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextlib.asynccontextmanager
+async def connected(config: RigConfig, clock: Clock) -> AsyncGenerator[Rig]:
+    """Connect camera, then robot; on the way out stop the arm first, whatever happened.
+
+    Raises `ConfigError` where another brushloop on this machine has the arm: closing would stop its motion.
+    """
+    async with contextlib.AsyncExitStack() as stack:
+        stack.enter_context(sole_driver(config))
+        camera = make_camera(config, clock)
+        stack.push_async_callback(camera.close)
+        camera_identity = await camera.connect()
+        robot = make_robot(config, clock)
+        stack.push_async_callback(robot.close)
+        robot_identity = await robot.connect()
+        yield Rig(config, clock, robot, camera, robot_identity, camera_identity)

@@ -1,0 +1,64 @@
+"""What a screen may know: one immutable picture of the engine, made anew when asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from collect.states import State
+
+
+@dataclass(frozen=True, slots=True)
+class CellCount:
+    """Progress of one (H, alpha) of the grid."""
+
+    height_mm: float
+    tilt_deg: float
+    done: int
+    planned: int
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The engine now."""
+
+    session_id: str
+    source: str
+    state: State
+    step: str
+    """What is being done, in words."""
+    strokes_done: int
+    strokes_planned: int
+    grid: tuple[CellCount, ...]
+    voids: int
+    elapsed_s: float
+    eta_s: float | None
+    """Seconds to go; None until a stroke has been timed."""
+    tip_mm: tuple[float, float, float] | None
+    """None where the arm has not told its pose lately."""
+    messages: tuple[str, ...]
+    """The newest lines of the log, oldest first."""
+    error: str
+    """Why it failed or stopped; empty while all is well."""
+    messages_before: int = 0
+    """How many older lines of the log are not in `messages` any more."""
+
+
+class EngineView(Protocol):
+    """What a screen may do: look, pause, go on, stop."""
+
+    def snapshot(self) -> Snapshot:
+        """The engine now; never blocks."""
+        ...
+
+    def pause(self) -> None:
+        """Pause before the next step; from any thread."""
+        ...
+
+    def resume(self) -> None:
+        """Go on after a pause; from any thread."""
+        ...
+
+    def stop(self) -> None:
+        """Stop the arm now and end the run; from any thread, in any state. Not an emergency stop."""
+        ...

@@ -1,0 +1,53 @@
+"""Steps: the units of a protocol and of resume."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+Value = float | int | str | bool | None
+Params = dict[str, Value]
+Result = dict[str, Any]
+"""JSON-able: it goes into the journal and comes back from there."""
+
+
+class StepKind(StrEnum):
+    """What a step does."""
+
+    ZERO_TOUCH = "zero_touch"
+    BOARD = "board"
+    DIP = "dip"
+    PRESS = "press"
+    CAPTURE = "capture"
+
+
+RUN_SCOPED = frozenset({StepKind.ZERO_TOUCH})
+"""Done again in every process: what they establish does not outlive it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step. `index` tells equal steps of one protocol apart."""
+
+    kind: StepKind
+    index: int
+    params: Params = field(default_factory=dict[str, Value])
+
+    @property
+    def key(self) -> str:
+        """Stable across processes: sha256 of kind, params and index."""
+        text = json.dumps([self.kind, self.params, self.index], sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    @property
+    def run_scoped(self) -> bool:
+        """True where a stored result must not stand in for doing it."""
+        return self.kind in RUN_SCOPED
+
+
+Protocol = Generator[Step, Result, None]
+"""Yields steps and is sent their results, so that later steps can depend on earlier ones."""

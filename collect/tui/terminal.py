@@ -1,0 +1,58 @@
+"""A terminal that may go away (a closed window, a lost ssh) without taking the process along.
+
+textual's own driver then waits for ever: its writer thread dies of the first failed write, and SIGCONT, which comes
+with every hang-up, starts a second set of threads that nobody ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from typing import TextIO
+
+from textual.drivers.linux_driver import LinuxDriver
+
+
+class TerminalDriver(LinuxDriver):
+    """textual's driver, less its two ways to hang."""
+
+    _suspended = False
+
+    def start_application_mode(self) -> None:
+        """Take the terminal."""
+        self._file = _Forgiving(self._file)
+        super().start_application_mode()
+
+    def suspend_application_mode(self) -> None:
+        """Hand the terminal back for a while."""
+        self._suspended = True
+        super().suspend_application_mode()
+
+    def resume_application_mode(self) -> None:
+        """Take it again, but only after handing it back."""
+        if self._suspended:
+            self._suspended = False
+            super().resume_application_mode()
+
+
+class _Forgiving(io.StringIO):
+    """A file whose writes are lost where the terminal is."""
+
+    def __init__(self, file: TextIO) -> None:
+        super().__init__()
+        self._terminal = file
+
+    def fileno(self) -> int:
+        return self._terminal.fileno()
+
+    def isatty(self) -> bool:
+        return self._terminal.isatty()
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            self._terminal.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            self._terminal.flush()
