@@ -1,0 +1,1 @@
+"""Benchmarks that measure this project beside a peer in the same run: `python -m bench [NAME] [--json]`."""

@@ -1,0 +1,43 @@
+"""`python -m bench [NAME] [--json]`: run one benchmark, or all, and print a line for each.
+
+Exit codes: 0 measured, 1 a benchmark could not be measured, 2 unknown name.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from bench import raster, startup
+from bench.harness import Bench, BenchError
+
+
+def benches() -> dict[str, Bench]:
+    """Every benchmark by name; a new one is added here."""
+    return {"raster": raster.run, "startup": startup.run}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    known = benches()
+    parser = argparse.ArgumentParser(prog="python -m bench", description="Measure this project beside its peers.")
+    parser.add_argument("name", nargs="?", metavar="NAME", help=f"one of {', '.join(known)}; all when left out")
+    parser.add_argument("--json", action="store_true", help="one JSON object per line")
+    options = parser.parse_args(arguments)
+    if options.name is not None and options.name not in known:
+        print(f"unknown bench {options.name!r}; known: {', '.join(known)}", file=sys.stderr)
+        return 2
+    code = 0
+    for name in known if options.name is None else [options.name]:
+        try:
+            result = known[name]()
+        except BenchError as error:
+            print(f"{name}: {error}", file=sys.stderr)
+            code = 1
+            continue
+        print(result.to_json() if options.json else result.to_line(), flush=True)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

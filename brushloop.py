@@ -1,0 +1,70 @@
+"""The front door: one typer app that mounts the sub-commands and imports nothing heavy."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import calibrate.cli
+import collect.cli
+import sessions.cli
+
+app = typer.Typer(
+    help="Press a Chinese brush with a robot arm, record it, and measure how well a stroke model predicts the ink.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+app.command("collect")(collect.cli.collect)
+app.command("calibrate")(calibrate.cli.calibrate)
+app.command("validate")(calibrate.cli.validate)
+app.add_typer(sessions.cli.app, name="sessions")
+
+
+@app.command()
+def sim(
+    write_rig: Annotated[Path | None, typer.Option(help="Write a rig.toml for this rig, then serve it.")] = None,
+    rate: Annotated[float, typer.Option(help="Simulated seconds per real second.")] = 1.0,
+    seed: Annotated[int, typer.Option(help="Seed of brush, presses and noise.")] = 1,
+    arcs_port: Annotated[int, typer.Option(help="Controller port; 0 lets the system choose.")] = 0,
+    camera_port: Annotated[int, typer.Option(help="Camera port; 0 lets the system choose.")] = 0,
+    idle_exit: Annotated[float, typer.Option(help="End after so many seconds without clients; 0 never.")] = 0.0,
+) -> None:
+    """Serve the loopback rig: an ARCS controller and an MJPEG camera over one simulated world, on 127.0.0.1 only."""
+    from drivers.sim.brush import BrushSpec
+    from drivers.sim.config import SimConfig
+    from drivers.sim.rig import serve
+
+    config = SimConfig(seed=seed, rate=rate, arcs_port=arcs_port, camera_port=camera_port, brush=BrushSpec(seed=seed))
+    serve(config, write_rig, idle_exit)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for everything that the demo makes.")] = Path("demo-run"),
+    repeats: Annotated[int, typer.Option(help="Presses per (H, alpha).")] = 2,
+    rate: Annotated[float, typer.Option(help="Simulated seconds per real second.")] = 20.0,
+    seed: Annotated[int, typer.Option(help="Seed of the rig and of the order of presses.")] = 1,
+) -> None:
+    """Collect, calibrate and validate a short session on the loopback rig; run again, it goes on where it stopped."""
+    from collect.demo import run_demo
+
+    run_demo(out, repeats, rate, seed)
+
+
+def main() -> None:
+    """Run the app; an error of ours is one line on stderr and its exit code, anything else a traceback."""
+    try:
+        app()
+    except Exception as error:
+        code = getattr(error, "exit_code", None)
+        if not isinstance(code, int):
+            raise
+        sys.stderr.write(f"brushloop: {error}\n")
+        sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()
