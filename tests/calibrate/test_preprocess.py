@@ -1,0 +1,138 @@
+"""From photographs to strokes, on pages whose ink is known to the pixel."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from calibrate.errors import CaptureRefused
+from calibrate.measure import fit_line, measure
+from calibrate.preprocess import PX_PER_MM, Params, prepare, rectify, rescale
+
+PAGE = (800, 800)
+PARAMS = Params()
+
+
+def stroke(length_mm: float = 20.0, width_mm: float = 8.0, centre: tuple[int, int] = (400, 400)) -> np.ndarray:
+    mask = np.zeros(PAGE, np.uint8)
+    axes = (round(length_mm * PX_PER_MM / 2), round(width_mm * PX_PER_MM / 2))
+    cv2.ellipse(mask, centre, axes, 0, 0, 360, 1, -1)
+    return mask > 0
+
+
+def page(mask: np.ndarray, *, shade: float = 0.0, ink: float = 0.1, noise: float = 2.0) -> np.ndarray:
+    light = 230.0 * (1.0 - shade * np.linspace(0, 1, PAGE[1])[None, :] * np.ones((PAGE[0], 1)))
+    image = light * np.where(mask, ink, 1.0) + np.random.default_rng(0).normal(0, noise, PAGE)
+    return np.clip(cv2.GaussianBlur(image, (0, 0), 1.0), 0, 255).astype(np.uint8)
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    return float((a & b).sum() / (a | b).sum())
+
+
+@pytest.mark.parametrize("shade", [0.0, 0.3, 0.6])
+def test_the_stroke_is_found_whatever_the_light_does(shade: float) -> None:
+    truth = stroke()
+    assert iou(prepare(page(truth, shade=shade), None, "page", PARAMS).mask, truth) > 0.98
+
+
+def test_a_thick_stroke_is_not_taken_for_shadow() -> None:
+    truth = stroke(34.0, 20.0)
+    assert iou(prepare(page(truth), None, "page", PARAMS).mask, truth) > 0.98
+
+
+@pytest.mark.parametrize("shade", [0.0, 0.5])
+def test_a_blank_page_is_refused_where_otsu_would_call_paper_ink(shade: float) -> None:
+    blank = np.zeros(PAGE, np.bool_)
+    with pytest.raises(CaptureRefused, match=r"capture 7: is blank"):
+        prepare(page(blank, shade=shade), None, "capture 7", PARAMS)
+
+
+def test_specks_and_neighbours_are_left_out() -> None:
+    truth, dirty = stroke(), stroke()
+    dirty |= stroke(6.0, 4.0, (90, 120))  # a neighbour's end
+    dirty[700:704, 500:504] = True  # a speck
+    assert iou(prepare(page(dirty), None, "page", PARAMS).mask, truth) > 0.98
+
+
+def test_the_anchor_tells_a_small_stroke_from_a_large_neighbour() -> None:
+    mine, neighbour = stroke(5.0, 3.0, (400, 400)), stroke(16.0, 8.0, (400, 700))
+    found = prepare(page(mine | neighbour), (420.0, 400.0), "page", PARAMS)
+    assert iou(found.mask, mine) > 0.95
+
+
+def test_parts_of_a_broken_stroke_stay_together() -> None:
+    truth = stroke()
+    truth[:, 400:412] = False  # a dry gap of .6 mm
+    assert iou(prepare(page(truth), (400.0, 400.0), "page", PARAMS).mask, truth) > 0.97
+
+
+def test_what_lies_outside_the_cell_is_not_seen() -> None:
+    truth, neighbour = stroke(), stroke(20.0, 8.0, (400, 620))
+    found = prepare(page(truth | neighbour), None, "page", PARAMS, (0, 200, 800, 330))
+    assert iou(found.mask, truth) > 0.98
+    assert not found.cut
+
+
+def test_a_stroke_that_reaches_the_edge_of_its_cell_is_said_to_be_cut() -> None:
+    assert prepare(page(stroke()), None, "page", PARAMS, (0, 0, 500, 800)).cut
+    assert prepare(page(stroke(30.0, 8.0, (700, 400))), None, "page", PARAMS).cut
+
+
+def test_soft_ink_is_one_inside_and_zero_away_from_the_stroke() -> None:
+    truth = stroke()
+    soft = prepare(page(truth), None, "page", PARAMS).soft
+    assert soft[380:420, 380:420].mean() > 0.95
+    assert soft[:100].max() == 0.0
+
+
+def test_rectify_puts_a_known_point_where_it_belongs() -> None:
+    # An image of 10 px/mm with y downward and the paper's (0, 0) at pixel (50, 450).
+    image_to_paper = np.array([[0.1, 0.0, -5.0], [0.0, -0.1, 45.0], [0.0, 0.0, 1.0]])
+    image = np.full((500, 500), 255, np.uint8)
+    cv2.circle(image, (150, 250), 10, 0, -1)  # paper (10, 20), radius 1 mm
+    window = rectify(image, image_to_paper, (0.0, 10.0, 20.0, 20.0))
+    assert window.shape == (400, 400)
+    ys, xs = np.nonzero(window < 128)
+    assert (xs.mean() + 0.5) / PX_PER_MM == pytest.approx(10.0, abs=0.03)
+    assert (ys.mean() + 0.5) / PX_PER_MM == pytest.approx(10.0, abs=0.03)  # 10 mm below the window's far edge
+
+
+def test_a_photograph_of_known_scale_keeps_its_millimetres() -> None:
+    image = np.full((350, 480), 255, np.uint8)
+    image[100:150, 200:300] = 30  # 100 x 50 px at 5 x 10 px/mm: 20 x 5 mm
+    raster = rescale(image, (5.0, 10.0), "photo")
+    measured = measure(prepare(raster, None, "photo", PARAMS).mask)
+    assert measured.length_mm == pytest.approx(20.0, abs=0.2)
+    assert measured.width_mm == pytest.approx(5.0, abs=0.15)
+    assert measured.area_mm2 == pytest.approx(100.0, rel=0.03)
+
+
+def test_a_raster_that_would_be_huge_is_refused() -> None:
+    with pytest.raises(CaptureRefused, match="allowed 8 to 8192"):
+        rescale(np.full((400, 4000), 255, np.uint8), (1.0, 1.0), "photo")
+
+
+def test_holes_of_glare_do_not_narrow_a_stroke_but_are_no_ink() -> None:
+    whole, holed = stroke(20.0, 10.0), stroke(20.0, 10.0)
+    holed[385:415, 300:500] = False  # a stripe of glare along the stroke, 1.5 mm
+    assert measure(holed).width_mm == pytest.approx(measure(whole).width_mm, abs=0.2)
+    assert measure(holed).area_mm2 < measure(whole).area_mm2 - 10.0
+
+
+def test_a_line_is_fitted_with_its_interval() -> None:
+    rng = np.random.default_rng(5)
+    hits = 0
+    for _ in range(200):
+        x = rng.uniform(0, 10, 60)
+        y = 0.6 * x + 2.0 + rng.normal(0, 0.5, 60)
+        line = fit_line(list(x), list(y))
+        assert line is not None
+        hits += line.interval[0] <= 0.6 <= line.interval[1]
+    assert 180 <= hits <= 199  # 95 %, give or take what 200 draws allow
+
+
+def test_a_line_needs_three_points_and_some_spread() -> None:
+    assert fit_line([1.0, 2.0], [1.0, 2.0]) is None
+    assert fit_line([1.0, 1.0, 1.0], [1.0, 2.0, 3.0]) is None

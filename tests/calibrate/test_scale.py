@@ -1,0 +1,96 @@
+"""Scale and plane from a board whose truth is known."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from calibrate.errors import CalibrationError
+from calibrate.scale import BoardSpec, apply, find_corners, fit_plane, local_scale
+
+SPEC = BoardSpec(squares=(7, 5), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_50", origin_mm=(-10.0, 5.0))
+
+
+def photograph(spec: BoardSpec = SPEC, noise: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
+    """(image, image -> paper homography) of the board seen at a slant."""
+    scale = 8.0
+    size = (round(spec.squares[0] * spec.square_mm * scale), round(spec.squares[1] * spec.square_mm * scale))
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
+    board = cv2.aruco.CharucoBoard(spec.squares, spec.square_mm, spec.marker_mm, dictionary)
+    picture = cv2.copyMakeBorder(board.generateImage(size), 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255)
+    top_mm = spec.origin_mm[1] + spec.squares[1] * spec.square_mm
+    picture_to_paper = np.array(
+        [
+            [1 / scale, 0, spec.origin_mm[0] + (0.5 - 40) / scale],
+            [0, -1 / scale, top_mm - (0.5 - 40) / scale],
+            [0, 0, 1],
+        ]
+    )
+    slant = np.array([[0.62, 0.03, 30.0], [-0.02, 0.6, 40.0], [1e-5, 4e-5, 1.0]])
+    image = cv2.warpPerspective(picture, slant, (900, 640), flags=cv2.INTER_AREA, borderValue=255)
+    noisy = cv2.GaussianBlur(image, (0, 0), 0.8) + np.random.default_rng(0).normal(0, noise, image.shape)
+    return np.clip(noisy, 0, 255).astype(np.uint8), picture_to_paper @ np.linalg.inv(slant)
+
+
+def test_the_plane_is_found_to_hundredths_of_a_millimetre() -> None:
+    image, truth = photograph()
+    plane = fit_plane(*find_corners(image, SPEC, "photo"), "photo")
+    assert plane.corners == 24
+    points = np.array([[200.0, 150.0], [650.0, 150.0], [450.0, 300.0], [200.0, 420.0]])
+    assert apply(plane.image_to_paper, points) == pytest.approx(apply(truth, points), abs=0.02)
+
+
+def test_the_scale_is_within_its_interval_and_that_is_narrow() -> None:
+    image, truth = photograph()
+    pixels, paper = find_corners(image, SPEC, "photo")
+    plane = fit_plane(pixels, paper, "photo")
+    low, high = plane.interval_mm_per_px
+    assert low < plane.mm_per_px < high
+    assert high - low < 1e-3 * plane.mm_per_px
+    assert plane.mm_per_px == pytest.approx(local_scale(truth, pixels.mean(axis=0)), rel=5e-4)
+
+
+def test_paper_y_grows_upward_in_the_image() -> None:
+    image, _ = photograph()
+    pixels, paper = find_corners(image, SPEC, "photo")
+    assert np.corrcoef(pixels[:, 1], paper[:, 1])[0, 1] < -0.99
+    assert np.corrcoef(pixels[:, 0], paper[:, 0])[0, 1] > 0.99
+
+
+def test_a_blank_page_tells_how_many_corners_were_found() -> None:
+    with pytest.raises(CalibrationError, match="0 of 24 board corners found, at least 8"):
+        find_corners(np.full((480, 640), 230, np.uint8), SPEC, "blank.png")
+
+
+def test_a_board_that_is_mostly_hidden_is_refused() -> None:
+    image, _ = photograph()
+    image[:, 240:] = 200
+    with pytest.raises(CalibrationError, match="of 24 board corners"):
+        find_corners(image, SPEC, "hidden.png")
+
+
+def test_a_misnamed_corner_is_dropped_and_counted() -> None:
+    image, truth = photograph()
+    pixels, paper = find_corners(image, SPEC, "photo")
+    pixels[3] += (7.0, -5.0)
+    plane = fit_plane(pixels, paper, "photo")
+    assert (plane.corners, plane.dropped) == (23, 1)
+    points = np.array([[200.0, 150.0], [650.0, 420.0]])
+    assert apply(plane.image_to_paper, points) == pytest.approx(apply(truth, points), abs=0.03)
+
+
+def test_corners_that_do_not_fit_one_plane_are_refused() -> None:
+    image, _ = photograph()
+    pixels, paper = find_corners(image, SPEC, "photo")
+    with pytest.raises(CalibrationError, match="residual"):
+        fit_plane(pixels + np.random.default_rng(1).normal(0, 4, pixels.shape), paper, "bent.png")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [({"dictionary": "DICT_NONE"}, "not one of OpenCV's"), ({"marker_mm": 20.0}, "must be less than")],
+)
+def test_a_board_that_cannot_be_is_refused(change: dict[str, object], words: str) -> None:
+    with pytest.raises(CalibrationError, match=words):
+        find_corners(np.zeros((64, 64), np.uint8), SPEC.model_copy(update=change), "photo")

@@ -1,0 +1,82 @@
+"""A loopback rig in a thread of its own, as small and fast as the collection needs it."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from collect.config import GridConfig, RigConfig, load_protocol, load_rig
+from collect.engine import Engine
+from collect.opening import Opening, find_resumable, open_store
+from drivers.clock import HostClock
+from drivers.sim.config import SimConfig, View
+from drivers.sim.rig import LoopbackRig
+
+SMALL_VIEW = View(width_px=512, height_px=384, px_per_mm=1.56, fps=50.0)
+
+
+@contextmanager
+def serving(config: SimConfig) -> Iterator[LoopbackRig]:
+    """The rig serves from another thread's event loop until the block ends."""
+    ready: Future[tuple[LoopbackRig, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
+
+    async def serve() -> None:
+        over = asyncio.Event()
+        async with LoopbackRig(config) as rig:
+            ready.set_result((rig, asyncio.get_running_loop(), over))
+            await over.wait()
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve()), name="loopback rig")
+    thread.start()
+    rig, loop, over = ready.result(timeout=30)
+    try:
+        yield rig
+    finally:
+        loop.call_soon_threadsafe(over.set)
+        thread.join()
+
+
+@dataclass
+class Lab:
+    """A rig that serves, its configuration on disk, and a folder for sessions."""
+
+    rig: LoopbackRig
+    folder: Path
+
+    @property
+    def sessions(self) -> Path:
+        return self.folder / "sessions"
+
+    def opening(self, **flags: bool) -> Opening:
+        return Opening(self.sessions, self.folder / "rig.toml", self.folder / "protocol.toml", **flags)
+
+    def configs(self) -> tuple[RigConfig, GridConfig]:
+        opening = self.opening()
+        return load_rig(opening.rig_path), load_protocol(opening.protocol_path)
+
+    def engine(self, **flags: bool) -> Engine:
+        opening, clock = self.opening(**flags), HostClock()
+        rig, protocol = self.configs()
+        resume = find_resumable(opening)
+        return Engine(rig, protocol, lambda r: open_store(opening, resume, r, rig, protocol, clock), clock)
+
+    def write_protocol(self, heights: str = "[11.0, 15.0]", tilts: str = "[0.0, 10.0]", repeats: int = 1) -> None:
+        text = f'kind = "grid"\nheights_mm = {heights}\ntilts_deg = {tilts}\nrepeats = {repeats}\ndwell_s = 0.0\n'
+        (self.folder / "protocol.toml").write_text(text, encoding="utf-8")
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Iterator[Lab]:
+    with serving(SimConfig(rate=60.0, view=SMALL_VIEW)) as rig:
+        made = Lab(rig, tmp_path)
+        text = rig.toml().replace("latency_ms = 250.0", "latency_ms = 60.0")
+        (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
+        made.write_protocol()
+        yield made

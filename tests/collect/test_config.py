@@ -1,0 +1,113 @@
+"""A configuration that cannot be used is one line: file, field, allowed range."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from collect.config import load_protocol, load_rig
+from collect.errors import ConfigError
+from collect.plan import check_plan
+from drivers.sim.config import SimConfig
+from drivers.sim.rig_toml import rig_toml
+
+RIG = rig_toml(SimConfig(), "127.0.0.1", 30004, 8080)
+PROTOCOL = 'kind = "grid"\nheights_mm = [11.0, 20.0]\ntilts_deg = [0.0, 10.0]\nrepeats = 2\n'
+
+
+def rig_file(tmp_path: Path, old: str = "", new: str = "") -> Path:
+    assert old in RIG
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG.replace(old, new) if old else RIG)
+    return path
+
+
+def protocol_file(tmp_path: Path, text: str = PROTOCOL) -> Path:
+    path = tmp_path / "protocol.toml"
+    path.write_text(text)
+    return path
+
+
+def test_the_rig_that_the_simulator_writes_is_valid(tmp_path: Path) -> None:
+    rig = load_rig(rig_file(tmp_path))
+    assert rig.paper.touch_z_mm == pytest.approx(120.03)
+    check_plan(tmp_path / "rig.toml", protocol_file(tmp_path), rig, load_protocol(protocol_file(tmp_path)))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("port = 30004", "port = 70000", r"rig.toml: robot.port: .*65535.*given: 70000"),
+        ("radius_mm = 6.0", "radius_mm = -1.0", r"brush.radius_mm: .*greater than 0"),
+        ("radius_mm = 6.0", "radius = 6.0", r"brush.*(radius_mm|radius)"),
+        ("touch_z_mm = 120.030", "touch_z_mm = nan", r"paper.touch_z_mm: .*finite"),
+        ("touch_z_mm = 120.030", "", r"paper.touch_z_mm: Field required"),
+        ("x_mm = [200.0, 640.0]", "x_mm = [640.0, 200.0]", r"robot.limits: .*x_mm = \[640.0, 200.0\]"),
+        ('kind = "aubo-arcs"', 'kind = "teapot"', r"robot.kind: .*'aubo-arcs'"),
+        ("[robot]", "[robot", r"is not TOML"),
+        ("tilt_deg = 15.0", "tilt_deg = 80.0", r"robot.limits.tilt_deg: .*30"),
+    ],
+)
+def test_a_bad_rig_is_refused_in_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as refused:
+        load_rig(rig_file(tmp_path, old, new))
+    assert refused.value.exit_code == 2
+    assert "\n" not in str(refused.value) or "TOML" in message
+
+
+def test_the_environment_names_machines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("BRUSHLOOP_ROBOT__HOST", "192.0.2.7")
+    monkeypatch.setenv("BRUSHLOOP_ROBOT__PORT", "31000")
+    rig = load_rig(rig_file(tmp_path))
+    assert (rig.robot.host, rig.robot.port, rig.camera.kind) == ("192.0.2.7", 31000, "opencv")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (PROTOCOL.replace("repeats = 2", "repeats = 0"), r"repeats: .*1"),
+        (PROTOCOL.replace("[11.0, 20.0]", "[]"), r"heights_mm: .*at least 1"),
+        (PROTOCOL.replace("[11.0, 20.0]", "[11.0, 11.0]"), r"heights_mm has the same value twice"),
+        (PROTOCOL.replace("[0.0, 10.0]", "[-5.0]"), r"tilts_deg.0: .*greater than or equal to 0"),
+        (PROTOCOL + "speed = 3\n", r"speed: Extra inputs"),
+    ],
+)
+def test_a_bad_protocol_is_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_protocol(protocol_file(tmp_path, text))
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"nowhere.toml: no such file"):
+        load_rig(tmp_path / "nowhere.toml")
+
+
+def plan(tmp_path: Path, protocol: str = PROTOCOL, old: str = "", new: str = "") -> None:
+    rig_path, protocol_path = rig_file(tmp_path, old, new), protocol_file(tmp_path, protocol)
+    check_plan(rig_path, protocol_path, load_rig(rig_path), load_protocol(protocol_path))
+
+
+def test_a_press_deeper_than_the_brush_survives_is_refused_before_anything_is_connected(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"heights_mm: 23 mm is deeper than brush.max_depth_mm = 22 mm"):
+        plan(tmp_path, PROTOCOL.replace("20.0", "23.0"))
+
+
+def test_a_pose_outside_the_box_is_refused_before_anything_is_connected(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"robot.limits: a planned pose has x = .* is outside"):
+        plan(tmp_path, old="x_mm = [200.0, 640.0]", new="x_mm = [240.0, 400.0]")
+
+
+def test_a_tilt_beyond_the_cone_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"tilt = 20.000 deg is outside \[0.000, 15.000\]"):
+        plan(tmp_path, PROTOCOL.replace("10.0", "20.0"))
+
+
+def test_a_speed_above_the_cap_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"speed = 200.000 mm/s is outside"):
+        plan(tmp_path, old="speed_mm_s = 250.0", new="speed_mm_s = 150.0")
+
+
+def test_a_cell_larger_than_the_sheet_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"paper.cell_mm: .* does not fit"):
+        plan(tmp_path, old="cell_mm = [40.0, 24.0]", new="cell_mm = [400.0, 24.0]")

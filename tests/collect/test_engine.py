@@ -1,0 +1,185 @@
+"""The engine on the loopback rig: every stroke exactly once, whatever interrupts it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import pytest
+
+from collect.engine import Engine
+from collect.errors import CollectAborted, ConfigError
+from collect.snapshot import Snapshot
+from collect.states import State
+from drivers.arcs.codes import SafetyMode
+from drivers.errors import RobotNotSafe
+from sessions.journal import replay
+from sessions.reader import Recording
+
+if TYPE_CHECKING:
+    from conftest import Lab
+
+
+def until(engine: Engine, condition: Callable[[Snapshot], bool], timeout_s: float = 30.0) -> Snapshot:
+    deadline = time.monotonic() + timeout_s
+    while not condition(now := engine.snapshot()):
+        assert time.monotonic() < deadline, f"waited in vain: {now}"
+        assert not engine.finished, f"over too early: {now}"
+        time.sleep(0.005)
+    return now
+
+
+def run(engine: Engine) -> None:
+    engine.start()
+    engine.join()
+
+
+def test_a_whole_session_is_collected_merged_and_told(lab: Lab) -> None:
+    engine = lab.engine()
+    run(engine)
+
+    now = engine.snapshot()
+    assert (now.state, now.strokes_done, now.strokes_planned) == (State.DONE, 4, 4)
+    assert now.source == "loopback rig"
+    [folder] = lab.sessions.iterdir()
+    recording = Recording(folder)
+    assert recording.header.source == "loopback rig"
+    captures = list(recording.captures())
+    assert sorted((c.stroke.height_mm, c.stroke.tilt_deg) for c in captures) == [(11, 0), (11, 10), (15, 0), (15, 10)]
+    assert all(c.image().shape == (384, 512) for c in captures)
+
+
+def test_the_arm_presses_what_the_protocol_says_where_the_cell_lies(lab: Lab) -> None:
+    run(lab.engine())
+
+    # World's own answer sheet; the operator taught the touch height .03 mm too high. The first contact is zero touch.
+    strokes = {c.stroke.still: c.stroke for c in Recording(next(lab.sessions.iterdir())).captures()}
+    pressed = [p for p in lab.rig.world.presses if p.depth_mm > 1.0]
+    for press, stroke in zip(pressed, (strokes[k] for k in sorted(strokes)), strict=True):
+        assert stroke.height_mm == pytest.approx(press.depth_mm + 0.03, abs=0.01)
+        assert stroke.tilt_deg == pytest.approx(press.tilt_deg, abs=0.01)
+        assert stroke.anchor_mm == pytest.approx((press.x_mm, press.y_mm), abs=0.05)
+        assert press.heading_deg == pytest.approx(0.0, abs=0.01)
+        assert press.ink_load == 1.0
+
+
+def test_stop_in_mid_press_voids_the_cell_and_the_same_command_goes_on(lab: Lab) -> None:
+    engine = lab.engine()
+    engine.start()
+    until(engine, lambda now: now.strokes_done == 1)
+    until(engine, lambda now: now.step.startswith("press") and now.tip_mm is not None and now.tip_mm[2] < 125.0)
+    engine.stop()
+    engine.stop()
+    with pytest.raises(CollectAborted):
+        engine.join()
+    assert engine.snapshot().state == State.STOPPED
+    stopped_at = lab.rig.world.tool()
+    time.sleep(0.1)
+    assert lab.rig.world.tool() == stopped_at
+
+    again = lab.engine()
+    run(again)
+
+    [folder] = lab.sessions.iterdir()
+    state = replay(folder / "journal.jsonl")
+    assert state.voids >= 1
+    ids = [c.stroke.stroke_id for c in Recording(folder).captures()]
+    assert len(ids) == len(set(ids)) == 4
+    # The cut press burnt its cell: five presses (one of them cut) touched five places.
+    assert len(state.used_cells) == 5
+
+
+def test_stop_before_anything_has_moved(lab: Lab) -> None:
+    engine = lab.engine()
+    engine.stop()
+    engine.start()
+    with pytest.raises(CollectAborted):
+        engine.join()
+    assert engine.snapshot().state == State.STOPPED
+
+
+def test_pause_waits_between_steps_and_resume_goes_on(lab: Lab) -> None:
+    engine = lab.engine()
+    engine.start()
+    until(engine, lambda now: now.strokes_done == 1)
+    engine.pause()
+    paused = until(engine, lambda now: now.state == State.PAUSED)
+    time.sleep(0.2)
+    assert engine.snapshot().strokes_done == paused.strokes_done
+    engine.resume()
+    engine.join()
+    assert engine.snapshot().state == State.DONE
+
+
+def test_stop_works_while_paused(lab: Lab) -> None:
+    engine = lab.engine()
+    engine.start()
+    until(engine, lambda now: now.state == State.RUNNING)
+    engine.pause()
+    until(engine, lambda now: now.state == State.PAUSED)
+    engine.stop()
+    with pytest.raises(CollectAborted):
+        engine.join()
+
+
+def test_a_protective_stop_ends_the_run_and_says_what_to_do(lab: Lab) -> None:
+    engine = lab.engine()
+    engine.start()
+    until(engine, lambda now: now.step.startswith("press"))
+    lab.rig.arcs.protective_stop(SafetyMode.PROTECTIVE_STOP)
+    with pytest.raises(RobotNotSafe, match="pendant"):
+        engine.join()
+    now = engine.snapshot()
+    assert now.state == State.FAILED
+    assert "ProtectiveStop" in now.error
+    assert lab.rig.arcs.safety == SafetyMode.PROTECTIVE_STOP, "nothing is ever cleared automatically"
+
+
+def test_a_changed_protocol_is_refused_with_the_difference(lab: Lab) -> None:
+    engine = lab.engine()
+    engine.start()
+    until(engine, lambda now: now.strokes_done == 1)
+    engine.stop()
+    with pytest.raises(CollectAborted):
+        engine.join()
+
+    lab.write_protocol(heights="[11.0, 16.0]")
+    with pytest.raises(ConfigError, match=r"(?s)-heights_mm = \[11.0, 15.0\].*\+heights_mm = \[11.0, 16.0\].*--new"):
+        lab.engine()
+    run(lab.engine(new=True))
+    assert len(list(lab.sessions.iterdir())) == 2
+
+
+def test_a_full_sheet_asks_for_a_fresh_one_and_goes_on_with_it(lab: Lab) -> None:
+    text = (lab.folder / "rig.toml").read_text().replace("cell_mm = [40.0, 24.0]", "cell_mm = [120.0, 80.0]")
+    (lab.folder / "rig.toml").write_text(text)
+    lab.write_protocol(heights="[11.0, 13.0, 15.0]")  # 6 presses, 4 cells
+
+    from collect.errors import SheetFull
+
+    with pytest.raises(SheetFull, match="--fresh-sheet"):
+        run(lab.engine())
+    run(lab.engine(fresh_sheet=True))
+    [folder] = lab.sessions.iterdir()
+    assert sum(1 for _ in Recording(folder).captures()) == 6
+
+
+def test_real_hardware_is_not_moved_unless_armed(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.arcs.robot.LOOPBACK_CONTROL_BOX", "something else")
+    with pytest.raises(ConfigError, match=r"real hardware.*--arm"):
+        run(lab.engine())
+    assert not lab.sessions.exists()
+    assert lab.rig.arcs.mode == "PowerOff"
+
+
+def test_a_session_is_not_resumed_on_another_robot(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = lab.engine()
+    engine.start()
+    until(engine, lambda now: now.strokes_done == 1)
+    engine.stop()
+    with pytest.raises(CollectAborted):
+        engine.join()
+    monkeypatch.setattr("drivers.arcs.robot.LOOPBACK_CONTROL_BOX", "something else")
+    with pytest.raises(ConfigError, match="was begun on"):
+        run(lab.engine(armed=True))

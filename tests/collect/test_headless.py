@@ -1,0 +1,74 @@
+"""`brushloop collect` without a screen, as a process: signals, exit codes, two at once."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from collect.headless import eta_text
+from collect.snapshot import Snapshot
+from collect.states import State
+from sessions.reader import Recording
+
+if TYPE_CHECKING:
+    from conftest import Lab
+
+
+def collect(lab: Lab, *flags: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "brushloop", "collect", "--no-tui", *flags]
+    command += ["--config", str(lab.folder / "rig.toml"), "--protocol", str(lab.folder / "protocol.toml")]
+    return subprocess.Popen(
+        [*command, "--out", str(lab.sessions)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def wait_for_presses(lab: Lab, count: int) -> None:
+    deadline = time.monotonic() + 60
+    while len(lab.rig.world.presses) < count:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_stops_the_arm_and_the_same_command_goes_on(lab: Lab, number: signal.Signals) -> None:
+    first = collect(lab)
+    wait_for_presses(lab, 2)
+    first.send_signal(number)
+    _, stderr = first.communicate(timeout=30)
+    assert first.returncode == 4
+    assert stderr.splitlines()[-1] == "brushloop: stopped; the same command goes on from here"
+    assert "Traceback" not in stderr
+    still = lab.rig.world.tool()
+    time.sleep(0.1)
+    assert lab.rig.world.tool() == still
+
+    again = collect(lab)
+    _, stderr = again.communicate(timeout=60)
+    assert again.returncode == 0, stderr
+    [folder] = lab.sessions.iterdir()
+    assert len({c.stroke.stroke_id for c in Recording(folder).captures()}) == 4
+
+
+def test_a_second_process_is_refused_and_the_first_goes_on(lab: Lab) -> None:
+    first = collect(lab)
+    wait_for_presses(lab, 2)
+    second = collect(lab)
+    _, stderr = second.communicate(timeout=30)
+    assert second.returncode == 2
+    assert "another brushloop is driving the arm" in stderr.splitlines()[-1]
+    first.communicate(timeout=60)
+    assert first.returncode == 0
+
+
+def snapshot(eta_s: float | None) -> Snapshot:
+    return Snapshot("s", "loopback rig", State.RUNNING, "dip", 1, 4, (), 0, 1.0, eta_s, None, (), "")
+
+
+@pytest.mark.parametrize(("eta_s", "text"), [(None, ""), (0.0, "ETA 0:00"), (59.6, "ETA 1:00"), (725.0, "ETA 12:05")])
+def test_the_eta_reads_as_minutes_and_seconds(eta_s: float | None, text: str) -> None:
+    assert eta_text(snapshot(eta_s)) == text

@@ -1,0 +1,95 @@
+"""The grid: every cell as often as asked, in an order that does not depend on the process."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections import Counter
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from collect.config import GridConfig, PaperConfig
+from collect.protocol import grid, plan_grid
+from collect.sheet import Sheet, to_base
+from collect.steps import Step, StepKind
+
+heights = st.lists(st.integers(1, 30).map(float), min_size=1, max_size=5, unique=True)
+tilts = st.lists(st.integers(0, 15).map(float), min_size=1, max_size=4, unique=True)
+
+
+def config(heights_mm: list[float], tilts_deg: list[float], repeats: int, seed: int = 1) -> GridConfig:
+    return GridConfig(kind="grid", heights_mm=heights_mm, tilts_deg=tilts_deg, repeats=repeats, seed=seed)
+
+
+@given(heights, tilts, st.integers(1, 5), st.integers(0, 99))
+def test_every_cell_is_pressed_as_often_as_asked_and_once_a_round(
+    heights_mm: list[float], tilts_deg: list[float], repeats: int, seed: int
+) -> None:
+    planned = plan_grid(config(heights_mm, tilts_deg, repeats, seed))
+    cells = Counter((p.height_mm, p.tilt_deg) for p in planned)
+    assert set(cells.values()) == {repeats}
+    assert len(cells) == len(heights_mm) * len(tilts_deg)
+    assert [p.repeat for p in planned] == sorted(p.repeat for p in planned)
+    assert len({p.stroke_id for p in planned}) == len(planned)
+
+
+def test_steps_of_a_stroke_follow_each_other_and_a_capture_belongs_to_the_cell_that_was_pressed() -> None:
+    protocol = grid(config([11.0], [0.0], 1))
+    kinds: list[str] = []
+    step = next(protocol)
+    try:
+        while True:
+            kinds.append(step.kind)
+            result = {"sheet": 0, "cell": 7} if step.kind == StepKind.PRESS else {}
+            step = protocol.send(result)
+            if step.kind == StepKind.CAPTURE:
+                assert step.params["cell"] == 7
+    except StopIteration:
+        pass
+    assert kinds == ["zero_touch", "board", "dip", "press", "capture"]
+
+
+def test_keys_are_stable_across_processes_and_tell_steps_apart() -> None:
+    step = Step(StepKind.PRESS, 3, {"height_mm": 11.0, "tilt_deg": 5.0})
+    program = "from collect.steps import *;print(Step(StepKind.PRESS, 3, {'tilt_deg': 5.0, 'height_mm': 11.0}).key)"
+    other = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.strip()
+    assert other == step.key
+    assert step.key != Step(StepKind.PRESS, 4, step.params).key
+    assert step.key != Step(StepKind.PRESS, 3, {"height_mm": 11.0, "tilt_deg": 6.0}).key
+
+
+def paper(**changes: object) -> PaperConfig:
+    values = {"origin_mm": (460.0, -110.0), "yaw_deg": 90.0, "touch_z_mm": 120.0, "size_mm": (244.0, 172.0)}
+    return PaperConfig.model_validate(values | changes)
+
+
+def test_cells_tile_the_sheet_without_overlap() -> None:
+    sheet = Sheet(paper())
+    assert (sheet.columns, sheet.rows, sheet.capacity) == (6, 7, 42)
+    corners = {sheet.cell(i).rect_mm[:2] for i in range(sheet.capacity)}
+    assert len(corners) == 42
+    for index in range(sheet.capacity):
+        x, y, width, height = sheet.cell(index).rect_mm
+        assert x >= 0.0
+        assert x + width <= 244.0
+        assert y >= 0.0
+        assert y + height <= 172.0
+        anchor_x, anchor_y = sheet.cell(index).anchor_mm
+        assert x < anchor_x < x + width
+        assert y < anchor_y < y + height
+
+
+def test_a_used_cell_is_never_handed_out_again() -> None:
+    sheet = Sheet(paper())
+    used: set[int] = set()
+    for _ in range(sheet.capacity):
+        cell = sheet.free(used)
+        assert cell.index not in used
+        used.add(cell.index)
+
+
+def test_paper_axes_turn_with_the_yaw() -> None:
+    assert to_base(paper(), 10.0, 0.0) == (460.0, -100.0)
+    x, y = to_base(paper(), 0.0, 10.0)
+    assert (round(x, 9), round(y, 9)) == (450.0, -110.0)

@@ -1,0 +1,59 @@
+"""The transition table and the recovery policy, read as tables."""
+
+from __future__ import annotations
+
+import pytest
+
+from collect.errors import SheetFull, StepVoid
+from collect.policy import MAX_FAILURES, Action, decide
+from collect.states import FINAL, TRANSITIONS, IllegalTransition, State, check_transition
+from collect.steps import Step, StepKind
+from drivers.errors import DeviceError, DeviceTimeout, MotionFailed, RobotNotSafe
+
+
+def test_stop_is_possible_from_every_state_that_is_not_over() -> None:
+    for state in State:
+        if state not in FINAL | {State.STOPPING}:
+            assert State.STOPPING in TRANSITIONS[state], state
+
+
+def test_nothing_leaves_a_final_state() -> None:
+    assert all(not TRANSITIONS[state] for state in FINAL)
+
+
+def test_every_state_can_be_reached() -> None:
+    reached, frontier = {State.IDLE}, [State.IDLE]
+    while frontier:
+        new = TRANSITIONS[frontier.pop()] - reached
+        reached |= new
+        frontier += new
+    assert reached == set(State)
+
+
+def test_a_way_that_the_table_does_not_have_is_a_defect() -> None:
+    with pytest.raises(IllegalTransition, match="done -> running"):
+        check_transition(State.DONE, State.RUNNING)
+
+
+PRESS, CAPTURE = Step(StepKind.PRESS, 0), Step(StepKind.CAPTURE, 0)
+LATE_CAMERA = DeviceTimeout("camera", "fresh", "no new frame")
+
+
+@pytest.mark.parametrize(
+    ("step", "error", "failures", "action"),
+    [
+        (PRESS, StepVoid("rests too high"), 1, Action.RETRY),
+        (PRESS, StepVoid("rests too high"), MAX_FAILURES, Action.ABORT),
+        (PRESS, MotionFailed("robot", "moveLine", "out of reach"), 1, Action.ABORT),
+        (PRESS, RobotNotSafe("robot", "moveLine", "ProtectiveStop", "", ""), 1, Action.ABORT),
+        (PRESS, SheetFull(42), 1, Action.ABORT),
+        (PRESS, LATE_CAMERA, 1, Action.ABORT),
+        (CAPTURE, LATE_CAMERA, 1, Action.RETRY),
+        (CAPTURE, LATE_CAMERA, MAX_FAILURES, Action.ABORT),
+        (CAPTURE, DeviceTimeout("robot", "getTcpPose", "no reply"), 1, Action.ABORT),
+    ],
+)
+def test_motion_is_never_blindly_repeated(
+    step: Step, error: StepVoid | DeviceError, failures: int, action: Action
+) -> None:
+    assert decide(step, error, failures) is action

@@ -1,0 +1,34 @@
+"""Rules that hold for every test: no thread and no task outlives it."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import AsyncIterator, Iterator
+
+import pytest
+
+TOLERATED = ("asyncio_", "pytest_timeout", "ThreadPoolExecutor", "tqdm")
+"""Pools that live as long as their loop or process; nothing of ours is called that."""
+
+
+@pytest.fixture(autouse=True)
+def no_thread_outlives_the_test() -> Iterator[None]:
+    before = set(threading.enumerate())
+    yield
+    deadline = time.monotonic() + 2.0
+    while True:
+        left = [t for t in set(threading.enumerate()) - before if t.is_alive() and not t.name.startswith(TOLERATED)]
+        if not left or time.monotonic() > deadline:
+            break
+        time.sleep(0.01)
+    assert not left, f"threads outlive the test: {left}"
+
+
+@pytest.fixture(autouse=True)
+async def no_task_outlives_the_test() -> AsyncIterator[None]:
+    before = asyncio.all_tasks()
+    yield
+    left = [task for task in asyncio.all_tasks() - before - {asyncio.current_task()} if not task.done()]
+    assert not left, f"tasks outlive the test: {left}"

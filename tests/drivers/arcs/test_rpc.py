@@ -1,0 +1,242 @@
+"""Transcripts: what the client must send, what the controller answers, what the caller gets."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
+
+import pytest
+
+from drivers.arcs.frames import FrameDecoder, encode
+from drivers.arcs.rpc import RpcConnection, encode_request
+from drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, RpcError
+
+TIMEOUT_S = 0.15
+Answer = Callable[[str, asyncio.StreamWriter], Awaitable[None]]
+Line = tuple[str, dict[str, Any] | None, Answer]
+
+
+def reply(ident: object, **body: object) -> bytes:
+    return encode(json.dumps({"id": ident, "jsonrpc": "2.0", **body}).encode())
+
+
+def result(value: object) -> Answer:
+    return sends(lambda ident: reply(ident, result=value))
+
+
+def sends(make: Callable[[str], bytes], after_s: float = 0.0) -> Answer:
+    async def answer(ident: str, writer: asyncio.StreamWriter) -> None:
+        await asyncio.sleep(after_s)
+        writer.write(make(ident))
+
+    return answer
+
+
+async def nothing(_: str, __: asyncio.StreamWriter) -> None:
+    pass
+
+
+async def hang_up(_: str, writer: asyncio.StreamWriter) -> None:
+    writer.close()
+
+
+class Controller:
+    """Expects the lines of its script in order, and nothing else."""
+
+    def __init__(self) -> None:
+        self.script: list[Line] = []
+        self.surprises: list[str] = []
+        self.ids: list[str] = []
+        self.port = 0
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        decoder = FrameDecoder()
+        while data := await reader.read(4096):
+            for payload in decoder.feed(data):
+                await self._follow(payload, writer)
+        writer.close()
+
+    async def _follow(self, payload: bytes, writer: asyncio.StreamWriter) -> None:
+        request = json.loads(payload)
+        if not self.script:
+            self.surprises.append(f"nobody expected {request}")
+            return
+        method, params, answer = self.script.pop(0)
+        expected = encode_request(request["id"], method, params)
+        if payload != expected:
+            self.surprises.append(f"expected {expected!r}, got {payload!r}")
+        self.ids.append(request["id"])
+        await answer(request["id"], writer)
+
+
+@pytest.fixture
+async def controller() -> AsyncIterator[Controller]:
+    it = Controller()
+    server = await asyncio.start_server(it.serve, "127.0.0.1", 0)
+    it.port = server.sockets[0].getsockname()[1]
+    yield it
+    server.close()
+    await server.wait_closed()
+    assert not it.surprises
+    assert not it.script, f"never asked for: {it.script}"
+
+
+@pytest.fixture
+async def client(controller: Controller) -> AsyncIterator[RpcConnection]:
+    connection = RpcConnection("127.0.0.1", controller.port, timeout_s=TIMEOUT_S)
+    await connection.open()
+    yield connection
+    await connection.close()
+
+
+async def test_a_call_sends_named_params_and_returns_the_result(controller: Controller, client: RpcConnection):
+    controller.script = [
+        ("getRobotNames", None, result(["rob1"])),
+        ("rob1.MotionControl.stopLine", {"acc": 2.0, "acc_rot": 2.0}, result(0)),
+    ]
+    assert await client.call("getRobotNames") == ["rob1"]
+    assert await client.call("rob1.MotionControl.stopLine", {"acc_rot": 2.0, "acc": 2.0}) == 0
+
+
+async def test_ids_have_the_vendors_shape_and_never_repeat(controller: Controller, client: RpcConnection):
+    controller.script = [("getRobotNames", None, result([]))] * 20
+    for _ in range(20):
+        await client.call("getRobotNames", {})
+    assert all(re.fullmatch(r"[A-Za-z0-9]{8}-[A-Za-z0-9]{4}-[A-Za-z0-9]{4}", i) for i in controller.ids)
+    assert len(set(controller.ids)) == 20
+
+
+async def test_callers_at_the_same_time_take_turns(controller: Controller, client: RpcConnection):
+    controller.script = [(name, None, sends(lambda i: reply(i, result=i), 0.02)) for name in "abc"]
+    answers = await asyncio.gather(*(client.call(name) for name in "abc"))
+    assert answers == controller.ids
+
+
+async def test_a_late_reply_to_an_old_call_is_dropped(controller: Controller, client: RpcConnection):
+    controller.script = [
+        ("first", None, nothing),
+        ("second", None, sends(lambda i: reply(controller.ids[0], result="late") + reply(i, result="mine"))),
+    ]
+    with pytest.raises(DeviceTimeout):
+        await client.call("first")
+    assert await client.call("second") == "mine"
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        pytest.param(sends(lambda _: reply("AAAAAAAA-BBBB-CCCC", result=0)), id="another id"),
+        pytest.param(sends(lambda _: reply(7, result=0)), id="an integer id"),
+        pytest.param(sends(lambda _: encode(b"[1, 2]")), id="no object"),
+        pytest.param(nothing, id="silence"),
+    ],
+)
+async def test_what_does_not_answer_the_call_is_waited_out(
+    controller: Controller, client: RpcConnection, answer: Answer
+):
+    controller.script = [("getRobotNames", None, answer)]
+    with pytest.raises(DeviceTimeout, match="getRobotNames"):
+        await client.call("getRobotNames")
+
+
+async def test_an_error_object_is_raised_with_its_code_and_method(controller: Controller, client: RpcConnection):
+    error = {"code": -32601, "message": "method not found"}
+    controller.script = [("rob1.Nonsense", None, sends(lambda i: reply(i, error=error)))]
+    with pytest.raises(RpcError, match=r"rob1\.Nonsense: controller answered error -32601") as caught:
+        await client.call("rob1.Nonsense")
+    assert caught.value.code == -32601
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        pytest.param(sends(lambda _: encode(b"hello")), id="no JSON"),
+        pytest.param(sends(lambda _: encode(b"\xff\xfe")), id="no UTF-8"),
+        pytest.param(sends(lambda _: encode(b"[" * 100_000)), id="nested without end"),
+        pytest.param(sends(lambda i: reply(i)), id="neither result nor error"),
+        pytest.param(sends(lambda i: reply(i, error="bad")), id="an error that is no object"),
+    ],
+)
+async def test_a_reply_that_makes_no_sense_is_a_violation_and_the_next_call_works(
+    controller: Controller, client: RpcConnection, answer: Answer
+):
+    controller.script = [("first", None, answer), ("second", None, result(2))]
+    with pytest.raises(ProtocolViolation):
+        await client.call("first")
+    assert await client.call("second") == 2
+
+
+async def test_a_reply_may_arrive_byte_by_byte(controller: Controller, client: RpcConnection):
+    async def dribble(ident: str, writer: asyncio.StreamWriter) -> None:
+        whole = reply(ident, result="ok")
+        for at in [slice(0, 8), *(slice(i, i + 1) for i in range(8, len(whole)))]:
+            writer.write(whole[at])
+            await writer.drain()
+            await asyncio.sleep(0.0002)
+
+    controller.script = [("getRobotNames", None, dribble)]
+    assert await client.call("getRobotNames") == "ok"
+
+
+async def test_the_first_of_two_replies_in_one_segment_counts(controller: Controller, client: RpcConnection):
+    controller.script = [("first", None, sends(lambda i: reply(i, result=1) + reply(i, result=99)))]
+    assert await client.call("first") == 1
+
+
+async def test_when_the_controller_hangs_up_the_call_and_all_later_ones_fail_at_once(
+    controller: Controller, client: RpcConnection
+):
+    controller.script = [("first", None, hang_up)]
+    began = time.monotonic()
+    with pytest.raises(ConnectionLost, match="first"):
+        await client.call("first")
+    with pytest.raises(ConnectionLost, match="second"):
+        await client.call("second")
+    assert time.monotonic() - began < TIMEOUT_S
+    assert client.lost
+
+
+async def test_garbage_that_breaks_the_framing_ends_the_connection(controller: Controller, client: RpcConnection):
+    controller.script = [("first", None, sends(lambda i: b"\x00garbage" + reply(i, result=1)))]
+    with pytest.raises(ConnectionLost, match="expected SOF"):
+        await client.call("first")
+
+
+async def test_a_lost_connection_can_be_opened_again(controller: Controller, client: RpcConnection):
+    controller.script = [("first", None, hang_up), ("second", None, result(2))]
+    with pytest.raises(ConnectionLost):
+        await client.call("first")
+    await client.close()
+    await client.open()
+    assert await client.call("second") == 2
+
+
+async def test_a_call_on_a_connection_that_was_never_opened_or_is_closed_says_so(
+    controller: Controller, client: RpcConnection
+):
+    with pytest.raises(NotConnected):
+        await RpcConnection("127.0.0.1", controller.port).call("first")
+    await client.close()
+    await client.close()
+    with pytest.raises(NotConnected):
+        await client.call("first")
+
+
+async def test_closing_wakes_the_caller_that_still_waits(controller: Controller, client: RpcConnection):
+    controller.script = [("first", None, nothing)]
+    waiting = asyncio.create_task(client.call("first"))
+    await asyncio.sleep(0.02)
+    await client.close()
+    with pytest.raises(NotConnected, match="closed while waiting"):
+        await waiting
+
+
+async def test_a_refused_port_is_a_lost_connection(unused_tcp_port: int):
+    connection = RpcConnection("127.0.0.1", unused_tcp_port, timeout_s=TIMEOUT_S)
+    with pytest.raises(ConnectionLost, match=str(unused_tcp_port)):
+        await connection.open()
+    await connection.close()

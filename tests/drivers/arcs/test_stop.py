@@ -1,0 +1,127 @@
+"""Stop: from any state, never queued behind anything, and after every move that does not end well."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator
+
+import pytest
+
+from drivers.arcs.robot import AuboArcs
+from drivers.errors import ConnectionLost, DeviceTimeout, MotionError
+from drivers.geometry import brush_pose, distance
+from drivers.sim.arcs_server import ArcsServer
+
+FAR = brush_pose(250.0, -30.0, 260.0)  # 200 mm from home: two seconds of the fast clock
+SLOW = {"speed_mm_s": 5.0, "acc_mm_s2": 800.0}
+
+
+@pytest.fixture
+async def move(arm: AuboArcs) -> AsyncIterator[asyncio.Task[None]]:
+    """A slow move that is under way."""
+    task = asyncio.create_task(arm.move(FAR, **SLOW))
+    await asyncio.sleep(0.2)
+    yield task
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+def to_go_mm(cabinet: ArcsServer) -> float:
+    return distance(cabinet._world.tool(), FAR)[0]
+
+
+async def comes_to_rest(cabinet: ArcsServer) -> bool:
+    """Within 0.1 s the arm rests, far from its target and not back at its start."""
+    await asyncio.sleep(0.1)
+    at_rest = cabinet._world.motion.exec_id(cabinet._now_s) == -1
+    return at_rest and 100.0 < to_go_mm(cabinet) < 199.0
+
+
+async def test_a_stop_in_mid_move_stops_the_arm_well_short_and_the_move_fails(
+    arm: AuboArcs, cabinet: ArcsServer, move: asyncio.Task[None]
+):
+    await arm.stop()
+    assert await comes_to_rest(cabinet)
+    with pytest.raises(MotionError, match="from the target"):
+        await move
+
+
+async def test_a_stop_is_fine_before_any_move_and_twice(sleeping_arm: AuboArcs):
+    await sleeping_arm.stop()
+    await asyncio.gather(sleeping_arm.stop(), sleeping_arm.stop())
+    await sleeping_arm.enable()
+    await sleeping_arm.stop()
+
+
+async def test_a_second_stop_in_mid_move_changes_nothing(arm: AuboArcs, cabinet: ArcsServer, move: asyncio.Task[None]):
+    await arm.stop()
+    await arm.stop()
+    assert await comes_to_rest(cabinet)
+
+
+async def test_a_stop_is_fine_in_a_protective_stop(arm: AuboArcs, cabinet: ArcsServer):
+    cabinet.protective_stop()
+    await arm.stop()
+
+
+async def test_a_move_after_a_stop_starts_where_the_arm_came_to_rest(
+    arm: AuboArcs, cabinet: ArcsServer, move: asyncio.Task[None]
+):
+    await arm.stop()
+    x, y, z = cabinet._world.tool().position_mm
+    step = brush_pose(x, y + 1.5, z)
+    await arm.move(step, speed_mm_s=100.0, acc_mm_s2=800.0)
+    assert distance(cabinet._world.tool(), step)[0] < 0.05
+
+
+async def test_cancelling_a_move_stops_the_arm(cabinet: ArcsServer, move: asyncio.Task[None]):
+    move.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await move
+    assert await comes_to_rest(cabinet)
+
+
+@pytest.mark.parametrize("silent", ["MotionControl.getExecId", "RobotState.getSafetyModeType"])
+async def test_a_stop_does_not_wait_behind_a_command_that_hangs(
+    arm: AuboArcs, cabinet: ArcsServer, move: asyncio.Task[None], silent: str
+):
+    cabinet.mute_to = {f"rob1.{silent}"}
+    await asyncio.sleep(0.1)  # the move now waits for an answer that does not come
+    began = time.monotonic()
+    await arm.stop()
+    assert time.monotonic() - began < 0.3
+    assert await comes_to_rest(cabinet)
+    assert not move.done()
+
+
+async def test_a_move_whose_answer_is_lost_stops_the_arm(arm: AuboArcs, cabinet: ArcsServer):
+    cabinet.mute_to = {"rob1.MotionControl.moveLine"}
+    with pytest.raises(DeviceTimeout, match="moveLine"):
+        await arm.move(FAR, **SLOW)
+    assert cabinet._world.motion.exec_id(cabinet._now_s) == -1
+    assert to_go_mm(cabinet) > 50.0
+
+
+async def test_a_stop_gets_through_after_its_connection_was_dropped(
+    arm: AuboArcs, cabinet: ArcsServer, move: asyncio.Task[None]
+):
+    cabinet.drop_clients()
+    await asyncio.sleep(0)
+    await arm.stop()
+    assert await comes_to_rest(cabinet)
+
+
+async def test_nothing_moves_while_there_is_no_way_to_stop_it(arm: AuboArcs, cabinet: ArcsServer):
+    await cabinet.stop()
+    with pytest.raises(ConnectionLost):
+        await arm.move(FAR, **SLOW)
+    assert to_go_mm(cabinet) == pytest.approx(200.0)
+
+
+async def test_a_move_that_could_not_be_stopped_says_so(arm: AuboArcs, cabinet: ArcsServer, move: asyncio.Task[None]):
+    cabinet.mute = True
+    with pytest.raises(DeviceTimeout) as caught:
+        await move
+    assert "may still be moving" in caught.value.__notes__[0]
+    cabinet.mute = False

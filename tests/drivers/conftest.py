@@ -1,0 +1,64 @@
+"""A loopback cabinet and an arm on it, quick enough for every test."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+
+import pytest
+
+from drivers.arcs.robot import ArcsOptions, AuboArcs
+from drivers.clock import HostClock
+from drivers.limits import Limits
+from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.config import SimConfig, View
+from drivers.sim.rig import HOST
+from drivers.sim.world import World
+
+RATE = 20.0
+
+
+@pytest.fixture
+def small_view() -> View:
+    """A camera image that renders in a few milliseconds, with the time of rendering in its top rows."""
+    return View(width_px=640, height_px=480, px_per_mm=1.95, stamp_strip=True)
+
+
+@pytest.fixture
+def limits() -> Limits:
+    return Limits((200.0, 640.0), (-260.0, 260.0), (95.0, 400.0), tilt_deg=15.0, speed_mm_s=250.0, acc_mm_s2=1000.0)
+
+
+@pytest.fixture
+async def cabinet() -> AsyncIterator[ArcsServer]:
+    """A controller with its power off, 20 times faster than life."""
+    server = ArcsServer(World(SimConfig(rate=RATE)))
+    await server.start(HOST, 0)
+    yield server
+    await server.stop()
+
+
+@pytest.fixture
+def arm_at(limits: Limits) -> Callable[[int], AuboArcs]:
+    """An arm that is not connected yet, by the port of its controller."""
+
+    def make(port: int) -> AuboArcs:
+        options = ArcsOptions(HOST, port, tcp_offset_mm=(0.0, 0.0, 180.0), power_timeout_s=5.0)
+        return AuboArcs(options, limits, HostClock())
+
+    return make
+
+
+@pytest.fixture
+async def sleeping_arm(cabinet: ArcsServer, arm_at: Callable[[int], AuboArcs]) -> AsyncIterator[AuboArcs]:
+    """Connected, powered off."""
+    arm = arm_at(cabinet.port)
+    await arm.connect()
+    yield arm
+    await arm.close()
+
+
+@pytest.fixture
+async def arm(sleeping_arm: AuboArcs) -> AuboArcs:
+    """Connected, powered, brakes released."""
+    await sleeping_arm.enable()
+    return sleeping_arm

@@ -1,0 +1,158 @@
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import AsyncIterator
+
+import numpy as np
+import pytest
+
+from drivers.camera import CameraOptions, OpenCvCamera
+from drivers.clock import HostClock
+from drivers.errors import ConnectionLost, DeviceError, NotConnected
+from drivers.protocols import Camera
+from drivers.samples import Frame, Stamp
+from drivers.sim.config import SimConfig, View
+from drivers.sim.mjpeg_server import MjpegServer
+from drivers.sim.rig import HOST
+from drivers.sim.scene import Scene, read_strip
+from drivers.sim.world import World
+
+CLOCK = HostClock()
+
+
+@pytest.fixture
+async def stream(small_view: View) -> AsyncIterator[MjpegServer]:
+    server = MjpegServer(Scene(World(SimConfig(view=small_view))), fps=15.0, jpeg_quality=90)
+    await server.start(HOST, 0)
+    yield server
+    await server.stop()
+
+
+def camera_at(port: int, timeout_s: float = 3.0) -> OpenCvCamera:
+    return OpenCvCamera(CameraOptions(f"http://{HOST}:{port}/stream.mjpg", timeout_s=timeout_s), CLOCK)
+
+
+@pytest.fixture
+async def camera(stream: MjpegServer) -> AsyncIterator[OpenCvCamera]:
+    it = camera_at(stream.port)
+    await it.connect()
+    yield it
+    await it.close()
+
+
+def grabbers() -> int:
+    return sum(t.name == "camera grabber" for t in threading.enumerate())
+
+
+async def test_connecting_waits_for_the_first_frame_and_tells_its_size(stream: MjpegServer):
+    camera = camera_at(stream.port)
+    assert isinstance(camera, Camera)
+    identity = await camera.connect()
+    assert "640x480" in identity.model
+    assert not identity.simulated  # a stream cannot say what it shows
+    await camera.close()
+
+
+async def test_after_two_idle_seconds_a_fresh_frame_is_no_older_than_asked(camera: OpenCvCamera):
+    await asyncio.sleep(2.0)
+    asked_ns = CLOCK.now_ns()
+    frame = await camera.fresh(Stamp(asked_ns))
+    assert read_strip(frame.image) >= asked_ns
+    assert frame.exposed_after_ns >= asked_ns
+
+
+async def test_no_frame_is_ever_older_than_asked_right_after_connecting_and_later(stream: MjpegServer):
+    camera = camera_at(stream.port)
+    await camera.connect()
+    for _ in range(4):
+        asked_ns = CLOCK.now_ns()
+        assert read_strip((await camera.fresh(Stamp(asked_ns))).image) >= asked_ns
+    await camera.close()
+
+
+async def test_a_frame_is_gray_stamped_and_counted(camera: OpenCvCamera):
+    first = await camera.fresh(Stamp(0))
+    second = await camera.fresh(Stamp(first.stamp.host_ns))
+    assert first.image.shape == (480, 640)
+    assert first.image.dtype == np.uint8
+    assert second.stamp.seq > first.stamp.seq
+    assert second.stamp.host_ns - second.exposed_after_ns == 250_000_000
+
+
+async def test_the_first_frame_counts_from_when_the_camera_was_opened(stream: MjpegServer):
+    camera = camera_at(stream.port)
+    opened_ns = CLOCK.now_ns()
+    await camera.connect()
+    connected_ns = CLOCK.now_ns()
+    first = await camera.fresh(Stamp(0))
+    if first.stamp.seq == 0:
+        assert opened_ns <= first.exposed_after_ns + 250_000_000 <= connected_ns
+        assert first.exposed_after_ns <= read_strip(first.image)
+    await camera.close()
+
+
+async def test_a_stream_that_ends_is_a_lost_connection_at_once_and_stays_one(stream: MjpegServer, camera: OpenCvCamera):
+    waiting = asyncio.create_task(camera.fresh(Stamp(CLOCK.now_ns() + 60 * 10**9)))
+    await asyncio.sleep(0.1)
+    began = time.monotonic()
+    await stream.stop()
+    with pytest.raises(ConnectionLost, match="ended after"):
+        await waiting
+    assert time.monotonic() - began < 1.0
+    with pytest.raises(ConnectionLost):
+        await camera.fresh(Stamp(CLOCK.now_ns()))
+
+
+async def test_closing_never_hands_an_old_frame_to_whoever_still_waits(camera: OpenCvCamera):
+    async def wait() -> Frame:
+        return await camera.fresh(Stamp(CLOCK.now_ns() + 60 * 10**9))
+
+    waiting = asyncio.create_task(wait())
+    await asyncio.sleep(0.1)
+    await camera.close()
+    with pytest.raises(ConnectionLost, match="closed while waiting"):
+        await waiting
+
+
+async def test_where_nothing_listens_the_connection_is_lost_quickly(unused_tcp_port: int):
+    camera = camera_at(unused_tcp_port)
+    began = time.monotonic()
+    with pytest.raises(ConnectionLost, match="cannot open"):
+        await camera.connect()
+    assert time.monotonic() - began < 1.5
+    assert grabbers() == 0
+
+
+async def test_a_server_that_says_nothing_is_given_up_within_the_timeout():
+    over = asyncio.Event()
+
+    async def say_nothing(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await over.wait()
+        writer.close()
+
+    async with await asyncio.start_server(say_nothing, HOST, 0) as mute:
+        camera = camera_at(mute.sockets[0].getsockname()[1], timeout_s=0.5)
+        began = time.monotonic()
+        with pytest.raises(DeviceError):
+            await camera.connect()
+        assert time.monotonic() - began < 3.0
+        assert grabbers() == 0
+        over.set()
+
+
+async def test_closing_joins_the_grabber_and_may_be_repeated(camera: OpenCvCamera):
+    assert grabbers() == 1
+    await camera.close()
+    assert grabbers() == 0
+    await camera.close()
+    with pytest.raises(NotConnected):
+        await camera.fresh(Stamp(0))
+
+
+async def test_a_camera_opened_again_shows_nothing_from_before(camera: OpenCvCamera):
+    await camera.close()
+    closed_ns = time.time_ns()
+    await camera.connect()
+    assert read_strip((await camera.fresh(Stamp(0))).image) >= closed_ns

@@ -1,0 +1,111 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from drivers.geometry import brush_pose, distance, from_wire, interpolate, lean, to_wire
+from drivers.samples import Pose
+
+lengths = st.floats(-900.0, 900.0)
+headings = st.floats(-180.0, 180.0)
+tilts = st.floats(0.0, 30.0)
+poses = st.builds(
+    lambda x, y, z, heading, tilt: brush_pose(x, y, z, heading_deg=heading, tilt_deg=tilt),
+    *(lengths, lengths, lengths, headings, tilts),
+)
+angles = st.floats(-math.pi, math.pi)
+
+
+def matrix(pose: Pose) -> np.ndarray:
+    return Rotation.from_quat(pose.quaternion).as_matrix()
+
+
+def by_hand(rx: float, ry: float, rz: float) -> np.ndarray:
+    """R = Rz(rz) Ry(ry) Rx(rx), written out."""
+    (cx, sx), (cy, sy), (cz, sz) = ((math.cos(a), math.sin(a)) for a in (rx, ry, rz))
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return about_z @ about_y @ about_x
+
+
+def turned_deg(a: float, b: float) -> float:
+    return abs((a - b + 180.0) % 360.0 - 180.0)
+
+
+@settings(deadline=None)
+@given(angles, angles, angles)
+def test_angles_on_the_wire_are_turns_about_z_then_y_then_x(rx: float, ry: float, rz: float):
+    assert matrix(from_wire([0.0, 0.0, 0.0, rx, ry, rz])) == pytest.approx(by_hand(rx, ry, rz), abs=1e-12)
+
+
+@settings(deadline=None)
+@given(poses)
+def test_a_pose_survives_the_wire(pose: Pose):
+    off_mm, off_deg = distance(pose, from_wire(to_wire(pose)))
+    assert off_mm < 1e-9
+    assert off_deg < 1e-5
+
+
+@settings(deadline=None)
+@given(lengths, lengths, lengths, angles, st.floats(-1.5, 1.5), angles)
+def test_a_wire_pose_survives_us(x: float, y: float, z: float, rx: float, ry: float, rz: float):
+    wire = [x / 1e3, y / 1e3, z / 1e3, rx, ry, rz]
+    back = to_wire(from_wire(wire))
+    assert back[:3] == pytest.approx(wire[:3])
+    assert by_hand(*back[3:]) == pytest.approx(by_hand(*wire[3:]), abs=1e-9)
+
+
+def test_the_home_pose_of_the_i5_points_the_tool_straight_down():
+    home = from_wire([0.5489, -0.1215, 0.2632, math.pi, 0.0, math.pi / 2])
+    assert matrix(home)[:, 2] == pytest.approx([0.0, 0.0, -1.0], abs=1e-12)
+    tilt_deg, heading_deg = lean(home)
+    assert tilt_deg == pytest.approx(0.0, abs=1e-6)
+    assert heading_deg == pytest.approx(90.0)
+
+
+@pytest.mark.parametrize("wire", [[0.0] * 5, [0.0] * 7, [], [0.0] * 5 + [math.nan], [math.inf] + [0.0] * 5])
+def test_what_is_no_pose_is_refused(wire: list[float]):
+    with pytest.raises(ValueError, match="six finite numbers"):
+        from_wire(wire)
+
+
+@settings(deadline=None)
+@given(tilts, headings)
+def test_lean_is_the_inverse_of_brush_pose(tilt: float, heading: float):
+    got_tilt, got_heading = lean(brush_pose(1.0, 2.0, 3.0, heading_deg=heading, tilt_deg=tilt))
+    assert got_tilt == pytest.approx(tilt, abs=1e-5)
+    assert turned_deg(got_heading, heading) < 0.01
+
+
+def test_the_ferrule_leans_toward_the_heading():
+    ferrule = -matrix(brush_pose(0.0, 0.0, 0.0, heading_deg=90.0, tilt_deg=10.0))[:, 2]
+    ten = math.radians(10.0)
+    assert ferrule == pytest.approx([0.0, math.sin(ten), math.cos(ten)])
+
+
+@settings(deadline=None)
+@given(headings)
+def test_upright_the_tools_x_axis_is_the_heading(heading: float):
+    phi = math.radians(heading)
+    x_axis = matrix(brush_pose(0.0, 0.0, 0.0, heading_deg=heading))[:, 0]
+    assert x_axis == pytest.approx([math.cos(phi), math.sin(phi), 0.0], abs=1e-12)
+
+
+@settings(deadline=None)
+@given(poses, poses, st.floats(0.0, 1.0))
+def test_on_the_way_both_distances_are_shared_out(a: Pose, b: Pose, s: float):
+    total_mm, total_deg = distance(a, b)
+    done_mm, done_deg = distance(a, interpolate(a, b, s))
+    assert done_mm == pytest.approx(s * total_mm, abs=1e-6)
+    assert done_deg == pytest.approx(s * total_deg, abs=1e-4)
+
+
+@settings(deadline=None)
+@given(headings, headings, tilts, st.floats(0.0, 1.0))
+def test_a_turn_between_two_headings_never_tilts_further(a: float, b: float, tilt: float, s: float):
+    ends = [brush_pose(0.0, 0.0, 0.0, heading_deg=h, tilt_deg=tilt) for h in (a, b)]
+    assert lean(interpolate(*ends, s))[0] <= tilt + 1e-4

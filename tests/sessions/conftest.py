@@ -1,0 +1,161 @@
+"""Small recordings to look at: `make` makes them, and reads them back without the code under test."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import itertools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from sessions.errors import InputError
+from sessions.importer import ImportOptions, import_photographs
+from sessions.journal import JOURNAL_NAME, read_lines
+from sessions.messages import encode_png, image_message, pose_message
+from sessions.schemas import Header, Source, StepEvent, Stroke, Topic
+from sessions.store import SessionStore
+from sessions.writer import Outgoing, SegmentWriter
+
+
+class Make:
+    """Messages, recordings, sessions and folders of photographs, all tiny."""
+
+    t0_ns = 1_700_000_000_000_000_000
+    header = Header(
+        session_id="2026-01-02-grid-01", source=Source.LOOPBACK, software="brushloop 0", brush="goat", lens="12 mm"
+    )
+    snapshots: ClassVar = {"rig.toml": 'name = "bench"\n', "protocol.toml": "repeats = 2\n"}
+
+    def clock(self) -> Callable[[], int]:
+        return functools.partial(next, itertools.count(self.t0_ns, 1_000_000))
+
+    @functools.cache  # noqa: B019 - one maker for the whole run
+    def png(self, seed: int = 0, side: int = 24) -> bytes:
+        image = np.full((side, side), 230, np.uint8)
+        cv2.circle(image, (side // 2, side // 2), 3 + seed % 7, 20, -1)
+        return encode_png(image)
+
+    def pose(self, number: int) -> Outgoing:
+        t_ns = self.t0_ns + number
+        return Outgoing(Topic.TCP, t_ns, t_ns - 1, number, pose_message(t_ns, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0)))
+
+    def still(self, number: int, data: bytes | None = None) -> Outgoing:
+        t_ns = self.t0_ns + number * 1000
+        return Outgoing(Topic.STILL, t_ns, t_ns, number, image_message(t_ns, data or self.png(number)))
+
+    def stroke(self, number: int, **fields: Any) -> Outgoing:
+        t_ns = self.t0_ns + number * 1000 + 1
+        values = {"stroke_id": f"H13-a05-r{number:02d}", "kind": "press", "still": number} | fields
+        return Outgoing(Topic.STROKE, t_ns, t_ns, number, Stroke.model_validate(values))
+
+    def strokes(self, count: int) -> list[Outgoing]:
+        return [message for number in range(count) for message in (self.still(number), self.stroke(number))]
+
+    def step(self, number: int, kind: str, phase: str) -> Outgoing:
+        t_ns = self.t0_ns + number * 1000 + (2 if phase == "end" else -2)
+        values = {"key": "k", "kind": kind, "index": number, "attempt": 1, "phase": phase, "params": {"dwell_s": 0.5}}
+        return Outgoing(Topic.STEP, t_ns, t_ns, number, StepEvent.model_validate(values))
+
+    def record(self, path: Path, *messages: Outgoing) -> Path:
+        """A finished MCAP file with these messages."""
+        writer = SegmentWriter(path, self.header)
+        for message in messages:
+            writer.write(message)
+        writer.finish()
+        return path
+
+    def store(self, folder: Path) -> SessionStore:
+        return SessionStore.create(folder, self.header, self.snapshots, self.clock())
+
+    def perform(self, store: SessionStore, key: str, cell: int | None = None) -> None:
+        """One step from begin to done, with a still and a stroke in it."""
+        attempt = store.begin(key, "capture", cell=cell, notes={})
+        attempt.writer.write(self.still(attempt.serial))
+        attempt.writer.write(self.stroke(attempt.serial, stroke_id=key))
+        store.done(attempt, {"serial": attempt.serial})
+
+    def events(self, folder: Path, kind: str) -> list[dict[str, Any]]:
+        return [line for line in read_lines(folder / JOURNAL_NAME) if line["event"] == kind]
+
+    def stroke_names(self, path: Path) -> list[str]:
+        """As any MCAP reader finds them, CRCs checked."""
+        with path.open("rb") as file:
+            messages = make_reader(file, validate_crcs=True).iter_messages(topics=[str(Topic.STROKE)])
+            return [Stroke.model_validate_json(message.data).stroke_id for _, _, message in messages]
+
+    def tree(self, folder: Path) -> dict[str, bytes | None]:
+        """Everything under a folder, so that two looks can be compared."""
+        paths = sorted(folder.rglob("*"))
+        return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None for p in paths}
+
+    def photographs(self, folder: Path, *rows: dict[str, str]) -> Path:
+        """A folder with a photograph for every row of its `table.csv`; returns the table."""
+        folder.mkdir(exist_ok=True)
+        for number, row in enumerate(rows):
+            (folder / row["file"]).write_bytes(self.png(number))
+        table = folder / "table.csv"
+        with table.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+        return table
+
+
+@pytest.fixture(scope="session")
+def make() -> Make:
+    return Make()
+
+
+@pytest.fixture
+def store(make: Make, tmp_path: Path) -> Iterator[SessionStore]:
+    """A session that has just been created; its folder is `store.folder`."""
+    made = make.store(tmp_path / make.header.session_id)
+    yield made
+    made.release()
+
+
+PRESSES = ImportOptions(kind="press", licence="CC0-1.0", origin="a museum", brush="wolf")
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    """The folder of photographs, not yet there."""
+    return tmp_path / "photos"
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """The session folder that an import makes."""
+    return tmp_path / "sessions" / "from-elsewhere"
+
+
+@pytest.fixture
+def run(make: Make, photos: Path, out: Path) -> Callable[..., Path]:
+    """Imports `photos/table.csv` into `out`."""
+
+    def run(options: ImportOptions = PRESSES) -> Path:
+        return import_photographs(photos, photos / "table.csv", out, options, "brushloop 0", make.clock())
+
+    return run
+
+
+@pytest.fixture
+def refusal(make: Make, tmp_path: Path, run: Callable[..., Path]) -> Callable[..., str]:
+    """Runs the import; it is refused in one line with exit code 2, and nothing is left behind."""
+
+    def refusal(options: ImportOptions = PRESSES) -> str:
+        before = make.tree(tmp_path)
+        with pytest.raises(InputError) as caught:
+            run(options)
+        assert make.tree(tmp_path) == before
+        assert caught.value.exit_code == 2
+        assert "\n" not in str(caught.value)
+        return str(caught.value).removeprefix(f"{tmp_path}/")
+
+    return refusal

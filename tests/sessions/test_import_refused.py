@@ -1,0 +1,176 @@
+"""What cannot be imported is refused in one line, which says what is allowed, and leaves no trace."""
+
+import math
+import os
+
+import pytest
+
+from sessions import importer, messages, table
+from sessions.errors import InputError
+from sessions.importer import ImportOptions, import_photographs
+
+ROWS = [
+    {"file": "a.png", "px_per_mm": "12.5", "height_mm": "13", "tilt_deg": "5"},
+    {"file": "b.png", "px_per_mm": "12.5", "height_mm": "15", "tilt_deg": "10"},
+]
+
+
+def lines(*rows):
+    return "\n".join(rows) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "table.csv: column `file` is missing; found: none"),
+        (lines("name,px_per_mm", "a.png,1"), "column `file` is missing; found: name, px_per_mm"),
+        (lines("file,px_per_mm,height_mm,tilt_deg"), "has no rows"),
+        (
+            lines("file,height_mm,tilt_deg", "a.png,1,1"),
+            "column `px_per_mm` (or px_per_mm_x and px_per_mm_y) is missing",
+        ),
+        (lines("file,px_per_mm_x,height_mm,tilt_deg", "a.png,1,1,1"), "column `px_per_mm_y` is missing"),
+        (lines("file,px_per_mm,tilt_deg", "a.png,1,1"), "column `height_mm` is missing; presses need it"),
+        (lines("file,px_per_mm,height_mm", "a.png,1,1"), "column `tilt_deg` is missing; presses need it"),
+        (lines("file,px_per_mm,height_mm,tilt_deg,start_x_px", "a.png,1,1,1,1"), "column `start_y_px` is missing"),
+        (
+            lines("file,px_per_mm,height_mm,tilt_deg,l_furlong", "a.png,1,1,1,1"),
+            "must end in one of: mm, cm, m, in, deg",
+        ),
+        (lines("file,px_per_mm,height_mm,tilt_deg,l_mm,l_cm", "a.png,1,1,1,1,1"), "column `l_mm` is there twice"),
+        (lines("file,px_per_mm,height_mm,tilt_deg,file", "a.png,1,1,1,b.png"), "column `file` is there twice"),
+        (lines("file,px_per_mm,height_mm,tilt_deg,", "a.png,1,1,1,"), "column `` has no known unit"),
+        (lines('"fi\nle",px_per_mm', "a.png,1"), "line 1 holds control characters"),
+        (
+            lines("file,px_per_mm,height_mm,tilt_deg", "a.png,1,deep,1"),
+            "line 2, column `height_mm`: 'deep' is not a fin",
+        ),
+        (
+            lines("file,px_per_mm,height_mm,tilt_deg", "a.png,1,1,nan"),
+            "line 2, column `tilt_deg`: 'nan' is not a finite",
+        ),
+        (lines("file,px_per_mm,height_mm,tilt_deg", "a.png,inf,1,1"), "line 2, column `px_per_mm`: 'inf' is not a fin"),
+        (lines("file,px_per_mm,height_mm,tilt_deg,l_m", "a.png,1,1,1,1e308"), "column `l_m`: '1e308' is not a finite"),
+        (lines("file,px_per_mm,height_mm,tilt_deg", "a.png,0,1,1"), "line 2: px_per_mm = (0.0, 0.0), allowed: 0.01 to"),
+        (lines("file,px_per_mm,height_mm,tilt_deg", "a.png,1,1"), "line 2 has 3 fields, expected 4"),
+        (lines("file,px_per_mm,height_mm,tilt_deg", "a.png,1,1,1,1"), "line 2 has 5 fields, expected 4"),
+        (
+            lines("file,px_per_mm,height_mm,tilt_deg", "a.png,1,1,1", "", "./a.png,1,1,1"),
+            "line 4: stroke a appears twice",
+        ),
+        (lines("file,px_per_mm,height_mm,tilt_deg", "c.png,1,1,1"), "line 2: file 'c.png' is not in photos/"),
+        (lines("file,px_per_mm,height_mm,tilt_deg", ",1,1,1"), "line 2: file '' is not in photos/"),
+        (lines("file,px_per_mm,height_mm,tilt_deg", ".,1,1,1"), "line 2: file '.' is not in photos/"),
+        (lines("file,px_per_mm,height_mm,tilt_deg", "../x.png,1,1,1"), "line 2: file '../x.png' lies outside photos/"),
+        (lines("file,px_per_mm,height_mm,tilt_deg", "/x.png,1,1,1"), "line 2: file '/x.png' lies outside photos/"),
+        (lines("file,px_per_mm,height_mm,tilt_deg", "link.png,1,1,1"), "line 2: file 'link.png' lies outside photos/"),
+        (lines("file,px_per_mm,height_mm,tilt_deg", "loop.png,1,1,1"), "line 2: file 'loop.png' lies outside photos/"),
+        (lines("file,px_per_mm,height_mm,tilt_deg", "x" * 5000 + ",1,1,1"), "line 2: file 'xxx"),
+        (lines("file,px_per_mm,height_mm,tilt_deg", '"a\n.png",1,1,1'), "column `file`: 'a\\n.png' holds control"),
+        (lines("file,px_per_mm,height_mm,tilt_deg", "a\0.png,1,1,1"), "line 2, column `file`: 'a\\x00.png' holds"),
+        (lines("file,px_per_mm,height_mm,tilt_deg", "a.png,1,1,1\u2028,1"), "line 2 has 5 fields"),
+        (lines("file,px_per_mm,height_mm,tilt_deg", '"a.png"x,1,1,1'), "line 2: ',' expected after '\"'"),
+        (lines("file,px_per_mm,height_mm,tilt_deg", '"' + "a" * 200_000), "line 2: "),
+        (
+            lines("file,px_per_mm,height_mm,tilt_deg", "text.png,1,1,1"),
+            "photos/text.png: is no whole PNG or JPEG image",
+        ),
+        (lines("file,px_per_mm,height_mm,tilt_deg", "cut.png,1,1,1"), "photos/cut.png: is no whole PNG or JPEG image"),
+    ],
+    ids=lambda value: "table" if "\n" in value else value,
+)
+def test_a_table_that_cannot_be_used_is_refused(make, tmp_path, photos, refusal, text, told):
+    make.photographs(photos, *ROWS)
+    (tmp_path / "x.png").write_bytes(make.png())
+    (photos / "link.png").symlink_to(tmp_path / "x.png")
+    (photos / "loop.png").symlink_to(photos / "loop.png")
+    (photos / "text.png").write_text("no image")
+    (photos / "cut.png").write_bytes(make.png()[:-20])
+    (photos / "table.csv").write_text(text, encoding="utf-8", newline="")
+    line = refusal()
+    assert told in line
+    assert len(line) < 400
+
+
+def test_an_existing_session_is_never_overwritten(make, photos, out, refusal):
+    make.photographs(photos, *ROWS)
+    out.mkdir(parents=True)
+    assert "exists already" in refusal()
+
+
+@pytest.mark.parametrize("kind", ["stamp", "", "Press"])
+def test_an_unknown_kind_is_refused(make, photos, refusal, kind):
+    make.photographs(photos, *ROWS)
+    assert f"--kind is {kind!r}, allowed: press, drag" in refusal(ImportOptions(kind=kind))
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, math.nan, 1e9])
+def test_a_scale_that_no_camera_has_is_refused(make, photos, refusal, scale):
+    make.photographs(photos, {"file": "a.png"})
+    assert "allowed: 0.01 to 10000" in refusal(ImportOptions(px_per_mm=scale))
+
+
+def test_a_folder_or_table_that_is_not_there_is_refused(make, photos, refusal):
+    assert refusal() == "photos: is not a folder of photographs"
+    photos.mkdir()
+    assert refusal() == "photos/table.csv: no such table"
+
+
+def test_a_table_that_is_not_utf8_is_refused(make, photos, refusal):
+    make.photographs(photos, *ROWS).write_bytes("file,größe_mm\n".encode("latin-1"))
+    assert refusal() == "photos/table.csv: is not UTF-8 text"
+
+
+def test_a_huge_table_is_refused(make, photos, refusal, monkeypatch):
+    make.photographs(photos, *ROWS)
+    monkeypatch.setattr(table, "MAX_ROWS", 1)
+    assert refusal() == "photos/table.csv: has more than 1 rows"
+    monkeypatch.setattr(table, "MAX_TABLE_BYTES", 10)
+    assert "exceeds 10" in refusal()
+
+
+def test_a_huge_photograph_is_refused(make, photos, refusal, monkeypatch):
+    make.photographs(photos, *ROWS)
+    monkeypatch.setattr(messages, "MAX_IMAGE_PIXELS", 100)
+    assert refusal() == "photos/a.png: image of 24 x 24 pixels exceeds 100"
+    monkeypatch.setattr(importer, "MAX_IMAGE_BYTES", 10)
+    assert "photos/a.png: image of" in refusal()
+
+
+def test_a_name_that_is_no_session_id_is_refused(make, tmp_path, photos):
+    make.photographs(photos, *ROWS)
+    with pytest.raises(InputError, match="a session's name is letters"):
+        import_photographs(photos, photos / "table.csv", tmp_path / "-x y", ImportOptions(), "", make.clock())
+
+
+def test_a_photograph_that_changes_under_the_import_is_refused(make, photos, refusal, monkeypatch):
+    make.photographs(photos, *ROWS)
+    (photos.parent / "sessions").mkdir()
+    read = importer._read_bytes
+    seen = []
+
+    def change(path):
+        seen.append(path)
+        return read(path) + b"x" * (len(seen) > 2)
+
+    monkeypatch.setattr(importer, "_read_bytes", change)
+    assert refusal() == "photos/a.png: changed while it was imported"
+
+
+def test_a_disk_without_room_is_refused(make, photos, refusal, monkeypatch):
+    make.photographs(photos, *ROWS)
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "mkdir", full)
+    assert refusal() == "sessions/from-elsewhere: cannot write: No space left on device"
+
+
+def test_a_damaged_photograph_is_told_by_us_and_not_by_a_library_on_stderr(make, photos, refusal, capfd):
+    make.photographs(photos, *ROWS)
+    data = bytearray(make.png())
+    data[data.index(b"IDAT") + 9] ^= 1
+    (photos / "a.png").write_bytes(data)
+    assert refusal() == "photos/a.png: is no whole PNG or JPEG image"
+    assert capfd.readouterr().err == ""

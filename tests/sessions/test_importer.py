@@ -1,0 +1,121 @@
+"""Photographs from elsewhere become a session that reads like any other."""
+
+import math
+import shutil
+import subprocess
+import sys
+
+import cv2
+import pytest
+from typer.testing import CliRunner
+
+from sessions.cli import app
+from sessions.importer import ImportOptions
+from sessions.reader import Recording
+from sessions.schemas import Source
+
+ROWS = [
+    {"file": "a.png", "px_per_mm": "12.5", "height_mm": "13", "tilt_deg": "5"},
+    {"file": "b.png", "px_per_mm": "12.5", "height_mm": "15", "tilt_deg": "10"},
+]
+
+
+def test_presses_become_a_session_like_any_other(make, photos, out, run):
+    make.photographs(photos, *ROWS)
+    assert run() == out / "from-elsewhere.mcap"
+    recording = Recording(out)
+    header = recording.header
+    assert (header.session_id, header.source, header.software) == ("from-elsewhere", Source.IMPORT, "brushloop 0")
+    assert (header.licence, header.origin, header.brush) == ("CC0-1.0", "a museum", "wolf")
+    captures = list(recording.captures())
+    assert [capture.still_png for capture in captures] == [make.png(0), make.png(1)]
+    stroke = captures[1].stroke
+    assert (stroke.stroke_id, stroke.kind, stroke.height_mm, stroke.tilt_deg) == ("b", "press", 15.0, 10.0)
+    assert stroke.px_per_mm == (12.5, 12.5)
+    assert [path.name for path in out.parent.iterdir()] == ["from-elsewhere"]
+
+
+def test_the_origin_is_the_folder_and_its_table_unless_it_is_told(make, photos, out, run):
+    make.photographs(photos, *ROWS)
+    run(ImportOptions())
+    assert Recording(out).header.origin == "photos, table.csv"
+
+
+def test_units_are_converted_and_the_anchor_is_kept(make, photos, out, run):
+    row = {"file": "a.png", "start_x_px": "3", "start_y_px": "4.5", "depth_nominal": "0.4", "ink_frac": "0.9"}
+    lengths = {"reach_cm": "2", "span_m": "0.01", "bend_in": "1", "turn_rad": str(math.pi), "yaw_deg": "7"}
+    make.photographs(photos, row | lengths)
+    run(ImportOptions(px_per_mm=8.0))
+    [capture] = Recording(out).captures()
+    assert capture.stroke.anchor_px == (3.0, 4.5)
+    assert capture.stroke.px_per_mm == (8.0, 8.0)
+    assert capture.stroke.commanded == pytest.approx(
+        {
+            "depth_nominal": 0.4,
+            "ink_frac": 0.9,
+            "reach_mm": 20.0,
+            "span_mm": 10.0,
+            "bend_mm": 25.4,
+            "turn_deg": 180.0,
+            "yaw_deg": 7.0,
+        }
+    )
+
+
+def test_a_table_may_come_from_a_spreadsheet(make, photos, out, run):
+    """Byte order mark, CRLF, quotes, an empty last line, photographs in sub-folders, one scale per axis."""
+    (photos / "day 1").mkdir(parents=True)
+    shutil.copy(make.photographs(photos, ROWS[0]).with_name("a.png"), photos / "day 1" / "ä, 1.png")
+    text = '\ufefffile, px_per_mm_x ,px_per_mm_y\r\n"day 1/ä, 1.png",10,20\r\n,,\r\n\r\n'
+    (photos / "table.csv").write_text(text, encoding="utf-8", newline="")
+    run(ImportOptions())
+    [capture] = Recording(out).captures()
+    assert capture.stroke.stroke_id == "day 1/ä, 1"
+    assert capture.stroke.px_per_mm == (10.0, 20.0)
+
+
+def test_every_photograph_is_decoded_once(make, photos, run, monkeypatch):
+    make.photographs(photos, *ROWS)
+    decoded = []
+    imdecode = cv2.imdecode
+    monkeypatch.setattr(cv2, "imdecode", lambda *args: decoded.append(1) or imdecode(*args))
+    run()
+    assert len(decoded) == 2
+
+
+def test_what_a_killed_import_left_is_cleared_away(make, photos, out, run):
+    make.photographs(photos, *ROWS)
+    stage = out.with_name(".from-elsewhere.partial")
+    stage.mkdir(parents=True)
+    (stage / "from-elsewhere.mcap.part").write_bytes(b"half")
+    run()
+    assert not stage.exists()
+
+
+def test_the_command_imports(make, photos, out):
+    make.photographs(photos, *ROWS)
+    arguments = ["import", str(photos), "--csv", str(photos / "table.csv"), "--out", str(out), "--kind", "press"]
+    ran = CliRunner().invoke(app, arguments)
+    assert (ran.exit_code, ran.output) == (0, f"Imported into {out / 'from-elsewhere.mcap'}\n")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda photos: (photos / "b.png").unlink(), "file 'b.png' is not in photos/"),
+        (lambda photos: (photos / "b.png").write_bytes(b"\x89PNG\r\n\x1a\n"), "b.png: is no whole PNG or JPEG"),
+        (lambda photos: (photos / "table.csv").write_text("file\n"), "column `px_per_mm`"),
+    ],
+    ids=["missing", "unreadable", "no scale"],
+)
+def test_a_refusal_is_one_line_on_stderr_and_exit_code_2(make, tmp_path, photos, spoil, told):
+    make.photographs(photos, *ROWS)
+    spoil(photos)
+    before = make.tree(tmp_path)
+    command = [sys.executable, "-m", "brushloop", "sessions", "import", "photos", "--csv", "photos/table.csv"]
+    ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ran.returncode == 2
+    assert ran.stdout == ""
+    [line] = ran.stderr.splitlines()
+    assert told in line
+    assert make.tree(tmp_path) == before

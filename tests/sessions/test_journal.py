@@ -1,0 +1,156 @@
+"""The journal: what it says happened, happened, whatever was cut off or did not fit on the disk."""
+
+import errno
+import json
+import os
+
+import pytest
+
+from sessions.errors import SessionDamaged, SessionError
+from sessions.journal import Journal, read_lines, replay
+
+BEGIN = {"event": "begin", "key": "k1", "kind": "press", "attempt": 1, "sheet": 0, "cell": 4, "file": "0000-k1.mcap"}
+DONE = {
+    "event": "done",
+    "key": "k1",
+    "kind": "press",
+    "attempt": 1,
+    "file": "0000-k1.mcap",
+    "sha256": "00",
+    "counts": {"/step": 2},
+    "result": {"depth_mm": 13.0},
+}
+
+
+def written(path, *lines, t_ns=1):
+    journal = Journal(path, t_ns)
+    for line in lines:
+        journal.append(t_ns, line)
+    journal.close()
+    return path
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "journal.jsonl"
+
+
+def test_lines_survive_closing_and_opening_again(path):
+    written(path, BEGIN)
+    written(path, DONE)
+    assert list(read_lines(path)) == [{"t_ns": 1, **BEGIN}, {"t_ns": 1, **DONE}]
+
+
+def test_every_line_is_on_disk_before_append_returns(path, monkeypatch):
+    journal = Journal(path, 1)
+    synced = []
+    fsync = os.fsync
+    monkeypatch.setattr(os, "fsync", lambda fd: (fsync(fd), synced.append(path.read_bytes().count(b"\n"))))
+    for _ in range(3):
+        journal.append(1, BEGIN)
+    journal.close()
+    assert synced == [1, 2, 3]
+
+
+def test_a_last_line_torn_at_any_byte_is_set_aside_and_the_rest_reads(path):
+    whole = written(path, BEGIN, DONE).read_bytes()
+    last_line_at = whole.index(b"\n") + 1
+    for cut in range(last_line_at + 1, len(whole)):
+        path.write_bytes(whole[:cut])
+        assert len(list(read_lines(path))) == 1
+        written(path, DONE, t_ns=7)
+        first, torn, again = read_lines(path)
+        assert (first["event"], again["event"]) == ("begin", "done")
+        assert torn == {"t_ns": 7, "event": "torn", "hex": whole[last_line_at:cut].hex()}
+
+
+def test_a_journal_that_is_only_a_torn_line_is_set_aside_too(path):
+    path.write_bytes(b'{"t_ns":1,"ev')
+    written(path)
+    [torn] = read_lines(path)
+    assert bytes.fromhex(torn["hex"]) == b'{"t_ns":1,"ev'
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        (b"{oops", "line 2 is not JSON"),
+        (b"\xff\xfe", "line 2 is not JSON"),
+        (b"", "line 2 is not JSON"),
+        (b"[" * 100_000, "line 2 is not JSON"),
+        (b"[1]", "line 2 has no event"),
+        (b'{"t_ns":1}', "line 2 has no event"),
+    ],
+    ids=["half", "binary", "empty", "deep", "list", "no event"],
+)
+def test_damage_in_the_middle_names_the_line(path, line, told):
+    whole = written(path, BEGIN).read_bytes()
+    path.write_bytes(whole + line + b"\n" + whole)
+    with pytest.raises(SessionDamaged, match=told) as caught:
+        list(read_lines(path))
+    assert caught.value.path == path
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        {"event": "begin"},
+        {**BEGIN, "attempt": "many"},
+        {**BEGIN, "cell": [1]},
+        {**BEGIN, "cell": float("inf")},
+        {"event": "done"},
+        {**DONE, "counts": 3},
+        {**DONE, "counts": {"/step": "2"}},
+        {**DONE, "result": None},
+        {"event": "sheet"},
+    ],
+)
+def test_an_event_that_lacks_a_field_is_damage_in_one_line(path, event):
+    path.write_text(json.dumps({"t_ns": 1, **event}) + "\n")
+    with pytest.raises(SessionDamaged, match=f"event '{event['event']}' lacks or spoils") as caught:
+        replay(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_replay_folds_begin_done_void_and_sheet(path):
+    other = {**BEGIN, "key": "k2", "cell": 5, "file": "0001-k2.mcap"}
+    void = {"event": "void", "key": "k2", "attempt": 1, "why": "stopped"}
+    again = {**other, "attempt": 2, "sheet": 1, "cell": 0}
+    state = replay(written(path, BEGIN, DONE, other, void, {"event": "sheet", "sheet": 1}, again))
+    assert state.done["k1"]["result"] == {"depth_mm": 13.0}
+    assert [line["file"] for line in state.segments] == ["0000-k1.mcap"]
+    assert state.attempts == {"k1": 1, "k2": 2}
+    assert (state.begun, state.voids, state.sheet) == (3, 2, 1)
+
+
+def test_a_press_that_was_begun_and_never_done_has_used_its_cell(path):
+    state = replay(written(path, BEGIN))
+    assert state.used_cells == {(0, 4)}
+    assert state.done == {}
+
+
+def test_what_does_not_fit_on_the_disk_is_an_error_and_spoils_nothing(path, monkeypatch):
+    journal = Journal(path, 1)
+    journal.append(1, BEGIN)
+    write = os.write
+
+    def half_then_full(fd, data):
+        if len(data) < 40:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(fd, bytes(data)[: len(data) // 2])
+
+    with monkeypatch.context() as full_disk:
+        full_disk.setattr(os, "write", half_then_full)
+        with pytest.raises(SessionError, match="cannot write: No space left on device"):
+            journal.append(2, DONE)
+    assert not path.read_bytes().endswith(b"\n"), "the test means to leave half a line"
+    journal.append(3, DONE)
+    journal.close()
+    assert [line["t_ns"] for line in read_lines(path)] == [1, 3]
+
+
+def test_a_journal_that_cannot_be_opened_is_a_session_error(tmp_path):
+    with pytest.raises(SessionError, match="cannot open"):
+        Journal(tmp_path, 1)
+    with pytest.raises(SessionError, match="cannot read"):
+        replay(tmp_path)

@@ -1,0 +1,73 @@
+"""kill -9 at any moment: every step is done exactly once, and no paper cell is used twice."""
+
+import random
+import subprocess
+import sys
+import time
+from collections import Counter
+
+from sessions.reader import Recording
+from sessions.store import open_sessions
+
+KEYS = [f"step-{number:02d}" for number in range(12)]
+KILLS = 10
+
+COLLECT = """
+import random, sys, time
+from pathlib import Path
+from sessions.messages import image_message
+from sessions.schemas import Header, Stroke, Topic
+from sessions.store import SessionStore
+from sessions.writer import Outgoing
+
+folder, keys = Path(sys.argv[1]), sys.argv[2:]
+header = Header(session_id=folder.name, source="loopback rig", software="test")
+if (folder / "journal.jsonl").exists():
+    store = SessionStore(folder, None, time.time_ns)
+else:
+    store = SessionStore.create(folder, header, {"rig.toml": "x = 1"}, time.time_ns)
+print("ready", flush=True)
+for key in keys:
+    if key in store.state.done:
+        continue
+    cell = max((cell for _, cell in store.state.used_cells), default=-1) + 1
+    attempt = store.begin(key, "press", cell=cell, notes={})
+    for number in range(4):
+        t_ns = time.time_ns()
+        still = image_message(t_ns, random.randbytes(20_000))
+        attempt.writer.write(Outgoing(Topic.STILL, t_ns, t_ns, number, still))
+        time.sleep(random.uniform(0, 0.01))
+    stroke = Stroke(stroke_id=key, kind="press", still=3)
+    attempt.writer.write(Outgoing(Topic.STROKE, t_ns, t_ns, 3, stroke))
+    store.done(attempt, {"cell": cell})
+store.close()
+"""
+
+
+def run(folder, kill_after_s):
+    """One process of the session; True where it came to its end before the kill."""
+    child = subprocess.Popen([sys.executable, "-c", COLLECT, folder, *KEYS], stdout=subprocess.PIPE, text=True)
+    with child:
+        child.stdout.readline()
+        if kill_after_s is not None:
+            time.sleep(kill_after_s)
+            child.kill()
+    return child.returncode == 0
+
+
+def test_a_session_killed_ten_times_is_whole_in_the_end(make, tmp_path):
+    folder = tmp_path / "2026-01-02-grid-01"
+    moments = random.Random(4)
+    for _ in range(KILLS):
+        if run(folder, moments.uniform(0.0, 0.06)):
+            break
+    assert open_sessions(tmp_path) == [] or run(folder, None)
+
+    recording = Recording(folder)
+    assert make.stroke_names(recording.path) == KEYS
+    done = make.events(folder, "done")
+    assert Counter(line["key"] for line in done) == Counter(KEYS)
+    cells = [line["cell"] for line in make.events(folder, "begin")]
+    assert len(cells) == len(set(cells)), "a cell was pressed twice"
+    assert len(make.events(folder, "process")) > 3, "the kills came too late to test anything"
+    assert sum(line["counts"]["/camera/still"] for line in done) == 48

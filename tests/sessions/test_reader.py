@@ -1,0 +1,230 @@
+"""Reading a recording: strokes with their stills, one at a time; whatever else a file holds is refused in one line."""
+
+import itertools
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from sessions.errors import InputError, SessionDamaged
+from sessions.messages import decode_gray
+from sessions.reader import Recording
+from sessions.writer import HEADER_METADATA, header_metadata
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "a.mcap"
+
+
+def foreign(path, *, metadata=None, use_chunking=True, messages=()):
+    """An MCAP file written by somebody else: (topic, encoding, data) of its messages."""
+    with path.open("wb") as file:
+        writer = Writer(file, use_chunking=use_chunking)
+        writer.start()
+        for name, values in (metadata or {}).items():
+            writer.add_metadata(name, values)
+        for number, (topic, encoding, data) in enumerate(messages):
+            channel = writer.register_channel(topic, encoding, 0)
+            writer.add_message(channel, number, data, number, 0)
+        writer.finish()
+    return path
+
+
+def test_every_stroke_comes_with_the_still_that_shows_it(make, path):
+    make.record(path, *make.strokes(3))
+    captures = list(Recording(path).captures())
+    assert [capture.stroke.stroke_id for capture in captures] == ["H13-a05-r00", "H13-a05-r01", "H13-a05-r02"]
+    for number, capture in enumerate(captures):
+        assert capture.still_png == make.png(number)
+        assert capture.image().shape == (24, 24)
+
+
+def test_one_still_may_show_several_strokes(make, path):
+    make.record(path, make.still(7), make.stroke(7, stroke_id="left"), make.stroke(7, stroke_id="right"))
+    assert [capture.still_png for capture in Recording(path).captures()] == [make.png(7)] * 2
+
+
+def test_captures_are_lazy_so_that_a_session_need_not_fit_in_memory(make, path):
+    make.record(path, *make.strokes(20), make.stroke(1, stroke_id="names a still long gone", still=3))
+    captures = Recording(path).captures()
+    assert len(list(itertools.islice(captures, 2))) == 2
+    captures.close()
+    with pytest.raises(SessionDamaged, match="names still 3, not there"):
+        list(Recording(path).captures())
+
+
+def test_an_error_of_whoever_reads_the_captures_stays_what_it_is(make, path):
+    make.record(path, *make.strokes(2))
+
+    def consume():
+        for capture in Recording(path).captures():
+            raise ValueError(capture.stroke.stroke_id)
+
+    with pytest.raises(ValueError, match="H13-a05-r00"):
+        consume()
+    captures = Recording(path).captures()
+    next(captures)
+    with pytest.raises(KeyError, match="mine"):
+        captures.throw(KeyError("mine"))
+
+
+def test_stills_are_found_by_the_kind_of_their_step(make, path):
+    board = [make.step(1, "board", "begin"), make.still(1), make.step(1, "board", "end")]
+    capture = [make.step(2, "capture", "begin"), make.still(2), make.step(2, "capture", "end")]
+    make.record(path, *board, *capture)
+    assert list(Recording(path).stills_of("board")) == [make.png(1)]
+    assert list(Recording(path).stills_of("dip")) == []
+
+
+def test_strokes_are_counted_without_reading_them(make, path):
+    assert Recording(make.record(path, *make.strokes(5))).strokes() == 5
+    assert Recording(make.record(path.with_name("b.mcap"))).strokes() == 0
+
+
+def test_an_attachment_that_is_not_there_is_named(make, path):
+    with pytest.raises(InputError, match=r"holds no rig\.toml"):
+        Recording(make.record(path)).attachment("rig.toml")
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b"hello, world: this is no recording\n" * 30], ids=len)
+def test_what_is_no_mcap_file_is_refused(path, content):
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="is not an MCAP file"):
+        Recording(path)
+
+
+def test_a_path_that_is_not_there_and_an_empty_folder_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no such session"):
+        Recording(tmp_path / "gone")
+    with pytest.raises(InputError, match="holds no"):
+        Recording(tmp_path)
+
+
+def test_an_open_session_is_refused_with_the_way_out(make, store):
+    make.perform(store, "a")
+    with pytest.raises(InputError, match="still open: run the same `brushloop collect` again"):
+        Recording(store.folder)
+
+
+def test_the_part_of_a_cut_step_is_refused(make, store):
+    store.begin("a", "press", cell=None, notes={}).writer.abandon()
+    [part] = store.folder.glob("*.part")
+    assert Recording(part).strokes() == 0, "it was ended in good order"
+    part.write_bytes(part.read_bytes()[:-200])
+    with pytest.raises(SessionDamaged, match="cannot read"):
+        Recording(part)
+
+
+def test_an_mcap_file_that_is_not_ours_is_refused(path):
+    with pytest.raises(InputError, match="not one of brushloop's"):
+        Recording(foreign(path, metadata={"ros": {"a": "b"}}, messages=[("/tf", "json", b"{}")]))
+
+
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        {"session_id": "not json"},
+        {"source": '"somewhere"'},
+        {"brush_radius_mm": "NaN"},
+        {"unknown": "1"},
+        {"lens": "[" * 5000},
+    ],
+    ids=lambda spoilt: next(iter(spoilt)),
+)
+def test_a_header_that_cannot_be_read_is_told_in_one_line(make, path, spoilt):
+    foreign(path, metadata={HEADER_METADATA: header_metadata(make.header) | spoilt})
+    with pytest.raises(SessionDamaged) as caught:
+        Recording(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("topic", "data", "told"),
+    [
+        ("/stroke", b"\xff", "Stroke"),
+        ("/stroke", b'{"stroke_id":"a","kind":"press"}', r"Stroke\.still"),
+        ("/stroke", b'{"stroke_id":"a","kind":"press","still":-1}', r"Stroke\.still"),
+        ("/stroke", b'{"stroke_id":"a","kind":"press","still":0,"height_mm":NaN}', r"Stroke\.height_mm"),
+        ("/stroke", b'{"stroke_id":"a","kind":"press","still":0,"px_per_mm":[0,0]}', r"Stroke\.px_per_mm"),
+        ("/stroke", b'{"stroke_id":"a","kind":"press","still":0,"extra":0}', r"Stroke\.extra"),
+        ("/camera/still", b"\xff\xff\xff", "a still cannot be read"),
+    ],
+)
+def test_a_message_that_cannot_be_read_names_its_field(make, path, topic, data, told):
+    foreign(path, metadata={HEADER_METADATA: header_metadata(make.header)}, messages=[(topic, "json", data)])
+    recording = Recording(path)
+    with pytest.raises(SessionDamaged, match=told) as caught:
+        list(recording.captures())
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_messages_outside_chunks_are_refused_because_no_crc_protects_them(make, path):
+    ours = {HEADER_METADATA: header_metadata(make.header)}
+    recording = Recording(foreign(path, metadata=ours, use_chunking=False, messages=[("/stroke", "json", b"{}")]))
+    with pytest.raises(SessionDamaged, match="outside chunks"):
+        list(recording.captures())
+
+
+def png_stating(width, height):
+    """A small PNG that states any size."""
+
+    def part(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    size = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", size) + part(b"IDAT", zlib.compress(bytes(64))) + part(b"IEND", b"")
+
+
+def jpeg(side=64):
+    return cv2.imencode(".jpg", np.random.default_rng(1).integers(0, 255, (side, side), np.uint8))[1].tobytes()
+
+
+def jpeg_stating(width, height):
+    data = bytearray(jpeg())
+    frame_at = data.index(b"\xff\xc0")
+    data[frame_at + 5 : frame_at + 9] = struct.pack(">HH", height, width)
+    return bytes(data)
+
+
+@pytest.mark.parametrize("bomb", [png_stating(30_000, 30_000), jpeg_stating(30_000, 30_000)], ids=["png", "jpeg"])
+def test_an_image_bomb_is_refused_before_it_is_decoded(make, path, bomb, monkeypatch):
+    make.record(path, make.still(0, bomb), make.stroke(0))
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    [capture] = Recording(path).captures()
+    with pytest.raises(SessionDamaged, match="30000 x 30000 pixels exceeds") as caught:
+        capture.image()
+    assert "stroke H13-a05-r00" in str(caught.value)
+
+
+def test_too_many_bytes_are_refused(make, monkeypatch):
+    monkeypatch.setattr("sessions.messages.MAX_IMAGE_BYTES", 10)
+    with pytest.raises(SessionDamaged, match="exceeds 10"):
+        decode_gray(make.png(), "a still")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"hello", b"BM" + bytes(100), png_stating(0, 8), jpeg()[:-2], jpeg()[:300], b"\xff\xd8" + b"\xff" * 50],
+    ids=["empty", "text", "bmp", "no pixels", "cut jpeg", "half jpeg", "filler"],
+)
+def test_what_is_no_whole_image_is_refused_in_one_line(data):
+    with pytest.raises(SessionDamaged, match="image") as caught:
+        decode_gray(data, "a still")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_png_cut_at_any_byte_is_refused(make):
+    whole = make.png()
+    for cut in range(len(whole) - 8):
+        with pytest.raises(SessionDamaged):
+            decode_gray(whole[:cut], "a still")
+
+
+def test_png_and_jpeg_are_read(make):
+    assert decode_gray(make.png(), "a still").shape == (24, 24)
+    assert decode_gray(jpeg(), "a still").shape == (64, 64)

@@ -1,0 +1,220 @@
+"""One segment: everything that was written is in it, and a failing disk is heard."""
+
+import contextlib
+import errno
+import hashlib
+import io
+import json
+import os
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.exceptions import EndOfFile
+from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from mcap_protobuf.decoder import DecoderFactory
+
+from sessions.errors import SessionError
+from sessions.messages import decode_gray, log_message
+from sessions.reader import Recording
+from sessions.schemas import Topic
+from sessions.writer import Outgoing, SegmentWriter
+
+
+class FullDisk(io.FileIO):
+    """A file on a disk with room for `room` bytes."""
+
+    room = 4096
+
+    def write(self, data):
+        if self.tell() + len(data) > self.room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return super().write(data)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "0001-press-abc.mcap"
+
+
+@pytest.fixture
+def full_disk(monkeypatch):
+    open_ = Path.open
+
+    def open_on_it(path, mode="r", **options):
+        return io.BufferedWriter(FullDisk(path, mode)) if mode == "xb" else open_(path, mode, **options)
+
+    monkeypatch.setattr(Path, "open", open_on_it)
+
+
+def write_all(writer, messages, pause_s=0.0):
+    for message in messages:
+        writer.write(message)
+        time.sleep(pause_s)
+
+
+def test_counts_digest_and_size_tell_what_is_in_the_file(make, path):
+    writer = SegmentWriter(path, make.header)
+    for message in [*make.strokes(3), make.pose(1)]:
+        writer.write(message)
+    recorded = writer.finish()
+    assert recorded.counts == {"/camera/still": 3, "/stroke": 3, "/robot/tcp": 1}
+    assert recorded.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert recorded.size_bytes == path.stat().st_size
+
+
+def test_times_and_sequence_are_the_devices_own(make, path):
+    make.record(path, make.pose(41), make.pose(43))
+    with path.open("rb") as file:
+        messages = [message for _, _, message in make_reader(file, validate_crcs=True).iter_messages()]
+    assert [m.sequence for m in messages] == [41, 43]
+    assert [(m.log_time, m.publish_time) for m in messages] == [
+        (make.t0_ns + 41, make.t0_ns + 40),
+        (make.t0_ns + 43, make.t0_ns + 42),
+    ]
+
+
+def test_any_viewer_decodes_the_still_from_the_schema_in_the_file(make, path):
+    log = Outgoing(Topic.LOG, 1, 1, 0, log_message(1, "brush is dry", warning=True))
+    make.record(path, make.still(5), log)
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        decoded = {channel.topic: message for _, channel, _, message in reader.iter_decoded_messages()}
+    assert decoded["/camera/still"].format == "png"
+    np.testing.assert_array_equal(decode_gray(decoded["/camera/still"].data, "still"), decode_gray(make.png(5), "made"))
+    assert (decoded["/log"].message, decoded["/log"].level) == ("brush is dry", 3)
+
+
+def test_our_own_events_carry_their_json_schema(make, path):
+    make.record(path, make.stroke(0))
+    with path.open("rb") as file:
+        [(schema, channel, _)] = make_reader(file).iter_messages()
+    assert (schema.name, schema.encoding, channel.message_encoding) == ("brushloop.Stroke", "jsonschema", "json")
+    assert set(json.loads(schema.data)["properties"]) >= {"stroke_id", "height_mm", "tilt_deg"}
+
+
+def test_the_header_reads_back_as_it_was(make, path):
+    header = make.header.model_copy(update={"brush": 'goat "大白云"\n', "brush_radius_mm": 4.5})
+    SegmentWriter(path, header).finish()
+    assert Recording(path).header == header
+
+
+def test_the_file_has_its_name_only_once_it_is_finished(make, path):
+    writer = SegmentWriter(path, make.header)
+    writer.write(make.pose(0))
+    assert [p.name for p in path.parent.iterdir()] == [f"{path.name}.part"]
+    writer.finish()
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("suffix", ["", ".part"])
+def test_a_recording_is_never_overwritten(make, path, suffix):
+    there = path.with_name(path.name + suffix)
+    there.write_bytes(b"precious")
+    with pytest.raises(SessionError, match="never overwritten"):
+        SegmentWriter(path, make.header)
+    assert make.tree(path.parent) == {there.name: b"precious"}
+
+
+def test_a_cut_attempt_leaves_its_part_as_evidence(make, path):
+    writer = SegmentWriter(path, make.header)
+    writer.write(make.stroke(0))
+    writer.abandon()
+    part = path.with_name(path.name + ".part")
+    assert make.stroke_names(part) == ["H13-a05-r00"]
+    assert not path.exists()
+
+
+def test_a_folder_that_is_gone_is_a_session_error(make, tmp_path):
+    with pytest.raises(SessionError, match="cannot create: No such file"):
+        SegmentWriter(tmp_path / "gone" / "a.mcap", make.header)
+
+
+def test_a_full_disk_is_heard_by_a_later_write_and_the_part_stays(make, path, full_disk):
+    writer = SegmentWriter(path, make.header)
+    noise = np.random.default_rng(0).bytes(9000)
+    with pytest.raises(SessionError, match="cannot write: No space left on device"):
+        write_all(writer, (make.still(number, noise) for number in range(1000)), pause_s=0.001)
+    writer.abandon()
+    assert [p.name for p in path.parent.iterdir()] == [f"{path.name}.part"]
+
+
+def test_a_disk_that_fills_up_at_the_very_end_is_heard_by_finish(make, path, full_disk, monkeypatch):
+    monkeypatch.setattr(FullDisk, "room", 1200)
+    writer = SegmentWriter(path, make.header)
+    writer.write(make.pose(0))
+    with pytest.raises(SessionError, match="cannot write: No space left on device"):
+        writer.finish()
+    writer.abandon()
+    assert [p.name for p in path.parent.iterdir()] == [f"{path.name}.part"]
+
+
+@pytest.mark.parametrize("failing", ["fsync", "rename"])
+def test_an_error_of_the_last_steps_is_a_session_error(make, path, monkeypatch, failing):
+    def fail(*_):
+        raise OSError(errno.EIO, "Input/output error")
+
+    writer = SegmentWriter(path, make.header)
+    monkeypatch.setattr(*((os, "fsync", fail) if failing == "fsync" else (Path, "rename", fail)))
+    with pytest.raises(SessionError, match="Input/output error"):
+        writer.finish()
+    assert [p.name for p in path.parent.iterdir()] == [f"{path.name}.part"]
+
+
+def test_a_disk_that_does_not_keep_up_is_heard(make, path):
+    writer = SegmentWriter(path, make.header, queue_limit=1)
+    noise = np.random.default_rng(0).bytes(1_000_000)
+    with pytest.raises(SessionError, match="1 messages wait: the disk does not keep up"):
+        write_all(writer, (make.still(number, noise) for number in range(1000)))
+    writer.abandon()
+
+
+def test_a_writer_that_may_wait_loses_nothing_in_a_short_queue(make, path):
+    writer = SegmentWriter(path, make.header, queue_limit=1)
+    for number in range(50):
+        writer.write(make.pose(number), 10.0)
+    assert writer.finish().counts == {"/robot/tcp": 50}
+
+
+KILLED = """
+import itertools, sys, time
+from pathlib import Path
+from sessions.messages import pose_message
+from sessions.schemas import Header, Topic
+from sessions.writer import Outgoing, SegmentWriter
+writer = SegmentWriter(Path(sys.argv[1]), Header(session_id="s", source="loopback rig", software="t"))
+for n in itertools.count():
+    t_ns = time.time_ns()
+    writer.write(Outgoing(Topic.TCP, t_ns, t_ns, n, pose_message(t_ns, (0, 0, 0), (0, 0, 0, 1))))
+    if n % 50 == 49:
+        print(n, flush=True)
+    time.sleep(0.001)
+"""
+
+
+def salvaged(part):
+    """The messages of an unfinished file, up to where it ends."""
+    found = []
+    with part.open("rb") as file, contextlib.suppress(EndOfFile, struct.error):
+        for record in StreamReader(file, validate_crcs=True).records:
+            found += [record] if isinstance(record, Message) else []
+    return found
+
+
+def test_a_killed_process_loses_at_most_half_a_second(path):
+    child = subprocess.Popen([sys.executable, "-c", KILLED, path], stdout=subprocess.PIPE, text=True)
+    with child:
+        for _ in range(25):
+            child.stdout.readline()
+        killed_ns = time.time_ns()
+        child.kill()
+    found = salvaged(path.with_name(path.name + ".part"))
+    assert [message.sequence for message in found] == list(range(len(found)))
+    # Flushes are 0.25 s apart; the rest is for a busy machine.
+    assert (killed_ns - found[-1].log_time) / 1e9 < 0.75

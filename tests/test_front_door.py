@@ -1,0 +1,71 @@
+"""The front door: light, one line per error, right exit codes, and nobody behind it looks back."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+HEAVY = ("torch", "cv2", "textual", "numpy", "pydantic", "mcap", "scipy", "drivers.sim")
+
+
+def brushloop(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "brushloop", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)
+
+
+def loaded(program: str) -> list[str]:
+    code = f"import sys\n{program}\nprint(*sorted(sys.modules))"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return ran.stdout.splitlines()[-1].split()
+
+
+def test_help_loads_nothing_heavy() -> None:
+    modules = loaded(
+        "import brushloop\nsys.argv = ['brushloop', '--help']\ntry:\n    brushloop.app()\nexcept SystemExit:\n    pass"
+    )
+    assert "brushloop" in modules
+    for heavy in HEAVY:
+        assert not [m for m in modules if m == heavy or m.startswith(heavy + ".")], heavy
+
+
+def test_a_rig_pc_collects_without_torch_and_a_validator_without_devices() -> None:
+    assert "torch" not in loaded("import collect.engine, collect.headless, collect.opening, collect.tui.app")
+    validating = loaded("import calibrate.validation, calibrate.write")
+    assert not {"serial", "can", "textual", "drivers"} & set(validating)
+
+
+@pytest.mark.parametrize("package", ["collect", "calibrate", "model", "drivers", "sessions"])
+def test_nobody_imports_the_front_door_and_nobody_outside_it_the_loopback_rig(package: str) -> None:
+    for path in (ROOT / package).rglob("*.py"):
+        imported: set[str] = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                imported.add(node.module)
+        assert "brushloop" not in imported, path
+        if "sim" not in path.parts:
+            assert not [name for name in imported if name.startswith("drivers.sim")], path
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("validate", "nowhere"), "nowhere: no such session"),
+        (("calibrate", "nowhere"), "nowhere: no such session"),
+        (("collect", "--config", "no.toml", "--protocol", "no.toml", "--no-tui"), "no.toml: no such file"),
+        (("sessions", "import", "nowhere", "--csv", "no.csv"), "nowhere: is not a folder"),
+        (("sessions", "list", "nowhere"), "nowhere: is not a folder"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:
+    ran = brushloop(*arguments, cwd=tmp_path)
+    assert ran.returncode == 2
+    assert ran.stderr.count("\n") == 1
+    assert words in ran.stderr
+    assert list(tmp_path.iterdir()) == []
