@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Future
@@ -66,6 +68,12 @@ class Lab:
         rig, protocol = self.configs()
         resume = find_resumable(opening)
         return Engine(rig, protocol, lambda r: open_store(opening, resume, r, rig, protocol, clock), clock)
+
+    def process(self) -> subprocess.Popen[str]:
+        """`brushloop collect` as an operator starts it, without a screen."""
+        command = [sys.executable, "-m", "brushloop", "collect", "--no-tui", "--out", str(self.sessions)]
+        command += ["--config", str(self.folder / "rig.toml"), "--protocol", str(self.folder / "protocol.toml")]
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
     def write_protocol(self, heights: str = "[11.0, 15.0]", tilts: str = "[0.0, 10.0]", repeats: int = 1) -> None:
         text = f'kind = "grid"\nheights_mm = {heights}\ntilts_deg = {tilts}\nrepeats = {repeats}\ndwell_s = 0.0\n'

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import signal
-import subprocess
-import sys
 import time
 from typing import TYPE_CHECKING
 
@@ -19,14 +17,6 @@ if TYPE_CHECKING:
     from conftest import Lab
 
 
-def collect(lab: Lab, *flags: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "brushloop", "collect", "--no-tui", *flags]
-    command += ["--config", str(lab.folder / "rig.toml"), "--protocol", str(lab.folder / "protocol.toml")]
-    return subprocess.Popen(
-        [*command, "--out", str(lab.sessions)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-
-
 def wait_for_presses(lab: Lab, count: int) -> None:
     deadline = time.monotonic() + 60
     while len(lab.rig.world.presses) < count:
@@ -36,7 +26,7 @@ def wait_for_presses(lab: Lab, count: int) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_stops_the_arm_and_the_same_command_goes_on(lab: Lab, number: signal.Signals) -> None:
-    first = collect(lab)
+    first = lab.process()
     wait_for_presses(lab, 2)
     first.send_signal(number)
     _, stderr = first.communicate(timeout=30)
@@ -47,7 +37,7 @@ def test_a_signal_stops_the_arm_and_the_same_command_goes_on(lab: Lab, number: s
     time.sleep(0.1)
     assert lab.rig.world.tool() == still
 
-    again = collect(lab)
+    again = lab.process()
     _, stderr = again.communicate(timeout=60)
     assert again.returncode == 0, stderr
     [folder] = lab.sessions.iterdir()
@@ -55,9 +45,9 @@ def test_a_signal_stops_the_arm_and_the_same_command_goes_on(lab: Lab, number: s
 
 
 def test_a_second_process_is_refused_and_the_first_goes_on(lab: Lab) -> None:
-    first = collect(lab)
+    first = lab.process()
     wait_for_presses(lab, 2)
-    second = collect(lab)
+    second = lab.process()
     _, stderr = second.communicate(timeout=30)
     assert second.returncode == 2
     assert "another brushloop is driving the arm" in stderr.splitlines()[-1]
