@@ -59,16 +59,31 @@ class RobotConfig(Config):
     limits: LimitsConfig
 
 
+class LockedConfig(Config):
+    """Settings of a camera device that must not drift; left out means left as it is. The device's own units."""
+
+    width: Annotated[int, Field(ge=16, le=65535)] | None = None
+    height: Annotated[int, Field(ge=16, le=65535)] | None = None
+    exposure: Finite | None = None
+    """Turns automatic exposure off."""
+    gain: Finite | None = None
+    white_balance_k: Finite | None = None
+    """Turns automatic white balance off."""
+    focus: Finite | None = None
+    """Turns autofocus off."""
+
+
 class CameraConfig(Config):
     """The camera that looks at the sheet."""
 
     kind: Literal["opencv"]
     source: str = Field(min_length=1)
-    """Stream URL, file, or device number."""
+    """Stream URL, file, folder of images, or device number as text."""
     latency_ms: Annotated[float, Field(ge=0.0, le=10_000.0)] = 250.0
     """Longest time from exposure to arrival; frames that may be older than a request are not used for it."""
     timeout_s: Annotated[float, Field(gt=0.0, le=120.0)] = 10.0
     lens: str = ""
+    locked: LockedConfig = LockedConfig()
 
 
 class BrushConfig(Config):

@@ -146,7 +146,7 @@ class Engine:
 
     async def _session(self) -> None:
         self._progress.doing("connect")
-        async with connected(self._rig_config, self._clock) as rig:
+        async with connected(self._rig_config, self._clock, self._progress.log) as rig:
             self._rig = rig
             store = self._open_store(rig)
             try:

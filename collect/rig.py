@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import tempfile
-from collections.abc import AsyncGenerator, Generator
+from collections.abc import AsyncGenerator, Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 from collect.config import RigConfig
 from collect.errors import ConfigError
 from drivers.arcs.robot import ArcsOptions, AuboArcs
-from drivers.camera import CameraOptions, OpenCvCamera
+from drivers.camera import CameraOptions, Locked, OpenCvCamera
 from drivers.clock import Clock
 from drivers.limits import Limits
 from drivers.protocols import Camera, Robot
@@ -46,10 +46,13 @@ def make_robot(config: RigConfig, clock: Clock) -> AuboArcs:
     return AuboArcs(ArcsOptions(robot.host, robot.port, robot.tcp_offset_mm), limits_of(config), clock)
 
 
-def make_camera(config: RigConfig, clock: Clock) -> OpenCvCamera:
+def make_camera(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> OpenCvCamera:
     """The camera's driver, not yet connected."""
     camera = config.camera
-    return OpenCvCamera(CameraOptions(camera.source, camera.latency_ms, camera.timeout_s), clock)
+    options = CameraOptions(
+        camera.source, camera.latency_ms, camera.timeout_s, locked=Locked(**camera.locked.model_dump())
+    )
+    return OpenCvCamera(options, clock, on_notice)
 
 
 @contextlib.contextmanager
@@ -69,14 +72,15 @@ def sole_driver(config: RigConfig) -> Generator[None]:
 
 
 @contextlib.asynccontextmanager
-async def connected(config: RigConfig, clock: Clock) -> AsyncGenerator[Rig]:
+async def connected(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> AsyncGenerator[Rig]:
     """Connect camera, then robot; on the way out stop the arm first, whatever happened.
 
-    Raises `ConfigError` where another brushloop on this machine has the arm: closing would stop its motion.
+    `on_notice` is told what a device says unasked, from any thread. Raises `ConfigError` where another brushloop on
+    this machine has the arm: closing would stop its motion.
     """
     async with contextlib.AsyncExitStack() as stack:
         stack.enter_context(sole_driver(config))
-        camera = make_camera(config, clock)
+        camera = make_camera(config, clock, on_notice)
         stack.push_async_callback(camera.close)
         camera_identity = await camera.connect()
         robot = make_robot(config, clock)

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
@@ -51,6 +51,7 @@ class Lab:
 
     rig: LoopbackRig
     folder: Path
+    processes: list[subprocess.Popen[str]] = field(default_factory=list)
 
     @property
     def sessions(self) -> Path:
@@ -73,7 +74,8 @@ class Lab:
         """`brushloop collect` as an operator starts it, without a screen."""
         command = [sys.executable, "-m", "brushloop", "collect", "--no-tui", "--out", str(self.sessions)]
         command += ["--config", str(self.folder / "rig.toml"), "--protocol", str(self.folder / "protocol.toml")]
-        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        self.processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
+        return self.processes[-1]
 
     def write_protocol(self, heights: str = "[11.0, 15.0]", tilts: str = "[0.0, 10.0]", repeats: int = 1) -> None:
         text = f'kind = "grid"\nheights_mm = {heights}\ntilts_deg = {tilts}\nrepeats = {repeats}\ndwell_s = 0.0\n'
@@ -88,3 +90,6 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
         (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
         made.write_protocol()
         yield made
+        for process in made.processes:
+            process.kill()
+            process.communicate()

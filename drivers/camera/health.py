@@ -1,0 +1,98 @@
+"""Whether a frame can be believed: black, saturated, torn, frozen and late ones are named and passed over."""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter, deque
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+SAMPLE_STEP = 7
+"""Every so many pixels in each direction are looked at; a prime, so that no pattern hides between them."""
+BLACK_BELOW = 25
+SATURATED_SHARE = 0.5
+TORN_BAND_SHARE = 0.02
+"""A band of this share of the rows at the bottom without any change: the decoder ran out of data."""
+BURST_SHARE = 0.5
+"""Frames that come faster than this share of the usual period are a backlog."""
+PERIODS_KEPT = 31
+
+
+class Fault(StrEnum):
+    """What is wrong with a frame."""
+
+    BLACK = "black"
+    SATURATED = "saturated"
+    TORN = "torn"
+    FROZEN = "frozen"
+    LATE = "late"
+
+
+class FrameHealth:
+    """Judges the frames of one camera in the order in which they arrive."""
+
+    def __init__(self, *, latency_ns: int, frozen_after: int, live: bool) -> None:
+        self._latency_ns = latency_ns
+        self._frozen_after = frozen_after
+        self._live = live
+        self._last_digest: int | None = None
+        self._equal = 0
+        self._last_ns: int | None = None
+        self._periods: deque[int] = deque(maxlen=PERIODS_KEPT)
+        self._backlog = False
+        self.counts: Counter[Fault] = Counter()
+
+    def judge(self, image: NDArray[np.uint8], arrival_ns: int) -> Fault | None:
+        """The first fault found in an (h, w) or (h, w, 3) uint8 frame, or None."""
+        fault = self._look(image)
+        # Clock and digest go on also for a frame that is faulty otherwise.
+        frozen, late = self._is_frozen(image), self._is_late(arrival_ns)
+        if fault is None and self._live:
+            fault = Fault.FROZEN if frozen else Fault.LATE if late else None
+        if fault is not None:
+            self.counts[fault] += 1
+        return fault
+
+    def summary(self) -> str:
+        """`3 black, 1 torn`, or empty."""
+        return ", ".join(f"{count} {fault}" for fault, count in sorted(self.counts.items()))
+
+    def _look(self, image: NDArray[np.uint8]) -> Fault | None:
+        import numpy as np
+
+        sample = image[::SAMPLE_STEP, ::SAMPLE_STEP]
+        if float(np.quantile(sample, 0.995)) < BLACK_BELOW:
+            return Fault.BLACK
+        if float(np.mean(sample >= 255)) > SATURATED_SHARE:
+            return Fault.SATURATED
+        band = image[-max(8, round(TORN_BAND_SHARE * image.shape[0])) :]
+        if int(band.max()) - int(band.min()) <= 1:
+            return Fault.TORN
+        return None
+
+    def _is_frozen(self, image: NDArray[np.uint8]) -> bool:
+        digest = zlib.crc32(image[::SAMPLE_STEP].tobytes())
+        self._equal = self._equal + 1 if digest == self._last_digest else 0
+        self._last_digest = digest
+        return self._equal + 1 >= self._frozen_after
+
+    def _is_late(self, arrival_ns: int) -> bool:
+        """True for what had waited in a buffer while nobody read: arrival then says nothing about exposure."""
+        gap_ns = arrival_ns - self._last_ns if self._last_ns is not None else 0
+        self._last_ns = arrival_ns
+        if len(self._periods) < 3:
+            self._periods.append(gap_ns)
+            return False
+        usual_ns = sorted(self._periods)[len(self._periods) // 2]
+        if gap_ns > max(3 * usual_ns, self._latency_ns):
+            self._backlog = True
+            return True
+        if self._backlog:
+            self._backlog = gap_ns < BURST_SHARE * usual_ns
+            return self._backlog
+        self._periods.append(gap_ns)
+        return False

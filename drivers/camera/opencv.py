@@ -1,0 +1,170 @@
+"""A camera that is read without pause, so that no frame is older than it looks.
+
+An unread capture hands back frames that are seconds old (its buffer cannot be shortened). A grabber thread
+reads all the time and keeps only the newest sound frame; `fresh` then waits for one that was exposed late enough.
+A live source that ends is opened again, and says so.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING, cast
+
+from drivers.camera.health import FrameHealth
+from drivers.camera.options import DEVICE, CameraOptions
+from drivers.camera.source import Source, open_source
+from drivers.clock import Clock
+from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected
+from drivers.samples import Frame, Identity, Stamp
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+REOPEN_AFTER_S = 0.5
+
+
+class OpenCvCamera:
+    """`Camera` over one source; the grabber thread owns it from open to release."""
+
+    def __init__(
+        self, options: CameraOptions, clock: Clock, on_notice: Callable[[str], None] = lambda _text: None
+    ) -> None:
+        self._options = options
+        self._clock = clock
+        self._on_notice = on_notice
+        self._condition = threading.Condition()
+        self._newest: Frame | None = None
+        self._trouble = ""
+        """Why no sound frame comes, for the message of a timeout."""
+        self._ended: DeviceError | None = None
+        self._closing = threading.Event()  # one for each grabber: an old one that hangs must not wake up again
+        self._thread: threading.Thread | None = None
+        self.settings: dict[str, float] = {}
+
+    async def connect(self) -> Identity:
+        """Start the grabber and wait for its first sound frame. Raises `ConnectionLost`, `DeviceError`, ..."""
+        self._newest, self._ended, self._trouble, self._closing = None, None, "", threading.Event()
+        self._thread = threading.Thread(target=self._grab, args=(self._closing,), name="camera grabber", daemon=True)
+        self._thread.start()
+        try:
+            frame = await self.fresh(Stamp(0))
+        except BaseException:
+            await self.close()
+            raise
+        height, width = frame.image.shape[:2]
+        locked = "".join(f", {name} {value:g}" for name, value in self.settings.items())
+        return Identity(DEVICE, f"{self._options.source} {width}x{height}{locked}", "", False)
+
+    async def fresh(self, after: Stamp) -> Frame:
+        """The first sound frame exposed after `after.host_ns`. Raises `DeviceTimeout`, `ConnectionLost`."""
+        if self._thread is None:
+            raise NotConnected(DEVICE, "fresh", "not connected")
+        return await asyncio.to_thread(self._wait_for, after.host_ns)
+
+    async def close(self) -> None:
+        """End the grabber and wait for it; a read that hangs is left to the daemon thread."""
+        self._closing.set()
+        with self._condition:
+            self._condition.notify_all()
+        if self._thread is not None:
+            await asyncio.to_thread(self._thread.join, 5.0)
+            self._thread = None
+
+    def _wait_for(self, after_ns: int) -> Frame:
+        closing = self._closing
+
+        def late_enough() -> Frame | None:
+            frame = self._newest
+            return frame if frame is not None and frame.exposed_after_ns >= after_ns else None
+
+        def over() -> bool:
+            return self._ended is not None or closing.is_set()
+
+        with self._condition:
+            if not self._condition.wait_for(lambda: late_enough() or over(), self._options.timeout_s):
+                why = f" ({self._trouble})" if self._trouble else ""
+                raise DeviceTimeout(
+                    DEVICE,
+                    "fresh",
+                    f"no sound new frame from {self._options.source} in {self._options.timeout_s:g} s{why}",
+                    remedy="Check cable, light and stream; the arm does not move meanwhile.",
+                )
+            frame = late_enough()
+            if self._ended is not None:
+                raise self._ended
+            if frame is None or closing.is_set():
+                raise ConnectionLost(DEVICE, "fresh", "closed while waiting")
+            return frame
+
+    def _grab(self, closing: threading.Event) -> None:
+        lost_ns: int | None = None
+        try:
+            while not closing.is_set():
+                try:
+                    source = open_source(self._options)
+                except ConnectionLost:
+                    if lost_ns is None:
+                        raise
+                    closing.wait(REOPEN_AFTER_S)
+                    continue
+                try:
+                    if lost_ns is not None:
+                        self._on_notice(f"camera is back after {(self._clock.now_ns() - lost_ns) / 1e9:.1f} s")
+                    self._read_all(source, closing)
+                finally:
+                    source.release()
+                if not source.live:
+                    raise ConnectionLost(DEVICE, "read", f"{self._options.source} ended")
+                lost_ns = self._clock.now_ns()
+                self._tell_trouble("the stream ended and is opened again")
+                closing.wait(REOPEN_AFTER_S)
+        except DeviceError as error:
+            self._end(error, closing)
+        except BaseException as error:
+            self._end(DeviceError(DEVICE, "read", f"the grabber failed: {error!r}"), closing)
+            raise
+
+    def _read_all(self, source: Source, closing: threading.Event) -> None:
+        """Read until the source ends; only sound frames are kept."""
+        import cv2
+
+        self.settings = source.settings
+        latency_ns = round(self._options.latency_ms * 1e6)
+        health = FrameHealth(latency_ns=latency_ns, frozen_after=self._options.frozen_after, live=source.live)
+        opened_ns = self._clock.now_ns()
+        first = True
+        while not closing.is_set():
+            image = source.read()
+            arrival_ns = self._clock.now_ns()
+            if image is None:
+                return
+            if self._options.gray and image.ndim == 3:
+                image = cast("NDArray[np.uint8]", cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+            fault = health.judge(image, arrival_ns)
+            if fault is not None:
+                self._tell_trouble(f"frames passed over: {health.summary()}")
+                continue
+            # The first frame was read to learn the format, and waited until the capture was open.
+            exposed_ns = (opened_ns if first else arrival_ns) - latency_ns
+            first = False
+            with self._condition:
+                seq = self._newest.stamp.seq + 1 if self._newest is not None else 0
+                self._newest = Frame(Stamp(arrival_ns, None, seq), exposed_ns, image)
+                self._trouble = ""
+                self._condition.notify_all()
+
+    def _tell_trouble(self, text: str) -> None:
+        with self._condition:
+            new = not self._trouble
+            self._trouble = text
+        if new:
+            self._on_notice(f"camera: {text}")
+
+    def _end(self, error: DeviceError, closing: threading.Event) -> None:
+        with self._condition:
+            if not closing.is_set():
+                self._ended = error
+            self._condition.notify_all()

@@ -1,0 +1,154 @@
+"""Where frames come from: one small protocol over OpenCV's capture and over a folder of images."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol, cast
+
+from drivers.camera.options import DEVICE, CameraOptions
+from drivers.errors import ConnectionLost, DeviceError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg"}
+SETTING_TOLERANCE = 0.01
+"""Relative difference up to which a setting that was read back counts as the one asked for."""
+
+
+class Source(Protocol):
+    """Owned by one thread from open to release."""
+
+    live: bool
+    """False where the frames are recorded: their end is an end, and equal ones are no fault."""
+
+    settings: dict[str, float]
+    """What was read back, by name."""
+
+    def read(self) -> NDArray[np.uint8] | None:
+        """The next frame, gray or BGR; None at the end."""
+        ...
+
+    def release(self) -> None:
+        """Let go of the device."""
+        ...
+
+
+def open_source(options: CameraOptions) -> Source:
+    """Open what `options.source` names. Raises `ConnectionLost`, or `DeviceError` for settings that do not hold."""
+    if Path(options.source).is_dir():
+        return FolderSource(options)
+    return CaptureSource(options)
+
+
+class FolderSource:
+    """The images of a folder in order of name, at a steady pace, the last one for ever."""
+
+    def __init__(self, options: CameraOptions) -> None:
+        folder = Path(options.source)
+        self._paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+        if not self._paths:
+            raise ConnectionLost(DEVICE, "open", f"{folder} holds no PNG or JPEG images")
+        self.live = False
+        self.settings: dict[str, float] = {}
+        self._period_s = 1.0 / options.folder_fps
+        self._shown = 0
+
+    def read(self) -> NDArray[np.uint8] | None:
+        """The next image after one period. Raises `DeviceError` naming one that cannot be read."""
+        import cv2
+
+        time.sleep(self._period_s)
+        path = self._paths[min(self._shown, len(self._paths) - 1)]
+        self._shown += 1
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if image is None:  # pyright: ignore[reportUnnecessaryComparison]
+            raise DeviceError(DEVICE, "read", f"{path} is no image")
+        return cast("NDArray[np.uint8]", image)
+
+    def release(self) -> None:
+        """Nothing to let go of."""
+
+
+class CaptureSource:
+    """A `cv2.VideoCapture` on a device, a stream or a file, its settings locked and read back."""
+
+    def __init__(self, options: CameraOptions) -> None:
+        # Before the first capture of the process: the libraries would write their own lines across the screen.
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+        import cv2
+
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        source = options.source
+        is_device = source.isdecimal()
+        self.live = is_device or "://" in source
+        timeout_ms = round(options.timeout_s * 1e3)
+        # One decoder thread: frame-parallel decoding would hold every frame back by one or more periods.
+        stream = [
+            *(cv2.CAP_PROP_N_THREADS, 1),
+            *(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, timeout_ms),
+            *(cv2.CAP_PROP_READ_TIMEOUT_MSEC, timeout_ms),
+        ]
+        self._capture = cv2.VideoCapture(int(source)) if is_device else cv2.VideoCapture(source, cv2.CAP_FFMPEG, stream)
+        try:
+            if not self._capture.isOpened():
+                raise ConnectionLost(DEVICE, "open", f"cannot open {source}")
+            self.settings = self._lock(options, is_device)
+        except BaseException:
+            self.release()
+            raise
+
+    def read(self) -> NDArray[np.uint8] | None:
+        """The next frame; blocks up to the stream's own timeout."""
+        ok, raw = self._capture.read()
+        return cast("NDArray[np.uint8]", raw) if ok else None
+
+    def release(self) -> None:
+        """Close the capture."""
+        self._capture.release()
+
+    def _lock(self, options: CameraOptions, is_device: bool) -> dict[str, float]:
+        import cv2
+
+        wanted = options.locked.wanted()
+        if wanted and not is_device:
+            names = ", ".join(wanted)
+            raise DeviceError(
+                DEVICE,
+                "lock",
+                f"{names} cannot be set through {options.source}",
+                remedy="Lock them in the camera's own set-up and leave them out of the configuration.",
+            )
+        properties = {
+            "width": cv2.CAP_PROP_FRAME_WIDTH,
+            "height": cv2.CAP_PROP_FRAME_HEIGHT,
+            "exposure": cv2.CAP_PROP_EXPOSURE,
+            "gain": cv2.CAP_PROP_GAIN,
+            "white_balance_k": cv2.CAP_PROP_WB_TEMPERATURE,
+            "focus": cv2.CAP_PROP_FOCUS,
+        }
+        automatic = {
+            # V4L2's menu: 1 is manual, 3 aperture priority.
+            "exposure": (cv2.CAP_PROP_AUTO_EXPOSURE, 1.0),
+            "white_balance_k": (cv2.CAP_PROP_AUTO_WB, 0.0),
+            "focus": (cv2.CAP_PROP_AUTOFOCUS, 0.0),
+        }
+        settings: dict[str, float] = {}
+        for name, value in wanted.items():
+            if name in automatic:
+                self._capture.set(*automatic[name])
+            self._capture.set(properties[name], value)
+        for name, value in wanted.items():
+            got = float(self._capture.get(properties[name]))
+            if abs(got - value) > SETTING_TOLERANCE * max(abs(value), 1.0):
+                raise DeviceError(
+                    DEVICE,
+                    "lock",
+                    f"{name} = {value:g} was asked for, but {got:g} is read back",
+                    remedy="Choose a value that the camera has; `v4l2-ctl --list-ctrls` lists them.",
+                )
+            settings[name] = got
+        return settings
