@@ -33,7 +33,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """The camera: where it looks and how well. Lens distortion is left for a later rig; perspective is here."""
+    """The camera: where it looks and how well."""
 
     width_px: int = 2048
     height_px: int = 1536
@@ -47,6 +47,10 @@ class View:
     """Standard deviation in gray levels."""
     shade: float = 0.18
     """Fall-off of the light toward one corner."""
+    shadow: float = 0.0
+    """Light that a soft-edged shadow across the sheet takes away, 0 to 1."""
+    k1: float = 0.0
+    """Radial distortion in OpenCV's model with a focal length of one image width; none until calibration undoes it."""
     blur_px: float = 0.7
     fps: float = 8.0
     jpeg_quality: int = 95

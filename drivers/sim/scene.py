@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.samples import Pose
-from drivers.sim.config import Table, View
+from drivers.sim.config import Table
+from drivers.sim.optics import Optics
 from drivers.sim.paper import PX_PER_MM
 from drivers.sim.world import World
 
@@ -41,9 +40,9 @@ class Scene:
         board_mm = [n * table.board_square_mm for n in table.board_squares]
         self._size_mm = (board_mm[0] + 2 * MARGIN_MM, board_mm[1] + 2 * MARGIN_MM)
         self._blank = self._draw_blank(table)
-        self.paper_to_image = homography(view)
+        self.optics = Optics(view, world.config.seed)
+        self.paper_to_image = self.optics.homography
         self._plane_to_image = self._raster_to_image()
-        self._light = _light(view)
         self._noise = [
             self._rng.normal(0.0, view.noise, (view.height_px, view.width_px)).astype(np.float32)
             for _ in range(NOISE_FIELDS)
@@ -115,32 +114,14 @@ class Scene:
             flags=cv2.INTER_LINEAR,
             borderValue=TABLE_GRAY,
         )
-        blurred = cv2.GaussianBlur(warped, (0, 0), view.blur_px)
-        return blurred.astype(np.float32) * self._light
+        blurred = cv2.GaussianBlur(self.optics.distort(warped.astype(np.uint8)), (0, 0), view.blur_px)
+        return blurred.astype(np.float32) * self.optics.light
 
     def _hide_behind_tool(self, image: NDArray[np.float32], tool: Pose) -> None:
         x_mm, y_mm = self._world.to_paper(tool.x_mm, tool.y_mm)
-        u, v, w = self.paper_to_image @ np.array([x_mm, y_mm, 1.0])
+        [[u, v]] = self.optics.image_of(np.array([[x_mm, y_mm]]))
         radius_px = round(TOOL_CLEAR_MM * self._world.config.view.px_per_mm)
-        cv2.circle(image, (round(u / w), round(v / w)), radius_px, (70.0,), -1)
-
-
-def homography(view: View) -> NDArray[np.float64]:
-    """(3, 3) from the paper plane in mm to image pixels, pixel centres on integers; rows run against y."""
-    turn = math.radians(view.turn_deg)
-    cos, sin, s = math.cos(turn), math.sin(turn), view.px_per_mm
-    x, y = view.centre_mm
-    to_centre = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, 1.0]])
-    flat = np.array([[s * cos, -s * sin, 0.0], [-s * sin, -s * cos, 0.0], [0.0, 0.0, 1.0]])
-    tilt = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, view.keystone / view.height_px, 1.0]])
-    to_image = np.array([[1.0, 0.0, view.width_px / 2], [0.0, 1.0, view.height_px / 2], [0.0, 0.0, 1.0]])
-    return to_image @ tilt @ flat @ to_centre
-
-
-def _light(view: View) -> NDArray[np.float32]:
-    x = np.linspace(0.0, 1.0, view.width_px, dtype=np.float32)
-    y = np.linspace(0.0, 1.0, view.height_px, dtype=np.float32)[:, None]
-    return (1.0 - view.shade * (0.6 * x + 0.4 * y) ** 2).astype(np.float32)
+        cv2.circle(image, (round(float(u)), round(float(v))), radius_px, (70.0,), -1)
 
 
 STRIP_BITS = 64
