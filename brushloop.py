@@ -18,6 +18,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("collect")(collect.cli.collect)
+app.command("doctor")(collect.cli.doctor)
 app.command("calibrate")(calibrate.cli.calibrate)
 app.command("validate")(calibrate.cli.validate)
 app.add_typer(sessions.cli.app, name="sessions")

@@ -47,3 +47,29 @@ def collect(
         from collect.headless import run_headless
 
         run_headless(engine)
+
+
+def doctor(
+    config: Annotated[Path, typer.Option(help="The rig: addresses, frames, limits.")],
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object a device.")] = False,
+) -> None:
+    """Ask every configured device who it is and what is wrong. Powers nothing and moves nothing."""
+    import asyncio
+    import json
+    import sys
+
+    from collect.config import load_rig
+    from collect.doctor import examine
+    from drivers.clock import HostClock
+
+    findings = asyncio.run(examine(load_rig(config), HostClock()))
+    if as_json:
+        sys.stdout.writelines(json.dumps(finding.as_json()) + "\n" for finding in findings)
+    else:
+        import rich
+
+        from collect.doctor_table import doctor_table
+
+        rich.print(doctor_table(findings))
+    if not all(finding.well for finding in findings):
+        raise typer.Exit(4)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -43,6 +44,15 @@ class ArcsOptions:
     stale_after_ms: float = 500.0
     power_timeout_s: float = 60.0
     stop_acc_m_s2: float = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """The controller's words for robot mode and safety mode, and the median time of a call."""
+
+    mode: str
+    safety: str
+    latency_ms: float
 
 
 class AuboArcs:
@@ -110,6 +120,17 @@ class AuboArcs:
             await self._motion.ask("RobotManage.startup")
             await self._until_mode({RobotMode.RUNNING})
         await self._read_pose()
+
+    async def condition(self, calls: int) -> Condition:
+        """What the controller says of the arm now; asks only. `calls` of one kind are timed, one after the other."""
+        loop = asyncio.get_running_loop()
+        took_s: list[float] = []
+        for _ in range(calls):
+            began = loop.time()
+            await self._motion.pose()
+            took_s.append(loop.time() - began)
+        safety = str(await self._motion.ask("RobotState.getSafetyModeType"))
+        return Condition(str(await self._motion.mode()), safety, statistics.median(took_s) * 1e3)
 
     def check(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
         """Pure: raises `LimitExceeded`, asks nothing of the controller."""

@@ -116,6 +116,8 @@ class OpenCvCamera:
                     self._read_all(source, closing)
                 finally:
                     source.release()
+                if closing.is_set():
+                    return
                 if not source.live:
                     raise ConnectionLost(DEVICE, "read", f"{self._options.source} ended")
                 lost_ns = self._clock.now_ns()

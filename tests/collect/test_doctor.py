@@ -1,0 +1,68 @@
+"""The doctor: what answers, what is wrong, how to mend it; and nothing is powered by asking."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from collect.config import load_rig
+from collect.doctor import examine
+from drivers.arcs.codes import SafetyMode
+from drivers.clock import HostClock
+
+if TYPE_CHECKING:
+    from conftest import Lab
+
+
+async def test_a_rig_in_order_is_told_as_it_is_and_left_as_it_was(lab: Lab) -> None:
+    camera, robot = await examine(load_rig(lab.folder / "rig.toml"), HostClock())
+    assert robot.well
+    assert robot.identity == "aubo_i5 (brushloop-loopback)"
+    assert robot.latency_ms is not None
+    assert robot.latency_ms < 1000.0
+    assert "PowerOff, safety Normal, simulated" in robot.notes
+    assert lab.rig.arcs.mode == "PowerOff"
+    assert camera.well
+    assert camera.notes.startswith("board: ")
+    assert "ended" not in camera.notes
+
+
+async def test_a_board_that_cannot_be_seen_is_a_problem_with_a_remedy(lab: Lab) -> None:
+    path = lab.folder / "rig.toml"
+    path.write_text(path.read_text().replace("DICT_5X5_1000", "DICT_4X4_1000"))
+    camera, _ = await examine(load_rig(path), HostClock())
+    assert camera.answers
+    assert not camera.well
+    assert "board corners found" in camera.problem
+    assert "into view" in camera.remedy
+
+
+async def test_a_protective_stop_is_told_and_not_cleared(lab: Lab) -> None:
+    lab.rig.arcs.protective_stop(SafetyMode.PROTECTIVE_STOP)
+    _, robot = await examine(load_rig(lab.folder / "rig.toml"), HostClock())
+    assert robot.answers
+    assert not robot.well
+    assert "ProtectiveStop" in robot.problem
+    assert lab.rig.arcs.safety == SafetyMode.PROTECTIVE_STOP
+
+
+@pytest.mark.parametrize("flag", [(), ("--json",)])
+def test_a_cabinet_that_does_not_answer_ends_with_code_4_and_the_rest_is_told(lab: Lab, flag: tuple[str, ...]) -> None:
+    path = lab.folder / "rig.toml"
+    path.write_text(path.read_text().replace(f"port = {lab.rig.arcs.port}", "port = 9"))
+    command = [sys.executable, "-m", "brushloop", "doctor", "--config", str(path), *flag]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ran.returncode == 4
+    assert "Traceback" not in ran.stderr
+    if flag:
+        camera, robot = (json.loads(line) for line in ran.stdout.splitlines())
+        assert camera["answers"]
+        assert not robot["answers"]
+        assert "127.0.0.1:9" in robot["problem"]
+        assert robot["remedy"]
+    else:
+        assert "no answer" in ran.stdout
