@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from calibrate.errors import CalibrationError
+from calibrate.files import write_whole
 
 SCHEMA_VERSION = 1
 FOLDER = "calibration"
@@ -58,9 +59,7 @@ class Calibration(BaseModel):
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"{self.digest}.json"
         if not path.exists():
-            part = path.with_name(path.name + ".part")
-            part.write_bytes(self._canonical())
-            part.replace(path)
+            write_whole(path, self._canonical().decode())
         return path
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import tomllib
+import json
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -13,21 +13,25 @@ from pydantic import ValidationError
 from calibrate.artefact import FOLDER, Calibration
 from calibrate.errors import CalibrationError
 from calibrate.preprocess import Params
-from calibrate.scale import BoardSpec, find_corners, fit_plane
+from calibrate.scale import BoardSpec, see_board
 from sessions.messages import decode_gray
 from sessions.reader import Recording
+from sessions.schemas import Source
+
+EFFECTIVE = "rig.effective.json"
 
 
 def calibrate_session(session: Path) -> Path:
     """Calibrate and save beside the recording; returns the artefact's path. Raises `CalibrationError`."""
     recording = Recording(session)
+    if recording.header.source == Source.IMPORT:
+        raise CalibrationError(str(recording.path), "is an import and brings its own scale: go on with `validate`")
     where = str(recording.path)
     spec = _board_of(recording)
     stills = list(recording.stills_of("board"))
     if not stills:
         raise CalibrationError(where, "holds no view of the board (a `board` step)")
-    pixels, paper = find_corners(decode_gray(stills[-1], where), spec, where)
-    plane = fit_plane(pixels, paper, where)
+    plane = see_board(decode_gray(stills[-1], where), spec, where)
     low, high = plane.interval_mm_per_px
     calibration = Calibration(
         session_id=recording.header.session_id,
@@ -47,12 +51,13 @@ def calibrate_session(session: Path) -> Path:
 
 
 def _board_of(recording: Recording) -> BoardSpec:
-    where = f"{recording.path} rig.toml"
+    # The effective one: what the environment changed on top of rig.toml is in it.
+    where = f"{recording.path} {EFFECTIVE}"
     try:
-        rig: dict[str, Any] = tomllib.loads(recording.attachment("rig.toml").decode())
-        return BoardSpec.model_validate(rig.get("board"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise CalibrationError(where, f"is not TOML: {error}") from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise CalibrationError(where, f"board.{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        rig: Any = json.loads(recording.attachment(EFFECTIVE))
+        return BoardSpec.model_validate(rig["board"])
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            raise CalibrationError(where, f"board.{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise CalibrationError(where, "holds no board") from None

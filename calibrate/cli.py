@@ -13,6 +13,7 @@ def calibrate(
 ) -> None:
     """Fit scale and paper plane from the board in view; writes an immutable calibration/<hash>.json."""
     import rich
+    from rich.markup import escape
 
     from calibrate.artefact import load
     from calibrate.calibration import calibrate_session
@@ -21,7 +22,7 @@ def calibrate(
     made = load(path)
     rich.print(
         f"pix2len {made.mm_per_px:.5f} mm/px (95 %: {made.mm_per_px_low:.5f} to {made.mm_per_px_high:.5f}), "
-        f"board residual {made.rms_px:.3f} px over {made.corners} corners, {made.source}\n{path}"
+        f"board residual {made.rms_px:.3f} px over {made.corners} corners, {made.source}\n{escape(str(path))}"
     )
 
 
@@ -36,16 +37,20 @@ def validate(
     import sys
 
     import rich
+    from rich.markup import escape
 
     from calibrate.field import Field
     from calibrate.terminal import summary
     from calibrate.validation import validate_recording
     from calibrate.write import write_report
+    from sessions.reader import Recording
 
     command = " ".join(["brushloop", *sys.argv[1:]])
+    for one in session:
+        Recording(one)  # all of them can be read, before anything is written for the first
     for one in session:
         validation = validate_recording(one, model or [], Field(mm_per_px=mm_per_px), calibration)
         folder = out / validation.header.session_id if out else validation.recording.parent / "validation"
         report = write_report(validation, folder, command)
         rich.print(*summary(validation), sep="\n")
-        rich.print(f"Report: {report}")
+        rich.print(f"Report: {escape(str(report))}")

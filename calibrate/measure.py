@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from calibrate.preprocess import PX_PER_MM, Mask
 
@@ -24,6 +25,8 @@ class Measured:
     """Diameter of the largest circle that fits inside the outline: the width at its widest, bent or not."""
     mid_width_mm: float
     """The same over the middle third of the length: free of the blobs where a drag begins and ends."""
+    breadth_mm: float
+    """Greatest thickness across the heading; only for a straight stroke is this its width."""
     area_mm2: float
     """Ink, without the holes in it."""
 
@@ -32,13 +35,15 @@ def measure(mask: Mask) -> Measured:
     """Measure a non-empty mask at 20 px/mm."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     stroke = mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    inside = cv2.distanceTransform(np.pad(outline(stroke), 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[:, 1:-1]
+    filled = outline(stroke)
+    inside = cv2.distanceTransform(np.pad(filled, 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[:, 1:-1]
     third = stroke.shape[1] // 3
     middle = inside[:, third : stroke.shape[1] - third]
     return Measured(
         length_mm=stroke.shape[1] / PX_PER_MM,
         width_mm=_diameter_mm(float(inside.max())),
         mid_width_mm=_diameter_mm(float(middle.max())),
+        breadth_mm=float(filled.sum(axis=0).max()) / PX_PER_MM,
         area_mm2=float(np.count_nonzero(stroke)) / PX_PER_MM**2,
     )
 
@@ -72,8 +77,9 @@ class Line:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % interval of the slope (normal)."""
-        return self.slope - 1.96 * self.slope_se, self.slope + 1.96 * self.slope_se
+        """95 % interval of the slope (Student's t with n - 2 degrees of freedom)."""
+        reach = float(stats.t.ppf(0.975, self.n - 2)) * self.slope_se
+        return self.slope - reach, self.slope + reach
 
 
 def fit_line(x: list[float], y: list[float]) -> Line | None:

@@ -24,6 +24,7 @@ PX_PER_MM = 20.0
 MAX_RASTER_PX = 8192
 MIN_WINDOW_PX = 40
 LIGHT_ROUNDS = 5
+GATE_MM2 = 1.0
 PAPER_ABOVE = 0.85
 """Share of the fitted light above which a pixel counts as paper."""
 
@@ -98,7 +99,10 @@ def prepare(
     # Only the cell: neighbours' ink and the table's edge are no paper to measure the light by.
     reflectance = np.ones(raster.shape, np.float32)
     reflectance[window] = flatten(raster[window], params)
-    darkest = float(np.quantile(reflectance, 0.0005))
+    # The reflectance that at least GATE_MM2 of ink stays under: an area, so that the picture's size does not matter.
+    pixels = reflectance[window].ravel()
+    kth = min(round(GATE_MM2 * PX_PER_MM**2), pixels.size - 1)
+    darkest = float(np.partition(pixels, kth)[kth])
     if 1.0 - darkest < params.contrast_gate:
         raise CaptureRefused(
             where, f"is blank: darkest ink {1.0 - darkest:.2f} below paper, gate {params.contrast_gate}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -15,13 +16,14 @@ from calibrate.measure import Measured, measure
 from calibrate.preprocess import PX_PER_MM, Params, Prepared, prepare, rectify, rescale
 from calibrate.similarity import csim, ssim
 from calibrate.simulate import simulated
+from model.ccdbsm import DomainError
 from model.registry import StrokeModel
 from sessions.errors import SessionDamaged
 from sessions.reader import Capture
 from sessions.schemas import Stroke
 
 CEILING = "another press"
-"""A capture predicted by the other captures of its cell: no model can be expected to do better."""
+"""A capture predicted by each other capture of its cell, averaged: how well one press foretells another."""
 Key = tuple[Alignment, Tone]
 KEYS: tuple[Key, ...] = tuple(itertools.product(Alignment, Tone))
 
@@ -84,9 +86,14 @@ def validate_presses(
         if stroke.height_mm is None or stroke.tilt_deg is None:
             results.refused.append((stroke.stroke_id, "tells no depth or tilt"))
             continue
-        compared = _compared(stroke.stroke_id, stroke.height_mm, stroke.tilt_deg, prepared)
+        try:
+            compared = _compared(stroke.stroke_id, stroke.height_mm, stroke.tilt_deg, prepared)
+            scores = _score_models(results, compared, models, view, cache)
+        except (CaptureRefused, DomainError) as error:
+            results.refused.append((stroke.stroke_id, getattr(error, "what", str(error))))
+            continue
         results.strokes.append(compared)
-        _score_models(results, compared, models, view, cache)
+        results.scores += scores
     _score_ceiling(results)
     return results
 
@@ -117,6 +124,8 @@ def _crop(prepared: Prepared, view: Field) -> Prepared:
     rows, columns = slice(top + side, top + 2 * side), slice(left + side, left + 2 * side)
     anchor = (prepared.anchor_px[0] - left, prepared.anchor_px[1] - top)
     kept = mask[rows, columns]
+    if not kept.any():
+        raise CaptureRefused("anchor", "lies so far from the stroke that none of it is in the field")
     cut = prepared.cut or bool(np.count_nonzero(kept) < np.count_nonzero(prepared.mask))
     return Prepared(kept, soft[rows, columns], anchor, prepared.threshold, cut)
 
@@ -135,6 +144,9 @@ def _compared(stroke_id: str, height_mm: float, tilt_deg: float, prepared: Prepa
         (alignment, tone): (captured_mm if alignment is Alignment.MM else captured_normalised)(prepared, tone)
         for alignment, tone in KEYS
     }
+    for (alignment, tone), image in images.items():
+        if not image.any():
+            raise CaptureRefused(stroke_id, f"is too thin to be seen at the scale of {alignment} ({tone})")
     return Compared(stroke_id, height_mm, tilt_deg, measure(prepared.mask), prepared.cut, images)
 
 
@@ -144,16 +156,18 @@ def _score_models(
     models: dict[str, StrokeModel],
     view: Field,
     cache: dict[tuple[str, float, float, Key], Image],
-) -> None:
+) -> list[Score]:
+    scores: list[Score] = []
     for name, model in models.items():
         for key in KEYS:
             ident = (name, stroke.height_mm, stroke.tilt_deg, key)
             if ident not in cache:
                 cache[ident] = simulated(model, stroke.height_mm, stroke.tilt_deg, *key, view)
-            results.scores.append(_score(stroke, name, key, cache[ident]))
+            scores.append(_score(stroke, name, key, cache[ident]))
         results.predicted[(name, stroke.height_mm, stroke.tilt_deg)] = cache[
             (name, stroke.height_mm, stroke.tilt_deg, (Alignment.MM, Tone.GRAY))
         ]
+    return scores
 
 
 def _score_ceiling(results: PressResults) -> None:
@@ -161,8 +175,16 @@ def _score_ceiling(results: PressResults) -> None:
         return stroke.height_mm, stroke.tilt_deg
 
     for _, group in itertools.groupby(sorted(results.strokes, key=cell), key=cell):
-        for one, other in itertools.permutations(group, 2):
-            results.scores += [_score(one, CEILING, key, other.images[key]) for key in KEYS]
+        presses = list(group)
+        for one in presses:
+            others = [other for other in presses if other is not one]
+            if others:
+                results.scores += [_mean([_score(one, CEILING, key, o.images[key]) for o in others]) for key in KEYS]
+
+
+def _mean(scores: list[Score]) -> Score:
+    csims, ssims = [s.csim for s in scores], [s.ssim for s in scores]
+    return dataclasses.replace(scores[0], csim=sum(csims) / len(csims), ssim=sum(ssims) / len(ssims))
 
 
 def _score(stroke: Compared, model: str, key: Key, predicted: Image) -> Score:

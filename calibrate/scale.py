@@ -8,7 +8,7 @@ from typing import Annotated
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from calibrate.errors import CalibrationError
 
@@ -34,6 +34,14 @@ class BoardSpec(BaseModel):
     dictionary: Annotated[str, Field(pattern=r"^DICT_[0-9A-Z_]+$")] = "DICT_5X5_1000"
     origin_mm: tuple[Annotated[float, Field(allow_inf_nan=False)], Annotated[float, Field(allow_inf_nan=False)]]
     """Lower left corner of the board, in the paper frame."""
+
+    @model_validator(mode="after")
+    def _exists(self) -> BoardSpec:
+        if not isinstance(getattr(cv2.aruco, self.dictionary, None), int):
+            raise ValueError(f"dictionary = {self.dictionary!r} is not one of OpenCV's DICT_*")
+        if self.marker_mm >= self.square_mm:
+            raise ValueError(f"marker_mm = {self.marker_mm} must be less than square_mm = {self.square_mm}")
+        return self
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +106,11 @@ def fit_plane(pixels: Floats, paper_mm: Floats, where: str, seed: int = 0) -> Pl
     return PlaneFit(image_to_paper, local_scale(image_to_paper, middle), (low, high), rms_px, len(pixels), dropped)
 
 
+def see_board(image: NDArray[np.uint8], spec: BoardSpec, where: str = "camera") -> PlaneFit:
+    """Find the board and fit its plane. Raises `CalibrationError`."""
+    return fit_plane(*find_corners(image, spec, where), where)
+
+
 def local_scale(image_to_paper: Floats, pixel: Floats) -> float:
     """mm per pixel at a pixel: square root of the area of its image on the paper."""
     step = 0.5
@@ -135,14 +148,7 @@ def _homography(pixels: Floats, paper_mm: Floats, where: str) -> Floats:
 
 
 def _board(spec: BoardSpec, where: str) -> cv2.aruco.CharucoBoard:
-    number = getattr(cv2.aruco, spec.dictionary, None)
-    if not isinstance(number, int):
-        raise CalibrationError(where, f"board.dictionary = {spec.dictionary!r} is not one of OpenCV's DICT_*")
-    if spec.marker_mm >= spec.square_mm:
-        raise CalibrationError(
-            where, f"board.marker_mm = {spec.marker_mm} must be less than board.square_mm = {spec.square_mm}"
-        )
-    dictionary = cv2.aruco.getPredefinedDictionary(number)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
     try:
         return cv2.aruco.CharucoBoard(spec.squares, spec.square_mm, spec.marker_mm, dictionary)
     except cv2.error as error:

@@ -30,10 +30,14 @@ def summary(validation: Validation) -> Iterator[Table | str]:
 
 
 def _scores(results: PressResults, alignment: Alignment, title: str) -> Table:
-    out = Table("model", "n", "CSIM max", "min", "avg", "SSIM max", "min", "avg", "paper's avg", title=escape(title))
+    # The paper's numbers stand beside the table that was made as its own was, as far as it tells.
+    beside = alignment is Alignment.SIZE_NORMALISED
+    columns = ["model", "n", "CSIM max", "min", "avg", "SSIM max", "min", "avg", *(["paper's avg"] if beside else [])]
+    out = Table(*columns, title=escape(title))
     for row in table(results.scores, alignment, Tone.BINARY):
         paper = "" if row.paper_csim_avg is None else f"{row.paper_csim_avg:.2f} / {row.paper_ssim_avg:.2f}"
-        out.add_row(row.model, str(row.n), *(f"{v:.2f}" for v in (*row.csim, *row.ssim)), paper)
+        cells = [row.model, str(row.n), *(f"{v:.2f}" for v in (*row.csim, *row.ssim))]
+        out.add_row(*cells, *([paper] if beside else []))
     return out
 
 

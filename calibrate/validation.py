@@ -64,29 +64,41 @@ def validate_recording(session: Path, names: list[str], view: Field, calibration
     )
 
 
-def scores_csv(scores: list[Score]) -> str:
-    """Every score, one row each."""
+def scores_csv(scores: list[Score], source: str) -> str:
+    """Every score, one row each, with the kind of ink it is of."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["stroke_id", "height_mm", "tilt_deg", "model", "alignment", "tone", "csim", "ssim"])
+    writer.writerow(["stroke_id", "height_mm", "tilt_deg", "model", "alignment", "tone", "csim", "ssim", "source"])
     for s in scores:
         writer.writerow(
-            [s.stroke_id, s.height_mm, s.tilt_deg, s.model, s.alignment, s.tone, f"{s.csim:.6f}", f"{s.ssim:.6f}"]
+            [
+                s.stroke_id,
+                s.height_mm,
+                s.tilt_deg,
+                s.model,
+                s.alignment,
+                s.tone,
+                f"{s.csim:.6f}",
+                f"{s.ssim:.6f}",
+                source,
+            ]
         )
     return out.getvalue()
 
 
-def drags_csv(results: DragResults) -> str:
+def drags_csv(results: DragResults, source: str) -> str:
     """Commanded beside measured, one row a stroke."""
     names = sorted({name for drag in results.strokes for name in drag.commanded})
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    columns = ["measured_length_mm", "measured_width_mm", "measured_mid_width_mm", "measured_area_mm2", "cut"]
+    columns = ["measured_length_mm", "measured_width_mm", "measured_mid_width_mm", "measured_area_mm2", "cut", "source"]
     writer.writerow(["stroke_id", *(f"commanded_{name}" for name in names), *columns])
     for drag in results.strokes:
         m = drag.measured
         sizes = [f"{v:.3f}" for v in (m.length_mm, m.width_mm, m.mid_width_mm, m.area_mm2)]
-        writer.writerow([drag.stroke_id, *(drag.commanded.get(name, "") for name in names), *sizes, int(drag.cut)])
+        writer.writerow(
+            [drag.stroke_id, *(drag.commanded.get(name, "") for name in names), *sizes, int(drag.cut), source]
+        )
     return out.getvalue()
 
 

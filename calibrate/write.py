@@ -10,6 +10,7 @@ from typing import Any
 from calibrate import pictures
 from calibrate.drags import DragResults
 from calibrate.field import Alignment, Tone
+from calibrate.files import write_whole
 from calibrate.presses import CEILING, PressResults
 from calibrate.similarity import SSIM_SETTINGS
 from calibrate.tables import table
@@ -22,7 +23,7 @@ MAX_THUMBNAILS = 60
 
 
 def write_report(validation: Validation, folder: Path, command: str) -> Path:
-    """Write `report.html` and its CSV into `folder`; returns the report's path."""
+    """Write `report.html` and its CSV into `folder`; returns the report's path. Raises OSError."""
     from jinja2 import Environment, StrictUndefined
 
     # Names, licences and origins come from files of others: everything is escaped.
@@ -39,11 +40,11 @@ def write_report(validation: Validation, folder: Path, command: str) -> Path:
     )
     folder.mkdir(parents=True, exist_ok=True)
     if isinstance(results, PressResults):
-        _write_whole(folder / "scores.csv", scores_csv(results.scores))
+        write_whole(folder / "scores.csv", scores_csv(results.scores, validation.header.source))
     else:
-        _write_whole(folder / "measured.csv", drags_csv(results))
+        write_whole(folder / "measured.csv", drags_csv(results, validation.header.source))
     report = folder / "report.html"
-    _write_whole(report, page)
+    write_whole(report, page)
     return report
 
 
@@ -63,6 +64,7 @@ def _presses(validation: Validation, results: PressResults) -> dict[str, Any]:
         "strokes": len(results.strokes),
         "tables": tables,
         "ceiling": CEILING,
+        "has_ceiling": any(score.model == CEILING for score in results.scores),
         "models": list(validation.models.values()),
         "field": validation.field,
         "ssim_settings": SSIM_SETTINGS,
@@ -143,9 +145,3 @@ def _brush(validation: Validation) -> str:
     if header.brush_radius_mm is None or header.brush_length_mm is None:
         return header.brush or "not known"
     return f"{header.brush}, R = {header.brush_radius_mm:g} mm, L = {header.brush_length_mm:g} mm"
-
-
-def _write_whole(path: Path, text: str) -> None:
-    part = path.with_name(path.name + ".part")
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)

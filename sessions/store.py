@@ -22,7 +22,7 @@ from sessions.schemas import Header, Recorded
 from sessions.writer import SegmentWriter
 
 SESSION_ID = re.compile(r"[0-9A-Za-z][0-9A-Za-z._-]{0,99}")
-SNAPSHOT_NAMES = ("rig.toml", "protocol.toml")
+SNAPSHOT_NAMES = ("rig.toml", "protocol.toml", "rig.effective.json")
 Snapshots = dict[str, str]
 """File name -> text of the configuration that a session was started with."""
 
@@ -135,10 +135,14 @@ class SessionStore:
         self.state.sheet += 1
         self._log({"event": "sheet", "sheet": self.state.sheet})
 
-    def close(self) -> Path:
-        """Verify every segment, merge, read back, journal `closed`. Returns the merged file."""
+    def verify(self) -> None:
+        """Raise `SessionDamaged` naming the first finished step whose file is missing or has changed."""
         for line in self.state.segments:
             verify(self.folder / str(line["file"]), str(line["sha256"]))
+
+    def close(self) -> Path:
+        """Verify every segment, merge, read back, journal `closed`. Returns the merged file."""
+        self.verify()
         final = self.folder / f"{self.folder.name}.mcap"
         files = [self.folder / str(line["file"]) for line in self.state.segments]
         snapshots = [path for name in SNAPSHOT_NAMES if (path := self.folder / name).is_file()]

@@ -80,6 +80,25 @@ def test_a_mark_drawn_by_a_model_is_recognised_by_it(model: str, height_mm: floa
             assert score.csim < 0.98, score
 
 
+@pytest.mark.parametrize("height_mm", [11.0, 13.0, 15.0, 17.0, 20.0])
+@pytest.mark.parametrize("tilt_deg", [0.0, 5.0, 10.0])
+def test_nothing_is_lost_by_moving_a_stroke_to_the_middle(height_mm: float, tilt_deg: float) -> None:
+    results = validate([capture("one", drawn(height_mm, tilt_deg), height_mm, tilt_deg)])
+    [score] = [
+        s
+        for s in results.scores
+        if s.model == "ccd-bsm" and s.alignment is Alignment.SIZE_NORMALISED and s.tone is Tone.BINARY
+    ]
+    assert score.csim > 0.993
+    assert score.ssim > 0.96
+
+
+def test_a_press_that_no_model_can_predict_is_listed_by_name() -> None:
+    results = validate([capture("deep", drawn(20.0, 0.0), 60.0, 0.0)])
+    assert [name for name, _ in results.refused] == ["deep"]
+    assert results.scores == []
+
+
 def test_a_capture_shifted_by_a_millimetre_is_punished_in_mm_and_forgiven_when_normalised() -> None:
     moved = np.roll(drawn(15.0, 0.0), 10, axis=0)
     results = validate([capture("moved", moved, 15.0, 0.0)])
@@ -99,7 +118,7 @@ def test_repeats_of_a_cell_give_the_ceiling() -> None:
     image = drawn(13.0, 5.0)
     results = validate([capture("r1", image, 13.0, 5.0), capture("r2", image, 13.0, 5.0)])
     ceiling = [s for s in results.scores if s.model == CEILING]
-    assert len(ceiling) == 2 * 4
+    assert len(ceiling) == 2 * 4  # one a stroke, for each alignment and tone
     assert all(s.csim == pytest.approx(1.0) and s.ssim == pytest.approx(1.0) for s in ceiling)
 
 

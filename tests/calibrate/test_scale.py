@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from calibrate.errors import CalibrationError
 from calibrate.scale import BoardSpec, apply, find_corners, fit_plane, local_scale
@@ -92,5 +93,5 @@ def test_corners_that_do_not_fit_one_plane_are_refused() -> None:
     [({"dictionary": "DICT_NONE"}, "not one of OpenCV's"), ({"marker_mm": 20.0}, "must be less than")],
 )
 def test_a_board_that_cannot_be_is_refused(change: dict[str, object], words: str) -> None:
-    with pytest.raises(CalibrationError, match=words):
-        find_corners(np.zeros((64, 64), np.uint8), SPEC.model_copy(update=change), "photo")
+    with pytest.raises(ValidationError, match=words):
+        BoardSpec.model_validate(SPEC.model_dump() | change)
