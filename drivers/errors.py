@@ -73,16 +73,20 @@ class RpcError(DeviceError):
 class LimitExceeded(DeviceError, ValueError):
     """A target lies outside the configured limits; nothing has moved."""
 
-    def __init__(self, device: str, field: str, value: float, low: float, high: float, unit: str) -> None:
+    def __init__(
+        self, device: str, field: str, value: float, low: float, high: float, unit: str, *, remedy: str = ""
+    ) -> None:
         self.field = field
         self.value = value
         self.low = low
         self.high = high
+        self.unit = unit
         super().__init__(
             device,
             "check",
             f"{field} = {value:.3f} {unit} is outside [{low:.3f}, {high:.3f}] {unit}",
             condition="Nothing has moved.",
+            remedy=remedy,
         )
 
 

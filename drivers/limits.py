@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from drivers.errors import LimitExceeded
-from drivers.geometry import lean
+from drivers.geometry import distance, lean
 from drivers.samples import Pose
 
 TILT_SLACK_DEG = 1e-6
@@ -24,6 +24,30 @@ class Limits:
     tilt_deg: float
     speed_mm_s: float
     acc_mm_s2: float
+    turn_deg_s: float = 45.0
+    """Fastest turn of the tool: a short line with a large turn would otherwise be a fling of the wrist."""
+
+    def turn_capped(self, start: Pose, target: Pose, speed_mm_s: float) -> float:
+        """The speed along the line at which the tool turns no faster than allowed, in mm/s."""
+        travel_mm, turn_deg = distance(start, target)
+        if travel_mm < 1.0 or turn_deg < 0.1:
+            return speed_mm_s  # in place, ARCS reads mm/s as thousandths of rad/s, which is slow
+        return max(min(speed_mm_s, self.turn_deg_s * travel_mm / turn_deg), 0.1)
+
+    def check_start(self, device: str, here: Pose) -> None:
+        """Raise `LimitExceeded` where the arm stands outside the box or the cone: no line from there is known."""
+        try:
+            self.check(device, here, speed_mm_s=self.speed_mm_s, acc_mm_s2=self.acc_mm_s2)
+        except LimitExceeded as error:
+            raise LimitExceeded(
+                device,
+                f"the arm stands where {error.field}",
+                error.value,
+                error.low,
+                error.high,
+                error.unit,
+                remedy="The brush may be down. Jog the arm up, into the box and upright, then start again.",
+            ) from None
 
     def check(self, device: str, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
         """Raise `LimitExceeded` naming the first field that is out of range; NaN is out of every range."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
+from drivers.force.samples import ForceSample
 from drivers.samples import Frame, Identity, Pose, PoseSample, Stamp
 
 
@@ -30,6 +31,10 @@ class Robot(Protocol):
 
     def latest(self) -> PoseSample:
         """The newest pose; never blocks. Raises `Stale` when it is too old to act on."""
+        ...
+
+    async def where(self) -> Pose:
+        """The pose now, asked of the controller."""
         ...
 
     def listen(self, on_sample: Callable[[PoseSample], None] | None) -> None:
@@ -62,25 +67,47 @@ class Camera(Protocol):
         ...
 
 
+@runtime_checkable
 class ForceSensor(Protocol):
     """A force sensor between flange and brush; optional in a rig."""
 
+    async def connect(self) -> Identity:
+        """Open the bus, start the stream and wait for the first sample."""
+        ...
+
     def latest_n(self) -> tuple[float, float, float]:
         """The newest force in N; never blocks. Raises `Stale`."""
+        ...
+
+    def listen(self, on_sample: Callable[[ForceSample], None] | None) -> None:
+        """Hand every sample to `on_sample`, in the event loop; None ends it."""
         ...
 
     async def bias(self, seconds: float) -> None:
         """Average for `seconds` with nothing touching, and subtract that from now on."""
         ...
 
+    async def close(self) -> None:
+        """Stop the stream and release the bus."""
+        ...
 
+
+@runtime_checkable
 class Ink(Protocol):
     """An ink station; optional in a rig."""
 
-    async def dose(self, volume_ml: float) -> None:
-        """Add ink to the well."""
+    async def connect(self) -> Identity:
+        """Open the line and make sure that the right device answers; gives no ink."""
         ...
 
-    async def level(self) -> float:
-        """Fill level of the well, 0 to 1."""
+    async def dose(self, volume_ml: float) -> None:
+        """Add ink to the well. Raises `LimitExceeded` before anything is sent."""
+        ...
+
+    async def level(self) -> float | None:
+        """Fill level of the well, 0 to 1; None where the device has no gauge."""
+        ...
+
+    async def close(self) -> None:
+        """Leave the device at rest and release the line."""
         ...

@@ -70,4 +70,4 @@ class Identity:
     model: str
     firmware: str
     simulated: bool
-    """True only where the device itself says that it is the loopback rig; never taken from configuration."""
+    """True where the device itself says that it is the loopback rig, or shows a recording; never from configuration."""

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
+import statistics
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from drivers.arcs.codes import (
@@ -13,10 +17,20 @@ from drivers.arcs.codes import (
     SafetyMode,
     refusal,
 )
+from drivers.arcs.errors import QueueFull
 from drivers.arcs.rpc import DEVICE, RpcConnection
-from drivers.errors import MotionRefused, ProtocolViolation, RobotNotSafe
+from drivers.errors import DeviceError, MotionRefused, ProtocolViolation, RobotNotSafe
 from drivers.geometry import from_wire, to_wire
 from drivers.samples import Pose
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """The controller's words for robot mode and safety mode, and the median time of a call."""
+
+    mode: str
+    safety: str
+    latency_ms: float
 
 
 class Controller:
@@ -25,6 +39,8 @@ class Controller:
     def __init__(self, connection: RpcConnection) -> None:
         self.connection = connection
         self.robot = ""
+        self.on_notice: Callable[[str], None] | None = None
+        self._reduced = False
 
     async def ask(self, method: str, **params: object) -> Any:
         """The answer of a method of the robot's, unchecked."""
@@ -58,8 +74,19 @@ class Controller:
         except ValueError:
             raise ProtocolViolation(DEVICE, "getRobotModeType", f"unknown mode {mode!r}") from None
 
+    async def condition(self, calls: int) -> Condition:
+        """Asks only; `calls` of one kind are timed, one after the other."""
+        loop = asyncio.get_running_loop()
+        took_s: list[float] = []
+        for _ in range(calls):
+            began = loop.time()
+            await self.pose()
+            took_s.append(loop.time() - began)
+        safety = str(await self.ask("RobotState.getSafetyModeType"))
+        return Condition(str(await self.mode()), safety, statistics.median(took_s) * 1e3)
+
     async def require_safe(self, op: str) -> None:
-        """Raise `RobotNotSafe`, with condition and remedy, unless the safety mode allows motion."""
+        """Raise `RobotNotSafe`, with condition and remedy, unless the mode allows motion; reduced is reported."""
         mode = str(await self.ask("RobotState.getSafetyModeType"))
         if mode not in MOVING_ALLOWED:
             known = mode in set(SafetyMode)
@@ -67,6 +94,9 @@ class Controller:
                 CONDITION_AND_REMEDY.get(SafetyMode(mode), UNKNOWN_CONDITION) if known else UNKNOWN_CONDITION
             )
             raise RobotNotSafe(DEVICE, op, mode, condition, remedy)
+        reduced, self._reduced = self._reduced, mode == SafetyMode.REDUCED
+        if self._reduced and not reduced and self.on_notice is not None:
+            self.on_notice("safety mode is ReducedMode: the arm may be slower than asked")
 
     async def move_line(self, target: Pose, speed_mm_s: float, acc_mm_s2: float) -> None:
         """Queue a straight line. Raises `RobotNotSafe` or `MotionRefused`; already there is fine."""
@@ -82,6 +112,15 @@ class Controller:
             await self.require_safe("moveLine")
         accepted("moveLine", code)
 
+    async def move_joint(self, joints: list[float], speed_rad_s: float, acc_rad_s2: float) -> None:
+        """Queue a move that is straight in joints. Raises as `move_line` does."""
+        code = await self.ask(
+            "MotionControl.moveJoint", q=joints, a=acc_rad_s2, v=speed_rad_s, blend_radius=0.0, duration=0.0
+        )
+        if code not in (ReturnCode.OK, ReturnCode.REQUEST_IGNORED):
+            await self.require_safe("moveJoint")
+        accepted("moveJoint", code)
+
     async def at_rest(self) -> bool:
         """True when the queue is empty and the arm is steady."""
         return await self.ask("MotionControl.getExecId") == -1 and await self.ask("RobotState.isSteady") is True
@@ -90,8 +129,10 @@ class Controller:
         """Decelerate along the path, then drop whatever is queued, the second also where the first fails."""
         try:
             await self.ask("MotionControl.stopLine", acc=acc_m_s2, acc_rot=acc_m_s2)
-        finally:
+        except DeviceError:
             await self.connection.call("RuntimeMachine.abort")
+            raise
+        await self.connection.call("RuntimeMachine.abort")
 
 
 def accepted(op: str, code: object) -> None:
@@ -100,4 +141,5 @@ def accepted(op: str, code: object) -> None:
         raise ProtocolViolation(DEVICE, op, f"expected a return code, got {code!r}")
     if code not in (ReturnCode.OK, ReturnCode.REQUEST_IGNORED):
         name, remedy = refusal(code)
-        raise MotionRefused(DEVICE, op, code, name, remedy)
+        error = QueueFull if code == ReturnCode.QUEUE_FULL else MotionRefused
+        raise error(DEVICE, op, code, name, remedy)

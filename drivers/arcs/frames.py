@@ -19,6 +19,13 @@ MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
 """Far above any reply of a controller; a hostile length must not make the host allocate gigabytes."""
 
 
+def encode_short(payload: bytes) -> bytes:
+    """One frame with a 16-bit length, as RTDE uses. Raises ValueError where the payload does not fit."""
+    if len(payload) > 0xFFFF:
+        raise ValueError(f"payload of {len(payload)} bytes exceeds 65535")
+    return MAGIC + bytes([FLAG_SHORT]) + struct.pack(">H", len(payload)) + payload
+
+
 def encode(payload: bytes) -> bytes:
     """One frame with a 32-bit length. Raises ValueError above `MAX_PAYLOAD_BYTES`."""
     if len(payload) > MAX_PAYLOAD_BYTES:
@@ -29,8 +36,11 @@ def encode(payload: bytes) -> bytes:
 class FrameDecoder:
     """Turns a byte stream, cut anywhere, into payloads."""
 
-    def __init__(self, device: str = "arcs") -> None:
+    def __init__(self, device: str = "arcs", *, skip: bytes = b"", max_bytes: int = MAX_PAYLOAD_BYTES) -> None:
+        """`skip` is what may stand between frames and means nothing."""
         self._device = device
+        self._skip = skip
+        self._max_bytes = max_bytes
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
@@ -42,7 +52,11 @@ class FrameDecoder:
         return payloads
 
     def _next(self) -> bytes | None:
-        buffer = self._buffer
+        buffer, skip = self._buffer, self._skip
+        while skip and buffer.startswith(skip):
+            del buffer[: len(skip)]
+        if 0 < len(buffer) < len(skip) and skip.startswith(bytes(buffer)):
+            return None
         if not MAGIC.startswith(bytes(buffer[:3])):
             raise ProtocolViolation(self._device, "decode", f"expected SOF, got {bytes(buffer[:8])!r}")
         if len(buffer) < 4:
@@ -56,8 +70,8 @@ class FrameDecoder:
                 raise ProtocolViolation(self._device, "decode", f"unknown SOF flag {flag:#04x}")
         if size is None:
             return None
-        if size > MAX_PAYLOAD_BYTES:
-            raise ProtocolViolation(self._device, "decode", f"frame of {size} bytes exceeds {MAX_PAYLOAD_BYTES}")
+        if size > self._max_bytes:
+            raise ProtocolViolation(self._device, "decode", f"frame of {size} bytes exceeds {self._max_bytes}")
         if len(buffer) < head + size:
             return None
         payload = bytes(buffer[head : head + size])

@@ -3,74 +3,57 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import statistics
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Coroutine, Sequence
 
 from drivers.arcs.codes import LOOPBACK_CONTROL_BOX, RobotMode
-from drivers.arcs.controller import Controller
+from drivers.arcs.controller import Condition, Controller
+from drivers.arcs.generation import open_arcs
+from drivers.arcs.joints import checked_path, reachable
+from drivers.arcs.messages import Messages
+from drivers.arcs.options import ArcsOptions
+from drivers.arcs.readying import make_ready
 from drivers.arcs.rpc import DEVICE, RpcConnection
+from drivers.arcs.stopping import Stopper
+from drivers.arcs.telemetry import Telemetry
 from drivers.arcs.waiting import Tolerance, planned_s, until_mode, until_settled
+from drivers.arcs.watchdog import Watchdog
 from drivers.clock import Clock
-from drivers.errors import (
-    ConnectionLost,
-    DeviceError,
-    DeviceTimeout,
-    NotConnected,
-    ProtocolViolation,
-    RpcError,
-    Stale,
-    WrongGeneration,
-)
+from drivers.errors import DeviceError, MotionFailed, NotConnected
 from drivers.limits import Limits
-from drivers.samples import Identity, Pose, PoseSample, Stamp
+from drivers.samples import Identity, Pose, PoseSample
+
+__all__ = ["ArcsOptions", "AuboArcs", "Condition"]
 
 AUBOPE_PORT = 8899
-
-
-@dataclass(frozen=True, slots=True)
-class ArcsOptions:
-    """Where the controller is and how the arm is set up."""
-
-    host: str
-    port: int = 30004
-    tcp_offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Flange to brush tip."""
-    position_tolerance_mm: float = 0.05
-    rotation_tolerance_deg: float = 0.1
-    poll_s: float = 0.02
-    telemetry_hz: float = 100.0
-    stale_after_ms: float = 500.0
-    power_timeout_s: float = 60.0
-    stop_acc_m_s2: float = 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class Condition:
-    """The controller's words for robot mode and safety mode, and the median time of a call."""
-
-    mode: str
-    safety: str
-    latency_ms: float
 
 
 class AuboArcs:
     """`Robot` for an Aubo arm under ARCS. FK and IK are the controller's; units on the wire are m, rad, s."""
 
-    def __init__(self, options: ArcsOptions, limits: Limits, clock: Clock) -> None:
+    def __init__(
+        self,
+        options: ArcsOptions,
+        limits: Limits,
+        clock: Clock,
+        on_notice: Callable[[str], None] = lambda _text: None,
+    ) -> None:
         self._options = options
         self._limits = limits
-        self._clock = clock
+        self._notice = on_notice
         self._motion, self._state, self._stop = (
-            Controller(RpcConnection(options.host, options.port)) for _ in range(3)
+            Controller(RpcConnection(options.host, options.port, framing=options.framing)) for _ in range(3)
         )
         self._reopening = asyncio.Lock()
+        self._stopper = Stopper([self._stop, self._state], self._motion, self._restore_stop)
+        self._own_stops: set[asyncio.Task[None]] = set()
+        self._unsettled = False
+        """True from the moment a line is sent until the arm was seen at rest."""
         self._connected = False
         self._enabled = False
-        self._latest: PoseSample | None = None
-        self._listener: Callable[[PoseSample], None] | None = None
-        self._telemetry: asyncio.Task[None] | None = None
+        self._telemetry = Telemetry(self._state, options, clock, on_notice)
+        self._watchdog = Watchdog(self._state.connection, options.watchdog_s, on_notice)
+        self._messages = Messages(self._motion)
+        self._motion.on_notice = on_notice
 
     async def connect(self) -> Identity:
         """Connect and identify; telemetry runs from here on. Raises `WrongGeneration` for AUBOPE cabinets.
@@ -84,17 +67,7 @@ class AuboArcs:
             raise
 
     async def _connect(self) -> Identity:
-        try:
-            await self._state.connection.open()
-        except (ConnectionLost, DeviceTimeout):
-            if await self._answers(AUBOPE_PORT):
-                raise WrongGeneration(
-                    DEVICE,
-                    "connect",
-                    f"port {self._options.port} does not answer but {AUBOPE_PORT} does: this cabinet runs AUBOPE (V4)",
-                    remedy="It needs the ARCS software; ask the maker for the upgrade.",
-                ) from None
-            raise
+        await open_arcs(self._state.connection, AUBOPE_PORT)
         version = await self._state.connection.call("SystemInfo.getInterfaceVersionCode")
         await self._state.connection.login()
         for controller in (self._stop, self._motion):
@@ -105,32 +78,35 @@ class AuboArcs:
         self._connected = True
         model = str(await self._state.ask("RobotConfig.getRobotType"))
         box = str(await self._state.ask("RobotConfig.getControlBoxType"))
-        await self._read_pose()
-        self._telemetry = asyncio.create_task(self._poll(), name="robot telemetry")
-        return Identity(DEVICE, f"{model} ({box})", f"interface {version}", box == LOOPBACK_CONTROL_BOX)
+        await self._telemetry.start()
+        firmware = f"interface {version}"
+        if self._options.rtde_port is not None:
+            firmware += f", telemetry by {self._telemetry.source}"
+        return Identity(DEVICE, f"{model} ({box})", firmware, box == LOOPBACK_CONTROL_BOX)
 
     async def enable(self) -> None:
-        """Set the tool offset, power on, release the brakes; moves nothing. Raises `RobotNotSafe`, `DeviceTimeout`."""
+        """Check the mode, set the tool, power on, release the brakes, arm the watchdog; moves nothing.
+
+        Raises `WrongOperationalMode`, `RobotNotSafe`, `MotionRefused`, `DeviceTimeout`.
+        """
         self._enabled = True
-        await self._motion.set_tcp_offset(self._options.tcp_offset_mm)
+        if not await self._motion.at_rest():
+            # A process that was killed may have left a line in the queue; nothing is set or computed meanwhile.
+            await self.stop()
+        await make_ready(self._motion, self._options, self._notice)
         await self._motion.require_safe("power on")
         if await self._motion.mode() != RobotMode.RUNNING:
             await self._motion.ask("RobotManage.poweron")
             await self._until_mode({RobotMode.IDLE, RobotMode.RUNNING})
             await self._motion.ask("RobotManage.startup")
             await self._until_mode({RobotMode.RUNNING})
-        await self._read_pose()
+        await self._messages.begin()
+        await self._watchdog.arm()
+        await self._telemetry.read()
 
     async def condition(self, calls: int) -> Condition:
         """What the controller says of the arm now; asks only. `calls` of one kind are timed, one after the other."""
-        loop = asyncio.get_running_loop()
-        took_s: list[float] = []
-        for _ in range(calls):
-            began = loop.time()
-            await self._motion.pose()
-            took_s.append(loop.time() - began)
-        safety = str(await self._motion.ask("RobotState.getSafetyModeType"))
-        return Condition(str(await self._motion.mode()), safety, statistics.median(took_s) * 1e3)
+        return await self._motion.condition(calls)
 
     def check(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
         """Pure: raises `LimitExceeded`, asks nothing of the controller."""
@@ -143,10 +119,31 @@ class AuboArcs:
         """
         self.check(target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
         await self._restore_stop()
+        start = await self._motion.pose()
+        speed_mm_s = self._limits.turn_capped(start, target, speed_mm_s)
+        expected_s = planned_s(start, target, speed_mm_s, acc_mm_s2)
+        await self._carry_out(self._motion.move_line(target, speed_mm_s, acc_mm_s2), target, expected_s)
+
+    async def move_joint(self, joints_rad: Sequence[float], *, speed_rad_s: float, acc_rad_s2: float) -> None:
+        """moveJoint, then wait as `move` does. The whole way is checked, by poses that the controller computes.
+
+        Only for an arm that is enabled: before, its tool is not set and the poses are of something else.
+        """
+        self._require_enabled("moveJoint")
+        await self._restore_stop()
+        target, expected_s = await checked_path(self._motion, self._limits, joints_rad, speed_rad_s, acc_rad_s2)
+        await self._carry_out(self._motion.move_joint([*joints_rad], speed_rad_s, acc_rad_s2), target, expected_s)
+
+    async def reachable(self, target: Pose) -> bool:
+        """Whether the controller finds joints for the tip pose. Raises `NotConnected` before `enable`."""
+        self._require_enabled("reachable")
+        return await reachable(self._motion, target)
+
+    async def _carry_out(self, command: Coroutine[None, None, None], target: Pose, expected_s: float) -> None:
         options = self._options
-        expected_s = planned_s(await self._motion.pose(), target, speed_mm_s, acc_mm_s2)
+        self._unsettled = True
         try:
-            await self._motion.move_line(target, speed_mm_s, acc_mm_s2)
+            await command
             await until_settled(
                 self._motion,
                 target,
@@ -154,54 +151,77 @@ class AuboArcs:
                 planned_s=expected_s,
                 poll_s=options.poll_s,
             )
+            self._unsettled = False
         except BaseException as error:
+            note = ""
             try:
-                await asyncio.shield(self.stop())
+                await asyncio.shield(self._own_stop())
             except DeviceError as failure:
-                error.add_note(f"The arm may still be moving; stopping it failed too: {failure}")
+                note = str(failure)
+                error.add_note(note)
+            if isinstance(error, MotionFailed) and (cause := await self._messages.explain(error)) is not error:
+                if note:
+                    cause.add_note(note)
+                raise cause from error
             raise
 
+    def _require_enabled(self, op: str) -> None:
+        if not self._enabled:
+            raise NotConnected(DEVICE, op, "not enabled")
+
     async def stop(self) -> None:
-        """Decelerate along the path, then drop whatever is queued; on its own socket, opened again if it was lost."""
+        """Decelerate along the path, drop whatever is queued, and return once the arm is seen at rest.
+
+        Raises `MotionFailed` where it is not: then only the emergency stop is left.
+        """
         if not self._connected:
             raise NotConnected(DEVICE, "stop", "not connected")
-        try:
-            await self._stop.halt(self._options.stop_acc_m_s2)
-        except ConnectionLost:
-            await self._restore_stop()
-            await self._stop.halt(self._options.stop_acc_m_s2)
+        await self._stopper.stop(self._options.stop_acc_m_s2)
+        self._unsettled = False
+
+    async def where(self) -> Pose:
+        """The pose as the controller tells it now, whatever telemetry does."""
+        return await self._motion.pose()
+
+    def _own_stop(self) -> asyncio.Task[None]:
+        """A stop that goes on although whoever asked for it is cancelled; `close` waits for it."""
+        task = asyncio.create_task(self.stop(), name="stop after a move that failed")
+        self._own_stops.add(task)
+        task.add_done_callback(self._own_stops.discard)
+        return task
 
     def latest(self) -> PoseSample:
         """The newest pose. Raises `NotConnected` before the first, `Stale` after `stale_after_ms`."""
-        if self._latest is None:
-            raise NotConnected(DEVICE, "latest", "no pose yet")
-        age_ms = (self._clock.now_ns() - self._latest.stamp.host_ns) / 1e6
-        if age_ms > self._options.stale_after_ms:
-            raise Stale(DEVICE, age_ms, self._options.stale_after_ms)
-        return self._latest
+        return self._telemetry.latest()
 
     def listen(self, on_sample: Callable[[PoseSample], None] | None) -> None:
         """Hand every telemetry sample to `on_sample` in the event loop."""
-        self._listener = on_sample
+        self._telemetry.listener = on_sample
 
     async def close(self) -> None:
         """Stop, end telemetry, close all sockets in reverse order of opening.
 
-        An arm that was never enabled from here is not stopped: it may be somebody else's motion.
+        An arm that was never enabled from here is not stopped: it may be somebody else's motion. Raises `MotionFailed`
+        where a line was under way and the arm is not seen at rest.
         """
-        self._listener = None
+        self._telemetry.listener = None
+        await asyncio.gather(*self._own_stops, return_exceptions=True)
         try:
             if self._enabled:
-                with contextlib.suppress(DeviceError):
+                under_way = self._unsettled
+                try:
                     await self.stop()
+                except DeviceError:
+                    # What cannot be stopped from here the controller stops by itself.
+                    await self._watchdog.abandon()
+                    if under_way:
+                        raise
         finally:
             await self._hang_up()
 
     async def _hang_up(self) -> None:
-        if self._telemetry is not None:
-            self._telemetry.cancel()
-            await asyncio.gather(self._telemetry, return_exceptions=True)
-            self._telemetry = None
+        await self._telemetry.stop()
+        await self._watchdog.disarm()
         for controller in (self._motion, self._stop, self._state):
             await controller.connection.close()
         self._connected = self._enabled = False
@@ -215,30 +235,3 @@ class AuboArcs:
         async with self._reopening:
             if self._stop.connection.lost:
                 await self._stop.connection.reopen()
-
-    async def _poll(self) -> None:
-        loop = asyncio.get_running_loop()
-        period_s = 1.0 / self._options.telemetry_hz
-        due = loop.time()
-        while True:
-            # A gap shows as an old sample (`Stale`); the motion path reports the cause.
-            with contextlib.suppress(DeviceTimeout, ConnectionLost, ProtocolViolation, RpcError):
-                await self._read_pose()
-            due = max(due + period_s, loop.time())
-            await asyncio.sleep(due - loop.time())
-
-    async def _read_pose(self) -> None:
-        pose = await self._state.pose()
-        seq = self._latest.stamp.seq + 1 if self._latest else 0
-        self._latest = PoseSample(Stamp(self._clock.now_ns(), None, seq), pose)
-        if self._listener is not None:
-            self._listener(self._latest)
-
-    async def _answers(self, port: int) -> bool:
-        probe = RpcConnection(self._options.host, port)
-        try:
-            await probe.open()
-        except DeviceError:
-            return False
-        await probe.close()
-        return True

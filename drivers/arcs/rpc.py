@@ -1,4 +1,8 @@
-"""One JSON-RPC connection to an ARCS controller: SOF frames, named params, one request outstanding at a time."""
+"""One JSON-RPC connection to an ARCS controller, in one of two framings, with one request outstanding at a time.
+
+`sof` is what the maker's client sends: SOF frames, named params, string ids, a login. `bare` is what the maker
+documents: JSON and nothing else, positional params, integer ids, no login.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +12,15 @@ import json
 import secrets
 import string
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
+from drivers.arcs.bare import BareDecoder
 from drivers.arcs.frames import FrameDecoder, encode
+from drivers.arcs.signatures import positional
 from drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, RpcError
 
 DEVICE = "robot"
+Framing = Literal["sof", "bare"]
 SDK_INTERFACE_VERSION = "0.24.0"
 # What the vendor's client 0.24.1 sends for the factory account; its obfuscation of other passwords is not known.
 FACTORY_LOGIN_TOKEN = "3353545435353664345433434443435463466335333566235443434253142434333426365553"
@@ -34,17 +41,26 @@ def encode_request(ident: str, method: str, params: Mapping[str, object] | None)
     return json.dumps(body, separators=(",", ":"), sort_keys=True).encode()
 
 
+def encode_bare_request(ident: int, method: str, params: Mapping[str, object] | None) -> bytes:
+    """As the maker documents it. Raises ValueError for a parameter that the method does not have."""
+    values = positional(method, params or {})
+    body = {"jsonrpc": "2.0", "method": method, "params": values, "id": ident}
+    return json.dumps(body, separators=(",", ":")).encode()
+
+
 class RpcConnection:
     """A socket with one caller at a time; late replies to calls that timed out are dropped."""
 
-    def __init__(self, host: str, port: int, *, timeout_s: float = 1.0) -> None:
+    def __init__(self, host: str, port: int, *, timeout_s: float = 1.0, framing: Framing = "sof") -> None:
         self.host = host
         self.port = port
         self._timeout_s = timeout_s
+        self._framing = framing
+        self._last_id = 0
         self._lock = asyncio.Lock()
         self._writer: asyncio.StreamWriter | None = None
         self._reader_task: asyncio.Task[None] | None = None
-        self._pending: tuple[str, str, asyncio.Future[Any]] | None = None
+        self._pending: tuple[str | int, str, asyncio.Future[Any]] | None = None
         self._lost: str | None = None
 
     @property
@@ -68,14 +84,19 @@ class RpcConnection:
         self._reader_task = asyncio.create_task(self._read(reader), name=f"rpc {self.host}:{self.port}")
 
     async def login(self) -> None:
-        """Send the login frame of the factory account and wait for any reply."""
+        """Send the login frame of the factory account and wait for any reply; bare clients have no login."""
+        if self._framing == "bare":
+            return
         token = f"__login__\naubo\n{FACTORY_LOGIN_TOKEN}\n{SDK_INTERFACE_VERSION}\n"
-        await self._exchange("", "login", token.encode())
+        await self._exchange("", "login", encode(token.encode()))
 
     async def call(self, method: str, params: Mapping[str, object] | None = None) -> Any:
         """The result of `method`. Raises `RpcError`, `DeviceTimeout`, `ConnectionLost`, `ProtocolViolation`."""
+        if self._framing == "bare":
+            self._last_id += 1
+            return await self._exchange(self._last_id, method, encode_bare_request(self._last_id, method, params))
         ident = request_id()
-        return await self._exchange(ident, method, encode_request(ident, method, params))
+        return await self._exchange(ident, method, encode(encode_request(ident, method, params)))
 
     async def reopen(self) -> None:
         """Close, connect and log in again. Raises what `open` and `login` raise."""
@@ -98,7 +119,7 @@ class RpcConnection:
         if self._pending is not None and not self._pending[2].done():
             self._pending[2].set_exception(NotConnected(DEVICE, self._pending[1], "closed while waiting"))
 
-    async def _exchange(self, ident: str, op: str, payload: bytes) -> Any:
+    async def _exchange(self, ident: str | int, op: str, request: bytes) -> Any:
         async with self._lock:
             if self._lost is not None:
                 raise ConnectionLost(DEVICE, op, self._lost)
@@ -108,7 +129,7 @@ class RpcConnection:
             self._pending = (ident, op, future)
             try:
                 # No drain: requests are small, and a socket that cannot be written to fails the reader.
-                self._writer.write(encode(payload))
+                self._writer.write(request)
                 async with asyncio.timeout(self._timeout_s):
                     return await future
             except TimeoutError:
@@ -117,7 +138,7 @@ class RpcConnection:
                 self._pending = None
 
     async def _read(self, reader: asyncio.StreamReader) -> None:
-        decoder = FrameDecoder(DEVICE)
+        decoder = BareDecoder(DEVICE) if self._framing == "bare" else FrameDecoder(DEVICE)
         try:
             while data := await reader.read(65536):
                 for payload in decoder.feed(data):
@@ -135,7 +156,7 @@ class RpcConnection:
         ident, op, future = self._pending
         if future.done():
             return
-        if not ident:  # the login reply is not JSON, and its content carries no meaning
+        if ident == "":  # the login reply is not JSON, and its content carries no meaning
             future.set_result(payload)
             return
         try:
@@ -143,9 +164,12 @@ class RpcConnection:
         except (ValueError, RecursionError):
             future.set_exception(ProtocolViolation(DEVICE, op, f"reply is not JSON: {payload[:40]!r}"))
             return
-        if not isinstance(reply, dict) or reply.get("id") != ident:  # pyright: ignore[reportUnknownMemberType]
+        if not isinstance(reply, dict):
             return
         answer: dict[str, Any] = reply  # pyright: ignore[reportUnknownVariableType]
+        echo = answer.get("id")
+        if type(echo) is not type(ident) or echo != ident:  # True equals 1
+            return
         match answer.get("error"):
             case {"code": int(code), "message": str(message)}:
                 future.set_exception(RpcError(DEVICE, op, code, message))

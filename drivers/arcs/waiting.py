@@ -16,6 +16,10 @@ from drivers.samples import Pose
 RESTS_ELSEWHERE_S = 1.0
 """An accepted move may not have started yet; an arm that rests elsewhere for so long will not start."""
 
+STUCK_S = 3.0
+PROGRESS = 0.05
+"""mm or deg nearer that count as coming nearer."""
+
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
@@ -48,24 +52,28 @@ async def until_settled(
 ) -> None:
     """Return once the queue is empty, the arm steady and the pose within tolerance.
 
-    Raises `RobotNotSafe`, or `MotionFailed` where the arm rests elsewhere or twice the planned time has gone.
+    Raises `RobotNotSafe`, or `MotionFailed` where the arm rests elsewhere, or where twice the planned time has gone
+    and it comes no nearer: a pendant whose speed is turned down is slow, not stuck.
     """
     loop = asyncio.get_running_loop()
     allowed_s = 2.0 * planned_s + 3.0
     deadline = loop.time() + allowed_s
     idle_since: float | None = None
+    nearest, nearer_at = math.inf, loop.time()
     while True:
         await controller.require_safe("moveLine")
         steady = await controller.at_rest()
         off_mm, off_deg = distance(await controller.pose(), target)
         now = loop.time()
+        if off_mm + off_deg < nearest - PROGRESS:
+            nearest, nearer_at = off_mm + off_deg, now
         if steady and off_mm <= tolerance.position_mm and off_deg <= tolerance.rotation_deg:
             return
         idle_since = (idle_since or now) if steady else None
         if idle_since is not None and now - idle_since > RESTS_ELSEWHERE_S:
             raise _not_arrived(f"rests {off_mm:.2f} mm and {off_deg:.2f} deg from the target")
-        if now > deadline:
-            raise _not_arrived(f"not settled after {allowed_s:.1f} s, {off_mm:.2f} mm to go")
+        if now > deadline and now - nearer_at > STUCK_S:
+            raise _not_arrived(f"not settled after {allowed_s:.1f} s, {off_mm:.2f} mm and {off_deg:.2f} deg to go")
         await asyncio.sleep(poll_s)
 
 

@@ -1,0 +1,113 @@
+"""Where the arm is, all the time: pushed by the controller over RTDE, or asked for again and again."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+
+from drivers.arcs.controller import Controller
+from drivers.arcs.options import ArcsOptions
+from drivers.arcs.rpc import DEVICE
+from drivers.arcs.rtde import RtdeStream
+from drivers.clock import Clock
+from drivers.errors import DeviceError, NotConnected, ProtocolViolation, Stale
+from drivers.geometry import from_wire
+from drivers.samples import Pose, PoseSample, Stamp
+
+POSE_SEGMENT = "R1_actual_TCP_pose"
+
+
+class Telemetry:
+    """The newest pose, stamped when it came. RTDE that is closed or silent is never fatal: polling takes over."""
+
+    def __init__(self, state: Controller, options: ArcsOptions, clock: Clock, on_notice: Callable[[str], None]) -> None:
+        self._state = state
+        self._options = options
+        self._clock = clock
+        self._notice = on_notice
+        self._latest: PoseSample | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._stream: RtdeStream | None = None
+        self.listener: Callable[[PoseSample], None] | None = None
+
+    @property
+    def source(self) -> str:
+        """How poses come: `RTDE` or `polling`."""
+        return "RTDE" if self._stream is not None else "polling"
+
+    async def start(self) -> None:
+        """Take the first pose, then go on until `stop`. Raises what asking for the first pose raises."""
+        await self.read()
+        if self._options.rtde_port is not None:
+            await self._subscribe(self._options.rtde_port)
+        self._task = asyncio.create_task(self._run(), name="robot telemetry")
+
+    async def stop(self) -> None:
+        """End it; the newest pose stays and grows stale."""
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+        await self._drop_stream()
+
+    def latest(self) -> PoseSample:
+        """The newest pose. Raises `NotConnected` before the first, `Stale` after `stale_after_ms`."""
+        if self._latest is None:
+            raise NotConnected(DEVICE, "latest", "no pose yet")
+        age_ms = (self._clock.now_ns() - self._latest.stamp.host_ns) / 1e6
+        if age_ms > self._options.stale_after_ms:
+            raise Stale(DEVICE, age_ms, self._options.stale_after_ms)
+        return self._latest
+
+    async def read(self) -> None:
+        """Ask for the pose once."""
+        self._take(await self._state.pose())
+
+    async def _subscribe(self, port: int) -> None:
+        stream = RtdeStream(self._options.host, port)
+        self._stream = stream
+        try:
+            await stream.open([POSE_SEGMENT], self._options.telemetry_hz)
+            self._take(await self._pushed(stream))
+        except DeviceError as error:
+            await self._fall_back(error)
+
+    async def _run(self) -> None:
+        if self._stream is not None:
+            try:
+                while True:
+                    self._take(await self._pushed(self._stream))
+            except DeviceError as error:
+                await self._fall_back(error)
+        loop = asyncio.get_running_loop()
+        period_s = 1.0 / self._options.telemetry_hz
+        due = loop.time()
+        while True:
+            # A gap shows as an old sample (`Stale`); the motion path reports the cause.
+            with contextlib.suppress(DeviceError):
+                await self.read()
+            due = max(due + period_s, loop.time())
+            await asyncio.sleep(due - loop.time())
+
+    async def _pushed(self, stream: RtdeStream) -> Pose:
+        [values] = await stream.newest()
+        try:
+            return from_wire([float(v) for v in values])
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ProtocolViolation(DEVICE, POSE_SEGMENT, str(error)) from None
+
+    async def _fall_back(self, error: DeviceError) -> None:
+        await self._drop_stream()
+        self._notice(f"telemetry is polled instead of pushed: {error.what}")
+
+    async def _drop_stream(self) -> None:
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            await stream.close()
+
+    def _take(self, pose: Pose) -> None:
+        seq = self._latest.stamp.seq + 1 if self._latest else 0
+        self._latest = PoseSample(Stamp(self._clock.now_ns(), None, seq), pose)
+        if self.listener is not None:
+            self.listener(self._latest)
