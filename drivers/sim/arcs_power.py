@@ -1,0 +1,86 @@
+"""The loopback cabinet's power and safety states: what takes time, and what only a person may clear."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drivers.arcs.codes import MOVING_ALLOWED, ReturnCode, RobotMode, SafetyMode
+
+BOOT_S = 0.7
+POWER_ON_S = 1.0
+"""From `poweron` to Idle."""
+BRAKE_RELEASE_S = 1.0
+POWER_OFF_S = 0.3
+
+EMERGENCY_STOPS = frozenset({SafetyMode.SYSTEM_EMERGENCY_STOP, SafetyMode.ROBOT_EMERGENCY_STOP})
+
+
+class Power:
+    """`now_s` is simulated time; transitions become true when their time has come."""
+
+    def __init__(self, now_s: Callable[[], float]) -> None:
+        self._now_s = now_s
+        self._steps: list[tuple[float, RobotMode]] = [(-1.0, RobotMode.POWER_OFF)]
+        self.safety = SafetyMode.NORMAL
+        self.collision = False
+        self.button_down = False
+        """The emergency stop button: a person pushes and releases it."""
+
+    @property
+    def mode(self) -> RobotMode:
+        """The robot mode now."""
+        while len(self._steps) > 1 and self._steps[1][0] <= self._now_s():
+            self._steps.pop(0)
+        return self._steps[0][1]
+
+    @property
+    def on(self) -> bool:
+        """True from PowerOn to Running."""
+        return self.mode in {RobotMode.POWER_ON, RobotMode.IDLE, RobotMode.BRAKE_RELEASING, RobotMode.RUNNING}
+
+    def power_on(self) -> int:
+        """Request power; Idle comes `POWER_ON_S` later."""
+        if self.safety in EMERGENCY_STOPS:
+            return ReturnCode.BAD_STATE
+        if self.mode == RobotMode.POWER_OFF:
+            self._then((0.0, RobotMode.BOOTING), (BOOT_S, RobotMode.POWER_ON), (POWER_ON_S, RobotMode.IDLE))
+        return ReturnCode.OK
+
+    def start_up(self) -> int:
+        """Request the brakes' release; Running comes `BRAKE_RELEASE_S` later."""
+        if self.mode == RobotMode.RUNNING:
+            return ReturnCode.OK
+        if self.mode != RobotMode.IDLE or self.safety not in MOVING_ALLOWED:
+            return ReturnCode.BAD_STATE
+        self._then((0.0, RobotMode.BRAKE_RELEASING), (BRAKE_RELEASE_S, RobotMode.RUNNING))
+        return ReturnCode.OK
+
+    def power_off(self) -> int:
+        """Brakes on, power off."""
+        if self.mode != RobotMode.POWER_OFF:
+            self._then((0.0, RobotMode.POWERING_OFF), (POWER_OFF_S, RobotMode.POWER_OFF))
+        return ReturnCode.OK
+
+    def press_emergency_stop(self, mode: SafetyMode) -> None:
+        """A person pushes the button: power is gone at once."""
+        self.safety, self.button_down = mode, True
+        self._then((0.0, RobotMode.POWER_OFF))
+
+    def unlock(self) -> int:
+        """Clear a protective stop, collision included; nothing else. The arm does not go on by itself."""
+        if self.safety != SafetyMode.PROTECTIVE_STOP:
+            return ReturnCode.REQUEST_IGNORED if self.safety == SafetyMode.NORMAL else ReturnCode.BAD_STATE
+        self.safety, self.collision = SafetyMode.NORMAL, False
+        return ReturnCode.OK
+
+    def restart_interface_board(self) -> int:
+        """After an emergency stop, once the button is released and the power is off."""
+        if self.button_down or self.mode != RobotMode.POWER_OFF:
+            return ReturnCode.BAD_STATE
+        if self.safety in EMERGENCY_STOPS or self.safety == SafetyMode.FAULT:
+            self.safety = SafetyMode.NORMAL
+        return ReturnCode.OK
+
+    def _then(self, *steps: tuple[float, RobotMode]) -> None:
+        now_s = self._now_s()
+        self._steps = [(now_s + after_s, mode) for after_s, mode in steps]

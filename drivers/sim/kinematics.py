@@ -1,0 +1,118 @@
+"""The i5's kinematics by its nominal table (modified DH): what the loopback controller answers for FK and IK.
+
+A real arm is calibrated and differs by most of a millimetre, so the driver always asks the controller.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from drivers.samples import Pose
+
+Matrix = NDArray[np.float64]
+Joints = tuple[float, float, float, float, float, float]
+
+A_M = (0.0, 0.0, 0.408, 0.376, 0.0, 0.0)
+ALPHA_DEG = (0.0, -90.0, 180.0, 180.0, -90.0, 90.0)
+D_M = (0.122, 0.1215, 0.0, 0.0, 0.1025, 0.094)
+THETA_DEG = (180.0, -90.0, 0.0, -90.0, 0.0, 0.0)
+LIMITS_DEG: Joints = (175.0, 175.0, 175.0, 175.0, 175.0, 360.0)
+"""Either way from zero."""
+HOME: Joints = (0.0, math.radians(-15.0), math.radians(100.0), math.radians(25.0), math.radians(90.0), 0.0)
+
+CLOSE_M, CLOSE_RAD = 1e-7, 1e-7
+MAX_STEP_RAD = 0.3
+ITERATIONS = 80
+DAMPING = 1e-3
+
+
+def _link(a_m: float, alpha_rad: float) -> Matrix:
+    c, s = math.cos(alpha_rad), math.sin(alpha_rad)
+    return np.array([[1.0, 0.0, 0.0, a_m], [0.0, c, -s, 0.0], [0.0, s, c, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+_LINKS = [_link(a, math.radians(alpha)) for a, alpha in zip(A_M, ALPHA_DEG, strict=True)]
+
+
+def _frames(q: Sequence[float]) -> list[Matrix]:
+    """The six joint frames in the base frame: T_i = Rx(alpha) Tx(a) Rz(q + theta) Tz(d)."""
+    frames: list[Matrix] = []
+    here: Matrix = np.eye(4)
+    for link, q_rad, theta_deg, d_m in zip(_LINKS, q, THETA_DEG, D_M, strict=True):
+        angle = q_rad + math.radians(theta_deg)
+        c, s = math.cos(angle), math.sin(angle)
+        here = here @ link @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, d_m], [0, 0, 0, 1]])
+        frames.append(here)
+    return frames
+
+
+def forward(q: Sequence[float]) -> Matrix:
+    """The flange in the base frame, metres, as a 4x4 matrix. Raises ValueError unless there are six finite joints."""
+    if len(q) != 6 or not all(math.isfinite(v) for v in q):
+        raise ValueError(f"joints are six finite numbers, got {q!r}")
+    return _frames(q)[-1]
+
+
+def inverse(target: Matrix, near: Sequence[float]) -> Joints | None:
+    """Joints that bring the flange to `target`, found from `near`, then from home turned toward the target.
+
+    None where that does not converge within the joint limits.
+    """
+    toward = math.atan2(target[1, 3], target[0, 3])
+    for seed in (near, (toward, *HOME[1:]), (toward + 0.3, *HOME[1:])):
+        q = _descend(target, np.array(seed, dtype=np.float64))
+        if q is not None and (found := _within(q, near)) is not None:
+            return found
+    return None
+
+
+def _descend(target: Matrix, q: Matrix) -> Matrix | None:
+    """Damped least squares; None where it has not arrived after `ITERATIONS`."""
+    for _ in range(ITERATIONS):
+        frames = _frames(q.tolist())
+        flange = frames[-1]
+        shift = target[:3, 3] - flange[:3, 3]
+        turn = Rotation.from_matrix(target[:3, :3] @ flange[:3, :3].T).as_rotvec()
+        if np.linalg.norm(shift) < CLOSE_M and np.linalg.norm(turn) < CLOSE_RAD:
+            return q
+        axes = np.stack([f[:3, 2] for f in frames], axis=1)
+        arms = np.stack([flange[:3, 3] - f[:3, 3] for f in frames], axis=1)
+        jacobian = np.vstack([np.cross(axes, arms, axis=0), axes])
+        error = np.concatenate([shift, turn])
+        damping = DAMPING * min(1.0, float(np.linalg.norm(error)))
+        square = jacobian @ jacobian.T + (damping * damping + 1e-12) * np.eye(6)  # never singular
+        step = jacobian.T @ np.linalg.solve(square, error)
+        q = q + step * min(1.0, MAX_STEP_RAD / max(float(np.abs(step).max()), 1e-12))
+    return None
+
+
+def _within(q: Matrix, near: Sequence[float]) -> Joints | None:
+    """Each joint by whole turns as near to `near` as its limit allows."""
+    found: list[float] = []
+    for value, close, limit_deg in zip(q.tolist(), near, LIMITS_DEG, strict=True):
+        turns = [math.remainder(value, 2 * math.pi) + 2 * math.pi * k for k in (-1, 0, 1)]
+        allowed = [v for v in turns if abs(v) <= math.radians(limit_deg)]
+        if not allowed:
+            return None
+        found.append(min(allowed, key=lambda v: abs(v - close)))
+    return (found[0], found[1], found[2], found[3], found[4], found[5])
+
+
+def matrix_of(pose: Pose) -> Matrix:
+    """A pose (mm) as a 4x4 matrix (m)."""
+    matrix: Matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat(pose.quaternion).as_matrix()
+    matrix[:3, 3] = np.array(pose.position_mm) / 1e3
+    return matrix
+
+
+def pose_of(matrix: Matrix) -> Pose:
+    """A 4x4 matrix (m) as a pose (mm)."""
+    qx, qy, qz, qw = (float(v) for v in Rotation.from_matrix(matrix[:3, :3]).as_quat())
+    x, y, z = (float(v) * 1e3 for v in matrix[:3, 3])
+    return Pose(x, y, z, qx, qy, qz, qw)

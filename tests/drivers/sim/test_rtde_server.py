@@ -1,0 +1,142 @@
+"""The loopback's RTDE port, byte by byte."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from typing import Any
+
+import cbor2
+import pytest
+
+from drivers.arcs.frames import FrameDecoder, encode, encode_short
+from drivers.arcs.rtde_wire import PING, encode_topic
+from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.rig import HOST
+from drivers.sim.rtde_server import RtdeServer
+
+EVERYTHING = [
+    "timestamp",
+    "runtime_state",
+    "R1_target_q",
+    "R1_actual_q",
+    "R1_robot_mode",
+    "R1_safety_mode",
+    "R1_speed_scaling",
+    "R1_actual_TCP_pose",
+    "R1_actual_TCP_force",
+    "R1_tool_digital_output_bits",
+]
+
+
+class Client:
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.reader, self.writer = reader, writer
+        self.decoder = FrameDecoder()
+
+    async def greeting(self) -> bytes:
+        return await self.reader.readuntil(b"}\n\n")
+
+    async def pushes(self, seconds: float) -> list[Any]:
+        got: list[Any] = []
+        try:
+            async with asyncio.timeout(seconds):
+                while data := await self.reader.read(65536):
+                    got += [cbor2.loads(p) for p in self.decoder.feed(data)]
+        except TimeoutError:
+            pass
+        return got
+
+
+@pytest.fixture
+async def rtde(cabinet: ArcsServer) -> AsyncIterator[RtdeServer]:
+    server = RtdeServer(cabinet.cabinet)
+    await server.start(HOST, 0)
+    yield server
+    await server.stop()
+
+
+@pytest.fixture
+async def client(rtde: RtdeServer) -> AsyncIterator[Client]:
+    it = Client(*await asyncio.open_connection(HOST, rtde.port))
+    yield it
+    it.writer.close()
+    await it.writer.wait_closed()
+
+
+async def test_the_server_speaks_first(client: Client):
+    hello = json.loads(await client.greeting())
+    assert (hello["protocol"], hello["version"]) == ("rtde", 1)
+    assert list(hello["output"]) == EVERYTHING
+    assert hello["output"]["R1_actual_TCP_pose"] == 1021
+
+
+async def test_the_makers_own_bytes_subscribe(client: Client):
+    await client.greeting()
+    client.writer.write(
+        b"SOF\x00\x00\\\x82\x18d\xa5fchanel\x00ifrequency\xfaBH\x00\x00hsegments\x82kR1_actual_qrR1_actual_TCP_poseito_server\xf4gtrigger\x1aAAAA"
+    )
+    got = await client.pushes(0.3)
+    assert 5 <= len(got) <= 20
+    chanel, q, pose = got[-1]
+    assert (chanel, len(q)) == (0, 6)
+    assert pose[:3] == pytest.approx([0.25, -0.23, 0.26])
+    client.writer.write(
+        b"SOF\x00\x009\x82\x18d\xa5fchanel\x00ifrequency\xfa\x00\x00\x00\x00hsegments\x80ito_server\xf4gtrigger\x00"
+    )
+    await client.pushes(0.05)
+    assert await client.pushes(0.1) == []
+
+
+async def test_everything_that_is_offered_can_be_had_with_enums_as_words(client: Client):
+    await client.greeting()
+    client.writer.write(encode_topic(3, EVERYTHING, 100.0))
+    chanel, *values = (await client.pushes(0.2))[-1]
+    sample = dict(zip(EVERYTHING, values, strict=True))
+    assert chanel == 3
+    assert (sample["R1_robot_mode"], sample["R1_safety_mode"]) == ("PowerOff", "Normal")
+    assert sample["runtime_state"] == "Stopped"
+    assert sample["R1_speed_scaling"] == 1.0
+
+
+async def test_pings_are_skipped_and_two_channels_run_side_by_side(client: Client, rtde: RtdeServer):
+    await client.greeting()
+    client.writer.write(PING + encode_topic(0, ["timestamp"], 100.0) + PING + encode_topic(1, ["timestamp"], 20.0))
+    got = await client.pushes(0.4)
+    slow = sum(1 for chanel, _ in got if chanel == 1)
+    assert 3 <= slow <= 12
+    assert len(got) - slow > 2 * slow
+    assert rtde.pings == 2
+
+
+@pytest.mark.parametrize("framed", [encode, encode_short])
+async def test_long_and_short_frames_subscribe(client: Client, framed: Any):
+    await client.greeting()
+    topic = {"chanel": 0, "frequency": 100, "segments": ["timestamp"]}
+    client.writer.write(framed(json.dumps([100, topic]).encode()))
+    assert await client.pushes(0.2)
+
+
+async def test_a_topic_with_an_unknown_name_pushes_nothing(client: Client):
+    await client.greeting()
+    client.writer.write(encode_topic(0, ["timestamp", "R9_nonsense"], 100.0))
+    assert await client.pushes(0.1) == []
+
+
+@pytest.mark.parametrize("junk", [b"GET /", b"SOF\x02\x00\x01x", encode_short(b"\xff"), encode_short(b"[100, 5]")])
+async def test_a_client_that_talks_nonsense_is_hung_up_on(client: Client, junk: bytes):
+    await client.greeting()
+    client.writer.write(junk)
+    async with asyncio.timeout(1.0):
+        assert await client.reader.read() == b""
+
+
+async def test_nothing_is_left_when_a_subscriber_goes(rtde: RtdeServer, client: Client):
+    await client.greeting()
+    client.writer.write(encode_topic(0, ["timestamp"], 500.0))
+    assert await client.pushes(0.1)
+    client.writer.close()
+    await asyncio.sleep(0.05)
+    assert rtde.clients == 0
+    assert not [t for t in asyncio.all_tasks() if t.get_name() == "rtde push"]
