@@ -4,16 +4,20 @@
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.footprint import Footprint, blank_footprint, draw_wander, grow_bristles, print_footprint
-from drivers.sim.spine import Bundle, SpineShape, Vector, press_spine
+from drivers.sim.bristles import draw_wander, grow_bristles
+from drivers.sim.drag import Stances, Waypoint, draw_drag
+from drivers.sim.flaws import Flaw, Trouble, draw_trouble
+from drivers.sim.footprint import Footprint, Tuft, blank_footprint, print_footprint
+from drivers.sim.spine import Bundle, SpineShape, Vector, press_spine, pull_spine, rest_spine
 
-__all__ = ["Brush", "BrushSpec", "Footprint"]
+__all__ = ["Brush", "BrushSpec", "Flaw", "Footprint", "Waypoint"]
 
 LINKS = 48
 MAX_TILT_DEG = 30.0
@@ -21,6 +25,7 @@ MAX_DEPTH = 0.9
 """Deepest press as a fraction of the ferrule's height at zero touch; beyond it the ferrule hits the paper."""
 
 REMEMBERED_SPINES = 64
+REMEMBERED_STANCES = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,42 +75,98 @@ class Brush:
         self._bristles = grow_bristles(spec.bristles, np.random.default_rng(spec.seed))
         # spines depend on (depth, tilt) only, and a protocol repeats its cells
         self._spine = lru_cache(maxsize=REMEMBERED_SPINES)(self._solve)
+        self._stances = lru_cache(maxsize=REMEMBERED_STANCES)(self._solve_stances)
 
     def press(
-        self, depth_mm: float, tilt_deg: float, *, ink_load: float, press_seed: int, px_per_mm: float = 10.0
+        self,
+        depth_mm: float,
+        tilt_deg: float,
+        *,
+        ink_load: float,
+        press_seed: int,
+        px_per_mm: float = 10.0,
+        flaw: Flaw | None = None,
+        severity: float = 1.0,
     ) -> Footprint:
         """Press once on fresh paper; equal arguments give equal bytes, another `press_seed` another natural
         repeat.
 
         The frame's origin is where the tip touched; the brush tilts about it until the ferrule leans toward
         +x by `tilt_deg` and then descends. Columns grow with +x, rows with -y. The upright bundle bends
-        toward -x, its set. A depth of 0 or less leaves the paper blank. Raises ValueError, naming value and
-        range, if `depth_mm` exceeds 0.9 length cos(tilt), or tilt is outside 0 .. 30 deg, `ink_load` outside
-        0 .. 1 (1 = freshly dipped), `px_per_mm` outside 2 .. 40, or `press_seed` is negative.
+        toward -x, its set. A depth of 0 or less leaves the paper blank; a flaw of severity 0 is none. Raises
+        ValueError, naming value and range, if `depth_mm` exceeds 0.9 length cos(tilt), or tilt is outside
+        0 .. 30 deg, `ink_load` or `severity` outside 0 .. 1 (1 = freshly dipped), `px_per_mm` outside 2 .. 40,
+        or `press_seed` is negative.
         """
+        self._check(depth_mm, tilt_deg, ink_load, press_seed, px_per_mm)
+        _within("severity", severity, 0.0, 1.0)
+        if depth_mm <= 0.0:
+            return blank_footprint(px_per_mm)
+        trouble: Trouble | None = None
+        if flaw is not None and severity > 0.0:
+            rng = np.random.default_rng([self.spec.seed, press_seed, 2])
+            trouble = draw_trouble(flaw, severity, self.spec.bristles, self.spec.length_mm, rng)
+        spine = self._spine(float(depth_mm), float(tilt_deg))
+        return print_footprint(spine, self._tuft(press_seed, trouble), ink_load, px_per_mm, self._paper(press_seed))
+
+    def drag(
+        self,
+        path: Sequence[Waypoint],
+        tilt_deg: float,
+        heading_deg: float,
+        *,
+        ink_load: float,
+        press_seed: int,
+        px_per_mm: float = 10.0,
+    ) -> Footprint:
+        """Draw the brush along straight lines between waypoints; equal arguments give equal bytes.
+
+        The mark's frame lies along the paper's: its origin is the first waypoint, columns grow with +x, rows with -y.
+        `heading_deg` is where the ferrule leans, or would lean, when the tip lands; from there on the bundle trails.
+        Raises ValueError as `press` does, and where there is no waypoint. No depth above 0 leaves the paper blank.
+        """
+        if not path:
+            raise ValueError("a drag needs at least one waypoint")
+        deepest = max(w.depth_mm for w in path)
+        self._check(deepest, tilt_deg, ink_load, press_seed, px_per_mm)
+        if deepest <= 0.0:
+            return blank_footprint(px_per_mm)
+        return draw_drag(
+            path,
+            self._stances(math.ceil(deepest), float(tilt_deg)),
+            math.radians(heading_deg),
+            self._tuft(press_seed, None),
+            ink_load,
+            px_per_mm,
+            self._paper(press_seed),
+        )
+
+    def _check(self, depth_mm: float, tilt_deg: float, ink_load: float, press_seed: int, px_per_mm: float) -> None:
         _within("tilt_deg", tilt_deg, 0.0, MAX_TILT_DEG)
         _within("ink_load", ink_load, 0.0, 1.0)
         _within("px_per_mm", px_per_mm, 2.0, 40.0)
         _within("press_seed", press_seed, 0, 2**63 - 1)
         deepest = MAX_DEPTH * self.spec.length_mm * math.cos(math.radians(tilt_deg))
         _within("depth_mm", depth_mm, -math.inf, deepest)
-        if depth_mm <= 0.0:
-            return blank_footprint(px_per_mm)
-        # two streams, so that the paper does not shift when the number of bristles changes
+
+    # two streams, so that the paper does not shift when the number of bristles changes
+    def _tuft(self, press_seed: int, trouble: Trouble | None) -> Tuft:
         lie_rng = np.random.default_rng([self.spec.seed, press_seed, 0])
-        paper_rng = np.random.default_rng([self.spec.seed, press_seed, 1])
-        return print_footprint(
-            self._spine(float(depth_mm), float(tilt_deg)),
-            self._bundle,
-            self._bristles,
-            draw_wander(self.spec.bristles, lie_rng),
-            ink_load,
-            px_per_mm,
-            paper_rng,
-        )
+        return Tuft(self._bundle, self._bristles, draw_wander(self.spec.bristles, lie_rng), trouble)
+
+    def _paper(self, press_seed: int) -> np.random.Generator:
+        return np.random.default_rng([self.spec.seed, press_seed, 1])
 
     def _solve(self, depth_mm: float, tilt_deg: float) -> tuple[SpineShape, ...]:
         return press_spine(self._bundle, depth_mm, math.radians(tilt_deg))
+
+    def _solve_stances(self, depth_mm: int, tilt_deg: float) -> Stances:
+        tilt_rad = math.radians(tilt_deg)
+        return Stances(
+            (rest_spine(self._bundle, tilt_rad), *press_spine(self._bundle, depth_mm, tilt_rad)),
+            (rest_spine(self._bundle, tilt_rad), *pull_spine(self._bundle, depth_mm, tilt_rad)),
+            float(depth_mm),
+        )
 
 
 def _bundle(spec: BrushSpec) -> Bundle:

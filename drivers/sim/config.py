@@ -67,6 +67,7 @@ class SimConfig:
     """Simulated seconds per real second."""
     arcs_port: int = 0
     """0 lets the system choose."""
+    rtde_port: int = 0
     camera_port: int = 0
     home_mm: tuple[float, float, float] = (250.0, -230.0, 260.0)
     """Where the tip rests when the rig starts, in the base frame."""

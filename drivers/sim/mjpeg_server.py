@@ -7,6 +7,7 @@ import time
 
 import cv2
 
+from drivers.camera.options import LOOPBACK_SERVER
 from drivers.samples import Pose
 from drivers.sim.scene import Scene
 from drivers.sim.server import LoopbackServer
@@ -27,11 +28,13 @@ class MjpegServer(LoopbackServer):
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer any request with the stream."""
         async with asyncio.timeout(5.0):
-            await reader.readuntil(b"\r\n\r\n")
+            request = await reader.readuntil(b"\r\n\r\n")
         writer.write(
-            b"HTTP/1.0 200 OK\r\nCache-Control: no-store\r\n"
+            b"HTTP/1.0 200 OK\r\nCache-Control: no-store\r\nServer: " + LOOPBACK_SERVER.encode() + b"\r\n"
             b"Content-Type: multipart/x-mixed-replace; boundary=" + BOUNDARY.encode() + b"\r\n\r\n"
         )
+        if request.startswith(b"HEAD"):
+            return
         await self._stream(writer)
 
     async def _stream(self, writer: asyncio.StreamWriter) -> None:

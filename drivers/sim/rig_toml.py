@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from drivers.sim.config import SimConfig
 
+LOOPBACK_HEAD = "# The loopback rig"
 TAUGHT_TOUCH_ERROR_MM = 0.03
 """Nobody teaches a touch height exactly."""
 
@@ -13,7 +14,7 @@ def rig_toml(config: SimConfig, host: str, arcs_port: int, camera_port: int) -> 
     table, view, brush = config.table, config.view, config.brush
     touch_z_mm = table.paper_z_mm + TAUGHT_TOUCH_ERROR_MM
     return f"""\
-# The loopback rig, seed {config.seed}. Simulated: nothing measured on it is a result on paper.
+{LOOPBACK_HEAD}, seed {config.seed}. Simulated: nothing measured on it is a result on paper.
 name = "loopback rig"
 
 [robot]

@@ -7,7 +7,9 @@ bending plus squash plus the lagged smoothed-Coulomb potential of incremental po
 ACM TOG 39(4), 2020), by damped Newton.
 """
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,19 +78,50 @@ def press_spine(bundle: Bundle, depth_mm: float, tilt_rad: float) -> tuple[Spine
     At zero touch the tip of the unloaded bundle is at x = z = 0; the bundle tilts about it, then the ferrule
     moves down.
     """
+    start = _unloaded(bundle, tilt_rad)
+    phi, last_x, last_normal = tilt_rad + np.cumsum(bundle.rest_bend_rad), start.last_x, start.last_normal
+    path: list[SpineShape] = []
+    steps = max(1, int(np.ceil(depth_mm / LOAD_STEP_MM)))
+    for lowered in np.linspace(0.0, depth_mm, steps + 1)[1:]:
+        step = start.moved(0.0, float(lowered), last_x, last_normal)
+        phi = step.solve(phi)
+        path.append(step.shape(phi))
+        last_x, last_normal = path[-1].x_mm, path[-1].normal_n
+    return tuple(path)
+
+
+def rest_spine(bundle: Bundle, tilt_rad: float) -> SpineShape:
+    """The unloaded spine at zero touch."""
+    return _unloaded(bundle, tilt_rad).shape(tilt_rad + np.cumsum(bundle.rest_bend_rad))
+
+
+def pull_spine(bundle: Bundle, depth_mm: int, tilt_rad: float) -> tuple[SpineShape, ...]:
+    """The spine while the ferrule is drawn toward +x at depths of 1, 2 .. `depth_mm` mm.
+
+    Positions are relative to the ferrule as in `press_spine`. The bundle slides all the time, so friction forgets how
+    it came down; the ferrule advances half a mm with each load step, and once more on the level.
+    """
+    start = _unloaded(bundle, tilt_rad)
+    phi, last_x, last_normal = tilt_rad + np.cumsum(bundle.rest_bend_rad), start.last_x, start.last_normal
+    shapes: list[SpineShape] = []
+    gone = 0.0
+    for depth in range(1, depth_mm + 1):
+        for lowered in (depth - 0.5, depth, depth):
+            gone += LOAD_STEP_MM
+            step = start.moved(gone, lowered, last_x, last_normal)
+            phi = step.solve(phi)
+            shape = step.shape(phi)
+            last_x, last_normal = shape.x_mm, shape.normal_n
+        shapes.append(replace(shape, x_mm=shape.x_mm - gone))
+    return tuple(shapes)
+
+
+def _unloaded(bundle: Bundle, tilt_rad: float) -> _LoadStep:
     phi = tilt_rad + np.cumsum(bundle.rest_bend_rad)
     clamp_x = bundle.link_mm * float(np.sin(phi).sum())
     clamp_z = bundle.link_mm * float(np.cos(phi).sum())
     x = clamp_x - bundle.link_mm * np.cumsum(np.sin(phi))
-    normal = np.zeros_like(phi)
-    path: list[SpineShape] = []
-    steps = max(1, int(np.ceil(depth_mm / LOAD_STEP_MM)))
-    for lowered in np.linspace(0.0, depth_mm, steps + 1)[1:]:
-        step = _LoadStep(bundle, tilt_rad, clamp_x, clamp_z - float(lowered), x, normal)
-        phi = step.solve(phi)
-        path.append(step.shape(phi))
-        x, normal = path[-1].x_mm, path[-1].normal_n
-    return tuple(path)
+    return _LoadStep(bundle, tilt_rad, clamp_x, clamp_z, x, np.zeros_like(phi))
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +134,11 @@ class _LoadStep:
     clamp_z: float
     last_x: Vector
     last_normal: Vector
+
+    def moved(self, gone_mm: float, lowered_mm: float, last_x: Vector, last_normal: Vector) -> _LoadStep:
+        """The next load step: the ferrule that far along +x and down, after the given positions and forces."""
+        clamp_x, clamp_z = self.clamp_x + gone_mm, self.clamp_z - lowered_mm
+        return _LoadStep(self.bundle, self.tilt_rad, clamp_x, clamp_z, last_x, last_normal)
 
     def solve(self, phi: Vector) -> Vector:
         """Minimise the energy from `phi` by Newton with a backtracking line search; stops at `MAX_NEWTON`."""

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
+
+import numpy as np
 
 from drivers.geometry import brush_pose, lean
 from drivers.samples import Pose
 from drivers.sim.brush import Brush
 from drivers.sim.clock import SimClock
 from drivers.sim.config import SimConfig
+from drivers.sim.contact import Contact, ContactWatch
+from drivers.sim.drag import ink_left
+from drivers.sim.flaws import Flaw, flaw_of_load, natural_split
+from drivers.sim.leash import Waypoint
 from drivers.sim.motion import MotionQueue
 from drivers.sim.paper import Paper
 
 INK_PER_PRESS = 0.12
-"""Share of a full brush that one press takes."""
+"""Share of a full brush that one press takes, and the landing of a drag."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +35,24 @@ class Press:
     tilt_deg: float
     heading_deg: float
     ink_load: float
+    flaw: Flaw | None = None
+    """What is wrong with the mark: scripted, a split that came by itself, or what the ink load makes of it."""
+    severity: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Drag:
+    """One contact that travelled along the paper, as it really happened."""
+
+    index: int
+    path: tuple[Waypoint, ...]
+    """The commanded tip in the paper frame, from touching to lifting off."""
+    tilt_deg: float
+    """At the deepest point."""
+    heading_deg: float
+    """Where the ferrule leaned, or would have leaned, when the tip landed."""
+    ink_load: float
+    """At landing."""
 
 
 class World:
@@ -43,11 +68,25 @@ class World:
         self.brush = Brush(config.brush)
         self.paper = Paper(*config.table.sheet_mm)
         self.presses: list[Press] = []
+        self.drags: list[Drag] = []
+        self.flaws: dict[int, tuple[Flaw, float]] = {}
+        """Flaw and severity to come, by the index of the press; severity 0 rules out that it splits by itself."""
         self.ink_load = 0.0
         self.version = 0
         """Counts changes of what the camera can see on the sheet."""
-        self._deepest: Pose | None = None
+        self._watch = ContactWatch(config.table.paper_z_mm)
         self.motion = MotionQueue(brush_pose(*config.home_mm), self._travelled)
+
+    def flaw_next(self, flaw: Flaw, severity: float = 1.0) -> None:
+        """Let something go wrong with the next press to lift off; raises ValueError unless severity is in 0 .. 1."""
+        if not 0.0 <= severity <= 1.0:
+            raise ValueError(f"severity = {severity:g} is outside 0 .. 1")
+        self.flaws[len(self.presses)] = (flaw, severity)
+
+    def fresh_sheet(self) -> None:
+        """Put a blank sheet in, as an operator would."""
+        self.paper = Paper(*self.config.table.sheet_mm)
+        self.version += 1
 
     def tool(self) -> Pose:
         """The tip's pose now, in the base frame."""
@@ -61,14 +100,16 @@ class World:
         return math.cos(yaw) * dx + math.sin(yaw) * dy, -math.sin(yaw) * dx + math.cos(yaw) * dy
 
     def _travelled(self, start: Pose, end: Pose) -> None:
-        # Along a straight line the tip's height is linear, so the deepest point is one of the ends.
+        # Along a straight line the tip's height is linear, so the lowest point is one of the ends.
         for pose in (start, end):
             self._dip(pose)
-            if pose.z_mm < self.config.table.paper_z_mm and (self._deepest is None or pose.z_mm < self._deepest.z_mm):
-                self._deepest = pose
-        if end.z_mm >= self.config.table.paper_z_mm and self._deepest is not None:
-            deepest, self._deepest = self._deepest, None
-            self._leave_mark(deepest)
+        contact = self._watch.travelled(start, end)
+        if contact is None:
+            return
+        if contact.dragged:
+            self._leave_drag(contact)
+        else:
+            self._leave_mark(contact.deepest)
 
     def _dip(self, pose: Pose) -> None:
         table = self.config.table
@@ -78,18 +119,68 @@ class World:
             self.ink_load = 1.0
 
     def _leave_mark(self, deepest: Pose) -> None:
-        table = self.config.table
-        x_mm, y_mm = self.to_paper(deepest.x_mm, deepest.y_mm)
-        if not (0.0 <= x_mm <= table.sheet_mm[0] and 0.0 <= y_mm <= table.sheet_mm[1]):
+        x_mm, y_mm, depth_mm = self._on_sheet(deepest)
+        if not self._is_on_sheet(x_mm, y_mm):
             return
-        tilt_deg, base_heading_deg = lean(deepest)
-        heading_deg = base_heading_deg - table.yaw_deg
-        depth_mm = table.paper_z_mm - deepest.z_mm
+        tilt_deg, heading_deg = self._lean(deepest)
         index = len(self.presses)
+        flaw, severity = self._flaw(index, depth_mm)
         footprint = self.brush.press(
-            depth_mm, tilt_deg, ink_load=self.ink_load, press_seed=self.config.seed * 100_003 + index
+            depth_mm,
+            tilt_deg,
+            ink_load=self.ink_load,
+            press_seed=self.config.seed * 100_003 + index,
+            flaw=flaw,
+            severity=severity,
         )
         self.paper.lay(footprint, x_mm, y_mm, heading_deg)
-        self.presses.append(Press(index, x_mm, y_mm, depth_mm, tilt_deg, heading_deg, self.ink_load))
+        want = flaw_of_load(self.ink_load)
+        if want is Flaw.BLANK or (flaw is None and want is not None):
+            # nothing was put on the hairs, or nothing of it shows
+            flaw, severity = want, 1.0 - self.ink_load
+        self.presses.append(Press(index, x_mm, y_mm, depth_mm, tilt_deg, heading_deg, self.ink_load, flaw, severity))
         self.ink_load = max(0.0, self.ink_load - INK_PER_PRESS)
         self.version += 1
+
+    def _leave_drag(self, contact: Contact) -> None:
+        path = tuple(Waypoint(*self._on_sheet(pose)) for pose in contact.poses)
+        if not any(self._is_on_sheet(w.x_mm, w.y_mm) for w in path):
+            return
+        tilt_deg, _ = self._lean(contact.deepest)
+        _, heading_deg = self._lean(contact.poses[0])
+        index = len(self.drags)
+        footprint = self.brush.drag(
+            path,
+            tilt_deg,
+            heading_deg,
+            ink_load=self.ink_load,
+            # far from the seeds of presses
+            press_seed=2**40 + self.config.seed * 100_003 + index,
+        )
+        self.paper.lay(footprint, path[0].x_mm, path[0].y_mm, 0.0)
+        self.drags.append(Drag(index, path, tilt_deg, heading_deg, self.ink_load))
+        travel_mm = sum(math.dist((a.x_mm, a.y_mm), (b.x_mm, b.y_mm)) for a, b in itertools.pairwise(path))
+        self.ink_load = max(0.0, ink_left(self.ink_load, travel_mm) - INK_PER_PRESS)
+        self.version += 1
+
+    def _flaw(self, index: int, depth_mm: float) -> tuple[Flaw | None, float]:
+        """What the hairs of this press suffer from: what was scripted, or a split that comes by itself."""
+        if index in self.flaws:
+            flaw, severity = self.flaws[index]
+        else:
+            rng = np.random.default_rng([self.config.seed, index, 3])
+            flaw, severity = Flaw.SPLIT, natural_split(self.ink_load, depth_mm, rng)
+        return (flaw, severity) if severity > 0.0 else (None, 0.0)
+
+    def _on_sheet(self, pose: Pose) -> tuple[float, float, float]:
+        """x, y and depth of the tip in the paper frame."""
+        return *self.to_paper(pose.x_mm, pose.y_mm), self.config.table.paper_z_mm - pose.z_mm
+
+    def _is_on_sheet(self, x_mm: float, y_mm: float) -> bool:
+        width_mm, height_mm = self.config.table.sheet_mm
+        return 0.0 <= x_mm <= width_mm and 0.0 <= y_mm <= height_mm
+
+    def _lean(self, pose: Pose) -> tuple[float, float]:
+        """(tilt_deg, heading_deg) in the paper frame."""
+        tilt_deg, base_heading_deg = lean(pose)
+        return tilt_deg, base_heading_deg - self.config.table.yaw_deg

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.sim.bristles import grow_bristles
 from drivers.sim.brush import Brush, BrushSpec, Footprint
-from drivers.sim.footprint import grow_bristles
 
 DEPTHS_MM = (5.0, 11.0, 13.0, 15.0, 17.0, 20.0)
 TILTS_DEG = (0.0, 5.0, 10.0)
@@ -181,6 +181,6 @@ def test_an_impossible_brush_is_refused():
 
 
 def test_the_brush_knows_neither_model_nor_torch():
-    probe = "import sys, drivers.sim.brush; print(sorted({'model', 'torch', 'collect'} & set(sys.modules)))"
+    probe = "import sys, drivers.sim.world; print(sorted({'model', 'torch', 'collect'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

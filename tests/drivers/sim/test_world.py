@@ -11,6 +11,8 @@ import pytest
 from drivers.geometry import brush_pose
 from drivers.samples import Pose
 from drivers.sim.config import SimConfig, Table
+from drivers.sim.drag import INK_PER_MM
+from drivers.sim.flaws import Flaw
 from drivers.sim.world import INK_PER_PRESS, Press, World
 
 TABLE = Table()
@@ -35,6 +37,16 @@ def press(x_mm: float, y_mm: float, depth_mm: float, **lean: float) -> list[Pose
 
 
 SCRIPT = [*dip(), *press(30.0, 40.0, 11.0), *press(90.0, 70.0, 15.0, heading_deg=33.0, tilt_deg=10.0)]
+
+
+def drag(*corners_mm: tuple[float, float], depth_mm: float = 8.0) -> list[Pose]:
+    """Straight down at the first corner, along all of them, straight up."""
+    above = [on_paper(*corner, 40.0) for corner in (corners_mm[0], corners_mm[-1])]
+    return [above[0], *(on_paper(*corner, -depth_mm) for corner in corners_mm), above[1]]
+
+
+L_CORNER = ((40.0, 60.0), (70.0, 60.0), (70.0, 40.0))
+STROKES = [*dip(), *press(30.0, 110.0, 11.0), *drag(*L_CORNER), *press(90.0, 110.0, 13.0)]
 
 
 def run(script: list[Pose], looks_s: Iterable[float] = (), rate: float = 1.0) -> World:
@@ -114,3 +126,114 @@ def test_equal_seeds_give_equal_sheets_and_another_seed_another(pressed: World):
         other.motion.add(pose, 200.0, 800.0, 0.0)
     other.motion.advance(1e4)
     assert not np.array_equal(other.paper.density, pressed.paper.density)
+
+
+def test_a_contact_that_travels_is_one_drag_and_no_press():
+    world = run(STROKES)
+    assert len(world.presses) == 2
+    (mark,) = world.drags
+    assert [(w.x_mm, w.y_mm) for w in mark.path[1:-1]] == [pytest.approx(corner) for corner in L_CORNER]
+    assert [w.depth_mm for w in mark.path] == pytest.approx([0.0, 8.0, 8.0, 8.0, 0.0], abs=1e-6)
+    assert mark.heading_deg == pytest.approx(0.0, abs=1e-5)
+    assert world.version == 3
+    # 20 px per 2 mm around the first line, before the leash pulls the patch off it
+    rows = slice(round((172.0 - 61.0) * 10), round((172.0 - 59.0) * 10))
+    assert (world.paper.density[rows, 420:560] > 0.3).mean() > 0.9
+
+
+@pytest.mark.parametrize(("step_s", "rate"), [(0.003, 1.0), (0.05, 50.0), (0.71, 1000.0)])
+def test_a_drag_depends_neither_on_who_looks_nor_on_the_rate(step_s: float, rate: float):
+    alone = run(STROKES)
+    watched = run(STROKES, np.arange(0.0, 12.0, step_s).tolist(), rate)
+    assert (watched.drags, watched.presses) == (alone.drags, alone.presses)
+    assert np.array_equal(watched.paper.density, alone.paper.density)
+
+
+def test_a_drag_takes_ink_for_landing_and_for_each_mm():
+    world = run([*dip(), *drag(*L_CORNER)])
+    assert world.drags[0].ink_load == 1.0
+    assert world.ink_load == pytest.approx(1.0 - INK_PER_PRESS - INK_PER_MM * 50.0)
+
+
+@pytest.mark.parametrize(("sideways_mm", "drags"), [(0.4, 0), (0.6, 1)])
+def test_a_hair_of_travel_is_still_a_press(sideways_mm: float, drags: int):
+    world = run([*dip(), *drag((40.0, 60.0), (40.0 + sideways_mm, 60.0))])
+    assert (len(world.presses), len(world.drags)) == (1 - drags, drags)
+
+
+def test_withdrawing_a_tilted_brush_along_its_own_axis_is_no_drag():
+    tilt = math.radians(10.0)
+    down = on_paper(40.0, 60.0, -15.0, tilt_deg=10.0)
+    out = on_paper(40.0 + 60.0 * math.sin(tilt), 60.0, -15.0 + 60.0 * math.cos(tilt), tilt_deg=10.0)
+    world = run([*dip(), on_paper(40.0, 60.0, 40.0, tilt_deg=10.0), down, out])
+    assert (len(world.presses), world.drags) == (1, [])
+
+
+def test_a_drag_that_leaves_the_sheet_is_cut_and_one_beside_it_leaves_nothing():
+    world = run([*dip(), *drag((200.0, 60.0), (280.0, 60.0))])
+    assert len(world.drags) == 1
+    assert world.paper.density[:, -1].any()
+    beside = run([*dip(), *drag((270.0, 80.0), (290.0, 80.0))])
+    assert beside.drags == []
+    assert not beside.paper.density.any()
+
+
+def test_a_drag_stopped_on_the_way_leaves_its_mark_when_it_lifts():
+    world = World(SimConfig())
+    for pose in [*dip(), on_paper(40.0, 60.0, 40.0), on_paper(40.0, 60.0, -8.0)]:
+        world.motion.add(pose, 200.0, 800.0, 0.0)
+    world.motion.advance(100.0)
+    world.motion.add(on_paper(90.0, 60.0, -8.0), 10.0, 800.0, 100.0)
+    world.motion.stop(2000.0, 2.0, 102.0)  # about 20 mm on
+    world.motion.advance(200.0)
+    assert world.drags == []
+    world.motion.add(on_paper(60.0, 60.0, 40.0), 200.0, 800.0, 200.0)
+    world.motion.advance(300.0)
+    (mark,) = world.drags
+    assert mark.path[-2].x_mm == pytest.approx(60.0, abs=0.5)
+
+
+def test_a_scripted_flaw_happens_once_and_is_on_the_answer_sheet():
+    def play(flaw: Flaw | None) -> World:
+        world = World(SimConfig())
+        if flaw is not None:
+            world.flaws[1] = (flaw, 0.8)
+        for pose in [*SCRIPT, *dip(), *press(150.0, 70.0, 15.0)]:
+            world.motion.add(pose, 200.0, 800.0, 0.0)
+        world.motion.advance(1e4)
+        return world
+
+    sound, split = play(None), play(Flaw.SPLIT)
+    assert [(p.flaw, p.severity) for p in sound.presses] == [(None, 0.0)] * 3
+    assert [(p.flaw, p.severity) for p in split.presses] == [(None, 0.0), (Flaw.SPLIT, 0.8), (None, 0.0)]
+    differ = np.nonzero((sound.paper.density != split.paper.density).any(axis=0))[0] / 10.0
+    assert 65.0 < differ.min() < differ.max() < 95.0
+
+
+def test_flaw_next_means_the_next_press():
+    world = World(SimConfig())
+    for number, flaw in enumerate((Flaw.BENT, Flaw.BLANK)):
+        world.flaw_next(flaw)
+        for pose in [*dip(), *press(40.0 + 50.0 * number, 70.0, 15.0)]:
+            world.motion.add(pose, 200.0, 800.0, 100.0 * number)
+        world.motion.advance(100.0 * (number + 1))
+    assert [(p.flaw, p.severity) for p in world.presses] == [(Flaw.BENT, 1.0), (Flaw.BLANK, 1.0)]
+    with pytest.raises(ValueError, match=r"severity = 2 is outside 0 \.\. 1"):
+        world.flaw_next(Flaw.SPLIT, 2.0)
+
+
+def test_pressing_on_without_a_dip_goes_wrong_by_itself_and_by_the_seed():
+    def named(seed: int) -> list[Flaw | None]:
+        world = World(SimConfig(seed=seed))
+        marks = [pose for n in range(10) for pose in press(20.0 + 21.0 * n, 70.0 + 40.0 * (n % 2), 13.0)]
+        for pose in [*dip(), *marks]:
+            world.motion.add(pose, 200.0, 800.0, 0.0)
+        world.motion.advance(1e4)
+        return [p.flaw for p in world.presses]
+
+    first, second = named(1), named(2)
+    assert first[:3] == second[:3] == [None] * 3
+    assert Flaw.SPLIT in first + second
+    assert Flaw.FAINT in first + second
+    assert first[-1] == second[-1] == Flaw.BLANK
+    assert named(1) == first != second

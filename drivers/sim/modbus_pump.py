@@ -1,0 +1,84 @@
+"""A peristaltic pump with the two registers that `drivers.ink.pump` writes; serve it with `PtyLine`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from drivers.errors import ProtocolViolation
+from drivers.ink.modbus import WRITE_BYTES, WRITE_REGISTER, exception, read_write, seal, unseal
+from drivers.ink.pump import MAX_RPM, RUN_REGISTER, SPEED_REGISTER, STOP
+
+FULL_SPEED = 2
+
+
+class PumpFirmware:
+    """Turns while it runs, by `now_s`; what it has pumped can be read at any time."""
+
+    def __init__(
+        self, *, unit: int = 1, ml_per_revolution: float = 0.1, now_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.unit = unit
+        self.rpm = 0.0
+        self.starts = 0
+        self._ml_per_revolution = ml_per_revolution
+        self._now_s = now_s
+        self._run = STOP
+        self._pumped_ml = 0.0
+        self._since_s = now_s()
+
+    @property
+    def running(self) -> bool:
+        """Whether the rotor turns."""
+        return self._run != STOP
+
+    @property
+    def pumped_ml(self) -> float:
+        """All that has been pumped so far."""
+        self._settle()
+        return self._pumped_ml
+
+    def take(self, buffer: bytearray) -> bytes | None:
+        """Eight bytes, the length of every request that it knows."""
+        if len(buffer) < WRITE_BYTES:
+            return None
+        frame = bytes(buffer[:WRITE_BYTES])
+        del buffer[:WRITE_BYTES]
+        return frame
+
+    def answer(self, request: bytes) -> bytes | None:
+        """Silence for a wrong CRC or another unit, as Modbus wants it."""
+        try:
+            unit, function, *_ = unseal(request)
+        except ProtocolViolation:
+            return None
+        if unit != self.unit:
+            return None
+        if function != WRITE_REGISTER:
+            return exception(unit, function & 0x7F, 1)
+        _, register, value = read_write(request)
+        self._settle()
+        if register not in (SPEED_REGISTER, RUN_REGISTER):
+            return exception(unit, function, 2)
+        if value > (MAX_RPM * 100 if register == SPEED_REGISTER else FULL_SPEED):
+            return exception(unit, function, 3)
+        if register == SPEED_REGISTER:
+            self.rpm = value / 100
+        else:
+            self.starts += value != STOP and not self.running
+            self._run = value
+        return request
+
+    def damage(self, reply: bytes) -> bytes:
+        """The last byte of the CRC changed."""
+        return reply[:-1] + bytes([reply[-1] ^ 0x55])
+
+    def mistake(self, reply: bytes) -> bytes:
+        """A sound confirmation of some other register."""
+        return seal(bytes([self.unit, WRITE_REGISTER, 0x00, 0x77, 0x00, 0x00]))
+
+    def _settle(self) -> None:
+        now_s = self._now_s()
+        rpm = {STOP: 0.0, FULL_SPEED: MAX_RPM}.get(self._run, self.rpm)
+        self._pumped_ml += rpm / 60.0 * self._ml_per_revolution * (now_s - self._since_s)
+        self._since_s = now_s
