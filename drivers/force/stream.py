@@ -1,0 +1,159 @@
+"""A thread that owns a CAN bus from open to shutdown and turns its frames into wrenches."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import can
+
+from drivers.clock import Clock
+from drivers.force.rounds import COMMAND_ID, START, STOP, RoundAssembler
+from drivers.force.samples import ForceHealth, Wrench
+from drivers.samples import Stamp
+
+RECEIVE_S = 0.05
+BUS_OFF = 0x40
+"""Bit of an error frame's id (Linux `can/error.h`): the controller took itself off the bus."""
+RATE_WINDOW = 200
+
+
+@dataclass(frozen=True, slots=True)
+class BusSettings:
+    """What python-can opens."""
+
+    interface: str
+    channel: str
+    bitrate: int
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """Why the stream ended and what to do about it."""
+
+    what: str
+    remedy: str
+
+
+class RoundStream:
+    """Starts the sensor, reads it until `stop`, and stops it again. Use one for each connection."""
+
+    def __init__(
+        self,
+        settings: BusSettings,
+        assembler: RoundAssembler,
+        clock: Clock,
+        *,
+        gap_ms: float,
+        on_round: Callable[[Stamp, Wrench], None],
+        on_loss: Callable[[], None],
+    ) -> None:
+        self._settings = settings
+        self._assembler = assembler
+        self._clock = clock
+        self._gap_ns = round(gap_ms * 1e6)
+        self._on_round = on_round
+        self._on_loss = on_loss
+        self._closing = threading.Event()
+        self._arrivals_ns: deque[int] = deque(maxlen=RATE_WINDOW)
+        self._rounds = self._gaps = self._bus_errors = 0
+        self.newest: tuple[Stamp, Wrench] | None = None
+        self.loss: Loss | None = None
+        self.channel_info = ""
+        self.virtual = False
+        self.collecting: list[Wrench] | None = None
+        """Where every round is put while somebody averages."""
+        self._thread = threading.Thread(target=self._run, name="force reader", daemon=True)
+
+    def start(self) -> None:
+        """Open the bus and read, in a thread; a failure shows in `loss`."""
+        self._thread.start()
+
+    def stop(self, timeout_s: float = 5.0) -> None:
+        """Stop the sensor, shut the bus down, join the thread; blocks."""
+        self._closing.set()
+        self._thread.join(timeout_s)
+
+    def health(self) -> ForceHealth:
+        """Rate and counters."""
+        arrivals_ns = self._arrivals_ns.copy()
+        span_ns = arrivals_ns[-1] - arrivals_ns[0] if len(arrivals_ns) > 1 else 0
+        rate_hz = (len(arrivals_ns) - 1) * 1e9 / span_ns if span_ns else 0.0
+        parts = self._assembler
+        return ForceHealth(rate_hz, self._rounds, parts.torn, parts.refused, self._gaps, self._bus_errors)
+
+    def _run(self) -> None:
+        try:
+            bus = self._open()
+        except Exception as error:
+            # Adapters' back ends raise what they like where a library or a package is missing.
+            self._lose(f"cannot open {self._name}: {error}", "Check the adapter and that its interface is up.")
+            return
+        try:
+            self.channel_info, self.virtual = str(bus.channel_info), self._settings.interface == "virtual"
+            bus.send(command(START), timeout=1.0)
+            while self.loss is None and not self._closing.is_set():
+                message = bus.recv(RECEIVE_S)
+                if message is not None:
+                    self._take(message)
+                elif bus.state is can.BusState.ERROR:
+                    self._lose_bus("is off")
+        except (can.CanError, OSError) as error:
+            self._lose_bus(f"failed: {error}")
+        finally:
+            with contextlib.suppress(can.CanError, OSError):
+                bus.send(command(STOP), timeout=1.0)
+            bus.shutdown()
+            if not self._closing.is_set() and self.loss is None:
+                self._lose("the reader failed", "Connect again.")
+
+    def _open(self) -> can.BusABC:
+        settings = self._settings
+        # Only what was asked for: python-can would also read can.ini, the environment and the home folder.
+        return can.Bus(settings.channel, settings.interface, ignore_config=True, bitrate=settings.bitrate)
+
+    def _take(self, message: can.Message) -> None:
+        if message.is_error_frame:
+            self._bus_errors += 1
+            if message.arbitration_id & BUS_OFF:
+                self._lose_bus("is off after too many errors")
+            return
+        if message.is_extended_id or message.is_remote_frame or message.is_fd:
+            return
+        wrench = self._assembler.feed(message.arbitration_id, bytes(message.data), message.timestamp)
+        if wrench is None:
+            return
+        device_ns = round(message.timestamp * 1e9) or None  # 0: the adapter has no clock
+        now_ns = self._clock.now_ns()
+        if self._arrivals_ns and now_ns - self._arrivals_ns[-1] > self._gap_ns:
+            self._gaps += 1
+        self._arrivals_ns.append(now_ns)
+        stamp = Stamp(now_ns, device_ns, self._rounds)
+        self._rounds += 1
+        self.newest = (stamp, wrench)
+        if (collecting := self.collecting) is not None:
+            collecting.append(wrench)
+        self._on_round(stamp, wrench)
+
+    @property
+    def _name(self) -> str:
+        return f"{self._settings.interface} {self._settings.channel}"
+
+    def _lose_bus(self, what: str) -> None:
+        self._lose(
+            f"the bus {self._name} {what}",
+            f"Check wiring, termination and that both ends run at {self._settings.bitrate} bit/s; "
+            "then set the interface down and up, and connect again.",
+        )
+
+    def _lose(self, what: str, remedy: str) -> None:
+        self.loss = Loss(what, remedy)
+        self._on_loss()
+
+
+def command(data: bytes) -> can.Message:
+    """A frame to the board."""
+    return can.Message(arbitration_id=COMMAND_ID, is_extended_id=False, data=data)

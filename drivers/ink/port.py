@@ -1,0 +1,172 @@
+"""A serial line that asks and waits for the answer, in one worker thread that owns the port from open to close.
+
+One thread, so that an exchange whose caller was cancelled still ends before the next begins: two requests at once
+on a half-duplex line would destroy each other.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Literal, Protocol, TypeVar, cast
+
+from drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation
+
+MAX_REPLY_BYTES = 4096
+"""Far above any reply; a device that chatters without end must not fill the memory."""
+POLL_S = 0.02
+REPLUG = "Check cable, power and the path of the port, then connect again."
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class SerialSettings:
+    """`path` is the device file or COM port."""
+
+    path: str
+    baud: int
+    bytesize: Literal[7, 8] = 8
+    parity: Literal["N", "E", "O"] = "N"
+    stopbits: Literal[1, 2] = 1
+    gap_s: float = 0.0
+    """Silence before each request; Modbus RTU tells frames apart by it."""
+
+
+class _Port(Protocol):
+    """What is used of pyserial, which ships no types."""
+
+    @property
+    def in_waiting(self) -> int: ...
+    def read(self, size: int) -> bytes: ...
+    def write(self, data: bytes) -> int | None: ...
+    def close(self) -> None: ...
+
+
+class SerialPort:
+    """Requests and replies over pyserial, without blocking the event loop."""
+
+    def __init__(self, device: str, settings: SerialSettings) -> None:
+        self._device = device
+        self._settings = settings
+        self._worker: ThreadPoolExecutor | None = None
+        self._port: _Port | None = None
+        self._lost: str | None = None
+        self._closing = threading.Event()
+
+    async def open(self) -> None:
+        """Open the port for this process alone. Raises `ConnectionLost`."""
+        await self.close()
+        self._lost, self._closing = None, threading.Event()
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"serial {self._settings.path}")
+        try:
+            await asyncio.get_running_loop().run_in_executor(self._worker, self._open)
+        except BaseException:
+            await self.close()
+            raise
+
+    async def exchange(
+        self, op: str, request: bytes, find: Callable[[bytes], T | None], *, timeout_s: float, condition: str = ""
+    ) -> T:
+        """Send `request`, then show all that arrives to `find` until it makes something of it.
+
+        Raises `DeviceTimeout` where nothing came, `ProtocolViolation` where something else came, `ConnectionLost`,
+        `NotConnected`, each with `condition`.
+        """
+        if self._worker is None:
+            raise NotConnected(self._device, op, "not connected")
+        loop, closing = asyncio.get_running_loop(), self._closing
+        try:
+            received, found = await loop.run_in_executor(
+                self._worker, lambda: self._ask(op, request, find, timeout_s, closing)
+            )
+        except ConnectionLost as error:
+            raise ConnectionLost(self._device, op, error.what, condition=condition, remedy=REPLUG) from None
+        if found is not None:
+            return found
+        if received:
+            raise ProtocolViolation(
+                self._device, op, f"no reply among {shown(received)} in {timeout_s:g} s", condition=condition
+            )
+        raise DeviceTimeout(
+            self._device, op, f"no reply in {timeout_s:g} s", condition=condition, remedy="Check power and cable."
+        )
+
+    async def close(self) -> None:
+        """Abandon a pending exchange, close the port and join the worker; may be repeated."""
+        self._closing.set()
+        worker, self._worker = self._worker, None
+        if worker is not None:
+            worker.submit(self._close)
+            await asyncio.shield(asyncio.to_thread(worker.shutdown))
+
+    def _open(self) -> None:
+        import serial
+
+        settings = self._settings
+        try:
+            port = serial.Serial(
+                settings.path,
+                settings.baud,
+                bytesize=settings.bytesize,
+                parity=settings.parity,
+                stopbits=settings.stopbits,
+                timeout=POLL_S,
+                write_timeout=1.0,
+                exclusive=True,
+            )
+        except (OSError, ValueError) as error:  # pyserial's own error is an OSError
+            why = f"cannot open {settings.path}: {error}"
+            raise ConnectionLost(self._device, "connect", why, remedy=REPLUG) from None
+        self._port = cast("_Port", port)
+
+    def _close(self) -> None:
+        port, self._port = self._port, None
+        if port is not None:
+            with contextlib.suppress(OSError):
+                port.close()
+
+    def _ask(
+        self,
+        op: str,
+        request: bytes,
+        find: Callable[[bytes], T | None],
+        timeout_s: float,
+        closing: threading.Event,
+    ) -> tuple[bytes, T | None]:
+        if self._lost is not None:
+            raise ConnectionLost(self._device, op, self._lost)
+        port = self._port
+        if port is None or closing.is_set():
+            raise NotConnected(self._device, op, "closed while waiting")
+        try:
+            time.sleep(self._settings.gap_s)
+            if waiting := port.in_waiting:
+                port.read(waiting)  # late replies and noise from before this request
+            port.write(request)
+            received = b""
+            deadline_s = time.monotonic() + timeout_s
+            while time.monotonic() < deadline_s:
+                if closing.is_set():
+                    raise NotConnected(self._device, op, "closed while waiting")
+                if not (arrived := port.read(max(1, port.in_waiting))):
+                    continue
+                received += arrived
+                if (found := find(received)) is not None:
+                    return received, found
+                if len(received) > MAX_REPLY_BYTES:
+                    break
+            return received, None
+        except OSError as error:
+            self._lost = f"{self._settings.path}: {error.strerror or error}"
+            raise ConnectionLost(self._device, op, self._lost) from None
+
+
+def shown(data: bytes) -> str:
+    """The first bytes, as a message can carry them."""
+    return f"{data[:48]!r}{'...' if len(data) > 48 else ''}"

@@ -1,0 +1,228 @@
+"""A peristaltic pump on Modbus RTU (RS-485).
+
+The register map is from public third-party code, not from the maker's manual, and no pump has confirmed it yet:
+register 1 is the speed in 0.01 rpm, register 4 is 1 to start, 0 to stop, 2 for full speed. Only writes are known to
+be answered, so nothing is read: the pump can tell neither who it is nor how full the well is.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Coroutine
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from drivers.clock import Clock
+from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, ProtocolViolation
+from drivers.ink.budget import DoseBudget
+from drivers.ink.errors import InkRefused
+from drivers.ink.modbus import DEVICE, EXCEPTIONS, find_reply, write_register
+from drivers.ink.port import SerialPort, SerialSettings
+from drivers.samples import Identity
+
+SPEED_REGISTER = 1
+RUN_REGISTER = 4
+STOP, START = 0, 1
+STOP_ATTEMPTS = 3
+MAX_RPM = 600.0
+"""The speed register would hold 655.35."""
+
+
+@dataclass(frozen=True, slots=True)
+class PumpOptions:
+    """Where the pump is and what its tube delivers."""
+
+    path: str
+    ml_per_revolution: float
+    """Calibrated: weigh what 100 revolutions deliver. A tube wears, so it is worth repeating."""
+    rpm: float = 50.0
+    unit: int = 1
+    baud: int = 9600
+    parity: Literal["N", "E", "O"] = "N"
+    stopbits: Literal[1, 2] = 1
+    max_dose_ml: float = 2.0
+    max_per_minute_ml: float = 5.0
+    timeout_s: float = 0.5
+    echo_s: float = 0.15
+    """How long `connect` waits for an echo: longer than eight characters and the adapter's own delay."""
+    max_overrun_s: float = 0.5
+    """A stop that comes later than this after its time is reported: the well got more than was asked for."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError where the pump could not run like that."""
+        if not (0.0 < self.rpm <= MAX_RPM and 0.0 < self.ml_per_revolution < 100.0):
+            raise ValueError(f"cannot pump {self.ml_per_revolution} ml per revolution at {self.rpm} rpm")
+
+    @property
+    def gap_s(self) -> float:
+        """3.5 characters of 11 bits, at least 1.75 ms: the silence that ends a frame."""
+        return max(0.00175, 3.5 * 11 / self.baud)
+
+
+class ModbusPump:
+    """`Ink` by time: so many revolutions at so many rpm; a running pump is always stopped."""
+
+    def __init__(self, options: PumpOptions, clock: Clock) -> None:
+        self._options = options
+        self._clock = clock
+        self._port = SerialPort(
+            DEVICE,
+            SerialSettings(
+                options.path, options.baud, parity=options.parity, stopbits=options.stopbits, gap_s=options.gap_s
+            ),
+        )
+        # Below a tenth of a second the time that messages take would matter more than the time pumped.
+        self._ml_per_s = options.ml_per_revolution * options.rpm / 60.0
+        self._budget = DoseBudget(
+            DEVICE,
+            smallest_ml=0.1 * self._ml_per_s,
+            max_dose_ml=options.max_dose_ml,
+            max_per_minute_ml=options.max_per_minute_ml,
+        )
+        self._running = asyncio.Lock()
+        self._connected = False
+        self._may_run = False
+
+    async def connect(self) -> Identity:
+        """Open the port, make sure of a line without echo, and stop the pump. Raises `DeviceError`; closed then."""
+        self._connected = False
+        await self._port.open()
+        try:
+            await self._refuse_echo()
+            await self._halt()
+        except BaseException:
+            await self._port.close()
+            raise
+        self._connected = True
+        # A pump cannot say whether it is the loopback rig's.
+        return Identity(DEVICE, f"Modbus RTU pump, unit {self._options.unit}", "", False)
+
+    async def dose(self, volume_ml: float) -> None:
+        """Pump for as long as `volume_ml` takes, then stop. Raises `LimitExceeded`, `InkRefused`, `DeviceError`.
+
+        Whatever goes wrong in between, cancellation included, the pump is stopped before it is passed on.
+        """
+        if not self._connected:
+            raise NotConnected(DEVICE, "dose", "not connected")
+        async with self._running:
+            self._budget.take(volume_ml, self._clock.now_ns())
+            speed = round(self._options.rpm * 100)
+            await self._write(SPEED_REGISTER, speed, "set speed", "The pump was not started.")
+            planned_s = volume_ml / self._ml_per_s
+            if not self._connected:  # closed meanwhile: its stop has been sent, and no start may follow it
+                raise NotConnected(DEVICE, "dose", "closed while waiting", condition="The pump was not started.")
+            try:
+                self._may_run = True
+                await self._write(RUN_REGISTER, START, "start", "The pump is stopped.")
+                began_s = time.monotonic()
+                await asyncio.sleep(planned_s)
+            except BaseException as error:
+                await self._halt_despite(error)
+                raise
+            ran_s = time.monotonic() - began_s
+            await finished(self._halt())
+            if ran_s > planned_s + self._options.max_overrun_s:
+                excess_ml = (ran_s - planned_s) * self._ml_per_s
+                raise DeviceError(
+                    DEVICE,
+                    "dose",
+                    f"ran {ran_s:.2f} s instead of {planned_s:.2f} s",
+                    condition=f"About {excess_ml:.2f} ml too much is in the well; the pump is stopped.",
+                    remedy="Something held the host up.",
+                )
+
+    async def level(self) -> float | None:
+        """None: the pump has no gauge, and what is in the well is unknown."""
+        if not self._connected:
+            raise NotConnected(DEVICE, "level", "not connected")
+        return None
+
+    async def close(self) -> None:
+        """Stop the pump once more, then close the port. Raises `DeviceError` only if the pump may still be running."""
+        connected, self._connected = self._connected, False
+        try:
+            if connected:
+                await self._halt()
+        except DeviceError:
+            if self._may_run:
+                raise
+        finally:
+            await self._port.close()
+
+    async def _halt(self) -> None:
+        """Stop, and try again: a pump that runs on is worse than a late error."""
+        for left in reversed(range(STOP_ATTEMPTS)):
+            try:
+                await self._write(RUN_REGISTER, STOP, "stop", "The pump may still be running.")
+            except (ConnectionLost, NotConnected):
+                raise
+            except DeviceError:
+                if not left:
+                    raise
+            else:
+                self._may_run = False
+                return
+
+    async def _halt_despite(self, error: BaseException) -> None:
+        """Stop after `error`. A stop that fails outweighs a failed start, but must not swallow a cancellation."""
+        try:
+            await finished(self._halt())
+        except DeviceError as failure:
+            if isinstance(error, DeviceError):
+                raise failure from error
+            error.add_note(str(failure))
+
+    async def _write(self, register: int, value: int, op: str, condition: str) -> None:
+        request = write_register(self._options.unit, register, value)
+        code = await self._port.exchange(
+            op,
+            request,
+            lambda received: find_reply(received, request),
+            timeout_s=self._options.timeout_s,
+            condition=condition,
+        )
+        if code:
+            text = EXCEPTIONS.get(code, "unknown")
+            raise InkRefused(DEVICE, op, code, text, condition=condition, remedy="Is this the pump's register map?")
+
+    async def _refuse_echo(self) -> None:
+        """Send a stop with a wrong CRC, which no device answers: only an adapter hands it back.
+
+        The reply to a write is the request itself, so an echo would pass for a pump that obeys.
+        """
+        sound = write_register(self._options.unit, RUN_REGISTER, STOP)
+        damaged = sound[:-2] + bytes(byte ^ 0xFF for byte in sound[-2:])
+        try:
+            await self._port.exchange(
+                "connect",
+                damaged,
+                lambda received: True if damaged in received else None,
+                timeout_s=self._options.echo_s,
+            )
+        except (DeviceTimeout, ProtocolViolation):
+            return
+        raise ProtocolViolation(
+            DEVICE,
+            "connect",
+            "the line echoes, so a confirmation would mean nothing",
+            remedy="Switch off local echo on the RS-485 adapter.",
+        )
+
+
+async def finished(work: Coroutine[Any, Any, None]) -> None:
+    """Run `work` to its end even where the caller is cancelled meanwhile, once or many times; then pass that on."""
+    task = asyncio.ensure_future(work)
+    cancelled: asyncio.CancelledError | None = None
+    while not task.done():
+        try:
+            await asyncio.shield(task)
+        except asyncio.CancelledError as error:
+            cancelled = error
+        except DeviceError:
+            break
+    if cancelled is None:
+        return await task
+    if not task.cancelled() and (failure := task.exception()) is not None:
+        cancelled.add_note(str(failure))
+    raise cancelled

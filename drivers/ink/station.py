@@ -1,0 +1,155 @@
+"""The ink station: a microcontroller with a pump, a light, a lid and a level gauge, on the lines of `drivers.ink.line`.
+
+A request whose reply is damaged or lost is sent again with the same number; the station answers a repeated line
+from memory, so that no dose is given twice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drivers.clock import Clock
+from drivers.errors import DeviceError, DeviceTimeout, LimitExceeded, ProtocolViolation
+from drivers.ink.budget import DoseBudget
+from drivers.ink.errors import InkRefused
+from drivers.ink.line import DEVICE, NUMBERS, Reply, find_reply, number_of, seal
+from drivers.ink.port import SerialPort, SerialSettings
+from drivers.samples import Identity
+
+MODEL = "ink-station"
+PROTOCOL = "1"
+SMALLEST_ML = 0.001
+FAILED = 6
+"""The one refusal after which something may have been done."""
+REMEDIES = {
+    1: "The firmware is older than this software; update it.",
+    3: "The station's own limit is lower than the configured one; set the configured one to match.",
+    4: "Refill the reservoir.",
+    5: "Open the lid of the well.",
+    FAILED: "Look at the pump and the lid before going on.",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class StationOptions:
+    """Where the station is and how much ink it may give."""
+
+    path: str
+    baud: int = 115200
+    max_dose_ml: float = 2.0
+    max_per_minute_ml: float = 5.0
+    timeout_s: float = 0.5
+    s_per_ml: float = 4.0
+    """The longest that the station takes for 1 ml; its reply comes when the ink is in the well."""
+    attempts: int = 2
+    connect_attempts: int = 6
+    """Many boards restart when their port is opened, and are deaf for two seconds."""
+
+
+class InkStation:
+    """`Ink` over the station's line protocol."""
+
+    def __init__(self, options: StationOptions, clock: Clock) -> None:
+        self._options = options
+        self._clock = clock
+        self._port = SerialPort(DEVICE, SerialSettings(options.path, options.baud))
+        self._budget = DoseBudget(
+            DEVICE,
+            smallest_ml=SMALLEST_ML,
+            max_dose_ml=options.max_dose_ml,
+            max_per_minute_ml=options.max_per_minute_ml,
+        )
+        self._number = 0
+
+    async def connect(self) -> Identity:
+        """Open the port and learn who answers; moves nothing. Raises `DeviceError`; nothing is left open then."""
+        self._number = 0
+        await self._port.open()
+        try:
+            return await self._identify()
+        except BaseException:
+            await self._port.close()
+            raise
+
+    async def dose(self, volume_ml: float) -> None:
+        """Add ink to the well; returns when it is in. Raises `LimitExceeded`, `InkRefused`, `DeviceError`.
+
+        It cannot be interrupted once it was sent, which is why one dose is small.
+        """
+        self._budget.take(volume_ml, self._clock.now_ns())
+        unknown = f"Between 0 and {volume_ml:.3f} ml may be in the well."
+        timeout_s = self._options.timeout_s + volume_ml * self._options.s_per_ml
+        reply = await self._ask("dose", f"{volume_ml:.3f}", timeout_s=timeout_s, condition=unknown)
+        given_ml = self._number_in(reply, "dose")
+        if abs(given_ml - volume_ml) > max(2 * SMALLEST_ML, 0.05 * volume_ml):
+            raise DeviceError(DEVICE, "dose", f"gave {given_ml:.3f} ml instead of {volume_ml:.3f} ml")
+
+    async def light(self, level: float) -> None:
+        """Set the light, 0 to 1. Raises `LimitExceeded`, `InkRefused`, `DeviceTimeout`, `ConnectionLost`."""
+        if not 0.0 <= level <= 1.0:
+            raise LimitExceeded(DEVICE, "light", level, 0.0, 1.0, "of full")
+        await self._ask("light", f"{level:.3f}")
+
+    async def open_lid(self) -> None:
+        """Open the well. Raises `InkRefused`, `DeviceTimeout`, `ConnectionLost`."""
+        await self._ask("lid", "open")
+
+    async def close_lid(self) -> None:
+        """Cover the well; keep the brush out of it. Raises `InkRefused`, `DeviceTimeout`, `ConnectionLost`."""
+        await self._ask("lid", "close")
+
+    async def level(self) -> float | None:
+        """Fill level of the well, 0 to 1. Raises `InkRefused`, `DeviceError`."""
+        level = self._number_in(await self._ask("level"), "level")
+        if level > 1.0:
+            raise ProtocolViolation(DEVICE, "level", f"level is {level:g}, above 1")
+        return level
+
+    async def close(self) -> None:
+        """Close the port; light and lid stay as they are."""
+        await self._port.close()
+
+    async def _identify(self) -> Identity:
+        reply = await self._ask("identify", attempts=self._options.connect_attempts)
+        match reply.values:
+            case (model, protocol, firmware, ("real" | "loopback") as kind) if (model, protocol) == (MODEL, PROTOCOL):
+                return Identity(DEVICE, MODEL, firmware, kind == "loopback")
+            case other:
+                raise ProtocolViolation(
+                    DEVICE,
+                    "connect",
+                    f"identifies as {' '.join(other)!r}, expected {MODEL} with protocol {PROTOCOL}",
+                    remedy="Check that the path is that of the ink station, and its firmware.",
+                )
+
+    async def _ask(
+        self, *words: str, timeout_s: float | None = None, attempts: int | None = None, condition: str = ""
+    ) -> Reply:
+        number, self._number = self._number, (self._number + 1) % NUMBERS
+        request = seal(number, " ".join(words))
+        left = attempts or self._options.attempts
+        while True:
+            try:
+                reply = await self._port.exchange(
+                    words[0],
+                    request,
+                    lambda received: find_reply(received, number),
+                    timeout_s=timeout_s or self._options.timeout_s,
+                    condition=condition,
+                )
+            except (DeviceTimeout, ProtocolViolation):
+                left -= 1
+                if not left:
+                    raise
+            else:
+                break
+        if reply.code:
+            left_at = condition if reply.code == FAILED else "Nothing was done."
+            remedy = REMEDIES.get(reply.code, "")
+            raise InkRefused(DEVICE, words[0], reply.code, reply.text, condition=left_at, remedy=remedy)
+        return reply
+
+    def _number_in(self, reply: Reply, op: str) -> float:
+        if len(reply.values) != 1:
+            raise ProtocolViolation(DEVICE, op, f"expected one number, got {' '.join(reply.values)!r}")
+        return number_of(reply.values[0])

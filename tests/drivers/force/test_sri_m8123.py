@@ -1,0 +1,352 @@
+"""The force driver against a board on a virtual bus: what it reads, what it refuses, and how it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import threading
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from itertools import count, pairwise
+
+import can
+import pytest
+from can.interfaces.virtual import VirtualBus
+
+from drivers.clock import HostClock
+from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, LimitExceeded, NotConnected, Stale
+from drivers.force.rounds import encode_round
+from drivers.force.samples import ForceSample, Wrench
+from drivers.force.sri_m8123 import SriM8123, SriOptions
+from drivers.protocols import ForceSensor
+from drivers.sim.force_sensor import Fault, SimForceSensor
+
+WRENCH: Wrench = (1.0, -2.0, 3.5, 0.25, -0.5, 0.125)
+NUMBERS = count()
+RATE_HZ = 100.0
+
+
+@pytest.fixture
+def channel() -> str:
+    return f"force-{next(NUMBERS)}"
+
+
+@pytest.fixture
+def board(channel: str) -> Iterator[SimForceSensor]:
+    with SimForceSensor(channel, lambda _: WRENCH, rate_hz=RATE_HZ) as it:
+        yield it
+
+
+def sensor_on(channel: str, **options: float) -> SriM8123:
+    # round_ms is wide: on a busy machine the simulated board may pause within a round.
+    made = SriOptions("virtual", channel, **{"round_ms": 200.0, "stale_after_ms": 250.0, "gap_ms": 150.0, **options})
+    return SriM8123(made, HostClock())
+
+
+@pytest.fixture
+async def sensor(board: SimForceSensor) -> AsyncIterator[SriM8123]:
+    it = sensor_on(board.channel)
+    await it.connect()
+    yield it
+    await it.close()
+
+
+async def until(met: Callable[[], bool], limit_s: float = 2.0) -> None:
+    async with asyncio.timeout(limit_s):
+        while not met():
+            await asyncio.sleep(0.005)
+
+
+def readers() -> int:
+    return sum(t.name == "force reader" for t in threading.enumerate())
+
+
+async def test_connecting_starts_the_board_and_closing_stops_it(board: SimForceSensor):
+    sensor = sensor_on(board.channel)
+    assert isinstance(sensor, ForceSensor)
+    identity = await sensor.connect()
+    assert identity.model.startswith("SRI M8123B2 on Virtual bus")
+    assert identity.simulated
+    assert sensor.latest_n() == WRENCH[:3]
+    assert sensor.latest().torque_nm == WRENCH[3:]
+    await sensor.close()
+    await until(lambda: board.commands == [b"\x02", b"\x00"])
+    assert not board.streaming
+    assert readers() == 0
+    with pytest.raises(NotConnected):
+        sensor.latest_n()
+    await sensor.close()
+
+
+async def test_the_wire_is_read_as_written(channel: str):
+    """The same bytes as a candump of a board would show, sent by hand."""
+    with can.Bus(channel, "virtual", ignore_config=True) as bus:
+
+        def play() -> None:
+            start = bus.recv(2.0)
+            assert start is not None
+            assert (start.arbitration_id, bytes(start.data), start.is_extended_id) == (0x80, b"\x02", False)
+            for can_id, data in (
+                (0x291, "00 00 80 3f 00 00 00 c0"),
+                (0x292, "00 00 60 40 00 00 80 3e"),
+                (0x293, "00 00 00 bf 00 00 00 3e"),
+            ):
+                bus.send(can.Message(arbitration_id=can_id, is_extended_id=False, data=bytes.fromhex(data)))
+
+        playing = asyncio.create_task(asyncio.to_thread(play))
+        sensor = sensor_on(channel)
+        await sensor.connect()
+        await playing
+        assert sensor.latest_n() == (1.0, -2.0, 3.5)
+        await sensor.close()
+        stop = bus.recv(1.0)
+        assert stop is not None
+        assert bytes(stop.data) == b"\x00"
+
+
+async def test_frames_of_others_are_passed_over(board: SimForceSensor, sensor: SriM8123):
+    with can.Bus(board.channel, "virtual", ignore_config=True) as other:
+        for can_id, extended in ((0x290, False), (0x294, False), (0x291, True), (0x292, True)):
+            other.send(can.Message(arbitration_id=can_id, is_extended_id=extended, data=bytes(8)))
+        other.send(can.Message(arbitration_id=0x291, is_extended_id=False, is_remote_frame=True, dlc=8))
+        await asyncio.sleep(0.05)
+    assert sensor.latest_n() == WRENCH[:3]
+    assert sensor.health().torn == 0
+
+
+async def test_samples_are_stamped_and_counted_and_reach_the_listener_in_the_loop(sensor: SriM8123):
+    seen: list[ForceSample] = []
+    loops: set[object] = set()
+
+    def listener(sample: ForceSample) -> None:
+        seen.append(sample)
+        loops.add(asyncio.get_running_loop())
+
+    before_ns = time.time_ns() - 50_000_000
+    sensor.listen(listener)
+    await until(lambda: len(seen) >= 10)
+    sensor.listen(None)
+    size = len(seen)
+    await asyncio.sleep(0.05)
+    assert len(seen) == size
+    assert loops == {asyncio.get_running_loop()}
+    assert [s.stamp.seq for s in seen] == list(range(seen[0].stamp.seq, seen[0].stamp.seq + size))
+    for earlier, later in pairwise(seen):
+        assert before_ns < earlier.stamp.host_ns < later.stamp.host_ns
+        assert earlier.stamp.device_ns is not None
+        assert abs(earlier.stamp.host_ns - earlier.stamp.device_ns) < 10**9
+
+
+async def test_no_sample_is_delivered_after_close(board: SimForceSensor, sensor: SriM8123):
+    seen: list[ForceSample] = []
+    sensor.listen(seen.append)
+    await until(lambda: bool(seen))
+    await sensor.close()
+    size = len(seen)
+    await asyncio.sleep(0.05)
+    assert len(seen) == size
+
+
+async def test_latest_never_blocks(sensor: SriM8123):
+    began = time.monotonic()
+    for _ in range(1000):
+        sensor.latest_n()
+    assert time.monotonic() - began < 0.5
+
+
+async def test_the_rate_is_measured(sensor: SriM8123):
+    await until(lambda: sensor.health().rounds >= 30)
+    health = sensor.health()
+    assert health.rate_hz == pytest.approx(RATE_HZ, rel=0.2)
+    assert (health.torn, health.refused, health.bus_errors) == (0, 0, 0)
+
+
+async def test_silence_makes_the_sample_stale_and_leaves_a_gap(board: SimForceSensor, sensor: SriM8123):
+    board.fail(*[Fault.SILENCE] * 40)
+    await asyncio.sleep(0.35)
+    with pytest.raises(Stale) as stale:
+        sensor.latest_n()
+    assert stale.value.age_ms > 250.0
+    await until(lambda: sensor.health().gaps == 1)
+    assert sensor.latest_n() == WRENCH[:3]
+
+
+@pytest.mark.parametrize("fault", [Fault.NO_FIRST, Fault.NO_SECOND, Fault.NO_THIRD, Fault.SHORT])
+async def test_a_torn_round_is_dropped_and_counted(fault: Fault, board: SimForceSensor, sensor: SriM8123):
+    seen: list[ForceSample] = []
+    sensor.listen(seen.append)
+    board.fail(fault, fault, fault)
+    await until(lambda: sensor.health().torn == 3)
+    await until(lambda: len(seen) > 5)
+    assert {s.force_n for s in seen} == {WRENCH[:3]}
+    assert sensor.health().torn == 3
+
+
+async def test_what_is_no_number_is_refused_and_goes_stale(board: SimForceSensor, sensor: SriM8123):
+    seen: list[ForceSample] = []
+    sensor.listen(seen.append)
+    board.fail(*[Fault.NAN, Fault.INF] * 20)
+    await asyncio.sleep(0.35)
+    with pytest.raises(Stale):
+        sensor.latest_n()
+    assert sensor.health().refused >= 20
+    assert all(math.isfinite(value) for s in seen for value in (*s.force_n, *s.torque_nm))
+
+
+async def test_bus_off_is_a_lost_connection_that_says_what_to_do(board: SimForceSensor, sensor: SriM8123):
+    board.fail(Fault.BUS_OFF)
+    await until(lambda: sensor.health().bus_errors == 1)
+    await until(lambda: readers() == 0)
+    for use in (sensor.latest_n, sensor.latest):
+        with pytest.raises(ConnectionLost, match=r"off after too many errors.*termination.*1000000 bit/s"):
+            use()
+    with pytest.raises(ConnectionLost):
+        await sensor.bias(0.1)
+    await sensor.connect()
+    assert sensor.latest_n() == WRENCH[:3]
+
+
+async def test_a_bus_error_is_counted_and_lived_with(board: SimForceSensor, sensor: SriM8123):
+    board.fail(Fault.BUS_ERROR, Fault.BUS_ERROR)
+    await until(lambda: sensor.health().bus_errors == 2)
+    assert sensor.latest_n() == WRENCH[:3]
+
+
+@pytest.mark.parametrize("error", [can.CanOperationError("network is down", 100), OSError(19, "No such device")])
+async def test_an_adapter_that_goes_away_is_a_lost_connection(
+    error: Exception, sensor: SriM8123, monkeypatch: pytest.MonkeyPatch
+):
+    real = VirtualBus.recv
+
+    def recv(bus: VirtualBus, timeout: float | None = None) -> can.Message | None:
+        if threading.current_thread().name == "force reader":
+            raise error
+        return real(bus, timeout)
+
+    monkeypatch.setattr(VirtualBus, "recv", recv)
+    await until(lambda: readers() == 0)
+    with pytest.raises(ConnectionLost, match=r"bus virtual force-\d+ failed: .*connect again"):
+        sensor.latest_n()
+
+
+async def test_a_controller_that_reports_bus_off_only_when_asked(
+    board: SimForceSensor, sensor: SriM8123, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("can.BusABC.state", can.BusState.ERROR)
+    board.fail(*[Fault.SILENCE] * 20)
+    await until(lambda: readers() == 0)
+    with pytest.raises(ConnectionLost, match="is off"):
+        sensor.latest_n()
+
+
+async def test_where_no_board_answers_the_connection_times_out(channel: str):
+    sensor = sensor_on(channel, connect_timeout_s=0.2)
+    with pytest.raises(DeviceTimeout, match=r"no whole round in 0.2 s \(0 torn, 0 refused\).*termination"):
+        await sensor.connect()
+    assert readers() == 0
+    with pytest.raises(NotConnected):
+        sensor.health()
+
+
+async def test_a_board_that_sends_only_nan_does_not_connect(board: SimForceSensor):
+    board.fail(*[Fault.NAN] * 100)
+    with pytest.raises(DeviceTimeout, match=r"\d+ refused"):
+        await sensor_on(board.channel, connect_timeout_s=0.2).connect()
+    await until(lambda: not board.streaming)
+
+
+@pytest.mark.parametrize("interface", ["socketcan", "no-such-interface", "pcan"])
+async def test_an_adapter_that_is_not_there_is_a_lost_connection(interface: str):
+    sensor = SriM8123(SriOptions(interface, "can9"), HostClock())
+    with pytest.raises(ConnectionLost, match=f"cannot open {interface} can9"):
+        await sensor.connect()
+    assert readers() == 0
+
+
+async def test_a_cancelled_connect_leaves_nothing_open(channel: str):
+    sensor = sensor_on(channel, connect_timeout_s=30.0)
+    with pytest.raises(TimeoutError):
+        async with asyncio.timeout(0.05):
+            await sensor.connect()
+    assert readers() == 0
+
+
+async def test_connecting_again_starts_afresh(board: SimForceSensor, sensor: SriM8123):
+    await sensor.bias(0.2)
+    await sensor.connect()
+    assert readers() == 1
+    assert sensor.latest_n() == WRENCH[:3]
+    await until(lambda: board.commands == [b"\x02", b"\x00", b"\x02"])
+
+
+async def test_a_bias_is_subtracted_from_now_on(channel: str):
+    load: list[Wrench] = [WRENCH]
+    with SimForceSensor(channel, lambda _: load[0], rate_hz=200.0, noise_n=0.02, noise_nm=0.002) as board:
+        sensor = sensor_on(board.channel)
+        await sensor.connect()
+        await sensor.bias(0.4)
+        assert sensor.latest_n() == pytest.approx((0.0, 0.0, 0.0), abs=0.1)
+        assert sensor.bias_wrench == pytest.approx(WRENCH, abs=0.02)
+        seen: list[ForceSample] = []
+        load[0] = (1.0, -2.0, 8.5, 0.25, -0.5, 0.125)
+        sensor.listen(seen.append)
+        await until(lambda: len(seen) > 5)
+        assert seen[-1].force_n == pytest.approx((0.0, 0.0, 5.0), abs=0.1)
+        await sensor.close()
+
+
+@pytest.mark.parametrize(("axis", "size", "says"), [(2, 1.0, "Fz varied"), (3, 0.1, "Mx varied")])
+async def test_a_bias_while_something_moves_is_refused(channel: str, axis: int, size: float, says: str):
+    def shake(t_s: float) -> Wrench:
+        values = list(WRENCH)
+        values[axis] += size * math.sin(50.0 * t_s)
+        fx, fy, fz, mx, my, mz = values
+        return (fx, fy, fz, mx, my, mz)
+
+    with SimForceSensor(channel, shake) as board:
+        sensor = sensor_on(board.channel)
+        await sensor.connect()
+        with pytest.raises(DeviceError, match=rf"{says}.*The former bias stays.*try again"):
+            await sensor.bias(0.2)
+        assert sensor.bias_wrench == (0.0,) * 6
+        await sensor.close()
+
+
+async def test_a_bias_from_too_few_rounds_is_refused(sensor: SriM8123):
+    with pytest.raises(DeviceTimeout, match="10 are needed"):
+        await sensor.bias(0.02)
+
+
+async def test_a_bias_over_silence_is_refused(board: SimForceSensor, sensor: SriM8123):
+    board.fail(*[Fault.SILENCE] * 60)
+    with pytest.raises(Stale):
+        await sensor.bias(0.4)
+
+
+async def test_a_bias_takes_a_sensible_time(sensor: SriM8123):
+    for seconds in (0.0, -1.0, 61.0, math.nan):
+        with pytest.raises(LimitExceeded, match="bias time"):
+            await sensor.bias(seconds)
+
+
+async def test_closing_while_averaging_ends_in_an_error(sensor: SriM8123):
+    averaging = asyncio.create_task(sensor.bias(0.1))
+    await asyncio.sleep(0.02)
+    await sensor.close()
+    with pytest.raises(NotConnected, match="closed while averaging"):
+        await averaging
+
+
+async def test_the_noise_of_a_board_is_a_matter_of_its_seed(channel: str):
+    def noisy(name: str, seed: int) -> list[bytes]:
+        with (
+            can.Bus(name, "virtual", ignore_config=True) as bus,
+            SimForceSensor(name, lambda _: WRENCH, rate_hz=500.0, noise_n=0.1, seed=seed),
+        ):
+            bus.send(can.Message(arbitration_id=0x80, is_extended_id=False, data=b"\x02"))
+            received = [bus.recv(1.0) for _ in range(9)]
+            return [bytes(m.data) for m in received if m is not None]
+
+    first, again, other = (noisy(f"{channel}-{i}", seed) for i, seed in enumerate((1, 1, 2)))
+    assert first == again != other
+    assert first[:3] != [data for _, data in encode_round(WRENCH)]

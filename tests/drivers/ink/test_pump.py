@@ -1,0 +1,258 @@
+"""Transcripts of the Modbus pump: whatever happens, the last thing on the wire is a stop."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import AsyncIterator, Iterator
+
+import pytest
+
+from drivers.clock import HostClock
+from drivers.errors import (
+    ConnectionLost,
+    DeviceError,
+    DeviceTimeout,
+    LimitExceeded,
+    NotConnected,
+    ProtocolViolation,
+)
+from drivers.ink.errors import InkRefused
+from drivers.ink.pump import ModbusPump, PumpOptions
+from drivers.protocols import Ink
+from drivers.sim.ink_station import Fault, PtyLine
+from drivers.sim.modbus_pump import PumpFirmware
+
+TIMEOUT_S = 0.08
+ML_PER_REV = 0.12  # at 50 rpm: 0.1 ml/s
+PROBE = bytes.fromhex("01 06 00 04 00 00 37 F4")  # a stop with a wrong CRC
+STOP = bytes.fromhex("01 06 00 04 00 00 C8 0B")
+SPEED = bytes.fromhex("01 06 00 01 13 88 D5 5C")
+START = bytes.fromhex("01 06 00 04 00 01 09 CB")
+HELLO = [(PROBE, b""), (STOP, STOP)]
+BYE = [(STOP, STOP)]
+
+
+def pump_at(path: str, **options: float) -> ModbusPump:
+    return ModbusPump(PumpOptions(path, ML_PER_REV, **{"timeout_s": TIMEOUT_S, "echo_s": 0.02, **options}), HostClock())
+
+
+@pytest.fixture
+def firmware() -> PumpFirmware:
+    return PumpFirmware(ml_per_revolution=ML_PER_REV)
+
+
+@pytest.fixture
+def line(firmware: PumpFirmware) -> Iterator[PtyLine]:
+    with PtyLine(firmware, late_s=1.5 * TIMEOUT_S) as it:
+        yield it
+
+
+@pytest.fixture
+async def pump(line: PtyLine, firmware: PumpFirmware) -> AsyncIterator[ModbusPump]:
+    it = pump_at(line.path)
+    await it.connect()
+    yield it
+    await it.close()
+    assert not firmware.running
+
+
+async def test_a_dose_sets_the_speed_starts_and_stops(expected_protocol):
+    with expected_protocol([*HELLO, (SPEED, SPEED), (START, START), (STOP, STOP), *BYE]) as path:
+        pump = pump_at(path)
+        assert isinstance(pump, Ink)
+        identity = await pump.connect()
+        assert (identity.model, identity.simulated) == ("Modbus RTU pump, unit 1", False)
+        began = time.monotonic()
+        await pump.dose(0.015)
+        assert time.monotonic() - began >= 0.15
+        assert await pump.level() is None  # unknown
+        await pump.close()
+
+
+async def test_a_line_that_echoes_is_refused(expected_protocol):
+    with expected_protocol([(PROBE, PROBE)]) as path:
+        pump = pump_at(path, echo_s=0.5)
+        with pytest.raises(ProtocolViolation, match=r"echoes.*Switch off local echo"):
+            await pump.connect()
+        with pytest.raises(NotConnected):
+            await pump.dose(0.1)
+
+
+async def test_where_no_pump_answers_nothing_stays_open(expected_protocol):
+    with expected_protocol([(PROBE, b""), (STOP, b""), (STOP, b""), (STOP, b"")]) as path:
+        pump = pump_at(path, timeout_s=0.05)
+        with pytest.raises(DeviceTimeout, match="stop"):
+            await pump.connect()
+        with pytest.raises(NotConnected):
+            await pump.level()
+
+
+async def test_a_speed_that_is_refused_starts_nothing(expected_protocol):
+    with expected_protocol([*HELLO, (SPEED, bytes.fromhex("01 86 02 C3 A1")), *BYE]) as path:
+        pump = pump_at(path)
+        await pump.connect()
+        with pytest.raises(InkRefused, match=r"2 \(illegal register\). The pump was not started") as refusal:
+            await pump.dose(0.1)
+        assert refusal.value.code == 2
+        await pump.close()
+
+
+async def test_a_start_without_a_reply_is_stopped(expected_protocol):
+    with expected_protocol([*HELLO, (SPEED, SPEED), (START, b""), (STOP, STOP), *BYE]) as path:
+        pump = pump_at(path)
+        await pump.connect()
+        with pytest.raises(DeviceTimeout, match=r"start: .*The pump is stopped"):
+            await pump.dose(0.1)
+        await pump.close()
+
+
+async def test_a_stop_without_a_reply_is_sent_three_times_and_closing_tries_again(expected_protocol):
+    silent = (STOP, b"")
+    with expected_protocol([*HELLO, (SPEED, SPEED), (START, START), *[silent] * 3, *[silent] * 3]) as path:
+        pump = pump_at(path, timeout_s=0.05)
+        await pump.connect()
+        with pytest.raises(DeviceTimeout, match="may still be running"):
+            await pump.dose(0.01)
+        with pytest.raises(DeviceTimeout, match="may still be running"):
+            await pump.close()
+        await pump.close()
+
+
+async def test_a_device_failure_at_the_stop_is_tried_again(expected_protocol):
+    failed = (STOP, bytes.fromhex("01 86 04 43 A3"))
+    with expected_protocol([*HELLO, (SPEED, SPEED), (START, START), failed, (STOP, STOP), *BYE]) as path:
+        pump = pump_at(path)
+        await pump.connect()
+        await pump.dose(0.01)
+        await pump.close()
+
+
+async def test_a_dose_delivers_what_was_asked(firmware: PumpFirmware, pump: ModbusPump):
+    await pump.dose(0.015)
+    assert firmware.pumped_ml == pytest.approx(0.015, abs=0.008)
+    assert firmware.rpm == 50.0
+    assert not firmware.running
+
+
+async def test_doses_at_the_same_time_take_turns(firmware: PumpFirmware, pump: ModbusPump):
+    await asyncio.gather(pump.dose(0.01), pump.dose(0.01))
+    assert firmware.starts == 2
+    assert firmware.pumped_ml == pytest.approx(0.02, abs=0.01)
+
+
+@pytest.mark.parametrize("times", [1, 3])
+async def test_a_cancelled_dose_stops_the_pump_however_often_it_is_cancelled(
+    firmware: PumpFirmware, line: PtyLine, pump: ModbusPump, times: int
+):
+    dosing = asyncio.create_task(pump.dose(2.0))
+    while not firmware.running:
+        await asyncio.sleep(0.01)
+    line.fail(Fault.LATE)
+    for _ in range(times):
+        dosing.cancel()
+        await asyncio.sleep(0.02)
+    with pytest.raises(asyncio.CancelledError):
+        await dosing
+    assert not firmware.running
+    assert firmware.pumped_ml < 0.2
+
+
+async def test_a_cancelled_dose_whose_stop_fails_says_so(firmware: PumpFirmware, line: PtyLine):
+    pump = pump_at(line.path)
+    await pump.connect()
+    dosing = asyncio.create_task(pump.dose(2.0))
+    while not firmware.running:
+        await asyncio.sleep(0.01)
+    line.unplug()
+    dosing.cancel()
+    with pytest.raises(asyncio.CancelledError) as cancelled:
+        await dosing
+    assert "may still be running" in cancelled.value.__notes__[0]
+    with pytest.raises(ConnectionLost, match="may still be running"):
+        await pump.close()
+
+
+@pytest.mark.parametrize("fault", [Fault.DEAF, Fault.GARBAGE, Fault.LATE, Fault.MISTAKEN])
+@pytest.mark.parametrize("at", ["start", "stop"])
+async def test_a_fault_anywhere_leaves_the_pump_stopped(
+    fault: Fault, at: str, firmware: PumpFirmware, line: PtyLine, pump: ModbusPump
+):
+    before = {"start": 1, "stop": 2}[at]
+    line.fail(*[Fault.SPLIT] * before, fault)
+    if at == "stop":
+        await pump.dose(0.01)  # the second stop is confirmed
+    else:
+        with pytest.raises(DeviceError):
+            await pump.dose(0.01)
+    assert not firmware.running
+    assert firmware.pumped_ml < 0.1
+
+
+@pytest.mark.parametrize("wait_s", [0.0, 0.01, 0.03, 0.1])
+async def test_closing_in_mid_dose_leaves_the_pump_stopped(firmware: PumpFirmware, line: PtyLine, wait_s: float):
+    pump = pump_at(line.path)
+    await pump.connect()
+    line.fail(*[Fault.SPLIT] * 3)
+    dosing = asyncio.create_task(pump.dose(0.01))
+    await asyncio.sleep(wait_s)
+    await pump.close()
+    with pytest.raises(NotConnected):
+        await dosing
+    assert not firmware.running
+
+
+async def test_a_pulled_cable_says_that_the_pump_may_run(line: PtyLine):
+    pump = pump_at(line.path)
+    await pump.connect()
+    line.fail(Fault.SPLIT, Fault.SPLIT, Fault.UNPLUG)
+    with pytest.raises(ConnectionLost, match=r"stop: .*may still be running.*Check cable"):
+        await pump.dose(0.01)
+    with pytest.raises(ConnectionLost):
+        await pump.close()
+
+
+async def test_a_late_reply_does_not_pass_for_the_next(line: PtyLine, firmware: PumpFirmware, pump: ModbusPump):
+    line.fail(Fault.LATE)
+    with pytest.raises(DeviceTimeout, match="not started"):
+        await pump.dose(0.01)
+    await pump.dose(0.01)
+    assert firmware.starts == 1
+
+
+async def test_a_host_that_was_held_up_reports_the_excess(firmware: PumpFirmware, line: PtyLine):
+    pump = pump_at(line.path, max_overrun_s=0.1)
+    await pump.connect()
+    dosing = asyncio.create_task(pump.dose(0.01))
+    while not firmware.running:
+        await asyncio.sleep(0.01)
+    time.sleep(0.25)  # the fault under test
+    with pytest.raises(DeviceError, match=r"instead of 0.10 s\. About .* too much.*is stopped"):
+        await dosing
+    assert not firmware.running
+    await pump.close()
+
+
+async def test_a_dose_beyond_the_limits_is_never_sent(expected_protocol):
+    with expected_protocol([*HELLO, *BYE]) as path:
+        pump = pump_at(path)
+        await pump.connect()
+        for volume_ml in (0.0, 0.009, 2.001, -1.0, math.nan, math.inf):
+            with pytest.raises(LimitExceeded):
+                await pump.dose(volume_ml)
+        await pump.close()
+
+
+@pytest.mark.parametrize(("ml_per_revolution", "rpm"), [(0.0, 50.0), (0.1, 0.0), (0.1, 601.0), (math.nan, 50.0)])
+def test_a_pump_that_cannot_run_like_that_is_refused(ml_per_revolution: float, rpm: float):
+    with pytest.raises(ValueError, match="cannot pump"):
+        PumpOptions("port", ml_per_revolution, rpm=rpm)
+
+
+async def test_other_line_settings_work_too(firmware: PumpFirmware, line: PtyLine):
+    firmware.unit = 17
+    options = PumpOptions(line.path, ML_PER_REV, unit=17, baud=19200, parity="N", stopbits=2)
+    pump = ModbusPump(options, HostClock())
+    assert (await pump.connect()).model == "Modbus RTU pump, unit 17"
+    await pump.close()

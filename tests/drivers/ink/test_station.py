@@ -1,0 +1,311 @@
+"""Transcripts of the ink station, and what the driver does when the line misbehaves."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import AsyncIterator, Iterator
+
+import pytest
+
+from drivers.clock import HostClock
+from drivers.errors import (
+    ConnectionLost,
+    DeviceError,
+    DeviceTimeout,
+    LimitExceeded,
+    NotConnected,
+    ProtocolViolation,
+)
+from drivers.ink.errors import InkRefused
+from drivers.ink.station import InkStation, StationOptions
+from drivers.protocols import Ink
+from drivers.sim.ink_station import Fault, PtyLine, StationFirmware
+
+TIMEOUT_S = 0.07
+HELLO = (b"000 identify*6A60\n", b"000 ok ink-station 1 1.0.0 real*8310\n")
+
+
+class StillClock:
+    def __init__(self) -> None:
+        self.ns = 0
+
+    def now_ns(self) -> int:
+        return self.ns
+
+
+def station_at(path: str, **options: float) -> InkStation:
+    made = StationOptions(path, **{"timeout_s": TIMEOUT_S, "s_per_ml": 0.0, "connect_attempts": 2, **options})
+    return InkStation(made, HostClock())
+
+
+@pytest.fixture
+def firmware() -> StationFirmware:
+    return StationFirmware()
+
+
+@pytest.fixture
+def line(firmware: StationFirmware) -> Iterator[PtyLine]:
+    with PtyLine(firmware, late_s=1.5 * TIMEOUT_S) as it:
+        yield it
+
+
+@pytest.fixture
+async def station(line: PtyLine) -> AsyncIterator[InkStation]:
+    it = station_at(line.path)
+    await it.connect()
+    yield it
+    await it.close()
+
+
+async def test_a_session_reads_like_the_documented_one(expected_protocol):
+    exchanges = [
+        HELLO,
+        (b"001 lid open*52D3\n", b"001 ok*C626\n"),
+        (b"002 light 0.500*BB62\n", b"002 ok*8226\n"),
+        (b"003 dose 1.250*EC29\n", b"003 ok 1.250*DAEB\n"),
+        (b"004 level*246B\n", b"004 ok 0.730*6174\n"),
+        (b"005 lid close*45F8\n", b"005 ok*F627\n"),
+        (b"006 dose 0.500*B1AA\n", b"006 err 4 reservoir is empty*7BA6\n"),
+    ]
+    with expected_protocol(exchanges) as path:
+        station = station_at(path)
+        identity = await station.connect()
+        assert (identity.model, identity.firmware, identity.simulated) == ("ink-station", "1.0.0", False)
+        await station.open_lid()
+        await station.light(0.5)
+        await station.dose(1.25)
+        assert await station.level() == 0.73
+        await station.close_lid()
+        with pytest.raises(InkRefused, match=r"reservoir is empty.*Nothing was done.*Refill") as refusal:
+            await station.dose(0.5)
+        assert refusal.value.code == 4
+        await station.close()
+
+
+async def test_a_lost_reply_is_asked_for_again_with_the_same_line(expected_protocol):
+    dose = b"001 dose 0.500*7A5F\n"
+    with expected_protocol([HELLO, (dose, b""), (dose, b"001 ok 0.500*41C5\n")]) as path:
+        station = station_at(path)
+        await station.connect()
+        await station.dose(0.5)
+        await station.close()
+
+
+async def test_a_dose_that_nobody_confirms_says_what_may_have_happened(expected_protocol):
+    dose = b"001 dose 0.500*7A5F\n"
+    with expected_protocol([HELLO, (dose, b""), (dose, b"")]) as path:
+        station = station_at(path)
+        await station.connect()
+        with pytest.raises(DeviceTimeout, match=r"Between 0 and 0.500 ml may be in the well"):
+            await station.dose(0.5)
+        await station.close()
+
+
+@pytest.mark.parametrize(
+    ("reply", "error", "says"),
+    [
+        (b"001 ok 1.5*CD6C\n", ProtocolViolation, "above 1"),
+        (b"001 ok nan*1429\n", ProtocolViolation, "not a decimal"),
+        (b"001 ok*C626\n", ProtocolViolation, "expected one number"),
+        (b"001 err 6 jammed*4073\n", InkRefused, "Look at the pump"),
+    ],
+)
+async def test_a_level_that_makes_no_sense_is_refused(expected_protocol, reply, error, says):
+    with expected_protocol([HELLO, (b"001 level*243E\n", reply)]) as path:
+        station = station_at(path)
+        await station.connect()
+        with pytest.raises(error, match=says):
+            await station.level()
+        await station.close()
+
+
+async def test_a_dose_that_comes_out_smaller_is_an_error(expected_protocol):
+    with expected_protocol([HELLO, (b"001 dose 0.500*7A5F\n", b"001 ok 0.400*8194\n")]) as path:
+        station = station_at(path)
+        await station.connect()
+        with pytest.raises(DeviceError, match=r"gave 0.400 ml instead of 0.500 ml"):
+            await station.dose(0.5)
+        await station.close()
+
+
+async def test_a_board_that_starts_slowly_and_chatters_is_waited_for(expected_protocol):
+    hello, answer = HELLO
+    with expected_protocol([(hello, b""), (hello, b"\x00\xffboot v1\r\n"), (hello, answer)]) as path:
+        station = station_at(path, connect_attempts=3)
+        await station.connect()
+        await station.close()
+
+
+@pytest.mark.parametrize("answer", [b"000 ok ink-station 2 9.0 real*24F2\n", b"000 ok gcode 1.1 real x*EE49\n"])
+async def test_another_device_is_refused_and_the_port_closed(expected_protocol, answer):
+    with expected_protocol([(HELLO[0], answer)]) as path:
+        station = station_at(path)
+        with pytest.raises(ProtocolViolation, match=r"expected ink-station with protocol 1.*Check that the path"):
+            await station.connect()
+        with pytest.raises(NotConnected):
+            await station.level()
+
+
+async def test_the_loopback_station_says_that_it_is_one(line: PtyLine):
+    station = station_at(line.path)
+    assert isinstance(station, Ink)
+    assert (await station.connect()).simulated
+    await station.close()
+
+
+@pytest.mark.parametrize(
+    "fault", [Fault.DEAF, Fault.MUTE, Fault.GARBAGE, Fault.LATE, Fault.SPLIT, Fault.DAMAGED, Fault.MISTAKEN, Fault.ECHO]
+)
+async def test_one_fault_of_any_kind_gives_the_dose_once(
+    fault: Fault, line: PtyLine, firmware: StationFirmware, station: InkStation
+):
+    line.fail(fault)
+    await station.dose(1.0)
+    assert firmware.well_ml == 11.0
+    assert await station.level() == 0.55
+
+
+@pytest.mark.parametrize(
+    ("fault", "error"),
+    [
+        (Fault.DEAF, DeviceTimeout),
+        (Fault.MUTE, DeviceTimeout),
+        (Fault.GARBAGE, ProtocolViolation),
+        (Fault.DAMAGED, ProtocolViolation),
+        (Fault.MISTAKEN, ProtocolViolation),
+        (Fault.ECHO, ProtocolViolation),
+    ],
+)
+async def test_a_fault_that_lasts_is_an_error_in_time_and_the_next_request_works(
+    fault: Fault, error: type[DeviceError], line: PtyLine, firmware: StationFirmware, station: InkStation
+):
+    line.fail(fault, fault)
+    began = time.monotonic()
+    with pytest.raises(error, match="may be in the well"):
+        await station.dose(1.0)
+    assert time.monotonic() - began < 2 * TIMEOUT_S + 0.3
+    assert firmware.well_ml == (10.0 if fault is Fault.DEAF else 11.0)
+    assert await station.level() == pytest.approx(firmware.well_ml / 20.0)
+
+
+async def test_a_pulled_cable_is_a_lost_connection_at_once_and_stays_one(line: PtyLine, station: InkStation):
+    line.fail(Fault.UNPLUG)
+    began = time.monotonic()
+    with pytest.raises(ConnectionLost, match=r"may be in the well.*Check cable") as lost:
+        await station.dose(1.0)
+    assert time.monotonic() - began < 0.5
+    assert lost.value.op == "dose"
+    with pytest.raises(ConnectionLost):
+        await station.level()
+    with pytest.raises(ConnectionLost, match="cannot open"):
+        await station.connect()
+
+
+async def test_where_there_is_no_port_nothing_is_connected(tmp_path):
+    station = station_at(str(tmp_path / "ttyUSB0"))
+    with pytest.raises(ConnectionLost, match=r"cannot open .*ttyUSB0"):
+        await station.connect()
+    with pytest.raises(NotConnected):
+        await station.light(1.0)
+    await station.close()
+
+
+async def test_a_port_that_somebody_else_holds_is_not_shared(line: PtyLine, station: InkStation):
+    with pytest.raises(ConnectionLost, match="lock"):
+        await station_at(line.path).connect()
+    await station.light(1.0)
+
+
+async def test_closing_ends_an_exchange_that_waits(line: PtyLine, station: InkStation):
+    line.fail(Fault.MUTE, Fault.MUTE)
+    slow = station_at(line.path, timeout_s=30.0)
+    await station.close()
+    waiting = asyncio.create_task(slow.connect())
+    await asyncio.sleep(0.1)
+    began = time.monotonic()
+    await slow.close()
+    with pytest.raises(NotConnected):
+        await waiting
+    assert time.monotonic() - began < 0.5
+
+
+async def test_the_event_loop_runs_on_while_the_station_is_silent(line: PtyLine, station: InkStation):
+    line.fail(Fault.MUTE, Fault.MUTE)
+    longest, last = 0.0, time.monotonic()
+    asking = asyncio.create_task(station.level())
+    while not asking.done():
+        await asyncio.sleep(0.005)
+        now = time.monotonic()
+        longest, last = max(longest, now - last), now
+    with pytest.raises(DeviceTimeout):
+        await asking
+    assert longest < 0.1
+
+
+async def test_a_cancelled_request_does_not_disturb_the_next(line: PtyLine, station: InkStation):
+    line.fail(Fault.LATE)
+    with pytest.raises(TimeoutError):
+        async with asyncio.timeout(0.03):
+            await station.light(1.0)
+    assert await station.level() == 0.5
+
+
+async def test_requests_at_the_same_time_take_turns(firmware: StationFirmware, station: InkStation):
+    await asyncio.gather(*(station.dose(0.25) for _ in range(8)), *(station.level() for _ in range(8)))
+    assert firmware.well_ml == 12.0
+
+
+async def test_a_thousand_and_one_requests_wrap_the_number(station: InkStation):
+    for _ in range(1001):
+        await station.light(0.5)
+    assert await station.level() == 0.5
+
+
+async def test_a_dose_beyond_the_limits_is_never_sent(expected_protocol):
+    with expected_protocol([HELLO]) as path:
+        station = station_at(path)
+        await station.connect()
+        for volume_ml in (0.0, -1.0, 2.001, math.nan, math.inf, 0.0004):
+            with pytest.raises(LimitExceeded, match="ml is outside"):
+                await station.dose(volume_ml)
+        await station.close()
+
+
+async def test_the_limit_per_minute_slides_and_counts_what_was_not_confirmed(line: PtyLine, firmware: StationFirmware):
+    clock = StillClock()
+    station = InkStation(StationOptions(line.path, timeout_s=0.05, s_per_ml=0.0, attempts=1), clock)
+    await station.connect()
+    await station.dose(2.0)
+    clock.ns = 30 * 10**9
+    line.fail(Fault.DEAF)
+    with pytest.raises(DeviceTimeout):
+        await station.dose(2.0)
+    with pytest.raises(LimitExceeded, match=r"dose per minute = 5\.500"):
+        await station.dose(1.5)
+    clock.ns = 60 * 10**9
+    await station.dose(1.5)
+    with pytest.raises(LimitExceeded):
+        await station.dose(2.0)
+    assert firmware.well_ml == 13.5
+    await station.close()
+
+
+async def test_a_light_out_of_range_is_refused(firmware: StationFirmware, station: InkStation):
+    for level in (-0.1, 1.1, math.nan):
+        with pytest.raises(LimitExceeded, match="light"):
+            await station.light(level)
+    await station.light(0.25)
+    assert firmware.light == 0.25
+
+
+async def test_a_station_refuses_what_it_cannot_do(firmware: StationFirmware, station: InkStation):
+    await station.close_lid()
+    with pytest.raises(InkRefused, match="Open the lid"):
+        await station.dose(1.0)
+    await station.open_lid()
+    firmware.well_ml = 19.5
+    with pytest.raises(InkRefused, match="overflow"):
+        await station.dose(1.0)
+    assert firmware.reservoir_ml == 100.0
