@@ -70,7 +70,7 @@ class FrameHealth:
         if float(np.mean(sample >= 255)) > SATURATED_SHARE:
             return Fault.SATURATED
         band = image[-max(8, round(TORN_BAND_SHARE * image.shape[0])) :]
-        if int(band.max()) - int(band.min()) <= 1:
+        if int(band.max()) - int(band.min()) <= 1 and int(band.min()) < 254:  # clipped white is light, not loss
             return Fault.TORN
         return None
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 REOPEN_AFTER_S = 0.5
+LASTING_NS = 1_000_000_000
 
 
 class OpenCvCamera:
@@ -39,10 +40,12 @@ class OpenCvCamera:
         self._newest: Frame | None = None
         self._trouble = ""
         """Why no sound frame comes, for the message of a timeout."""
+        self._told = False
         self._ended: DeviceError | None = None
         self._closing = threading.Event()  # one for each grabber: an old one that hangs must not wake up again
         self._thread: threading.Thread | None = None
         self.settings: dict[str, float] = {}
+        self._simulated = False
 
     async def connect(self) -> Identity:
         """Start the grabber and wait for its first sound frame. Raises `ConnectionLost`, `DeviceError`, ..."""
@@ -56,7 +59,7 @@ class OpenCvCamera:
             raise
         height, width = frame.image.shape[:2]
         locked = "".join(f", {name} {value:g}" for name, value in self.settings.items())
-        return Identity(DEVICE, f"{self._options.source} {width}x{height}{locked}", "", False)
+        return Identity(DEVICE, f"{self._options.source} {width}x{height}{locked}", "", self._simulated)
 
     async def fresh(self, after: Stamp) -> Frame:
         """The first sound frame exposed after `after.host_ns`. Raises `DeviceTimeout`, `ConnectionLost`."""
@@ -93,16 +96,15 @@ class OpenCvCamera:
                     remedy="Check cable, light and stream; the arm does not move meanwhile.",
                 )
             frame = late_enough()
-            if self._ended is not None:
-                raise self._ended
-            if frame is None or closing.is_set():
-                raise ConnectionLost(DEVICE, "fresh", "closed while waiting")
-            return frame
+            if frame is not None and not closing.is_set():
+                return frame
+            raise self._ended or ConnectionLost(DEVICE, "fresh", "closed while waiting")
 
     def _grab(self, closing: threading.Event) -> None:
         lost_ns: int | None = None
         try:
             while not closing.is_set():
+                opening_ns = self._clock.now_ns()
                 try:
                     source = open_source(self._options)
                 except ConnectionLost:
@@ -113,7 +115,7 @@ class OpenCvCamera:
                 try:
                     if lost_ns is not None:
                         self._on_notice(f"camera is back after {(self._clock.now_ns() - lost_ns) / 1e9:.1f} s")
-                    self._read_all(source, closing)
+                    self._read_all(source, closing, opening_ns)
                 finally:
                     source.release()
                 if closing.is_set():
@@ -129,15 +131,14 @@ class OpenCvCamera:
             self._end(DeviceError(DEVICE, "read", f"the grabber failed: {error!r}"), closing)
             raise
 
-    def _read_all(self, source: Source, closing: threading.Event) -> None:
+    def _read_all(self, source: Source, closing: threading.Event, opening_ns: int) -> None:
         """Read until the source ends; only sound frames are kept."""
         import cv2
 
-        self.settings = source.settings
+        self.settings, self._simulated = source.settings, source.simulated
         latency_ns = round(self._options.latency_ms * 1e6)
         health = FrameHealth(latency_ns=latency_ns, frozen_after=self._options.frozen_after, live=source.live)
-        opened_ns = self._clock.now_ns()
-        first = True
+        first, sound_ns = True, opening_ns
         while not closing.is_set():
             image = source.read()
             arrival_ns = self._clock.now_ns()
@@ -147,22 +148,25 @@ class OpenCvCamera:
                 image = cast("NDArray[np.uint8]", cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
             fault = health.judge(image, arrival_ns)
             if fault is not None:
-                self._tell_trouble(f"frames passed over: {health.summary()}")
+                # Single ones happen; a second without a sound frame is worth a word.
+                self._tell_trouble(f"frames passed over: {health.summary()}", aloud=arrival_ns - sound_ns > LASTING_NS)
                 continue
+            sound_ns = arrival_ns
             # The first frame was read to learn the format, and waited until the capture was open.
-            exposed_ns = (opened_ns if first else arrival_ns) - latency_ns
+            exposed_ns = (opening_ns if first else arrival_ns) - latency_ns
             first = False
             with self._condition:
                 seq = self._newest.stamp.seq + 1 if self._newest is not None else 0
                 self._newest = Frame(Stamp(arrival_ns, None, seq), exposed_ns, image)
-                self._trouble = ""
+                self._trouble, self._told = "", False
                 self._condition.notify_all()
 
-    def _tell_trouble(self, text: str) -> None:
+    def _tell_trouble(self, text: str, *, aloud: bool = True) -> None:
         with self._condition:
-            new = not self._trouble
             self._trouble = text
-        if new:
+            tell = aloud and not self._told
+            self._told = self._told or tell
+        if tell:
             self._on_notice(f"camera: {text}")
 
     def _end(self, error: DeviceError, closing: threading.Event) -> None:

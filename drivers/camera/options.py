@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 DEVICE = "camera"
+LOOPBACK_SERVER = "brushloop-loopback"
+"""What the loopback camera calls itself in HTTP; no camera maker does."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import http.client
 import os
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
+from urllib.parse import urlsplit
 
-from drivers.camera.options import DEVICE, CameraOptions
+from drivers.camera.options import DEVICE, LOOPBACK_SERVER, CameraOptions
 from drivers.errors import ConnectionLost, DeviceError
 
 if TYPE_CHECKING:
@@ -28,6 +30,9 @@ class Source(Protocol):
     settings: dict[str, float]
     """What was read back, by name."""
 
+    simulated: bool
+    """True for the loopback camera, which says so itself, and for recordings, which show no ink of this session."""
+
     def read(self) -> NDArray[np.uint8] | None:
         """The next frame, gray or BGR; None at the end."""
         ...
@@ -44,6 +49,21 @@ def open_source(options: CameraOptions) -> Source:
     return CaptureSource(options)
 
 
+def says_loopback(url: str) -> bool:
+    """Whether an HTTP server calls itself the loopback camera; False where it cannot be asked."""
+    if not url.startswith("http://"):
+        return False
+    parts = urlsplit(url)
+    connection = http.client.HTTPConnection(parts.hostname or "", parts.port or 80, timeout=2.0)
+    try:
+        connection.request("HEAD", parts.path or "/")
+        return connection.getresponse().getheader("Server") == LOOPBACK_SERVER
+    except (OSError, http.client.HTTPException):
+        return False
+    finally:
+        connection.close()
+
+
 class FolderSource:
     """The images of a folder in order of name, at a steady pace, the last one for ever."""
 
@@ -53,6 +73,7 @@ class FolderSource:
         if not self._paths:
             raise ConnectionLost(DEVICE, "open", f"{folder} holds no PNG or JPEG images")
         self.live = False
+        self.simulated = True
         self.settings: dict[str, float] = {}
         self._period_s = 1.0 / options.folder_fps
         self._shown = 0
@@ -97,6 +118,7 @@ class CaptureSource:
             if not self._capture.isOpened():
                 raise ConnectionLost(DEVICE, "open", f"cannot open {source}")
             self.settings = self._lock(options, is_device)
+            self.simulated = not self.live or says_loopback(source)
         except BaseException:
             self.release()
             raise

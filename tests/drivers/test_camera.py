@@ -51,7 +51,7 @@ async def test_connecting_waits_for_the_first_frame_and_tells_its_size(stream: M
     assert isinstance(camera, Camera)
     identity = await camera.connect()
     assert "640x480" in identity.model
-    assert not identity.simulated  # a stream cannot say what it shows
+    assert identity.simulated  # the loopback camera says so itself
     await camera.close()
 
 
