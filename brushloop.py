@@ -27,27 +27,30 @@ app.add_typer(sessions.cli.app, name="sessions")
 @app.command()
 def sim(
     write_rig: Annotated[Path | None, typer.Option(help="Write a rig.toml for this rig, then serve it.")] = None,
-    rate: Annotated[float, typer.Option(help="Simulated seconds per real second.")] = 1.0,
-    seed: Annotated[int, typer.Option(help="Seed of brush, presses and noise.")] = 1,
-    arcs_port: Annotated[int, typer.Option(help="Controller port; 0 lets the system choose.")] = 0,
-    camera_port: Annotated[int, typer.Option(help="Camera port; 0 lets the system choose.")] = 0,
-    idle_exit: Annotated[float, typer.Option(help="End after so many seconds without clients; 0 never.")] = 0.0,
+    rate: Annotated[float, typer.Option(min=0.01, max=1000, help="Simulated seconds per real second.")] = 1.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of brush, presses and noise.")] = 1,
+    arcs_port: Annotated[int, typer.Option(min=0, max=65535, help="Controller port; 0: any.")] = 0,
+    camera_port: Annotated[int, typer.Option(min=0, max=65535, help="Camera port; 0: any.")] = 0,
+    idle_exit: Annotated[float, typer.Option(min=0, help="End after so many seconds without clients; 0 never.")] = 0.0,
 ) -> None:
-    """Serve the loopback rig: an ARCS controller and an MJPEG camera over one simulated world, on 127.0.0.1 only."""
+    """Serve the loopback rig: an ARCS controller and an MJPEG camera over one simulated world, on 127.0.0.1 only.
+
+    Ctrl-C ends it; SIGUSR1 puts a fresh sheet in.
+    """
     from drivers.sim.brush import BrushSpec
     from drivers.sim.config import SimConfig
     from drivers.sim.rig import serve
 
     config = SimConfig(seed=seed, rate=rate, arcs_port=arcs_port, camera_port=camera_port, brush=BrushSpec(seed=seed))
-    serve(config, write_rig, idle_exit)
+    serve(config, write_rig, idle_exit, typer.echo)
 
 
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for everything that the demo makes.")] = Path("demo-run"),
-    repeats: Annotated[int, typer.Option(help="Presses per (H, alpha).")] = 2,
-    rate: Annotated[float, typer.Option(help="Simulated seconds per real second.")] = 20.0,
-    seed: Annotated[int, typer.Option(help="Seed of the rig and of the order of presses.")] = 1,
+    repeats: Annotated[int, typer.Option(min=1, max=2, help="Presses per (H, alpha); one sheet holds two.")] = 2,
+    rate: Annotated[float, typer.Option(min=0.01, max=1000, help="Simulated seconds per real second.")] = 20.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the rig and of the order of presses.")] = 1,
 ) -> None:
     """Collect, calibrate and validate a short session on the loopback rig; run again, it goes on where it stopped."""
     from collect.demo import run_demo
@@ -60,10 +63,13 @@ def main() -> None:
     try:
         app()
     except Exception as error:
-        code = getattr(error, "exit_code", None)
+        # A path of the user's that cannot be read or written is no defect of ours.
+        code = 2 if isinstance(error, OSError) and error.filename else None
+        code = getattr(error, "exit_code", code)
         if not isinstance(code, int):
             raise
-        sys.stderr.write(f"brushloop: {error}\n")
+        words = " ".join([str(error), *getattr(error, "__notes__", [])])
+        sys.stderr.write(f"brushloop: {words}\n")
         sys.exit(code)
 
 

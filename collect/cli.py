@@ -13,7 +13,10 @@ def collect(
     protocol: Annotated[Path, typer.Option(help="What to do: depths, tilts, repeats.")],
     out: Annotated[Path, typer.Option(help="Folder that holds sessions.")] = Path("sessions"),
     new: Annotated[bool, typer.Option("--new", help="Start a new session though one is open.")] = False,
-    fresh_sheet: Annotated[bool, typer.Option("--fresh-sheet", help="A fresh sheet is in.")] = False,
+    sheet: Annotated[
+        int | None,
+        typer.Option(min=1, help="Sheet N of the session is in: confirms a fresh one. Repeating it is safe."),
+    ] = None,
     arm: Annotated[bool, typer.Option("--arm", help="Let real hardware move.")] = False,
     tui: Annotated[
         bool | None, typer.Option("--tui/--no-tui", help="Screen; by default where there is a terminal.")
@@ -22,23 +25,16 @@ def collect(
     """Collect strokes. Ctrl-C stops the arm; the same command goes on where it stopped."""
     import sys
 
-    from collect.config import load_protocol, load_rig
     from collect.engine import Engine
     from collect.opening import Opening, find_resumable, open_store
     from collect.plan import check_plan
     from drivers.clock import HostClock
 
-    opening = Opening(out, config, protocol, new, fresh_sheet, arm)
-    rig_config, protocol_config = load_rig(config), load_protocol(protocol)
-    check_plan(config, protocol, rig_config, protocol_config)
+    opening = Opening.load(out, config, protocol, new=new, sheet=sheet, armed=arm)
+    check_plan(config, protocol, opening.rig, opening.protocol)
     resume = find_resumable(opening)
     clock = HostClock()
-    engine = Engine(
-        rig_config,
-        protocol_config,
-        lambda rig: open_store(opening, resume, rig, rig_config, protocol_config, clock),
-        clock,
-    )
+    engine = Engine(opening.rig, opening.protocol, lambda rig: open_store(opening, resume, rig, clock), clock)
     if tui if tui is not None else sys.stdin.isatty() and sys.stdout.isatty():
         from collect.tui.app import run_screen
 

@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict
+from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, SettingsError
 
 from calibrate.scale import BoardSpec
 from collect.errors import ConfigError
 
 MAX_CONFIG_BYTES = 1024 * 1024
+TRAVEL_CLEARANCE_MM = 15.0
+"""Least height of travel above the paper: more than a drop at the tip."""
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -56,6 +58,16 @@ class RobotConfig(Config):
     port: int = Field(30004, ge=1, le=65535)
     tcp_offset_mm: tuple[Finite, Finite, Finite]
     """Flange to brush tip."""
+    framing: Literal["sof", "bare"] = "sof"
+    """`sof` as the maker's client speaks, `bare` as the maker documents."""
+    rtde_port: int | None = Field(None, ge=1, le=65535)
+    """Where poses are pushed from (30010); left out, they are polled for."""
+    watchdog_s: Annotated[float, Field(ge=0.5, le=60.0)] | None = None
+    """Dead-man on the controller: without a sign of life for so long it goes into a protective stop, which only a
+    person releases. Left out, none is armed."""
+    speed_fraction: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
+    collision_level: Annotated[int, Field(ge=1, le=9)] | None = None
+    """1 to 9, most sensitive; left out, what the pendant has stays."""
     limits: LimitsConfig
 
 
@@ -149,6 +161,25 @@ class RigConfig(BaseSettings):
     board: BoardSpec
     motion: MotionConfig
 
+    @model_validator(mode="after")
+    def _clear_of_the_paper(self) -> RigConfig:
+        lowest_mm = self.paper.touch_z_mm + TRAVEL_CLEARANCE_MM
+        if self.motion.safe_z_mm < lowest_mm:
+            raise ValueError(
+                f"motion.safe_z_mm = {self.motion.safe_z_mm:g} is below {lowest_mm:g} mm: "
+                f"travel must clear the paper (paper.touch_z_mm) by {TRAVEL_CLEARANCE_MM:g} mm"
+            )
+        if self.motion.park_mm[2] < self.motion.safe_z_mm:
+            raise ValueError(f"motion.park_mm[2] = {self.motion.park_mm[2]:g} is below motion.safe_z_mm")
+        width, height = self.paper.size_mm
+        x, y = self.ink.well_mm
+        if 0.0 <= x <= width and 0.0 <= y <= height:
+            raise ValueError(f"ink.well_mm = [{x:g}, {y:g}] lies on the sheet: dips would press on it")
+        x, y = self.paper.touch_point_mm
+        if not (0.0 <= x <= width and 0.0 <= y <= height):
+            raise ValueError(f"paper.touch_point_mm = [{x:g}, {y:g}] does not lie on the sheet")
+        return self
+
     @classmethod
     def settings_customise_sources(
         cls,
@@ -209,10 +240,16 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def _validate(path: Path, kind: type[_M], values: dict[str, Any]) -> _M:
+    for name in values:
+        if name.startswith("_"):
+            raise ConfigError(path, name, "is not a table of this file")
     try:
         return kind(**values)
+    except SettingsError as error:
+        raise ConfigError("environment", "", f"{error}".splitlines()[0]) from None
     except ValidationError as error:
-        first = error.errors()[0]
+        # An unknown key first: it is often the misspelt name of one that is missing.
+        first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
         field = ".".join(str(part) for part in first["loc"])
         given = f" (given: {first['input']!r})" if first["type"] not in ("missing", "value_error") else ""
         more = f"; and {error.error_count() - 1} more" if error.error_count() > 1 else ""

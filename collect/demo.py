@@ -14,6 +14,7 @@ from pathlib import Path
 
 from collect.config import RigConfig, load_rig
 from collect.errors import CollectAborted
+from sessions.store import open_sessions
 
 HEIGHTS_MM = [11.0, 13.0, 15.0, 17.0, 20.0]
 TILTS_DEG = [0.0, 5.0, 10.0]
@@ -30,9 +31,11 @@ def run_demo(out: Path, repeats: int, rate: float, seed: int) -> None:
     )
     if not protocol_toml.exists() or protocol_toml.read_text(encoding="utf-8") != protocol:
         protocol_toml.write_text(protocol, encoding="utf-8")
-    rig = _serving(rig_toml, rate, seed)
+    finished = sessions.is_dir() and any(sessions.iterdir()) and not open_sessions(sessions)
+    rig = _serving(rig_toml, rate, seed, fresh=finished)
     try:
-        _run("collect", "--config", rig_toml, "--protocol", protocol_toml, "--out", sessions, "--no-tui")
+        sheet = ("--sheet", "1") if finished else ()
+        _run("collect", "--config", rig_toml, "--protocol", protocol_toml, "--out", sessions, "--no-tui", *sheet)
     finally:
         if rig is not None and rig.poll() is not None:
             sys.stderr.write(f"the loopback rig ended with {rig.returncode}; see {out / 'rig.log'}\n")
@@ -47,10 +50,10 @@ def run_demo(out: Path, repeats: int, rate: float, seed: int) -> None:
     )
 
 
-def _serving(rig_toml: Path, rate: float, seed: int) -> subprocess.Popen[bytes] | None:
-    """The rig of an earlier demo where it still serves, else a new one on the same ports."""
+def _serving(rig_toml: Path, rate: float, seed: int, *, fresh: bool) -> subprocess.Popen[bytes] | None:
+    """The rig of an earlier demo where it still serves and has a session to finish, else a new one."""
     arcs_port, camera_port = _free_port(), _free_port()
-    if rig_toml.exists():
+    if rig_toml.exists() and not fresh:
         known = load_rig(rig_toml)
         arcs_port, camera_port = known.robot.port, _camera_port(known)
         if _listens(arcs_port) and _listens(camera_port):
@@ -68,7 +71,7 @@ def _serving(rig_toml: Path, rate: float, seed: int) -> subprocess.Popen[bytes] 
             start_new_session=True,
         )
     deadline = time.monotonic() + START_S
-    while not (_listens(arcs_port) and _listens(camera_port) and rig_toml.exists()):
+    while not (_listens(arcs_port) and _listens(camera_port) and _names(rig_toml, arcs_port)):
         if process.poll() is not None or time.monotonic() > deadline:
             raise CollectAborted(f"the loopback rig did not start; see {rig_toml.parent / 'rig.log'}")
         time.sleep(0.1)
@@ -79,7 +82,13 @@ def _run(*arguments: str | Path) -> None:
     words = [str(argument) for argument in arguments]
     sys.stdout.write(f"$ brushloop {' '.join(words)}\n")
     sys.stdout.flush()
-    code = subprocess.run([sys.executable, "-m", "brushloop", *words], check=False).returncode
+    process = subprocess.Popen([sys.executable, "-m", "brushloop", *words])
+    while True:
+        try:
+            code = process.wait()
+            break
+        except KeyboardInterrupt:
+            continue  # the command got it too, stops the arm and says so
     if code != 0:
         # The command has said why; the demo ends with its exit code.
         sys.exit(code)
@@ -95,6 +104,10 @@ def _listens(port: int) -> bool:
     with socket.socket() as probe:
         probe.settimeout(1.0)
         return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def _names(rig_toml: Path, arcs_port: int) -> bool:
+    return rig_toml.exists() and f"port = {arcs_port}\n" in rig_toml.read_text(encoding="utf-8")
 
 
 def _camera_port(rig: RigConfig) -> int:

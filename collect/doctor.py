@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from calibrate.errors import CalibrationError
-from calibrate.scale import find_corners, fit_plane
+from calibrate.scale import see_board
 from collect.config import RigConfig
 from collect.rig import make_camera, make_robot
 from drivers.arcs.codes import MOVING_ALLOWED, RobotMode
@@ -92,19 +92,21 @@ async def _camera(config: RigConfig, clock: Clock) -> Finding:
 
 def _board(config: RigConfig, image: Any) -> tuple[str, str, str]:
     try:
-        plane = fit_plane(*find_corners(image, config.board, "camera"), "camera")
+        plane = see_board(image, config.board)
     except CalibrationError as error:
         return "", f"board: {error.what}", "Put the configured board into view, in focus and evenly lit."
     return f"board: {plane.corners} corners, residual {plane.rms_px:.2f} px, {plane.mm_per_px:.4f} mm/px", "", ""
 
 
 async def _robot(config: RigConfig, clock: Clock, address: str) -> Finding:
-    robot = make_robot(config, clock)
+    notices: list[str] = []
+    robot = make_robot(config, clock, notices.append)
     try:
         identity = await robot.connect()
         state = await robot.condition(CALLS)
     finally:
         await robot.close()
+    condition = f"{state.mode}, safety {state.safety}" + (", simulated" if identity.simulated else "")
     problem = remedy = ""
     if state.safety not in MOVING_ALLOWED:
         problem, remedy = f"safety mode is {state.safety}", "Look at the pendant; nothing is cleared from here."
@@ -117,7 +119,7 @@ async def _robot(config: RigConfig, clock: Clock, address: str) -> Finding:
         identity=identity.model,
         firmware=identity.firmware,
         latency_ms=state.latency_ms,
-        notes=f"{state.mode}, safety {state.safety}" + (", simulated" if identity.simulated else ""),
+        notes="; ".join([condition, *notices]),
         problem=problem,
         remedy=remedy,
     )

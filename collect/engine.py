@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable
 
 from collect.config import GridConfig, RigConfig
-from collect.errors import CollectAborted, StepError
+from collect.errors import CollectAborted, StepError, told
 from collect.perform import Performer, uninterrupted
 from collect.policy import Action, decide
 from collect.progress import Progress
@@ -23,7 +23,7 @@ from collect.snapshot import Snapshot
 from collect.states import FINAL, State, check_transition
 from collect.steps import Result, Step
 from drivers.clock import Clock
-from drivers.errors import DeviceError
+from drivers.errors import DeviceError, MotionError, NotConnected, RpcError
 from sessions.store import SessionStore
 
 OpenStore = Callable[[Rig], SessionStore]
@@ -48,6 +48,7 @@ class Engine:
         self._rig: Rig | None = None
         self._stop_wanted = False
         self._pause_wanted = False
+        self._stop_failure: DeviceError | None = None
         self._closing = False
         self._thread = threading.Thread(target=self._run_thread, name="engine", daemon=True)
         self._outcome: concurrent.futures.Future[None] = concurrent.futures.Future()
@@ -103,18 +104,20 @@ class Engine:
             self._loop.call_soon_threadsafe(self._stop_now)
 
     def _stop_now(self) -> None:
-        if self._stopper is None:
+        if self._stopper is None or self._stopper.done():
             self._stopper = asyncio.create_task(self._stop_arm(), name="stop")
         # Once all is collected the arm is parked; the merge ends by itself and loses nothing.
         if self._task is not None and not self._closing and not self._task.cancelling():
             self._task.cancel()
 
     async def _stop_arm(self) -> None:
-        # Its own socket: it neither waits for the session's task nor for what that waits for. If it fails, the
-        # driver's close stops the arm once more.
+        # Its own socket: it neither waits for the session's task nor for what that waits for.
         if self._rig is not None:
-            with contextlib.suppress(DeviceError):
+            try:
                 await self._rig.robot.stop()
+            except DeviceError as error:
+                self._stop_failure = error
+                self._progress.log(told(error), warning=True)
 
     def _run_thread(self) -> None:
         try:
@@ -133,16 +136,25 @@ class Engine:
         try:
             await self._task
         except asyncio.CancelledError:
-            self._end(State.STOPPED, "stopped by the operator")
-            raise CollectAborted("stopped; the same command goes on from here") from None
+            await self._stopped()
         except Exception as error:
-            self._end(State.FAILED, str(error) or type(error).__name__)
+            self._end(State.FAILED, told(error))
             raise
         finally:
             if self._stopper is not None:
                 await self._stopper
             with self._lock:
                 self._loop = None
+
+    async def _stopped(self) -> None:
+        if self._stopper is not None:
+            await self._stopper
+        if self._stop_failure is not None and not isinstance(self._stop_failure, NotConnected):
+            # Never told as stopped: the arm was not seen at rest.
+            self._end(State.FAILED, told(self._stop_failure))
+            raise self._stop_failure
+        self._end(State.STOPPED, "stopped by the operator")
+        raise CollectAborted("stopped; the same command goes on from here")
 
     async def _session(self) -> None:
         self._progress.doing("connect")
@@ -153,6 +165,8 @@ class Engine:
                 self._progress.opened(store)
                 await self._protocol(rig, store)
                 with self._lock:
+                    if self._state == State.STOPPING:
+                        raise asyncio.CancelledError
                     self._closing = True
                 self._progress.doing("merge and verify")
                 final = await uninterrupted(store.close)
@@ -187,8 +201,18 @@ class Engine:
                 action = decide(step, error, failures)
                 self._progress.log(f"{step.kind}: {error} -> {action}", warning=True)
                 if action is Action.ABORT:
+                    await self._lift(performer, error)
                     raise
                 await self._recover(performer)
+
+    async def _lift(self, performer: Performer, error: StepError | DeviceError) -> None:
+        """Leave no brush in the paper, where the arm itself is in order: not after its own trouble."""
+        if isinstance(error, MotionError | RpcError) or getattr(error, "device", "") == "robot":
+            return
+        try:
+            await self._recover(performer)
+        except (StepError, DeviceError) as failure:
+            error.add_note(f"The brush could not be lifted: {failure}")
 
     async def _recover(self, performer: Performer) -> None:
         self._move_to(State.RECOVERING)
@@ -200,10 +224,11 @@ class Engine:
         with self._lock:
             if self._state != State.PAUSING:
                 return
-            self._go_on.clear()
             self._set(State.PAUSED)
         self._progress.doing("paused")
-        await self._go_on.wait()
+        while self._pause_wanted:
+            self._go_on.clear()
+            await self._go_on.wait()
         self._move_to(State.RUNNING)
 
     def _move_to(self, new: State) -> None:

@@ -14,7 +14,7 @@ from typing import ClassVar
 
 
 class ConfigError(Exception):
-    """A configuration cannot be used; nothing was connected and nothing moved."""
+    """A configuration cannot be used; nothing was powered and nothing moved."""
 
     exit_code: ClassVar[int] = 2
 
@@ -38,11 +38,12 @@ class StepVoid(StepError):
 class SheetFull(StepError):
     """No free cell on this sheet. Leaves the arm parked; a fresh sheet must go in before the next press."""
 
-    def __init__(self, capacity: int) -> None:
+    def __init__(self, capacity: int, sheet: int) -> None:
         self.capacity = capacity
+        self.sheet = sheet
         super().__init__(
-            f"all {capacity} cells of the sheet are used. "
-            "Put a fresh sheet in, then run the same command with --fresh-sheet."
+            f"all {capacity} cells of sheet {sheet} are used. "
+            f"Put a fresh sheet in, then run the same command with --sheet {sheet + 1}."
         )
 
 
@@ -50,3 +51,8 @@ class CollectAborted(Exception):
     """Stopped before the end; the same command goes on from here."""
 
     exit_code: ClassVar[int] = 4
+
+
+def told(error: BaseException) -> str:
+    """An error with the notes that were added on its way: one of them may say that the arm still moves."""
+    return " ".join([str(error) or type(error).__name__, *getattr(error, "__notes__", [])])

@@ -37,22 +37,26 @@ class RunnableEngine(EngineView, Protocol):
 
 
 def run_headless(engine: RunnableEngine) -> None:
-    """Run to the end; raises what ended the run."""
-    console = Console(stderr=True)
-    shown = 0
-    with (
-        stopping_signals(engine),
-        Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[eta]}"),
-            console=console,
-        ) as progress,
-    ):
-        task = progress.add_task("connect", total=None, eta="")
+    """Run to the end; raises what ended the run. If the screen goes away, the arm is stopped."""
+    with stopping_signals(engine):
         engine.start()
+        try:
+            _show(engine, Console(stderr=True))
+        finally:
+            _end(engine)
+
+
+def _show(engine: RunnableEngine, console: Console) -> None:
+    shown = 0
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[eta]}"),
+    )
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("connect", total=None, eta="")
         while True:
             over = engine.finished
             now = engine.snapshot()
@@ -67,8 +71,14 @@ def run_headless(engine: RunnableEngine) -> None:
                 eta=eta_text(now),
             )
             if over:
-                break
+                return
             time.sleep(REFRESH_S)
+
+
+def _end(engine: RunnableEngine) -> None:
+    """Nobody watches any more: an engine that still runs is stopped."""
+    if not engine.finished:
+        engine.stop()
     engine.join()
 
 

@@ -7,61 +7,126 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from collect.config import GridConfig, RigConfig
+from collect.config import GridConfig, RigConfig, load_protocol, load_rig
 from collect.errors import ConfigError
 from collect.rig import Rig
+from collect.steps import StepKind
 from drivers.clock import Clock
+from sessions.errors import SessionDamaged
+from sessions.journal import JOURNAL_NAME, replay
 from sessions.schemas import Header, Source
 from sessions.store import SessionStore, Snapshots, differences, next_session_id, open_sessions
+
+COMPARED = ("protocol.toml", "rig.effective.json")
+MACHINE_NAMES = {"robot": {"host", "port"}, "camera": {"source"}}
+"""What may differ between two runs of one session: where the devices are, not what they do."""
 
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """What the command line said about the session."""
+    """What the command line said about the session, with its configuration as it was read once."""
 
     root: Path
     rig_path: Path
     protocol_path: Path
+    rig: RigConfig
+    protocol: GridConfig
+    snapshots: Snapshots
     new: bool = False
     """Start a new session although another one is open."""
-    fresh_sheet: bool = False
-    """The operator has put a fresh sheet in."""
+    sheet: int | None = None
+    """The number of the sheet that is in, counted from 1: the operator's word for it."""
     armed: bool = False
     """The operator has looked at the cell: real hardware may move."""
 
-    def snapshots(self) -> Snapshots:
-        """The configuration as text, for the session's folder."""
-        return {
-            "rig.toml": self.rig_path.read_text(encoding="utf-8"),
-            "protocol.toml": self.protocol_path.read_text(encoding="utf-8"),
+    @classmethod
+    def load(
+        cls,
+        root: Path,
+        rig_path: Path,
+        protocol_path: Path,
+        *,
+        new: bool = False,
+        sheet: int | None = None,
+        armed: bool = False,
+    ) -> Opening:
+        """Read both files once. Raises `ConfigError`."""
+        rig, protocol = load_rig(rig_path), load_protocol(protocol_path)
+        snapshots = {
+            "rig.toml": rig_path.read_text(encoding="utf-8"),
+            "protocol.toml": protocol_path.read_text(encoding="utf-8"),
+            # What really holds, the environment included: a touch height from there is part of the record.
+            "rig.effective.json": rig.model_dump_json(indent=2, exclude=MACHINE_NAMES) + "\n",
         }
+        return cls(root, rig_path, protocol_path, rig, protocol, snapshots, new, sheet, armed)
 
 
 def find_resumable(opening: Opening) -> Path | None:
-    """The open session to go on with, None for a new one. Raises `ConfigError` where the configuration changed."""
-    if opening.new or not opening.root.is_dir():
+    """The open session to go on with, None for a new one.
+
+    Raises `ConfigError` where the configuration changed, or where a new session might press on a used sheet.
+    """
+    if not opening.root.is_dir():
         return None
     changed: list[tuple[Path, str]] = []
-    for folder in reversed(open_sessions(opening.root)):
-        difference = differences(folder, opening.snapshots())
+    for folder in reversed(open_sessions(opening.root)) if not opening.new else ():
+        difference = differences(folder, {name: opening.snapshots[name] for name in COMPARED})
         if not difference:
             return folder
         changed.append((folder, difference))
     if changed:
         folder, difference = changed[0]
         raise ConfigError(
-            opening.protocol_path,
+            opening.root,
             "",
             f"session {folder.name} is open, but was started with another configuration:\n{difference}\n"
             "Go on with the old configuration, or start a new session with --new.",
         )
+    if opening.sheet is None and any(map(_has_pressed, opening.root.glob(f"*/{JOURNAL_NAME}"))):
+        raise ConfigError(
+            opening.root,
+            "",
+            "holds earlier sessions, and a new one would press on whatever sheet is in. "
+            "Put a fresh sheet in, then confirm it with --sheet 1",
+        )
+    if opening.sheet not in (None, 1):
+        raise ConfigError("--sheet", "", f"{opening.sheet}: a new session begins with sheet 1")
     return None
 
 
-def open_store(
-    opening: Opening, resume: Path | None, rig: Rig, config: RigConfig, protocol: GridConfig, clock: Clock
-) -> SessionStore:
+def _has_pressed(journal: Path) -> bool:
+    try:
+        return bool(replay(journal).used_cells)
+    except SessionDamaged:
+        return True  # nobody knows; ask
+
+
+def put_in_sheet(store: SessionStore, sheet: int | None) -> None:
+    """Take the operator's word for the sheet that is in. The same word twice changes nothing.
+
+    Raises `ConfigError` for a number that cannot be, or while a press still has to be photographed.
+    """
+    now = store.state.sheet + 1
+    if sheet is None or sheet == now:
+        return
+    if sheet != now + 1:
+        raise ConfigError("--sheet", "", f"{sheet}: sheet {now} is in use, so only {now} or {now + 1} can be in")
+    results = [(line["kind"], line["result"]) for line in store.state.segments]
+    pressed = {r["stroke_id"] for kind, r in results if kind == StepKind.PRESS}
+    waiting = sorted(pressed - {r["stroke_id"] for kind, r in results if kind == StepKind.CAPTURE})
+    if waiting:
+        raise ConfigError(
+            "--sheet",
+            "",
+            f"{sheet}: {', '.join(waiting)} is pressed on sheet {now} but not photographed. "
+            f"Put sheet {now} back and run the same command without --sheet",
+        )
+    store.fresh_sheet()
+
+
+def open_store(opening: Opening, resume: Path | None, rig: Rig, clock: Clock) -> SessionStore:
     """Make or resume the session. Raises `ConfigError` for unarmed hardware or another robot than before."""
+    config = opening.rig
     if not rig.robot_identity.simulated and not opening.armed:
         raise ConfigError(
             opening.rig_path,
@@ -69,29 +134,35 @@ def open_store(
             f"{rig.robot_identity.model} at {config.robot.host}:{config.robot.port} is real hardware: "
             "look at the cell, keep a hand at the emergency stop, then add --arm",
         )
-    header = _header(opening, rig, config, protocol)
+    header = _header(opening, rig)
     if resume is None:
-        session_id = next_session_id(opening.root, protocol.kind, dt.date.today())
+        session_id = next_session_id(opening.root, opening.protocol.kind, dt.date.today())
         header = header.model_copy(update={"session_id": session_id})
-        return SessionStore.create(opening.root / session_id, header, opening.snapshots(), clock.now_ns)
+        return SessionStore.create(opening.root / session_id, header, opening.snapshots, clock.now_ns)
     store = SessionStore(resume, None, clock.now_ns)
-    if (store.header.source, store.header.robot) != (header.source, header.robot):
+    try:
+        # Before anything moves: a damaged step would otherwise show only when all is collected.
+        store.verify()
+        if (store.header.source, store.header.robot) != (header.source, header.robot):
+            raise ConfigError(
+                opening.rig_path,
+                "robot",
+                f"session {resume.name} was begun on {store.header.robot} ({store.header.source}), "
+                f"but {header.robot} ({header.source}) answers",
+            )
+        put_in_sheet(store, opening.sheet)
+    except BaseException:
         store.release()
-        raise ConfigError(
-            opening.rig_path,
-            "robot",
-            f"session {resume.name} was begun on {store.header.robot} ({store.header.source}), "
-            f"but {header.robot} ({header.source}) answers",
-        )
-    if opening.fresh_sheet:
-        store.fresh_sheet()
+        raise
     return store
 
 
-def _header(opening: Opening, rig: Rig, config: RigConfig, protocol: GridConfig) -> Header:
+def _header(opening: Opening, rig: Rig) -> Header:
+    config, protocol = opening.rig, opening.protocol
+    simulated = rig.robot_identity.simulated or rig.camera_identity.simulated
     return Header(
         session_id="",
-        source=Source.LOOPBACK if rig.robot_identity.simulated else Source.REAL,
+        source=Source.LOOPBACK if simulated else Source.REAL,
         software=f"brushloop {version('brushloop')}",
         robot=rig.robot_identity.model,
         robot_firmware=rig.robot_identity.firmware,

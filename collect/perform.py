@@ -6,6 +6,9 @@ import asyncio
 from collections.abc import Callable
 from typing import TypeVar
 
+from calibrate.errors import CalibrationError
+from calibrate.scale import see_board
+from collect.errors import StepError, told
 from collect.procedures import Procedures
 from collect.progress import Progress
 from collect.recorder import Recorder
@@ -36,7 +39,7 @@ class Performer:
         await self._procedures.retreat()
 
     async def perform(self, step: Step) -> Result:
-        """Do the step once. Whatever is raised, the attempt has been voided and its cell is used up."""
+        """Do the step once. If it is cut, the attempt is voided and its cell stays used. Raises `SheetFull` first."""
         self._progress.doing(_in_words(step))
         cell = self._free_cell() if step.kind == StepKind.PRESS else None
         attempt = self._store.begin(
@@ -62,7 +65,8 @@ class Performer:
         except BaseException as error:
             self._inked = False
             self._progress.voided()
-            await uninterrupted(self._store.void, attempt, str(error) or type(error).__name__)
+            why = "stopped by the operator" if isinstance(error, asyncio.CancelledError) else told(error)
+            await uninterrupted(self._store.void, attempt, why)
             raise
         await uninterrupted(self._store.done, attempt, result)
         if step.kind == StepKind.CAPTURE:
@@ -88,7 +92,12 @@ class Performer:
     async def _board(self, attempt: Attempt, recorder: Recorder) -> Result:
         frame = await self._procedures.capture()
         await uninterrupted(recorder.still, frame, attempt.serial)
-        return {"still": attempt.serial}
+        try:
+            plane = await uninterrupted(see_board, frame.image, self._rig.config.board)
+        except CalibrationError as error:
+            # Without it nothing that follows could be measured: better now than after 150 presses.
+            raise StepError(f"the board is not seen: {error.what}") from None
+        return {"still": attempt.serial, "corners": plane.corners, "mm_per_px": plane.mm_per_px}
 
     async def _press(self, step: Step, cell: Cell, recorder: Recorder) -> Result:
         if not self._inked:
@@ -102,9 +111,16 @@ class Performer:
             _number(step, "tilt_deg"),
             _number(step, "dwell_s"),
         )
-        return {"sheet": self._store.state.sheet, "cell": cell.index, "depth_mm": depth_mm}
+        return {
+            "stroke_id": step.params["stroke_id"],
+            "sheet": self._store.state.sheet,
+            "cell": cell.index,
+            "depth_mm": depth_mm,
+        }
 
     async def _capture(self, step: Step, attempt: Attempt, recorder: Recorder) -> Result:
+        if int(_number(step, "sheet")) != self._store.state.sheet:
+            raise StepError(f"{step.params['stroke_id']} lies on another sheet than the one that is in")
         frame = await self._procedures.capture()
         await uninterrupted(recorder.still, frame, attempt.serial)
         cell = self._sheet.cell(int(_number(step, "cell")))
@@ -127,7 +143,8 @@ class Performer:
 
     def _free_cell(self) -> Cell:
         state = self._store.state
-        return self._sheet.free({cell for sheet, cell in state.used_cells if sheet == state.sheet})
+        used = {cell for sheet, cell in state.used_cells if sheet == state.sheet}
+        return self._sheet.free(used, state.sheet + 1)
 
 
 async def uninterrupted(function: Callable[..., _R], *args: object) -> _R:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from collect.config import RigConfig
 from collect.errors import StepVoid
-from collect.rig import Rig
+from collect.rig import Rig, limits_of
 from collect.sheet import Cell, to_base
 from drivers.geometry import brush_pose, lean
 from drivers.limits import Limits
@@ -16,6 +16,8 @@ from drivers.samples import Frame, Pose, Stamp
 
 CLEARANCE_MM = 8.0
 """Height above the paper at which the fast approach ends."""
+DEPTH_TOLERANCE_MM = 0.1
+"""How far the depth at the end of the dwell may be from the one asked for."""
 TOUCH_TOLERANCE_MM = 0.1
 """How far the arm may rest from the taught height at zero touch."""
 
@@ -37,7 +39,8 @@ class Procedures:
 
     async def retreat(self) -> None:
         """Lift along the tool axis to safe height, then park. A killed process may have left the brush down."""
-        here = self._rig.robot.latest().pose
+        here = await self._rig.robot.where()
+        limits_of(self._config).check_start("robot", here)
         for move in retreat_moves(self._config, here):
             await self._go(move)
 
@@ -49,7 +52,7 @@ class Procedures:
         *down, up = zero_touch_moves(self._config)
         for move in down:
             await self._go(move)
-        rests_mm = (await self._pose_now()).z_mm
+        rests_mm = (await self._rig.robot.where()).z_mm
         off_mm = rests_mm - self._config.paper.touch_z_mm
         if abs(off_mm) > TOUCH_TOLERANCE_MM:
             raise StepVoid(f"zero touch rests {off_mm:+.3f} mm from the taught height; limit {TOUCH_TOLERANCE_MM} mm")
@@ -67,9 +70,11 @@ class Procedures:
         for move in before:
             await self._go(move)
         await asyncio.sleep(dwell_s)
-        depth_mm = self._config.paper.touch_z_mm - (await self._pose_now()).z_mm
+        depth_mm = self._config.paper.touch_z_mm - (await self._rig.robot.where()).z_mm
         for move in after:
             await self._go(move)
+        if abs(depth_mm - height_mm) > DEPTH_TOLERANCE_MM:
+            raise StepVoid(f"pressed {depth_mm:.3f} mm deep, {height_mm:g} mm were asked for")
         return depth_mm
 
     async def capture(self) -> Frame:
@@ -77,12 +82,6 @@ class Procedures:
         for move in park_moves(self._config):
             await self._go(move)
         return await self._rig.camera.fresh(Stamp(self._rig.clock.now_ns()))
-
-    async def _pose_now(self) -> Pose:
-        called_ns = self._rig.clock.now_ns()
-        while (sample := self._rig.robot.latest()).stamp.host_ns < called_ns:
-            await asyncio.sleep(0.005)
-        return sample.pose
 
     async def _go(self, move: Move) -> None:
         motion = self._config.motion
@@ -93,7 +92,7 @@ def retreat_moves(config: RigConfig, here: Pose) -> list[Move]:
     """From anywhere: along the tool axis up to safe height if below it, upright, then to the park position."""
     motion = config.motion
     moves: list[Move] = []
-    x_mm, y_mm = here.x_mm, here.y_mm
+    x_mm, y_mm, z_mm = here.position_mm
     if here.z_mm < motion.safe_z_mm:
         tilt_deg, heading_deg = lean(here)
         rise_mm = motion.safe_z_mm - here.z_mm
@@ -101,8 +100,10 @@ def retreat_moves(config: RigConfig, here: Pose) -> list[Move]:
         x_mm += out_mm * math.cos(math.radians(heading_deg))
         y_mm += out_mm * math.sin(math.radians(heading_deg))
         qx, qy, qz, qw = here.quaternion
-        moves.append(Move(Pose(x_mm, y_mm, motion.safe_z_mm, qx, qy, qz, qw), motion.press_speed_mm_s))
-        moves.append(Move(_upright(config, x_mm, y_mm, motion.safe_z_mm), motion.travel_speed_mm_s))
+        z_mm = motion.safe_z_mm
+        moves.append(Move(Pose(x_mm, y_mm, z_mm, qx, qy, qz, qw), motion.press_speed_mm_s))
+    # Upright in place before travelling: a turn and a long line at once sweep the ferrule around.
+    moves.append(Move(_upright(config, x_mm, y_mm, z_mm), motion.travel_speed_mm_s))
     return moves + park_moves(config)
 
 

@@ -80,7 +80,6 @@ class Progress:
         with self._lock:
             self._error = why
             self._over_ns = self._clock.now_ns()
-        self.log(why, warning=True)
 
     def closed(self, text: str) -> None:
         """The run is done."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import socket
 import tempfile
 from collections.abc import AsyncGenerator, Callable, Generator
 from dataclasses import dataclass
@@ -40,10 +41,20 @@ def limits_of(config: RigConfig) -> Limits:
     return Limits(box.x_mm, box.y_mm, (floor, box.z_mm[1]), box.tilt_deg, box.speed_mm_s, box.acc_mm_s2)
 
 
-def make_robot(config: RigConfig, clock: Clock) -> AuboArcs:
+def make_robot(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> AuboArcs:
     """The arm's driver, not yet connected."""
     robot = config.robot
-    return AuboArcs(ArcsOptions(robot.host, robot.port, robot.tcp_offset_mm), limits_of(config), clock)
+    options = ArcsOptions(
+        robot.host,
+        robot.port,
+        robot.tcp_offset_mm,
+        framing=robot.framing,
+        rtde_port=robot.rtde_port,
+        watchdog_s=robot.watchdog_s,
+        speed_fraction=robot.speed_fraction,
+        collision_level=robot.collision_level,
+    )
+    return AuboArcs(options, limits_of(config), clock, on_notice)
 
 
 def make_camera(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> OpenCvCamera:
@@ -55,15 +66,23 @@ def make_camera(config: RigConfig, clock: Clock, on_notice: Callable[[str], None
     return OpenCvCamera(options, clock, on_notice)
 
 
+def _resolved(host: str) -> str:
+    """One arm under two names is one arm."""
+    try:
+        return socket.gethostbyname(host)
+    except OSError:
+        return host
+
+
 @contextlib.contextmanager
 def sole_driver(config: RigConfig) -> Generator[None]:
     """Hold the arm at this address against other processes of this machine."""
-    address = f"{config.robot.host}:{config.robot.port}"
+    address = f"{_resolved(config.robot.host)}:{config.robot.port}"
     name = f"brushloop-{hashlib.sha256(address.encode()).hexdigest()[:16]}.lock"
     lock = FileLock(Path(tempfile.gettempdir()) / name, timeout=0)
     try:
         lock.acquire()
-    except Timeout:
+    except (Timeout, PermissionError):
         raise ConfigError("rig.toml", "robot", f"another brushloop is driving the arm at {address}") from None
     try:
         yield
@@ -83,7 +102,7 @@ async def connected(config: RigConfig, clock: Clock, on_notice: Callable[[str], 
         camera = make_camera(config, clock, on_notice)
         stack.push_async_callback(camera.close)
         camera_identity = await camera.connect()
-        robot = make_robot(config, clock)
+        robot = make_robot(config, clock, on_notice)
         stack.push_async_callback(robot.close)
         robot_identity = await robot.connect()
         yield Rig(config, clock, robot, camera, robot_identity, camera_identity)

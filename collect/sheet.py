@@ -59,12 +59,12 @@ class Sheet:
         y_mm = self._bottom + (self.rows - 1 - row) * cell_h
         return Cell(index, self._left + column * cell_w, y_mm, cell_w, cell_h)
 
-    def free(self, used: set[int]) -> Cell:
-        """The first cell that no press has ever been begun on. Raises `SheetFull`."""
+    def free(self, used: set[int], sheet: int = 1) -> Cell:
+        """The first cell of that sheet that no press has ever been begun on. Raises `SheetFull`."""
         for index in range(self.capacity):
             if index not in used:
                 return self.cell(index)
-        raise SheetFull(self.capacity)
+        raise SheetFull(self.capacity, sheet)
 
 
 def to_base(paper: PaperConfig, x_mm: float, y_mm: float) -> tuple[float, float]:

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import pytest
 
-from collect.config import GridConfig, RigConfig, load_protocol, load_rig
 from collect.engine import Engine
 from collect.opening import Opening, find_resumable, open_store
 from drivers.clock import HostClock
@@ -57,18 +56,11 @@ class Lab:
     def sessions(self) -> Path:
         return self.folder / "sessions"
 
-    def opening(self, **flags: bool) -> Opening:
-        return Opening(self.sessions, self.folder / "rig.toml", self.folder / "protocol.toml", **flags)
-
-    def configs(self) -> tuple[RigConfig, GridConfig]:
-        opening = self.opening()
-        return load_rig(opening.rig_path), load_protocol(opening.protocol_path)
-
-    def engine(self, **flags: bool) -> Engine:
-        opening, clock = self.opening(**flags), HostClock()
-        rig, protocol = self.configs()
+    def engine(self, *, new: bool = False, sheet: int | None = None, armed: bool = False) -> Engine:
+        rig, protocol, clock = self.folder / "rig.toml", self.folder / "protocol.toml", HostClock()
+        opening = Opening.load(self.sessions, rig, protocol, new=new, sheet=sheet, armed=armed)
         resume = find_resumable(opening)
-        return Engine(rig, protocol, lambda r: open_store(opening, resume, r, rig, protocol, clock), clock)
+        return Engine(opening.rig, opening.protocol, lambda r: open_store(opening, resume, r, clock), clock)
 
     def process(self) -> subprocess.Popen[str]:
         """`brushloop collect` as an operator starts it, without a screen."""

@@ -14,7 +14,8 @@ from collect.snapshot import Snapshot
 from collect.states import State
 from drivers.arcs.codes import SafetyMode
 from drivers.errors import RobotNotSafe
-from sessions.journal import replay
+from drivers.samples import Identity
+from sessions.journal import read_lines, replay
 from sessions.reader import Recording
 
 if TYPE_CHECKING:
@@ -147,7 +148,9 @@ def test_a_changed_protocol_is_refused_with_the_difference(lab: Lab) -> None:
     lab.write_protocol(heights="[11.0, 16.0]")
     with pytest.raises(ConfigError, match=r"(?s)-heights_mm = \[11.0, 15.0\].*\+heights_mm = \[11.0, 16.0\].*--new"):
         lab.engine()
-    run(lab.engine(new=True))
+    with pytest.raises(ConfigError, match="--sheet 1"):
+        lab.engine(new=True)
+    run(lab.engine(new=True, sheet=1))
     assert len(list(lab.sessions.iterdir())) == 2
 
 
@@ -158,11 +161,60 @@ def test_a_full_sheet_asks_for_a_fresh_one_and_goes_on_with_it(lab: Lab) -> None
 
     from collect.errors import SheetFull
 
-    with pytest.raises(SheetFull, match="--fresh-sheet"):
+    with pytest.raises(SheetFull, match="--sheet 2"):
         run(lab.engine())
-    run(lab.engine(fresh_sheet=True))
+    second = lab.engine(sheet=2)
+    second.start()
+    until(second, lambda now: now.strokes_done == 5)
+    second.stop()
+    with pytest.raises(CollectAborted):
+        second.join()
+    with pytest.raises(ConfigError, match="only 2 or 3"):
+        run(lab.engine(sheet=5))
+    run(lab.engine(sheet=2))  # the same command again: the sheet is not changed twice
     [folder] = lab.sessions.iterdir()
     assert sum(1 for _ in Recording(folder).captures()) == 6
+    pressed = [
+        (line["sheet"], line["cell"]) for line in read_lines(folder / "journal.jsonl") if line.get("cell") is not None
+    ]
+    assert len(pressed) == len(set(pressed))
+    assert {sheet for sheet, _ in pressed} == {0, 1}
+
+
+def test_a_sheet_is_not_changed_while_a_press_on_it_waits_for_its_photograph(lab: Lab) -> None:
+    engine = lab.engine()
+    engine.start()
+    until(engine, lambda now: now.step.startswith("capture"))
+    engine.stop()
+    with pytest.raises(CollectAborted):
+        engine.join()
+    with pytest.raises(ConfigError, match=r"is pressed on sheet 1 but not photographed"):
+        run(lab.engine(sheet=2))
+    run(lab.engine())
+
+
+def test_a_finished_session_is_not_followed_by_another_on_the_same_sheet(lab: Lab) -> None:
+    run(lab.engine())
+    with pytest.raises(ConfigError, match="Put a fresh sheet in, then confirm it with --sheet 1"):
+        lab.engine()
+    assert len(list(lab.sessions.iterdir())) == 1
+
+
+def test_what_the_environment_changes_is_recorded_and_held_against_a_resume(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("BRUSHLOOP_PAPER__TOUCH_Z_MM", "121.0")
+    engine = lab.engine()
+    engine.start()
+    until(engine, lambda now: now.strokes_done == 1)
+    engine.stop()
+    with pytest.raises(CollectAborted):
+        engine.join()
+    [folder] = lab.sessions.iterdir()
+    assert '"touch_z_mm": 121.0' in (folder / "rig.effective.json").read_text()
+    monkeypatch.delenv("BRUSHLOOP_PAPER__TOUCH_Z_MM")
+    with pytest.raises(ConfigError, match=r'-    "touch_z_mm": 121.0'):
+        lab.engine()
 
 
 def test_real_hardware_is_not_moved_unless_armed(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,6 +232,8 @@ def test_a_session_is_not_resumed_on_another_robot(lab: Lab, monkeypatch: pytest
     engine.stop()
     with pytest.raises(CollectAborted):
         engine.join()
-    monkeypatch.setattr("drivers.arcs.robot.LOOPBACK_CONTROL_BOX", "something else")
+    monkeypatch.setattr(
+        "drivers.arcs.robot.Identity", lambda device, _model, *rest: Identity(device, "another arm", *rest)
+    )
     with pytest.raises(ConfigError, match="was begun on"):
         run(lab.engine(armed=True))

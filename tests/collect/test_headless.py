@@ -30,7 +30,7 @@ def test_a_signal_stops_the_arm_and_the_same_command_goes_on(lab: Lab, number: s
     wait_for_presses(lab, 2)
     first.send_signal(number)
     _, stderr = first.communicate(timeout=30)
-    assert first.returncode == 4
+    assert first.returncode == 4, stderr
     assert stderr.splitlines()[-1] == "brushloop: stopped; the same command goes on from here"
     assert "Traceback" not in stderr
     still = lab.rig.world.tool()

@@ -46,7 +46,7 @@ LATE_CAMERA = DeviceTimeout("camera", "fresh", "no new frame")
         (PRESS, StepVoid("rests too high"), MAX_FAILURES, Action.ABORT),
         (PRESS, MotionFailed("robot", "moveLine", "out of reach"), 1, Action.ABORT),
         (PRESS, RobotNotSafe("robot", "moveLine", "ProtectiveStop", "", ""), 1, Action.ABORT),
-        (PRESS, SheetFull(42), 1, Action.ABORT),
+        (PRESS, SheetFull(42, 1), 1, Action.ABORT),
         (PRESS, LATE_CAMERA, 1, Action.ABORT),
         (CAPTURE, LATE_CAMERA, 1, Action.RETRY),
         (CAPTURE, LATE_CAMERA, MAX_FAILURES, Action.ABORT),
