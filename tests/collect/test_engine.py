@@ -36,6 +36,14 @@ def run(engine: Engine) -> None:
     engine.join()
 
 
+def run_and_stop(engine: Engine, when: Callable[[Snapshot], bool]) -> None:
+    engine.start()
+    until(engine, when)
+    engine.stop()
+    with pytest.raises(CollectAborted):
+        engine.join()
+
+
 def test_a_whole_session_is_collected_merged_and_told(lab: Lab) -> None:
     engine = lab.engine()
     run(engine)
@@ -138,12 +146,7 @@ def test_a_protective_stop_ends_the_run_and_says_what_to_do(lab: Lab) -> None:
 
 
 def test_a_changed_protocol_is_refused_with_the_difference(lab: Lab) -> None:
-    engine = lab.engine()
-    engine.start()
-    until(engine, lambda now: now.strokes_done == 1)
-    engine.stop()
-    with pytest.raises(CollectAborted):
-        engine.join()
+    run_and_stop(lab.engine(), lambda now: now.strokes_done == 1)
 
     lab.write_protocol(heights="[11.0, 16.0]")
     with pytest.raises(ConfigError, match=r"(?s)-heights_mm = \[11.0, 15.0\].*\+heights_mm = \[11.0, 16.0\].*--new"):
@@ -163,12 +166,7 @@ def test_a_full_sheet_asks_for_a_fresh_one_and_goes_on_with_it(lab: Lab) -> None
 
     with pytest.raises(SheetFull, match="--sheet 2"):
         run(lab.engine())
-    second = lab.engine(sheet=2)
-    second.start()
-    until(second, lambda now: now.strokes_done == 5)
-    second.stop()
-    with pytest.raises(CollectAborted):
-        second.join()
+    run_and_stop(lab.engine(sheet=2), lambda now: now.strokes_done == 5)
     with pytest.raises(ConfigError, match="only 2 or 3"):
         run(lab.engine(sheet=5))
     run(lab.engine(sheet=2))  # the same command again: the sheet is not changed twice
@@ -182,12 +180,7 @@ def test_a_full_sheet_asks_for_a_fresh_one_and_goes_on_with_it(lab: Lab) -> None
 
 
 def test_a_sheet_is_not_changed_while_a_press_on_it_waits_for_its_photograph(lab: Lab) -> None:
-    engine = lab.engine()
-    engine.start()
-    until(engine, lambda now: now.step.startswith("capture"))
-    engine.stop()
-    with pytest.raises(CollectAborted):
-        engine.join()
+    run_and_stop(lab.engine(), lambda now: now.step.startswith("capture"))
     with pytest.raises(ConfigError, match=r"is pressed on sheet 1 but not photographed"):
         run(lab.engine(sheet=2))
     run(lab.engine())
@@ -204,12 +197,7 @@ def test_what_the_environment_changes_is_recorded_and_held_against_a_resume(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("BRUSHLOOP_PAPER__TOUCH_Z_MM", "121.0")
-    engine = lab.engine()
-    engine.start()
-    until(engine, lambda now: now.strokes_done == 1)
-    engine.stop()
-    with pytest.raises(CollectAborted):
-        engine.join()
+    run_and_stop(lab.engine(), lambda now: now.strokes_done == 1)
     [folder] = lab.sessions.iterdir()
     assert '"touch_z_mm": 121.0' in (folder / "rig.effective.json").read_text()
     monkeypatch.delenv("BRUSHLOOP_PAPER__TOUCH_Z_MM")
@@ -226,12 +214,7 @@ def test_real_hardware_is_not_moved_unless_armed(lab: Lab, monkeypatch: pytest.M
 
 
 def test_a_session_is_not_resumed_on_another_robot(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    engine = lab.engine()
-    engine.start()
-    until(engine, lambda now: now.strokes_done == 1)
-    engine.stop()
-    with pytest.raises(CollectAborted):
-        engine.join()
+    run_and_stop(lab.engine(), lambda now: now.strokes_done == 1)
     monkeypatch.setattr(
         "drivers.arcs.robot.Identity", lambda device, _model, *rest: Identity(device, "another arm", *rest)
     )
