@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calibrate.errors import CaptureRefused
 from calibrate.measure import Line, Measured, fit_line, measure
-from calibrate.preprocess import PX_PER_MM, Params, prepare, rescale
+from calibrate.preprocess import Params, on_raster, prepare, rescale
 from sessions.errors import SessionDamaged
 from sessions.reader import Capture
 
@@ -75,10 +75,7 @@ def _measure(capture: Capture, params: Params) -> Drag:
     if stroke.px_per_mm is None:
         raise CaptureRefused(stroke.stroke_id, "has no scale (px_per_mm)")
     raster = rescale(capture.image(), stroke.px_per_mm, capture.where)
-    anchor = None
-    if stroke.anchor_px is not None:
-        scaled = [a * PX_PER_MM / s for a, s in zip(stroke.anchor_px, stroke.px_per_mm, strict=True)]
-        anchor = (scaled[0], scaled[1])
+    anchor = on_raster(stroke.anchor_px, stroke.px_per_mm) if stroke.anchor_px is not None else None
     prepared = prepare(raster, anchor, capture.where, params)
     commanded = dict(stroke.commanded)
     if stroke.height_mm is not None:
@@ -92,14 +89,10 @@ def _thumbnail(raster: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     side = round(1.15 * max(rows[-1] - rows[0], columns[-1] - columns[0])) + 8
     centre = ((rows[0] + rows[-1]) // 2, (columns[0] + columns[-1]) // 2)
-    padded = np.pad(raster, side, mode="edge")
-    crop = np.ascontiguousarray(
-        padded[centre[0] + side // 2 : centre[0] + side // 2 + side, centre[1] + side // 2 :][:, :side]
-    )
-    inside = np.pad(mask.astype(np.uint8), side)
-    inside = np.ascontiguousarray(
-        inside[centre[0] + side // 2 : centre[0] + side // 2 + side, centre[1] + side // 2 :][:, :side]
-    )
+    # Padded by `side`, so that a square of that size around the stroke always fits.
+    rows_shown, columns_shown = (slice(c + side // 2, c + side // 2 + side) for c in centre)
+    crop = np.pad(raster, side, mode="edge")[rows_shown, columns_shown]
+    inside = np.pad(mask.astype(np.uint8), side)[rows_shown, columns_shown]
     small = cv2.resize(crop, (THUMB_PX, THUMB_PX), interpolation=cv2.INTER_AREA)
     shape = cv2.resize(inside, (THUMB_PX, THUMB_PX), interpolation=cv2.INTER_AREA)
     outline = cv2.morphologyEx((shape > 0).astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((2, 2), np.uint8)) > 0

@@ -2,7 +2,6 @@
 
 CalibrationError       the captures do not allow the number that was asked for; says which and why
  +-- CaptureRefused    one capture cannot be used: blank, cut, no contrast; named in every report
-GateMissed             a validation gate was not reached
 """
 
 from __future__ import annotations
@@ -23,9 +22,3 @@ class CalibrationError(Exception):
 
 class CaptureRefused(CalibrationError):
     """This capture cannot be compared; it is listed by name, never dropped in silence."""
-
-
-class GateMissed(Exception):
-    """A score is below the gate."""
-
-    exit_code: ClassVar[int] = 5

@@ -84,6 +84,11 @@ def rescale(image: Gray, px_per_mm: tuple[float, float], where: str) -> Gray:
     return cast("Gray", cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR))
 
 
+def on_raster(point_px: tuple[float, float], px_per_mm: tuple[float, float]) -> tuple[float, float]:
+    """A point of a photograph on the raster that `rescale` makes of it."""
+    return point_px[0] * PX_PER_MM / px_per_mm[0], point_px[1] * PX_PER_MM / px_per_mm[1]
+
+
 def prepare(
     raster: Gray,
     anchor_px: tuple[float, float] | None,

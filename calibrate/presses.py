@@ -13,7 +13,7 @@ from calibrate.artefact import Calibration
 from calibrate.errors import CaptureRefused
 from calibrate.field import Alignment, Field, Image, Tone, best_shift, captured_mm, captured_normalised
 from calibrate.measure import Measured, measure
-from calibrate.preprocess import PX_PER_MM, Params, Prepared, prepare, rectify, rescale
+from calibrate.preprocess import PX_PER_MM, Params, Prepared, on_raster, prepare, rectify, rescale
 from calibrate.similarity import csim, ssim
 from calibrate.simulate import simulated
 from model.ccdbsm import DomainError
@@ -111,8 +111,8 @@ def _prepare(capture: Capture, calibration: Calibration | None, params: Params, 
     raster = rescale(image, stroke.px_per_mm, capture.where)
     if stroke.anchor_px is None:
         raise CaptureRefused(stroke.stroke_id, "has no anchor (start_x_px, start_y_px): it cannot be laid on a model")
-    whole_anchor = tuple(a * PX_PER_MM / s for a, s in zip(stroke.anchor_px, stroke.px_per_mm, strict=True))
-    return _crop(prepare(raster, (whole_anchor[0], whole_anchor[1]), capture.where, params), view)
+    anchor = on_raster(stroke.anchor_px, stroke.px_per_mm)
+    return _crop(prepare(raster, anchor, capture.where, params), view)
 
 
 def _crop(prepared: Prepared, view: Field) -> Prepared:

@@ -18,7 +18,7 @@ from calibrate.presses import PressResults, Score, validate_presses
 from model.ccdbsm import Brush
 from model.registry import StrokeModel, stroke_models
 from sessions.reader import Recording
-from sessions.schemas import Header
+from sessions.schemas import Header, Stroke
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +39,13 @@ def validate_recording(session: Path, names: list[str], view: Field, calibration
     """Validate one session. Raises `CalibrationError` where it was not calibrated or a model is unknown."""
     recording = Recording(session)
     digest = recording.sha256
-    kinds = {capture.stroke.kind for capture in recording.captures()}
+    strokes = list(recording.stroke_records())
+    kinds = {stroke.kind for stroke in strokes}
     if not kinds:
         raise CalibrationError(str(recording.path), "holds no strokes")
     if len(kinds) > 1:
         raise CalibrationError(str(recording.path), "mixes presses and drags; validate them as two sessions")
-    calibration = _calibration(recording, digest, calibration_path)
+    calibration = _calibration(recording, strokes[0], digest, calibration_path)
     models = _models(recording.header, names)
     params = Params(**calibration.preprocess) if calibration else Params()
     results = (
@@ -102,8 +103,7 @@ def drags_csv(results: DragResults, source: str) -> str:
     return out.getvalue()
 
 
-def _calibration(recording: Recording, digest: str, given: Path | None) -> Calibration | None:
-    first = next(recording.captures()).stroke
+def _calibration(recording: Recording, first: Stroke, digest: str, given: Path | None) -> Calibration | None:
     if first.px_per_mm is not None:
         return None  # an import brings its own scale
     path = given or artefact.newest(recording.path.parent)

@@ -65,6 +65,11 @@ class Recording:
         """How many strokes the index tells, without reading one."""
         return container.indexed_counts(self.path).get(Topic.STROKE, 0)
 
+    def stroke_records(self) -> Iterator[Stroke]:
+        """What was commanded, stroke by stroke, without their stills. Raises `SessionDamaged`."""
+        for _topic, _sequence, data in self._messages([Topic.STROKE]):
+            yield _event(self.path, Stroke, data)
+
     def captures(self) -> Iterator[Capture]:
         """Every stroke in order of capture. Raises `SessionDamaged`."""
         stills: OrderedDict[int, bytes] = OrderedDict()
