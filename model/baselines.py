@@ -2,7 +2,7 @@
 mark.
 
 Every baseline takes its sizes from the mark of the same (H, alpha) and stands on the mark's bounding box in
-the frame of `model.coverage`, so a score between two models shows their shape and not a shift. The sources do
+the frame of `model.raster.frame`, so a score between two models shows their shape and not a shift. The sources do
 not define them; each function states the definition chosen and its alternatives, because a score depends on
 them strongly.
 """
@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from model.ccdbsm import CcdBsm
+from model.outline import Outline, loop
 from model.profile import column, disc_integral, safe_sqrt
 
 Diameter = Literal["length", "width", "area"]
@@ -49,6 +50,10 @@ class Ellipse:
     def area_mm2(self) -> Tensor:
         """pi times the product of the semi-axes, (B,)."""
         return math.pi * self.semi_x_mm * self.semi_y_mm
+
+    def outline(self) -> Outline:
+        """Four quarters of an ellipse."""
+        return rounded(self.centre_mm, self.semi_x_mm, self.semi_y_mm)
 
     def half_width(self, x_mm: Tensor) -> Tensor:
         """The half width at x, (B, N) -> (B, N) mm; zero outside."""
@@ -101,6 +106,11 @@ class Capsule:
     def area_mm2(self) -> Tensor:
         """A disc and a rectangle, (B,)."""
         return self.radius_mm * (math.pi * self.radius_mm + 4 * (self.reach_x_mm + self.reach_y_mm))
+
+    def outline(self) -> Outline:
+        """Four quarters of a circle and four straight lines, two of them of no length."""
+        r = self.radius_mm
+        return rounded(self.centre_mm, self.reach_x_mm + r, self.reach_y_mm + r, r, r)
 
     def half_width(self, x_mm: Tensor) -> Tensor:
         """The half width at x, (B, N) -> (B, N) mm; zero outside."""
@@ -171,6 +181,26 @@ def line(mark: CcdBsm) -> Capsule:
         reach_x_mm=half_length - radius,
         reach_y_mm=half_width - radius,
     )
+
+
+def rounded(
+    centre: Tensor, half_x: Tensor, half_y: Tensor, corner_x: Tensor | None = None, corner_y: Tensor | None = None
+) -> Outline:
+    """A box about (centre, 0) whose corners are quarters of an ellipse, all (B,); an ellipse without corners."""
+    ex, ey = half_x if corner_x is None else corner_x, half_y if corner_y is None else corner_y
+    x, y, quarter = half_x - ex, half_y - ey, math.sqrt(0.5)
+    arcs: list[tuple[list[Tensor], float]] = []
+    for k in range(4):
+        # Corners counter-clockwise from the upper right: each a quarter, then the line to the next.
+        sx, sy = (1, -1, -1, 1)[k], (1, 1, -1, -1)[k]
+        nx, ny = (-1, -1, 1, 1)[k], (1, -1, -1, 1)[k]
+        side, top = [centre + sx * half_x, sy * y], [centre + sx * x, sy * half_y]
+        start, end = (side, top) if k % 2 == 0 else (top, side)
+        arcs.append(([*start, centre + sx * half_x, sy * half_y, *end], quarter))
+        if corner_x is not None:
+            onward = [centre + nx * x, ny * half_y] if k % 2 == 0 else [centre + nx * half_x, ny * y]
+            arcs.append(([*end, *(0.5 * (a + b) for a, b in zip(end, onward, strict=True)), *onward], 1.0))
+    return loop(*arcs)
 
 
 def _centre(mark: CcdBsm) -> Tensor:

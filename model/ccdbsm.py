@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from model.outline import Outline, loop
 from model.profile import column, disc_integral, safe_sqrt
 
 
@@ -33,6 +34,10 @@ class DomainError(ValueError):
         self.name = name
         self.value = value
         self.allowed = allowed
+
+
+DILATIONS = {"1": 1.0, "pi/2": 0.5 * math.pi, "pi": math.pi}
+"""The lambdas of the paper's figure 3; a fitted one is any positive number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +98,18 @@ class CcdBsm:
         """The area enclosed by Eq. 1, lambda O3C (pi/2 O3A + 4/3 O4O3), (B,)."""
         return self.half_width_mm * (0.5 * math.pi * self.o3a_mm + 4 / 3 * self.o4o3_mm)
 
+    def outline(self) -> Outline:
+        """Eq. 1 as two quarters of an ellipse and two parabolas, exactly."""
+        a, t, w = self.o3a_mm, self.o4o3_mm, self.half_width_mm
+        o = torch.zeros_like(a)
+        # The parabola's tangents, level at x = 0 and 2 w / t steep at the tip, meet halfway.
+        return loop(
+            ((a, o, a, w, o, w), math.sqrt(0.5)),
+            ((o, w, -0.5 * t, w, -t, o), 1.0),
+            ((-t, o, -0.5 * t, -w, o, -w), 1.0),
+            ((o, -w, a, -w, a, o), math.sqrt(0.5)),
+        )
+
     def half_width(self, x_mm: Tensor) -> Tensor:
         """Eq. 1 at x, (B, N) -> (B, N) mm; zero outside the mark."""
         heel, tip = self._fractions(x_mm)
@@ -132,7 +149,7 @@ def ccdbsm(
     alpha, lambda > 0.
     """
     _require_positive("lam", lam)
-    height, tilt, radius, length, dilation = _as_batch(
+    height, tilt, radius, length, dilation = as_batch(
         height_mm, tilt_deg, brush.radius_mm, brush.length_mm, lam, dtype=dtype
     )
     alpha = torch.deg2rad(tilt)
@@ -144,8 +161,12 @@ def ccdbsm(
     return CcdBsm(o3a_mm=o3a, o3c_mm=o3c, o4o3_mm=o4o3, lam=dilation)
 
 
-def _as_batch(*values: float | Tensor, dtype: torch.dtype | None) -> tuple[Tensor, ...]:
-    """All values as (B,) tensors of one floating dtype on the device of the first tensor."""
+def as_batch(*values: float | Tensor, dtype: torch.dtype | None = None) -> tuple[Tensor, ...]:
+    """All values as (B,) tensors of one floating dtype on the device of the first tensor.
+
+    The dtype is `dtype`, else that of the floating-point tensors given, else float64. Raises ValueError for a
+    tensor of two dimensions or more.
+    """
     tensors = [value for value in values if isinstance(value, Tensor)]
     if dtype is None:
         floating = [tensor.dtype for tensor in tensors if tensor.is_floating_point()]

@@ -1,13 +1,6 @@
-"""Exact area coverage of axis-aligned shapes: the share of each pixel that ink covers, without sampling.
+"""Exact area coverage of shapes at heading 0: the share of each pixel that ink covers, without sampling.
 
-Frame (the one definition in this project; other modules refer to it):
-  - x runs along the stroke axis in mm; +x is the belly and heel, the direction that the ferrule leans to;
-  - the tip lies at x = -O4O3, the end of the heel at x = +O3A;
-  - y points to the left of +x, so a quarter turn counter-clockwise takes x to y;
-  - the origin is O3, where the brush axis meets the paper.
-Image: square, 128 x 128 pixels of 0.2 mm (25.6 mm) unless said otherwise; the column grows with +x, the row
-with -y. Pixel (i, j) is the square between row edges i, i + 1 and column edges j, j + 1. Where the origin
-lies in the image is given as (mm from the left edge, mm from the top edge).
+The frame is defined in `model.raster.frame`; at heading 0 the stroke axis lies along a row.
 
 Why this is exact: for a half width w let G(x, a) be the integral up to x of min(w(t), a) dt for a >= 0, and
 odd in a. The ink below height y in a column is an integral of w clipped at y, so the ink in a pixel is the
@@ -23,33 +16,34 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from model.profile import Profile, column
+from model.profile import Profile, Shape, column
+from model.raster.exact import coverage_at
+from model.raster.frame import PX_MM, SIZE_PX, Place, check_raster, place
 
-SIZE_PX = 128
-PX_MM = 0.2
+__all__ = ["PX_MM", "SIZE_PX", "centred_origin", "coverage"]
 _CHUNK = 4  # images walked at a time, so that their corner grids stay in cache: three times the throughput
 
 
 def coverage(
-    profile: Profile,
-    origin_mm: Tensor | tuple[float, float],
+    profile: Shape,
+    origin_mm: Place,
     *,
     size_px: int = SIZE_PX,
     px_mm: float = PX_MM,
 ) -> Tensor:
-    """The covered share of every pixel, (B, size_px, size_px) in [0, 1], for B axis-aligned shapes.
+    """The covered share of every pixel, (B, size_px, size_px) in [0, 1], for B shapes at heading 0.
 
     `origin_mm` is the origin's place in the image, (x from the left edge, y from the top edge): one pair for
     all, or (B, 2). Whatever lies outside the image is cut off. dtype and device are the profile's.
     Differentiable in the profile's parameters and the origin. Raises ValueError for a size or shape that
-    makes no image. In float32 the error stays below 1e-3 for marks that fit the default image.
+    makes no image. In float32 the error stays below 1e-3 for marks that fit the default image. A shape that is no
+    profile, so has no level sets in closed form, is left to `coverage_at`, which is slower.
     """
-    _check_raster(size_px, px_mm)
+    check_raster(size_px, px_mm)
+    if not isinstance(profile, Profile):
+        return coverage_at(profile, origin_mm, size_px=size_px, px_mm=px_mm)
     like = profile.x_min_mm
-    origin = torch.as_tensor(origin_mm, dtype=like.dtype, device=like.device)
-    if origin.shape not in ((2,), (like.shape[0], 2)):
-        raise ValueError(f"origin_mm has shape {tuple(origin.shape)}, expected (2,) or ({like.shape[0]}, 2)")
-    origin = origin.expand(like.shape[0], 2)
+    origin = place(origin_mm, like)
     # Lines in double precision whatever the image's: areas of 200 mm^2 are subtracted to shares of a pixel.
     edges = torch.arange(size_px + 1, dtype=torch.float64, device=like.device) * px_mm
     x = edges - column(origin[:, 0])
@@ -76,9 +70,9 @@ def coverage(
     return images
 
 
-def centred_origin(profile: Profile, *, size_px: int = SIZE_PX, px_mm: float = PX_MM) -> Tensor:
+def centred_origin(profile: Shape, *, size_px: int = SIZE_PX, px_mm: float = PX_MM) -> Tensor:
     """The `origin_mm` that puts each shape's bounding box in the middle of the image, (B, 2)."""
-    _check_raster(size_px, px_mm)
+    check_raster(size_px, px_mm)
     middle = torch.full_like(profile.x_min_mm, 0.5 * size_px * px_mm)
     return torch.stack((middle - 0.5 * (profile.x_min_mm + profile.x_max_mm), middle), dim=-1)
 
@@ -88,9 +82,3 @@ def _clamped_steps(value: Tensor, low: Tensor, high: Tensor) -> Tensor:
     # Twice as fast as torch.clamp with three broadcast tensors.
     clamped = torch.minimum(torch.maximum(value[:, None, :], column(low)), column(high))
     return clamped[:, :, 1:] - clamped[:, :, :-1]
-
-
-def _check_raster(size_px: int, px_mm: float) -> None:
-    """Raise ValueError unless the raster has pixels of a positive size."""
-    if size_px < 1 or not px_mm > 0:
-        raise ValueError(f"size_px = {size_px}, px_mm = {px_mm:g}: both must be positive")

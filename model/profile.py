@@ -1,20 +1,24 @@
 """What a stroke shape has to offer so that it can be rasterised exactly, and the closed forms shapes share.
 
-A profile is a shape that is symmetric about the x axis and whose half width w(x) rises to one plateau or peak
-and falls again on [x_min, x_max], so that every level set {x : w(x) >= a} is one interval. The frame is
-defined in `model.coverage`. All parameters are batched: one shape per row, `(B,)`.
+Every shape has an outline, which can be drawn at any heading. A profile is a shape that is symmetric about the x
+axis and whose half width w(x) rises to one plateau or peak and falls again on [x_min, x_max], so that every level
+set {x : w(x) >= a} is one interval. The frame is defined in `model.raster.frame`. All parameters are batched: one
+shape per row, `(B,)`.
 """
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
+if TYPE_CHECKING:
+    from model.outline import Outline
 
-class Profile(Protocol):
-    """A batch of B shapes symmetric about the x axis with a unimodal half width; lengths in mm."""
+
+class Shape(Protocol):
+    """A batch of B shapes in the stroke frame; lengths in mm."""
 
     @property
     def x_min_mm(self) -> Tensor:
@@ -28,13 +32,22 @@ class Profile(Protocol):
 
     @property
     def width_mm(self) -> Tensor:
-        """The full width at the widest place, (B,)."""
+        """The extent along y; for a profile, the full width at the widest place, (B,)."""
         ...
 
     @property
     def area_mm2(self) -> Tensor:
         """The area of the whole shape (both halves) in closed form, (B,)."""
         ...
+
+    def outline(self) -> Outline:
+        """The boundary as a closed loop of conic arcs."""
+        ...
+
+
+@runtime_checkable
+class Profile(Shape, Protocol):
+    """A batch of B shapes symmetric about the x axis with a unimodal half width."""
 
     def half_width(self, x_mm: Tensor) -> Tensor:
         """The half width w at x, (B, N) -> (B, N); zero outside [x_min, x_max]."""

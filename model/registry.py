@@ -1,17 +1,20 @@
-"""The stroke models by name: what a validation compares and a report describes."""
+"""The stroke models by name: what a validation compares, a report describes and a generator is trained on.
+
+A model is a file in `model/strokes/` with a function `models(basis) -> tuple[StrokeModel, ...]`; being there is
+enough to be listed here.
+"""
 
 from __future__ import annotations
 
+import importlib
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
+import pkgutil
 
-from torch import Tensor
+from model import strokes
+from model.ccdbsm import Brush
+from model.protocol import Basis, ParameterSpec, StrokeModel
 
-from model import baselines
-from model.ccdbsm import Brush, CcdBsm, ccdbsm
-from model.profile import Profile
+__all__ = ["Basis", "ParameterSpec", "StrokeModel", "UnknownModelError", "stroke_model", "stroke_models"]
 
 
 class UnknownModelError(LookupError):
@@ -23,83 +26,24 @@ class UnknownModelError(LookupError):
         self.known = known
 
 
-class StrokeModel(Protocol):
-    """Something that predicts the mark of a press from depth and tilt."""
+def stroke_models(brush: Brush, lam: float = math.pi, *, fitted: bool = False) -> dict[str, StrokeModel]:
+    """Every model of one brush by name: ccd-bsm first, then the others by name.
 
-    @property
-    def name(self) -> str:
-        """The key on the command line and in files."""
-        ...
-
-    @property
-    def label(self) -> str:
-        """The name as a report prints it."""
-        ...
-
-    @property
-    def fitted(self) -> bool:
-        """Whether any parameter was fitted to captures; a report must say so beside a score."""
-        ...
-
-    @property
-    def definition(self) -> str:
-        """What the shape is, in one sentence."""
-        ...
-
-    def profile(self, height_mm: float | Tensor, tilt_deg: float | Tensor) -> Profile:
-        """The shapes of presses to depth H at tilt alpha, scalars or (B,); may raise DomainError."""
-        ...
+    `fitted` says that lambda or the brush was fitted to captures. Raises ValueError if two files claim one name.
+    """
+    basis = Basis(brush, lam, fitted)
+    found: dict[str, StrokeModel] = {}
+    for file in pkgutil.iter_modules(strokes.__path__):
+        for model in importlib.import_module(f"{strokes.__name__}.{file.name}").models(basis):
+            if model.name in found:
+                raise ValueError(f"two stroke models are called {model.name!r}, one in {file.name}")
+            found[model.name] = model
+    return {name: found[name] for name in sorted(found, key=lambda name: (name != "ccd-bsm", name))}
 
 
-@dataclass(frozen=True, slots=True)
-class ClosedFormModel:
-    """A `StrokeModel` that is a function of the CCD-BSM mark of one brush; nothing is fitted."""
-
-    name: str
-    label: str
-    definition: str
-    brush: Brush
-    lam: float
-    shape: Callable[[CcdBsm], Profile]
-    fitted: bool = False
-
-    def profile(self, height_mm: float | Tensor, tilt_deg: float | Tensor) -> Profile:
-        """The shapes of presses to depth H at tilt alpha, scalars or (B,); may raise DomainError."""
-        return self.shape(ccdbsm(self.brush, height_mm, tilt_deg, self.lam))
-
-
-def stroke_models(brush: Brush, lam: float = math.pi) -> dict[str, StrokeModel]:
-    """The closed-form models of one brush by name: ccd-bsm, and the baselines sized by it."""
-    table: tuple[tuple[str, str, str, Callable[[CcdBsm], Profile]], ...] = (
-        (
-            "ccd-bsm",
-            "CCD-BSM",
-            f"Half an ellipse at the heel and two parabolas to the tip (Eq. 1-5), dilation {lam:.4g}.",
-            lambda mark: mark,
-        ),
-        (
-            "ellipse",
-            "ellipse",
-            "The bounding ellipse of the CCD-BSM mark: same length and width.",
-            baselines.ellipse,
-        ),
-        (
-            "circle",
-            "circle",
-            "The circle whose diameter is the length of the CCD-BSM mark.",
-            baselines.circle,
-        ),
-        ("line", "line", "The capsule with the length and width of the CCD-BSM mark.", baselines.line),
-    )
-    return {
-        name: ClosedFormModel(name=name, label=label, definition=definition, brush=brush, lam=lam, shape=shape)
-        for name, label, definition, shape in table
-    }
-
-
-def stroke_model(name: str, brush: Brush, lam: float = math.pi) -> StrokeModel:
+def stroke_model(name: str, brush: Brush, lam: float = math.pi, *, fitted: bool = False) -> StrokeModel:
     """The model of that name for one brush; raises UnknownModelError, which lists the known names."""
-    models = stroke_models(brush, lam)
+    models = stroke_models(brush, lam, fitted=fitted)
     if name not in models:
         raise UnknownModelError(name, tuple(models))
     return models[name]

@@ -1,4 +1,4 @@
-"""The baseline shapes against their formulae, and the registry that names them."""
+"""The baseline shapes against their formulae."""
 
 import math
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from scipy.integrate import quad
 from model.baselines import Capsule, Ellipse, circle, ellipse, line
 from model.ccdbsm import Brush, CcdBsm, DomainError, ccdbsm
 from model.coverage import centred_origin, coverage
-from model.registry import UnknownModelError, stroke_model, stroke_models
+from model.registry import stroke_models
 
 GRID_MM = torch.tensor([11.0, 15.0, 20.0], dtype=torch.float64)
 MARK = ccdbsm(Brush(), GRID_MM, 5)
@@ -84,24 +84,6 @@ def test_every_model_paints_its_area(name: str) -> None:
     profile = model.profile(GRID_MM, 5.0)
     painted = coverage(profile, centred_origin(profile)).sum((1, 2)) * 0.2**2
     torch.testing.assert_close(painted, profile.area_mm2, rtol=1e-10, atol=0)
-
-
-def test_models_describe_themselves() -> None:
-    models = stroke_models(Brush())
-    assert list(models) == ["ccd-bsm", "ellipse", "circle", "line"]
-    for name, model in models.items():
-        assert model.name == name
-        assert not model.fitted
-        assert model.definition.endswith(".")
-        assert model.label
-    assert "1.5" in stroke_models(Brush(), 1.5)["ccd-bsm"].definition
-
-
-def test_unknown_model_names_the_known_ones() -> None:
-    assert stroke_model("line", Brush()).label == "line"
-    with pytest.raises(UnknownModelError, match="'bezier'; known: ccd-bsm, ellipse, circle, line") as caught:
-        stroke_model("bezier", Brush())
-    assert caught.value.known == ("ccd-bsm", "ellipse", "circle", "line")
 
 
 def test_models_share_the_domain_of_the_mark() -> None:

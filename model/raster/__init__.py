@@ -1,0 +1,1 @@
+"""Outlines to images: exact and compiled, exact and differentiable, and soft."""

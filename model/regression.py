@@ -1,0 +1,82 @@
+"""Linear regression of stroke parameters on depth and tilt, as Wang and Min do for Bezier strokes.
+
+The paper describes theirs as a least-squares multiple linear regression of the stroke's lengths on the descending
+height and the tilt angle. Here the terms are 1, H and H alpha: the tilt acts in proportion to the depth, as every
+length of CCD-BSM does, so a regressed stroke stays a stroke far from the cells. Where no captures are at hand the
+regression runs on CCD-BSM's own marks at the cells of the paper and adds no information about real ink.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from model.ccdbsm import CcdBsm, as_batch
+from model.protocol import Basis, Number, Values
+
+# The paper's H and alpha; H as a share of its brush's 48 mm, so that any brush is regressed inside its domain.
+DEPTHS = tuple(height_mm / 48 for height_mm in (11.0, 13.0, 15.0, 17.0, 20.0))
+TILTS_DEG = (0.0, 5.0, 10.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plane:
+    """Parameters as c0 + c1 H + c2 H alpha: `coefficients` (P, 3) for the P `names`."""
+
+    names: tuple[str, ...]
+    coefficients: Tensor
+
+    def at(self, height_mm: Number, tilt_deg: Number) -> Values:
+        """The parameters at H and alpha, scalars or (B,), each (B,)."""
+        height, tilt = as_batch(height_mm, tilt_deg)
+        c = self.coefficients.to(height)
+        return {name: c[k, 0] + height * (c[k, 1] + c[k, 2] * tilt) for k, name in enumerate(self.names)}
+
+
+def fit_plane(height_mm: Tensor, tilt_deg: Tensor, values: Values) -> Plane:
+    """The least-squares fit to values (N,) at H and alpha (N,), for captures or marks alike.
+
+    Raises ValueError where the cells do not span a plane: at least two depths and two tilts are needed.
+    """
+    design = torch.stack((torch.ones_like(height_mm), height_mm, height_mm * tilt_deg), dim=-1).double()
+    if torch.linalg.matrix_rank(design) < 3:
+        raise ValueError(f"{len(design)} cells do not span depth and tilt: two depths and two tilts are needed")
+    targets = torch.stack([value.detach().double() for value in values.values()], dim=-1)
+    return Plane(tuple(values), torch.linalg.lstsq(design, targets).solution.T)
+
+
+def regressed(basis: Basis, measure: Callable[[CcdBsm], Values]) -> Callable[[Number, Number], Values]:
+    """(H, alpha) to parameters: `measure` of CCD-BSM's marks at the paper's cells, regressed at the first press.
+
+    The function raises DomainError where CCD-BSM has no mark.
+    """
+    planes: list[Plane] = []
+
+    def press(height_mm: Number, tilt_deg: Number) -> Values:
+        basis.mark(height_mm, tilt_deg)
+        if not planes:
+            length_mm = float(torch.as_tensor(basis.brush.length_mm).detach().reshape(-1)[0])
+            cells = torch.cartesian_prod(
+                length_mm * torch.tensor(DEPTHS, dtype=torch.float64), torch.tensor(TILTS_DEG, dtype=torch.float64)
+            )
+            height, tilt = cells.unbind(-1)
+            planes.append(fit_plane(height, tilt, measure(basis.mark(height, tilt))))
+        return planes[0].at(height_mm, tilt_deg)
+
+    return press
+
+
+def solve(value: Callable[[Tensor], Tensor], target: Tensor, low: Tensor, high: Tensor, steps: int = 50) -> Tensor:
+    """Where a growing function (B,) -> (B,) reaches `target` between low and high, by bisection; else the end.
+
+    The result carries no gradient.
+    """
+    with torch.no_grad():
+        for _ in range(steps):
+            middle = 0.5 * (low + high)
+            below = value(middle) < target
+            low, high = torch.where(below, middle, low), torch.where(below, high, middle)
+        return 0.5 * (low + high)

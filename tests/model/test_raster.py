@@ -1,0 +1,234 @@
+"""Coverage at any heading and place: exact, compiled and soft, against quadrature, supersampling and each other."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.integrate import quad
+from scipy.ndimage import gaussian_filter
+
+from model.ccdbsm import Brush, CcdBsm, ccdbsm
+from model.coverage import centred_origin, coverage
+from model.raster.compiled import coverage_numpy
+from model.raster.exact import coverage_at
+from model.raster.soft import soft_coverage
+from model.registry import stroke_models
+
+Array = NDArray[np.floating]
+MODELS = stroke_models(Brush())
+DOUBLE = {"dtype": torch.float64}
+HEADINGS = (0.0, 90.0, 180.0, -90.0)
+ORIGIN = (12.117, 13.743)
+
+
+def half_width_of(mark: CcdBsm) -> Callable[[float], float]:
+    """Eq. 1 of one mark, written anew."""
+    a, w, t = mark.o3a_mm.item(), mark.half_width_mm.item(), mark.o4o3_mm.item()
+
+    def half_width(x: float) -> float:
+        if not -t < x < a:
+            return -1.0
+        return w * (1 - (x / t) ** 2) if x < 0 else w * math.sqrt(1 - (x / a) ** 2)
+
+    return half_width
+
+
+def pixel_by_quadrature(mark: CcdBsm, i: int, j: int, origin: tuple[float, float], heading_deg: float) -> float:
+    """The share of pixel (i, j) under the mark: the pixel's square is turned into the stroke frame and integrated."""
+    px, psi = 0.2, math.radians(heading_deg)
+    corners = []
+    for column, row in ((j, i), (j + 1, i), (j + 1, i + 1), (j, i + 1)):
+        right, up = column * px - origin[0], origin[1] - row * px
+        corners.append((right * math.cos(psi) + up * math.sin(psi), up * math.cos(psi) - right * math.sin(psi)))
+    half_width = half_width_of(mark)
+
+    def inked(x: float) -> float:
+        cuts = []
+        for (xa, ya), (xb, yb) in zip(corners, [*corners[1:], corners[0]], strict=True):
+            if min(xa, xb) <= x <= max(xa, xb) and xa != xb:
+                cuts.append(ya + (x - xa) / (xb - xa) * (yb - ya))
+        w = half_width(x)
+        return max(0.0, min(max(cuts), w) - max(min(cuts), -w)) if cuts and w > 0 else 0.0
+
+    low, high = min(x for x, _ in corners), max(x for x, _ in corners)
+    kinks = [*(x for x, _ in corners), 0.0, mark.o3a_mm.item(), -mark.o4o3_mm.item()]
+    points = sorted(x for x in kinks if low < x < high)
+    area, _ = quad(inked, low, high, points=points or None, limit=500, epsabs=1e-10, epsrel=1e-10)
+    return area / px**2
+
+
+@pytest.mark.parametrize("press", [(15.0, 7.0), (11.0, 0.0), (20.0, 10.0)])
+@pytest.mark.parametrize("heading_deg", [17.0, 45.0, 133.3, -71.0])
+def test_boundary_pixels_match_quadrature_at_any_heading(press: tuple[float, float], heading_deg: float) -> None:
+    mark = ccdbsm(Brush(), *press)
+    exact = coverage_at(mark, ORIGIN, heading_deg)[0].numpy()
+    compiled = coverage_numpy(mark, ORIGIN, heading_deg, out=np.empty((1, 128, 128)))[0]
+    boundary = np.argwhere((exact > 0) & (exact < 1))
+    chosen = np.random.default_rng(0).choice(len(boundary), 25, replace=False)
+    for i, j in boundary[chosen]:
+        expected = pixel_by_quadrature(mark, i, j, ORIGIN, heading_deg)
+        assert abs(exact[i, j] - expected) < 1e-6
+        assert abs(compiled[i, j] - expected) < 1e-6
+
+
+@pytest.mark.parametrize("name", ["ccd-bsm", "ellipse", "circle", "line"])
+def test_quarter_turns_match_the_closed_form_in_every_pixel(name: str) -> None:
+    shape = MODELS[name].profile(torch.tensor([11.0, 15.0, 20.0], **DOUBLE), 5.0)
+    origin = centred_origin(shape) + torch.tensor([0.037, -0.061])
+    level = coverage(shape, origin)
+    for quarters, heading_deg in enumerate(HEADINGS[:3]):
+        # Turning the picture counter-clockwise about its middle takes (x, y) to (y, side - x), from the top left.
+        placed = origin
+        for _ in range(quarters):
+            placed = torch.stack((placed[:, 1], 25.6 - placed[:, 0]), dim=-1)
+        turned = torch.rot90(level, quarters, (1, 2))
+        assert (coverage_at(shape, placed, heading_deg) - turned).abs().max().item() < 1e-6
+        assert abs(coverage_numpy(shape, placed, heading_deg) - turned.numpy()).max() < 1e-6
+
+
+presses = st.tuples(st.floats(3, 20), st.floats(0, 60))
+
+
+@given(presses, st.floats(-360, 360), st.floats(-5, 30), st.floats(-5, 30), st.sampled_from(sorted(MODELS)))
+@settings(deadline=None, max_examples=60)
+def test_both_exact_paths_agree_wherever_a_mark_lies(
+    press: tuple[float, float], heading_deg: float, x_mm: float, y_mm: float, name: str
+) -> None:
+    shape = MODELS[name].profile(*press)
+    exact = coverage_at(shape, (x_mm, y_mm), heading_deg, size_px=64, px_mm=0.4)[0].numpy()
+    compiled = coverage_numpy(shape, (x_mm, y_mm), heading_deg, size_px=64, px_mm=0.4)[0]
+    assert abs(exact - compiled).max() < 1e-6
+    assert exact.min() >= 0
+    assert exact.max() <= 1
+
+
+@given(presses, st.floats(-180, 180), st.sampled_from(sorted(MODELS)))
+@settings(deadline=None, max_examples=40)
+def test_the_ink_of_a_whole_mark_is_its_area(press: tuple[float, float], heading_deg: float, name: str) -> None:
+    shape = MODELS[name].profile(*press)
+    side = 1.2 * float(2 * (shape.x_max_mm - shape.x_min_mm) + 2 * shape.width_mm)
+    px_mm = side / 128
+    image = coverage_at(shape, (side / 2, side / 2), heading_deg, px_mm=px_mm)
+    assert image.sum().item() * px_mm**2 == pytest.approx(shape.area_mm2.item(), rel=1e-6)
+
+
+@pytest.mark.parametrize("heading_deg", [30.0, -100.0])
+def test_supersampling_agrees_at_a_heading(heading_deg: float) -> None:
+    # A point is counted whole, so single pixels differ by up to half a line of 32 points; see test_coverage.py.
+    mark = ccdbsm(Brush(), 15.0, 7.0)
+    fine = (np.arange(32 * 128) + 0.5) * 0.2 / 32
+    right, up, psi = fine - ORIGIN[0], ORIGIN[1] - fine, math.radians(heading_deg)
+    x = right[None, :] * math.cos(psi) + up[:, None] * math.sin(psi)
+    y = up[:, None] * math.cos(psi) - right[None, :] * math.sin(psi)
+    a, w, t = mark.o3a_mm.item(), mark.half_width_mm.item(), mark.o4o3_mm.item()
+    inside = abs(y) <= np.where(x < 0, w * (1 - (x / t) ** 2), w * np.sqrt(np.maximum(0, 1 - (x / a) ** 2)))
+    inside &= (x > -t) & (x < a)
+    sampled = inside.reshape(128, 32, 128, 32).mean((1, 3))
+    for image in (
+        coverage_at(mark, ORIGIN, heading_deg)[0].numpy(),
+        coverage_at(ccdbsm(Brush(), 15.0, 7.0, dtype=torch.float32), ORIGIN, heading_deg)[0].numpy(),
+        coverage_numpy(mark, ORIGIN, heading_deg)[0],
+    ):
+        boundary = (image > 0) & (image < 1)
+        assert abs(image - sampled)[boundary].mean() < 1e-3
+        assert abs(image - sampled).max() <= 1 / 32
+        assert image.sum() == pytest.approx(sampled.sum(), rel=1e-4)
+
+
+@given(presses, st.floats(-180, 180))
+@settings(deadline=None, max_examples=30)
+def test_single_precision_is_good_to_a_thousandth(press: tuple[float, float], heading_deg: float) -> None:
+    double, single = (ccdbsm(Brush(), *press, dtype=dtype) for dtype in (torch.float64, torch.float32))
+    image = coverage_at(single, ORIGIN, heading_deg)
+    assert image.dtype == torch.float32
+    assert (image - coverage_at(double, ORIGIN, heading_deg)).abs().max().item() < 1e-3
+
+
+def parameters() -> list[torch.Tensor]:
+    """H, alpha, R, L, lambda, (x0, y0), heading: no boundary runs along a pixel edge."""
+    values = ([13.0], [6.0], [6.0], [48.0], [3.0], [[14.3, 8.0]], [25.0])
+    return [torch.tensor(v, **DOUBLE, requires_grad=True) for v in values]
+
+
+# torch itself compiles its forward-mode rules with torch.jit.script on first use, and warns about it.
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
+@pytest.mark.parametrize("soft", [False, True])
+def test_gradients_are_exact_in_every_parameter(soft: bool) -> None:
+    def image(h, tilt, radius, length, lam, origin, heading) -> torch.Tensor:
+        mark = ccdbsm(Brush(radius, length), h, tilt, lam)
+        if soft:
+            return soft_coverage(mark, origin, heading, softness_px=0.7, size_px=9, px_mm=2.0)
+        return coverage_at(mark, origin, heading, size_px=9, px_mm=2.0)
+
+    assert torch.autograd.gradcheck(image, parameters(), check_forward_ad=True)
+
+
+@pytest.mark.parametrize("name", sorted(MODELS))
+def test_every_model_has_exact_gradients_in_its_own_parameters(name: str) -> None:
+    model = MODELS[name]
+    start = {key: value.detach() for key, value in model.of_press(13.0, 6.0).items()}
+    if name == "qbc":  # bent, so that no derivative vanishes
+        start["y1_mm"] = start["y1_mm"] + 2.3
+    names = [key for key in start if not (name == "line" and key == "reach_y_mm")]  # 0 is its lower end
+
+    def image(*values: torch.Tensor) -> torch.Tensor:
+        return coverage_at(
+            model.shape(start | dict(zip(names, values, strict=True))), (14.3, 8.1), 25.0, size_px=9, px_mm=2.0
+        )
+
+    assert torch.autograd.gradcheck(image, [start[key].clone().requires_grad_() for key in names])
+
+
+def test_softness_is_a_gaussian_over_the_exact_image() -> None:
+    mark = ccdbsm(Brush(), 15.0, 5.0)
+    soft = soft_coverage(mark, (20.0, 12.8), 10.0, softness_px=1.5)[0].numpy()
+    exact = coverage_at(mark, (20.0, 12.8), 10.0)[0].numpy()
+    inner = (slice(8, -8), slice(8, -8))
+    assert abs(soft - gaussian_filter(exact, 1.5, truncate=4.0, mode="constant"))[inner].max() < 1e-6
+    sharp = soft_coverage(mark, (20.0, 12.8), 10.0, softness_px=0.05)[0].numpy()
+    assert abs(sharp - exact).max() < 1e-6
+    # Ink beyond the edge still shines in: here the mark lies just outside on the left.
+    assert soft_coverage(mark, (-2.0, 12.8), softness_px=1.5)[0, 64, 0].item() > 0.01
+
+
+def test_a_soft_gradient_reaches_pixels_that_the_exact_one_does_not() -> None:
+    height_mm = torch.tensor([15.0], **DOUBLE)
+
+    def image(draw: Callable[..., torch.Tensor], **extra: float) -> torch.Tensor:
+        return torch.func.jvp(
+            lambda h: draw(ccdbsm(Brush(), h, 5.0), (20.0, 12.8), **extra), (height_mm,), (torch.ones_like(height_mm),)
+        )[1]
+
+    exact, soft = image(coverage_at), image(soft_coverage, softness_px=2.0)
+    assert ((soft != 0).sum() > 4 * (exact != 0).sum()).item()
+    assert soft.sum().item() == pytest.approx(exact.sum().item(), rel=1e-6)
+
+
+def test_large_batches_run_on_threads_and_come_out_the_same() -> None:
+    heights_mm = torch.linspace(11, 20, 150, **DOUBLE)
+    mark = ccdbsm(Brush(), heights_mm, 5.0)
+    one, two = (coverage_numpy(mark, centred_origin(mark), heights_mm, threads=n) for n in (1, 2))
+    assert one.dtype == np.float32
+    np.testing.assert_array_equal(one, two)
+    assert coverage_numpy(ccdbsm(Brush(), heights_mm[:0], 5.0), (1.0, 1.0)).shape == (0, 128, 128)
+    assert coverage_at(ccdbsm(Brush(), heights_mm[:0], 5.0), (1.0, 1.0)).shape == (0, 128, 128)
+
+
+def test_what_makes_no_image_is_refused() -> None:
+    mark = ccdbsm(Brush(), torch.tensor([11.0, 13.0, 15.0]), 5.0)
+    for draw in (coverage_at, coverage_numpy, soft_coverage):
+        with pytest.raises(ValueError, match="size_px = 0"):
+            draw(mark, (1.0, 1.0), size_px=0)
+        with pytest.raises(ValueError, match=r"heading_deg has shape \(2,\)"):
+            draw(mark, (1.0, 1.0), torch.zeros(2))
+        with pytest.raises(ValueError, match=r"origin_mm has shape \(2, 2\)"):
+            draw(mark, torch.zeros(2, 2))
+    with pytest.raises(ValueError, match=r"softness_px = 0 is outside \(0, inf\)"):
+        soft_coverage(mark, (1.0, 1.0), softness_px=0.0)
+    with pytest.raises(ValueError, match=r"out is int64 \(3, 128, 128\)"):
+        coverage_numpy(mark, (1.0, 1.0), out=np.zeros((3, 128, 128), np.int64))
