@@ -18,7 +18,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.reader import FOOTER_SIZE, SeekingReader
-from mcap.records import Attachment, Channel, ChunkIndex, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
@@ -44,13 +44,16 @@ _T = TypeVar("_T")
 
 
 def messages(path: Path, topics: list[str] | None = None) -> Iterator[tuple[Schema | None, Channel, Message]]:
-    """Messages in order of log time, every CRC checked. Raises `SessionDamaged`."""
+    """Messages in the order in which they were written, every CRC checked. Raises `SessionDamaged`.
+
+    By log time a stroke could come before its still, where the host's clock was set back between the two.
+    """
     return _guarded(path, lambda file: _messages(file, topics))
 
 
 def metadata(path: Path) -> Iterator[Metadata]:
     """Metadata records. Raises `SessionDamaged`."""
-    return _guarded(path, lambda file: _indexed(file)[0].iter_metadata())
+    return _guarded(path, lambda file: indexed(file)[0].iter_metadata())
 
 
 def attachments(path: Path) -> Iterator[Attachment]:
@@ -63,7 +66,7 @@ def indexed_counts(path: Path) -> dict[str, int]:
     return next(_guarded(path, _indexed_counts))
 
 
-class _BoundedFile(io.BufferedReader):
+class BoundedFile(io.BufferedReader):
     """Asks for no more than the file holds, whatever length a damaged record states."""
 
     def __init__(self, path: Path) -> None:
@@ -71,14 +74,15 @@ class _BoundedFile(io.BufferedReader):
         self.size = os.fstat(self.fileno()).st_size
 
     def read(self, size: int | None = -1, /) -> bytes:
+        """At most what is left of the file."""
         left = max(self.size - self.tell(), 0)
         return super().read(left if size is None or size < 0 else min(size, left))
 
 
-def _guarded(path: Path, read: Callable[[_BoundedFile], Iterator[_T]]) -> Iterator[_T]:
+def _guarded(path: Path, read: Callable[[BoundedFile], Iterator[_T]]) -> Iterator[_T]:
     """Only the library's own steps are guarded: an exception of the code between two items is not the file's."""
     try:
-        file = _BoundedFile(path)
+        file = BoundedFile(path)
     except OSError as error:
         raise InputError(path, f"cannot open: {in_one_line(error)}") from None
     with file:
@@ -97,7 +101,9 @@ def _guarded(path: Path, read: Callable[[_BoundedFile], Iterator[_T]]) -> Iterat
             yield item
 
 
-def _indexed(file: _BoundedFile) -> tuple[SeekingReader, Summary]:
+def indexed(file: BoundedFile) -> tuple[SeekingReader, Summary]:
+    """A reader, and the index at the end of the file, its CRC checked. Raises any of `UNREADABLE`."""
+    file.seek(0)
     reader = SeekingReader(file, validate_crcs=True, record_size_limit=MAX_RECORD_BYTES)
     _check_summary_crc(file)
     summary = reader.get_summary()
@@ -106,7 +112,7 @@ def _indexed(file: _BoundedFile) -> tuple[SeekingReader, Summary]:
     return reader, summary
 
 
-def _check_summary_crc(file: _BoundedFile) -> None:
+def _check_summary_crc(file: BoundedFile) -> None:
     """The index says which chunks hold which topic: unchecked, one wrong bit would hide strokes in silence."""
     footer_at = file.size - FOOTER_SIZE - len(MCAP0_MAGIC)
     file.seek(footer_at)
@@ -122,20 +128,20 @@ def _check_summary_crc(file: _BoundedFile) -> None:
         raise McapError("the index does not match its CRC")
 
 
-def _messages(file: _BoundedFile, topics: list[str] | None) -> Iterator[tuple[Schema | None, Channel, Message]]:
-    reader, summary = _indexed(file)
+def _messages(file: BoundedFile, topics: list[str] | None) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    reader, summary = indexed(file)
     if not summary.chunk_indexes:
         if summary.statistics is None or summary.statistics.message_count:
             raise McapError("has messages outside chunks, which no CRC protects")
         return
     for index in summary.chunk_indexes:
-        _check_chunk(file, index)
-    yield from reader.iter_messages(topics)
+        check_chunk_at(file, index.chunk_start_offset)
+    yield from reader.iter_messages(topics, log_time_order=False)
 
 
-def _check_chunk(file: _BoundedFile, index: ChunkIndex) -> None:
+def check_chunk_at(file: BoundedFile, offset: int) -> None:
     """Refuse a chunk that would unpack to more than `MAX_RECORD_BYTES`, whichever of its three lengths says so."""
-    file.seek(index.chunk_start_offset + 1 + 8 + 8 + 8)
+    file.seek(offset + 1 + 8 + 8 + 8)
     stream = ReadDataStream(file)
     size = stream.read8()
     stream.read4()
@@ -149,8 +155,8 @@ def _check_chunk(file: _BoundedFile, index: ChunkIndex) -> None:
         raise McapError(f"chunk of {size} bytes exceeds {MAX_RECORD_BYTES}")
 
 
-def _attachments(file: _BoundedFile) -> Iterator[Attachment]:
-    reader, summary = _indexed(file)
+def _attachments(file: BoundedFile) -> Iterator[Attachment]:
+    reader, summary = indexed(file)
     for index, attachment in zip(summary.attachment_indexes, reader.iter_attachments(), strict=True):
         again = RecordBuilder()
         attachment.write(again)
@@ -160,7 +166,7 @@ def _attachments(file: _BoundedFile) -> Iterator[Attachment]:
         yield attachment
 
 
-def _indexed_counts(file: _BoundedFile) -> Iterator[dict[str, int]]:
-    _reader, summary = _indexed(file)
+def _indexed_counts(file: BoundedFile) -> Iterator[dict[str, int]]:
+    _reader, summary = indexed(file)
     counts = summary.statistics.channel_message_counts if summary.statistics else {}
     yield {summary.channels[channel_id].topic: count for channel_id, count in counts.items()}

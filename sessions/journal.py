@@ -1,23 +1,24 @@
 """The journal of a session: append-only JSON lines, one fsync each. What it says happened, happened.
 
 Events: `open` (header, configs), `process` (a process took the session), `begin` and `done` or `void` for a step
-attempt, `sheet` (a fresh sheet was put in), `torn` (a half-written line was found and set aside), `closed`.
+attempt, `sheet` (a fresh sheet was put in), `torn` (a half-written line was found and set aside), `clock` (the host's
+clock was set back), `closed`. A repair adds `repaired`, `held`, `lost`, `doubt` and `journal`.
 """
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Iterator
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from sessions.errors import SessionDamaged, SessionError, in_one_line
+from sessions.errors import SessionDamaged, disk_error
+from sessions.lines import Line, encode_line
+from sessions.lines import read_lines as read_lines
 from sessions.schemas import TornTail
 
 JOURNAL_NAME = "journal.jsonl"
-Line = dict[str, Any]
+_SERIAL = re.compile(r"\d+(?=-)")
 DONE_FIELDS = {"key": str, "kind": str, "file": str, "sha256": str, "counts": dict, "result": dict}
 
 
@@ -38,11 +39,11 @@ class Journal:
             if created:
                 fsync_folder(path.parent)
         except OSError as error:
-            raise SessionError(path, f"cannot open: {in_one_line(error)}") from error
+            raise disk_error(path, "cannot open", error) from error
 
     def append(self, t_ns: int, line: Line) -> None:
         """Write one event and wait until it is on disk. Raises `SessionError` where that fails."""
-        data = _encode(t_ns, line)
+        data = encode_line(t_ns, line)
         try:
             if os.fstat(self._fd).st_size != self._size:
                 os.ftruncate(self._fd, self._size)  # part of a line that did not fit on the disk
@@ -51,7 +52,7 @@ class Journal:
                 view = view[os.write(self._fd, view) :]
             os.fsync(self._fd)
         except OSError as error:
-            raise SessionError(self.path, f"cannot write: {in_one_line(error)}") from error
+            raise disk_error(self.path, "cannot write", error) from error
         self._size += len(data)
 
     def close(self) -> None:
@@ -68,33 +69,13 @@ def fsync_folder(folder: Path) -> None:
         os.close(fd)
 
 
-def read_lines(path: Path) -> Iterator[Line]:
-    """Every complete line. A torn last line is left out; damage anywhere else raises `SessionDamaged`."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SessionError(path, f"cannot read: {in_one_line(error)}") from None
-    for number, raw in enumerate(data.split(b"\n")[:-1], start=1):
-        try:
-            line = json.loads(raw)
-        except (ValueError, RecursionError):
-            raise SessionDamaged(path, f"line {number} is not JSON") from None
-        if not isinstance(line, dict) or not isinstance(line.get("event"), str):  # pyright: ignore[reportUnknownMemberType]
-            raise SessionDamaged(path, f"line {number} has no event")
-        yield line
-
-
-def _encode(t_ns: int, line: Line) -> bytes:
-    return json.dumps({"t_ns": t_ns, **line}, separators=(",", ":"), allow_nan=False).encode() + b"\n"
-
-
 def _set_torn_tail_aside(path: Path, t_ns: int) -> None:
     data = path.read_bytes()
     keep = data.rfind(b"\n") + 1
     if keep == len(data):
         return
     # Longer than what it overwrites, and one write: a crash here leaves the old tail or the note, never neither.
-    note = _encode(t_ns, TornTail(hex=data[keep:].hex()).model_dump())
+    note = encode_line(t_ns, TornTail(hex=data[keep:].hex()).model_dump())
     with path.open("r+b", buffering=0) as file:
         file.seek(keep)
         file.write(note)
@@ -114,9 +95,15 @@ class Replay:
     attempts: dict[str, int] = field(default_factory=dict[str, int])
     used_cells: set[tuple[int, int]] = field(default_factory=set[tuple[int, int]])
     """(sheet, cell) of every press that was begun, finished or not: never to be pressed again."""
+    doubtful_sheets: set[int] = field(default_factory=set[int])
+    """Sheets on which a press may lie that nobody knows of: nothing more is pressed on them."""
+    repairs: list[Line] = field(default_factory=list[Line])
+    """`repaired` and `lost` events: what the merged file has to tell of."""
     sheet: int = 0
     begun: int = 0
     voids: int = 0
+    last_ns: int = 0
+    """Time of the latest line, to notice a clock that was set back."""
 
 
 def replay(path: Path) -> Replay:
@@ -124,8 +111,8 @@ def replay(path: Path) -> Replay:
     state = Replay()
     for line in read_lines(path):
         try:
-            _fold(state, line)
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            fold(state, line)
+        except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
             raise SessionDamaged(path, f"event {line['event']!r} lacks or spoils {error}") from None
     state.voids = state.begun - len(state.segments)
     return state
@@ -136,27 +123,69 @@ def is_open(state: Replay) -> bool:
     return state.opened is not None and state.closed is None
 
 
-def _fold(state: Replay, line: Line) -> None:
+def fold(state: Replay, line: Line) -> None:
+    """Take one line into the memory. Raises `KeyError`, `TypeError`, `ValueError` for what makes no sense."""
+    state.last_ns = int(line.get("t_ns", 0))
     match line["event"]:
         case "open":
             state.opened = line
         case "begin":
-            key = str(line["key"])
-            state.begun += 1
-            state.attempts[key] = max(state.attempts.get(key, 0), int(line["attempt"]))
-            if line["cell"] is not None:
-                state.used_cells.add((int(line["sheet"]), int(line["cell"])))
+            _begin(state, line)
         case "done":
             for name, kind in DONE_FIELDS.items():
                 if not isinstance(line[name], kind):
                     raise TypeError(name)
-            if not all(type(count) is int for count in line["counts"].values()):
-                raise TypeError("counts")
+            _check_counts(line["counts"])
             state.done[str(line["key"])] = line
             state.segments.append(line)
         case "sheet":
             state.sheet = int(line["sheet"])
         case "closed":
             state.closed = line
+        case "repaired" | "held" | "lost":
+            _repair(state, line)
+        case "doubt":
+            state.doubtful_sheets.add(int(line["sheet"]))
+            state.begun = max(state.begun, _next_serial(line))
         case _:
-            pass  # `process`, `void` and `torn` are for people who read the journal
+            pass  # `process`, `void`, `clock`, `journal` and `torn` are for people who read the journal
+
+
+def _begin(state: Replay, line: Line) -> None:
+    key, sheet = str(line["key"]), int(line["sheet"])
+    # A line that was lost must not give its number, which names stills as well, to another attempt.
+    state.begun = max(state.begun + 1, _next_serial(line))
+    state.attempts[key] = max(state.attempts.get(key, 0), int(line["attempt"]))
+    state.sheet = max(state.sheet, sheet)
+    if line["cell"] is not None:
+        state.used_cells.add((sheet, int(line["cell"])))
+
+
+def _next_serial(line: Line) -> int:
+    serial = _SERIAL.match(str(line.get("file", "")))
+    return int(serial[0]) + 1 if serial else 0
+
+
+def _repair(state: Replay, line: Line) -> None:
+    file = str(line["file"])
+    for at, segment in enumerate(state.segments):
+        if segment["file"] != file:
+            continue
+        key = str(segment["key"])
+        if line["event"] == "lost":
+            del state.segments[at]
+            if state.done.get(key, segment)["file"] == file:
+                state.done.pop(key, None)
+        elif line["event"] == "held":
+            state.segments[at] = {**segment, "held": str(line["by"])}
+        else:
+            _check_counts(line["counts"])
+            state.segments[at] = {**segment, "sha256": str(line["sha256"]), "counts": line["counts"]}
+        break
+    if line["event"] != "held":
+        state.repairs.append(line)
+
+
+def _check_counts(counts: Line) -> None:
+    if not all(type(count) is int for count in counts.values()):
+        raise TypeError("counts")

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
 
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 
@@ -20,6 +25,17 @@ MAX_IMAGE_BYTES = 256 * 1024 * 1024
 MAX_IMAGE_PIXELS = 200_000_000
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+
+
+@dataclass(frozen=True, slots=True)
+class Transform:
+    """Where a frame lies in its parent's: from the child's coordinates to the parent's."""
+
+    parent: str
+    child: str
+    translation_mm: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+    """x, y, z, w."""
 
 
 def pose_message(
@@ -41,11 +57,88 @@ def image_message(t_ns: int, encoded: bytes, kind: str = "png") -> CompressedIma
     return message
 
 
+def joints_message(
+    t_ns: int,
+    names: Sequence[str],
+    positions_rad: Sequence[float],
+    velocities_rad_s: Sequence[float] | None = None,
+    efforts_nm: Sequence[float] | None = None,
+) -> JointStates:
+    """The arm's joints in their order. Raises `ValueError` where the lengths differ."""
+    for values in (velocities_rad_s, efforts_nm):
+        if values is not None and len(values) != len(names):
+            raise ValueError(f"{len(values)} values for {len(names)} joints")
+    message = JointStates()
+    message.timestamp.FromNanoseconds(t_ns)
+    for number, (name, position) in enumerate(zip(names, positions_rad, strict=True)):
+        joint = message.joints.add(name=name, position=position)
+        if velocities_rad_s is not None:
+            joint.velocity = velocities_rad_s[number]
+        if efforts_nm is not None:
+            joint.effort = efforts_nm[number]
+    return message
+
+
+def transforms_message(t_ns: int, transforms: Iterable[Transform]) -> FrameTransforms:
+    """Where the frames lie; metres on disk."""
+    message = FrameTransforms()
+    for transform in transforms:
+        added = message.transforms.add(parent_frame_id=transform.parent, child_frame_id=transform.child)
+        added.timestamp.FromNanoseconds(t_ns)
+        there, turned = added.translation, added.rotation
+        there.x, there.y, there.z = (v / 1e3 for v in transform.translation_mm)
+        turned.x, turned.y, turned.z, turned.w = transform.quaternion
+    return message
+
+
+def calibration_message(
+    t_ns: int,
+    size_px: tuple[int, int],
+    camera_matrix: Sequence[Sequence[float]],
+    distortion: Sequence[float],
+    model: str = "plumb_bob",
+) -> CameraCalibration:
+    """Intrinsics of a camera that is alone and not rectified: R is the identity, P is [K | 0].
+
+    `camera_matrix` is K, 3 x 3 in pixels; `distortion` is k1, k2, p1, p2, k3 for `plumb_bob`. Raises `ValueError`.
+    """
+    rows = [list(map(float, row)) for row in camera_matrix]
+    if [len(row) for row in rows] != [3, 3, 3]:
+        raise ValueError(f"a camera matrix is 3 x 3, got rows of {[len(row) for row in rows]}")
+    message = CameraCalibration(
+        frame_id="camera",
+        width=size_px[0],
+        height=size_px[1],
+        distortion_model=model,
+        D=distortion,
+        K=[v for row in rows for v in row],
+        R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        P=[v for row in rows for v in [*row, 0.0]],
+    )
+    message.timestamp.FromNanoseconds(t_ns)
+    return message
+
+
 def log_message(t_ns: int, text: str, *, warning: bool = False) -> Log:
     """A line for the operator and for whoever reads the file later."""
     message = Log(level=Log.WARNING if warning else Log.INFO, message=text, name="brushloop")
     message.timestamp.FromNanoseconds(t_ns)
     return message
+
+
+def decode_still(data: bytes) -> bytes:
+    """The encoded image in a message on an image topic. Raises `google.protobuf.message.DecodeError`."""
+    return CompressedImage.FromString(data).data
+
+
+def encode_jpeg(image: NDArray[np.uint8], quality: int = 80) -> bytes:
+    """A preview; never for what is measured. `quality` is 0 to 100."""
+    import cv2
+
+    ok, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not ok:
+        raise ValueError(f"cannot encode an image of shape {image.shape} and type {image.dtype}")
+    return data.tobytes()
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:

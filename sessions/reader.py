@@ -9,16 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
 from sessions import container
 from sessions.errors import InputError, SessionDamaged, in_one_line
 from sessions.journal import JOURNAL_NAME, is_open, replay
-from sessions.messages import decode_gray
+from sessions.messages import decode_gray, decode_still
 from sessions.schemas import Event, Header, StepEvent, Stroke, Topic
-from sessions.writer import HEADER_METADATA, file_sha256
+from sessions.writer import HEADER_METADATA, file_sha256, header_crc
 
 if TYPE_CHECKING:
     import numpy as np
@@ -115,19 +114,26 @@ def _find_mcap(path: Path) -> Path:
 def _read_header(path: Path) -> Header:
     for record in container.metadata(path):
         if record.name == HEADER_METADATA:
-            try:
-                values: dict[str, Any] = {name: json.loads(text) for name, text in record.metadata.items()}
-                return Header.model_validate(values, strict=False)
-            except ValidationError as error:
-                raise SessionDamaged(path, _first_error(Header, error)) from None
-            except (ValueError, RecursionError) as error:
-                raise SessionDamaged(path, f"header cannot be read: {in_one_line(error)}") from None
+            if record.metadata.get("crc", header_crc(record.metadata)) != header_crc(record.metadata):
+                raise SessionDamaged(path, "header does not match its CRC")
+            return parse_header(path, record.metadata)
     raise InputError(path, "is an MCAP file, but not one of brushloop's: it has no header")
+
+
+def parse_header(path: Path, metadata: dict[str, str]) -> Header:
+    """The header from its metadata record, its CRC not looked at. Raises `SessionDamaged`."""
+    try:
+        values: dict[str, Any] = {name: json.loads(text) for name, text in metadata.items() if name != "crc"}
+        return Header.model_validate(values, strict=False)
+    except ValidationError as error:
+        raise SessionDamaged(path, _first_error(Header, error)) from None
+    except (ValueError, RecursionError) as error:
+        raise SessionDamaged(path, f"header cannot be read: {in_one_line(error)}") from None
 
 
 def _still(path: Path, data: bytes) -> bytes:
     try:
-        return CompressedImage.FromString(data).data
+        return decode_still(data)
     except DecodeError as error:
         raise SessionDamaged(path, f"a still cannot be read: {in_one_line(error)}") from None
 

@@ -18,7 +18,15 @@ class Topic(StrEnum):
     """Every topic that a session may hold."""
 
     TCP = "/robot/tcp"
+    JOINTS = "/robot/joints"
+    TRANSFORMS = "/tf"
     STILL = "/camera/still"
+    CALIBRATION = "/camera/calibration"
+    PREVIEW = "/camera/preview"
+    WRENCH = "/force/wrench"
+    INK = "/ink/state"
+    QUALITY = "/quality"
+    CADENCE = "/cadence"
     STEP = "/step"
     STROKE = "/stroke"
     LOG = "/log"
@@ -73,8 +81,76 @@ class Stroke(Event):
     """The same in the still, for imports that tell it."""
     px_per_mm: tuple[PxPerMm, PxPerMm] | None = None
     """Scale in x and y, for imports that tell it."""
+    again_of: str | None = None
+    """The stroke of an earlier session that this one repeats."""
     commanded: dict[str, float] = Field(default_factory=dict[str, float])
     """Whatever else the source commanded, by name with unit (`length_mm`, `bend_mm`, ...)."""
+
+
+class Wrench(Event):
+    """One sample of the force sensor, in its own frame, its bias subtracted."""
+
+    fx_n: float
+    fy_n: float
+    fz_n: float
+    mx_nm: float
+    my_nm: float
+    mz_nm: float
+
+
+class InkState(Event):
+    """What is known of the ink station; None where it cannot tell."""
+
+    level: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
+    """Fill of the well."""
+    dosed_ml: Annotated[float, Field(ge=0.0)] | None = None
+    """Pumped since the session's process began."""
+    light: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
+
+
+class Check(Event):
+    """One question asked of a capture."""
+
+    name: str
+    score: float | None = None
+    """What was measured; None where it could not be."""
+    threshold: float | None = None
+    passed: bool
+    reason: str = ""
+    """In words for the operator; empty where the check passed."""
+
+
+class Quality(Event):
+    """The checks of one stroke."""
+
+    stroke_id: str
+    checks: tuple[Check, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether every check passed."""
+        return all(check.passed for check in self.checks)
+
+
+class SlowSection(Event):
+    """A part of a loop that took longer than it may."""
+
+    name: str
+    times: int = Field(ge=1)
+    longest_ms: float = Field(ge=0.0)
+
+
+class Cadence(Event):
+    """How steadily a topic came, over one step."""
+
+    topic: str
+    expected_hz: float = Field(gt=0.0)
+    received: int = Field(ge=0)
+    missed: int = Field(ge=0)
+    """Slots of 1 / `expected_hz` in which nothing came."""
+    longest_gap_ms: float | None = Field(default=None, ge=0.0)
+    """None for fewer than two messages."""
+    slow_sections: tuple[SlowSection, ...] = ()
 
 
 class Header(Event):
@@ -92,6 +168,10 @@ class Header(Event):
     brush_radius_mm: float | None = None
     brush_length_mm: float | None = None
     ink: str = ""
+    ink_device: str = ""
+    """Empty where a person keeps the well filled."""
+    force_sensor: str = ""
+    """Empty where there is none."""
     paper: str = ""
     protocol: str = ""
     licence: str = ""

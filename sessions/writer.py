@@ -10,14 +10,15 @@ import os
 import queue
 import threading
 import time
+import zlib
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mcap.writer import CompressionType, Writer
 
-from sessions.errors import SessionError, in_one_line
+from sessions.errors import SessionError, disk_error
 from sessions.journal import fsync_folder
 from sessions.schemas import Event, Header, Recorded, Topic
 
@@ -29,6 +30,7 @@ FLUSH_S = 0.25
 QUEUE_LIMIT = 20_000
 """About 200 s of poses: more means that the disk does not keep up, and that must be heard."""
 HEADER_METADATA = "brushloop.header"
+BEGIN_NOTE, DONE_NOTE = "brushloop.begin", "brushloop.done"
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,14 +47,19 @@ class Outgoing:
 class SegmentWriter:
     """Writes `<name>.mcap.part`, then renames it to `<name>.mcap`.
 
-    Raises `SessionError` where either exists: recordings are never overwritten.
+    `begun` travels inside as a note, so that a lost journal can be rebuilt from the files. Raises `SessionError`
+    where either file exists: recordings are never overwritten.
     """
 
-    def __init__(self, final: Path, header: Header, queue_limit: int = QUEUE_LIMIT) -> None:
+    def __init__(
+        self, final: Path, header: Header, queue_limit: int = QUEUE_LIMIT, begun: dict[str, Any] | None = None
+    ) -> None:
         self.final = final
         self._part = final.with_name(final.name + ".part")
         self._header = header
         self._queue: queue.Queue[Outgoing | None] = queue.Queue(queue_limit)
+        self._begun = begun
+        self._finished: dict[str, Any] | None = None
         self._error: Exception | None = None
         self._ended = False
         """Set by the thread once it has taken the end mark off the queue: nothing comes after it."""
@@ -64,7 +71,7 @@ class SegmentWriter:
         except FileExistsError:
             raise SessionError(final, "exists already; recordings are never overwritten") from None
         except OSError as error:
-            raise SessionError(self._part, f"cannot create: {in_one_line(error)}") from error
+            raise disk_error(self._part, "cannot create", error) from error
         self._thread = threading.Thread(target=self._run, name=f"writer {final.name}")
         self._thread.start()
 
@@ -76,8 +83,12 @@ class SegmentWriter:
         except queue.Full:
             raise SessionError(self._part, f"{self._queue.maxsize} messages wait: the disk does not keep up") from None
 
-    def finish(self) -> Recorded:
-        """Drain, finish, fsync, rename, fsync the folder. Raises `SessionError`; the part file then stays."""
+    def finish(self, finished: dict[str, Any] | None = None) -> Recorded:
+        """Drain, finish, fsync, rename, fsync the folder. Raises `SessionError`; the part file then stays.
+
+        `finished` travels inside as a note, with the counts of messages.
+        """
+        self._finished = finished
         self._join()
         self._raise_error()
         try:
@@ -85,7 +96,7 @@ class SegmentWriter:
             self._part.rename(self.final)
             fsync_folder(self.final.parent)
         except OSError as error:
-            raise SessionError(self._part, f"cannot finish: {in_one_line(error)}") from error
+            raise disk_error(self._part, "cannot finish", error) from error
         return recorded
 
     def abandon(self) -> None:
@@ -94,7 +105,7 @@ class SegmentWriter:
 
     def _raise_error(self) -> None:
         if self._error is not None:
-            raise SessionError(self._part, f"cannot write: {in_one_line(self._error)}") from self._error
+            raise disk_error(self._part, "cannot write", self._error) from self._error
 
     def _join(self) -> None:
         if self._thread.is_alive():
@@ -116,6 +127,9 @@ class SegmentWriter:
         writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         writer.start(profile="", library=self._header.software)
         writer.add_metadata(HEADER_METADATA, header_metadata(self._header))
+        if self._begun is not None:
+            writer.add_metadata(BEGIN_NOTE, note(self._begun))
+            writer.flush()
         channels = ChannelTable(writer)
         flushed = time.monotonic()
         while True:
@@ -133,6 +147,8 @@ class SegmentWriter:
             if time.monotonic() - flushed > FLUSH_S:
                 writer.flush()
                 flushed = time.monotonic()
+        if self._finished is not None:
+            writer.add_metadata(DONE_NOTE, note({**self._finished, "counts": dict(self.counts)}))
         writer.finish()
 
 
@@ -177,10 +193,37 @@ class ChannelTable:
 
 
 def header_metadata(header: Header) -> dict[str, str]:
-    """The header as MCAP metadata: every value JSON, so that it reads back as it was."""
+    """The header as MCAP metadata: every value JSON, so that it reads back as it was, and a CRC over all of them."""
     import json
 
-    return {name: json.dumps(value) for name, value in header.model_dump(mode="json").items()}
+    values = {name: json.dumps(value) for name, value in header.model_dump(mode="json").items()}
+    return {**values, "crc": header_crc(values)}
+
+
+def header_crc(values: dict[str, str]) -> str:
+    """CRC-32 of a header's metadata, `crc` itself left out."""
+    import json
+
+    texts = {name: text for name, text in values.items() if name != "crc"}
+    return f"{zlib.crc32(json.dumps(texts, sort_keys=True).encode()):08x}"
+
+
+def note(values: dict[str, Any]) -> dict[str, str]:
+    """Values as MCAP metadata with a CRC of their own: the format gives metadata none."""
+    import json
+
+    text = json.dumps(values, separators=(",", ":"), allow_nan=False)
+    return {"json": text, "crc": f"{zlib.crc32(text.encode()):08x}"}
+
+
+def read_note(metadata: dict[str, str]) -> dict[str, Any] | None:
+    """The values of a note; None where it does not match its CRC."""
+    import json
+
+    text = metadata.get("json", "")
+    if metadata.get("crc") != f"{zlib.crc32(text.encode()):08x}":
+        return None
+    return json.loads(text)
 
 
 def file_sha256(path: Path) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import functools
 import itertools
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar
@@ -79,6 +80,46 @@ class Make:
         attempt.writer.write(self.still(attempt.serial))
         attempt.writer.write(self.stroke(attempt.serial, stroke_id=key))
         store.done(attempt, {"serial": attempt.serial})
+
+    def collect(self, store: SessionStore, strokes: int = 2) -> None:
+        """A small grid as the engine collects it: a board, presses with poses, captures, and one press that was cut."""
+        self.take(store, "board", "board", [self.still(1000)], {})
+        store.void(store.begin("H13-a05-r00 press", "press", cell=0, notes={"params": {}}), "stopped by the operator")
+        for number in range(strokes):
+            stroke, sheet, cell = f"H13-a05-r{number:02d}", store.state.sheet, number + 1
+            poses = [self.pose(100 * number + at) for at in range(5)]
+            pressed = {"stroke_id": stroke, "sheet": sheet, "cell": cell, "depth_mm": 13.0}
+            self.take(store, f"{stroke} press", "press", poses, pressed, cell)
+            captured = {"stroke_id": stroke, "still": number}
+            self.take(store, f"{stroke} capture", "capture", [self.still(number), self.stroke(number)], captured)
+
+    def take(
+        self,
+        store: SessionStore,
+        key: str,
+        kind: str,
+        messages: list[Outgoing],
+        result: dict[str, Any],
+        cell: int | None = None,
+    ) -> None:
+        """One step from begin to done, with its step events around the messages."""
+        params = {"stroke_id": result.get("stroke_id", "")}
+        attempt = store.begin(key, kind, cell=cell, notes={"params": params})
+        event = {"key": key, "kind": kind, "index": 0, "attempt": attempt.attempt, "params": params}
+        times = (messages[0].log_ns - 1, messages[-1].log_ns + 1)
+        begin, end = (
+            Outgoing(Topic.STEP, t_ns, t_ns, attempt.serial, StepEvent.model_validate({**event, "phase": phase}))
+            for t_ns, phase in zip(times, ("begin", "end"), strict=True)
+        )
+        for message in (begin, *messages, end):
+            attempt.writer.write(message)
+        store.done(attempt, result)
+
+    def messages(self, path: Path) -> Counter[tuple[str, int, int, int, bytes]]:
+        """Every message, as any MCAP reader finds it, CRCs checked."""
+        with path.open("rb") as file:
+            found = make_reader(file, validate_crcs=True).iter_messages()
+            return Counter((c.topic, m.sequence, m.log_time, m.publish_time, m.data) for _, c, m in found)
 
     def events(self, folder: Path, kind: str) -> list[dict[str, Any]]:
         return [line for line in read_lines(folder / JOURNAL_NAME) if line["event"] == kind]

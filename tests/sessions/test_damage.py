@@ -58,9 +58,9 @@ def test_a_file_cut_short_anywhere_is_refused(whole, path):
         assert refusal(path), f"cut at {cut} of {len(whole)} was not noticed"
 
 
-def test_a_flipped_bit_is_refused_or_changes_nothing_that_is_measured(whole, path):
+def test_a_flipped_bit_is_refused_or_changes_nothing(whole, path):
     path.write_bytes(whole)
-    _header, *as_written = everything(path)
+    as_written = everything(path)
     chosen = random.Random(6)
     refused = 0
     for _ in range(FLIPS):
@@ -70,8 +70,7 @@ def test_a_flipped_bit_is_refused_or_changes_nothing_that_is_measured(whole, pat
         if refusal(path):
             refused += 1
         else:
-            _text_of_the_header, *now = everything(path)  # the format has no CRC for metadata
-            assert now == as_written, f"bit at {at} changed what was read, unnoticed"
+            assert everything(path) == as_written, f"bit at {at} changed what was read, unnoticed"
     assert refused > FLIPS / 2
 
 

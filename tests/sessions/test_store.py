@@ -2,6 +2,7 @@
 
 import datetime as dt
 import json
+import re
 import subprocess
 import sys
 import threading
@@ -11,9 +12,12 @@ from mcap.reader import make_reader
 
 from sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked
 from sessions.journal import JOURNAL_NAME, Journal
+from sessions.lines import with_crc
 from sessions.merge import count_messages
 from sessions.reader import Recording
 from sessions.store import SessionStore, differences, next_session_id, open_sessions
+
+CRC = re.compile(rb',"crc":"[0-9a-f]{8}"\}$')
 
 
 @pytest.fixture
@@ -175,7 +179,8 @@ def test_a_segment_that_changed_is_named_and_nothing_is_merged(make, store, dama
 def test_counts_that_do_not_agree_leave_the_merged_file_unnamed(make, store, resume):
     make.perform(store, "a")
     journal = store.folder / JOURNAL_NAME
-    journal.write_text(journal.read_text().replace('"/stroke":1', '"/stroke":2'))
+    lines = [line.replace(b'"/stroke":1', b'"/stroke":2') for line in journal.read_bytes().splitlines()]
+    journal.write_bytes(b"".join(with_crc(CRC.sub(b"}", line)) + b"\n" for line in lines))
     with pytest.raises(SessionDamaged, match="the journal says"):
         resume(store).close()
     assert not (store.folder / f"{store.folder.name}.mcap").exists()

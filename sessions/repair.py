@@ -1,0 +1,79 @@
+"""Repair a session: give back every intact finished stroke, mark the rest as lost, say what was done.
+
+Nothing recorded is overwritten or deleted: a damaged original is kept as `<name>.damaged-1`. Cut short anywhere and
+started again, a repair comes to the same end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from sessions.errors import InputError, SessionDamaged, disk_error
+from sessions.journal import JOURNAL_NAME
+from sessions.reader import parse_header
+from sessions.repair_folder import FolderRepair, Report, kept_words
+from sessions.rewrite import replace_damaged, with_their_stills
+from sessions.salvage import scan
+from sessions.schemas import Topic
+from sessions.store import SEGMENT_NAME, lock
+from sessions.verify import verify_session
+from sessions.writer import HEADER_METADATA, header_crc
+
+
+def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
+    """Repair a session's folder, or one MCAP file. Raises `SessionDamaged` where nothing can be rebuilt.
+
+    `SessionLocked` while another process has the session, `DiskFull` and `SessionError` where the disk fails.
+    """
+    target = path.resolve()
+    if not target.exists():
+        raise InputError(path, "no such session: give a session's folder or its .mcap file")
+    try:
+        if target.is_file():
+            return _repair_file(target)
+        files = [file.name for file in target.glob("*.mcap*")]
+        if not (target / JOURNAL_NAME).exists() and not any(map(SEGMENT_NAME.fullmatch, files)):
+            final = target / f"{target.name}.mcap"
+            if not final.is_file():
+                raise InputError(path, f"holds neither {JOURNAL_NAME} nor {final.name}: not a session")
+            return _repair_file(final)
+        held = lock(target)
+        try:
+            return FolderRepair(target, now_ns).run()
+        finally:
+            held.release()
+    except OSError as error:
+        raise disk_error(target, "cannot be repaired", error) from error
+
+
+def _repair_file(path: Path) -> Report:
+    """A recording that stands alone: an import, or a merged file without its session."""
+    report = Report(path.name)
+    verdict = verify_session(path)
+    report.strokes = verdict.strokes
+    if verdict.sound:
+        return report
+    found = scan(path)
+    metadata = found.metadata.get(HEADER_METADATA)
+    if metadata is None:
+        raise SessionDamaged(path, "nothing is left that tells its header; it cannot be repaired")
+    header = parse_header(path, metadata)
+    if metadata.get("crc", "") not in ("", header_crc(metadata)):
+        report.lost.append("the certainty of its header: it does not match its CRC, and is kept as it reads")
+    messages, strokes = with_their_stills(found)
+    notes = {name: values for name, values in found.notes.items() if name != HEADER_METADATA}
+    files = {attachment.name: attachment.data for attachment in found.attachments}
+    kept, counts = replace_damaged(path, header, notes, files, messages)
+    why = "; ".join(finding.what for finding in verdict.findings)
+    report.did.append(f"wrote {path.name} again from what can be read of it: {why}{kept_words(kept)}")
+    report.strokes = counts.get(Topic.STROKE, 0)
+    report.lost += [f"stroke {name}: its photograph is lost" for name in strokes]
+    if found.stated is None:
+        report.lost.append("whatever lay behind the damage: without its index nobody knows how much that was")
+        return report
+    gone = {topic: count - counts.get(topic, 0) for topic, count in found.stated.items()}
+    report.lost += [f"messages on {topic}: {count}" for topic, count in gone.items() if count > 0]
+    if len(files) < found.stated_attachments or len(found.notes) < found.stated_notes:
+        report.lost.append("an attached file, or a note of what was done to the recording")
+    return report

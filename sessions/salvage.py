@@ -1,0 +1,193 @@
+"""What can still be read of a damaged MCAP file: every chunk that its CRC vouches for, and nothing else.
+
+The file is walked record by record; where a wrong length leads astray, the index at the end, if it is sound, tells
+where the other chunks lie. A torn tail never yields a wrong record.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import MCAP0_MAGIC
+
+from sessions.container import MAX_RECORD_BYTES, UNREADABLE, BoundedFile, check_chunk_at, indexed
+from sessions.errors import InputError, in_one_line
+from sessions.writer import HEADER_METADATA, header_crc, read_note
+
+_START = struct.Struct("<BQ")
+
+
+@dataclass(slots=True)
+class Scan:
+    """Where the sound parts of a file lie, and what is wrong with the rest."""
+
+    path: Path
+    chunks: list[int] = field(default_factory=list[int])
+    """Offsets of the chunks that read back with their CRC, in order."""
+    schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
+    channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
+    notes: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
+    """Our own notes (`brushloop.begin`, ...) whose CRC holds."""
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
+    """All metadata, which the format gives no CRC."""
+    attachments: list[Attachment] = field(default_factory=list[Attachment])
+    counts: Counter[str] = field(default_factory=Counter[str])
+    stated: dict[str, int] | None = None
+    """Messages by topic that the index, where it is sound, says there are."""
+    stated_attachments: int = 0
+    stated_notes: int = 0
+    """Metadata records of ours that the index knows of, the header left out."""
+    damage: list[str] = field(default_factory=list[str])
+    """In words; empty for a file that is whole."""
+
+
+def scan(path: Path) -> Scan:
+    """Look at every record. Raises `InputError` where the file cannot be opened; damage is told, never raised."""
+    found = Scan(path)
+    try:
+        file = BoundedFile(path)
+    except OSError as error:
+        raise InputError(path, f"cannot open: {in_one_line(error)}") from None
+    with file:
+        try:
+            offsets = _walk(file, found)
+            offsets += _from_index(file, found, set(offsets))
+        except OSError as error:
+            found.damage.append(f"cannot be read: {in_one_line(error)}")
+            return found
+        for offset in sorted(offsets):
+            try:
+                for _schema, channel, _message in _chunk(file, offset, found):
+                    found.counts[channel.topic] += 1
+            except UNREADABLE as error:
+                found.damage.append(f"a chunk at byte {offset} cannot be read ({in_one_line(error)})")
+            else:
+                found.chunks.append(offset)
+    return found
+
+
+def salvaged(found: Scan) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    """The messages of the sound chunks, in the order in which they were written. Raises `OSError`."""
+    if found.chunks:
+        with BoundedFile(found.path) as file:
+            for offset in found.chunks:
+                yield from _chunk(file, offset, found)
+
+
+def _walk(file: BoundedFile, found: Scan) -> list[int]:
+    """Offsets of what look like chunks, up to the end or to where the walk loses its way."""
+    offsets: list[int] = []
+    if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+        found.damage.append("does not begin as an MCAP file does")
+    at = len(MCAP0_MAGIC)
+    while True:
+        file.seek(at)
+        start = file.read(_START.size)
+        if len(start) < _START.size:
+            found.damage.append(f"ends at byte {file.size} without an index")
+            return offsets
+        opcode, length = _START.unpack(start)
+        if not Opcode.HEADER <= opcode <= Opcode.DATA_END:
+            found.damage.append(f"no record can be read at byte {at}")
+            return offsets
+        if at + _START.size + length > file.size:
+            found.damage.append(f"is cut short in the record at byte {at}")
+            return offsets
+        if opcode == Opcode.CHUNK:
+            offsets.append(at)
+        else:
+            _record(file, found, opcode, at, length)
+        at += _START.size + length
+        if opcode == Opcode.DATA_END:
+            return offsets
+
+
+def _record_at(file: BoundedFile, found: Scan, offset: int) -> None:
+    """A record that only the index knows of."""
+    file.seek(offset)
+    start = file.read(_START.size)
+    if len(start) == _START.size:
+        opcode, length = _START.unpack(start)
+        _record(file, found, opcode, offset, length)
+
+
+def _record(file: BoundedFile, found: Scan, opcode: int, at: int, length: int) -> None:
+    if opcode not in (Opcode.METADATA, Opcode.ATTACHMENT) or length > MAX_RECORD_BYTES:
+        return
+    data = file.read(length)
+    try:
+        if opcode == Opcode.METADATA:
+            _metadata(Metadata.read(ReadDataStream(io.BytesIO(data))), found)
+        elif struct.unpack("<I", data[-4:])[0] != zlib.crc32(data[:-4]):
+            found.damage.append(f"an attachment at byte {at} does not match its CRC")
+        else:
+            found.attachments.append(Attachment.read(ReadDataStream(io.BytesIO(data))))
+    except UNREADABLE as error:
+        found.damage.append(f"the record at byte {at} cannot be read ({in_one_line(error)})")
+
+
+def _metadata(record: Metadata, found: Scan) -> None:
+    found.metadata[record.name] = record.metadata
+    if record.name == HEADER_METADATA:
+        if record.metadata.get("crc", "") not in ("", header_crc(record.metadata)):
+            found.damage.append("its header does not match its CRC")
+    elif "crc" in record.metadata:
+        values = read_note(record.metadata)
+        if values is None:
+            found.damage.append(f"its note {record.name!r} does not match its CRC")
+        else:
+            found.notes[record.name] = values
+
+
+def _from_index(file: BoundedFile, found: Scan, known: set[int]) -> list[int]:
+    """Chunks that only the index knows of; its channels stand in for those of a chunk that is lost."""
+    try:
+        _reader, summary = indexed(file)
+    except UNREADABLE as error:
+        found.damage.append(f"its index cannot be read ({in_one_line(error)})")
+        return []
+    found.schemas.update(summary.schemas)
+    found.channels.update(summary.channels)
+    counts = summary.statistics.channel_message_counts if summary.statistics else {}
+    found.stated = {found.channels[key].topic: count for key, count in counts.items() if key in found.channels}
+    found.stated_attachments = len(summary.attachment_indexes)
+    found.stated_notes = len({index.name for index in summary.metadata_indexes} - {HEADER_METADATA})
+    missed = [index.chunk_start_offset for index in summary.chunk_indexes if index.chunk_start_offset not in known]
+    for index in summary.metadata_indexes:
+        if index.name not in found.metadata:
+            _record_at(file, found, index.offset)
+    if len(missed) + len(known) > len(summary.chunk_indexes):
+        found.damage.append("holds chunks that its index does not know of")
+    return missed
+
+
+def _chunk(file: BoundedFile, offset: int, found: Scan) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    """Messages of one chunk, all of them or an error."""
+    check_chunk_at(file, offset)
+    file.seek(offset)
+    opcode, length = _START.unpack(file.read(_START.size))
+    if opcode != Opcode.CHUNK or length > MAX_RECORD_BYTES:
+        raise ValueError("no chunk")
+    chunk = Chunk.read(ReadDataStream(io.BytesIO(file.read(length))))
+    if chunk.uncompressed_crc == 0:
+        raise ValueError("no CRC")
+    records = breakup_chunk(chunk, validate_crc=True)
+    for record in records:
+        if isinstance(record, Schema):
+            found.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            found.channels[record.id] = record
+    messages = [record for record in records if isinstance(record, Message)]
+    pairs = [(found.channels[message.channel_id], message) for message in messages]
+    return iter([(found.schemas[ch.schema_id] if ch.schema_id else None, ch, message) for ch, message in pairs])

@@ -1,0 +1,218 @@
+"""Is a session as it was recorded? Every file is read again in full, and what is damaged is named in words."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from google.protobuf.message import DecodeError
+from pydantic import ValidationError
+
+from sessions.errors import InputError, SessionDamaged, SessionError
+from sessions.evidence import Evidence, gather
+from sessions.journal import JOURNAL_NAME
+from sessions.lines import Line
+from sessions.merge import verify as verify_digest
+from sessions.messages import decode_gray, decode_still
+from sessions.reader import Recording
+from sessions.salvage import Scan, salvaged, scan
+from sessions.schemas import Stroke, Topic
+from sessions.store import SEGMENT_NAME, counts_of
+
+IMAGES = (Topic.STILL, Topic.PREVIEW)
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is not as it was recorded."""
+
+    file: str
+    what: str
+
+
+@dataclass(slots=True)
+class Verdict:
+    """What a check of a session found."""
+
+    session: str
+    state: str
+    """`closed`, `open`, or `recording` for a file or folder without a journal."""
+    findings: list[Finding] = field(default_factory=list[Finding])
+    notes: list[str] = field(default_factory=list[str])
+    """Worth knowing, and no damage."""
+    files: int = 0
+    """How many were read in full."""
+    strokes: int = 0
+    messages: int = 0
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing is damaged."""
+        return not self.findings
+
+
+def verify_session(path: Path) -> Verdict:
+    """Check a session's folder, or one MCAP file. Raises `InputError` where it is neither."""
+    if path.is_file():
+        return _verify_file(path, path.name)
+    if not path.is_dir():
+        raise InputError(path, "no such session: give a session's folder or its .mcap file")
+    name = path.resolve().name
+    collected = (path / JOURNAL_NAME).is_file() or any(SEGMENT_NAME.fullmatch(p.name) for p in path.glob("*.mcap*"))
+    if not collected:
+        final = path / f"{name}.mcap"
+        if not final.is_file():
+            raise InputError(path, f"holds neither {JOURNAL_NAME} nor {final.name}: not a session")
+        return _verify_file(final, name)
+    return _verify_folder(path.resolve())
+
+
+def file_problems(path: Path) -> tuple[Scan, list[str]]:
+    """Read a file in full: its chunks and index, every image, and that every stroke has its still."""
+    found = scan(path)
+    problems = list(found.damage)
+    if found.stated is not None and not problems and found.stated != dict(found.counts):
+        problems.append(f"holds {dict(found.counts)}, but its index says {found.stated}")
+    stills: set[int] = set()
+    try:
+        for _schema, channel, message in salvaged(found):
+            if channel.topic in IMAGES:
+                decode_gray(decode_still(message.data), f"the image {message.sequence} on {channel.topic}")
+            if channel.topic == Topic.STILL:
+                stills.add(message.sequence)
+            elif channel.topic == Topic.STROKE:
+                stroke = Stroke.model_validate_json(message.data)
+                if stroke.still not in stills:
+                    problems.append(f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there")
+    except SessionDamaged as error:
+        problems.append(f"{error.path} {error.what}")
+    except (DecodeError, ValidationError) as error:
+        problems.append(f"a message does not fit its schema ({type(error).__name__})")
+    except OSError as error:
+        problems.append(f"cannot be read: {error.strerror}")
+    return found, problems
+
+
+def step_words(line: Line) -> str:
+    """A step as people call it: `capture H13-a05-r02`."""
+    stroke = line.get("result", {}).get("stroke_id", "")
+    return f"{line.get('kind', 'step')} {stroke}".strip().replace("_", " ")
+
+
+def _verify_file(path: Path, name: str) -> Verdict:
+    verdict = Verdict(name, "recording", files=1)
+    found, problems = file_problems(path)
+    verdict.findings += [Finding(path.name, problem) for problem in problems]
+    if not problems:
+        try:
+            Recording(path)
+        except SessionError as error:
+            verdict.findings.append(Finding(path.name, error.what))
+    _count(verdict, found.counts)
+    return verdict
+
+
+def _verify_folder(folder: Path) -> Verdict:
+    verdict = Verdict(folder.name, "open")
+    try:
+        evidence = gather(folder)
+    except SessionDamaged as error:
+        verdict.findings.append(Finding(error.path.name, error.what))
+        return verdict
+    _journal(verdict, evidence)
+    state = evidence.state
+    for line in state.segments:
+        verdict.findings += _segment(verdict, folder, line)
+    for name, text in (state.opened or {}).get("snapshots", {}).items():
+        path = folder / str(name)
+        if not path.is_file():
+            verdict.findings.append(Finding(str(name), "is missing, though the journal holds its text"))
+        elif path.read_bytes() != str(text).encode():
+            verdict.findings.append(Finding(str(name), "has changed since the session was started"))
+    if state.closed is not None:
+        verdict.state = "closed"
+        _final(verdict, folder, evidence)
+    _count(verdict, Counter(counts_of(state)))
+    verdict.notes += [f"{line['file']}: {_repair_words(line)}" for line in state.repairs]
+    kept = [p for p in folder.iterdir() if ".damaged-" in p.name or ".superseded-" in p.name]
+    if kept:
+        verdict.notes.append(f"{len(kept)} damaged or replaced files are kept beside the session's own")
+    return verdict
+
+
+def _count(verdict: Verdict, counts: Counter[str]) -> None:
+    verdict.strokes, verdict.messages = counts[Topic.STROKE], counts.total()
+
+
+def _repair_words(line: Line) -> str:
+    if line["event"] == "lost":
+        return f"was lost: {line.get('why', '')}"
+    missing = ", ".join(f"{count} of {topic}" for topic, count in line.get("missing", {}).items())
+    return f"was repaired; missing: {missing or 'nothing'}"
+
+
+def _journal(verdict: Verdict, evidence: Evidence) -> None:
+    journal = evidence.journal
+    if evidence.data is None:
+        verdict.findings.append(Finding(JOURNAL_NAME, "is missing, though the folder holds recordings"))
+    if journal.torn:
+        verdict.notes.append(f"{JOURNAL_NAME}: its last line was cut off; the next process sets it aside")
+    if evidence.data is not None and not journal.whole:
+        spoilt = len(evidence.journal.spoilt)
+        what = f"{spoilt} lines are damaged" if spoilt else "a line end is damaged"
+        verdict.findings.append(Finding(JOURNAL_NAME, f"{what}, {len(evidence.spoilt)} of them beyond rebuilding"))
+    for line in evidence.rebuilt:
+        match line["event"]:
+            case "begin":
+                verdict.findings.append(Finding(JOURNAL_NAME, f"says nothing of {line['file']}"))
+            case "done":
+                verdict.notes.append(f"{line['file']}: {step_words(line)} is finished, but not journalled as done")
+            case "closed":
+                verdict.notes.append(f"{line['file']} is complete, but not journalled as closed")
+            case _:
+                verdict.findings.append(Finding(JOURNAL_NAME, "does not say how the session was opened"))
+    for name in evidence.doubtful:
+        verdict.findings.append(Finding(name, "nothing tells which cell of which sheet it pressed"))
+
+
+def _segment(verdict: Verdict, folder: Path, line: Line) -> list[Finding]:
+    path, step = folder / str(line["file"]), step_words(line)
+    if "held" in line:
+        return []
+    verdict.files += 1
+    try:
+        verify_digest(path, str(line["sha256"]))
+    except SessionDamaged as error:
+        if not path.is_file():
+            return [Finding(path.name, f"({step}) {error.what}")]
+        found, problems = file_problems(path)
+        lost = Counter[str](line["counts"]) - found.counts
+        words = ", ".join(f"{count} of {topic}" for topic, count in lost.items()) or "none"
+        why = "; ".join(problems) or error.what
+        return [Finding(path.name, f"({step}) {why}; messages lost: {words}")]
+    found, problems = file_problems(path)
+    if dict(found.counts) != line["counts"]:
+        problems.append(f"holds {dict(found.counts)}, but the journal says {line['counts']}")
+    return [Finding(path.name, f"({step}) {problem}") for problem in problems]
+
+
+def _final(verdict: Verdict, folder: Path, evidence: Evidence) -> None:
+    state = evidence.state
+    closed = state.closed or {}
+    path = folder / f"{folder.name}.mcap"
+    verdict.files += 1
+    try:
+        if "sha256" in closed:
+            verify_digest(path, str(closed["sha256"]))
+        elif not path.is_file():
+            raise SessionDamaged(path, "is missing, though the journal says it was closed")
+    except SessionDamaged as error:
+        verdict.findings.append(Finding(path.name, error.what))
+    if not path.is_file():
+        return
+    found, problems = file_problems(path)
+    expected = closed.get("counts", counts_of(state))
+    if dict(found.counts) != expected and not problems:
+        problems.append(f"holds {dict(found.counts)}, but the journal says {expected}")
+    verdict.findings += [Finding(path.name, problem) for problem in problems]

@@ -1,0 +1,150 @@
+"""Exports: what other tools read back is what was recorded, and a folder is whole or not there."""
+
+import csv
+import json
+import sys
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sessions import export as module
+from sessions.cli import app
+from sessions.errors import InputError, SessionError
+from sessions.export import export
+from sessions.messages import decode_gray
+from sessions.reader import Recording
+
+
+@pytest.fixture
+def session(make, store):
+    """A closed session of two strokes, five poses each."""
+    make.collect(store)
+    store.close()
+    store.release()
+    return store.folder
+
+
+@pytest.fixture
+def to(tmp_path):
+    return tmp_path / "exported"
+
+
+def test_png_and_csv_hold_the_photographs_byte_for_byte(make, session, to):
+    export(session, to, "png")
+    with (to / "strokes.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["stroke_id"] for row in rows] == ["H13-a05-r00", "H13-a05-r01"]
+    assert [(to / row["file"]).read_bytes() for row in rows] == [make.png(0), make.png(1)]
+    assert {row["source"] for row in rows} == {"loopback rig"}
+    assert rows[0].keys() >= {"height_mm", "tilt_deg", "anchor_x_mm", "anchor_y_mm", "anchor_x_px", "px_per_mm_x"}
+    assert json.loads((to / "header.json").read_text())["exported_from"]["sha256"] == Recording(session).sha256
+
+
+def test_values_that_were_commanded_are_columns_and_what_is_not_told_is_empty(make, tmp_path, to):
+    told = {"height_mm": 13.0, "anchor_mm": (1.5, 2.5), "commanded": {"length_mm": 30.0}}
+    path = make.record(tmp_path / "a.mcap", make.still(0), make.stroke(0, **told), make.still(1), make.stroke(1))
+    export(path, to, "png")
+    with (to / "strokes.csv").open(newline="") as file:
+        first, second = csv.DictReader(file)
+    assert [first[c] for c in ("height_mm", "anchor_x_mm", "anchor_y_mm", "commanded_length_mm")] == [
+        "13.0",
+        "1.5",
+        "2.5",
+        "30.0",
+    ]
+    assert [second[c] for c in ("height_mm", "anchor_x_mm", "commanded_length_mm")] == ["", "", ""]
+
+
+def test_the_poses_of_each_press_are_a_time_series_of_its_stroke(make, session, to):
+    export(session, to, "png")
+    with (to / "poses.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["episode_index"], row["frame_index"]) for row in rows] == [
+        (str(episode), str(frame)) for episode in range(2) for frame in range(5)
+    ]
+    assert [int(row["sequence"]) for row in rows[5:]] == [100, 101, 102, 103, 104]
+    assert int(rows[5]["t_ns"]) == make.pose(100).publish_ns
+    assert [float(rows[0][c]) for c in ("x_mm", "y_mm", "z_mm", "qw")] == [1.0, 2.0, 3.0, 1.0]
+
+
+def test_npz_loads_without_pickle(make, session, to):
+    export(session, to, "npz")
+    with np.load(to / "strokes.npz", allow_pickle=False) as arrays:
+        assert arrays["stroke_id"].tolist() == ["H13-a05-r00", "H13-a05-r01"]
+        np.testing.assert_array_equal(arrays["image_0001"], decode_gray(make.png(1), "made"))
+        assert np.isnan(arrays["height_mm"]).all()
+        assert arrays["pose_position_mm"].shape == (10, 3)
+        assert arrays["pose_t_ns"].dtype == np.int64
+        assert arrays["pose_episode_index"].tolist() == [0] * 5 + [1] * 5
+
+
+def test_parquet_is_what_datasets_reads(make, session, to):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    export(session, to, "parquet")
+    table = parquet.read_table(to / "strokes" / "train-00000-of-00001.parquet")
+    assert [image["bytes"] for image in table["image"].to_pylist()] == [make.png(0), make.png(1)]
+    features = json.loads(table.schema.metadata[b"huggingface"])["info"]["features"]
+    assert features["image"] == {"_type": "Image"}
+    assert features["height_mm"] == {"dtype": "float64", "_type": "Value"}
+    assert list(features) == table.column_names
+
+    poses = parquet.read_table(to / "poses" / "train-00000-of-00001.parquet")
+    assert poses["episode_index"].to_pylist() == [0] * 5 + [1] * 5
+    assert poses["timestamp"].to_pylist()[:3] == [0.0, 1e-9, 2e-9]
+    assert poses["observation.state"].to_pylist()[0] == [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]
+    state = json.loads(poses.schema.metadata[b"huggingface"])["info"]["features"]["observation.state"]
+    assert (state["_type"], state["length"]) == ("Sequence", 7)
+    card = (to / "README.md").read_text()
+    assert "path: strokes/train-*.parquet" in card
+    assert "Source: **loopback rig**" in card
+
+
+def test_without_pyarrow_the_way_out_is_told_and_nothing_is_left(session, to, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(InputError, match="parquet needs pyarrow: pip install pyarrow"):
+        export(session, to, "parquet")
+    assert list(to.parent.glob("*exported*")) == []
+
+
+@pytest.mark.parametrize("kind", ["png", "npz", "parquet"])
+def test_a_damaged_photograph_or_a_full_disk_leaves_nothing(make, tmp_path, to, kind, monkeypatch):
+    path = make.record(tmp_path / "a.mcap", make.still(0), make.stroke(0))
+    monkeypatch.setattr(module, "fsync_folder", lambda _: (_ for _ in ()).throw(OSError(28, "No space left")))
+    with pytest.raises(SessionError, match="No space left"):
+        export(path, to, kind)
+    assert list(tmp_path.glob("*exported*")) == []
+
+
+def test_a_folder_that_holds_anything_is_left_as_it_is(session, to):
+    to.mkdir()
+    (to / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="not an empty folder"):
+        export(session, to, "png")
+    assert [path.name for path in to.iterdir()] == ["notes.txt"]
+
+
+def test_an_empty_folder_is_used(session, to):
+    to.mkdir()
+    assert (export(session, to, "png") / "strokes.csv").is_file()
+
+
+def test_names_that_a_file_system_would_refuse_become_names(make, tmp_path, to):
+    strokes = [make.stroke(n, stroke_id=name) for n, name in enumerate(["../../etc/x", "a/b", "a_b", "墨" * 90])]
+    path = make.record(tmp_path / "a.mcap", *(make.still(n) for n in range(4)), *strokes)
+    export(path, to, "png")
+    names = sorted(p.name for p in (to / "images").iterdir())
+    assert names == ["0000-______etc_x.png", "0001-a_b.png", "0002-a_b.png", f"0003-{'_' * 80}.png"]
+
+
+def test_an_unknown_format_and_an_open_session_are_refused(make, store, to):
+    make.collect(store)
+    with pytest.raises(InputError, match="'zarr', allowed: png, npz, parquet"):
+        export(store.folder, to, "zarr")
+    with pytest.raises(InputError, match="still open"):
+        export(store.folder, to, "png")
+
+
+def test_the_command(session, to):
+    ran = CliRunner().invoke(app, ["export", str(session), str(to), "--format", "npz"])
+    assert (ran.exit_code, ran.output) == (0, f"Exported into {to}\n")

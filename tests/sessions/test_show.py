@@ -1,0 +1,86 @@
+"""Show: what is in a session, for people and as JSON."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from sessions.cli import app
+from sessions.errors import InputError
+from sessions.show import GridCell, Sheet, details
+from sessions.show_text import ranges
+from sessions.store import SessionStore
+
+PROTOCOL = '{"kind":"grid","heights_mm":[13.0,15.0],"tilts_deg":[5.0],"repeats":2}'
+
+
+@pytest.fixture
+def store(make, tmp_path):
+    header = make.header.model_copy(update={"protocol": PROTOCOL, "robot": "aubo_i5", "robot_firmware": "24"})
+    made = SessionStore.create(tmp_path / header.session_id, header, make.snapshots, make.clock())
+    yield made
+    made.release()
+
+
+def press(make, store, stroke_id, height_mm, cell):
+    params = {"stroke_id": stroke_id, "height_mm": height_mm, "tilt_deg": 5.0}
+    attempt = store.begin(f"press {stroke_id}", "press", cell=cell, notes={"params": params})
+    store.done(attempt, {"stroke_id": stroke_id, "sheet": store.state.sheet, "cell": cell})
+    attempt = store.begin(f"capture {stroke_id}", "capture", cell=None, notes={"params": params})
+    attempt.writer.write(make.still(attempt.serial))
+    attempt.writer.write(make.stroke(attempt.serial, stroke_id=stroke_id, height_mm=height_mm, tilt_deg=5.0))
+    store.done(attempt, {"stroke_id": stroke_id, "height_mm": height_mm, "tilt_deg": 5.0})
+
+
+@pytest.fixture
+def collected(make, store):
+    """Two strokes of four, one press that was stopped, one that the process did not survive."""
+    press(make, store, "H13-a5-r01", 13.0, 0)
+    store.void(store.begin("v", "press", cell=1, notes={"params": {"stroke_id": "H15-a5-r01"}}), "stopped")
+    press(make, store, "H15-a5-r01", 15.0, 2)
+    store.fresh_sheet()
+    store.begin("k", "press", cell=0, notes={"params": {"stroke_id": "H13-a5-r02"}}).writer.abandon()
+    return store
+
+
+def test_an_open_session_tells_what_is_done_cut_and_next(collected):
+    told = details(collected.folder)
+    assert (told.state, told.strokes, told.planned, told.processes) == ("open", 2, 4, 1)
+    assert told.finished == {"press": 2, "capture": 2}
+    assert told.void == [
+        "press H15-a5-r01, attempt 1: stopped",
+        "press H13-a5-r02, attempt 1: the process ended during it",
+    ]
+    assert told.next == "press H13-a5-r02"
+    assert told.grid == [GridCell(13.0, 5.0, 1, 2), GridCell(15.0, 5.0, 1, 2)]
+    assert told.sheets == [Sheet(1, [0, 1, 2]), Sheet(2, [0])]
+    assert told.devices["robot"] == "aubo_i5"
+    assert [segment.messages for segment in told.segments[:2]] == [{}, {"/camera/still": 1, "/stroke": 1}]
+
+
+def test_a_closed_session_and_its_file_agree(collected):
+    final = collected.close()
+    of_folder, of_file = details(collected.folder), details(final)
+    assert (of_folder.state, of_folder.next, of_folder.file) == ("closed", "", final.name)
+    assert of_folder.grid == of_file.grid
+    assert of_folder.messages == of_file.messages
+    assert (of_file.state, of_file.strokes) == ("recording", 2)
+
+
+def test_cells_that_follow_each_other_are_put_together():
+    assert ranges(Sheet(1, [0, 1, 2, 5, 7, 8])) == "0-2, 5, 7-8"
+    assert ranges(Sheet(1, [])) == "none"
+
+
+def test_the_command_prints_it_and_json_holds_all_of_it(collected):
+    ran = CliRunner(env={"COLUMNS": "160"}).invoke(app, ["show", str(collected.folder)])
+    assert ran.exit_code == 0
+    for word in ("2 of 4 planned", "3 cells used: 0-2", "13 mm", "1/2", "press H13-a5-r02 (was being done", "goat"):
+        assert word in ran.output
+    as_json = json.loads(CliRunner().invoke(app, ["show", str(collected.folder), "--json"]).output)
+    assert as_json["segments"][1]["messages"] == {"/camera/still": 1, "/stroke": 1}
+
+
+def test_what_is_not_there_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no such session"):
+        details(tmp_path / "gone")

@@ -1,0 +1,152 @@
+"""Every topic that a rig may record: its schema is one that viewers know, and the merged file carries it."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap_protobuf.decoder import DecoderFactory
+from pydantic import ValidationError
+
+from sessions.messages import (
+    Transform,
+    calibration_message,
+    encode_jpeg,
+    image_message,
+    joints_message,
+    log_message,
+    transforms_message,
+)
+from sessions.schemas import Cadence, Check, InkState, Quality, SlowSection, Topic, Wrench
+from sessions.writer import Outgoing
+
+JOINTS = ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3")
+K = [[1500.0, 0.0, 1024.0], [0.0, 1500.0, 768.0], [0.0, 0.0, 1.0]]
+
+
+@pytest.fixture
+def each(make):
+    """One message on every topic."""
+    t_ns = make.t0_ns
+    jpeg = encode_jpeg(np.full((32, 32), 200, np.uint8))
+    messages = {
+        Topic.JOINTS: joints_message(t_ns, JOINTS, range(6), efforts_nm=[0.5] * 6),
+        Topic.TRANSFORMS: transforms_message(t_ns, [Transform("base", "paper", (400, -100, 5), (0, 0, 0, 1))]),
+        Topic.CALIBRATION: calibration_message(t_ns, (2048, 1536), K, [0.1, 0, 0, 0, 0]),
+        Topic.PREVIEW: image_message(t_ns, jpeg, "jpeg"),
+        Topic.LOG: log_message(t_ns, "brush is dry"),
+        Topic.WRENCH: Wrench(fx_n=0.0, fy_n=0.1, fz_n=-1.5, mx_nm=0.0, my_nm=0.0, mz_nm=0.01),
+        Topic.INK: InkState(level=0.7, dosed_ml=1.25, light=0.5),
+        Topic.QUALITY: Quality(
+            stroke_id="H13-a05-r00",
+            checks=(Check(name="sharp", score=0.2, threshold=0.4, passed=False, reason="out of focus"),),
+        ),
+        Topic.CADENCE: Cadence(
+            topic="/robot/tcp",
+            expected_hz=100.0,
+            received=990,
+            missed=10,
+            longest_gap_ms=50.0,
+            slow_sections=(SlowSection(name="png", times=3, longest_ms=80.0),),
+        ),
+    }
+    outgoing = [Outgoing(topic, t_ns, t_ns, n, message) for n, (topic, message) in enumerate(messages.items())]
+    return [*outgoing, make.pose(0), make.step(0, "press", "begin"), make.still(0), make.stroke(0)]
+
+
+def test_the_merged_file_carries_every_topic_under_a_name_that_viewers_know(make, store, each):
+    make.take(store, "all", "press", each, {})
+    with store.close().open("rb") as file:
+        found = {channel.topic: (schema, channel) for schema, channel, _ in make_reader(file).iter_messages()}
+    assert set(found) == {str(topic) for topic in Topic}
+    for schema, channel in found.values():
+        if schema.name.startswith("foxglove."):
+            assert (schema.encoding, channel.message_encoding) == (SchemaEncoding.Protobuf, MessageEncoding.Protobuf)
+        else:
+            assert schema.name.startswith("brushloop.")
+            assert (schema.encoding, channel.message_encoding) == (SchemaEncoding.JSONSchema, MessageEncoding.JSON)
+            assert json.loads(schema.data)["type"] == "object"
+    names = {topic: schema.name for topic, (schema, _) in found.items()}
+    assert names["/robot/joints"] == "foxglove.JointStates"
+    assert names["/tf"] == "foxglove.FrameTransforms"
+    assert names["/camera/calibration"] == "foxglove.CameraCalibration"
+    assert names["/force/wrench"] == "brushloop.Wrench"
+
+
+def test_any_viewer_decodes_them_from_the_schemas_in_the_file(make, tmp_path, each):
+    path = make.record(tmp_path / "a.mcap", *each)
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        protobuf = [str(t) for t in (Topic.JOINTS, Topic.TRANSFORMS, Topic.CALIBRATION, Topic.PREVIEW)]
+        decoded = {c.topic: m for _, c, _, m in reader.iter_decoded_messages(topics=protobuf)}
+    joints = decoded["/robot/joints"].joints
+    assert [(joint.name, joint.position, joint.effort) for joint in joints][2] == ("elbow", 2.0, 0.5)
+    assert not joints[0].HasField("velocity")
+    [transform] = decoded["/tf"].transforms
+    assert (transform.parent_frame_id, transform.translation.x, transform.rotation.w) == ("base", 0.4, 1.0)
+    calibration = decoded["/camera/calibration"]
+    assert list(calibration.P) == [1500.0, 0, 1024.0, 0, 0, 1500.0, 768.0, 0, 0, 0, 1.0, 0]
+    assert decoded["/camera/preview"].format == "jpeg"
+
+
+def test_quality_passes_where_every_check_does():
+    good, bad = Check(name="a", passed=True), Check(name="b", passed=False, reason="too dark")
+    assert Quality(stroke_id="s", checks=(good,)).passed
+    assert not Quality(stroke_id="s", checks=(good, bad)).passed
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda: Wrench(fx_n=float("nan"), fy_n=0, fz_n=0, mx_nm=0, my_nm=0, mz_nm=0),
+        lambda: InkState(level=1.2),
+        lambda: Cadence(topic="/x", expected_hz=0, received=0, missed=0),
+    ],
+)
+def test_what_cannot_be_is_not_recorded(wrong):
+    with pytest.raises(ValidationError):
+        wrong()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda: joints_message(0, JOINTS, [0.0] * 5),
+        lambda: joints_message(0, JOINTS, [0.0] * 6, [0.0] * 7),
+        lambda: joints_message(0, JOINTS, [0.0] * 6, efforts_nm=[0.0] * 5),
+        lambda: calibration_message(0, (1, 1), [[1.0] * 4] * 3, []),
+    ],
+)
+def test_lists_of_the_wrong_length_are_refused(wrong):
+    with pytest.raises(ValueError, match=r"shorter|longer|values|3 x 3"):
+        wrong()
+
+
+LAYOUT = Path(__file__).parents[2] / "docs" / "foxglove-layout.json"
+
+
+def test_the_foxglove_layout_asks_for_topics_and_fields_that_there_are(make, store, each):
+    make.take(store, "all", "press", each, {})
+    with store.close().open("rb") as file:
+        fields = {}
+        for schema, channel, _ in make_reader(file).iter_messages():
+            fields[channel.topic] = schema.data.decode(errors="replace")
+    layout = json.loads(LAYOUT.read_text())
+    panels = json.dumps(layout["configById"])
+    asked = re.findall(r'"(/[a-z/]+)((?:\.\w+)*)"', panels)
+    assert {topic for topic, _ in asked} <= set(fields)
+    for topic, path in asked:
+        for field in filter(None, path.split(".")[1:2] + path.split(".")[-1:]):
+            assert field in fields[topic], f"{topic}{path}"
+
+
+def test_the_foxglove_layout_places_every_panel_once():
+    layout = json.loads(LAYOUT.read_text())
+
+    def panels(node):
+        return [node] if isinstance(node, str) else panels(node["first"]) + panels(node["second"])
+
+    assert sorted(panels(layout["layout"])) == sorted(layout["configById"])
