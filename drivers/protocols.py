@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
 from drivers.force.samples import ForceSample
@@ -23,6 +23,13 @@ class Robot(Protocol):
 
     async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
         """Move the tip in a straight line; returns when the arm has settled within tolerance."""
+        ...
+
+    async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float) -> None:
+        """Move the tip through all poses without halting between them; returns when it has settled at the last.
+
+        Corners may be rounded within `blend_mm` of a pose. Every pose is checked before the arm moves.
+        """
         ...
 
     async def stop(self) -> None:
@@ -102,6 +109,10 @@ class Ink(Protocol):
 
     async def dose(self, volume_ml: float) -> None:
         """Add ink to the well. Raises `LimitExceeded` before anything is sent."""
+        ...
+
+    async def light(self, level: float) -> bool:
+        """Set the light over the sheet, 0 to 1; False where the device has none."""
         ...
 
     async def level(self) -> float | None:

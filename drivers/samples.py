@@ -48,6 +48,8 @@ class PoseSample:
 
     stamp: Stamp
     pose: Pose
+    joints_rad: tuple[float, ...] | None = None
+    """Joint positions of the same moment; None where they do not come with the pose."""
 
 
 @dataclass(frozen=True, slots=True)

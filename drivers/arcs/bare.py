@@ -31,9 +31,15 @@ class BareDecoder:
         self._at = 0
         self._open: list[int] = []
         self._in_string = False
+        self._broken: str | None = None
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Documents completed by `data`, in order, each valid JSON. Raises `ProtocolViolation`."""
+        """Documents completed by `data`, in order, each JSON as Python takes it: NaN and Infinity are let through.
+
+        Raises `ProtocolViolation`, and from then on always: nothing after it, nor of the same `data`, can be trusted.
+        """
+        if self._broken is not None:
+            raise self._violation(self._broken)
         self._buffer += data
         documents: list[bytes] = []
         while (document := self._next()) is not None:
@@ -86,4 +92,6 @@ class BareDecoder:
                     raise self._violation(f"nested deeper than {MAX_DEPTH}")
 
     def _violation(self, what: str) -> ProtocolViolation:
+        self._broken = what
+        self._buffer.clear()
         return ProtocolViolation(self._device, "decode", what)

@@ -18,6 +18,7 @@ from drivers.arcs.codes import (
     refusal,
 )
 from drivers.arcs.errors import QueueFull
+from drivers.arcs.numbers import numbers
 from drivers.arcs.rpc import DEVICE, RpcConnection
 from drivers.errors import DeviceError, MotionRefused, ProtocolViolation, RobotNotSafe
 from drivers.geometry import from_wire, to_wire
@@ -62,8 +63,8 @@ class Controller:
         """Where the tip is. Raises `ProtocolViolation`."""
         values = await self.ask("RobotState.getTcpPose")
         try:
-            return from_wire([float(v) for v in values])
-        except (TypeError, ValueError) as error:
+            return from_wire(numbers(values, 6))
+        except ValueError as error:
             raise ProtocolViolation(DEVICE, "getTcpPose", str(error)) from None
 
     async def mode(self) -> RobotMode:
@@ -98,14 +99,17 @@ class Controller:
         if self._reduced and not reduced and self.on_notice is not None:
             self.on_notice("safety mode is ReducedMode: the arm may be slower than asked")
 
-    async def move_line(self, target: Pose, speed_mm_s: float, acc_mm_s2: float) -> None:
-        """Queue a straight line. Raises `RobotNotSafe` or `MotionRefused`; already there is fine."""
+    async def move_line(self, target: Pose, speed_mm_s: float, acc_mm_s2: float, blend_mm: float = 0.0) -> None:
+        """Queue a straight line. Raises `RobotNotSafe` or `MotionRefused`; already there is fine.
+
+        The next line may begin `blend_mm` before its end: 0 halts there, else 1 mm to 1 m.
+        """
         code = await self.ask(
             "MotionControl.moveLine",
             pose=to_wire(target),
             a=acc_mm_s2 / 1e3,
             v=speed_mm_s / 1e3,
-            blend_radius=0.0,
+            blend_radius=blend_mm / 1e3,
             duration=0.0,
         )
         if code not in (ReturnCode.OK, ReturnCode.REQUEST_IGNORED):
@@ -124,6 +128,13 @@ class Controller:
     async def at_rest(self) -> bool:
         """True when the queue is empty and the arm is steady."""
         return await self.ask("MotionControl.getExecId") == -1 and await self.ask("RobotState.isSteady") is True
+
+    async def queue(self) -> tuple[int, int]:
+        """(id of the running line, -1 for none; lines queued, the running one included). Raises `ProtocolViolation`."""
+        running, size = await self.ask("MotionControl.getExecId"), await self.ask("MotionControl.getQueueSize")
+        if type(running) is not int or type(size) is not int or size < 0:
+            raise ProtocolViolation(DEVICE, "getQueueSize", f"expected two counts, got {running!r} and {size!r}")
+        return running, size
 
     async def halt(self, acc_m_s2: float) -> None:
         """Decelerate along the path, then drop whatever is queued, the second also where the first fails."""

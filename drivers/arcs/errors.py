@@ -28,7 +28,7 @@ class WrongOperationalMode(MotionError):
 
 
 class QueueFull(MotionRefused):
-    """The controller's queue has no room, although this driver never queues a second line."""
+    """The controller's queue has no room, although this driver queues few lines and waits."""
 
 
 class OutOfReach(MotionFailed):

@@ -42,9 +42,16 @@ class FrameDecoder:
         self._skip = skip
         self._max_bytes = max_bytes
         self._buffer = bytearray()
+        self._broken: str | None = None
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Payloads completed by `data`, in order. Raises `ProtocolViolation` where the stream is not SOF."""
+        """Payloads completed by `data`, in order.
+
+        Raises `ProtocolViolation` where the stream is not SOF, and from then on always: nothing after it, nor of the
+        same `data`, can be trusted.
+        """
+        if self._broken is not None:
+            raise self._violation(self._broken)
         self._buffer += data
         payloads: list[bytes] = []
         while (payload := self._next()) is not None:
@@ -58,7 +65,7 @@ class FrameDecoder:
         if 0 < len(buffer) < len(skip) and skip.startswith(bytes(buffer)):
             return None
         if not MAGIC.startswith(bytes(buffer[:3])):
-            raise ProtocolViolation(self._device, "decode", f"expected SOF, got {bytes(buffer[:8])!r}")
+            raise self._violation(f"expected SOF, got {bytes(buffer[:8])!r}")
         if len(buffer) < 4:
             return None
         match buffer[3]:
@@ -67,13 +74,18 @@ class FrameDecoder:
             case 0x00:
                 head, size = 6, struct.unpack_from(">H", buffer, 4)[0] if len(buffer) >= 6 else None
             case flag:
-                raise ProtocolViolation(self._device, "decode", f"unknown SOF flag {flag:#04x}")
+                raise self._violation(f"unknown SOF flag {flag:#04x}")
         if size is None:
             return None
         if size > self._max_bytes:
-            raise ProtocolViolation(self._device, "decode", f"frame of {size} bytes exceeds {self._max_bytes}")
+            raise self._violation(f"frame of {size} bytes exceeds {self._max_bytes}")
         if len(buffer) < head + size:
             return None
         payload = bytes(buffer[head : head + size])
         del buffer[: head + size]
         return payload
+
+    def _violation(self, what: str) -> ProtocolViolation:
+        self._broken = what
+        self._buffer.clear()
+        return ProtocolViolation(self._device, "decode", what)

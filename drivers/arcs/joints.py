@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from drivers.arcs.controller import Controller
+from drivers.arcs.numbers import numbers
 from drivers.arcs.rpc import DEVICE
 from drivers.errors import LimitExceeded, ProtocolViolation
 from drivers.geometry import distance, from_wire, to_wire
@@ -30,8 +31,8 @@ async def forward(controller: Controller, joints: Sequence[float]) -> Pose:
     match await controller.ask("RobotAlgorithm.forwardKinematics", q=list(joints)):
         case [list(pose), 0]:  # pyright: ignore[reportUnknownVariableType]
             try:
-                return from_wire([float(v) for v in pose])  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
-            except (TypeError, ValueError) as error:
+                return from_wire(numbers(pose, 6))  # pyright: ignore[reportUnknownArgumentType]
+            except ValueError as error:
                 raise ProtocolViolation(DEVICE, "forwardKinematics", str(error)) from None
         case other:
             raise ProtocolViolation(DEVICE, "forwardKinematics", f"no pose: {other!r}")
@@ -81,9 +82,6 @@ async def checked_path(
 
 def _joints(op: str, values: Any) -> list[float]:
     try:
-        joints = [float(v) for v in values]
-    except (TypeError, ValueError):
-        joints = []
-    if len(joints) != 6 or not all(math.isfinite(v) for v in joints):
-        raise ProtocolViolation(DEVICE, op, f"expected six joints, got {values!r}")
-    return joints
+        return numbers(values, 6)
+    except ValueError as error:
+        raise ProtocolViolation(DEVICE, op, str(error)) from None

@@ -7,6 +7,7 @@ from collections.abc import Callable, Coroutine, Sequence
 
 from drivers.arcs.codes import LOOPBACK_CONTROL_BOX, RobotMode
 from drivers.arcs.controller import Condition, Controller
+from drivers.arcs.following import feed, legs_of
 from drivers.arcs.generation import open_arcs
 from drivers.arcs.joints import checked_path, reachable
 from drivers.arcs.messages import Messages
@@ -46,6 +47,8 @@ class AuboArcs:
         self._reopening = asyncio.Lock()
         self._stopper = Stopper([self._stop, self._state], self._motion, self._restore_stop)
         self._own_stops: set[asyncio.Task[None]] = set()
+        self._stops = 0
+        """How often the arm was told to stop: no line of a way may follow."""
         self._unsettled = False
         """True from the moment a line is sent until the arm was seen at rest."""
         self._connected = False
@@ -124,6 +127,31 @@ class AuboArcs:
         expected_s = planned_s(start, target, speed_mm_s, acc_mm_s2)
         await self._carry_out(self._motion.move_line(target, speed_mm_s, acc_mm_s2), target, expected_s)
 
+    async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float) -> None:
+        """Lines through all poses without a halt between them, then wait as `move` does at the last.
+
+        Every pose is checked before the first line is sent; between two of them the box holds by itself, being convex.
+        Raises ValueError for no poses.
+        """
+        if not poses:
+            raise ValueError("follow: no poses")
+        for pose in poses:
+            self.check(pose, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
+        await self._restore_stop()
+        start = await self._motion.pose()
+        legs = legs_of(start, poses, self._limits, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=blend_mm)
+        stops, options = self._stops, self._options
+        feeding = feed(
+            self._motion,
+            legs,
+            acc_mm_s2,
+            stopped=lambda: self._stops != stops,
+            tolerance=Tolerance(options.position_tolerance_mm, options.rotation_tolerance_deg),
+            poll_s=options.poll_s,
+            notice=self._notice,
+        )
+        await self._carry_out(feeding, poses[-1], sum(leg.seconds for leg in legs))
+
     async def move_joint(self, joints_rad: Sequence[float], *, speed_rad_s: float, acc_rad_s2: float) -> None:
         """moveJoint, then wait as `move` does. The whole way is checked, by poses that the controller computes.
 
@@ -176,6 +204,7 @@ class AuboArcs:
         """
         if not self._connected:
             raise NotConnected(DEVICE, "stop", "not connected")
+        self._stops += 1
         await self._stopper.stop(self._options.stop_acc_m_s2)
         self._unsettled = False
 

@@ -101,8 +101,14 @@ class RpcConnection:
     async def reopen(self) -> None:
         """Close, connect and log in again. Raises what `open` and `login` raise."""
         await self.close()
-        await self.open()
-        await self.login()
+        try:
+            await self.open()
+            await self.login()
+        except BaseException:
+            # Half open is lost, so that whoever needs it opens it again.
+            await self.close()
+            self._lost = "it was not opened again"
+            raise
 
     async def close(self) -> None:
         """End the reader, close the socket; a call that still waits gets `NotConnected`."""

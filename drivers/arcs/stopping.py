@@ -18,7 +18,7 @@ from drivers.geometry import distance
 HEDGE_S = 0.15
 """A stop that is not acknowledged by then goes out over the next connection too."""
 CONFIRM_S = 6.0
-"""Rest must be seen within this time: a stop from full speed takes a fraction of a second."""
+"""Rest must be seen within this time from the call on: a stop from full speed takes a fraction of a second."""
 RESEND_S = 0.3
 POLL_S = 0.02
 STILL_S = 0.1
@@ -36,66 +36,73 @@ class Stopper:
         self._reopen = reopen
 
     async def stop(self, acc_m_s2: float) -> None:
-        """Send, then wait until the arm rests, sending again meanwhile.
+        """Send, then wait until the arm rests, sending again meanwhile; `CONFIRM_S` is the end of it all.
 
         Raises `MotionFailed` saying that the arm may still be moving.
         """
-        failure = await self._send(acc_m_s2)
-        trailing = asyncio.create_task(self._quietly(self._behind.halt(acc_m_s2)), name="stop behind the last line")
+        failures: list[DeviceError] = []
+        trailing: asyncio.Task[None] | None = None
+        # Whoever waits for this must hear in time that it is his turn, however many calls hang.
+        limit = asyncio.timeout(CONFIRM_S)
         try:
-            await self._until_rest(acc_m_s2, failure)
+            async with limit:
+                await self._send(acc_m_s2, failures)
+                halt = self._behind.halt(acc_m_s2)
+                trailing = asyncio.create_task(self._quietly(halt), name="stop behind the last line")
+                await self._until_rest(acc_m_s2, failures)
+        except TimeoutError:
+            if not limit.expired():
+                raise
+            why = f": {failures[-1].what}" if failures else ""
+            raise MotionFailed(
+                DEVICE,
+                "stop",
+                f"the arm was not seen at rest within {CONFIRM_S:g} s{why}",
+                condition="The arm may still be moving.",
+                remedy="Use the emergency stop.",
+            ) from None
         finally:
-            trailing.cancel()
-            await asyncio.gather(trailing, return_exceptions=True)
+            if trailing is not None:
+                trailing.cancel()
+                await asyncio.gather(trailing, return_exceptions=True)
 
-    async def _send(self, acc_m_s2: float) -> DeviceError | None:
-        """None once one connection has acknowledged; else the last failure."""
+    async def _send(self, acc_m_s2: float, failures: list[DeviceError]) -> None:
+        """Return once one connection has acknowledged, or all have failed."""
         pending: set[asyncio.Task[None]] = set()
-        failure: DeviceError | None = None
         try:
             for way in self._ways:
                 pending.add(asyncio.create_task(way.halt(acc_m_s2), name="stop"))
                 done, pending = await asyncio.wait(pending, timeout=HEDGE_S, return_when=asyncio.FIRST_COMPLETED)
-                acknowledged, failure = _outcome(done, failure)
-                if acknowledged:
-                    return None
+                if _acknowledged(done, failures):
+                    return
             while pending:
                 done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
-                acknowledged, failure = _outcome(done, failure)
-                if acknowledged:
-                    return None
-            return failure
+                if _acknowledged(done, failures):
+                    return
         finally:
             for task in pending:
                 task.cancel()
             await asyncio.gather(*pending, return_exceptions=True)
 
-    async def _until_rest(self, acc_m_s2: float, failure: DeviceError | None) -> None:
+    async def _until_rest(self, acc_m_s2: float, failures: list[DeviceError]) -> None:
+        """Return once rest was seen; never by itself where it is not."""
         loop = asyncio.get_running_loop()
-        deadline, resend_at, rests = loop.time() + CONFIRM_S, loop.time() + RESEND_S, 0
+        resend_at, rests = loop.time() + RESEND_S, 0
         proofs = self._proofs()
-        while loop.time() < deadline:
+        while rests < RESTS_NEEDED:
             if not proofs or loop.time() > resend_at:
                 await self._quietly(self._reopen())
-                failure = await self._send(acc_m_s2) or failure
+                await self._send(acc_m_s2, failures)
                 proofs, resend_at = proofs or self._proofs(), loop.time() + RESEND_S
             try:
                 rests = rests + 1 if await proofs[0]() else 0
             except DeviceError as error:
                 # This question gets no answer; the next one may.
-                failure, rests = error, 0
+                failures.append(error)
+                rests = 0
                 proofs.pop(0)
-            if rests >= RESTS_NEEDED:
-                return
-            await asyncio.sleep(POLL_S)
-        why = f": {failure.what}" if failure is not None else ""
-        raise MotionFailed(
-            DEVICE,
-            "stop",
-            f"the arm was not seen at rest within {CONFIRM_S:g} s{why}",
-            condition="The arm may still be moving.",
-            remedy="Use the emergency stop.",
-        )
+            if rests < RESTS_NEEDED:
+                await asyncio.sleep(POLL_S)
 
     def _proofs(self) -> list[Callable[[], Awaitable[bool]]]:
         """Ways to ask whether the arm rests, the best one first."""
@@ -114,12 +121,12 @@ async def _stands_still(way: Controller) -> bool:
     return moved_mm < 0.01 and turned_deg < 0.01
 
 
-def _outcome(done: set[asyncio.Task[None]], failure: DeviceError | None) -> tuple[bool, DeviceError | None]:
+def _acknowledged(done: set[asyncio.Task[None]], failures: list[DeviceError]) -> bool:
     for task in done:
         error = task.exception()
         if error is None:
-            return True, failure
+            return True
         if not isinstance(error, DeviceError):
             raise error
-        failure = error
-    return False, failure
+        failures.append(error)
+    return False

@@ -7,6 +7,7 @@ import contextlib
 from collections.abc import Callable
 
 from drivers.arcs.controller import Controller
+from drivers.arcs.numbers import numbers
 from drivers.arcs.options import ArcsOptions
 from drivers.arcs.rpc import DEVICE
 from drivers.arcs.rtde import RtdeStream
@@ -16,6 +17,7 @@ from drivers.geometry import from_wire
 from drivers.samples import Pose, PoseSample, Stamp
 
 POSE_SEGMENT = "R1_actual_TCP_pose"
+JOINTS_SEGMENT = "R1_actual_q"
 
 
 class Telemetry:
@@ -68,8 +70,8 @@ class Telemetry:
         stream = RtdeStream(self._options.host, port)
         self._stream = stream
         try:
-            await stream.open([POSE_SEGMENT], self._options.telemetry_hz)
-            self._take(await self._pushed(stream))
+            await stream.open([POSE_SEGMENT, JOINTS_SEGMENT], self._options.telemetry_hz)
+            self._take(*await self._pushed(stream))
         except DeviceError as error:
             await self._fall_back(error)
 
@@ -77,7 +79,7 @@ class Telemetry:
         if self._stream is not None:
             try:
                 while True:
-                    self._take(await self._pushed(self._stream))
+                    self._take(*await self._pushed(self._stream))
             except DeviceError as error:
                 await self._fall_back(error)
         loop = asyncio.get_running_loop()
@@ -90,12 +92,12 @@ class Telemetry:
             due = max(due + period_s, loop.time())
             await asyncio.sleep(due - loop.time())
 
-    async def _pushed(self, stream: RtdeStream) -> Pose:
-        [values] = await stream.newest()
+    async def _pushed(self, stream: RtdeStream) -> tuple[Pose, tuple[float, ...]]:
+        pose, joints = await stream.newest()
         try:
-            return from_wire([float(v) for v in values])
-        except (TypeError, ValueError, OverflowError) as error:
-            raise ProtocolViolation(DEVICE, POSE_SEGMENT, str(error)) from None
+            return from_wire(numbers(pose, 6)), tuple(numbers(joints, 6))
+        except ValueError as error:
+            raise ProtocolViolation(DEVICE, "sample", str(error)) from None
 
     async def _fall_back(self, error: DeviceError) -> None:
         await self._drop_stream()
@@ -106,8 +108,8 @@ class Telemetry:
         if stream is not None:
             await stream.close()
 
-    def _take(self, pose: Pose) -> None:
+    def _take(self, pose: Pose, joints_rad: tuple[float, ...] | None = None) -> None:
         seq = self._latest.stamp.seq + 1 if self._latest else 0
-        self._latest = PoseSample(Stamp(self._clock.now_ns(), None, seq), pose)
+        self._latest = PoseSample(Stamp(self._clock.now_ns(), None, seq), pose, joints_rad)
         if self.listener is not None:
             self.listener(self._latest)

@@ -17,6 +17,8 @@ BLACK_BELOW = 25
 SATURATED_SHARE = 0.5
 TORN_BAND_SHARE = 0.02
 """A band of this share of the rows at the bottom without any change: the decoder ran out of data."""
+END_ROWS = 16
+"""The last row of blocks of a JPEG."""
 BURST_SHARE = 0.5
 """Frames that come faster than this share of the usual period are a backlog."""
 PERIODS_KEPT = 31
@@ -35,22 +37,33 @@ class Fault(StrEnum):
 class FrameHealth:
     """Judges the frames of one camera in the order in which they arrive."""
 
-    def __init__(self, *, latency_ns: int, frozen_after: int, live: bool) -> None:
+    def __init__(self, *, latency_ns: int, frozen_after: int, live: bool, independent: bool = False) -> None:
+        """`independent`: each frame is coded by itself; pixels of the one before are then the decoder's doing."""
         self._latency_ns = latency_ns
         self._frozen_after = frozen_after
         self._live = live
+        self._independent = independent
+        self._last_end: int | None = None
         self._last_digest: int | None = None
         self._equal = 0
         self._last_ns: int | None = None
         self._periods: deque[int] = deque(maxlen=PERIODS_KEPT)
         self._backlog = False
         self.counts: Counter[Fault] = Counter()
+        self.repeated = False
+        """The frame judged last is the one before it again: nothing new, though as yet no fault."""
 
     def judge(self, image: NDArray[np.uint8], arrival_ns: int) -> Fault | None:
         """The first fault found in an (h, w) or (h, w, 3) uint8 frame, or None."""
         fault = self._look(image)
         # Clock and digest go on also for a frame that is faulty otherwise.
-        frozen, late = self._is_frozen(image), self._is_late(arrival_ns)
+        digest = zlib.crc32(image[::SAMPLE_STEP].tobytes())
+        same, self._last_digest = digest == self._last_digest, digest
+        self.repeated = self._live and same
+        patched = self._is_patched(image, same)
+        frozen, late = self._is_frozen(same), self._is_late(arrival_ns)
+        if fault is None and patched:
+            fault = Fault.TORN
         if fault is None and self._live:
             fault = Fault.FROZEN if frozen else Fault.LATE if late else None
         if fault is not None:
@@ -74,10 +87,22 @@ class FrameHealth:
             return Fault.TORN
         return None
 
-    def _is_frozen(self, image: NDArray[np.uint8]) -> bool:
-        digest = zlib.crc32(image[::SAMPLE_STEP].tobytes())
-        self._equal = self._equal + 1 if digest == self._last_digest else 0
-        self._last_digest = digest
+    def _is_patched(self, image: NDArray[np.uint8], same: bool) -> bool:
+        """True where the end of the frame is to the bit that of the last whole one, while the frame is another.
+
+        FFmpeg fills what is missing of a JPEG with the picture before: half of a photograph would be an old one.
+        """
+        if not self._independent:
+            return False
+        end = image[-END_ROWS:]
+        digest, clipped = zlib.crc32(end.tobytes()), int(end.min()) >= 254
+        if digest == self._last_end and not clipped and not same:
+            return True
+        self._last_end = digest
+        return False
+
+    def _is_frozen(self, same: bool) -> bool:
+        self._equal = self._equal + 1 if same else 0
         return self._equal + 1 >= self._frozen_after
 
     def _is_late(self, arrival_ns: int) -> bool:

@@ -137,7 +137,12 @@ class OpenCvCamera:
 
         self.settings, self._simulated = source.settings, source.simulated
         latency_ns = round(self._options.latency_ms * 1e6)
-        health = FrameHealth(latency_ns=latency_ns, frozen_after=self._options.frozen_after, live=source.live)
+        health = FrameHealth(
+            latency_ns=latency_ns,
+            frozen_after=self._options.frozen_after,
+            live=source.live,
+            independent=source.independent,
+        )
         first, sound_ns = True, opening_ns
         while not closing.is_set():
             image = source.read()
@@ -152,6 +157,8 @@ class OpenCvCamera:
                 self._tell_trouble(f"frames passed over: {health.summary()}", aloud=arrival_ns - sound_ns > LASTING_NS)
                 continue
             sound_ns = arrival_ns
+            if health.repeated:
+                continue  # it arrived now, but was exposed when its first copy was
             # The first frame was read to learn the format, and waited until the capture was open.
             exposed_ns = (opening_ns if first else arrival_ns) - latency_ns
             first = False

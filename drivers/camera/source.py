@@ -27,6 +27,9 @@ class Source(Protocol):
     live: bool
     """False where the frames are recorded: their end is an end, and equal ones are no fault."""
 
+    independent: bool
+    """True where FFmpeg decodes a JPEG for each frame."""
+
     settings: dict[str, float]
     """What was read back, by name."""
 
@@ -73,6 +76,7 @@ class FolderSource:
         if not self._paths:
             raise ConnectionLost(DEVICE, "open", f"{folder} holds no PNG or JPEG images")
         self.live = False
+        self.independent = False
         self.simulated = True
         self.settings: dict[str, float] = {}
         self._period_s = 1.0 / options.folder_fps
@@ -117,6 +121,8 @@ class CaptureSource:
         try:
             if not self._capture.isOpened():
                 raise ConnectionLost(DEVICE, "open", f"cannot open {source}")
+            fourcc = int(self._capture.get(cv2.CAP_PROP_FOURCC))
+            self.independent = not is_device and fourcc == cv2.VideoWriter.fourcc(*"MJPG")
             self.settings = self._lock(options, is_device)
             self.simulated = not self.live or says_loopback(source)
         except BaseException:

@@ -33,6 +33,9 @@ class SriOptions:
     interface: str = "socketcan"
     channel: str = "can0"
     bitrate: int = BITRATE
+    host: str | None = None
+    """Of a CAN gateway, for the interface `socketcand`."""
+    port: int | None = None
     stale_after_ms: float = 100.0
     connect_timeout_s: float = 2.0
     round_ms: float = 5.0
@@ -83,7 +86,7 @@ class SriM8123:
                 self._listener(self._sample(stamp, wrench))
 
         stream = RoundStream(
-            BusSettings(options.interface, options.channel, options.bitrate),
+            BusSettings(options.interface, options.channel, options.bitrate, options.host, options.port),
             RoundAssembler(round_ms=options.round_ms, max_n=options.max_n, max_nm=options.max_nm),
             self._clock,
             gap_ms=options.gap_ms,
@@ -108,7 +111,7 @@ class SriM8123:
         except BaseException:
             await self.close()
             raise
-        # The board does not tell who it is. A virtual bus ends within this process: nothing real can be on it.
+        # The board does not tell who it is. Nothing real can be on a virtual bus, nor on the loopback rig's.
         return Identity(DEVICE, f"SRI M8123B2 on {stream.channel_info}", "", stream.virtual)
 
     def latest_n(self) -> tuple[float, float, float]:

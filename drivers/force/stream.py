@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import can
 
@@ -19,6 +22,11 @@ RECEIVE_S = 0.05
 BUS_OFF = 0x40
 """Bit of an error frame's id (Linux `can/error.h`): the controller took itself off the bus."""
 RATE_WINDOW = 200
+SILENT_S = 1.0
+"""A board that streamed and then sends nothing for so long is lost: a gateway that goes away never says so."""
+LOOPBACK_CHANNEL = "loopback-force-board"
+"""The loopback rig's bus on a socketcand gateway. Longer than the 15 characters that a network interface's name may
+have, so no gateway to a real bus can serve it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +36,9 @@ class BusSettings:
     interface: str
     channel: str
     bitrate: int
+    host: str | None = None
+    """Of a gateway (`socketcand`); None where the adapter is in this machine."""
+    port: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,12 +104,16 @@ class RoundStream:
             self._lose(f"cannot open {self._name}: {error}", "Check the adapter and that its interface is up.")
             return
         try:
-            self.channel_info, self.virtual = str(bus.channel_info), self._settings.interface == "virtual"
+            self.channel_info, self.virtual = str(bus.channel_info), _is_virtual(self._settings)
             bus.send(command(START), timeout=1.0)
+            heard_s = math.inf
             while self.loss is None and not self._closing.is_set():
                 message = bus.recv(RECEIVE_S)
                 if message is not None:
+                    heard_s = time.monotonic()
                     self._take(message)
+                elif time.monotonic() - heard_s > SILENT_S:
+                    self._lose_bus(f"has been silent for {SILENT_S:g} s")
                 elif bus.state is can.BusState.ERROR:
                     self._lose_bus("is off")
         except (can.CanError, OSError) as error:
@@ -113,7 +128,8 @@ class RoundStream:
     def _open(self) -> can.BusABC:
         settings = self._settings
         # Only what was asked for: python-can would also read can.ini, the environment and the home folder.
-        return can.Bus(settings.channel, settings.interface, ignore_config=True, bitrate=settings.bitrate)
+        gateway: dict[str, Any] = {} if settings.host is None else {"host": settings.host, "port": settings.port}
+        return can.Bus(settings.channel, settings.interface, ignore_config=True, bitrate=settings.bitrate, **gateway)
 
     def _take(self, message: can.Message) -> None:
         if message.is_error_frame:
@@ -157,3 +173,9 @@ class RoundStream:
 def command(data: bytes) -> can.Message:
     """A frame to the board."""
     return can.Message(arbitration_id=COMMAND_ID, is_extended_id=False, data=data)
+
+
+def _is_virtual(settings: BusSettings) -> bool:
+    return settings.interface == "virtual" or (
+        settings.interface == "socketcand" and settings.channel == LOOPBACK_CHANNEL
+    )

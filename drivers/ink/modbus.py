@@ -68,16 +68,17 @@ def read_write(frame: bytes) -> tuple[int, int, int]:
 def find_reply(received: bytes, request: bytes) -> int | None:
     """0 where `received` confirms `request`, the code where it is an exception, None while it is neither.
 
-    Noise before the reply is passed over: the CRC decides where a frame is.
+    Noise before the reply is passed over: the CRC decides where a frame is. Of two replies the one that ends first
+    counts, so that it does not matter in which pieces they came.
     """
-    if request in received:
-        return 0
+    confirmed = received.find(request)
+    before = received if confirmed < 0 else received[: confirmed + len(request) - 1]
     head = bytes([request[0], request[1] | EXCEPTION_BIT])
-    start = received.find(head)
-    while 0 <= start <= len(received) - EXCEPTION_BYTES:
-        frame = received[start : start + EXCEPTION_BYTES]
+    start = before.find(head)
+    while 0 <= start <= len(before) - EXCEPTION_BYTES:
+        frame = before[start : start + EXCEPTION_BYTES]
         # Code 0 is not an exception, and would read as a confirmation.
         if seal(frame[:3]) == frame and frame[2]:
             return frame[2]
-        start = received.find(head, start + 1)
-    return None
+        start = before.find(head, start + 1)
+    return None if confirmed < 0 else 0

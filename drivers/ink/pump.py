@@ -132,6 +132,10 @@ class ModbusPump:
                     remedy="Something held the host up.",
                 )
 
+    async def light(self, level: float) -> bool:
+        """False: a pump has no light."""
+        return False
+
     async def level(self) -> float | None:
         """None: the pump has no gauge, and what is in the well is unknown."""
         if not self._connected:

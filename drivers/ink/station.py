@@ -84,11 +84,15 @@ class InkStation:
         if abs(given_ml - volume_ml) > max(2 * SMALLEST_ML, 0.05 * volume_ml):
             raise DeviceError(DEVICE, "dose", f"gave {given_ml:.3f} ml instead of {volume_ml:.3f} ml")
 
-    async def light(self, level: float) -> None:
-        """Set the light, 0 to 1. Raises `LimitExceeded`, `InkRefused`, `DeviceTimeout`, `ConnectionLost`."""
+    async def light(self, level: float) -> bool:
+        """Set the light, 0 to 1; True: it has one.
+
+        Raises `LimitExceeded`, `InkRefused`, `DeviceTimeout`, `ConnectionLost`.
+        """
         if not 0.0 <= level <= 1.0:
             raise LimitExceeded(DEVICE, "light", level, 0.0, 1.0, "of full")
         await self._ask("light", f"{level:.3f}")
+        return True
 
     async def open_lid(self) -> None:
         """Open the well. Raises `InkRefused`, `DeviceTimeout`, `ConnectionLost`."""

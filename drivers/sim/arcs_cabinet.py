@@ -7,7 +7,6 @@ planning, a path that a protective stop keeps. It fakes no accuracy and no safet
 from __future__ import annotations
 
 import asyncio
-import math
 from typing import Any
 
 import numpy as np
@@ -15,14 +14,12 @@ import numpy as np
 from drivers.arcs.codes import MOVING_ALLOWED, ReturnCode, RobotMode, SafetyMode
 from drivers.geometry import from_wire, to_wire
 from drivers.samples import Pose
-from drivers.sim.arcs_io import DigitalIo
-from drivers.sim.arcs_motion import ArmQueue
-from drivers.sim.arcs_power import Power
-from drivers.sim.kinematics import LIMITS_DEG, Joints, Matrix, forward, inverse, matrix_of, pose_of
+from drivers.sim.arcs_io import Io
+from drivers.sim.arcs_power import EMERGENCY_STOPS, Power
+from drivers.sim.kinematics import Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
 from drivers.sim.world import World
 
 ROBOT = "rob1"
-POSE_OUT_OF_REACH = 30047
 IK_NO_CONVERGE = -23
 HARD_STOP_M_S2 = 10.0
 SOFT_STOP_M_S2 = 2.0
@@ -37,13 +34,15 @@ class Cabinet:
 
     def __init__(self, world: World) -> None:
         self.world = world
-        self.motion = world.motion = ArmQueue.instead_of(world.motion)
+        self.motion = world.motion
         self.power = Power(self.now_s)
-        self.io = DigitalIo()
-        self.tcp_offset: list[float] = [0.0] * 6
+        self.io = Io(self.now_s)
+        self.tcp_offset = [0.0] * 6
         self.payload: list[Any] = [0.0, [0.0] * 3, [0.0] * 3, [0.0] * 6]
         self.collision_level = 6
         self.operational_mode = "Automatic"
+        self.servo_mode = 0
+        """0 off; the others as `setServoModeSelect` numbers them."""
         self.messages: list[dict[str, Any]] = []
         self.watchdogs: dict[str, tuple[float, int]] = {}
         """(timeout in real seconds, action) by key."""
@@ -60,7 +59,12 @@ class Cabinet:
 
     def safety_stop(self, mode: SafetyMode) -> None:
         """Enter a safety stop where the arm is. A protective stop keeps the path; only a person clears any of them."""
-        self.power.safety = mode
+        if mode in EMERGENCY_STOPS:
+            self.emergency_stop(mode)
+            return
+        if self.power.safety in EMERGENCY_STOPS:
+            return  # nothing less takes its place
+        self.power.safety, self.servo_mode = mode, 0
         if mode == SafetyMode.PROTECTIVE_STOP:
             self.hold(HARD_STOP_M_S2)
         else:
@@ -74,6 +78,7 @@ class Cabinet:
     def emergency_stop(self, mode: SafetyMode = SafetyMode.ROBOT_EMERGENCY_STOP) -> None:
         """A person pushes the button."""
         self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
+        self.servo_mode = 0
         self.power.press_emergency_stop(mode)
 
     def power_off(self) -> int:
@@ -81,18 +86,44 @@ class Cabinet:
         self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
         return self.power.power_off()
 
+    @property
+    def tcp_offset(self) -> list[float]:
+        """Flange to tool centre point as configured: [x, y, z m, rx, ry, rz rad]. It moves no real tip."""
+        return self._tcp_offset
+
+    @tcp_offset.setter
+    def tcp_offset(self, offset: list[float]) -> None:
+        self._tcp_offset = list(offset)
+        tool = matrix_of(from_wire(offset))
+        fix = inverted(tool) @ self.motion.tool
+        self.fix = None if np.allclose(fix, np.eye(4), rtol=0.0, atol=1e-9) else fix
+        """From the configured tool centre point to the true tip; None where they are one."""
+        self._tool = tool
+
     def tool(self) -> Matrix:
-        """Flange to tip, as configured."""
-        return matrix_of(from_wire(self.tcp_offset))
+        """Flange to tool centre point, as configured."""
+        return self._tool
+
+    def tcp(self) -> Pose:
+        """Where the configured tool centre point is: what the controller takes for the tip."""
+        return self.configured(self.world.tool())
+
+    def configured(self, tip: Pose) -> Pose:
+        """Where the configured tool centre point is when the true tip is there."""
+        return tip if self.fix is None else pose_of(matrix_of(tip) @ inverted(self.fix))
+
+    def tcp_speed(self) -> list[float]:
+        """[vx, vy, vz m/s, wx, wy, wz rad/s] of the true tip, in the base frame."""
+        velocity = self.motion.velocity(self.now_s())
+        return [*(v / 1e3 for v in velocity[:3]), *velocity[3:]]
 
     def joints(self) -> Joints:
         """The joints that put the tip where it is."""
-        exact = self.motion.joints(self.now_s())
-        return exact or self.motion.seen(self.world.tool(), self.tool())
+        return self.motion.joints(self.now_s())
 
     def flange(self) -> Pose:
         """Where the flange is."""
-        return pose_of(matrix_of(self.world.tool()) @ np.linalg.inv(self.tool()))
+        return pose_of(matrix_of(self.world.tool()) @ inverted(self.motion.tool))
 
     def force(self) -> list[float]:
         """[Fx, Fy, Fz N, Mx, My, Mz Nm] in the base frame: the bristles' push while the tip is below the paper."""
@@ -107,36 +138,11 @@ class Cabinet:
         flange = forward([float(v) for v in q])
         return [to_wire(pose_of(flange @ self.tool() if tip else flange)), 0]
 
-    def ik(self, near: list[float], pose: list[float]) -> list[Any]:
+    def ik(self, near: list[float], pose: list[float], *, tip: bool = True) -> list[Any]:
         """[joints, return code]; the joints are `near` where there is no solution."""
-        found = inverse(matrix_of(from_wire([float(v) for v in pose])) @ np.linalg.inv(self.tool()), near)
+        target = matrix_of(from_wire([float(v) for v in pose]))
+        found = inverse(target @ inverted(self.tool()) if tip else target, near)
         return [list(near), IK_NO_CONVERGE] if found is None else [list(found), 0]
-
-    def move_line(self, p: Params) -> int:
-        """Queue a line, or refuse it; a pose out of reach is accepted and fails in planning."""
-        target = from_wire([float(v) for v in p["pose"]])
-        acc, speed, duration_s = float(p["a"]), float(p["v"]), float(p.get("duration", 0.0))
-        if (code := self._admit(acc, speed, float(p.get("blend_radius", 0.0)))) != ReturnCode.OK:
-            return code
-        if inverse(matrix_of(target) @ np.linalg.inv(self.tool()), self.motion.near) is None:
-            return self._out_of_reach()
-        added = self.motion.add(target, speed * 1e3, acc * 1e3, self.now_s(), duration_s)
-        return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
-
-    def move_joint(self, p: Params) -> int:
-        """Queue a joint move, or refuse it; joints beyond their limits are accepted and fail in planning."""
-        q = [float(v) for v in p["q"]]
-        acc, speed, duration_s = float(p["a"]), float(p["v"]), float(p.get("duration", 0.0))
-        if len(q) != 6 or not all(math.isfinite(v) for v in q):
-            return -ReturnCode.INVALID_ARGUMENT
-        if (code := self._admit(acc, speed, float(p.get("blend_radius", 0.0)))) != ReturnCode.OK:
-            return code
-        if any(abs(v) > math.radians(limit) for v, limit in zip(q, LIMITS_DEG, strict=True)):
-            return self._out_of_reach()
-        self.joints()
-        joints = (q[0], q[1], q[2], q[3], q[4], q[5])
-        added = self.motion.add_joints(joints, self.tool(), speed, acc, self.now_s(), duration_s)
-        return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
 
     def stop(self, acc_m_s2: float, acc_rad_s2: float) -> int:
         """Decelerate and forget the path."""
@@ -192,17 +198,3 @@ class Cabinet:
                 self.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2)
             case _:
                 self.safety_stop(SafetyMode.PROTECTIVE_STOP)
-
-    def _admit(self, acc: float, speed: float, blend_m: float) -> int:
-        if self.power.mode != RobotMode.RUNNING:
-            return -1
-        if self.power.safety not in MOVING_ALLOWED:
-            return ReturnCode.BAD_STATE
-        if not (acc > 0.0 and speed > 0.0) or not (blend_m == 0.0 or 0.001 <= blend_m <= 1.0):
-            return -ReturnCode.INVALID_ARGUMENT
-        return ReturnCode.QUEUE_FULL if self.motion.full else ReturnCode.OK
-
-    def _out_of_reach(self) -> int:
-        self.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2)
-        self.tell(POSE_OUT_OF_REACH)
-        return ReturnCode.OK

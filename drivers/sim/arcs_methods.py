@@ -6,13 +6,17 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from drivers.arcs.codes import LOOPBACK_CONTROL_BOX, MOVING_ALLOWED, ReturnCode
+from drivers.arcs.codes import LOOPBACK_CONTROL_BOX, MOVING_ALLOWED, ReturnCode, RobotMode
 from drivers.geometry import to_wire
 from drivers.sim.arcs_cabinet import ROBOT, SOFT_STOP_M_S2, Cabinet
-from drivers.sim.kinematics import A_M, ALPHA_DEG, D_M, LIMITS_DEG, THETA_DEG
+from drivers.sim.arcs_limits import tables
+from drivers.sim.arcs_moves import Moves
+from drivers.sim.arcs_refused import CABINET_METHODS, ROBOT_METHODS, refusals
+from drivers.sim.arcs_steering import Steering
 
 INTERFACE_VERSION = 24000
 CONTROL_SOFTWARE_VERSION = 31001
+SOFTWARE_VERSION = f"0.31.1-{LOOPBACK_CONTROL_BOX}"
 OPERATIONAL_MODES = ("Disabled", "Automatic", "Manual")
 
 Params = dict[str, Any]
@@ -21,14 +25,18 @@ Table = dict[str, Callable[[Params], Any]]
 
 def methods(cabinet: Cabinet) -> Table:
     """Every method that the controller knows; each takes named params and returns what goes on the wire."""
-    table = _of_the_robot(cabinet) | _motion(cabinet) | cabinet.io.methods()
-    return {f"{ROBOT}.{name}": method for name, method in table.items()} | _of_the_controller(cabinet)
+    table = refusals(ROBOT_METHODS) | _of_the_robot(cabinet) | _of_the_state(cabinet) | tables() | cabinet.io.methods()
+    table |= Moves(cabinet).methods() | Steering(cabinet).methods()
+    whole = {f"{ROBOT}.{name}": method for name, method in table.items()}
+    return whole | refusals(CABINET_METHODS) | _of_the_controller(cabinet)
 
 
 def _of_the_controller(cabinet: Cabinet) -> Table:
     return {
         "SystemInfo.getInterfaceVersionCode": lambda _: INTERFACE_VERSION,
         "SystemInfo.getControlSoftwareVersionCode": lambda _: CONTROL_SOFTWARE_VERSION,
+        "SystemInfo.getControlSoftwareFullVersion": lambda _: SOFTWARE_VERSION,
+        "SystemInfo.getControlSystemTime": lambda _: int(cabinet.now_s() * 1e9),
         "getRobotNames": lambda _: [ROBOT],
         "getAxisNames": lambda _: [],
         "RuntimeMachine.abort": lambda _: cabinet.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2),
@@ -55,15 +63,10 @@ def _of_the_robot(cabinet: Cabinet) -> Table:
         "RobotConfig.getName": lambda _: ROBOT,
         "RobotConfig.getDof": lambda _: 6,
         "RobotConfig.getCycletime": lambda _: 0.005,
-        "RobotConfig.getJointMaxPositions": lambda _: [math.radians(v) for v in LIMITS_DEG],
-        "RobotConfig.getJointMinPositions": lambda _: [-math.radians(v) for v in LIMITS_DEG],
-        "RobotConfig.getKinematicsParam": lambda _: {
-            "a": A_M,
-            "alpha": [math.radians(v) for v in ALPHA_DEG],
-            "beta": [0.0] * 6,
-            "d": D_M,
-            "theta": [math.radians(v) for v in THETA_DEG],
-        },
+        "RobotConfig.hasTcpForceSensor": lambda _: False,
+        "RobotConfig.getTcpForceSensorNames": lambda _: [],
+        "RobotConfig.hasBaseForceSensor": lambda _: False,
+        "RobotConfig.getBaseForceSensorNames": lambda _: [],
         "RobotConfig.setTcpOffset": lambda p: _set_tcp_offset(cabinet, p),
         "RobotConfig.getTcpOffset": lambda _: cabinet.tcp_offset,
         "RobotConfig.setPayload": lambda p: _set_payload(cabinet, p),
@@ -77,40 +80,43 @@ def _of_the_robot(cabinet: Cabinet) -> Table:
         "RobotManage.setOperationalMode": lambda p: _set_operational_mode(cabinet, p),
         "RobotManage.setUnlockProtectiveStop": lambda _: power.unlock(),
         "RobotManage.restartInterfaceBoard": lambda _: power.restart_interface_board(),
-        "RobotState.getRobotModeType": lambda _: power.mode.value,
-        "RobotState.getSafetyModeType": lambda _: power.safety.value,
-        "RobotState.isPowerOn": lambda _: power.on,
-        "RobotState.isCollisionOccurred": lambda _: power.collision,
-        "RobotState.isWithinSafetyLimits": lambda _: power.safety in MOVING_ALLOWED,
-        "RobotState.isSteady": lambda _: cabinet.motion.steady(cabinet.now_s()),
-        "RobotState.getTcpPose": lambda _: to_wire(cabinet.world.tool()),
-        "RobotState.getToolPose": lambda _: to_wire(cabinet.flange()),
-        "RobotState.getActualTcpOffset": lambda _: cabinet.tcp_offset,
-        "RobotState.getJointPositions": lambda _: cabinet.joints(),
-        "RobotState.getTcpForce": lambda _: cabinet.force(),
-        "RobotAlgorithm.forwardKinematics": lambda p: cabinet.fk(p["q"], tip=True),
-        "RobotAlgorithm.forwardToolKinematics": lambda p: cabinet.fk(p["q"], tip=False),
-        "RobotAlgorithm.inverseKinematics": lambda p: cabinet.ik(_floats(p["qnear"], 6), p["pose"]),
+        "RobotManage.getRobotControlMode": lambda _: control_mode(cabinet),
+        # No arm is behind this controller.
+        "RobotManage.isSimulationEnabled": lambda _: True,
+        "RobotManage.isFreedriveEnabled": lambda _: False,
+        "RobotManage.isBackdriveEnabled": lambda _: False,
+        "RobotManage.isLinkModeEnabled": lambda _: False,
+        "ForceControl.isFcEnabled": lambda _: False,
+        "ForceControl.fcDisable": lambda _: ReturnCode.OK,
         "Trace.peek": lambda p: _peek(cabinet, int(p["num"]), int(p.get("last_time", 0))),
         "Trace.textmsg": lambda _: ReturnCode.OK,
     }
 
 
-def _motion(cabinet: Cabinet) -> Table:
-    motion, now_s = cabinet.motion, cabinet.now_s
+def _of_the_state(cabinet: Cabinet) -> Table:
+    power, motion, now_s = cabinet.power, cabinet.motion, cabinet.now_s
     return {
-        "MotionControl.getExecId": lambda _: motion.exec_id(now_s()),
-        "MotionControl.getQueueSize": lambda _: _queue_size(cabinet),
-        "MotionControl.getTrajectoryQueueSize": lambda _: _queue_size(cabinet),
-        "MotionControl.moveLine": cabinet.move_line,
-        "MotionControl.moveJoint": cabinet.move_joint,
-        "MotionControl.stopLine": lambda p: cabinet.stop(float(p["acc"]), float(p["acc_rot"])),
-        "MotionControl.stopJoint": lambda p: cabinet.stop(SOFT_STOP_M_S2, float(p["acc"])),
-        "MotionControl.clearPath": lambda _: cabinet.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2),
-        "MotionControl.stopMove": lambda _: cabinet.hold(),
-        "MotionControl.startMove": lambda _: cabinet.resume(),
-        "MotionControl.setSpeedFraction": lambda p: cabinet.set_speed_fraction(float(p["fraction"])),
-        "MotionControl.getSpeedFraction": lambda _: motion.fraction,
+        "RobotState.getRobotModeType": lambda _: power.mode.value,
+        "RobotState.getSafetyModeType": lambda _: power.safety.value,
+        "RobotState.isPowerOn": lambda _: power.on,
+        "RobotState.isCollisionOccurred": lambda _: power.collision,
+        "RobotState.isWithinSafetyLimits": lambda _: power.safety in MOVING_ALLOWED,
+        "RobotState.isSteady": lambda _: motion.steady(now_s()),
+        "RobotState.getTcpPose": lambda _: to_wire(cabinet.tcp()),
+        "RobotState.getToolPose": lambda _: to_wire(cabinet.flange()),
+        "RobotState.getActualTcpOffset": lambda _: cabinet.tcp_offset,
+        "RobotState.getJointPositions": lambda _: cabinet.joints(),
+        "RobotState.getJointTargetPositions": lambda _: cabinet.joints(),
+        "RobotState.getJointState": lambda _: [joint_state(power.mode)] * 6,
+        "RobotState.getTcpTargetPose": lambda _: to_wire(cabinet.tcp()),
+        "RobotState.getTargetTcpPose": lambda _: to_wire(cabinet.configured(motion.ends(now_s()))),
+        "RobotState.getTcpSpeed": lambda _: cabinet.tcp_speed(),
+        "RobotState.getJointSpeeds": lambda _: motion.joint_velocity(now_s()),
+        "RobotState.getTcpForce": lambda _: cabinet.force(),
+        "RobotAlgorithm.forwardKinematics": lambda p: cabinet.fk(p["q"], tip=True),
+        "RobotAlgorithm.forwardToolKinematics": lambda p: cabinet.fk(p["q"], tip=False),
+        "RobotAlgorithm.inverseKinematics": lambda p: cabinet.ik(_floats(p["qnear"], 6), p["pose"]),
+        "RobotAlgorithm.inverseToolKinematics": lambda p: cabinet.ik(_floats(p["qnear"], 6), p["pose"], tip=False),
     }
 
 
@@ -119,9 +125,18 @@ def runtime_state(cabinet: Cabinet) -> str:
     return "Paused" if cabinet.motion.held else "Stopped"
 
 
-def _queue_size(cabinet: Cabinet) -> int:
-    cabinet.motion.advance(cabinet.now_s())
-    return cabinet.motion.size
+def control_mode(cabinet: Cabinet) -> str:
+    """How the arm is controlled, in the maker's words."""
+    if cabinet.servo_mode:
+        return "Servo"
+    return "Speed" if cabinet.motion.drifting(cabinet.now_s()) else "Position"
+
+
+def joint_state(mode: RobotMode) -> str:
+    """What every joint says of itself in a robot mode."""
+    if mode in {RobotMode.POWER_ON, RobotMode.IDLE, RobotMode.BRAKE_RELEASING}:
+        return "Idle"
+    return "Running" if mode == RobotMode.RUNNING else "Poweroff"
 
 
 def _floats(values: Any, count: int) -> list[float]:

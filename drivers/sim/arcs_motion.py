@@ -1,8 +1,4 @@
-"""The loopback controller's trajectory queue: lines and joint moves that can be held, resumed and slowed down.
-
-It takes over the world's own queue when a controller is put in charge of the arm. Blending is accepted and not done:
-every segment ends at rest.
-"""
+"""The arm's queue as a controller knows it: moves in joints, circles and splines, held paths."""
 
 from __future__ import annotations
 
@@ -11,234 +7,223 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from drivers.geometry import distance
 from drivers.samples import Pose
-from drivers.sim.kinematics import HOME, Joints, Matrix, forward, inverse, matrix_of, pose_of
-from drivers.sim.motion import ROTATION_AS_LINEAR_MM, SAME_POSE_DEG, SAME_POSE_MM, MotionQueue, Ramp, Segment
+from drivers.sim.curves import Arc, Spline
+from drivers.sim.kinematics import Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
+from drivers.sim.motion import SAME_POSE_DEG, SAME_POSE_MM, MotionQueue
+from drivers.sim.paths import JointLine, Part, Path, fixed
+from drivers.sim.plan import Move
 
 SAME_JOINT_RAD = 1e-6
-STRETCHES = 16
-"""Straight pieces that a joint move is told to the world in."""
+DT_S = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
-    """One accepted move, before anything is known of when it begins. Speeds in mm and s, or rad and s for joints."""
+class Pace:
+    """How fast a move goes: speed and acceleration in mm and s, or rad and s, and the time it takes at least."""
 
-    ident: int
-    target: Pose
     speed: float
     acc: float
-    duration_s: float
-    joints: Joints | None = None
-    tool: Matrix | None = None
-    """Flange to tip, for joint moves."""
-
-
-@dataclass(frozen=True, slots=True)
-class JointSegment(Segment):
-    """A move that is straight in joint space."""
-
-    from_joints: Joints = HOME
-    to_joints: Joints = HOME
-    tool: Matrix | None = None
-
-    def joints(self, now_s: float) -> Joints:
-        """The joints at `now_s`."""
-        share = self.share(now_s)
-        q = [a + share * (b - a) for a, b in zip(self.from_joints, self.to_joints, strict=True)]
-        return (q[0], q[1], q[2], q[3], q[4], q[5])
-
-    def share(self, now_s: float) -> float:
-        """How much of the way is done at `now_s`, 0 to 1."""
-        if not self.ramp.length:
-            return 1.0
-        done, speed = self.ramp.at((now_s if self.stop_s is None else min(now_s, self.stop_s)) - self.begin_s)
-        if self.stop_s is not None and now_s > self.stop_s:
-            dt = min(now_s, self.end_s) - self.stop_s
-            done += speed * dt - 0.5 * self.stop_acc * dt * dt
-        return min(done / self.ramp.length, 1.0)
-
-    def pose(self, now_s: float) -> Pose:
-        """Where the tip is at `now_s`."""
-        flange = forward(self.joints(now_s))
-        return pose_of(flange if self.tool is None else flange @ self.tool)
+    duration_s: float = 0.0
+    blend_mm: float = 0.0
 
 
 class ArmQueue(MotionQueue):
-    """A `MotionQueue` that can also hold its path, resume it, and run what has not begun at a fraction of its speed."""
+    """A `MotionQueue` that knows joints, and can hold its path and go on with it. `tool` is the true flange to tip."""
 
-    def __init__(self, home: Pose, on_path: Callable[[Pose, Pose], None], capacity: int = 64) -> None:
+    def __init__(
+        self, home: Pose, on_path: Callable[[Pose, Pose], None], tool: Matrix | None = None, capacity: int = 64
+    ) -> None:
         super().__init__(home, on_path, capacity)
-        self.fraction = 1.0
-        self._next_id: int = 0
-        self.near: Joints = HOME
-        """The joints where the arm was last seen: where inverse kinematics begins."""
-        self._commands: dict[int, Command] = {}
-        self._held: list[Command] | None = None
-
-    @classmethod
-    def instead_of(cls, queue: MotionQueue) -> ArmQueue:
-        """Take over from a queue in which nothing is under way."""
-        return cls(queue._rest, queue._on_path, queue._capacity)  # pyright: ignore[reportPrivateUsage]
-
-    @property
-    def full(self) -> bool:
-        """True when another move would be refused."""
-        return self.size >= self._capacity
+        self.tool: Matrix = np.eye(4) if tool is None else tool
+        self._held: list[Move] | None = None
+        self._spline: list[Joints] = []
 
     @property
     def size(self) -> int:
         """Moves that are queued, running or held; one that decelerates into a hold counts once."""
-        return len(self._held) if self._held is not None else len(self._queue)
+        return len(self._held) if self._held is not None else super().size
 
     @property
     def held(self) -> bool:
         """True between `hold` and `resume`, also where nothing was under way."""
         return self._held is not None
 
-    def add(self, target: Pose, speed_mm_s: float, acc_mm_s2: float, now_s: float, duration_s: float = 0.0) -> bool:
-        """Append a line; False where the target is where the last move ends."""
+    def add_joints(self, joints: Joints, pace: Pace, now_s: float) -> bool:
+        """Append a move that is straight in joints; False where the arm will be there already."""
         self.advance(now_s)
-        travel_mm, turn_deg = distance(self._last(), target)
-        if travel_mm <= SAME_POSE_MM and turn_deg <= SAME_POSE_DEG:
-            return False
-        self._append(Command(self._next_id, target, speed_mm_s, acc_mm_s2, duration_s), now_s)
-        return True
-
-    def add_joints(
-        self, joints: Joints, tool: Matrix, speed_rad_s: float, acc_rad_s2: float, now_s: float, duration_s: float = 0.0
-    ) -> bool:
-        """Append a joint move; False where the arm will be there already."""
-        self.advance(now_s)
-        target = pose_of(forward(joints) @ tool)
+        target = pose_of(forward(joints) @ self.tool)
         travel_mm, turn_deg = distance(self._last(), target)
         idle = not self._queue and not self._held
         turned = max(abs(a - b) for a, b in zip(joints, self.near, strict=True))
         if travel_mm <= SAME_POSE_MM and turn_deg <= SAME_POSE_DEG and (not idle or turned <= SAME_JOINT_RAD):
             return False
-        command = Command(self._next_id, target, speed_rad_s, acc_rad_s2, duration_s, joints, tool)
-        self._append(command, now_s)
+        self._append(_move(self._next_id, JointLine(self._last_joints(), joints, self.tool), pace), now_s)
         return True
 
-    def advance(self, now_s: float) -> None:
-        """Retire every segment that is over by `now_s`."""
-        while self._queue and self._queue[0].end_s <= now_s:
-            segment = self._queue.popleft()
-            # A path that was held and resumed has its last part still to come, under the same id.
-            if segment.ident not in (c.ident for c in (*self._queue, *(self._held or ()))):
-                self._commands.pop(segment.ident, None)
-            final = segment.pose(segment.end_s)
-            self._rest, self._rest_since_s = final, segment.end_s
-            pieces = 1
-            if isinstance(segment, JointSegment):
-                self.near, pieces = segment.joints(segment.end_s), STRETCHES
-            span_s = segment.end_s - segment.begin_s
-            way = [segment.start, *(segment.pose(segment.begin_s + span_s * k / pieces) for k in range(1, pieces))]
-            for a, b in zip(way, [*way[1:], final], strict=True):
-                self._on_path(a, b)
+    def add_arc(self, via: Pose, end: Pose, mode: int, fix: Matrix | None, pace: Pace, now_s: float) -> None:
+        """Append a circle through `via` to `end`. Raises ValueError where there is none.
+
+        On a circle of radius r the speed stays below sqrt(acc r), so that the bend needs no more than `acc`.
+        """
+        self.advance(now_s)
+        start = self._last() if fix is None else fixed(self._last(), inverted(fix))
+        arc = Arc(start, via, end, mode, fix)
+        speed = min(pace.speed, math.sqrt(pace.acc * arc.radius_mm))
+        self._append(_move(self._next_id, arc, replace(pace, speed=speed, blend_mm=0.0)), now_s)
+
+    def spline_through(self, joints: Joints, now_s: float) -> None:
+        """Note a point for `add_spline`."""
+        self.advance(now_s)
+        if joints != (self._spline[-1] if self._spline else None):
+            self._spline.append(joints)
+
+    def add_spline(self, pace: Pace, now_s: float) -> bool:
+        """Append the spline through the points noted since the last one; False where there are none."""
+        self.advance(now_s)
+        points, self._spline = [self._last_joints(), *self._spline], []
+        if len(points) > 1 and max(abs(a - b) for a, b in zip(points[0], points[1], strict=True)) <= SAME_JOINT_RAD:
+            del points[0]
+        if len(points) < 2:
+            return False
+        spline = Spline(points, self.tool)
+        speed = pace.speed / spline.steepest
+        if spline.sharpest > 0.0:
+            speed = min(speed, math.sqrt(pace.acc / spline.sharpest))
+        acc = pace.acc / spline.steepest
+        self._append(_move(self._next_id, spline, replace(pace, speed=speed, acc=acc, blend_mm=0.0)), now_s)
+        return True
 
     def stop(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
-        """Decelerate on the current segment and forget the rest, held or not; this ends a hold."""
+        """Decelerate on the path and forget the rest, held or not; this ends a hold."""
         super().stop(acc_mm_s2, acc_rad_s2, now_s)
-        self._held = None
-        self._commands = {s.ident: self._commands[s.ident] for s in self._queue if s.ident in self._commands}
+        self._held, self._spline = None, []
 
     def hold(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
-        """Decelerate on the current segment and keep the path; its id stays the one that is executed."""
+        """Decelerate on the path and keep it; the id stays that of the move in which the arm comes to rest."""
         self.advance(now_s)
         if self._held is not None:
             return
-        # A segment that was already stopped has forgotten where it was going.
-        going = [s for s in self._queue if s.stop_s is None]
-        self._held = [self._commands[s.ident] for s in going]
-        super().stop(acc_mm_s2, acc_rad_s2, now_s)
+        moves, planned = self._moves, list(self._queue)
+        resting = self._brake(acc_mm_s2, acc_rad_s2, now_s)
+        # what was already braking has forgotten where it was going; what was queued behind it has not begun
+        self._held = moves if resting is None else []
+        if resting is None:
+            return
+        segment, done = resting
+        rest = next((i for i, m in enumerate(moves) if m.ident == segment.ident), None)
+        if rest is None:
+            return  # speed or servo motion: there is no path to keep
+        move = moves[rest]
+        if segment.corner:
+            after = next(s.enter for s in planned if s.ident == segment.ident and not s.corner)
+            rest_of_it = Part(segment.path, segment.enter + done)
+            first = replace(move, lead=(rest_of_it, segment.ramp.speed), enter=after)
+        else:
+            first = replace(move, enter=segment.enter + done, lead=None, held=True)
+        self._held = [first, *moves[rest + 1 :]]
 
     def resume(self, now_s: float) -> None:
         """Go on with the path that was held, from where the arm came to rest."""
         self.advance(now_s)
-        held, self._held = self._held or [], None
-        for command in held:
-            self._plan(command, now_s)
+        held, self._held = self._held, None
+        if held:
+            self._moves = [*self._moves, *held]
+            self._replan(0, now_s)
 
     def set_fraction(self, fraction: float, now_s: float) -> None:
         """Run every move that has not begun at this share of its speed, 0 to 1."""
         self.advance(now_s)
         self.fraction = fraction
-        waiting = [self._commands[s.ident] for s in list(self._queue)[1:]]
-        while len(self._queue) > 1:
-            self._queue.pop()
-        for command in waiting:
-            self._plan(command, now_s)
+        begun = {s.ident for s in self._queue if s.begin_s <= now_s}
+        first = next((i for i, m in enumerate(self._moves) if m.ident not in begun), len(self._moves))
+        self._replan(first, now_s)
 
     def exec_id(self, now_s: float) -> int:
-        """Id of the running segment, or of the one that is held; -1 when there is none."""
+        """Id of the running move, or of the one that is held; -1 when there is none."""
         ident = super().exec_id(now_s)
         return self._held[0].ident if ident == -1 and self._held else ident
 
-    def joints(self, now_s: float) -> Joints | None:
-        """The joints, where the running segment is a joint move."""
+    def joints(self, now_s: float) -> Joints:
+        """The joints that put the tip where it is."""
         self.advance(now_s)
-        segment = self._queue[0] if self._queue else None
-        return segment.joints(now_s) if isinstance(segment, JointSegment) else None
+        exact = self._queue[0].joints(now_s) if self._queue else None
+        return exact or self.near_joints(self.pose(now_s))
 
-    def _last(self) -> Pose:
-        """Where the last accepted move ends."""
-        if self._held:
-            return self._held[-1].target
-        return self._queue[-1].rest if self._queue else self._rest
+    def blending(self, now_s: float) -> bool:
+        """True in a corner between two moves."""
+        self.advance(now_s)
+        return bool(self._queue) and self._queue[0].corner
 
-    def _append(self, command: Command, now_s: float) -> None:
-        self._next_id += 1
-        self._commands[command.ident] = command
-        if self._held is not None:
-            self._held.append(command)
-        else:
-            self._plan(command, now_s)
+    def progress(self, now_s: float) -> float:
+        """Share of the running move that is done, 0 to 1; 0 at rest."""
+        self.advance(now_s)
+        if not self._queue:
+            return 0.0
+        front = self._queue[0]
+        done = front.enter + front.at(now_s)[0]
+        # half of a corner lies on the move before
+        whole = next((s.path for s in self._queue if s.ident == front.ident and not s.corner), front.path)
+        return (0.5 * done if front.corner else done) / whole.length if whole.length else 0.0
 
-    def _plan(self, command: Command, now_s: float) -> None:
-        before = self._queue[-1] if self._queue else None
-        start, begin_s = (before.rest, before.end_s) if before else (self._rest, now_s)
-        speed, acc = command.speed * self.fraction, command.acc
-        if command.joints is None:
-            travel_mm, turn_deg = distance(start, command.target)
-            turn_rad = math.radians(turn_deg)
-            if travel_mm < ROTATION_AS_LINEAR_MM and turn_rad > 1e-4:
-                ramp = Ramp(turn_rad, speed / 1e3, acc / 1e3, angular=True)
-            else:
-                ramp = Ramp(travel_mm, speed, acc)
-            ramp = _stretched(ramp, command.duration_s)
-            self._queue.append(Segment(command.ident, start, command.target, ramp, begin_s))
-            return
-        origin = before.joints(before.end_s) if isinstance(before, JointSegment) else self.seen(start, command.tool)
-        length = max(abs(a - b) for a, b in zip(command.joints, origin, strict=True))
-        ramp = _stretched(Ramp(length, speed, acc, angular=True), command.duration_s)
-        self._queue.append(
-            JointSegment(
-                command.ident,
-                start,
-                command.target,
-                ramp,
-                begin_s,
-                from_joints=origin,
-                to_joints=command.joints,
-                tool=command.tool,
-            )
-        )
+    def times(self, ident: int, now_s: float) -> tuple[float, float]:
+        """(from the first piece that a move still has to its end, from now to its end) in s; zeros where it is over."""
+        self.advance(now_s)
+        mine = [s for s in self._queue if s.ident == ident]
+        return (mine[-1].end_s - mine[0].begin_s, mine[-1].end_s - now_s) if mine else (0.0, 0.0)
 
-    def seen(self, tip: Pose, tool: Matrix | None) -> Joints:
+    def velocity(self, now_s: float) -> tuple[float, ...]:
+        """[mm/s x3, rad/s x3] of the tip in the base frame, over the next millisecond."""
+        self.advance(now_s)
+        if not self._queue:
+            return (0.0,) * 6
+        front = self._queue[0]
+        a, b = front.pose(now_s), front.pose(now_s + DT_S)
+        turn = Rotation.from_quat(b.quaternion) * Rotation.from_quat(a.quaternion).inv()
+        way = np.subtract(b.position_mm, a.position_mm)
+        return tuple(float(v) / DT_S for v in (*way, *turn.as_rotvec()))
+
+    def joint_velocity(self, now_s: float) -> tuple[float, ...]:
+        """Of every joint in rad/s, over the next millisecond."""
+        self.advance(now_s)
+        if not self._queue:
+            return (0.0,) * 6
+        front, later_s = self._queue[0], now_s + DT_S
+        a = self.joints(now_s)
+        b = front.joints(later_s) or self.near_joints(front.pose(later_s))
+        return tuple((q - p) / DT_S for p, q in zip(a, b, strict=True))
+
+    def ends(self, now_s: float) -> Pose:
+        """Where the running move ends; where the arm is, at rest."""
+        self.advance(now_s)
+        return next((m.path.pose(m.path.length) for m in (*(self._held or ()), *self._moves)), self.pose(now_s))
+
+    def near_joints(self, tip: Pose) -> Joints:
         """The joints for a tip pose, near those seen last; those themselves where no solution is found."""
-        flange = matrix_of(tip)
-        if tool is not None:
-            flange = flange @ np.linalg.inv(tool)
-        self.near = inverse(flange, self.near) or self.near
+        self.near = inverse(matrix_of(tip) @ inverted(self.tool), self.near) or self.near
         return self.near
 
+    def _last(self) -> Pose:
+        return self._held[-1].path.pose(self._held[-1].path.length) if self._held else super()._last()
 
-def _stretched(ramp: Ramp, duration_s: float) -> Ramp:
-    """The ramp slowed down to last `duration_s`; a duration can lengthen a move and never shorten it."""
-    if duration_s <= ramp.duration_s or ramp.length == 0.0:
-        return ramp
-    lead = ramp.acc * duration_s
-    return replace(ramp, speed=0.5 * (lead - math.sqrt(max(lead * lead - 4.0 * ramp.acc * ramp.length, 0.0))))
+    def _last_joints(self) -> Joints:
+        path = (self._held or self._moves)[-1].path if self._held or self._moves else None
+        if path is not None:
+            exact = path.joints(path.length)
+        else:
+            exact = self._queue[-1].joints(self._queue[-1].end_s) if self._queue else None
+        return exact or self.near_joints(self._last())
+
+    def _append(self, move: Move, now_s: float) -> None:
+        if self._held is None:
+            super()._append(move, now_s)
+        else:
+            self._next_id += 1
+            self._held.append(move)
+
+
+def _move(ident: int, path: Path, pace: Pace) -> Move:
+    return Move(ident, path, pace.speed, pace.acc, pace.duration_s, pace.blend_mm)

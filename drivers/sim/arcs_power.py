@@ -66,6 +66,20 @@ class Power:
         self.safety, self.button_down = mode, True
         self._then((0.0, RobotMode.POWER_OFF))
 
+    def release_emergency_stop(self) -> None:
+        """A person releases the button. That alone brings nothing back: the board is restarted, then the power."""
+        self.button_down = False
+
+    def reset_safeguard(self) -> None:
+        """A person closes the safeguard and resets it at its own input; no method on the wire does."""
+        if self.safety == SafetyMode.SAFEGUARD_STOP:
+            self.safety = SafetyMode.NORMAL
+
+    def reduce(self, reduced: bool) -> None:
+        """The input for reduced mode opens or closes; a stop of any kind outlasts it."""
+        if self.safety in MOVING_ALLOWED:
+            self.safety = SafetyMode.REDUCED if reduced else SafetyMode.NORMAL
+
     def unlock(self) -> int:
         """Clear a protective stop, collision included; nothing else. The arm does not go on by itself."""
         if self.safety != SafetyMode.PROTECTIVE_STOP:

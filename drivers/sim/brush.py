@@ -109,6 +109,15 @@ class Brush:
         spine = self._spine(float(depth_mm), float(tilt_deg))
         return print_footprint(spine, self._tuft(press_seed, trouble), ink_load, px_per_mm, self._paper(press_seed))
 
+    def deepest_mm(self, tilt_deg: float) -> float:
+        """Where the ferrule is about to hit the paper."""
+        return MAX_DEPTH * self.spec.length_mm * math.cos(math.radians(min(tilt_deg, MAX_TILT_DEG)))
+
+    def push_n(self, depth_mm: float, tilt_deg: float) -> Vector:
+        """Normal force in N at equally spaced depths from 0 to `depth_mm`, on the way down."""
+        path = press_spine(self._bundle, depth_mm, math.radians(tilt_deg))
+        return np.array([0.0, *(float(shape.normal_n.sum()) for shape in path)])
+
     def drag(
         self,
         path: Sequence[Waypoint],
@@ -146,8 +155,7 @@ class Brush:
         _within("ink_load", ink_load, 0.0, 1.0)
         _within("px_per_mm", px_per_mm, 2.0, 40.0)
         _within("press_seed", press_seed, 0, 2**63 - 1)
-        deepest = MAX_DEPTH * self.spec.length_mm * math.cos(math.radians(tilt_deg))
-        _within("depth_mm", depth_mm, -math.inf, deepest)
+        _within("depth_mm", depth_mm, -math.inf, self.deepest_mm(tilt_deg))
 
     # two streams, so that the paper does not shift when the number of bristles changes
     def _tuft(self, press_seed: int, trouble: Trouble | None) -> Tuft:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 from drivers.sim.brush import BrushSpec
 
@@ -16,6 +18,9 @@ class Table:
     yaw_deg: float = 90.0
     """From base x to paper x. Not zero, so that a forgotten rotation shows at once."""
     paper_z_mm: float = 120.0
+    """Of the sheet at its origin; the well stands at this height too."""
+    slope_deg: tuple[float, float] = (0.0, 0.0)
+    """How the sheet is turned about paper x (its far edge rises) and about paper y (its right edge falls)."""
     sheet_mm: tuple[float, float] = (244.0, 172.0)
     board_origin_mm: tuple[float, float] = (-34.0, -34.0)
     """Lower left corner of the ChArUco board, in the paper frame. The sheet lies on it, so that corners are seen all
@@ -27,8 +32,26 @@ class Table:
     well_mm: tuple[float, float] = (305.0, 20.0)
     """Centre of the ink well, in the paper frame."""
     well_radius_mm: float = 15.0
+    well_depth_mm: float = 14.0
+    """From its bottom, which stands on the table at the height of the paper, to its rim."""
     ink_level_mm: float = 10.0
-    """Ink surface above the paper plane."""
+    """Ink surface above the paper plane when the rig starts."""
+
+    @property
+    def normal(self) -> tuple[float, float, float]:
+        """Unit vector out of the sheet, in the paper frame (whose z is the base frame's)."""
+        about_x, about_y = (math.tan(math.radians(v)) for v in self.slope_deg)
+        length = math.sqrt(1.0 + about_x**2 + about_y**2)
+        return about_y / length, -about_x / length, 1.0 / length
+
+    def surface_z_mm(self, x_mm: float, y_mm: float) -> float:
+        """Height of the sheet at a point of the paper frame, in the base frame."""
+        nx, ny, nz = self.normal
+        return self.paper_z_mm - (nx * x_mm + ny * y_mm) / nz
+
+    def above_mm(self, x_mm: float, y_mm: float, z_mm: float) -> float:
+        """Distance from the sheet along its normal; negative below."""
+        return (z_mm - self.surface_z_mm(x_mm, y_mm)) * self.normal[2]
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +72,12 @@ class View:
     """Fall-off of the light toward one corner."""
     shadow: float = 0.0
     """Light that a soft-edged shadow across the sheet takes away, 0 to 1."""
+    glare: float = 0.0
+    """Gray levels that the reflection of a lamp adds where it is brightest; wet ink throws it back as paper does."""
+    glare_mm: tuple[float, float] = (122.0, 86.0)
+    """Where it lies, in the paper frame."""
+    glare_sigma_mm: float = 6.0
+    """Standard deviation of its bell."""
     k1: float = 0.0
     """Radial distortion in OpenCV's model with a focal length of one image width; none until calibration undoes it."""
     blur_px: float = 0.7
@@ -69,8 +98,25 @@ class SimConfig:
     """0 lets the system choose."""
     rtde_port: int = 0
     camera_port: int = 0
+    force_port: int = 0
     home_mm: tuple[float, float, float] = (250.0, -230.0, 260.0)
     """Where the tip rests when the rig starts, in the base frame."""
+    ink_device: Literal["station", "pump", "none"] = "station"
+    """What stands at the well: an ink station, a Modbus pump, or a person with a bottle."""
+    reservoir_ml: float = 100.0
+    """What the ink device can still give."""
+    force_sensor: bool = True
+    """Whether a force sensor sits between flange and brush."""
+    force_hz: float = 200.0
+    """Rounds per real second."""
+    force_noise_n: float = 0.002
+    """Standard deviation of each round: a sensor of a few N, as a soft brush needs one."""
+    force_noise_nm: float = 2e-4
+    sensor_to_tip_mm: float = 180.0
+    hanging_kg: float = 0.12
+    """Holder and brush below the sensor."""
+    tool_mm: float = 180.0
+    """True length from the flange to the tip, along the flange's z: what an operator measures and configures."""
     brush: BrushSpec = field(default_factory=BrushSpec)
     table: Table = field(default_factory=Table)
     view: View = field(default_factory=View)

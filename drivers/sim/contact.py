@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,11 +22,8 @@ class Contact:
     """The path of the tip at and below the paper plane; straight lines between poses."""
 
     poses: tuple[Pose, ...]
-
-    @property
-    def deepest(self) -> Pose:
-        """The first of the lowest poses."""
-        return min(self.poses, key=lambda pose: pose.z_mm)
+    deepest: Pose
+    """The first of those farthest below the plane."""
 
     @property
     def dragged(self) -> bool:
@@ -34,26 +32,27 @@ class Contact:
 
 
 class ContactWatch:
-    """Collects finished stretches of the path until the brush lifts off the plane at `paper_z_mm`."""
+    """Collects finished stretches of the path until the brush lifts off the paper.
 
-    def __init__(self, paper_z_mm: float) -> None:
-        self._paper_z_mm = paper_z_mm
+    `above_mm` is the distance of a pose from the paper plane, negative below; it is linear in the position.
+    """
+
+    def __init__(self, above_mm: Callable[[Pose], float]) -> None:
+        self._above_mm = above_mm
         self._poses: list[Pose] = []
 
     def travelled(self, start: Pose, end: Pose) -> Contact | None:
         """Take one straight stretch; the contact that it ended, if it ended one."""
-        plane = self._paper_z_mm
-        if start.z_mm < plane or end.z_mm < plane:
+        high, low = self._above_mm(start), self._above_mm(end)
+        if high < 0.0 or low < 0.0:
             if not self._poses:
-                self._poses.append(start if start.z_mm < plane else self._crossing(start, end))
-            self._poses.append(end if end.z_mm < plane else self._crossing(start, end))
-        if end.z_mm < plane or not self._poses:
+                self._poses.append(start if high < 0.0 else interpolate(start, end, high / (high - low)))
+            self._poses.append(end if low < 0.0 else interpolate(start, end, high / (high - low)))
+        if low < 0.0 or not self._poses:
             return None
-        contact, self._poses = Contact(tuple(self._poses)), []
+        contact = Contact(tuple(self._poses), min(self._poses, key=self._above_mm))
+        self._poses = []
         return contact
-
-    def _crossing(self, start: Pose, end: Pose) -> Pose:
-        return interpolate(start, end, (self._paper_z_mm - start.z_mm) / (end.z_mm - start.z_mm))
 
 
 def _sideways_mm(a: Pose, b: Pose) -> float:

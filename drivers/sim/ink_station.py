@@ -8,13 +8,13 @@ import select
 import threading
 import tty
 from collections import deque
-from collections.abc import Callable
 from enum import StrEnum
 from types import TracebackType
 from typing import Protocol, Self
 
 from drivers.errors import ProtocolViolation
 from drivers.ink.line import number_of, seal, unseal
+from drivers.sim.well import Well
 
 GARBAGE = b"\xff\x00*\n\x86\x01ok 1*0000\n"
 BYTE_S = 0.001
@@ -78,10 +78,16 @@ class PtyLine:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """Join the thread and close the pty."""
+        """Close."""
+        self.close()
+
+    def close(self) -> None:
+        """Join the thread and close the pty; harmless where it was never opened."""
         self.unplug()
         for end in self._wake:
-            os.close(end)
+            if end >= 0:
+                os.close(end)
+        self._wake = (-1, -1)
 
     def fail(self, *faults: Fault) -> None:
         """Let the next requests meet these, one each."""
@@ -150,14 +156,12 @@ class StationFirmware:
         well_ml: float = 10.0,
         capacity_ml: float = 20.0,
         reservoir_ml: float = 100.0,
-        on_dose: Callable[[float], None] | None = None,
+        well: Well | None = None,
     ) -> None:
-        self.well_ml = well_ml
-        self.capacity_ml = capacity_ml
+        self.well = Well(well_ml, capacity_ml) if well is None else well
         self.reservoir_ml = reservoir_ml
         self.light = 0.0
         self.lid_open = True
-        self._on_dose = on_dose
         self._memory: tuple[bytes, bytes] = (b"", b"")
 
     def take(self, buffer: bytearray) -> bytes | None:
@@ -209,7 +213,7 @@ class StationFirmware:
                 self.lid_open = word == "open"
                 return "ok"
             case ["level"]:
-                return f"ok {min(1.0, self.well_ml / self.capacity_ml):.3f}"
+                return f"ok {self.well.share:.3f}"
             case _:
                 return "err 1 unknown command"
 
@@ -218,10 +222,8 @@ class StationFirmware:
             return "err 5 lid is closed"
         if volume_ml > self.reservoir_ml:
             return "err 4 reservoir is empty"
-        if self.well_ml + volume_ml > self.capacity_ml:
+        if self.well.ml + volume_ml > self.well.capacity_ml:
             return "err 3 well would overflow"
         self.reservoir_ml -= volume_ml
-        self.well_ml += volume_ml
-        if self._on_dose is not None:
-            self._on_dose(volume_ml)
+        self.well.add(volume_ml)
         return f"ok {volume_ml:.3f}"

@@ -116,3 +116,9 @@ def pose_of(matrix: Matrix) -> Pose:
     qx, qy, qz, qw = (float(v) for v in Rotation.from_matrix(matrix[:3, :3]).as_quat())
     x, y, z = (float(v) * 1e3 for v in matrix[:3, 3])
     return Pose(x, y, z, qx, qy, qz, qw)
+
+
+def inverted(matrix: Matrix) -> Matrix:
+    """The other way round."""
+    inverse_of: Matrix = np.linalg.inv(matrix).astype(np.float64)
+    return inverse_of

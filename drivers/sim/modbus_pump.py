@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 
@@ -16,12 +17,20 @@ class PumpFirmware:
     """Turns while it runs, by `now_s`; what it has pumped can be read at any time."""
 
     def __init__(
-        self, *, unit: int = 1, ml_per_revolution: float = 0.1, now_s: Callable[[], float] = time.monotonic
+        self,
+        *,
+        unit: int = 1,
+        ml_per_revolution: float = 0.1,
+        reservoir_ml: float = math.inf,
+        on_pumped: Callable[[float], None] = lambda _volume_ml: None,
+        now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self.unit = unit
         self.rpm = 0.0
         self.starts = 0
         self._ml_per_revolution = ml_per_revolution
+        self._reservoir_ml = reservoir_ml
+        self._on_pumped = on_pumped
         self._now_s = now_s
         self._run = STOP
         self._pumped_ml = 0.0
@@ -80,5 +89,8 @@ class PumpFirmware:
     def _settle(self) -> None:
         now_s = self._now_s()
         rpm = {STOP: 0.0, FULL_SPEED: MAX_RPM}.get(self._run, self.rpm)
-        self._pumped_ml += rpm / 60.0 * self._ml_per_revolution * (now_s - self._since_s)
+        turned_ml = rpm / 60.0 * self._ml_per_revolution * (now_s - self._since_s)
+        volume_ml = min(turned_ml, self._reservoir_ml - self._pumped_ml)  # an empty tube pumps air
+        self._pumped_ml += volume_ml
+        self._on_pumped(volume_ml)
         self._since_s = now_s

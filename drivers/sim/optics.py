@@ -22,6 +22,7 @@ class Optics:
     def __init__(self, view: View, seed: int) -> None:
         self.homography = homography(view)
         self.light = _light(view, np.random.default_rng([seed, 11]))
+        self.glare = _glare(view, self.homography) if view.glare else None
         f, cx, cy = float(view.width_px), (view.width_px - 1) / 2, (view.height_px - 1) / 2
         self.camera_matrix: Floats = np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
         self.distortion: Floats = np.array([view.k1, 0.0, 0.0, 0.0])
@@ -71,3 +72,11 @@ def _light(view: View, rng: np.random.Generator) -> NDArray[np.float32]:
     edge = rng.uniform(-0.1, 0.1)
     in_shadow = 1.0 / (1.0 + np.exp(-(across - edge) / SHADOW_SOFTNESS))
     return (slope * (1.0 - view.shadow * in_shadow)).astype(np.float32)
+
+
+def _glare(view: View, paper_to_image: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Gray levels (h, w) that a lamp's reflection adds; it is far larger than what the lens could bend."""
+    u, v, scale = paper_to_image @ np.array([*view.glare_mm, 1.0])
+    x, y = np.arange(view.width_px) - u / scale, np.arange(view.height_px)[:, None] - v / scale
+    sigma_px = view.glare_sigma_mm * view.px_per_mm
+    return (view.glare * np.exp(-0.5 * (x**2 + y**2) / sigma_px**2)).astype(np.float32)

@@ -2,14 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+from drivers.force.stream import LOOPBACK_CHANNEL
 from drivers.sim.config import SimConfig
 
 LOOPBACK_HEAD = "# The loopback rig"
 TAUGHT_TOUCH_ERROR_MM = 0.03
 """Nobody teaches a touch height exactly."""
+PUMP_ML = 0.1
+"""What one revolution of the loopback pump delivers."""
 
 
-def rig_toml(config: SimConfig, host: str, arcs_port: int, camera_port: int) -> str:
+@dataclass(frozen=True, slots=True)
+class Addresses:
+    """Where the devices of one rig are served."""
+
+    host: str
+    arcs_port: int
+    rtde_port: int
+    camera_port: int
+    force_port: int | None
+    ink_path: str | None
+
+
+def rig_toml(config: SimConfig, at: Addresses) -> str:
     """TOML text; addresses as served."""
     table, view, brush = config.table, config.view, config.brush
     touch_z_mm = table.paper_z_mm + TAUGHT_TOUCH_ERROR_MM
@@ -19,8 +36,9 @@ name = "loopback rig"
 
 [robot]
 kind = "aubo-arcs"
-host = "{host}"
-port = {arcs_port}
+host = "{at.host}"
+port = {at.arcs_port}
+rtde_port = {at.rtde_port}
 tcp_offset_mm = [0.0, 0.0, 180.0]
 
 [robot.limits]
@@ -33,7 +51,7 @@ acc_mm_s2 = 1000.0
 
 [camera]
 kind = "opencv"
-source = "http://{host}:{camera_port}/stream.mjpg"
+source = "http://{at.host}:{at.camera_port}/stream.mjpg"
 latency_ms = 250.0
 lens = "simulated, {view.px_per_mm:g} px/mm, no distortion"
 
@@ -56,7 +74,7 @@ touch_point_mm = [2.0, 2.0]
 name = "simulated ink"
 well_mm = [{table.well_mm[0]}, {table.well_mm[1]}]
 dip_z_mm = {table.paper_z_mm + table.ink_level_mm - 8.0}
-
+{_ink_device(config, at)}{_force(at)}
 [board]
 squares = [{table.board_squares[0]}, {table.board_squares[1]}]
 square_mm = {table.board_square_mm}
@@ -70,4 +88,28 @@ park_mm = [{config.home_mm[0]}, {config.home_mm[1]}, {config.home_mm[2]}]
 travel_speed_mm_s = 200.0
 press_speed_mm_s = 20.0
 acc_mm_s2 = 800.0
+"""
+
+
+def _ink_device(config: SimConfig, at: Addresses) -> str:
+    match config.ink_device:
+        case "station":
+            return f'\n[ink.device]\nkind = "ink-station"\nport = "{at.ink_path}"\nlight = 0.8\n'
+        case "pump":
+            return f'\n[ink.device]\nkind = "modbus-pump"\nport = "{at.ink_path}"\nml_per_revolution = {PUMP_ML}\n'
+        case "none":
+            return ""
+
+
+def _force(at: Addresses) -> str:
+    if at.force_port is None:
+        return ""
+    return f"""
+[force]
+kind = "sri-m8123"
+interface = "socketcand"
+channel = "{LOOPBACK_CHANNEL}"
+host = "{at.host}"
+port = {at.force_port}
+stale_ms = 1000.0    # simulated beside you on one machine, the sensor may have to wait for it
 """

@@ -8,18 +8,23 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.arcs.frames import FrameDecoder
+from drivers.arcs.frames import FrameDecoder, encode_short
 from drivers.arcs.rtde_wire import MAX_MESSAGE_BYTES, PING, SET_RECIPE, decode_message, encode_sample
 from drivers.errors import ProtocolViolation
 from drivers.geometry import to_wire
 from drivers.sim.arcs_cabinet import Cabinet
 from drivers.sim.arcs_io import mask
 from drivers.sim.arcs_methods import runtime_state
+from drivers.sim.faults.board import FaultBoard
+from drivers.sim.faults.truth import Truth
+from drivers.sim.faults.vocabulary import ALWAYS, KINDS, Device, Fault
 from drivers.sim.server import LoopbackServer
 
 MAX_HZ = 500.0
 BACKLOG_BYTES = 32 * 1024
 """A client that does not read is sent nothing more until it has caught up."""
+MALFORMED = b"\xff\x81"
+"""A break where a value should be: neither CBOR nor JSON."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +41,9 @@ class RtdeServer(LoopbackServer):
 
     def __init__(self, cabinet: Cabinet) -> None:
         super().__init__()
-        self.mute = False
-        """While True, nothing is pushed (a fault that tests script)."""
+        self.faults = FaultBoard(Truth(cabinet.world))
+        """What goes wrong here; a rig puts one board in all its servers."""
+        self._muted: int | None = None
         self.pings = 0
         """Keep-alives seen, for tests."""
         self._outputs: dict[str, tuple[int, Callable[[], Any]]] = {
@@ -48,10 +54,23 @@ class RtdeServer(LoopbackServer):
             "R1_robot_mode": (1014, lambda: cabinet.power.mode.value),
             "R1_safety_mode": (1015, lambda: cabinet.power.safety.value),
             "R1_speed_scaling": (1019, lambda: cabinet.motion.fraction),
-            "R1_actual_TCP_pose": (1021, lambda: to_wire(cabinet.world.tool())),
+            "R1_actual_TCP_pose": (1021, lambda: to_wire(cabinet.tcp())),
             "R1_actual_TCP_force": (1023, cabinet.force),
             "R1_tool_digital_output_bits": (1049, lambda: mask(cabinet.io.outputs["Tool"])),
         }
+
+    @property
+    def mute(self) -> bool:
+        """While True, nothing is pushed (a fault that tests script)."""
+        return self._muted is not None
+
+    @mute.setter
+    def mute(self, mute: bool) -> None:
+        if mute and self._muted is None:
+            self._muted = self.faults.hang(Fault(device=Device.TELEMETRY, kind="mute", count=ALWAYS))
+        elif not mute and self._muted is not None:
+            self.faults.take(self._muted)
+            self._muted = None
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Greet, then follow the client's topics until it goes."""
@@ -78,10 +97,22 @@ class RtdeServer(LoopbackServer):
         loop = asyncio.get_running_loop()
         due = loop.time()
         while not writer.is_closing():
-            if not self.mute and writer.transport.get_write_buffer_size() < BACKLOG_BYTES:
-                writer.write(encode_sample(topic.chanel, [self._outputs[name][1]() for name in topic.segments]))
+            if writer.transport.get_write_buffer_size() < BACKLOG_BYTES:
+                self._push_once(topic, writer)
             due = max(due + topic.period_s, loop.time())
             await asyncio.sleep(due - loop.time())
+
+    def _push_once(self, topic: Topic, writer: asyncio.StreamWriter) -> None:
+        fault = self.faults.meet(Device.TELEMETRY, "push", KINDS[Device.TELEMETRY])
+        match fault.kind if fault is not None else "":
+            case "mute":
+                pass
+            case "malformed":
+                writer.write(encode_short(MALFORMED))
+            case "drop":
+                writer.close()
+            case _:
+                writer.write(encode_sample(topic.chanel, [self._outputs[name][1]() for name in topic.segments]))
 
 
 def topic_of(payload: bytes) -> Topic:

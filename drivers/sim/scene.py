@@ -1,4 +1,4 @@
-"""What the camera sees: sheet, board, ink and tool under uneven light, in perspective, with noise."""
+"""What the camera sees: sheet, board, ink and tool under uneven light with its glare, in perspective, with noise."""
 
 from __future__ import annotations
 
@@ -115,7 +115,8 @@ class Scene:
             borderValue=TABLE_GRAY,
         )
         blurred = cv2.GaussianBlur(self.optics.distort(warped.astype(np.uint8)), (0, 0), view.blur_px)
-        return blurred.astype(np.float32) * self.optics.light
+        lit = blurred.astype(np.float32) * self.optics.light
+        return lit if self.optics.glare is None else lit + self.optics.glare
 
     def _hide_behind_tool(self, image: NDArray[np.float32], tool: Pose) -> None:
         x_mm, y_mm = self._world.to_paper(tool.x_mm, tool.y_mm)

@@ -5,8 +5,20 @@ from __future__ import annotations
 import abc
 import asyncio
 import contextlib
+import ipaddress
+from typing import ClassVar
 
 from drivers.errors import ProtocolViolation
+
+
+class NotLoopback(ValueError):
+    """A simulated device was to be served where others could reach it."""
+
+    exit_code: ClassVar[int] = 2
+
+    def __init__(self, host: str) -> None:
+        self.host = host
+        super().__init__(f"host = {host!r}: a loopback rig is served on a loopback address only, such as 127.0.0.1")
 
 
 class LoopbackServer(abc.ABC):
@@ -22,7 +34,12 @@ class LoopbackServer(abc.ABC):
         """Speak to one client until it goes away; may raise what its going away raises."""
 
     async def start(self, host: str, port: int) -> None:
-        """Listen; `port` 0 lets the system choose, `self.port` tells."""
+        """Listen; `port` 0 lets the system choose, `self.port` tells.
+
+        Raises `NotLoopback` unless `host` is a loopback address; a name could resolve to anything.
+        """
+        if not _is_loopback(host):
+            raise NotLoopback(host)
         self._server = await asyncio.start_server(self._serve, host, port)
         self.port = self._server.sockets[0].getsockname()[1]
 
@@ -61,3 +78,10 @@ class LoopbackServer(abc.ABC):
             writer.close()
             with contextlib.suppress(ConnectionError, asyncio.CancelledError):
                 await writer.wait_closed()
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

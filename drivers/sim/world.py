@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drivers.force.samples import Wrench
 from drivers.geometry import brush_pose, lean
 from drivers.samples import Pose
-from drivers.sim.brush import Brush
+from drivers.sim.arcs_stream import StreamedQueue
+from drivers.sim.brush import MAX_TILT_DEG, Brush
 from drivers.sim.clock import SimClock
 from drivers.sim.config import SimConfig
 from drivers.sim.contact import Contact, ContactWatch
 from drivers.sim.drag import ink_left
 from drivers.sim.flaws import Flaw, flaw_of_load, natural_split
 from drivers.sim.leash import Waypoint
-from drivers.sim.motion import MotionQueue
 from drivers.sim.paper import Paper
+from drivers.sim.reaction import Reaction, leaning_with
+from drivers.sim.well import Well
 
 INK_PER_PRESS = 0.12
 """Share of a full brush that one press takes, and the landing of a drag."""
@@ -72,10 +76,15 @@ class World:
         self.flaws: dict[int, tuple[Flaw, float]] = {}
         """Flaw and severity to come, by the index of the press; severity 0 rules out that it splits by itself."""
         self.ink_load = 0.0
+        table = config.table
+        self.well = Well.round(table.well_radius_mm, table.ink_level_mm, table.well_depth_mm)
+        self.reaction = Reaction(self.brush, sensor_to_tip_mm=config.sensor_to_tip_mm, hanging_kg=config.hanging_kg)
         self.version = 0
         """Counts changes of what the camera can see on the sheet."""
-        self._watch = ContactWatch(config.table.paper_z_mm)
-        self.motion = MotionQueue(brush_pose(*config.home_mm), self._travelled)
+        self._watch = ContactWatch(self._above_mm)
+        tool = np.eye(4)
+        tool[2, 3] = config.tool_mm / 1e3
+        self.motion = StreamedQueue(brush_pose(*config.home_mm), self._travelled, tool)
 
     def flaw_next(self, flaw: Flaw, severity: float = 1.0) -> None:
         """Let something go wrong with the next press to lift off; raises ValueError unless severity is in 0 .. 1."""
@@ -91,6 +100,12 @@ class World:
     def tool(self) -> Pose:
         """The tip's pose now, in the base frame."""
         return self.motion.pose(self.clock.now_s())
+
+    def wrench(self) -> Wrench:
+        """What the force sensor feels now, in the tool's frame."""
+        tip = self.tool()
+        x_mm, y_mm, depth_mm = self._on_sheet(tip)
+        return self.reaction.wrench(tip, 0.0 if self._in_well(x_mm, y_mm) else depth_mm, self._normal)
 
     def to_paper(self, x_mm: float, y_mm: float) -> tuple[float, float]:
         """Base frame to paper frame, in the plane."""
@@ -114,9 +129,8 @@ class World:
     def _dip(self, pose: Pose) -> None:
         table = self.config.table
         x_mm, y_mm = self.to_paper(pose.x_mm, pose.y_mm)
-        in_well = math.dist((x_mm, y_mm), table.well_mm) <= table.well_radius_mm
-        if in_well and pose.z_mm < table.paper_z_mm + table.ink_level_mm:
-            self.ink_load = 1.0
+        if self._in_well(x_mm, y_mm) and pose.z_mm < table.paper_z_mm + self.well.level_mm:
+            self.ink_load = self.well.dip(self.ink_load)
 
     def _leave_mark(self, deepest: Pose) -> None:
         x_mm, y_mm, depth_mm = self._on_sheet(deepest)
@@ -125,15 +139,17 @@ class World:
         tilt_deg, heading_deg = self._lean(deepest)
         index = len(self.presses)
         flaw, severity = self._flaw(index, depth_mm)
-        footprint = self.brush.press(
-            depth_mm,
-            tilt_deg,
+        deepest_mm = self.brush.deepest_mm(tilt_deg)
+        make = functools.partial(
+            self.brush.press,
+            min(depth_mm, deepest_mm),  # the ferrule stands on the paper
+            min(tilt_deg, MAX_TILT_DEG),
             ink_load=self.ink_load,
             press_seed=self.config.seed * 100_003 + index,
             flaw=flaw,
             severity=severity,
         )
-        self.paper.lay(footprint, x_mm, y_mm, heading_deg)
+        self.paper.lay_later(make, x_mm, y_mm, heading_deg)
         want = flaw_of_load(self.ink_load)
         if want is Flaw.BLANK or (flaw is None and want is not None):
             # nothing was put on the hairs, or nothing of it shows
@@ -149,15 +165,16 @@ class World:
         tilt_deg, _ = self._lean(contact.deepest)
         _, heading_deg = self._lean(contact.poses[0])
         index = len(self.drags)
-        footprint = self.brush.drag(
-            path,
-            tilt_deg,
+        make = functools.partial(
+            self.brush.drag,
+            tuple(replace(w, depth_mm=min(w.depth_mm, self.brush.deepest_mm(tilt_deg))) for w in path),
+            min(tilt_deg, MAX_TILT_DEG),
             heading_deg,
             ink_load=self.ink_load,
             # far from the seeds of presses
             press_seed=2**40 + self.config.seed * 100_003 + index,
         )
-        self.paper.lay(footprint, path[0].x_mm, path[0].y_mm, 0.0)
+        self.paper.lay_later(make, path[0].x_mm, path[0].y_mm, 0.0)
         self.drags.append(Drag(index, path, tilt_deg, heading_deg, self.ink_load))
         travel_mm = sum(math.dist((a.x_mm, a.y_mm), (b.x_mm, b.y_mm)) for a, b in itertools.pairwise(path))
         self.ink_load = max(0.0, ink_left(self.ink_load, travel_mm) - INK_PER_PRESS)
@@ -173,14 +190,30 @@ class World:
         return (flaw, severity) if severity > 0.0 else (None, 0.0)
 
     def _on_sheet(self, pose: Pose) -> tuple[float, float, float]:
-        """x, y and depth of the tip in the paper frame."""
-        return *self.to_paper(pose.x_mm, pose.y_mm), self.config.table.paper_z_mm - pose.z_mm
+        """x and y in the paper frame of the point of the sheet nearest to the tip, and the tip's depth below it."""
+        x_mm, y_mm = self.to_paper(pose.x_mm, pose.y_mm)
+        depth_mm = -self._above_mm(pose)
+        nx, ny, _ = self.config.table.normal
+        return x_mm + depth_mm * nx, y_mm + depth_mm * ny, depth_mm
+
+    def _above_mm(self, pose: Pose) -> float:
+        return self.config.table.above_mm(*self.to_paper(pose.x_mm, pose.y_mm), pose.z_mm)
+
+    @property
+    def _normal(self) -> tuple[float, float, float]:
+        """Unit vector out of the sheet, in the base frame."""
+        nx, ny, nz = self.config.table.normal
+        yaw = math.radians(self.config.table.yaw_deg)
+        return math.cos(yaw) * nx - math.sin(yaw) * ny, math.sin(yaw) * nx + math.cos(yaw) * ny, nz
+
+    def _in_well(self, x_mm: float, y_mm: float) -> bool:
+        return math.dist((x_mm, y_mm), self.config.table.well_mm) <= self.config.table.well_radius_mm
 
     def _is_on_sheet(self, x_mm: float, y_mm: float) -> bool:
         width_mm, height_mm = self.config.table.sheet_mm
         return 0.0 <= x_mm <= width_mm and 0.0 <= y_mm <= height_mm
 
     def _lean(self, pose: Pose) -> tuple[float, float]:
-        """(tilt_deg, heading_deg) in the paper frame."""
-        tilt_deg, base_heading_deg = lean(pose)
+        """(tilt_deg, heading_deg) in the paper frame; tilt from the sheet's normal."""
+        tilt_deg, base_heading_deg = lean(leaning_with(pose, self._normal))
         return tilt_deg, base_heading_deg - self.config.table.yaw_deg

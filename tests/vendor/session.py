@@ -104,10 +104,82 @@ def joints(robot: Any) -> None:
     SEEN["joints off"] = max(abs(a - b) for a, b in zip(target, state.getJointPositions(), strict=True))
 
 
+def blend(robot: Any) -> None:
+    """Four moves, sent while the path is held, as a client does that must not be slower than the arm."""
+    motion, state = robot.getMotionControl(), robot.getRobotState()
+
+    def at_rest() -> bool:
+        return motion.getExecId() == -1 and state.isSteady()
+
+    start = state.getTcpPose()
+    corner, end = shifted(start, 0.04), [start[0] + 0.04, start[1] + 0.04, *start[2:]]
+    motion.stopMove(True, True)
+    SEEN["blend sent"] = [motion.moveLine(pose, 1.0, 0.1, 0.015, 0.0) for pose in (corner, end)]
+    SEEN["blend start"] = motion.startMove()
+    nearest, ids, blending = 1.0, set(), False
+    while not at_rest():
+        pose = state.getTcpPose()
+        nearest = min(nearest, sum((a - b) ** 2 for a, b in zip(pose[:3], corner[:3], strict=True)) ** 0.5)
+        ids.add(motion.getExecId())
+        blending = blending or motion.isBlending()
+    SEEN["blend"] = [
+        nearest,
+        len(ids - {-1}),
+        blending,
+        max(abs(a - b) for a, b in zip(end, state.getTcpPose(), strict=True)),
+    ]
+    via = [start[0] + 0.04 + 0.02, start[1] + 0.02, *start[2:]]
+    SEEN["circle"] = [motion.setCirclePathMode(1), motion.moveCircle(via, corner, 1.0, 0.1, 0.0, 0.0), until(at_rest)]
+    SEEN["circle off"] = max(abs(a - b) for a, b in zip(corner, state.getTcpPose(), strict=True))
+    q = state.getJointPositions()
+    points = [[q[0] + 0.02 * k, *q[1:]] for k in range(1, 4)]
+    SEEN["spline"] = [motion.moveSpline(p, 1.0, 0.5, 0.0) for p in (*points, [])]
+    SEEN["spline done"] = until(at_rest)
+    SEEN["spline off"] = max(abs(a - b) for a, b in zip(points[-1], state.getJointPositions(), strict=True))
+
+
+def steer(robot: Any) -> None:
+    motion, state = robot.getMotionControl(), robot.getRobotState()
+
+    def at_rest() -> bool:
+        return motion.getExecId() == -1 and state.isSteady()
+
+    before = state.getTcpPose()
+    SEEN["speed"] = [
+        motion.speedLine([0.0, 0.0, 0.01, 0.0, 0.0, 0.0], 0.5, 0.0),
+        str(robot.getRobotManage().getRobotControlMode()),
+    ]
+    time.sleep(0.1)
+    SEEN["speed stopped"] = [motion.stopLine(1.0, 1.0), until(at_rest), state.getTcpPose()[2] - before[2]]
+    q = state.getJointPositions()
+    SEEN["servo off"] = motion.servoJoint(q, 0.0, 0.0, 0.05, 0.1, 200.0)
+    SEEN["servo on"] = [motion.setServoModeSelect(2), motion.isServoModeEnabled()]
+    SEEN["servo"] = [motion.servoJoint([q[0] + 0.005 * k, *q[1:]], 0.0, 0.0, 0.05, 0.1, 200.0) for k in range(1, 11)]
+    SEEN["servo done"] = [until(at_rest), motion.setServoModeSelect(0)]
+    SEEN["servo moved"] = state.getJointPositions()[0] - q[0]
+
+
+def limits(rpc: Any, robot: Any) -> None:
+    config, state, force = robot.getRobotConfig(), robot.getRobotState(), robot.getForceControl()
+    SEEN["limits"] = [
+        *(config.getJointMaxPositions(), config.getJointMinPositions(), config.getJointMaxSpeeds()),
+        *(config.getJointMaxAccelerations(), config.getTcpMaxSpeeds(), config.getTcpMaxAccelerations()),
+    ]
+    SEEN["version"] = rpc.getSystemInfo().getControlSoftwareFullVersion()
+    SEEN["joint state"] = [str(s) for s in state.getJointState()]
+    SEEN["speeds at rest"] = [state.getTcpSpeed(), state.getJointSpeeds()]
+    SEEN["simulated"] = robot.getRobotManage().isSimulationEnabled()
+    SEEN["not simulated"] = [force.fcEnable(), force.isFcEnabled(), robot.getMotionControl().pathBufferAlloc("x", 2, 3)]
+
+
 def io(rpc: Any, robot: Any) -> None:
     control, register = robot.getIoControl(), rpc.getRegisterControl()
     SEEN["tool io"] = [control.setToolDigitalOutput(1, True), control.getToolDigitalOutput(1)]
     SEEN["standard io"] = [control.setStandardDigitalOutput(3, True), control.getStandardDigitalOutputs()]
+    SEEN["configurable io"] = [control.setConfigurableDigitalOutput(4, True), control.getConfigurableDigitalOutputs()]
+    SEEN["analog io"] = [control.setStandardAnalogOutput(0, 0.5), control.getStandardAnalogOutput(0)]
+    SEEN["pulse"] = control.setToolDigitalOutputPulse(2, True, 0.1)
+    SEEN["pulse over"] = until(lambda: not control.getToolDigitalOutput(2))
     SEEN["bad io"] = control.setStandardDigitalOutput(99, True)
     SEEN["watchdog"] = [register.setWatchDog("test", 5.0, 3), register.setWatchDog("test", 5.0, 0)]
 
@@ -159,6 +231,9 @@ def main(port: int, rtde_port: int) -> None:
     power(robot)
     move(rpc, robot)
     joints(robot)
+    blend(robot)
+    steer(robot)
+    limits(rpc, robot)
     io(rpc, robot)
     subscribe(rtde_port)
     go_wrong(robot)

@@ -128,9 +128,54 @@ def test_its_kinematics_go_there_and_back(seen: dict[str, Any]):
     assert seen["joints off"] < 1e-5
 
 
+def test_its_moves_are_rounded_into_each_other(seen: dict[str, Any]):
+    assert seen["blend sent"] == [0, 0]
+    assert seen["blend start"] == 0
+    nearest_m, ids, blending, off_m = seen["blend"]
+    assert 0.001 < nearest_m < 0.015
+    assert ids == 2
+    assert blending
+    assert off_m < 1e-6
+
+
+def test_its_circles_and_splines_arrive(seen: dict[str, Any]):
+    assert seen["circle"] == [0, 0, True]
+    assert seen["circle off"] < 1e-6
+    assert seen["spline"] == [0] * 4
+    assert seen["spline done"]
+    assert seen["spline off"] < 1e-5
+
+
+def test_it_steers_by_velocities_and_servo_steps(seen: dict[str, Any]):
+    assert seen["speed"] == [0, "RobotControlModeType.Speed"]
+    code, at_rest, moved_m = seen["speed stopped"]
+    assert (code, at_rest) == (0, True)
+    assert moved_m > 0.005
+    assert seen["servo off"] == -13
+    assert seen["servo on"] == [0, True]
+    assert seen["servo"] == [0] * 10
+    assert seen["servo done"] == [True, 0]
+    assert seen["servo moved"] == pytest.approx(0.05, abs=1e-5)
+
+
+def test_it_reads_limits_and_is_told_what_is_not_simulated(seen: dict[str, Any]):
+    highest, lowest, *others = seen["limits"]
+    assert lowest == [-v for v in highest]
+    assert [len(v) for v in others] == [6, 6, 2, 2]
+    assert seen["version"] == "0.31.1-brushloop-loopback"
+    assert seen["joint state"] == ["JointStateType.Running"] * 6
+    assert seen["speeds at rest"] == [[0.0] * 6, [0.0] * 6]
+    assert seen["simulated"] is True
+    assert seen["not simulated"] == [-6, False, -6]
+
+
 def test_it_sets_outputs_and_watchdogs(seen: dict[str, Any]):
     assert seen["tool io"] == [0, True]
     assert seen["standard io"] == [0, 8]
+    assert seen["configurable io"] == [0, 16]
+    assert seen["analog io"] == [0, 0.5]
+    assert seen["pulse"] == 0
+    assert seen["pulse over"]
     assert seen["bad io"] == -5
     assert seen["watchdog"] == [0, 0]
 

@@ -44,7 +44,8 @@ async def test_connecting_tells_who_answers_and_where_the_tool_is(cabinet: ArcsS
     identity = await arm.connect()
     assert identity.simulated
     assert identity.model.startswith("aubo_i5")
-    assert arm.latest().pose.position_mm == pytest.approx((250.0, -230.0, 260.0))
+    # no tool is set yet: it speaks of the flange
+    assert arm.latest().pose.position_mm == pytest.approx((250.0, -230.0, 260.0 + 180.0))
     await arm.close()
 
 
@@ -63,12 +64,13 @@ async def test_an_arm_without_power_refuses_to_move(sleeping_arm: AuboArcs, cabi
 
 
 async def test_enabling_runs_the_arm_and_sets_the_tool_but_moves_nothing(sleeping_arm: AuboArcs, cabinet: ArcsServer):
-    before = sleeping_arm.latest().pose
+    before = cabinet._world.tool()
     await sleeping_arm.enable()
     await sleeping_arm.enable()
     assert cabinet.mode == RobotMode.RUNNING
     assert cabinet.tcp_offset == [0.0, 0.0, 0.18, 0.0, 0.0, 0.0]
-    assert distance(before, sleeping_arm.latest().pose)[0] < 1e-6
+    assert distance(before, cabinet._world.tool())[0] == 0.0
+    assert distance(before, sleeping_arm.latest().pose)[0] < 1e-6, "with the tool set, it speaks of the tip"
 
 
 async def test_an_arm_that_does_not_take_the_tool_offset_is_not_powered(sleeping_arm: AuboArcs, cabinet: ArcsServer):

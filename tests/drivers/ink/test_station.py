@@ -163,7 +163,7 @@ async def test_one_fault_of_any_kind_gives_the_dose_once(
 ):
     line.fail(fault)
     await station.dose(1.0)
-    assert firmware.well_ml == 11.0
+    assert firmware.well.ml == 11.0
     assert await station.level() == 0.55
 
 
@@ -186,8 +186,8 @@ async def test_a_fault_that_lasts_is_an_error_in_time_and_the_next_request_works
     with pytest.raises(error, match="may be in the well"):
         await station.dose(1.0)
     assert time.monotonic() - began < 2 * TIMEOUT_S + 0.3
-    assert firmware.well_ml == (10.0 if fault is Fault.DEAF else 11.0)
-    assert await station.level() == pytest.approx(firmware.well_ml / 20.0)
+    assert firmware.well.ml == (10.0 if fault is Fault.DEAF else 11.0)
+    assert await station.level() == pytest.approx(firmware.well.ml / 20.0)
 
 
 async def test_a_pulled_cable_is_a_lost_connection_at_once_and_stays_one(line: PtyLine, station: InkStation):
@@ -254,7 +254,7 @@ async def test_a_cancelled_request_does_not_disturb_the_next(line: PtyLine, stat
 
 async def test_requests_at_the_same_time_take_turns(firmware: StationFirmware, station: InkStation):
     await asyncio.gather(*(station.dose(0.25) for _ in range(8)), *(station.level() for _ in range(8)))
-    assert firmware.well_ml == 12.0
+    assert firmware.well.ml == 12.0
 
 
 async def test_a_thousand_and_one_requests_wrap_the_number(station: InkStation):
@@ -288,7 +288,7 @@ async def test_the_limit_per_minute_slides_and_counts_what_was_not_confirmed(lin
     await station.dose(1.5)
     with pytest.raises(LimitExceeded):
         await station.dose(2.0)
-    assert firmware.well_ml == 13.5
+    assert firmware.well.ml == 13.5
     await station.close()
 
 
@@ -305,7 +305,7 @@ async def test_a_station_refuses_what_it_cannot_do(firmware: StationFirmware, st
     with pytest.raises(InkRefused, match="Open the lid"):
         await station.dose(1.0)
     await station.open_lid()
-    firmware.well_ml = 19.5
+    firmware.well.ml = 19.5
     with pytest.raises(InkRefused, match="overflow"):
         await station.dose(1.0)
     assert firmware.reservoir_ml == 100.0

@@ -9,78 +9,14 @@ from typing import Any
 import pytest
 
 from drivers.arcs.codes import SafetyMode
-from drivers.geometry import brush_pose, distance, from_wire, to_wire
-from drivers.samples import Pose
-from drivers.sim.arcs_cabinet import Cabinet
-from drivers.sim.arcs_methods import methods
-from drivers.sim.config import SimConfig
+from drivers.geometry import brush_pose, distance, from_wire
 from drivers.sim.kinematics import HOME
-from drivers.sim.world import World
 
 START = brush_pose(250.0, -230.0, 260.0)
 NEAR = brush_pose(350.0, -230.0, 260.0)
 
 
-class Hand:
-    """A clock that stands still until it is turned."""
-
-    rate = 1.0
-    s = 0.0
-
-    def now_s(self) -> float:
-        return self.s
-
-
-class Bench:
-    """A cabinet, its clock, and a caller."""
-
-    def __init__(self) -> None:
-        self.world = World(SimConfig())
-        self.clock = self.world.clock = Hand()  # type: ignore[assignment]
-        self.cabinet = Cabinet(self.world)
-        self.table = methods(self.cabinet)
-
-    def ask(self, method: str, **params: Any) -> Any:
-        name = method if method.split(".")[0] in ("RuntimeMachine", "RegisterControl") else f"rob1.{method}"
-        return self.table[name](params)
-
-    def line(self, target: Pose, v: float = 0.1, **more: float) -> int:
-        return self.ask("MotionControl.moveLine", pose=to_wire(target), a=1.0, v=v, **more)
-
-    def run(self) -> None:
-        self.ask("RobotManage.poweron")
-        self.clock.s += 1.5
-        self.ask("RobotManage.startup")
-        self.clock.s += 1.5
-
-    @property
-    def mode(self) -> str:
-        return self.ask("RobotState.getRobotModeType")
-
-    @property
-    def safety(self) -> str:
-        return self.ask("RobotState.getSafetyModeType")
-
-    @property
-    def exec_id(self) -> int:
-        return self.ask("MotionControl.getExecId")
-
-    def off_mm(self, pose: Pose) -> float:
-        return distance(self.world.tool(), pose)[0]
-
-
-@pytest.fixture
-def off() -> Bench:
-    return Bench()
-
-
-@pytest.fixture
-def on(off: Bench) -> Bench:
-    off.run()
-    return off
-
-
-def test_power_comes_in_steps_that_take_time(off: Bench):
+def test_power_comes_in_steps_that_take_time(off: Any):
     assert (off.mode, off.ask("RobotState.isPowerOn")) == ("PowerOff", False)
     assert off.ask("RobotManage.startup") == 1
     assert off.ask("RobotManage.poweron") == 0
@@ -100,7 +36,7 @@ def test_power_comes_in_steps_that_take_time(off: Bench):
     assert off.mode == "PowerOff"
 
 
-def test_motion_is_refused_until_running_and_in_a_safety_stop(off: Bench):
+def test_motion_is_refused_until_running_and_in_a_safety_stop(off: Any):
     assert off.line(NEAR) == -1
     off.run()
     off.cabinet.power.safety = SafetyMode.SAFEGUARD_STOP
@@ -110,12 +46,12 @@ def test_motion_is_refused_until_running_and_in_a_safety_stop(off: Bench):
 
 
 @pytest.mark.parametrize("wrong", [{"v": 0.0}, {"v": math.nan}, {"blend_radius": 0.0005}, {"blend_radius": 2.0}])
-def test_a_move_with_a_wrong_argument_is_refused(on: Bench, wrong: dict[str, float]):
+def test_a_move_with_a_wrong_argument_is_refused(on: Any, wrong: dict[str, float]):
     assert on.line(NEAR, **wrong) == -5
     assert on.exec_id == -1
 
 
-def test_moves_queue_up_to_a_limit_and_the_same_pose_is_ignored(on: Bench):
+def test_moves_queue_up_to_a_limit_and_the_same_pose_is_ignored(on: Any):
     assert on.line(START) == 13
     codes = [on.line(brush_pose(250.0 + k, -230.0, 260.0)) for k in range(1, 67)]
     assert (codes.count(0), codes.count(2)) == (64, 2)
@@ -124,7 +60,7 @@ def test_moves_queue_up_to_a_limit_and_the_same_pose_is_ignored(on: Bench):
     assert on.ask("MotionControl.getQueueSize") == 0
 
 
-def test_the_speed_fraction_slows_down_what_has_not_begun(on: Bench):
+def test_the_speed_fraction_slows_down_what_has_not_begun(on: Any):
     assert on.ask("MotionControl.getSpeedFraction") == 1.0
     on.line(NEAR)
     on.line(START)
@@ -141,7 +77,7 @@ def test_the_speed_fraction_slows_down_what_has_not_begun(on: Bench):
     assert on.ask("MotionControl.getSpeedFraction") == 0.5
 
 
-def test_a_duration_lengthens_a_move_and_never_shortens_it(on: Bench):
+def test_a_duration_lengthens_a_move_and_never_shortens_it(on: Any):
     on.line(NEAR, duration=4.0)
     on.clock.s += 3.9
     assert on.exec_id == 0
@@ -159,7 +95,7 @@ def test_a_duration_lengthens_a_move_and_never_shortens_it(on: Bench):
         (("MotionControl.stopMove", {"quick": True, "all_tasks": True}), "MotionControl.startMove"),
     ],
 )
-def test_a_hold_keeps_the_path_and_resuming_ends_it(on: Bench, hold: tuple[str, dict[str, Any]], resume: str):
+def test_a_hold_keeps_the_path_and_resuming_ends_it(on: Any, hold: tuple[str, dict[str, Any]], resume: str):
     on.line(NEAR)
     on.line(START)
     on.clock.s += 0.5
@@ -182,7 +118,7 @@ def test_a_hold_keeps_the_path_and_resuming_ends_it(on: Bench, hold: tuple[str, 
     assert on.ask("RuntimeMachine.getRuntimeState") == "Stopped"
 
 
-def test_a_path_can_be_held_again_and_again_even_before_the_arm_has_come_to_rest(on: Bench):
+def test_a_path_can_be_held_again_and_again_even_before_the_arm_has_come_to_rest(on: Any):
     on.line(NEAR)
     on.line(START)
     for _ in range(6):
@@ -195,10 +131,10 @@ def test_a_path_can_be_held_again_and_again_even_before_the_arm_has_come_to_rest
     on.clock.s += 20.0
     assert on.exec_id == -1
     assert on.off_mm(START) == pytest.approx(0.0)
-    assert on.cabinet.motion._commands == {}
+    assert on.cabinet.motion._moves == []
 
 
-def test_an_abort_ends_a_hold_and_forgets_the_path(on: Bench):
+def test_an_abort_ends_a_hold_and_forgets_the_path(on: Any):
     on.line(NEAR)
     on.clock.s += 0.5
     on.ask("RuntimeMachine.pause")
@@ -213,7 +149,7 @@ def test_an_abort_ends_a_hold_and_forgets_the_path(on: Bench):
     assert on.off_mm(START) == pytest.approx(0.0)
 
 
-def test_stopping_a_program_does_not_stop_motion(on: Bench):
+def test_stopping_a_program_does_not_stop_motion(on: Any):
     on.line(NEAR)
     on.clock.s += 0.5
     assert on.ask("RuntimeMachine.stop") == 0
@@ -221,7 +157,7 @@ def test_stopping_a_program_does_not_stop_motion(on: Bench):
     assert on.off_mm(NEAR) == 0.0
 
 
-def test_a_protective_stop_keeps_the_path_until_a_person_unlocks_and_someone_resumes(on: Bench):
+def test_a_protective_stop_keeps_the_path_until_a_person_unlocks_and_someone_resumes(on: Any):
     on.line(NEAR)
     on.clock.s += 0.5
     on.cabinet.collide()
@@ -238,7 +174,7 @@ def test_a_protective_stop_keeps_the_path_until_a_person_unlocks_and_someone_res
     assert on.off_mm(NEAR) == 0.0
 
 
-def test_a_safeguard_stop_drops_the_path_and_is_not_unlocked_over_the_wire(on: Bench):
+def test_a_safeguard_stop_drops_the_path_and_is_not_unlocked_over_the_wire(on: Any):
     on.line(NEAR)
     on.clock.s += 0.5
     on.cabinet.safety_stop(SafetyMode.SAFEGUARD_STOP)
@@ -248,7 +184,7 @@ def test_a_safeguard_stop_drops_the_path_and_is_not_unlocked_over_the_wire(on: B
     assert on.safety == "SafeguardStop"
 
 
-def test_after_an_emergency_stop_a_person_the_board_and_the_power_come_in_that_order(on: Bench):
+def test_after_an_emergency_stop_a_person_the_board_and_the_power_come_in_that_order(on: Any):
     on.cabinet.emergency_stop()
     assert (on.mode, on.safety) == ("PowerOff", "RobotEmergencyStop")
     assert on.ask("RobotManage.setUnlockProtectiveStop") == 1
@@ -260,7 +196,7 @@ def test_after_an_emergency_stop_a_person_the_board_and_the_power_come_in_that_o
     assert (on.mode, on.safety) == ("Running", "Normal")
 
 
-def test_joints_and_pose_agree_with_the_tool_on(on: Bench):
+def test_joints_and_pose_agree_with_the_tool_on(on: Any):
     on.ask("RobotConfig.setTcpOffset", offset=[0.0, 0.0, 0.18, 0.0, 0.0, 0.0])
     joints = on.ask("RobotState.getJointPositions")
     pose, code = on.ask("RobotAlgorithm.forwardKinematics", q=joints)
@@ -274,7 +210,7 @@ def test_joints_and_pose_agree_with_the_tool_on(on: Bench):
     assert (near, code) == (list(joints), -23)
 
 
-def test_a_joint_move_is_straight_in_joints_and_ends_where_it_should(on: Bench):
+def test_a_joint_move_is_straight_in_joints_and_ends_where_it_should(on: Any):
     before = on.ask("RobotState.getJointPositions")
     assert on.ask("MotionControl.moveJoint", q=list(HOME), a=1.0, v=0.5) == 0
     on.clock.s += 0.8
@@ -288,7 +224,7 @@ def test_a_joint_move_is_straight_in_joints_and_ends_where_it_should(on: Bench):
     assert on.line(START) == 0
 
 
-def test_a_joint_move_can_be_stopped_and_another_started(on: Bench):
+def test_a_joint_move_can_be_stopped_and_another_started(on: Any):
     on.ask("MotionControl.moveJoint", q=list(HOME), a=1.0, v=0.5)
     on.clock.s += 0.8
     assert on.ask("MotionControl.stopJoint", acc=5.0) == 0
@@ -301,7 +237,7 @@ def test_a_joint_move_can_be_stopped_and_another_started(on: Bench):
     assert on.ask("RobotState.getJointPositions") == pytest.approx(HOME, abs=1e-5)
 
 
-def test_what_is_out_of_reach_is_accepted_and_told_by_a_message(on: Bench):
+def test_what_is_out_of_reach_is_accepted_and_told_by_a_message(on: Any):
     assert on.ask("Trace.peek", num=10, last_time=0) == []
     on.line(NEAR)
     on.clock.s += 0.5
@@ -316,7 +252,7 @@ def test_what_is_out_of_reach_is_accepted_and_told_by_a_message(on: Bench):
     assert second["timestamp"] > first["timestamp"]
 
 
-def test_what_is_set_is_what_is_got(on: Bench):
+def test_what_is_set_is_what_is_got(on: Any):
     payload = {"m": 0.5, "cog": [0.0, 0.0, 0.05], "aom": [0.0] * 3, "inertia": [0.0] * 6}
     assert on.ask("RobotConfig.setPayload", **payload) == 0
     assert on.ask("RobotConfig.getPayload") == [0.5, [0.0, 0.0, 0.05], [0.0] * 3, [0.0] * 6]
@@ -331,7 +267,7 @@ def test_what_is_set_is_what_is_got(on: Bench):
 
 
 @pytest.mark.parametrize("place", ["Standard", "Tool"])
-def test_outputs_stay_as_they_are_put_and_inputs_are_the_worlds(on: Bench, place: str):
+def test_outputs_stay_as_they_are_put_and_inputs_are_the_worlds(on: Any, place: str):
     digital = f"IoControl.set{place}DigitalOutput"
     assert on.ask(digital, index=1, value=True) == 0
     assert on.ask(f"IoControl.get{place}DigitalOutput", index=1) is True
@@ -343,7 +279,7 @@ def test_outputs_stay_as_they_are_put_and_inputs_are_the_worlds(on: Bench, place
     assert on.ask(f"IoControl.get{place}DigitalInputs") == 8
 
 
-def test_the_brush_pushes_back_only_while_it_is_on_the_paper(on: Bench):
+def test_the_brush_pushes_back_only_while_it_is_on_the_paper(on: Any):
     table = on.world.config.table
     assert on.ask("RobotState.getTcpForce") == [0.0] * 6
     x, y = table.origin_mm[0] - 80.0, table.origin_mm[1] + 100.0
@@ -352,7 +288,7 @@ def test_the_brush_pushes_back_only_while_it_is_on_the_paper(on: Bench):
     assert on.ask("RobotState.getTcpForce")[2] == pytest.approx(0.5)
 
 
-async def test_a_watchdog_that_is_not_fed_bites_and_one_that_is_fed_does_not(on: Bench):
+async def test_a_watchdog_that_is_not_fed_bites_and_one_that_is_fed_does_not(on: Any):
     on.line(NEAR)
     for _ in range(4):
         assert on.ask("RegisterControl.setWatchDog", key="wd", timeout=0.15, action=3) == 0
@@ -365,7 +301,7 @@ async def test_a_watchdog_that_is_not_fed_bites_and_one_that_is_fed_does_not(on:
     assert on.safety == "Normal"  # it bites once
 
 
-async def test_a_watchdog_can_be_disarmed_and_its_actions_differ(on: Bench):
+async def test_a_watchdog_can_be_disarmed_and_its_actions_differ(on: Any):
     on.ask("RegisterControl.setWatchDog", key="wd", timeout=0.1, action=3)
     assert on.ask("RegisterControl.getWatchDogAction", key="wd") == 3
     on.ask("RegisterControl.setWatchDog", key="wd", timeout=0.1, action=0)

@@ -51,6 +51,7 @@ class Client:
 
 @pytest.fixture
 async def rtde(cabinet: ArcsServer) -> AsyncIterator[RtdeServer]:
+    cabinet.cabinet.tcp_offset = [0.0, 0.0, 0.18, 0.0, 0.0, 0.0]
     server = RtdeServer(cabinet.cabinet)
     await server.start(HOST, 0)
     yield server
@@ -87,6 +88,22 @@ async def test_the_makers_own_bytes_subscribe(client: Client):
     )
     await client.pushes(0.05)
     assert await client.pushes(0.1) == []
+
+
+async def test_a_pose_comes_a_hundred_times_a_second_as_the_driver_asks_for_it(client: Client, cabinet: ArcsServer):
+    await client.greeting()
+    client.writer.write(encode_topic(0, ["R1_actual_TCP_pose"], 100.0))
+    got = await client.pushes(0.6)
+    assert 40 <= len(got) <= 65
+    assert all(len(pose) == 6 for _, pose in got)
+
+
+async def test_the_pose_is_that_of_the_configured_tool(client: Client, cabinet: ArcsServer):
+    cabinet.cabinet.tcp_offset = [0.0] * 6
+    await client.greeting()
+    client.writer.write(encode_topic(0, ["R1_actual_TCP_pose"], 100.0))
+    _, pose = (await client.pushes(0.1))[-1]
+    assert pose[:3] == pytest.approx([0.25, -0.23, 0.44])
 
 
 async def test_everything_that_is_offered_can_be_had_with_enums_as_words(client: Client):

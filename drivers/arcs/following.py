@@ -1,0 +1,120 @@
+"""Through many poses without a halt: lines with rounded corners, fed into the controller's queue while it runs.
+
+The queue is kept short, so that a stop has little to forget, and long enough that a slow call does not let the arm run
+dry with the brush on the paper.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from drivers.arcs.controller import Controller
+from drivers.arcs.errors import QueueFull
+from drivers.arcs.rpc import DEVICE
+from drivers.arcs.waiting import RESTS_ELSEWHERE_S, STUCK_S, Tolerance, planned_s
+from drivers.errors import MotionFailed
+from drivers.geometry import distance
+from drivers.limits import Limits
+from drivers.samples import Pose
+
+MOST_QUEUED = 16
+"""Lines that the controller holds at a time. How many a real cabinet takes is not documented; see `QueueFull` below."""
+EMPTY = (-1, 0)
+LEAST_BLEND_MM = 1.0
+"""ARCS takes 0 or 1 mm to 1 m."""
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """One line of the way."""
+
+    target: Pose
+    speed_mm_s: float
+    blend_mm: float
+    seconds: float
+    """An upper estimate of how long it takes."""
+
+
+def legs_of(
+    start: Pose, poses: Sequence[Pose], limits: Limits, *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float
+) -> list[Leg]:
+    """The lines, each as slow as its turn of the tool asks for. A corner is rounded within half the shorter line, but
+    never by less than the controller takes; at the last pose the arm halts."""
+    ways = [distance(a, b)[0] for a, b in zip([start, *poses], poses, strict=False)]
+    legs: list[Leg] = []
+    before = start
+    for i, pose in enumerate(poses):
+        speed = limits.turn_capped(before, pose, speed_mm_s)
+        last = i + 1 == len(poses)
+        blend = 0.0 if last else max(min(blend_mm, 0.5 * ways[i], 0.5 * ways[i + 1]), LEAST_BLEND_MM)
+        legs.append(Leg(pose, speed, blend, planned_s(before, pose, speed, acc_mm_s2)))
+        before = pose
+    return legs
+
+
+async def feed(
+    controller: Controller,
+    legs: Sequence[Leg],
+    acc_mm_s2: float,
+    *,
+    stopped: Callable[[], bool],
+    tolerance: Tolerance,
+    poll_s: float,
+    notice: Callable[[str], None],
+) -> None:
+    """Queue every leg, at most `MOST_QUEUED` at a time; returns once the last one is queued.
+
+    Raises `RobotNotSafe`, `MotionRefused`, and `MotionFailed` where the arm was stopped meanwhile or does not advance.
+    """
+    loop = asyncio.get_running_loop()
+    room, sent = MOST_QUEUED, 0
+    seen, advanced_at = (-1, 0), loop.time()
+    dry_since: float | None = None
+    await controller.require_safe("moveLine")
+    while True:
+        while sent < len(legs) and room > 0:
+            # Looked at before every line, with nothing awaited between: after a stop none may follow.
+            if stopped():
+                raise _cut_short(sent, len(legs), "the arm was told to stop")
+            leg = legs[sent]
+            try:
+                await controller.move_line(leg.target, leg.speed_mm_s, acc_mm_s2, leg.blend_mm)
+            except QueueFull:
+                # Refused, so it may be sent again: the controller holds fewer lines than we thought.
+                if sent == 0 or await controller.queue() == EMPTY:
+                    raise  # none of them is ours
+                break
+            sent, room = sent + 1, room - 1
+        if sent == len(legs):
+            return
+        await asyncio.sleep(poll_s)
+        await controller.require_safe("moveLine")
+        queue, now = await controller.queue(), loop.time()
+        if queue != seen:
+            seen, advanced_at = queue, now
+        elif now - advanced_at > STUCK_S + 2.0 * max(leg.seconds for leg in legs[:sent]):
+            raise _cut_short(sent, len(legs), "the arm does not advance")
+        room = max(MOST_QUEUED - queue[1], 0)
+        if queue != EMPTY:
+            dry_since = None
+            continue
+        # Fed too slowly, which is a pity; not begun yet; or stopped by somebody, and then nothing may follow.
+        off_mm, off_deg = distance(await controller.pose(), legs[sent - 1].target)
+        if off_mm <= tolerance.position_mm and off_deg <= tolerance.rotation_deg:
+            notice(f"the arm halted at point {sent} of {len(legs)}: lines did not reach the controller in time")
+            continue
+        room, dry_since = 0, dry_since or now
+        if now - dry_since > RESTS_ELSEWHERE_S:
+            raise _cut_short(sent, len(legs), f"the arm rests {off_mm:.2f} mm from where it was sent")
+
+
+def _cut_short(sent: int, legs: int, why: str) -> MotionFailed:
+    return MotionFailed(
+        DEVICE,
+        "follow",
+        f"{why}, after {sent} of {legs} points were sent",
+        condition="The arm was told to stop, and the brush may be down.",
+        remedy="Lift the brush before anything else.",
+    )

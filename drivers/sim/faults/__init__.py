@@ -1,0 +1,1 @@
+"""Faults of the loopback rig on a script: what may go wrong, when, and for how long."""

@@ -1,0 +1,143 @@
+"""The board on which faults hang until they strike; every server of the rig looks at it before it answers."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from drivers.sim.faults.phases import Phase
+from drivers.sim.faults.vocabulary import Device, Fault
+
+KEPT = 100
+"""Faults that are over and still told."""
+MOST = 1000
+"""Faults that may hang at once."""
+
+
+class Watched(Protocol):
+    """What triggers look at; `drivers.sim.faults.truth.Truth` in a rig."""
+
+    @property
+    def presses(self) -> int:
+        """Presses on the paper."""
+        ...
+
+    def now_s(self) -> float:
+        """Simulated time."""
+        ...
+
+    def phase(self) -> Phase:
+        """What the arm does."""
+        ...
+
+
+@dataclass(slots=True)
+class Hung:
+    """A fault on the board and how far it has got."""
+
+    ident: int
+    fault: Fault
+    seen: int = 0
+    """Requests that matched before it began."""
+    struck: int = 0
+    until_s: float | None = None
+    """Real time at which `for_s` is over, once it has begun."""
+
+
+class FaultBoard:
+    """Faults in the order in which they were hung; of several that match one request the first strikes it.
+
+    `hang`, `take` and `clear` may come from any thread; the rest belongs to the event loop of the rig.
+    """
+
+    def __init__(self, truth: Watched, real_s: Callable[[], float] = time.monotonic) -> None:
+        self._truth = truth
+        self._real_s = real_s
+        self._idents = itertools.count(1)
+        self._hanging: tuple[Hung, ...] = ()
+        self.over: deque[Hung] = deque(maxlen=KEPT)
+        """The newest faults whose extent is over."""
+
+    def hang(self, fault: Fault) -> int:
+        """Arm a fault; returns the number by which it can be taken down. Raises ValueError above `MOST`."""
+        if len(self._hanging) >= MOST:
+            raise ValueError(f"{MOST} faults hang already")
+        hung = Hung(next(self._idents), fault)
+        self._hanging = (*self._hanging, hung)
+        return hung.ident
+
+    def take(self, ident: int) -> bool:
+        """Take one down; False where none of that number hangs."""
+        before = self._hanging
+        self._hanging = tuple(hung for hung in before if hung.ident != ident)
+        return len(self._hanging) < len(before)
+
+    def clear(self) -> int:
+        """Take all down; returns how many hung."""
+        count, self._hanging = len(self._hanging), ()
+        return count
+
+    @property
+    def hanging(self) -> tuple[Hung, ...]:
+        """What waits or strikes."""
+        self._expire()
+        return self._hanging
+
+    @property
+    def waits_by_itself(self) -> bool:
+        """True while a fault hangs that no request will find: somebody must ask `due` now and then."""
+        return any(hung.fault.by_itself for hung in self._hanging)
+
+    def meet(self, device: Device, op: str, kinds: frozenset[str]) -> Fault | None:
+        """The fault, of these kinds, that strikes this request, push or frame; it counts as one strike."""
+        for hung in self.hanging:
+            fault = hung.fault
+            if fault.device is device and fault.kind in kinds and not fault.by_itself and self._strikes(hung, op):
+                return fault
+        return None
+
+    def due(self) -> list[Fault]:
+        """Faults that begin by themselves and do so now; they are over with that."""
+        begun = [hung for hung in self._hanging if hung.fault.by_itself and self._holds(hung.fault)]
+        for hung in begun:
+            hung.struck = hung.fault.strikes or 1
+            self._end(hung)
+        return [hung.fault for hung in begun]
+
+    def _strikes(self, hung: Hung, op: str) -> bool:
+        fault = hung.fault
+        if not fault.matches(op):
+            return False
+        if not hung.struck:
+            if not self._holds(fault):
+                return False
+            hung.seen += 1
+            if hung.seen < fault.nth:
+                return False
+            if fault.for_s is not None:
+                hung.until_s = self._real_s() + fault.for_s
+        hung.struck += 1
+        if fault.strikes is not None and hung.struck >= fault.strikes:
+            self._end(hung)
+        return True
+
+    def _holds(self, fault: Fault) -> bool:
+        truth = self._truth
+        return (
+            truth.now_s() >= fault.after_s
+            and (fault.press is None or truth.presses == fault.press)
+            and (fault.phase is None or truth.phase() is fault.phase)
+        )
+
+    def _expire(self) -> None:
+        for hung in self._hanging:
+            if hung.until_s is not None and self._real_s() >= hung.until_s:
+                self._end(hung)
+
+    def _end(self, hung: Hung) -> None:
+        if self.take(hung.ident):
+            self.over.append(hung)

@@ -1,0 +1,72 @@
+"""What the arm is doing, from where its tip is and where it goes: what the world knows, not what anyone asked for."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+from drivers.sim.config import Table
+
+ON_PAPER_MM = 0.1
+"""Nobody teaches the paper's height exactly: a tip that ends or rests so little above it counts as on it."""
+LIFT_MM = 10.0
+"""Rising counts as lifting from so low on."""
+HOME_MM = 1.0
+
+
+class Phase(StrEnum):
+    """One at a time; the first that fits."""
+
+    DIPPING = "dipping"
+    """Over the well, and below its rim or on the way there."""
+    PRESSED = "pressed"
+    """At rest on or below the paper plane, over the sheet."""
+    DESCENDING = "descending"
+    """Over the sheet, on a line down that ends on or below the paper plane."""
+    LIFTING = "lifting"
+    """Over the sheet, rising from the paper or from just above it."""
+    TRAVELLING = "travelling"
+    """Any other motion."""
+    PARKED = "parked"
+    """At rest where the tip was when the rig started, which is where its `rig.toml` parks it."""
+    RESTING = "resting"
+    """At rest anywhere else."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spot:
+    """A place of the tip: x and y in the paper frame, height above the paper plane."""
+
+    x_mm: float
+    y_mm: float
+    height_mm: float
+
+    def distance_mm(self, other: Spot) -> float:
+        """Straight-line distance."""
+        return math.dist((self.x_mm, self.y_mm, self.height_mm), (other.x_mm, other.y_mm, other.height_mm))
+
+
+def phase_of(table: Table, home: Spot, here: Spot, to: Spot | None) -> Phase:
+    """The phase of a tip at `here`, on its way to `to`; None where it rests."""
+    heights = [spot.height_mm for spot in (here, to) if spot is not None]
+    if _over_well(table, here) and min(heights) < table.well_depth_mm:
+        return Phase.DIPPING
+    over_sheet = _over_sheet(table, here)
+    if to is None:
+        if over_sheet and here.height_mm <= ON_PAPER_MM:
+            return Phase.PRESSED
+        return Phase.PARKED if here.distance_mm(home) <= HOME_MM else Phase.RESTING
+    if over_sheet and to.height_mm < here.height_mm and to.height_mm <= ON_PAPER_MM:
+        return Phase.DESCENDING
+    if over_sheet and to.height_mm > here.height_mm and here.height_mm <= LIFT_MM:
+        return Phase.LIFTING
+    return Phase.TRAVELLING
+
+
+def _over_well(table: Table, spot: Spot) -> bool:
+    return math.dist((spot.x_mm, spot.y_mm), table.well_mm) <= table.well_radius_mm
+
+
+def _over_sheet(table: Table, spot: Spot) -> bool:
+    return 0.0 <= spot.x_mm <= table.sheet_mm[0] and 0.0 <= spot.y_mm <= table.sheet_mm[1]

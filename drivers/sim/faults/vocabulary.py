@@ -1,0 +1,108 @@
+"""The vocabulary of faults: one entry says what breaks, how, when it begins and how long it lasts."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from drivers.sim.faults.phases import Phase
+
+ALWAYS = 1_000_000
+"""A count that no session reaches."""
+
+
+class Device(StrEnum):
+    """What breaks."""
+
+    ROBOT = "robot"
+    """The controller's JSON-RPC port."""
+    TELEMETRY = "telemetry"
+    """Its RTDE port."""
+    CAMERA = "camera"
+    INK = "ink"
+    FORCE = "force"
+
+
+LOST = frozenset({"deaf"})
+"""The request never arrives: neither done nor answered."""
+REPLIES = frozenset({"mute", "late", "split", "duplicate", "wrong-id", "malformed", "garbage", "drop"})
+"""The request is carried out; something is wrong with its reply."""
+STOPS = frozenset({"protective-stop", "emergency-stop", "safeguard-stop"})
+"""The cabinet stops the arm by itself; only a person ends that."""
+
+KINDS: dict[Device, frozenset[str]] = {
+    Device.ROBOT: LOST | REPLIES | STOPS,
+    Device.TELEMETRY: frozenset({"mute", "malformed", "drop"}),
+    Device.CAMERA: frozenset({"stale", "black", "frozen", "torn", "drop"}),
+    Device.INK: frozenset(
+        {"deaf", "mute", "garbage", "late", "split", "damaged", "mistaken", "echo", "unplug"}
+    ),  # the names of drivers.sim.ink_station.Fault
+    Device.FORCE: frozenset(
+        {"silence", "no-first", "no-second", "no-third", "short", "nan", "inf", "bus-error", "bus-off"}
+    ),  # the names of drivers.sim.force_board.Fault
+}
+HANDED_OVER = frozenset({Device.INK, Device.FORCE})
+"""Their simulators keep their own list of faults, one for each of the next requests or rounds."""
+
+
+class Fault(BaseModel):
+    """One fault. All conditions of its trigger must hold at once; without any it begins at once.
+
+    Once begun it strikes every request, push or frame that it matches until its extent is over.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    device: Device
+    kind: str
+    after_s: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
+    """Not before so many simulated seconds since the rig started."""
+    on: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.]{0,79}$")] | None = None
+    """Only requests of this method: `moveLine`, or in full `rob1.MotionControl.moveLine`; `login` for the login."""
+    nth: Annotated[int, Field(ge=1, le=ALWAYS)] = 1
+    """It begins with the n-th request, push or frame of those for which all other conditions hold."""
+    phase: Phase | None = None
+    """Begins only while the arm really does this."""
+    press: Annotated[int, Field(ge=0, le=ALWAYS)] | None = None
+    """Begins only while so many presses lie on the paper: from lifting off one to lifting off the next."""
+    count: Annotated[int, Field(ge=1, le=ALWAYS)] | None = None
+    """Strikes so many times; once where neither this nor `for_s` is given."""
+    for_s: Annotated[float, Field(gt=0.0, le=86_400.0)] | None = None
+    """Strikes for so many real seconds, as the timeouts of drivers are, from when it begins."""
+    late_s: Annotated[float, Field(ge=0.001, le=60.0)] = 0.3
+    """How late a `late` reply of the robot comes, in real seconds."""
+
+    @model_validator(mode="after")
+    def _coherent(self) -> Fault:
+        kinds = KINDS[self.device]
+        if self.kind not in kinds:
+            raise ValueError(f"kind = {self.kind!r} is not one of {self.device}'s: {', '.join(sorted(kinds))}")
+        if self.count is not None and self.for_s is not None:
+            raise ValueError("count and for_s exclude each other")
+        if self.on is not None and self.device is not Device.ROBOT:
+            raise ValueError(f"on = {self.on!r}: only the robot has methods")
+        if self.kind in STOPS and (self.for_s is not None or self.count not in (None, 1)):
+            raise ValueError(f"{self.kind} happens once and lasts until a person ends it: no count, no for_s")
+        if self.device in HANDED_OVER and self.for_s is not None:
+            raise ValueError(f"for_s does not go with {self.device}: give count")
+        if self.by_itself and self.nth != 1:
+            raise ValueError(f"nth = {self.nth} counts nothing here: {self.kind} of {self.device} waits for no request")
+        if "late_s" in self.model_fields_set and (self.device, self.kind) != (Device.ROBOT, "late"):
+            raise ValueError("late_s goes with device = 'robot', kind = 'late' only")
+        return self
+
+    @property
+    def by_itself(self) -> bool:
+        """True where it begins without anything being asked."""
+        return self.device in HANDED_OVER or (self.kind in STOPS and self.on is None)
+
+    @property
+    def strikes(self) -> int | None:
+        """How often; None where `for_s` ends it."""
+        return None if self.for_s is not None else self.count or 1
+
+    def matches(self, op: str) -> bool:
+        """Whether `op`, a method's full name, is one that it waits for."""
+        return self.on is None or op == self.on or op.endswith(f".{self.on}")

@@ -1,0 +1,205 @@
+"""What a `Robot` promises, whoever answers: the loopback controller in either framing, or the arm of `--rig`.
+
+Tests that power or move the arm are marked `moves`; each begins where the arm stands and brings it back there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import itertools
+import math
+from collections.abc import AsyncIterator
+
+import pytest
+
+from collect.config import RigConfig
+from collect.rig import limits_of, make_robot
+from drivers.arcs.robot import AuboArcs
+from drivers.arcs.rpc import RpcConnection
+from drivers.clock import HostClock
+from drivers.errors import LimitExceeded, MotionError, NotConnected
+from drivers.geometry import distance
+from drivers.samples import Pose, PoseSample
+from tests.contract.motion import ACC_MM_S2, LIFT_MM, SLOW_MM_S, SPEED_MM_S, Enabled, raised
+
+GENTLY = {"speed_mm_s": SPEED_MM_S, "acc_mm_s2": ACC_MM_S2}
+SLOWLY = {"speed_mm_s": SLOW_MM_S, "acc_mm_s2": ACC_MM_S2}
+POSITION_MM, ROTATION_DEG = 0.05, 0.1
+STILL_MM = 0.02
+SAMPLES, LEAST_HZ = 40, 20.0
+
+
+def assert_there(here: Pose, target: Pose) -> None:
+    off_mm, off_deg = distance(here, target)
+    assert off_mm <= POSITION_MM
+    assert off_deg <= ROTATION_DEG
+
+
+async def assert_still(robot: AuboArcs) -> Pose:
+    """Where the arm rests; it must not creep away within a fifth of a second."""
+    before = await robot.where()
+    await asyncio.sleep(0.2)
+    after = await robot.where()
+    assert distance(before, after)[0] <= STILL_MM
+    return after
+
+
+@contextlib.asynccontextmanager
+async def on_the_way_up(arm: Enabled) -> AsyncIterator[asyncio.Task[None]]:
+    """A slow move that has risen by a tenth of its way; ended when the block ends."""
+    moving = asyncio.Event()
+    arm.robot.listen(lambda s: moving.set() if s.pose.z_mm > arm.start.z_mm + LIFT_MM / 10 else None)
+    move = asyncio.create_task(arm.robot.move(arm.top, **SLOWLY))
+    try:
+        async with asyncio.timeout(10.0):
+            await moving.wait()
+        yield move
+    finally:
+        arm.robot.listen(None)
+        move.cancel()
+        await asyncio.gather(move, return_exceptions=True)
+
+
+async def test_connecting_says_who_answers(rig: RigConfig, the_only_driver: None):
+    robot = make_robot(rig, HostClock(), print)
+    with pytest.raises(NotConnected):
+        robot.latest()
+    try:
+        identity = await robot.connect()
+    finally:
+        await robot.close()
+    assert identity.device
+    assert identity.model
+    assert identity.firmware
+
+
+async def test_where_and_latest_agree_on_an_arm_at_rest(arm: AuboArcs):
+    here = await assert_still(arm)
+    assert_there(arm.latest().pose, here)
+
+
+async def test_telemetry_comes_often_and_in_order(arm: AuboArcs):
+    samples: list[PoseSample] = []
+    enough = asyncio.Event()
+
+    def take(sample: PoseSample) -> None:
+        samples.append(sample)
+        if len(samples) == SAMPLES:
+            enough.set()
+
+    arm.listen(take)
+    async with asyncio.timeout(SAMPLES / LEAST_HZ):
+        await enough.wait()
+    arm.listen(None)
+    taken = samples[:SAMPLES]
+    assert all(b.stamp.seq == a.stamp.seq + 1 for a, b in itertools.pairwise(taken))
+    assert all(b.stamp.host_ns > a.stamp.host_ns for a, b in itertools.pairwise(taken))
+
+
+async def test_a_target_out_of_limits_is_refused_before_anything_is_sent(
+    rig: RigConfig, arm: AuboArcs, monkeypatch: pytest.MonkeyPatch
+):
+    limits = limits_of(rig)
+    axes = {axis: getattr(limits, axis) for axis in ("x_mm", "y_mm", "z_mm")}
+    inside = dataclasses.replace(await arm.where(), **{axis: sum(ends) / 2 for axis, ends in axes.items()})
+    wrong = [(axis, side, SPEED_MM_S) for axis, (low, high) in axes.items() for side in (low - 1.0, high + 1.0)]
+    wrong += [("x_mm", math.nan, SPEED_MM_S), ("speed", 0.0, limits.speed_mm_s + 1.0)]
+    sent: list[str] = []
+    call = RpcConnection.call
+
+    async def seen(self: RpcConnection, method: str, params: dict[str, object] | None = None) -> object:
+        sent.append(method)
+        return await call(self, method, params)
+
+    monkeypatch.setattr(RpcConnection, "call", seen)
+    for field, value, speed_mm_s in wrong:
+        target = inside if field == "speed" else dataclasses.replace(inside, **{field: value})
+        with pytest.raises(LimitExceeded) as caught:
+            await arm.move(target, speed_mm_s=speed_mm_s, acc_mm_s2=ACC_MM_S2)
+        assert caught.value.field in (field.removesuffix("_mm"), "tilt")
+    assert not [method for method in sent if not method.rpartition(".")[2].startswith("get")], "more than questions"
+
+
+async def test_connecting_and_closing_leaves_the_arm_where_it_is(rig: RigConfig, the_only_driver: None):
+    poses: list[Pose] = []
+    for _ in range(2):
+        robot = make_robot(rig, HostClock(), print)
+        try:
+            await robot.connect()
+            poses.append(await assert_still(robot))
+        finally:
+            await robot.close()
+        with pytest.raises(NotConnected):
+            await robot.where()
+    assert distance(*poses)[0] <= STILL_MM
+
+
+@pytest.mark.moves
+async def test_enabling_readies_the_arm_and_moves_nothing(enabled: Enabled):
+    condition = await enabled.robot.condition(1)
+    assert condition.mode == "Running"
+    assert_there(await assert_still(enabled.robot), enabled.start)
+
+
+@pytest.mark.moves
+async def test_a_move_arrives(enabled: Enabled):
+    for target in (raised(enabled.start, LIFT_MM / 2), enabled.top, enabled.start):
+        await enabled.robot.move(target, **GENTLY)
+        assert_there(await assert_still(enabled.robot), target)
+
+
+@pytest.mark.moves
+async def test_a_move_to_where_the_arm_stands_is_done_at_once(enabled: Enabled):
+    async with asyncio.timeout(1.0):
+        await enabled.robot.move(enabled.start, **GENTLY)
+    assert_there(await assert_still(enabled.robot), enabled.start)
+
+
+@pytest.mark.moves
+async def test_a_stop_in_mid_move_stops_short_and_a_later_move_works(enabled: Enabled):
+    async with on_the_way_up(enabled) as move:
+        await enabled.robot.stop()
+        stopped = await assert_still(enabled.robot)
+        with pytest.raises(MotionError):
+            await move
+    risen_mm = stopped.z_mm - enabled.start.z_mm
+    assert 0.0 < risen_mm < LIFT_MM - 10 * POSITION_MM
+    await enabled.robot.move(enabled.start, **GENTLY)
+    assert_there(await enabled.robot.where(), enabled.start)
+
+
+@pytest.mark.moves
+async def test_a_move_that_is_cancelled_stops_the_arm(enabled: Enabled):
+    async with on_the_way_up(enabled) as move:
+        move.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await move
+        stopped = await assert_still(enabled.robot)
+    assert stopped.z_mm - enabled.start.z_mm < LIFT_MM - 10 * POSITION_MM
+
+
+@pytest.mark.moves
+async def test_a_stop_of_an_idle_arm_is_harmless_also_twice_and_at_once(enabled: Enabled):
+    await enabled.robot.stop()
+    await enabled.robot.stop()
+    await asyncio.gather(enabled.robot.stop(), enabled.robot.stop())
+    assert_there(await assert_still(enabled.robot), enabled.start)
+    await enabled.robot.move(raised(enabled.start, LIFT_MM / 2), **GENTLY)
+
+
+@pytest.mark.moves
+async def test_closing_in_mid_move_leaves_no_motion(rig: RigConfig, enabled: Enabled):
+    async with on_the_way_up(enabled):
+        await enabled.robot.close()
+    other = make_robot(rig, HostClock(), print)
+    try:
+        await other.connect()
+        stopped = await assert_still(other)
+    finally:
+        await other.close()
+    assert stopped.z_mm - enabled.start.z_mm < LIFT_MM - 10 * POSITION_MM
+    # Again, so that it can be brought back.
+    await enabled.robot.connect()
+    await enabled.robot.enable()

@@ -1,0 +1,122 @@
+"""`--rig` as an operator has it: a pytest of its own, on a terminal or without one, against a loopback rig."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import re
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+QUESTION = "May the arm move? [y/N]"
+# One test that moves and two that do not.
+CHOSEN = "a_move_arrives or who_answers or agree_on_an_arm"
+WITHIN_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def rig_toml(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A loopback rig in a process of its own, as `brushloop sim --write-rig` serves it."""
+    path = tmp_path_factory.mktemp("rig") / "rig.toml"
+    command = [sys.executable, "-m", "brushloop", "sim", "--write-rig", str(path), "--rate", "5"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as sim:
+        try:
+            deadline = time.monotonic() + WITHIN_S
+            while not path.exists():
+                assert sim.poll() is None
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+            yield path
+        finally:
+            sim.terminate()
+
+
+def command(rig_toml: Path, *more: str) -> list[str]:
+    what = [sys.executable, "-m", "pytest", "tests/contract", "--rig", str(rig_toml), "-k", CHOSEN]
+    return [*what, "-p", "no:cacheprovider", "--color=no", *more]
+
+
+def on_a_terminal(rig_toml: Path, answer: str) -> tuple[int, str]:
+    """Exit code and output of a run that is given `answer` once it asks."""
+    ours, theirs = pty.openpty()
+    with subprocess.Popen(
+        command(rig_toml), cwd=ROOT, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True
+    ) as run:
+        os.close(theirs)
+        try:
+            output, answered = "", False
+            deadline = time.monotonic() + WITHIN_S
+            # Linux tells that the other end has gone by an error.
+            with contextlib.suppress(OSError):
+                while time.monotonic() < deadline:
+                    if not select.select([ours], [], [], 1.0)[0]:
+                        continue
+                    if not (data := os.read(ours, 65536)):
+                        break
+                    output += data.decode()
+                    if QUESTION in output and not answered:
+                        assert "passed" not in output, "asks before the first test"
+                        os.write(ours, f"{answer}\n".encode())
+                        answered = True
+            return run.wait(WITHIN_S), output
+        finally:
+            run.kill()
+            os.close(ours)
+
+
+def test_it_says_what_it_will_do_and_after_a_yes_it_moves(rig_toml: Path):
+    code, output = on_a_terminal(rig_toml, "y")
+    assert code == 0, output
+    assert "3 passed" in output
+    for told in (
+        r"1 tests are about to power an arm and move it",
+        r"robot +aubo_i5 \(brushloop-loopback\).*: the loopback rig, simulated",
+        r"address +127\.0\.0\.1:\d+, framing sof",
+        r"tip +x 250\.0, y -230\.0, z \d+\.0 mm",
+        r"box +straight up by at most 5 mm from where the tip stands, and back",
+        r"step +5 mm at most, at 10 mm/s",
+    ):
+        assert re.search(told, output), told
+
+
+@pytest.mark.parametrize("answer", ["n", ""])
+def test_any_other_answer_skips_what_moves_and_runs_the_rest(rig_toml: Path, answer: str):
+    code, output = on_a_terminal(rig_toml, answer)
+    assert code == 0, output
+    assert "2 passed, 1 skipped" in output
+    assert f"the answer to whether the arm may move was {answer or 'no'!r}" in output
+
+
+def test_without_a_terminal_nothing_moves(rig_toml: Path):
+    run = subprocess.run(
+        command(rig_toml), cwd=ROOT, input="y\n", capture_output=True, text=True, check=False, timeout=WITHIN_S
+    )
+    assert run.returncode == 0, run.stdout
+    assert "2 passed, 1 skipped" in run.stdout
+    assert "no terminal to ask on" in run.stdout
+
+
+@pytest.mark.parametrize(
+    ("toml", "more", "told"),
+    [
+        (None, [], "no such file"),
+        ("name = 1", [], "rig.toml"),
+        ("", ["-n", "2"], "several processes"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line(tmp_path: Path, toml: str | None, more: list[str], told: str):
+    path = tmp_path / "rig.toml"
+    if toml is not None:
+        path.write_text(toml, encoding="utf-8")
+    run = subprocess.run(command(path, *more), cwd=ROOT, capture_output=True, text=True, check=False, timeout=WITHIN_S)
+    assert run.returncode == pytest.ExitCode.USAGE_ERROR
+    assert told in run.stderr
+    assert "Traceback" not in run.stderr

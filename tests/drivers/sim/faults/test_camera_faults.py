@@ -1,0 +1,116 @@
+"""What the camera's driver does with frames that must not be believed, through a real decoder.
+
+How a single frame is judged is in tests/drivers/test_camera_health.py; a stream that ends, in test_camera.py.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+
+import numpy as np
+import pytest
+
+from drivers.camera import CameraOptions, OpenCvCamera
+from drivers.camera.health import Fault as Judgement
+from drivers.camera.health import FrameHealth
+from drivers.clock import HostClock
+from drivers.errors import DeviceTimeout
+from drivers.samples import Stamp
+from drivers.sim.faults.vocabulary import ALWAYS, Device, Fault
+from drivers.sim.rig import HOST, LoopbackRig
+from drivers.sim.scene import read_strip
+
+CLOCK = HostClock()
+
+
+@pytest.fixture
+def notices() -> list[str]:
+    return []
+
+
+@pytest.fixture
+async def camera(rig: LoopbackRig, notices: list[str]) -> AsyncIterator[OpenCvCamera]:
+    url = f"http://{HOST}:{rig.camera.port}/stream.mjpg"
+    camera = OpenCvCamera(CameraOptions(url, timeout_s=1.5), CLOCK, notices.append)
+    await camera.connect()
+    yield camera
+    await camera.close()
+
+
+def view(kind: str, **more: object) -> Fault:
+    return Fault.model_validate({"device": Device.CAMERA, "kind": kind, **more})
+
+
+async def seen_after(camera: OpenCvCamera, after_ns: int) -> int:
+    """When the frame that the driver hands over was really rendered."""
+    return read_strip((await camera.fresh(Stamp(after_ns))).image)
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("black", r"frames passed over: \d+ black"),
+        ("frozen", r"frames passed over: .*\d+ frozen"),
+        ("torn", r"frames passed over: .*\d+ torn"),
+    ],
+)
+async def test_frames_that_are_no_picture_are_a_timeout_that_names_them_and_then_it_goes_on(
+    rig: LoopbackRig, camera: OpenCvCamera, notices: list[str], kind: str, words: str
+):
+    ident = rig.faults.hang(view(kind, count=ALWAYS))
+    with pytest.raises(DeviceTimeout, match=words):
+        # The first of equal frames cannot be told from a new one: ask for what is exposed well after it.
+        await camera.fresh(Stamp(CLOCK.now_ns() + 10**9))
+    assert kind in notices[-1]
+    rig.faults.board.take(ident)
+    asked_ns = CLOCK.now_ns()
+    assert await seen_after(camera, asked_ns) >= asked_ns
+
+
+async def test_a_stream_that_stalls_is_a_timeout(rig: LoopbackRig, camera: OpenCvCamera):
+    rig.faults.hang(view("stale", count=ALWAYS))
+    await asyncio.sleep(0.3)
+    with pytest.raises(DeviceTimeout, match="no sound new frame"):
+        await camera.fresh(Stamp(CLOCK.now_ns()))
+
+
+async def test_of_a_backlog_that_comes_at_once_nothing_is_taken_for_new(rig: LoopbackRig, camera: OpenCvCamera):
+    """After a stall the stream hands over what it held back, oldest first, as a camera's buffer does."""
+    await camera.fresh(Stamp(CLOCK.now_ns()))  # the driver knows the usual pace
+    rig.faults.hang(view("stale", for_s=1.0))
+    await asyncio.sleep(0.1)
+    for _ in range(7):
+        asked_ns = CLOCK.now_ns()
+        assert await seen_after(camera, asked_ns) >= asked_ns
+        await asyncio.sleep(0.05)
+
+
+async def test_a_dropped_stream_is_opened_again_and_told(rig: LoopbackRig, camera: OpenCvCamera, notices: list[str]):
+    rig.faults.hang(view("drop"))
+    await asyncio.sleep(0.3)
+    asked_ns = CLOCK.now_ns()
+    assert await seen_after(camera, asked_ns) >= asked_ns
+    assert notices[0] == "camera: the stream ended and is opened again"
+    assert notices[1].startswith("camera is back after")
+
+
+def test_a_picture_whose_end_is_to_the_bit_that_of_the_one_before_is_torn():
+    """FFmpeg fills what is missing of a JPEG with the last whole picture, so that it looks sound."""
+    rng = np.random.default_rng(1)
+    first, second, third = (rng.normal(200.0, 2.0, (480, 640)).clip(0, 255).astype(np.uint8) for _ in range(3))
+    patched, again = second.copy(), third.copy()
+    patched[300:], again[400:] = first[300:], first[400:]
+    jpegs = FrameHealth(latency_ns=0, frozen_after=5, live=True, independent=True)
+    judged = [jpegs.judge(image, k * 10**8) for k, image in enumerate((first, patched, again, third, third))]
+    assert judged == [None, Judgement.TORN, Judgement.TORN, None, None]
+    video = FrameHealth(latency_ns=0, frozen_after=5, live=True)  # repeats what does not move, and may
+    assert [video.judge(image, k * 10**8) for k, image in enumerate((first, patched))] == [None, None]
+
+
+async def test_a_picture_that_comes_again_is_not_taken_for_new_even_once(rig: LoopbackRig, camera: OpenCvCamera):
+    """A freeze that begins just before a photograph is asked for is shorter than what is called frozen."""
+    for _ in range(3):
+        rig.faults.hang(view("frozen", count=4))
+        asked_ns = CLOCK.now_ns()
+        assert await seen_after(camera, asked_ns) >= asked_ns

@@ -1,0 +1,187 @@
+"""The control socket: what it answers, who may open it, and that nothing a client says ends the rig."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import stat
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.arcs.codes import SafetyMode
+from drivers.sim.config import SimConfig
+from drivers.sim.faults.control import MAX_LINE_BYTES, ControlPathError, ControlServer, live_control
+from drivers.sim.rig import LoopbackRig
+
+Ask = Callable[[object], Awaitable[dict[str, Any]]]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "control"
+
+
+@pytest.fixture
+async def control(rig: LoopbackRig, path: Path) -> AsyncIterator[ControlServer]:
+    server = ControlServer(rig.faults)
+    await server.open(path)
+    yield server
+    await server.stop()
+    assert not path.exists()
+
+
+@pytest.fixture
+async def ask(control: ControlServer, path: Path) -> AsyncIterator[Ask]:
+    reader, writer = await asyncio.open_unix_connection(str(path))
+
+    async def exchange(request: object) -> dict[str, Any]:
+        writer.write((request if isinstance(request, bytes) else json.dumps(request).encode()) + b"\n")
+        async with asyncio.timeout(3.0):
+            return json.loads(await reader.readline())
+
+    yield exchange
+    writer.close()
+    await writer.wait_closed()
+
+
+async def test_a_fault_is_hung_listed_and_taken_down(ask: Ask, rig: LoopbackRig):
+    fault = {"device": "robot", "kind": "mute", "on": "moveLine", "nth": 2}
+    assert await ask({"do": "add", "fault": fault}) == {"ok": True, "id": 1}
+    assert (await ask({"do": "list"}))["hanging"] == [{"id": 1, "fault": fault, "struck": 0}]
+    assert await ask({"do": "clear", "id": 7}) == {"ok": True, "taken": 0}
+    assert await ask({"do": "clear", "id": 1}) == {"ok": True, "taken": 1}
+    await ask({"do": "add", "fault": fault})
+    assert await ask({"do": "clear"}) == {"ok": True, "taken": 1}
+    assert not rig.faults.board.hanging
+
+
+async def test_the_state_is_what_the_world_knows(ask: Ask):
+    state = await ask({"do": "state"})
+    assert state["ok"]
+    assert (state["phase"], state["moving"], state["presses"], state["ink_load"]) == ("parked", False, 0, 0.0)
+    assert (state["robot_mode"], state["safety_mode"], state["faults"]) == ("PowerOff", "Normal", 0)
+    assert state["tip_mm"] == [250.0, -230.0, 260.0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "mode"),
+    [
+        ("protective-stop", SafetyMode.PROTECTIVE_STOP),
+        ("safeguard-stop", SafetyMode.SAFEGUARD_STOP),
+        ("emergency-stop", SafetyMode.ROBOT_EMERGENCY_STOP),
+    ],
+)
+async def test_a_person_ends_a_stop_that_was_asked_for(ask: Ask, kind: str, mode: SafetyMode):
+    await ask({"do": "add", "fault": {"device": "robot", "kind": kind}})
+    async with asyncio.timeout(2.0):
+        while (await ask({"do": "state"}))["safety_mode"] != mode:
+            await asyncio.sleep(0.005)
+    assert await ask({"do": "release"}) == {"ok": True, "was": mode.value}
+    assert (await ask({"do": "state"}))["safety_mode"] == "Normal"
+    assert await ask({"do": "release"}) == {"ok": True, "was": "Normal"}
+
+
+async def test_a_fresh_sheet_is_put_in(ask: Ask, rig: LoopbackRig):
+    before = rig.world.version
+    assert await ask({"do": "fresh-sheet"}) == {"ok": True}
+    assert rig.world.version == before + 1
+
+
+REFUSED: list[tuple[object, str]] = [
+    (b"hello", "not JSON"),
+    (b"", "not JSON"),
+    (b"\xff\xfe", "not JSON"),
+    (b"[" * 5000, "not JSON"),
+    (b"[]", "not a request"),
+    (b"null", "not a request"),
+    ({"do": "explode"}, "not a request"),
+    ({"do": ["add"]}, "not a request"),
+    ({"do": "state", "more": 1}, "not a request"),
+    ({"do": "clear", "id": "1"}, "not a request"),
+    ({"do": "clear", "id": True}, "not a request"),
+    ({"do": "add"}, "not a request"),
+    ({"do": "add", "fault": 3}, "not a request"),
+    ({"do": "add", "fault": {}}, "Field required"),
+    ({"do": "add", "fault": {"device": "robot", "kind": "loud"}}, "is not one of robot's"),
+    ({"do": "add", "fault": {"device": "robot", "kind": "mute", "count": 1e30}}, "count"),
+]
+
+
+@pytest.mark.parametrize(("request_", "words"), REFUSED, ids=range(len(REFUSED)))
+async def test_what_is_no_request_gets_one_line_and_the_next_is_answered(ask: Ask, request_: object, words: str):
+    answer = await ask(request_)
+    assert not answer["ok"]
+    assert words in answer["error"]
+    assert answer["error"].isprintable()
+    assert (await ask({"do": "state"}))["ok"]
+
+
+async def test_a_line_without_end_is_refused_and_hung_up_on(control: ControlServer, path: Path, ask: Ask):
+    reader, writer = await asyncio.open_unix_connection(str(path))
+    writer.write(b"x" * (4 * MAX_LINE_BYTES))
+    assert b"at most" in await reader.readline()
+    assert await reader.read() == b""
+    writer.close()
+    await writer.wait_closed()
+    assert (await ask({"do": "state"}))["ok"]
+
+
+NAMES = st.sampled_from(["do", "fault", "id", "device", "kind", "on", "count"]) | st.text(max_size=6)
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda value: st.lists(value, max_size=3) | st.dictionaries(NAMES, value, max_size=4),
+    max_leaves=8,
+)
+
+
+@pytest.fixture(scope="module")
+def idle_control() -> ControlServer:
+    """One that does not listen."""
+    return ControlServer(LoopbackRig(SimConfig(ink_device="none", force_sensor=False)).faults)
+
+
+@settings(deadline=None)
+@given(line=st.binary(max_size=80) | json_values.map(lambda value: json.dumps(value).encode()))
+def test_whatever_a_client_says_has_an_answer_of_one_line(idle_control: ControlServer, line: bytes):
+    answer = idle_control.answer(line)
+    assert isinstance(answer["ok"], bool)
+    assert answer["ok"] or answer["error"].isprintable()
+
+
+async def test_only_its_owner_can_open_it(control: ControlServer, path: Path):
+    mode = path.stat().st_mode
+    assert stat.S_ISSOCK(mode)
+    assert stat.S_IMODE(mode) == 0o600
+
+
+async def test_what_stands_at_the_path_is_not_overwritten(rig: LoopbackRig, path: Path):
+    path.write_text("mine")
+    with pytest.raises(ControlPathError, match="exists and is not a socket"):
+        async with live_control(rig.faults, path):
+            pass
+    assert path.read_text() == "mine"
+
+
+async def test_two_rigs_do_not_share_a_socket_and_one_that_is_dead_is_replaced(rig: LoopbackRig, path: Path):
+    async with live_control(rig.faults, path):
+        with pytest.raises(ControlPathError, match="another rig listens here"):
+            await ControlServer(rig.faults).open(path)
+        path.rename(f"{path}.old")
+    assert Path(f"{path}.old").exists()  # what it did not find at its path it left alone
+    Path(f"{path}.old").rename(path)
+    async with live_control(rig.faults, path):
+        _, writer = await asyncio.open_unix_connection(str(path))
+        writer.close()
+        await writer.wait_closed()
+
+
+async def test_a_path_that_the_system_would_cut_is_refused(rig: LoopbackRig, tmp_path: Path):
+    for path, words in ((tmp_path / ("x" * 120), "at most"), (tmp_path / "no" / "where", "cannot listen here")):
+        with pytest.raises(ControlPathError, match=words) as caught:
+            await ControlServer(rig.faults).open(path)
+        assert caught.value.exit_code == 2

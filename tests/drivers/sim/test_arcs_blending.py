@@ -1,0 +1,273 @@
+"""Moves that are rounded into each other: how near, how fast, and the same whoever looks, whenever they were sent."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.geometry import brush_pose, distance
+from drivers.samples import Pose
+from drivers.sim.arcs_motion import ArmQueue, Pace
+from drivers.sim.config import SimConfig
+from drivers.sim.kinematics import HOME, Joints
+from drivers.sim.motion import MotionQueue
+from drivers.sim.world import World
+
+V, A = 100.0, 1000.0
+DT_S = 0.004
+
+
+def at(x_mm: float, y_mm: float = 0.0, heading_deg: float = 0.0) -> Pose:
+    return brush_pose(x_mm, y_mm, 200.0, heading_deg=heading_deg)
+
+
+CORNER = at(100.0)
+BEYOND = at(100.0, 100.0)
+
+
+class Told:
+    """A queue and the stretches that it told of."""
+
+    def __init__(self) -> None:
+        self.stretches: list[tuple[Pose, Pose]] = []
+        self.queue = ArmQueue(at(0.0), lambda a, b: self.stretches.append((a, b)))
+
+    def corner(self, blend_mm: float, second_s: float = 0.0) -> ArmQueue:
+        self.queue.add(CORNER, V, A, 0.0, blend_mm=blend_mm)
+        self.queue.add(BEYOND, V, A, second_s)
+        return self.queue
+
+
+def walked(queue: MotionQueue, until_s: float) -> np.ndarray:
+    """(times, positions) from 0 on."""
+    times = np.arange(0.0, until_s, DT_S)
+    return np.array([[t, *queue.pose(t).position_mm] for t in times])
+
+
+def speeds(walk: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(np.diff(walk[:, 1:], axis=0), axis=1) / DT_S
+
+
+def test_a_corner_is_rounded_within_its_radius_and_taken_without_a_rest():
+    walk = walked(Told().corner(20.0), 2.5)
+    near = np.linalg.norm(walk[:, 1:] - CORNER.position_mm, axis=1)
+    assert 3.0 < near.min() < 20.0
+    off_the_lines = np.minimum(np.abs(walk[:, 2]), np.abs(walk[:, 1] - 100.0))
+    assert near[off_the_lines > 1e-6].max() <= 20.0 + 1e-6
+    moving = speeds(walk)[np.linalg.norm(walk[:-1, 1:] - CORNER.position_mm, axis=1) < 20.0]
+    assert moving.min() > 60.0
+    assert tuple(walk[-1, 1:]) == BEYOND.position_mm
+
+
+def test_without_a_radius_the_arm_rests_at_the_corner():
+    told = Told()
+    walk = walked(told.corner(0.0), 3.0)
+    assert np.linalg.norm(walk[:, 1:] - CORNER.position_mm, axis=1).min() < 0.1
+    assert len(told.stretches) == 2
+
+
+def test_the_next_id_comes_without_a_gap_and_steady_only_at_the_end():
+    queue = Told().corner(20.0)
+    seen = [(queue.exec_id(t), queue.steady(t)) for t in np.arange(0.0, 3.0, DT_S)]
+    assert [ident for ident, _ in itertools.groupby(ident for ident, _ in seen)] == [0, 1, -1]
+    assert not any(steady for ident, steady in seen if ident >= 0)
+    assert seen[-1] == (-1, True)
+    assert queue.size == 0
+
+
+def test_a_straight_corner_is_no_corner():
+    queue = ArmQueue(at(0.0), lambda *_: None)
+    for x in (50.0, 100.0, 150.0):
+        queue.add(at(x), V, A, 0.0, blend_mm=10.0)
+    assert queue.exec_id(150.0 / V + V / A - 1e-6) == 2
+    assert queue.exec_id(150.0 / V + V / A + 1e-6) == -1
+
+
+ways = st.lists(
+    st.tuples(st.floats(-80.0, 80.0), st.floats(-80.0, 80.0), st.floats(0.0, 60.0), st.floats(20.0, 200.0)),
+    min_size=2,
+    max_size=6,
+)
+
+
+@settings(deadline=None, max_examples=30)
+@given(ways)
+def test_no_way_is_taken_faster_or_harder_than_allowed_and_all_of_them_arrive(
+    way: Sequence[tuple[float, float, float, float]],
+):
+    queue = ArmQueue(at(0.0), lambda *_: None)
+    for x, y, blend, v in way:
+        queue.add(at(x, y), v, A, 0.0, blend_mm=blend)
+    fastest = max(v for *_, v in way)
+    end_s = queue._queue[-1].end_s if queue._queue else 0.0
+    walk = walked(queue, min(end_s + 0.1, 30.0))
+    moving = speeds(walk)
+    assert moving.max() <= fastest * (1 + 1e-6)
+    change = np.linalg.norm(np.diff(walk[:, 1:], n=2, axis=0), axis=1) / DT_S**2
+    # a straight piece slows down while the corner bends at an even speed: never both at once
+    assert change.max() <= A * 1.02 + 1e-3
+    if end_s < 29.0:
+        x, y, *_ = way[-1]
+        assert np.linalg.norm(walk[-1, 1:3] - (x, y)) < 1e-3
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.floats(0.0, 1.04), st.lists(st.floats(0.0, 3.0), max_size=8))
+def test_the_path_depends_neither_on_who_looks_nor_on_when_the_next_move_came(second_s: float, looks: list[float]):
+    def told(second_s: float, looks: list[float]) -> list[tuple[Pose, Pose]]:
+        told = Told()
+        told.queue.add(CORNER, V, A, 0.0, blend_mm=5.0)
+        for t in (t for t in looks if t < second_s):
+            told.queue.pose(t)
+        told.queue.add(BEYOND, V, A, second_s)
+        for t in (t for t in looks if t >= second_s):
+            told.queue.pose(t)
+        told.queue.advance(10.0)
+        # when it began to slow down for the corner (5 mm at 1 m/s2), the second must be there
+        return told.stretches
+
+    one, two = told(min(second_s, 0.9), sorted(looks)), told(0.0, [])
+    assert one == two
+
+
+def test_a_move_that_comes_too_late_begins_at_rest():
+    walk = walked(Told().corner(20.0, second_s=1.09), 3.0)
+    assert np.linalg.norm(walk[:, 1:] - CORNER.position_mm, axis=1).min() < 1e-3
+
+
+def test_a_corner_is_never_larger_than_half_of_its_moves():
+    told = Told()
+    told.queue.add(at(10.0), V, A, 0.0, blend_mm=50.0)
+    told.queue.add(at(10.0, 100.0), V, A, 0.0)
+    told.queue.advance(10.0)
+    assert told.stretches[0][1].x_mm == pytest.approx(5.0)
+
+
+def test_a_turn_on_the_spot_is_not_rounded():
+    told = Told()
+    told.queue.add(CORNER, V, A, 0.0, blend_mm=20.0)
+    told.queue.add(at(100.0, heading_deg=30.0), V, A, 0.0, blend_mm=20.0)
+    told.queue.advance(100.0)
+    assert told.stretches[0][1] == CORNER
+
+
+@pytest.mark.parametrize("stop_s", [0.3, 0.85, 0.9, 1.0, 1.5])
+@pytest.mark.parametrize("acc", [50.0, 400.0, 5000.0])
+def test_a_stop_follows_the_path_through_the_corner(stop_s: float, acc: float):
+    free, stopped = walked(Told().corner(20.0), 4.0), Told().corner(20.0)
+    stopped.pose(stop_s)
+    stopped.stop(acc, 10.0, stop_s)
+    walk = walked_from(stopped, stop_s, 6.0)
+    moving = speeds(walk)
+    assert np.all(np.diff(moving) <= 0.03 * V)
+    assert moving[-1] == 0.0
+    for point in walk[::30, 1:]:
+        assert np.linalg.norm(free[:, 1:] - point, axis=1).min() < 0.4
+    assert stopped.exec_id(6.0) == -1
+
+
+def walked_from(queue: MotionQueue, begin_s: float, until_s: float) -> np.ndarray:
+    return np.array([[t, *queue.pose(t).position_mm] for t in np.arange(begin_s, until_s, DT_S)])
+
+
+@pytest.mark.parametrize("hold_s", [0.05, 0.5, 0.8, 0.86, 0.9, 1.1])
+@pytest.mark.parametrize("acc", [200.0, 2000.0])
+def test_a_path_held_anywhere_goes_on_along_itself(hold_s: float, acc: float):
+    free, told = walked(Told().corner(20.0), 4.0), Told()
+    queue = told.corner(20.0)
+    queue.pose(hold_s)
+    queue.hold(acc, 10.0, hold_s)
+    before = queue.exec_id(hold_s)
+    assert before in (0, 1)
+    assert queue.exec_id(8.0) >= before
+    assert queue.steady(8.0)
+    queue.resume(8.0)
+    walk = walked_from(queue, 8.0, 14.0)
+    assert np.linalg.norm(walk[-1, 1:] - BEYOND.position_mm) < 1e-6
+    assert speeds(walk).max() <= V * (1 + 1e-6)
+    for point in walk[::30, 1:]:
+        assert np.linalg.norm(free[:, 1:] - point, axis=1).min() < 0.4
+    queue.advance(20.0)
+    assert queue.exec_id(20.0) == -1
+    assert queue._moves == []
+    for (_, a), (b, _) in itertools.pairwise(told.stretches):
+        assert distance(a, b)[0] < 1e-6
+
+
+def test_a_slower_fraction_applies_after_the_corner_that_is_planned_and_nothing_is_faster():
+    queue = Told().corner(20.0)
+    queue.pose(0.5)
+    queue.set_fraction(0.25, 0.5)
+    walk = walked_from(queue, 0.5, 8.0)
+    moving = speeds(walk)
+    late = walk[:-1, 2] > 40.0
+    assert moving[late].max() <= 0.25 * V + 1e-6
+    assert tuple(walk[-1, 1:]) == BEYOND.position_mm
+
+
+@pytest.mark.parametrize("blend_mm", [0.0, 20.0])
+def test_a_duration_is_how_long_a_move_takes_rounded_or_not(blend_mm: float):
+    queue = ArmQueue(at(0.0), lambda *_: None)
+    for pose in (at(100.0), at(200.0), at(300.0)):
+        queue.add(pose, V, A, 0.0, 3.0, blend_mm=blend_mm)
+    seen = [queue.exec_id(t) for t in np.arange(0.0, 12.0, 0.01)]
+    spent_s = {ident: 0.01 * len(list(run)) for ident, run in itertools.groupby(seen)}
+    # a corner of 20 mm is counted with the move that it leads into: half of it is the other's
+    assert spent_s[1] == pytest.approx(3.0, abs=0.02)
+    assert sum(spent_s[i] for i in range(3)) == pytest.approx(9.0, abs=0.1)
+
+
+def turned(by_rad: float, joint: int) -> Joints:
+    q = list(HOME)
+    q[joint] += by_rad
+    return (q[0], q[1], q[2], q[3], q[4], q[5])
+
+
+def test_moves_in_joints_are_rounded_in_joints():
+    def run(blend_mm: float) -> tuple[float, float]:
+        queue = ArmQueue(at(0.0), lambda *_: None)
+        queue.add_joints(HOME, Pace(1.0, 2.0), 0.0)
+        queue.advance(1e3)
+        via = turned(0.4, 0)
+        for q in (via, turned(0.4, 1)):
+            queue.add_joints(q, Pace(0.5, 2.0, blend_mm=blend_mm), 1e3)
+        ids: list[int] = []
+        nearest, t = math.inf, 1e3
+        while (ident := queue.exec_id(t)) != -1:
+            ids.append(ident)
+            nearest = min(nearest, max(abs(a - b) for a, b in zip(queue.joints(t), via, strict=True)))
+            t += 0.005
+        assert [i for i, _ in itertools.groupby(ids)] == [1, 2]
+        return nearest, t
+
+    (rest, slow_s), (rounded, quick_s) = run(0.0), run(30.0)
+    assert rest < 2e-3 < rounded
+    assert quick_s < slow_s - 0.05
+
+
+RATES = (20.0, 500.0)
+
+
+def test_the_same_moves_leave_the_same_path_at_any_rate():
+    def stretches(rate: float) -> list[tuple[Pose, Pose]]:
+        told: list[tuple[Pose, Pose]] = []
+        world = World(SimConfig(rate=rate))
+        world.motion._on_path = lambda a, b: told.append((a, b))
+        # held until all of them are there: what a client can do that sends slower than the arm moves
+        world.motion.hold(A, 1.0, world.clock.now_s())
+        for x, y in ((300.0, -230.0), (300.0, -180.0), (340.0, -180.0)):
+            world.motion.add(brush_pose(x, y, 260.0), 200.0, A, world.clock.now_s(), blend_mm=15.0)
+        world.motion.resume(world.clock.now_s())
+        while world.motion.exec_id(world.clock.now_s()) != -1:
+            world.tool()
+        return told
+
+    slow, quick = (stretches(rate) for rate in RATES)
+    assert slow == quick
+    assert len(slow) > 20
