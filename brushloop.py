@@ -17,7 +17,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-app.command("collect")(collect.cli.collect)
+app.add_typer(collect.cli.app, name="collect")
 app.command("doctor")(collect.cli.doctor)
 app.command("calibrate")(calibrate.cli.calibrate)
 app.command("validate")(calibrate.cli.validate)
@@ -32,6 +32,8 @@ def sim(
     arcs_port: Annotated[int, typer.Option(min=0, max=65535, help="Controller port; 0: any.")] = 0,
     camera_port: Annotated[int, typer.Option(min=0, max=65535, help="Camera port; 0: any.")] = 0,
     idle_exit: Annotated[float, typer.Option(min=0, help="End after so many seconds without clients; 0 never.")] = 0.0,
+    faults: Annotated[Path | None, typer.Option(help="A script of faults, faults.toml.")] = None,
+    control: Annotated[Path | None, typer.Option(help="Make a control socket here, for `brushloop fault`.")] = None,
 ) -> None:
     """Serve the loopback rig: an ARCS controller and an MJPEG camera over one simulated world, on 127.0.0.1 only.
 
@@ -42,7 +44,32 @@ def sim(
     from drivers.sim.rig import serve
 
     config = SimConfig(seed=seed, rate=rate, arcs_port=arcs_port, camera_port=camera_port, brush=BrushSpec(seed=seed))
-    serve(config, write_rig, idle_exit, typer.echo)
+    serve(config, write_rig, idle_exit, typer.echo, faults=faults, control=control)
+
+
+@app.command()
+def fault(
+    control: Annotated[Path, typer.Argument(help="Control socket of a rig: `brushloop sim --control PATH`.")],
+    what: Annotated[str, typer.Argument(help="A device to break, or list, clear, state, release, fresh-sheet.")],
+    kind: Annotated[str | None, typer.Argument(help="How it breaks: mute, late, black, bus-off, ...")] = None,
+    after_s: Annotated[float | None, typer.Option(help="Not before this simulated time.")] = None,
+    on: Annotated[str | None, typer.Option(help="Only on this method of the robot's, as moveLine.")] = None,
+    nth: Annotated[int | None, typer.Option(help="From the n-th request, push or frame on.")] = None,
+    phase: Annotated[str | None, typer.Option(help="Begin while the arm does this, as descending.")] = None,
+    press: Annotated[int | None, typer.Option(help="Begin while so many presses lie on the paper.")] = None,
+    count: Annotated[int | None, typer.Option(help="Strike so often.")] = None,
+    for_s: Annotated[float | None, typer.Option(help="Strike for so many real seconds.")] = None,
+    late_s: Annotated[float | None, typer.Option(help="How late a late reply comes, in real seconds.")] = None,
+    ident: Annotated[int | None, typer.Option("--id", help="Which fault to clear; all without.")] = None,
+) -> None:
+    """Break a device of a loopback rig that runs, look at what hangs, or be the person at its pendant."""
+    from json import dumps
+
+    from drivers.sim.fault_cli import ask, request_of
+
+    options = {"after_s": after_s, "on": on, "nth": nth, "phase": phase, "press": press, "count": count}
+    request = request_of(what, kind, options | {"for_s": for_s, "late_s": late_s, "id": ident})
+    typer.echo(dumps(ask(control, request), indent=2))
 
 
 @app.command()
@@ -69,7 +96,10 @@ def main() -> None:
         if not isinstance(code, int):
             raise
         words = " ".join([str(error), *getattr(error, "__notes__", [])])
-        sys.stderr.write(f"brushloop: {words}\n")
+        try:
+            sys.stderr.write(f"brushloop: {words}\n")
+        except OSError:
+            sys.stderr = None  # the terminal is gone; Python would try again at its exit, and change the code
         sys.exit(code)
 
 

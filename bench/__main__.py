@@ -1,4 +1,4 @@
-"""`python -m bench [NAME] [--json]`: run one benchmark, or all, and print a line for each.
+"""`python -m bench [NAME] [--json]`: run one benchmark, or all, and print a line for each figure.
 
 Exit codes: 0 measured, 1 a benchmark could not be measured, 2 unknown name.
 """
@@ -8,13 +8,19 @@ from __future__ import annotations
 import argparse
 import sys
 
-from bench import raster, startup
-from bench.harness import Bench, BenchError
+from bench import quality, raster, recorder, rpc, startup
+from bench.harness import Bench, BenchError, results_of
 
 
 def benches() -> dict[str, Bench]:
     """Every benchmark by name; a new one is added here."""
-    return {"raster": raster.run, "startup": startup.run}
+    return {
+        "quality": quality.run,
+        "raster": raster.run,
+        "recorder": recorder.run,
+        "rpc": rpc.run,
+        "startup": startup.run,
+    }
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -30,12 +36,15 @@ def main(arguments: list[str] | None = None) -> int:
     code = 0
     for name in known if options.name is None else [options.name]:
         try:
-            result = known[name]()
+            results = results_of(known[name]())
         except BenchError as error:
             print(f"{name}: {error}", file=sys.stderr)
             code = 1
             continue
-        print(result.to_json() if options.json else result.to_line(), flush=True)
+        for before, result in zip([None, *results], results, strict=False):
+            if not options.json and result.conditions and (before is None or before.conditions != result.conditions):
+                print(f"# {result.conditions}")
+            print(result.to_json() if options.json else result.to_line(), flush=True)
     return code
 
 

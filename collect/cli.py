@@ -1,4 +1,4 @@
-"""`brushloop collect`: runs a protocol, with the Textual screen or with a progress bar."""
+"""`brushloop collect`: runs a protocol, on the Textual screen or with a progress bar; `collect plan` only walks it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ from typing import Annotated
 
 import typer
 
+app = typer.Typer(invoke_without_command=True, pretty_exceptions_enable=False)
 
+
+@app.callback()
 def collect(
-    config: Annotated[Path, typer.Option(help="The rig: addresses, frames, limits.")],
-    protocol: Annotated[Path, typer.Option(help="What to do: depths, tilts, repeats.")],
+    ctx: typer.Context,
+    config: Annotated[Path | None, typer.Option(help="The rig: addresses, frames, limits; required.")] = None,
+    protocol: Annotated[Path | None, typer.Option(help="What to do; required.")] = None,
     out: Annotated[Path, typer.Option(help="Folder that holds sessions.")] = Path("sessions"),
     new: Annotated[bool, typer.Option("--new", help="Start a new session though one is open.")] = False,
     sheet: Annotated[
@@ -18,31 +22,82 @@ def collect(
         typer.Option(min=1, help="Sheet N of the session is in: confirms a fresh one. Repeating it is safe."),
     ] = None,
     arm: Annotated[bool, typer.Option("--arm", help="Let real hardware move.")] = False,
+    dry_run: Annotated[
+        float | None,
+        typer.Option(help="Only move, lifted by so many mm: nothing is pressed, dipped or kept."),
+    ] = None,
     tui: Annotated[
         bool | None, typer.Option("--tui/--no-tui", help="Screen; by default where there is a terminal.")
     ] = None,
+    live: Annotated[bool, typer.Option("--live", help="Let a Foxglove viewer on this machine look on.")] = False,
+    live_port: Annotated[int, typer.Option(min=0, max=65535, help="Where it listens; 0: any.")] = 8765,
 ) -> None:
     """Collect strokes. Ctrl-C stops the arm; the same command goes on where it stopped."""
+    if ctx.invoked_subcommand is not None:
+        return
+    if config is None or protocol is None:
+        ctx.fail(f"Missing option '{'--config' if config is None else '--protocol'}'.")
     import sys
 
-    from collect.engine import Engine
-    from collect.opening import Opening, find_resumable, open_store
-    from collect.plan import check_plan
-    from drivers.clock import HostClock
+    from collect import start
+    from collect.live import LiveView
+    from collect.opening import Opening
 
+    on_screen = tui if tui is not None else sys.stdin.isatty() and sys.stdout.isatty()
+    if dry_run is not None:
+        start.dry_run(config, protocol, dry_run, armed=arm, on_screen=on_screen)
+        return
     opening = Opening.load(out, config, protocol, new=new, sheet=sheet, armed=arm)
-    check_plan(config, protocol, opening.rig, opening.protocol)
-    resume = find_resumable(opening)
-    clock = HostClock()
-    engine = Engine(opening.rig, opening.protocol, lambda rig: open_store(opening, resume, rig, clock), clock)
-    if tui if tui is not None else sys.stdin.isatty() and sys.stdout.isatty():
-        from collect.tui.app import run_screen
+    given_up = start.start(opening, on_screen=on_screen, live=LiveView(live_port) if live else None)
+    if given_up:
+        typer.echo(f"finished; {given_up} strokes came out badly every time and were left out", err=True)
+        raise typer.Exit(3)
 
-        run_screen(engine)
-    else:
-        from collect.headless import run_headless
 
-        run_headless(engine)
+@app.command()
+def plan(
+    config: Annotated[Path, typer.Option(help="The rig: addresses, frames, limits.")],
+    protocol: Annotated[Path, typer.Option(help="What would be done.")],
+    picture: Annotated[Path | None, typer.Option(help="Draw the sheets into this file, as plan.png.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
+    ask: Annotated[
+        bool, typer.Option("--ask", help="Ask the arm's controller whether it reaches every pose; moves nothing.")
+    ] = False,
+) -> None:
+    """Walk a protocol without moving: limits, sheets, dips, ink, time, and a picture of the sheets."""
+    import asyncio
+    import json
+    import sys
+
+    import rich
+
+    from collect.config import load_rig
+    from collect.plan import check_plan
+    from collect.plane import PaperPlane
+    from collect.planning.limits import all_poses
+    from collect.planning.plan_table import plan_table
+    from collect.planning.summary import make_plan
+    from collect.protocols.loading import load_protocol
+
+    rig, wanted = load_rig(config), load_protocol(protocol)
+    check_plan(config, protocol, rig, wanted)
+    made = make_plan(rig, wanted)
+    asked = None
+    if ask:
+        from collect.planning.asking import ask_reach
+
+        poses = all_poses(rig, wanted, PaperPlane(rig.paper.touch_z_mm), every_cell=True)
+        asked = asyncio.run(ask_reach(config, rig, poses))
+    if picture is not None:
+        from collect.planning.picture import draw_plan
+
+        draw_plan(rig, wanted, made, picture)
+    if as_json:
+        sys.stdout.write(json.dumps(made.as_json() | {"poses_in_reach": asked}) + "\n")
+        return
+    rich.print(plan_table(made))
+    if asked is not None:
+        rich.print(f"The controller finds joints for all {asked} poses.")
 
 
 def doctor(

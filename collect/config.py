@@ -1,4 +1,4 @@
-"""`rig.toml` and `protocol.toml`: frozen, complete, refused with one line that names file, field and range.
+"""`rig.toml`: frozen, complete, refused with one line that names file, field and range.
 
 Any value can be overridden from the environment: `BRUSHLOOP_ROBOT__HOST=192.0.2.7` sets `[robot] host`.
 """
@@ -7,95 +7,21 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, SettingsError
 
 from calibrate.scale import BoardSpec
+from collect.config_base import Config, Finite, Positive
+from collect.config_devices import CameraConfig, ForceConfig, InkDeviceConfig, RobotConfig
 from collect.errors import ConfigError
+from collect.quality.config import QualityConfig
+from collect.touch.config import SelfCheckConfig, TouchConfig
 
 MAX_CONFIG_BYTES = 1024 * 1024
 TRAVEL_CLEARANCE_MM = 15.0
 """Least height of travel above the paper: more than a drop at the tip."""
-
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Range = tuple[Finite, Finite]
-
-
-class Config(BaseModel):
-    """Base: frozen, extra keys refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class LimitsConfig(Config):
-    """Where the brush tip may ever be, in the robot's base frame."""
-
-    x_mm: Range
-    y_mm: Range
-    z_mm: Range
-    """The lower end is the floor: paper height less the deepest press."""
-    tilt_deg: Annotated[float, Field(gt=0.0, le=30.0)] = 15.0
-    speed_mm_s: Annotated[float, Field(gt=0.0, le=500.0)] = 250.0
-    acc_mm_s2: Annotated[float, Field(gt=0.0, le=5000.0)] = 1000.0
-
-    @model_validator(mode="after")
-    def _ordered(self) -> LimitsConfig:
-        for name in ("x_mm", "y_mm", "z_mm"):
-            low, high = getattr(self, name)
-            if low >= high:
-                raise ValueError(f"{name} = [{low}, {high}]: the first must be less than the second")
-        return self
-
-
-class RobotConfig(Config):
-    """The arm."""
-
-    kind: Literal["aubo-arcs"]
-    host: str = Field(min_length=1)
-    port: int = Field(30004, ge=1, le=65535)
-    tcp_offset_mm: tuple[Finite, Finite, Finite]
-    """Flange to brush tip."""
-    framing: Literal["sof", "bare"] = "sof"
-    """`sof` as the maker's client speaks, `bare` as the maker documents."""
-    rtde_port: int | None = Field(None, ge=1, le=65535)
-    """Where poses are pushed from (30010); left out, they are polled for."""
-    watchdog_s: Annotated[float, Field(ge=0.5, le=60.0)] | None = None
-    """Dead-man on the controller: without a sign of life for so long it goes into a protective stop, which only a
-    person releases. Left out, none is armed."""
-    speed_fraction: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
-    collision_level: Annotated[int, Field(ge=1, le=9)] | None = None
-    """1 to 9, most sensitive; left out, what the pendant has stays."""
-    limits: LimitsConfig
-
-
-class LockedConfig(Config):
-    """Settings of a camera device that must not drift; left out means left as it is. The device's own units."""
-
-    width: Annotated[int, Field(ge=16, le=65535)] | None = None
-    height: Annotated[int, Field(ge=16, le=65535)] | None = None
-    exposure: Finite | None = None
-    """Turns automatic exposure off."""
-    gain: Finite | None = None
-    white_balance_k: Finite | None = None
-    """Turns automatic white balance off."""
-    focus: Finite | None = None
-    """Turns autofocus off."""
-
-
-class CameraConfig(Config):
-    """The camera that looks at the sheet."""
-
-    kind: Literal["opencv"]
-    source: str = Field(min_length=1)
-    """Stream URL, file, folder of images, or device number as text."""
-    latency_ms: Annotated[float, Field(ge=0.0, le=10_000.0)] = 250.0
-    """Longest time from exposure to arrival; frames that may be older than a request are not used for it."""
-    timeout_s: Annotated[float, Field(gt=0.0, le=120.0)] = 10.0
-    lens: str = ""
-    locked: LockedConfig = LockedConfig()
 
 
 class BrushConfig(Config):
@@ -133,6 +59,8 @@ class InkConfig(Config):
     """Centre, in the paper frame."""
     dip_z_mm: Finite
     """Height of the tip at the bottom of a dip, in the base frame."""
+    device: InkDeviceConfig | None = None
+    """What keeps the well filled; left out, the operator does."""
 
 
 class MotionConfig(Config):
@@ -155,11 +83,15 @@ class RigConfig(BaseSettings):
     name: str
     robot: RobotConfig
     camera: CameraConfig
+    force: ForceConfig | None = None
     brush: BrushConfig
     paper: PaperConfig
     ink: InkConfig
     board: BoardSpec
     motion: MotionConfig
+    touch: TouchConfig = TouchConfig()
+    self_check: SelfCheckConfig = SelfCheckConfig()
+    quality: QualityConfig = QualityConfig()
 
     @model_validator(mode="after")
     def _clear_of_the_paper(self) -> RigConfig:
@@ -175,6 +107,7 @@ class RigConfig(BaseSettings):
         x, y = self.ink.well_mm
         if 0.0 <= x <= width and 0.0 <= y <= height:
             raise ValueError(f"ink.well_mm = [{x:g}, {y:g}] lies on the sheet: dips would press on it")
+        self.touch.check_points(self.paper.size_mm)
         x, y = self.paper.touch_point_mm
         if not (0.0 <= x <= width and 0.0 <= y <= height):
             raise ValueError(f"paper.touch_point_mm = [{x:g}, {y:g}] does not lie on the sheet")
@@ -193,37 +126,12 @@ class RigConfig(BaseSettings):
         return env_settings, init_settings
 
 
-class GridConfig(Config):
-    """The paper's grid: every depth at every tilt, `repeats` times, in an order shuffled by `seed`."""
-
-    kind: Literal["grid"]
-    heights_mm: Annotated[list[Positive], Field(min_length=1, max_length=100)]
-    tilts_deg: Annotated[list[Annotated[float, Field(ge=0.0, le=30.0)]], Field(min_length=1, max_length=100)]
-    repeats: Annotated[int, Field(ge=1, le=1000)] = 10
-    seed: Annotated[int, Field(ge=0)] = 1
-    dwell_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.2
-    """Time at full depth."""
-
-    @model_validator(mode="after")
-    def _distinct(self) -> GridConfig:
-        for name in ("heights_mm", "tilts_deg"):
-            values = getattr(self, name)
-            if len(set(values)) != len(values):
-                raise ValueError(f"{name} has the same value twice: {values}")
-        return self
-
-
 _M = TypeVar("_M", bound=BaseModel)
 
 
 def load_rig(path: Path) -> RigConfig:
     """Read `rig.toml`, with overrides from the environment. Raises `ConfigError`."""
     return _validate(path, RigConfig, _read_toml(path))
-
-
-def load_protocol(path: Path) -> GridConfig:
-    """Read `protocol.toml`. Raises `ConfigError`."""
-    return _validate(path, GridConfig, _read_toml(path))
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

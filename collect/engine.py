@@ -9,21 +9,26 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import contextlib
+import math
 import threading
 from collections.abc import Callable
 
-from collect.config import GridConfig, RigConfig
-from collect.errors import CollectAborted, StepError, told
-from collect.perform import Performer, uninterrupted
-from collect.policy import Action, decide
+from collect.arming import arm
+from collect.asking import Asker
+from collect.config import RigConfig
+from collect.errors import CollectAborted, told
+from collect.live import LiveView, watching
+from collect.perform import Performer
+from collect.planning.walk import steps_on
 from collect.progress import Progress
-from collect.protocol import grid
+from collect.protocols.config import ProtocolConfig
 from collect.rig import Rig, connected
+from collect.running import Run
 from collect.snapshot import Snapshot
 from collect.states import FINAL, State, check_transition
-from collect.steps import Result, Step
+from collect.work.waiting import uninterrupted
 from drivers.clock import Clock
-from drivers.errors import DeviceError, MotionError, NotConnected, RpcError
+from drivers.errors import DeviceError, NotConnected
 from sessions.store import SessionStore
 
 OpenStore = Callable[[Rig], SessionStore]
@@ -33,12 +38,26 @@ OpenStore = Callable[[Rig], SessionStore]
 class Engine:
     """Runs one session. `start`, then look at `snapshot` until `finished`, then `join`."""
 
-    def __init__(self, rig: RigConfig, protocol: GridConfig, open_store: OpenStore, clock: Clock) -> None:
+    def __init__(
+        self,
+        rig: RigConfig,
+        protocol: ProtocolConfig,
+        open_store: OpenStore,
+        clock: Clock,
+        *,
+        watched: bool = False,
+        armed: bool = False,
+        live: LiveView | None = None,
+    ) -> None:
+        """`watched`: a screen can answer. `armed`: the operator has let real hardware move. `live` has been started."""
         self._rig_config = rig
         self._protocol_config = protocol
         self._open_store = open_store
         self._progress = Progress(protocol, clock)
         self._clock = clock
+        self._asker = Asker(watched=watched)
+        self._armed = armed
+        self._live = live
         self._state = State.IDLE
         self._lock = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -71,11 +90,17 @@ class Engine:
 
     def snapshot(self) -> Snapshot:
         """The engine now; from any thread."""
-        tip_mm = None
-        if self._rig is not None:
+        tip_mm = force_n = None
+        if (rig := self._rig) is not None:
             with contextlib.suppress(DeviceError):
-                tip_mm = self._rig.robot.latest().pose.position_mm
-        return self._progress.snapshot(self._state, tip_mm)
+                tip_mm = rig.robot.latest().pose.position_mm
+            with contextlib.suppress(DeviceError):
+                force_n = math.hypot(*rig.force.latest_n()) if rig.force is not None else None
+        return self._progress.snapshot(self._state, tip_mm, force_n, self._asker.prompt)
+
+    def answer(self, number: int, key: str) -> bool:
+        """Answer the prompt of that number; False where it is over. From any thread."""
+        return self._asker.answer(number, key)
 
     def pause(self) -> None:
         """Pause before the next step."""
@@ -160,10 +185,12 @@ class Engine:
         self._progress.doing("connect")
         async with connected(self._rig_config, self._clock, self._progress.log) as rig:
             self._rig = rig
+            await arm(rig, self._asker, armed=self._armed)
             store = self._open_store(rig)
             try:
                 self._progress.opened(store)
-                await self._protocol(rig, store)
+                async with watching(self._live, rig.camera, self._progress.log):
+                    await self._protocol(rig, store)
                 with self._lock:
                     if self._state == State.STOPPING:
                         raise asyncio.CancelledError
@@ -177,50 +204,12 @@ class Engine:
             self._set(State.DONE)
 
     async def _protocol(self, rig: Rig, store: SessionStore) -> None:
-        performer = Performer(rig, store, self._progress)
-        self._progress.doing("power on")
-        await rig.robot.enable()
-        await self._recover(performer)
-        protocol = grid(self._protocol_config)
-        step = next(protocol)
-        with contextlib.suppress(StopIteration):
-            while True:
-                step = protocol.send(await self._result(performer, store, step))
+        performer = Performer(rig, store, self._protocol_config, self._progress, self._asker, self._live)
+        run = Run(rig, store, performer, self._progress, self._asker, self)
+        await run.protocol(steps_on(self._rig_config, self._protocol_config))
 
-    async def _result(self, performer: Performer, store: SessionStore, step: Step) -> Result:
-        known = store.state.done.get(step.key)
-        if known is not None and not step.run_scoped:
-            return known["result"]
-        failures = 0
-        while True:
-            await self._pause_point()
-            try:
-                return await performer.perform(step)
-            except (StepError, DeviceError) as error:
-                failures += 1
-                action = decide(step, error, failures)
-                self._progress.log(f"{step.kind}: {error} -> {action}", warning=True)
-                if action is Action.ABORT:
-                    await self._lift(performer, error)
-                    raise
-                await self._recover(performer)
-
-    async def _lift(self, performer: Performer, error: StepError | DeviceError) -> None:
-        """Leave no brush in the paper, where the arm itself is in order: not after its own trouble."""
-        if isinstance(error, MotionError | RpcError) or getattr(error, "device", "") == "robot":
-            return
-        try:
-            await self._recover(performer)
-        except (StepError, DeviceError) as failure:
-            error.add_note(f"The brush could not be lifted: {failure}")
-
-    async def _recover(self, performer: Performer) -> None:
-        self._move_to(State.RECOVERING)
-        self._progress.doing("retreat")
-        await performer.retreat()
-        self._move_to(State.PAUSING if self._pause_wanted else State.RUNNING)
-
-    async def _pause_point(self) -> None:
+    async def pause_point(self) -> None:
+        """Between two steps: wait here while paused."""
         with self._lock:
             if self._state != State.PAUSING:
                 return
@@ -229,9 +218,14 @@ class Engine:
         while self._pause_wanted:
             self._go_on.clear()
             await self._go_on.wait()
-        self._move_to(State.RUNNING)
+        self.move_to(State.RUNNING)
 
-    def _move_to(self, new: State) -> None:
+    def running(self) -> State:
+        """The state to go on in."""
+        return State.PAUSING if self._pause_wanted else State.RUNNING
+
+    def move_to(self, new: State) -> None:
+        """Change the state, unless the stop key was faster."""
         with self._lock:
             if self._state == State.STOPPING:
                 raise asyncio.CancelledError  # the stop key was faster than this step

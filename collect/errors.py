@@ -3,6 +3,9 @@
 ConfigError            a file of the user cannot be used: file, field, allowed range
 StepError              a step failed in a way that is understood; says what it leaves and what comes next
  +-- StepVoid          the press was cut: its paper cell is burnt, do it again on a new one
+ +-- BadPicture        the photograph cannot be used: take it again
+ +-- ForceTooHigh      the press met more force than allowed: the arm was stopped where it was
+ +-- NeedsOperator     something that only a person can put right
  +-- SheetFull         no free cell is left on the sheet
 CollectAborted         the session stopped before its protocol was finished; it can be resumed
 """
@@ -33,6 +36,26 @@ class StepError(Exception):
 
 class StepVoid(StepError):
     """A press did not go as asked. Leaves ink where it should not count: never press that cell again."""
+
+
+class BadPicture(StepError):
+    """The photograph shows too little of the stroke. Leaves the arm parked and the stroke as it is."""
+
+
+class ForceTooHigh(StepError):
+    """The brush met something hard. Leaves the arm stopped, perhaps with the brush down; a person must look first."""
+
+    def __init__(self, force_n: float, limit_n: float) -> None:
+        self.force_n = force_n
+        self.limit_n = limit_n
+        super().__init__(
+            f"the force reached {force_n:.2f} N, the ceiling is {limit_n:g} N: the arm was stopped. "
+            "Look what is under the brush before going on."
+        )
+
+
+class NeedsOperator(StepError):
+    """Leaves the arm where the step began, at safe height; says what a person must put right."""
 
 
 class SheetFull(StepError):

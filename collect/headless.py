@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import threading
 import time
@@ -17,6 +18,14 @@ from collect.snapshot import EngineView, Snapshot
 
 REFRESH_S = 0.1
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class Stoppable(Protocol):
+    """What a signal does."""
+
+    def stop(self) -> None:
+        """Stop the arm now; from any thread."""
+        ...
 
 
 class RunnableEngine(EngineView, Protocol):
@@ -41,7 +50,9 @@ def run_headless(engine: RunnableEngine) -> None:
     with stopping_signals(engine):
         engine.start()
         try:
-            _show(engine, Console(stderr=True))
+            # A terminal or a pipe that is gone; rich makes a broken pipe a SystemExit.
+            with contextlib.suppress(OSError, SystemExit):
+                _show(engine, Console(stderr=True))
         finally:
             _end(engine)
 
@@ -91,7 +102,7 @@ def eta_text(now: Snapshot) -> str:
 
 
 @contextmanager
-def stopping_signals(engine: EngineView) -> Generator[None]:
+def stopping_signals(engine: Stoppable) -> Generator[None]:
     """SIGINT, SIGTERM and SIGHUP stop the arm at once; the run then ends by itself."""
 
     def on_signal(_number: int, _frame: FrameType | None) -> None:

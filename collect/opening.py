@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 import datetime as dt
+import os
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from collect.config import GridConfig, RigConfig, load_protocol, load_rig
+from collect.config import RigConfig, load_rig
+from collect.dry_run import lifted
 from collect.errors import ConfigError
+from collect.protocols.config import ProtocolConfig
+from collect.protocols.loading import load_protocol
 from collect.rig import Rig
 from collect.steps import StepKind
 from drivers.clock import Clock
+from drivers.samples import Identity
 from sessions.errors import SessionDamaged
 from sessions.journal import JOURNAL_NAME, replay
 from sessions.schemas import Header, Source
 from sessions.store import SessionStore, Snapshots, differences, next_session_id, open_sessions
 
-COMPARED = ("protocol.toml", "rig.effective.json")
-MACHINE_NAMES = {"robot": {"host", "port"}, "camera": {"source"}}
+COMPARED = ("protocol.effective.json", "rig.effective.json")
+MACHINE_NAMES = {
+    "robot": {"host", "port", "rtde_port"},
+    "camera": {"source"},
+    "force": {"interface", "channel", "host", "port"},
+    "ink": {"device": {"port"}},
+}
 """What may differ between two runs of one session: where the devices are, not what they do."""
 
 
@@ -30,7 +40,7 @@ class Opening:
     rig_path: Path
     protocol_path: Path
     rig: RigConfig
-    protocol: GridConfig
+    protocol: ProtocolConfig
     snapshots: Snapshots
     new: bool = False
     """Start a new session although another one is open."""
@@ -49,14 +59,19 @@ class Opening:
         new: bool = False,
         sheet: int | None = None,
         armed: bool = False,
+        dry_run_mm: float | None = None,
     ) -> Opening:
-        """Read both files once. Raises `ConfigError`."""
+        """Read both files once; a dry run is lifted by so much. Raises `ConfigError`."""
         rig, protocol = load_rig(rig_path), load_protocol(protocol_path)
+        if dry_run_mm is not None:
+            rig = lifted(rig, protocol, dry_run_mm)
         snapshots = {
             "rig.toml": rig_path.read_text(encoding="utf-8"),
             "protocol.toml": protocol_path.read_text(encoding="utf-8"),
             # What really holds, the environment included: a touch height from there is part of the record.
             "rig.effective.json": rig.model_dump_json(indent=2, exclude=MACHINE_NAMES) + "\n",
+            # With the rows of the files that it names.
+            "protocol.effective.json": protocol.model_dump_json(indent=2) + "\n",
         }
         return cls(root, rig_path, protocol_path, rig, protocol, snapshots, new, sheet, armed)
 
@@ -94,6 +109,15 @@ def find_resumable(opening: Opening) -> Path | None:
     return None
 
 
+def check_writable(folder: Path) -> None:
+    """Raise `ConfigError` unless sessions can be written there, or made; before anything is connected."""
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise ConfigError(there, "", "is a file; a folder for sessions is needed")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ConfigError(there, "", "may not be written: it is read-only, or another user's")
+
+
 def _has_pressed(journal: Path) -> bool:
     try:
         return bool(replay(journal).used_cells)
@@ -125,15 +149,7 @@ def put_in_sheet(store: SessionStore, sheet: int | None) -> None:
 
 
 def open_store(opening: Opening, resume: Path | None, rig: Rig, clock: Clock) -> SessionStore:
-    """Make or resume the session. Raises `ConfigError` for unarmed hardware or another robot than before."""
-    config = opening.rig
-    if not rig.robot_identity.simulated and not opening.armed:
-        raise ConfigError(
-            opening.rig_path,
-            "robot",
-            f"{rig.robot_identity.model} at {config.robot.host}:{config.robot.port} is real hardware: "
-            "look at the cell, keep a hand at the emergency stop, then add --arm",
-        )
+    """Make or resume the session. Raises `ConfigError` for another robot than before."""
     header = _header(opening, rig)
     if resume is None:
         session_id = next_session_id(opening.root, opening.protocol.kind, dt.date.today())
@@ -159,10 +175,9 @@ def open_store(opening: Opening, resume: Path | None, rig: Rig, clock: Clock) ->
 
 def _header(opening: Opening, rig: Rig) -> Header:
     config, protocol = opening.rig, opening.protocol
-    simulated = rig.robot_identity.simulated or rig.camera_identity.simulated
     return Header(
         session_id="",
-        source=Source.LOOPBACK if simulated else Source.REAL,
+        source=Source.LOOPBACK if rig.simulated else Source.REAL,
         software=f"brushloop {version('brushloop')}",
         robot=rig.robot_identity.model,
         robot_firmware=rig.robot_identity.firmware,
@@ -172,7 +187,13 @@ def _header(opening: Opening, rig: Rig) -> Header:
         brush_radius_mm=config.brush.radius_mm,
         brush_length_mm=config.brush.length_mm,
         ink=config.ink.name,
+        ink_device=_who(rig.ink_identity),
+        force_sensor=_who(rig.force_identity),
         paper=config.paper.name,
         protocol=protocol.model_dump_json(),
         origin=f"{config.name}, {opening.rig_path.name}",
     )
+
+
+def _who(identity: Identity | None) -> str:
+    return "" if identity is None else " ".join(part for part in (identity.model, identity.firmware) if part)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from collect.errors import SheetFull, StepError, StepVoid
+from collect.errors import BadPicture, ForceTooHigh, NeedsOperator, SheetFull, StepError, StepVoid
 from collect.steps import Step, StepKind
-from drivers.errors import DeviceError, DeviceTimeout
+from drivers.errors import DeviceError, DeviceTimeout, RobotNotSafe
+from drivers.ink.errors import InkRefused
 
 MAX_FAILURES = 3
-"""The third failure of one step ends the run: by then it is not chance."""
+"""The third failure of one step is not chance: a person decides."""
 
 
 class Action(StrEnum):
@@ -17,18 +18,25 @@ class Action(StrEnum):
 
     RETRY = "again"
     """Retreat, then do the step again; a press takes a new cell."""
+    ASK = "ask"
+    """A person decides. Where nobody watches, it means to stop the run."""
     ABORT = "stop the run"
-    """Retreat is left to the next run; the session stays open. Headless, asking means this."""
+    """The session stays open; the same command goes on from there."""
 
 
 def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
     """The action for the `failures`-th failure of `step`. Motion is never blindly repeated."""
-    if failures >= MAX_FAILURES or isinstance(error, SheetFull):
-        return Action.ABORT
     match step.kind, error:
-        case StepKind.PRESS, StepVoid():
-            return Action.RETRY
-        case ((StepKind.CAPTURE | StepKind.BOARD), DeviceTimeout(device="camera")):
-            return Action.RETRY
+        # What only a person can put right: paper, ink, the arm's own stops, and what lies under the brush.
+        case _, SheetFull() | NeedsOperator() | ForceTooHigh() | InkRefused() | RobotNotSafe():
+            return Action.ASK
+        case StepKind.PRESS | StepKind.DRAW, StepVoid():
+            action = Action.RETRY
+        case StepKind.PRESS | StepKind.DRAW, DeviceTimeout(device="force"):
+            # Stopped because nothing was felt any more; if the sensor is not back, the next press says so at once.
+            action = Action.RETRY
+        case StepKind.CAPTURE | StepKind.BOARD, DeviceTimeout(device="camera") | BadPicture():
+            action = Action.RETRY
         case _:
             return Action.ABORT
+    return action if failures < MAX_FAILURES else Action.ASK

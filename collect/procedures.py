@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from collect.config import RigConfig
 from collect.errors import StepVoid
+from collect.plane import PaperPlane
 from collect.rig import Rig, limits_of
 from collect.sheet import Cell, to_base
 from drivers.geometry import brush_pose, lean
@@ -36,13 +37,15 @@ class Procedures:
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._config = rig.config
+        self.plane = PaperPlane(rig.config.paper.touch_z_mm)
+        """The taught height, level, until touches say better."""
 
     async def retreat(self) -> None:
         """Lift along the tool axis to safe height, then park. A killed process may have left the brush down."""
         here = await self._rig.robot.where()
         limits_of(self._config).check_start("robot", here)
         for move in retreat_moves(self._config, here):
-            await self._go(move)
+            await self.go(move)
 
     async def zero_touch(self) -> float:
         """Visit the taught touch height at the touch point; returns the height at which the arm rests, in mm.
@@ -51,28 +54,28 @@ class Procedures:
         """
         *down, up = zero_touch_moves(self._config)
         for move in down:
-            await self._go(move)
+            await self.go(move)
         rests_mm = (await self._rig.robot.where()).z_mm
         off_mm = rests_mm - self._config.paper.touch_z_mm
         if abs(off_mm) > TOUCH_TOLERANCE_MM:
             raise StepVoid(f"zero touch rests {off_mm:+.3f} mm from the taught height; limit {TOUCH_TOLERANCE_MM} mm")
-        await self._go(up)
+        await self.go(up)
         return rests_mm
 
     async def dip(self) -> None:
         """Into the well and out again."""
         for move in dip_moves(self._config):
-            await self._go(move)
+            await self.go(move)
 
     async def press(self, cell: Cell, height_mm: float, tilt_deg: float, dwell_s: float) -> float:
-        """Press once; returns the depth reached below the taught height, in mm."""
-        before, after = press_moves(self._config, cell, height_mm, tilt_deg)
+        """Press once; returns the depth reached below the paper along its normal, in mm."""
+        before, after = press_moves(self._config, self.plane, cell, height_mm, tilt_deg)
         for move in before:
-            await self._go(move)
+            await self.go(move)
         await asyncio.sleep(dwell_s)
-        depth_mm = self._config.paper.touch_z_mm - (await self._rig.robot.where()).z_mm
+        depth_mm = -self.plane.above_mm(self._config.paper, await self._rig.robot.where())
         for move in after:
-            await self._go(move)
+            await self.go(move)
         if abs(depth_mm - height_mm) > DEPTH_TOLERANCE_MM:
             raise StepVoid(f"pressed {depth_mm:.3f} mm deep, {height_mm:g} mm were asked for")
         return depth_mm
@@ -80,10 +83,11 @@ class Procedures:
     async def capture(self) -> Frame:
         """Park, then the first frame exposed after the arm had settled there."""
         for move in park_moves(self._config):
-            await self._go(move)
+            await self.go(move)
         return await self._rig.camera.fresh(Stamp(self._rig.clock.now_ns()))
 
-    async def _go(self, move: Move) -> None:
+    async def go(self, move: Move) -> None:
+        """One move, to its end."""
         motion = self._config.motion
         await self._rig.robot.move(move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=motion.acc_mm_s2)
 
@@ -136,37 +140,41 @@ def dip_moves(config: RigConfig) -> list[Move]:
     ]
 
 
-def press_moves(config: RigConfig, cell: Cell, height_mm: float, tilt_deg: float) -> tuple[list[Move], list[Move]]:
+def press_moves(
+    config: RigConfig, plane: PaperPlane, cell: Cell, height_mm: float, tilt_deg: float
+) -> tuple[list[Move], list[Move]]:
     """(down to depth, up again): over the cell, tilt about the tip at clearance, touch height, descend H.
 
     Tilting about the tip just above the paper instead of on it leaves the same pose at touch and no smear.
     """
-    motion, touch_mm = config.motion, config.paper.touch_z_mm
-    x_mm, y_mm = to_base(config.paper, *cell.anchor_mm)
+    motion, paper = config.motion, config.paper
+    above = _upright(config, *to_base(paper, *cell.anchor_mm), motion.safe_z_mm)
 
-    def pose(z_mm: float, tilt: float) -> Pose:
-        return brush_pose(x_mm, y_mm, z_mm, heading_deg=config.paper.yaw_deg, tilt_deg=tilt)
+    def pose(above_mm: float, tilt: float) -> Pose:
+        return plane.pose(paper, *cell.anchor_mm, above_mm, tilt_deg=tilt)
 
     down = [
-        Move(pose(motion.safe_z_mm, 0.0), motion.travel_speed_mm_s),
-        Move(pose(touch_mm + CLEARANCE_MM, 0.0), motion.travel_speed_mm_s),
-        Move(pose(touch_mm + CLEARANCE_MM, tilt_deg), motion.press_speed_mm_s),
-        Move(pose(touch_mm, tilt_deg), motion.press_speed_mm_s),
-        Move(pose(touch_mm - height_mm, tilt_deg), motion.press_speed_mm_s),
+        Move(above, motion.travel_speed_mm_s),
+        Move(pose(CLEARANCE_MM, 0.0), motion.travel_speed_mm_s),
+        Move(pose(CLEARANCE_MM, tilt_deg), motion.press_speed_mm_s),
+        Move(pose(0.0, tilt_deg), motion.press_speed_mm_s),
+        Move(pose(-height_mm, tilt_deg), motion.press_speed_mm_s),
     ]
     up = [
-        Move(pose(touch_mm + CLEARANCE_MM, tilt_deg), motion.press_speed_mm_s),
-        Move(pose(motion.safe_z_mm, 0.0), motion.travel_speed_mm_s),
+        Move(pose(CLEARANCE_MM, tilt_deg), motion.press_speed_mm_s),
+        Move(above, motion.travel_speed_mm_s),
     ]
     return down, up
 
 
-def check_all(config: RigConfig, limits: Limits, cells: list[Cell], presses: set[tuple[float, float]]) -> None:
+def check_all(
+    config: RigConfig, plane: PaperPlane, limits: Limits, cells: list[Cell], presses: set[tuple[float, float]]
+) -> None:
     """Check every pose that a protocol can ask for, before the first motion. Raises `LimitExceeded`."""
     moves = park_moves(config) + zero_touch_moves(config) + dip_moves(config)
     for cell in cells:
         for height_mm, tilt_deg in presses:
-            down, up = press_moves(config, cell, height_mm, tilt_deg)
+            down, up = press_moves(config, plane, cell, height_mm, tilt_deg)
             moves += down + up
     for move in moves:
         limits.check("robot", move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=config.motion.acc_mm_s2)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 from collections import Counter, deque
 
-from collect.config import GridConfig
-from collect.protocol import plan_grid
+from collect.asking import Prompt
+from collect.protocols.plans import ProtocolConfig, planned
 from collect.snapshot import CellCount, Snapshot
 from collect.states import State
 from collect.steps import Result, StepKind
@@ -19,10 +19,10 @@ LOG_LINES = 200
 class Progress:
     """Written by the engine's thread, read from any."""
 
-    def __init__(self, protocol: GridConfig, clock: Clock) -> None:
+    def __init__(self, protocol: ProtocolConfig, clock: Clock) -> None:
         self._clock = clock
         self._lock = threading.Lock()
-        self._plan = plan_grid(protocol)
+        self._plan = planned(protocol)
         self._planned = Counter((p.height_mm, p.tilt_deg) for p in self._plan)
         self._done: Counter[tuple[float, float]] = Counter()
         self._at_start = 0
@@ -33,6 +33,8 @@ class Progress:
         self._source = ""
         self._step = ""
         self._voids = 0
+        self._given_up = 0
+        self._ink_level: float | None = None
         self._error = ""
         self._logged = 0
         self._over_ns: int | None = None
@@ -46,7 +48,7 @@ class Progress:
             self._voids = store.state.voids
             for line in store.state.done.values():
                 if line["kind"] == StepKind.CAPTURE:
-                    self._count(line["result"])
+                    self._take(line["result"])
             self._at_start = self._done.total()
         verb = f"resumed with {self._at_start} strokes" if self._at_start else "session"
         self.log(f"{verb}: {store.folder}")
@@ -57,12 +59,17 @@ class Progress:
             self._step = what
 
     def captured(self, result: Result) -> None:
-        """A stroke is complete."""
+        """A mark was photographed and judged."""
         with self._lock:
             now_ns = self._clock.now_ns()
             self._first_stroke_ns = self._first_stroke_ns or now_ns
             self._last_stroke_ns = now_ns
-            self._count(result)
+            self._take(result)
+
+    def inked(self, level: float | None) -> None:
+        """The well's level before a dip, 0 to 1; None where nothing can tell."""
+        with self._lock:
+            self._ink_level = level
 
     def voided(self) -> None:
         """An attempt was cut."""
@@ -87,7 +94,13 @@ class Progress:
             self._over_ns = self._clock.now_ns()
         self.log(text)
 
-    def snapshot(self, state: State, tip_mm: tuple[float, float, float] | None) -> Snapshot:
+    def snapshot(
+        self,
+        state: State,
+        tip_mm: tuple[float, float, float] | None,
+        force_n: float | None = None,
+        prompt: Prompt | None = None,
+    ) -> Snapshot:
         """One consistent picture."""
         with self._lock:
             grid = tuple(
@@ -102,13 +115,23 @@ class Progress:
                 strokes_planned=len(self._plan),
                 grid=grid,
                 voids=self._voids,
+                given_up=self._given_up,
                 elapsed_s=((self._over_ns or self._clock.now_ns()) - self._started_ns) / 1e9,
                 eta_s=self._eta_s(),
                 tip_mm=tip_mm,
+                force_n=force_n,
+                prompt=prompt,
+                ink_level=self._ink_level,
                 messages=tuple(self._messages),
                 error=self._error,
                 messages_before=self._logged - len(self._messages),
             )
+
+    def _take(self, result: Result) -> None:
+        if result.get("kept", True):
+            self._count(result)
+        elif not result["retake"]:
+            self._given_up += 1
 
     def _count(self, result: Result) -> None:
         self._done[(float(result["height_mm"]), float(result["tilt_deg"]))] += 1

@@ -3,33 +3,91 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
+from collect.cadence import Arrivals, Sections
 from drivers.clock import Clock
-from drivers.samples import Frame, PoseSample
+from drivers.force.samples import ForceSample
+from drivers.samples import Frame, PoseSample, Stamp
 from sessions.errors import SessionError
-from sessions.messages import encode_png, image_message, log_message, pose_message
-from sessions.schemas import Event, StepEvent, Stroke, Topic
+from sessions.messages import (
+    Transform,
+    encode_png,
+    image_message,
+    joints_message,
+    log_message,
+    pose_message,
+    transforms_message,
+)
+from sessions.schemas import Event, InkState, Quality, StepEvent, Stroke, Topic, Wrench
 from sessions.writer import Outgoing, SegmentWriter
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
 
+POSE_HZ = 100.0
+"""What the driver asks of the arm."""
+
 
 class Recorder:
     """One attempt's writer, spoken to in the engine's terms."""
 
-    def __init__(self, writer: SegmentWriter, clock: Clock) -> None:
+    def __init__(
+        self,
+        writer: SegmentWriter,
+        clock: Clock,
+        force_hz: float | None = None,
+        show: Callable[[Outgoing], None] | None = None,
+    ) -> None:
+        """`show` is handed every message as well, and neither waits nor raises."""
         self._writer = writer
+        self._show = show
         self._clock = clock
+        self._poses = Arrivals(Topic.TCP, POSE_HZ)
+        self._forces = None if force_hz is None else Arrivals(Topic.WRENCH, force_hz)
+        self.sections = Sections()
 
     def pose(self, sample: PoseSample) -> None:
-        """A pose, stamped when the host got it."""
+        """A pose, and the joints where they came with it, stamped when the host got them."""
         stamp = sample.stamp
-        message = pose_message(stamp.host_ns, sample.pose.position_mm, sample.pose.quaternion)
-        # A failed disk must not end the telemetry that raised this; the step's next event hears of it.
-        with contextlib.suppress(SessionError):
-            self._put(Topic.TCP, stamp.host_ns, stamp.device_ns or stamp.host_ns, stamp.seq, message)
+        self._poses.arrived(stamp.host_ns)
+        self._sample(Topic.TCP, stamp, pose_message(stamp.host_ns, sample.pose.position_mm, sample.pose.quaternion))
+        if sample.joints_rad is not None:
+            names = [f"joint{number}" for number in range(1, len(sample.joints_rad) + 1)]
+            self._sample(Topic.JOINTS, stamp, joints_message(stamp.host_ns, names, sample.joints_rad))
+
+    def force(self, sample: ForceSample) -> None:
+        """A sample of the force sensor, stamped when the host got it."""
+        if self._forces is not None:
+            self._forces.arrived(sample.stamp.host_ns)
+        (fx, fy, fz), (mx, my, mz) = sample.force_n, sample.torque_nm
+        wrench = Wrench(fx_n=fx, fy_n=fy, fz_n=fz, mx_nm=mx, my_nm=my, mz_nm=mz)
+        self._sample(Topic.WRENCH, sample.stamp, wrench)
+
+    def ink(self, level: float | None, dosed_ml: float, light: float | None) -> None:
+        """The well before a dip."""
+        now_ns = self._clock.now_ns()
+        self._put(Topic.INK, now_ns, now_ns, 0, InkState(level=level, dosed_ml=dosed_ml, light=light))
+
+    def frames(self, transforms: Iterable[Transform]) -> None:
+        """Where the frames lie."""
+        now_ns = self._clock.now_ns()
+        self._put(Topic.TRANSFORMS, now_ns, now_ns, 0, transforms_message(now_ns, transforms))
+
+    def quality(self, quality: Quality, number: int) -> None:
+        """The checks of the stroke that still `number` shows."""
+        now_ns = self._clock.now_ns()
+        self._put(Topic.QUALITY, now_ns, now_ns, number, quality)
+
+    def cadence(self) -> None:
+        """How steadily samples came so far, and what was slow: once, at the end of the step."""
+        now_ns = self._clock.now_ns()
+        slow = self.sections.report()
+        for arrivals in (self._poses, self._forces):
+            report = None if arrivals is None else arrivals.report(slow if arrivals is self._poses else ())
+            if report is not None:
+                self._put(Topic.CADENCE, now_ns, now_ns, 0, report)
 
     def still(self, frame: Frame, number: int) -> None:
         """A lossless still; `number` is unique in the session. Encoding takes tens of ms: call it off the loop."""
@@ -52,5 +110,13 @@ class Recorder:
         now_ns = self._clock.now_ns()
         self._put(Topic.LOG, now_ns, now_ns, 0, log_message(now_ns, text, warning=warning))
 
+    def _sample(self, topic: Topic, stamp: Stamp, message: Event | Message) -> None:
+        # A failed disk must not end the telemetry that raised this; the step's next event hears of it.
+        with contextlib.suppress(SessionError):
+            self._put(topic, stamp.host_ns, stamp.device_ns or stamp.host_ns, stamp.seq, message)
+
     def _put(self, topic: Topic, log_ns: int, publish_ns: int, sequence: int, message: Event | Message) -> None:
-        self._writer.write(Outgoing(topic, log_ns, publish_ns, sequence, message))
+        outgoing = Outgoing(topic, log_ns, publish_ns, sequence, message)
+        self._writer.write(outgoing)
+        if self._show is not None:
+            self._show(outgoing)

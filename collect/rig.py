@@ -13,13 +13,20 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from collect.config import RigConfig
+from collect.config_devices import ForceConfig, InkDeviceConfig, InkStationConfig
 from collect.errors import ConfigError
 from drivers.arcs.robot import ArcsOptions, AuboArcs
 from drivers.camera import CameraOptions, Locked, OpenCvCamera
 from drivers.clock import Clock
+from drivers.force.sri_m8123 import SriM8123, SriOptions
+from drivers.ink.pump import ModbusPump, PumpOptions
+from drivers.ink.station import InkStation, StationOptions
 from drivers.limits import Limits
-from drivers.protocols import Camera, Robot
+from drivers.protocols import Camera, ForceSensor, Ink, Robot
 from drivers.samples import Identity
+
+FORCE_CONNECT_S = 10.0
+"""To open the bus, through a gateway as well, and get a first round."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +39,16 @@ class Rig:
     camera: Camera
     robot_identity: Identity
     camera_identity: Identity
+    force: ForceSensor | None = None
+    ink: Ink | None = None
+    force_identity: Identity | None = None
+    ink_identity: Identity | None = None
+
+    @property
+    def simulated(self) -> bool:
+        """True where any device says that it is the loopback rig, or shows a recording."""
+        known = (self.robot_identity, self.camera_identity, self.force_identity, self.ink_identity)
+        return any(identity.simulated for identity in known if identity is not None)
 
 
 def limits_of(config: RigConfig) -> Limits:
@@ -53,6 +70,8 @@ def make_robot(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]
         watchdog_s=robot.watchdog_s,
         speed_fraction=robot.speed_fraction,
         collision_level=robot.collision_level,
+        payload_kg=robot.payload_kg,
+        payload_cog_mm=robot.payload_cog_mm,
     )
     return AuboArcs(options, limits_of(config), clock, on_notice)
 
@@ -64,6 +83,43 @@ def make_camera(config: RigConfig, clock: Clock, on_notice: Callable[[str], None
         camera.source, camera.latency_ms, camera.timeout_s, locked=Locked(**camera.locked.model_dump())
     )
     return OpenCvCamera(options, clock, on_notice)
+
+
+def make_force(config: ForceConfig, clock: Clock) -> SriM8123:
+    """The force sensor's driver, not yet connected."""
+    options = SriOptions(
+        config.interface,
+        config.channel,
+        config.bitrate,
+        host=config.host,
+        port=config.port,
+        stale_after_ms=config.stale_ms,
+        connect_timeout_s=FORCE_CONNECT_S,
+    )
+    return SriM8123(options, clock)
+
+
+def make_ink(config: InkDeviceConfig, clock: Clock) -> InkStation | ModbusPump:
+    """The ink device's driver, not yet connected."""
+    if isinstance(config, InkStationConfig):
+        return InkStation(
+            StationOptions(
+                config.port, config.baud, max_dose_ml=config.dose_ml, max_per_minute_ml=config.max_per_minute_ml
+            ),
+            clock,
+        )
+    return ModbusPump(
+        PumpOptions(
+            config.port,
+            config.ml_per_revolution,
+            rpm=config.rpm,
+            unit=config.unit,
+            baud=config.baud,
+            max_dose_ml=config.dose_ml,
+            max_per_minute_ml=config.max_per_minute_ml,
+        ),
+        clock,
+    )
 
 
 def _resolved(host: str) -> str:
@@ -92,7 +148,7 @@ def sole_driver(config: RigConfig) -> Generator[None]:
 
 @contextlib.asynccontextmanager
 async def connected(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> AsyncGenerator[Rig]:
-    """Connect camera, then robot; on the way out stop the arm first, whatever happened.
+    """Connect camera, force sensor, ink device, then the robot; on the way out stop the arm first, come what may.
 
     `on_notice` is told what a device says unasked, from any thread. Raises `ConfigError` where another brushloop on
     this machine has the arm: closing would stop its motion.
@@ -102,7 +158,18 @@ async def connected(config: RigConfig, clock: Clock, on_notice: Callable[[str], 
         camera = make_camera(config, clock, on_notice)
         stack.push_async_callback(camera.close)
         camera_identity = await camera.connect()
+        force = force_identity = ink = ink_identity = None
+        if config.force is not None:
+            force = make_force(config.force, clock)
+            stack.push_async_callback(force.close)
+            force_identity = await force.connect()
+        if config.ink.device is not None:
+            ink = make_ink(config.ink.device, clock)
+            stack.push_async_callback(ink.close)
+            ink_identity = await ink.connect()
         robot = make_robot(config, clock, on_notice)
         stack.push_async_callback(robot.close)
         robot_identity = await robot.connect()
-        yield Rig(config, clock, robot, camera, robot_identity, camera_identity)
+        yield Rig(
+            config, clock, robot, camera, robot_identity, camera_identity, force, ink, force_identity, ink_identity
+        )

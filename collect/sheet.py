@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from collect.config import PaperConfig
 from collect.errors import SheetFull
+from collect.protocols.planned import Layout
 
 ANCHOR_SHARE = 0.75
 """The zero-touch point's place along a cell: the mark reaches mostly toward -x, where the tip lies."""
@@ -36,10 +37,11 @@ class Cell:
 class Sheet:
     """The cells of one sheet, row by row from the far edge, so that the arm never reaches across wet ink."""
 
-    def __init__(self, paper: PaperConfig) -> None:
-        self._paper = paper
+    def __init__(self, paper: PaperConfig, cell_mm: tuple[float, float] | None = None) -> None:
+        """`cell_mm` is what the protocol needs; None is `paper.cell_mm`."""
+        self.cell_mm = paper.cell_mm if cell_mm is None else cell_mm
         width, height = paper.size_mm
-        cell_w, cell_h = paper.cell_mm
+        cell_w, cell_h = self.cell_mm
         self.columns = int(width // cell_w)
         self.rows = int(height // cell_h)
         self._left = 0.5 * (width - self.columns * cell_w)
@@ -50,12 +52,25 @@ class Sheet:
         """Cells on a sheet."""
         return self.columns * self.rows
 
+    @property
+    def layout(self) -> Layout:
+        """Its columns and rows."""
+        return Layout(self.columns, self.rows)
+
+    @property
+    def corners(self) -> list[Cell]:
+        """The outermost cells: what fits there within a convex box fits on all of them. None on an empty sheet."""
+        if not self.capacity:
+            return []
+        last_row = self.capacity - self.columns
+        return [self.cell(i) for i in sorted({0, self.columns - 1, last_row, self.capacity - 1})]
+
     def cell(self, index: int) -> Cell:
         """The cell of that number."""
         if not 0 <= index < self.capacity:
             raise IndexError(f"cell {index} is outside [0, {self.capacity - 1}]")
         row, column = divmod(index, self.columns)
-        cell_w, cell_h = self._paper.cell_mm
+        cell_w, cell_h = self.cell_mm
         y_mm = self._bottom + (self.rows - 1 - row) * cell_h
         return Cell(index, self._left + column * cell_w, y_mm, cell_w, cell_h)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from collect.asking import Prompt
 from collect.states import State
 
 
@@ -40,6 +41,14 @@ class Snapshot:
     """The newest lines of the log, oldest first."""
     error: str
     """Why it failed or stopped; empty while all is well."""
+    given_up: int = 0
+    """Strokes that came out badly every time and were left out."""
+    force_n: float | None = None
+    """Of the force sensor, less its bias; None without one, or where it has not told lately."""
+    ink_level: float | None = None
+    """Of the well, 0 to 1, before the last dip; None where nothing can tell."""
+    prompt: Prompt | None = None
+    """What waits for an answer."""
     messages_before: int = 0
     """How many older lines of the log are not in `messages` any more."""
 
@@ -57,6 +66,10 @@ class EngineView(Protocol):
 
     def resume(self) -> None:
         """Go on after a pause; from any thread."""
+        ...
+
+    def answer(self, number: int, key: str) -> bool:
+        """Answer the prompt of that number; False where it is over. From any thread."""
         ...
 
     def stop(self) -> None:

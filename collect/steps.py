@@ -22,9 +22,17 @@ class StepKind(StrEnum):
     BOARD = "board"
     DIP = "dip"
     PRESS = "press"
+    DRAW = "draw"
+    """A figure: all strokes of one character, on one cell. Cut anywhere, the whole of it is done again."""
+    TOUCH = "touch"
+    """Bring the tip down on a named point of the sheet and tell how high it lies there."""
     CAPTURE = "capture"
+    SELF_CHECK = "self_check"
+    """An uneven triangle of marks that a mirrored, turned or stretched rig does not reproduce."""
 
 
+MARKING = frozenset({StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK})
+"""They leave ink on a paper cell of their own."""
 RUN_SCOPED = frozenset({StepKind.ZERO_TOUCH})
 """Done again in every process: what they establish does not outlive it."""
 

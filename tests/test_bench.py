@@ -5,19 +5,22 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import pytest
 
-from bench import raster
-from bench.harness import Result, interleave
+import bench.__main__
+from bench import footprints, raster, rpc
+from bench.harness import BenchError, Result, interleave, percentile, results_of
+from bench.processes import started
 from model.ccdbsm import Brush, ccdbsm
 
 ROOT = Path(__file__).resolve().parent.parent
 
 
 def test_raster_reports_the_agreed_fields() -> None:
-    result = raster.run(n=1, seed=3)
+    result = results_of(raster.run(n=1, seed=3))[0]
     fields = json.loads(result.to_json())
-    assert list(fields) == ["name", "value", "unit", "peer", "ratio", "n", "seed"]
+    assert list(fields) == ["name", "value", "unit", "peer", "ratio", "n", "seed", "conditions"]
     assert (result.name, result.unit, result.n, result.seed) == ("raster", "images/s", 1, 3)
     assert result.value > 0
     assert result.ratio > 0
@@ -43,9 +46,69 @@ def test_the_line_for_people_says_what_the_ratio_means() -> None:
     assert line == "x: 1,234 images/s, 2.00 x p (above 1 is better; n = 5, seed = 0)"
 
 
+def test_people_read_shared_conditions_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results = [Result(name, 1.0, "ms", "p", 1.0, 1, 0, told) for name, told in (("a", "x"), ("b", "x"), ("c", "y"))]
+    monkeypatch.setattr(bench.__main__, "benches", lambda: {"three": lambda: results})
+    assert bench.__main__.main(["three"]) == 0
+    assert [line[:3] for line in capsys.readouterr().out.splitlines()] == ["# x", "a: ", "b: ", "# y", "c: "]
+
+
+def test_one_bench_may_return_several_results_a_line_each(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, two = (Result(name, 1.0, "ms", "p", 1.0, 1, 0) for name in ("one", "two"))
+    assert list(results_of(one)) == [one]
+    monkeypatch.setattr(bench.__main__, "benches", lambda: {"both": lambda: [one, two]})
+    assert bench.__main__.main(["both", "--json"]) == 0
+    assert [json.loads(line)["name"] for line in capsys.readouterr().out.splitlines()] == ["one", "two"]
+
+
+@pytest.mark.parametrize(("percent", "value"), [(50, 2.0), (75, 3.0), (99, 4.0), (100, 4.0), (0, 1.0)])
+def test_a_percentile_is_one_of_the_values(percent: float, value: float) -> None:
+    assert percentile([3.0, 1.0, 4.0, 2.0], percent) == value
+
+
+def test_rpc_measures_every_part_of_the_wire() -> None:
+    results = {result.name: result for result in rpc.run(n=3, seed=2)}
+    for framing in ("sof", "bare"):
+        assert results[f"rpc {framing}"].value > 50.0
+        assert 0.0 < results[f"rpc {framing} p50"].value <= results[f"rpc {framing} p99"].value
+    for source in ("RTDE", "polling"):
+        assert results[f"telemetry {source} missed"].value >= 0.0
+        assert 0.0 <= results[f"telemetry {source} jitter p50"].value <= results[f"telemetry {source} jitter max"].value
+    # The call that is not answered ends after a second; a stop that waited for it would be as late.
+    assert 0.0 < results["stop latency p50"].value < 500.0
+    assert results["presses"].value > 0.1
+    assert all((r.n, r.seed) == (3, 2) and r.ratio > 0.0 for r in results.values())
+    assert all("loopback rig" in r.conditions for r in results.values())
+
+
+def test_rpc_wants_at_least_one_round() -> None:
+    with pytest.raises(ValueError, match="n = 0"):
+        rpc.run(n=0)
+
+
+def test_a_helper_process_that_ends_early_is_an_error_of_the_bench() -> None:
+    with pytest.raises(BenchError, match="ended with 1"), started("bench.processes", "nonsense"):
+        pass
+
+
+def test_the_picture_of_footprints_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(footprints, "HEIGHTS_MM", (11, 20))
+    footprints.draw(tmp_path / "footprints.png")
+    image = cv2.imread(str(tmp_path / "footprints.png"))
+    assert image is not None
+    dark = (image.max(axis=2) < 80).mean()
+    red = ((image[:, :, 2] > 180) & (image[:, :, 1] < 90)).mean()
+    assert 0.01 < dark < 0.5
+    assert 0.001 < red < 0.1
+
+
 def test_unknown_name_is_one_line_and_exit_code_2() -> None:
     command = [sys.executable, "-m", "bench", "rasta"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 2
     assert done.stdout == ""
-    assert done.stderr == "unknown bench 'rasta'; known: raster, startup\n"
+    assert done.stderr == "unknown bench 'rasta'; known: quality, raster, recorder, rpc, startup\n"

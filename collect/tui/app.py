@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from typing import ClassVar
 
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
 from textual.widgets import Footer
 
+from collect.asking import Prompt
 from collect.errors import CollectAborted
 from collect.headless import REFRESH_S, RunnableEngine, stopping_signals
 from collect.snapshot import EngineView, Snapshot
 from collect.states import FINAL, State
+from collect.tui.ask import AskScreen
 from collect.tui.confirm import ConfirmQuit
 from collect.tui.terminal import TerminalDriver
 from collect.tui.view import RunView
@@ -109,28 +112,27 @@ class RunApp(App[None]):
             self.exit()
         before, self._now = self._now, self._engine.snapshot()
         self._view.show(self._now)
+        self._ask(self._now.prompt)
         if self._now.state is not before.state:
             self.refresh_bindings()
 
+    def _ask(self, prompt: Prompt | None) -> None:
+        shown = next((screen for screen in self.screen_stack if isinstance(screen, AskScreen)), None)
+        if shown is not None and prompt is not None and shown.prompt.number == prompt.number:
+            shown.tell_time(time.time_ns())
+            return
+        if shown is not None and shown is self.screen:
+            self.pop_screen()
+        if prompt is not None and not isinstance(self.screen, ConfirmQuit | AskScreen):
+            self.push_screen(AskScreen(prompt, self._engine))
+
 
 class _StopAndLeave:
-    """The engine as signals see it: a signal may mean that nobody is there to press q."""
+    """What signals may do: one may mean that nobody is there to press q."""
 
     def __init__(self, engine: EngineView, app: RunApp) -> None:
         self._engine = engine
         self._app = app
-
-    def snapshot(self) -> Snapshot:
-        """The engine's."""
-        return self._engine.snapshot()
-
-    def pause(self) -> None:
-        """The engine's."""
-        self._engine.pause()
-
-    def resume(self) -> None:
-        """The engine's."""
-        self._engine.resume()
 
     def stop(self) -> None:
         """Stop the arm first, then end the screen."""

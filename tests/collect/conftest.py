@@ -18,6 +18,7 @@ from collect.engine import Engine
 from collect.opening import Opening, find_resumable, open_store
 from drivers.clock import HostClock
 from drivers.sim.config import SimConfig, View
+from drivers.sim.flaws import Flaw
 from drivers.sim.rig import LoopbackRig
 
 SMALL_VIEW = View(width_px=512, height_px=384, px_per_mm=1.56, fps=50.0)
@@ -56,11 +57,20 @@ class Lab:
     def sessions(self) -> Path:
         return self.folder / "sessions"
 
-    def engine(self, *, new: bool = False, sheet: int | None = None, armed: bool = False) -> Engine:
+    def engine(
+        self, *, new: bool = False, sheet: int | None = None, armed: bool = False, watched: bool = False
+    ) -> Engine:
         rig, protocol, clock = self.folder / "rig.toml", self.folder / "protocol.toml", HostClock()
-        opening = Opening.load(self.sessions, rig, protocol, new=new, sheet=sheet, armed=armed)
+        opening = Opening.load(self.sessions, rig, protocol, new=new, sheet=sheet)
         resume = find_resumable(opening)
-        return Engine(opening.rig, opening.protocol, lambda r: open_store(opening, resume, r, clock), clock)
+        return Engine(
+            opening.rig,
+            opening.protocol,
+            lambda r: open_store(opening, resume, r, clock),
+            clock,
+            watched=watched,
+            armed=armed,
+        )
 
     def process(self) -> subprocess.Popen[str]:
         """`brushloop collect` as an operator starts it, without a screen."""
@@ -79,9 +89,25 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
     with serving(SimConfig(rate=60.0, view=SMALL_VIEW)) as rig:
         made = Lab(rig, tmp_path)
         text = rig.toml().replace("latency_ms = 250.0", "latency_ms = 60.0")
-        (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
+        # Its camera is too coarse to judge ink by.
+        text += "\n[quality]\nenabled = false\n"
+        (tmp_path / "rig.toml").write_text(text.replace("[force]", "[force]\nbias_s = 0.25"), encoding="utf-8")
         made.write_protocol()
         yield made
         for process in made.processes:
             process.kill()
             process.communicate()
+
+
+@pytest.fixture
+def sharp_lab(tmp_path: Path) -> Iterator[Lab]:
+    """With the camera's full sharpness, so that captures are judged; one stroke, and nothing splits by itself."""
+    with serving(SimConfig(rate=60.0, view=View(fps=20.0))) as rig:
+        made = Lab(rig, tmp_path)
+        text = (
+            rig.toml().replace("latency_ms = 250.0", "latency_ms = 100.0").replace("[force]", "[force]\nbias_s = 0.25")
+        )
+        (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
+        made.write_protocol("[13.0]", "[0.0]")
+        rig.world.flaws.update(dict.fromkeys(range(20), (Flaw.SPLIT, 0.0)))
+        yield made

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from collect.config import load_protocol, load_rig
+from collect.config import load_rig
 from collect.errors import ConfigError
 from collect.plan import check_plan
+from collect.protocols.loading import load_protocol
 from drivers.sim.config import SimConfig
-from drivers.sim.rig_toml import rig_toml
+from drivers.sim.rig_toml import Addresses, rig_toml
 
-RIG = rig_toml(SimConfig(), "127.0.0.1", 30004, 8080)
+RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
 PROTOCOL = 'kind = "grid"\nheights_mm = [11.0, 20.0]\ntilts_deg = [0.0, 10.0]\nrepeats = 2\n'
 
 

@@ -13,13 +13,15 @@ from collect.config import load_rig
 from collect.doctor import examine
 from drivers.arcs.codes import SafetyMode
 from drivers.clock import HostClock
+from drivers.sim.force_board import Fault
+from drivers.sim.ink_station import Fault as InkFault
 
 if TYPE_CHECKING:
     from conftest import Lab
 
 
 async def test_a_rig_in_order_is_told_as_it_is_and_left_as_it_was(lab: Lab) -> None:
-    camera, robot = await examine(load_rig(lab.folder / "rig.toml"), HostClock())
+    camera, force, ink, robot = await examine(load_rig(lab.folder / "rig.toml"), HostClock())
     assert robot.well
     assert robot.identity == "aubo_i5 (brushloop-loopback)"
     assert robot.latency_ms is not None
@@ -29,12 +31,34 @@ async def test_a_rig_in_order_is_told_as_it_is_and_left_as_it_was(lab: Lab) -> N
     assert camera.well
     assert camera.notes.startswith("board: ")
     assert "ended" not in camera.notes
+    assert force.well
+    assert "rounds/s" in force.notes
+    assert force.notes.endswith("N before bias, simulated")
+    assert ink.well
+    assert (ink.identity, ink.firmware) == ("ink-station", "1.0.0")
+    assert ink.notes == "well 71% full, simulated"
+
+
+async def test_an_instrument_that_was_unplugged_is_told_and_the_others_are_still_asked(lab: Lab) -> None:
+    assert lab.rig.ink is not None
+    assert lab.rig.force is not None
+    lab.rig.ink.fail(*[InkFault.DEAF] * 100)
+    lab.rig.force.board.fail(*[Fault.NO_SECOND] * 10_000)
+    camera, force, ink, robot = await examine(load_rig(lab.folder / "rig.toml"), HostClock())
+    assert camera.well
+    assert robot.well
+    assert not ink.answers
+    assert "no reply" in ink.problem
+    assert ink.remedy
+    assert not force.answers
+    assert "no whole round" in force.problem
+    assert "wiring" in force.remedy
 
 
 async def test_a_board_that_cannot_be_seen_is_a_problem_with_a_remedy(lab: Lab) -> None:
     path = lab.folder / "rig.toml"
     path.write_text(path.read_text().replace("DICT_5X5_1000", "DICT_4X4_1000"))
-    camera, _ = await examine(load_rig(path), HostClock())
+    camera, *_ = await examine(load_rig(path), HostClock())
     assert camera.answers
     assert not camera.well
     assert "board corners found" in camera.problem
@@ -43,7 +67,7 @@ async def test_a_board_that_cannot_be_seen_is_a_problem_with_a_remedy(lab: Lab) 
 
 async def test_a_protective_stop_is_told_and_not_cleared(lab: Lab) -> None:
     lab.rig.arcs.protective_stop(SafetyMode.PROTECTIVE_STOP)
-    _, robot = await examine(load_rig(lab.folder / "rig.toml"), HostClock())
+    *_, robot = await examine(load_rig(lab.folder / "rig.toml"), HostClock())
     assert robot.answers
     assert not robot.well
     assert "ProtectiveStop" in robot.problem
@@ -53,13 +77,13 @@ async def test_a_protective_stop_is_told_and_not_cleared(lab: Lab) -> None:
 @pytest.mark.parametrize("flag", [(), ("--json",)])
 def test_a_cabinet_that_does_not_answer_ends_with_code_4_and_the_rest_is_told(lab: Lab, flag: tuple[str, ...]) -> None:
     path = lab.folder / "rig.toml"
-    path.write_text(path.read_text().replace(f"port = {lab.rig.arcs.port}", "port = 9"))
+    path.write_text(path.read_text().replace(f"port = {lab.rig.arcs.port}\n", "port = 9\n"))
     command = [sys.executable, "-m", "brushloop", "doctor", "--config", str(path), *flag]
     ran = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ran.returncode == 4
     assert "Traceback" not in ran.stderr
     if flag:
-        camera, robot = (json.loads(line) for line in ran.stdout.splitlines())
+        camera, _, _, robot = (json.loads(line) for line in ran.stdout.splitlines())
         assert camera["answers"]
         assert not robot["answers"]
         assert "127.0.0.1:9" in robot["problem"]

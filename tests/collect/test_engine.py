@@ -149,7 +149,7 @@ def test_a_changed_protocol_is_refused_with_the_difference(lab: Lab) -> None:
     run_and_stop(lab.engine(), lambda now: now.strokes_done == 1)
 
     lab.write_protocol(heights="[11.0, 16.0]")
-    with pytest.raises(ConfigError, match=r"(?s)-heights_mm = \[11.0, 15.0\].*\+heights_mm = \[11.0, 16.0\].*--new"):
+    with pytest.raises(ConfigError, match=r"(?s)protocol.effective.json.*-    15.0\n\+    16.0.*--new"):
         lab.engine()
     with pytest.raises(ConfigError, match="--sheet 1"):
         lab.engine(new=True)

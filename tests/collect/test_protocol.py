@@ -9,8 +9,9 @@ from collections import Counter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from collect.config import GridConfig, PaperConfig
+from collect.config import PaperConfig
 from collect.protocol import grid, plan_grid
+from collect.protocols.config import GridConfig
 from collect.sheet import Sheet, to_base
 from collect.steps import Step, StepKind
 

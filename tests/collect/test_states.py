@@ -43,13 +43,13 @@ LATE_CAMERA = DeviceTimeout("camera", "fresh", "no new frame")
     ("step", "error", "failures", "action"),
     [
         (PRESS, StepVoid("rests too high"), 1, Action.RETRY),
-        (PRESS, StepVoid("rests too high"), MAX_FAILURES, Action.ABORT),
+        (PRESS, StepVoid("rests too high"), MAX_FAILURES, Action.ASK),
         (PRESS, MotionFailed("robot", "moveLine", "out of reach"), 1, Action.ABORT),
-        (PRESS, RobotNotSafe("robot", "moveLine", "ProtectiveStop", "", ""), 1, Action.ABORT),
-        (PRESS, SheetFull(42, 1), 1, Action.ABORT),
+        (PRESS, RobotNotSafe("robot", "moveLine", "ProtectiveStop", "", ""), 1, Action.ASK),
+        (PRESS, SheetFull(42, 1), 1, Action.ASK),
         (PRESS, LATE_CAMERA, 1, Action.ABORT),
         (CAPTURE, LATE_CAMERA, 1, Action.RETRY),
-        (CAPTURE, LATE_CAMERA, MAX_FAILURES, Action.ABORT),
+        (CAPTURE, LATE_CAMERA, MAX_FAILURES, Action.ASK),
         (CAPTURE, DeviceTimeout("robot", "getTcpPose", "no reply"), 1, Action.ABORT),
     ],
 )

@@ -1,0 +1,17 @@
+"""What every table of `rig.toml` and `protocol.toml` is made of."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Range = tuple[Finite, Finite]
+
+
+class Config(BaseModel):
+    """Base: frozen, extra keys refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")

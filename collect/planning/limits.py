@@ -1,0 +1,156 @@
+"""Every pose that a protocol can command, against the limits: on every cell, since void presses move what follows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+from collect.config import RigConfig
+from collect.errors import ConfigError, StepError
+from collect.plane import PaperPlane
+from collect.planning.moves import moves_of
+from collect.planning.walk import sheet_of, steps_on
+from collect.procedures import park_moves
+from collect.protocols.config import CalibrationConfig, GridConfig, ProtocolConfig, WriteConfig
+from collect.protocols.plans import planned
+from collect.rig import limits_of
+from collect.sheet import Cell, Sheet
+from collect.steps import MARKING, Result, Step, StepKind
+from collect.touch.selfcheck import triangle_in
+from drivers.errors import LimitExceeded
+from drivers.samples import Pose
+
+TOUCH_CLEAR_MM = 5.0
+MARKED = {"sheet": 0, "cell": 0}
+
+
+def check_protocol(rig_path: Path, protocol_path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
+    """Raise `ConfigError` naming file, field and range for the first thing that cannot be done."""
+    _check_brush(protocol_path, rig, protocol)
+    sheet = sheet_of(rig, protocol)
+    if not isinstance(protocol, CalibrationConfig):
+        _check_cells(rig_path, protocol_path, rig, protocol, sheet)
+    _check_touches(protocol_path, rig, protocol)
+    check_poses(rig_path, rig, protocol, PaperPlane(rig.paper.touch_z_mm))
+
+
+def distinct_steps(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Step]:
+    """The steps, each thing that they can ask for once."""
+    generator = steps_on(config, protocol)
+    seen: set[tuple[object, ...]] = set()
+    try:
+        step = next(generator)
+        while True:
+            names = sorted(set(step.params) - {"stroke_id", "again_of", "dwell_s", "sheet", "cell"})
+            asked = (step.kind, *(step.params[name] for name in names if step.kind != StepKind.CAPTURE))
+            if asked not in seen:
+                seen.add(asked)
+                yield step
+            answer: Result = MARKED if step.kind in MARKING else {}
+            step = generator.send(answer)
+    except StopIteration:
+        return
+
+
+def _check_brush(path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
+    brush = rig.brush
+    field = {"grid": "heights_mm", "write": "figures"}.get(protocol.kind, "presses")
+    for depth_mm, tilt_deg, name in _depths(protocol):
+        if depth_mm > brush.max_depth_mm:
+            raise ConfigError(
+                path,
+                field,
+                f"{name}{depth_mm:g} mm is deeper than brush.max_depth_mm = {brush.max_depth_mm:g} mm allows",
+            )
+        most_mm = brush.length_mm * math.cos(math.radians(tilt_deg))
+        if depth_mm > most_mm:
+            raise ConfigError(
+                path,
+                field,
+                f"{name}{depth_mm:g} mm at {tilt_deg:g} deg is more than the bundle is long ({most_mm:.1f} mm)",
+            )
+
+
+def _depths(protocol: ProtocolConfig) -> Iterator[tuple[float, float, str]]:
+    """(depth, tilt, what to call it) of every press and every drawn point."""
+    if isinstance(protocol, WriteConfig):
+        for figure in protocol.figures:
+            for stroke in figure.strokes:
+                yield from ((point[2], point[3], f"{figure.name}: ") for point in stroke.points)
+    else:
+        for stroke in planned(protocol):
+            yield stroke.height_mm, stroke.tilt_deg, "" if isinstance(protocol, GridConfig) else f"{stroke.stroke_id}: "
+
+
+def _check_cells(rig_path: Path, path: Path, rig: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> None:
+    own = isinstance(protocol, WriteConfig)
+    if sheet.capacity == 0:
+        raise ConfigError(
+            path if own else rig_path,
+            "cell_mm" if own else "paper.cell_mm",
+            f"{sheet.cell_mm} does not fit on {rig.paper.size_mm}",
+        )
+    if rig.self_check.enabled:
+        try:
+            triangle_in(sheet.cell(0), rig.self_check)
+        except StepError as error:
+            raise ConfigError(rig_path, "self_check.legs_mm", str(error)) from None
+    x_mm, y_mm = rig.paper.touch_point_mm
+    for cell in map(sheet.cell, range(sheet.capacity)):
+        for mark_x, mark_y in _marks(protocol, cell):
+            if math.dist((mark_x, mark_y), (x_mm, y_mm)) < TOUCH_CLEAR_MM:
+                what = "a drawn point" if own else "a press"
+                raise ConfigError(
+                    rig_path,
+                    "paper.touch_point_mm",
+                    f"{[x_mm, y_mm]} lies within {TOUCH_CLEAR_MM:g} mm of {what} at "
+                    f"{[round(mark_x, 1), round(mark_y, 1)]}",
+                )
+
+
+def _marks(protocol: ProtocolConfig, cell: Cell) -> Iterator[tuple[float, float]]:
+    if not isinstance(protocol, WriteConfig):
+        yield cell.anchor_mm
+        return
+    for figure in protocol.figures:
+        for stroke in figure.strokes:
+            yield from ((cell.x_mm + x_mm, cell.y_mm + y_mm) for x_mm, y_mm, *_ in stroke.points)
+
+
+def _check_touches(path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
+    if not isinstance(protocol, CalibrationConfig):
+        return
+    width, height = rig.paper.size_mm
+    for x_mm, y_mm in protocol.touches_mm:
+        if not (0.0 <= x_mm <= width and 0.0 <= y_mm <= height):
+            raise ConfigError(
+                path, "touches_mm", f"[{x_mm:g}, {y_mm:g}] lies off the sheet of {width:g} x {height:g} mm"
+            )
+
+
+def check_poses(rig_path: Path, rig: RigConfig, protocol: ProtocolConfig, plane: PaperPlane) -> None:
+    """The same for poses over this plane: the taught one, or the one that was touched. Raises `ConfigError`."""
+    limits, acc_mm_s2 = limits_of(rig), rig.motion.acc_mm_s2
+    for pose, speed_mm_s, where in all_poses(rig, protocol, plane):
+        try:
+            limits.check("robot", pose, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
+        except LimitExceeded as error:
+            raise ConfigError(rig_path, "robot.limits", f"a planned pose leaves them: {error.what} ({where})") from None
+
+
+def all_poses(
+    rig: RigConfig, protocol: ProtocolConfig, plane: PaperPlane, *, every_cell: bool = False
+) -> Iterator[tuple[Pose, float, str]]:
+    """(pose, speed in mm/s, what it belongs to) of everything that the protocol can ask for.
+
+    The box of the limits is convex, so what fits on the outermost cells fits on all of them; reach is not so simple.
+    """
+    yield from ((move.target, move.speed_mm_s, "park") for move in park_moves(rig))
+    sheet = sheet_of(rig, protocol)
+    cells = [sheet.cell(i) for i in range(sheet.capacity)] if every_cell else sheet.corners
+    for step in distinct_steps(rig, protocol):
+        for cell in cells if step.kind in MARKING else [None]:
+            name = str(step.params.get("stroke_id", step.kind))
+            where = f"{name} on cell {cell.index}" if cell is not None else name
+            yield from ((pose, speed, where) for pose, speed in moves_of(rig, plane, step, cell).poses)

@@ -1,0 +1,165 @@
+"""A picture of the sheets from above: cells with their strokes, touch points, well, park position, board."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from collect.config import RigConfig
+from collect.plane import to_paper
+from collect.planning.summary import Placed, Plan
+from collect.planning.walk import sheet_of
+from collect.protocols.config import ProtocolConfig
+from collect.protocols.plans import planned
+from collect.sheet import Sheet
+
+Axes = Any
+"""matplotlib's, whose types are incomplete."""
+MOST_SHEETS = 11
+"""With the view of the whole place a picture of twelve panels."""
+BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
+"""Of the palette of Okabe and Ito, which people who see few colours can tell apart; the marks differ in shape too."""
+
+
+def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Path) -> None:
+    """Write the picture; its format is that of the file's name. Raises OSError where it cannot be written."""
+    from matplotlib.figure import Figure as Picture
+
+    shown = min(plan.sheets, MOST_SHEETS) if plan.placed else 0
+    columns = 1 if shown == 0 else 2 if shown < 6 else 3
+    rows = math.ceil((shown + 1) / columns)
+    width, height = config.paper.size_mm
+    panel_in = 7.2
+    picture: Any = Picture(
+        figsize=(panel_in * columns, (panel_in * height / width + 0.35) * rows), layout="constrained"
+    )
+    axes: list[Axes] = list(picture.subplots(rows, columns, squeeze=False).flat)
+    sheet = sheet_of(config, protocol)
+    _place(axes[0], config, plan, sheet)
+    drawn = {p.stroke_id: p for p in planned(protocol) if p.figure is not None}
+    for number, panel in enumerate(axes[1 : shown + 1], 1):
+        _sheet(panel, config, sheet, number, [p for p in plan.placed if p.sheet == number], plan, drawn)
+    for panel in axes[shown + 1 :]:
+        panel.set_axis_off()
+    if plan.sheets > shown > 0:
+        picture.suptitle(f"the first {shown} of {plan.sheets} sheets")
+    picture.savefig(path, dpi=110)
+
+
+def _place(axes: Axes, config: RigConfig, plan: Plan, sheet: Sheet) -> None:
+    """Everything around the sheet, without strokes."""
+    from matplotlib.patches import Circle, Rectangle
+
+    board = config.board
+    size = [n * board.square_mm for n in board.squares]
+    axes.add_patch(Rectangle(board.origin_mm, *size, fill=False, edgecolor=GREY, linestyle="--", label="board"))
+    axes.add_patch(Rectangle((0.0, 0.0), *config.paper.size_mm, facecolor="#fbf7ea", edgecolor="black", label="sheet"))
+    for index in range(sheet.capacity if plan.placed else 0):
+        cell = sheet.cell(index)
+        axes.add_patch(_outline(cell.rect_mm, GREY))
+    axes.add_patch(Circle(config.ink.well_mm, 6.0, facecolor=BLUE, edgecolor="black", label="well"))
+    axes.plot(*zip(*plan.touches_mm, strict=True), "x", color=ORANGE, markersize=9, mew=2.5, label="touch point")
+    park = to_paper(config.paper, config.motion.park_mm[0], config.motion.park_mm[1])
+    axes.plot(*park, "^", color=GREEN, markersize=11, label="park")
+    axes.annotate("x", (0.0, 0.0), (40.0, 0.0), arrowprops={"arrowstyle": "<-", "color": "black"}, va="center")
+    axes.annotate("y", (0.0, 0.0), (0.0, 40.0), arrowprops={"arrowstyle": "<-", "color": "black"}, ha="center")
+    xs = [
+        0.0,
+        config.paper.size_mm[0],
+        config.ink.well_mm[0],
+        park[0],
+        board.origin_mm[0],
+        board.origin_mm[0] + size[0],
+    ]
+    ys = [
+        0.0,
+        config.paper.size_mm[1],
+        config.ink.well_mm[1],
+        park[1],
+        board.origin_mm[1],
+        board.origin_mm[1] + size[1],
+    ]
+    axes.set_xlim(min(xs) - 15.0, max(xs) + 15.0)
+    axes.set_ylim(min(ys) - 15.0, max(ys) + 15.0)
+    _finish(axes, "the place from above, paper frame")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5, frameon=False)
+
+
+def _sheet(
+    axes: Axes,
+    config: RigConfig,
+    sheet: Sheet,
+    number: int,
+    placed: Sequence[Placed],
+    plan: Plan,
+    drawn: dict[str, Any],
+) -> None:
+    from matplotlib import colormaps
+
+    heights = [p.height_mm for p in plan.placed]
+    low, high = min(heights), max(heights)
+    axes.add_patch(_outline((0.0, 0.0, *config.paper.size_mm), "black"))
+    for stroke in placed:
+        cell = sheet.cell(stroke.cell)
+        share = 0.5 if high == low else (stroke.height_mm - low) / (high - low)
+        shade = colormaps["cividis"](0.25 + 0.75 * (1.0 - share))
+        axes.add_patch(_outline(cell.rect_mm, GREY, None if stroke.drawn else shade))
+        ink = "white" if not stroke.drawn and 0.25 + 0.75 * (1.0 - share) < 0.55 else "black"
+        points = max(4.0, min(0.34 * cell.height_mm, 0.17 * cell.width_mm) * 498.0 / config.paper.size_mm[0])
+        if stroke.drawn:
+            _figure(axes, cell.rect_mm, drawn[stroke.stroke_id].figure)
+            axes.text(cell.x_mm + 1.0, cell.y_mm + 1.0, f"#{stroke.order} {_plain(stroke.stroke_id)}", fontsize=8)
+        else:
+            axes.text(
+                cell.x_mm + 0.36 * cell.width_mm,
+                cell.y_mm + 0.5 * cell.height_mm,
+                f"#{stroke.order}\nH{stroke.height_mm:g} a{stroke.tilt_deg:g}",
+                fontsize=min(points, 9.0),
+                color=ink,
+                ha="center",
+                va="center",
+            )
+            axes.plot(*cell.anchor_mm, "+", color=ink, markersize=5, alpha=0.7)
+    if number == 1 and plan.steps.get("self_check"):
+        cell = sheet.cell(0)
+        axes.add_patch(_outline(cell.rect_mm, GREY))
+        axes.text(cell.x_mm + 2.0, cell.y_mm + 0.5 * cell.height_mm, "self-check", fontsize=8, va="center")
+    axes.plot(*zip(*plan.touches_mm, strict=True), "x", color=ORANGE, markersize=7, mew=2.0)
+    axes.set_xlim(-3.0, config.paper.size_mm[0] + 3.0)
+    axes.set_ylim(-3.0, config.paper.size_mm[1] + 3.0)
+    note = "" if placed and placed[0].drawn else ": # order, H mm, a deg; darker is deeper; + touch height of the press"
+    _finish(axes, f"sheet {number}, {len(placed)} strokes{note}")
+
+
+def _figure(axes: Axes, rect_mm: tuple[float, float, float, float], figure: Any) -> None:
+    """Trajectories, as thick as they are deep; a ring where each stroke begins."""
+    x_mm, y_mm, *_ = rect_mm
+    for number, stroke in enumerate(figure.strokes, 1):
+        for a, b in zip(stroke.points, stroke.points[1:], strict=False):
+            thick = 0.6 + 0.25 * max(0.0, 0.5 * (a[2] + b[2]))
+            axes.plot([x_mm + a[0], x_mm + b[0]], [y_mm + a[1], y_mm + b[1]], color=BLUE, lw=thick, alpha=0.75)
+        first = stroke.points[0]
+        axes.plot(x_mm + first[0], y_mm + first[1], "o", mfc="white", mec=ORANGE, markersize=9)
+        axes.text(x_mm + first[0], y_mm + first[1], str(number), fontsize=6, ha="center", va="center")
+
+
+def _plain(name: str) -> str:
+    """A name as every font has it: characters beyond Latin by their code point, and nothing that is read as TeX."""
+    return "".join(c if ord(c) < 0x250 else f"U+{ord(c):04X}" for c in name).replace("$", r"\$")
+
+
+def _outline(rect_mm: tuple[float, float, float, float], edge: str, face: object = None) -> Any:
+    from matplotlib.patches import Rectangle
+
+    x_mm, y_mm, width_mm, height_mm = rect_mm
+    return Rectangle((x_mm, y_mm), width_mm, height_mm, edgecolor=edge, facecolor=face or "none", linewidth=0.8)
+
+
+def _finish(axes: Axes, title: str) -> None:
+    axes.set_aspect("equal")
+    axes.set_title(title, fontsize=10)
+    axes.set_xlabel("x mm", fontsize=8)
+    axes.set_ylabel("y mm", fontsize=8)
+    axes.tick_params(labelsize=8)

@@ -1,0 +1,155 @@
+"""A whole plan: what is done where, in what order, and what it takes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from collect.config import RigConfig
+from collect.planning.ink import InkNeed, ink_need
+from collect.planning.marks import reach_of
+from collect.planning.timing import OMITTED, step_s
+from collect.planning.walk import sheet_of, walk
+from collect.procedures import park_moves
+from collect.protocols.config import ProtocolConfig, ReplayConfig, WriteConfig
+from collect.protocols.plans import planned
+from collect.sheet import Cell, Sheet
+from collect.steps import StepKind
+
+STROKES = frozenset({StepKind.PRESS, StepKind.DRAW})
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """One stroke and where it goes."""
+
+    order: int
+    """From 1."""
+    stroke_id: str
+    height_mm: float
+    tilt_deg: float
+    sheet: int
+    cell: int
+    drawn: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The walk in numbers."""
+
+    kind: str
+    steps: dict[str, int]
+    """By kind."""
+    placed: tuple[Placed, ...]
+    cells_per_sheet: int
+    sheets: int
+    sheet_changes: tuple[str, ...]
+    """Strokes before which a fresh sheet goes in."""
+    dips: int
+    ink: InkNeed
+    poses: int
+    seconds: float
+    seconds_by_kind: dict[str, float]
+    touches_mm: tuple[tuple[float, float], ...]
+    """In the paper frame, the taught point first."""
+    warnings: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Everything, for a file."""
+        return asdict(self) | {"seconds_omit": OMITTED}
+
+
+def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
+    """Walk it. `check_plan` must have passed."""
+    sheet = sheet_of(config, protocol)
+    placed: list[Placed] = []
+    changes: list[str] = []
+    kinds: Counter[str] = Counter()
+    seconds: dict[str, float] = {}
+    touches = [config.paper.touch_point_mm]
+    dips = poses = 0
+    here = park_moves(config)[-1].target
+    for walked in walk(config, protocol):
+        step = walked.step
+        kind = str(step.kind)
+        kinds[kind] += 1
+        took_s, here = step_s(config, here, walked.moves)
+        seconds[kind] = seconds.get(kind, 0.0) + took_s
+        dips += walked.moves.dips
+        poses += len(walked.moves.poses)
+        if step.kind == StepKind.TOUCH:
+            touches.append((float(step.params["x_mm"] or 0.0), float(step.params["y_mm"] or 0.0)))
+        if step.kind in STROKES and walked.cell is not None:
+            stroke_id = str(step.params["stroke_id"])
+            if placed and walked.sheet != placed[-1].sheet:
+                changes.append(stroke_id)
+            placed.append(
+                Placed(
+                    len(placed) + 1,
+                    stroke_id,
+                    float(step.params["height_mm"] or 0.0),
+                    float(step.params["tilt_deg"] or 0.0),
+                    walked.sheet,
+                    walked.cell.index,
+                    step.kind == StepKind.DRAW,
+                )
+            )
+    return Plan(
+        kind=protocol.kind,
+        steps=dict(kinds),
+        placed=tuple(placed),
+        cells_per_sheet=sheet.capacity,
+        sheets=placed[-1].sheet if placed else 1,
+        sheet_changes=tuple(changes),
+        dips=dips,
+        ink=ink_need(config, dips),
+        poses=poses,
+        seconds=sum(seconds.values()),
+        seconds_by_kind=seconds,
+        touches_mm=tuple(dict.fromkeys(touches)),
+        warnings=tuple(_warnings(config, protocol, sheet)),
+    )
+
+
+def _warnings(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list[str]:
+    warnings: list[str] = []
+    if isinstance(protocol, ReplayConfig) and protocol.ignored_columns:
+        warnings.append(f"{protocol.file}: columns that are not used: {', '.join(protocol.ignored_columns)}")
+    over_mm, worst = max(_overhangs(config, protocol, sheet), default=(0.0, ""))
+    if over_mm > 0.0:
+        warnings.append(
+            f"{worst} may reach {over_mm:.1f} mm beyond its cell of {sheet.cell_mm[0]:g} x {sheet.cell_mm[1]:g} mm, "
+            "by the closed-form stroke model: marks may run into each other"
+        )
+    return warnings
+
+
+def _overhangs(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list[tuple[float, str]]:
+    """(mm beyond the cell, stroke id) of every distinct press or figure."""
+    if not sheet.capacity:
+        return []
+    cell = sheet.cell(0)
+    if isinstance(protocol, WriteConfig):
+        return [
+            (max(_figure_overhang(config, cell, point) for s in figure.strokes for point in s.points), figure.name)
+            for figure in protocol.figures
+        ]
+    anchor_x, anchor_y = cell.anchor_mm[0] - cell.x_mm, cell.anchor_mm[1] - cell.y_mm
+    found: dict[tuple[float, float], tuple[float, str]] = {}
+    for stroke in planned(protocol):
+        reach = reach_of(config.brush, stroke.height_mm, stroke.tilt_deg)
+        beyond_mm = max(
+            reach.behind_mm - anchor_x,
+            anchor_x + reach.ahead_mm - cell.width_mm,
+            reach.side_mm - min(anchor_y, cell.height_mm - anchor_y),
+        )
+        found.setdefault((stroke.height_mm, stroke.tilt_deg), (beyond_mm, stroke.stroke_id))
+    return list(found.values())
+
+
+def _figure_overhang(config: RigConfig, cell: Cell, point: tuple[float, float, float, float, float]) -> float:
+    """Of one drawn point: its mark lies to either side of the line, by half its width."""
+    x_mm, y_mm, depth_mm, tilt_deg, _ = point
+    side_mm = reach_of(config.brush, depth_mm, tilt_deg).side_mm
+    return side_mm - min(x_mm, y_mm, cell.width_mm - x_mm, cell.height_mm - y_mm)

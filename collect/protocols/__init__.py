@@ -1,0 +1,1 @@
+"""Protocols: what `protocol.toml` may ask for, one module a kind."""

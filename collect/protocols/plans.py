@@ -1,0 +1,50 @@
+"""Any protocol: what it has planned, and its steps."""
+
+from __future__ import annotations
+
+from collect.protocols import calibration, grid, listed, replay, write
+from collect.protocols.config import (
+    CalibrationConfig,
+    GridConfig,
+    ListConfig,
+    ProtocolConfig,
+    ReplayConfig,
+    WriteConfig,
+)
+from collect.protocols.planned import Layout, Planned
+from collect.steps import Protocol
+
+
+def planned(config: ProtocolConfig, layout: Layout | None = None) -> list[Planned]:
+    """Every stroke exactly once, in order. Empty for `calibration`."""
+    match config:
+        case GridConfig():
+            return grid.planned(config, layout)
+        case ListConfig():
+            return listed.planned(config, layout)
+        case ReplayConfig():
+            return replay.planned(config, layout)
+        case WriteConfig():
+            return write.planned(config, layout)
+        case CalibrationConfig():
+            return []
+
+
+def steps(config: ProtocolConfig, layout: Layout | None = None) -> Protocol:
+    """The generator to run. Which keys its steps have does not depend on the layout, only in what order they come."""
+    match config:
+        case GridConfig():
+            return grid.steps(config, layout)
+        case ListConfig():
+            return listed.steps(config, layout)
+        case ReplayConfig():
+            return replay.steps(config, layout)
+        case WriteConfig():
+            return write.steps(config, layout)
+        case CalibrationConfig():
+            return calibration.steps(config)
+
+
+def cell_mm(config: ProtocolConfig) -> tuple[float, float] | None:
+    """The paper cell that it needs; None is the rig's own."""
+    return config.cell_mm if isinstance(config, WriteConfig) else None

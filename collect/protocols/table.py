@@ -1,0 +1,132 @@
+"""CSV files next to `protocol.toml`: bounded, and refused with file, line, field and allowed range."""
+
+from __future__ import annotations
+
+import csv
+import io
+import stat
+from pathlib import Path
+from typing import TypeVar
+
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import BaseModel, ValidationError
+
+from collect.errors import ConfigError
+
+MAX_TABLE_BYTES = 4 * 1024 * 1024
+MAX_COLUMNS = 100
+
+_R = TypeVar("_R", bound=BaseModel)
+
+
+def read_rows(
+    protocol: Path, field: str, name: object, row: type[_R], at_most: int, *, ignore_others: bool = False
+) -> tuple[tuple[_R, ...], tuple[str, ...]]:
+    """(rows, names of the columns that were ignored) of the CSV called `name` beside `protocol`.
+
+    The first line names the columns; an empty cell counts as left out. `field` is where the protocol names the file.
+    Raises `ConfigError`.
+    """
+    path = _beside(protocol, field, name)
+    lines = csv.reader(io.StringIO(_text(path), newline=""), strict=True)
+    rows: list[_R] = []
+    try:
+        header = _header(path, next(lines, list[str]()), row, ignore_others=ignore_others)
+        for cells in lines:
+            if not cells:
+                continue
+            if len(rows) == at_most:
+                raise ConfigError(path, f"line {lines.line_num}", f"more than {at_most} rows")
+            if len(cells) != len(header):
+                raise ConfigError(path, f"line {lines.line_num}", f"{len(cells)} cells under {len(header)} columns")
+            values = {
+                column: cell.strip()
+                for column, cell in zip(header, cells, strict=True)
+                if column in row.model_fields and cell.strip()
+            }
+            rows.append(_checked(path, lines.line_num, row, values))
+    except csv.Error as error:
+        raise ConfigError(path, f"line {lines.line_num}", f"is not CSV: {error}") from None
+    if not rows:
+        raise ConfigError(path, "", "has no rows")
+    return tuple(rows), tuple(column for column in header if column not in row.model_fields)
+
+
+def allowed(row: type[BaseModel], column: str) -> str:
+    """The range of a column, in words."""
+    words: list[str] = []
+    for rule in _rules(row, column):
+        match rule:
+            case Ge(ge=least):
+                words.append(f"at least {least:g}")
+            case Gt(gt=least):
+                words.append(f"more than {least:g}")
+            case Le(le=most):
+                words.append(f"at most {most:g}")
+            case Lt(lt=most):
+                words.append(f"less than {most:g}")
+            case _:
+                pass
+    return f"a number, {' and '.join(words)}" if words else ""
+
+
+def _rules(row: type[BaseModel], column: str) -> list[object]:
+    info = row.model_fields[column]
+    rules = list(info.metadata)
+    for part in getattr(info.annotation, "__args__", ()):
+        for rule in getattr(part, "__metadata__", ()):
+            rules += getattr(rule, "metadata", [rule])
+    return rules
+
+
+def _beside(protocol: Path, field: str, name: object) -> Path:
+    if not isinstance(name, str) or not name or Path(name).name != name or not name.isprintable() or "\\" in name:
+        raise ConfigError(protocol, field, f"must be the plain name of a file next to it (given: {name!r:.80})")
+    return protocol.parent / name
+
+
+def _text(path: Path) -> str:
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise ConfigError(path, "", "is not a file")
+        if status.st_size > MAX_TABLE_BYTES:
+            raise ConfigError(path, "", f"is larger than {MAX_TABLE_BYTES} bytes")
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise ConfigError(path, "", "no such file") from None
+    except OSError as error:
+        raise ConfigError(path, "", error.strerror or str(error)) from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(path, "", f"is not UTF-8 at byte {error.start}") from None
+
+
+def _header(path: Path, cells: list[str], row: type[BaseModel], *, ignore_others: bool) -> list[str]:
+    columns = [cell.strip() for cell in cells]
+    known = list(row.model_fields)
+    if len(columns) > MAX_COLUMNS:
+        raise ConfigError(path, "line 1", f"{len(columns)} columns, at most {MAX_COLUMNS}")
+    for column in columns:
+        if not column or len(column) > 60 or not column.isprintable():
+            raise ConfigError(path, "line 1", f"{column!r:.80} is no name of a column")
+        if columns.count(column) > 1:
+            raise ConfigError(path, "line 1", f"the column {column} is there twice")
+        if column not in known and not ignore_others:
+            raise ConfigError(path, "line 1", f"{column}: no such column; there are {', '.join(known)}")
+    for column, info in row.model_fields.items():
+        if info.is_required() and column not in columns:
+            raise ConfigError(path, "line 1", f"the column {column} is missing")
+    return columns
+
+
+def _checked(path: Path, line: int, row: type[_R], values: dict[str, str]) -> _R:
+    try:
+        return row.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        column = str(first["loc"][0])
+        if first["type"] == "missing":
+            raise ConfigError(path, f"line {line}: {column}", "is empty") from None
+        what = allowed(row, column)
+        what = f"must be {what}" if what else first["msg"].removeprefix("Value error, ")
+        raise ConfigError(path, f"line {line}: {column}", f"{what} (given: {values[column]!r:.80})") from None

@@ -1,0 +1,97 @@
+"""What ink lies in a cell: the press's own, what was there before, and what fell beside it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from calibrate.preprocess import PX_PER_MM, Mask
+from collect.quality.patch import Patch, Point, Rect
+
+COARSE = 4
+"""Parts of a stroke are put together on a raster so many times coarser."""
+JOIN_MM = 2.5
+"""Spots of ink closer than this belong together: hairs of a dry brush, the halves of a split tuft."""
+NEAR_MM = 3.0
+"""What comes so close to the zero-touch point is taken for the stroke, if it is not small beside something else."""
+NEAR_SHARE = 0.2
+HOME_SHARE = 0.3
+SMALLEST_MM2 = 0.2
+"""Spots below this are specks of the paper."""
+SEAM_MM = 0.3
+"""Ink seen before is grown by this: the same edge never falls on the same place to a pixel."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ink:
+    """The ink of a press, told from everything else in its window."""
+
+    patch: Patch
+    own: Mask
+    """(h, w) the press's own ink, every spot of it above the gate."""
+    before_mm2: float
+    """Ink in the cell that was there before the press; 0 where nobody had looked."""
+    beside_mm2: float
+    """Other ink in the cell that lies apart from the press's own."""
+
+    @property
+    def own_mm2(self) -> float:
+        """Area of the press's own ink."""
+        return mm2(self.own)
+
+
+def tell_apart(now: Patch, before: Patch | None, cell_mm: Rect, anchor_mm: Point, gate: float) -> Ink:
+    """Which ink is the press's own: new since `before` where that is given, in one piece, and by the anchor."""
+    ink = now.inked(gate)
+    cell = now.inside(cell_mm)
+    before_mm2 = 0.0
+    if before is not None:
+        old = before.inked(gate)
+        before_mm2 = mm2(old[cell])
+        side = round(SEAM_MM * PX_PER_MM) | 1
+        ink &= cv2.dilate(old.astype(np.uint8), np.ones((side, side), np.uint8)) == 0
+    # Where nobody knows what is new, what lies mostly next door is taken to be next door's.
+    least_share = HOME_SHARE if before is None else 0.0
+    own, beside_mm2 = _own_piece(ink, now.to_px(anchor_mm), cell, least_share)
+    return Ink(now, own, before_mm2, beside_mm2)
+
+
+def mm2(mask: Mask) -> float:
+    """Area of a mask at 20 px/mm."""
+    return float(np.count_nonzero(mask)) / PX_PER_MM**2
+
+
+def _own_piece(ink: Mask, anchor_px: Point, cell: tuple[slice, slice], least_share: float) -> tuple[Mask, float]:
+    """The piece that is the stroke, `least_share` of it in the cell, and the mm^2 of the others within the cell."""
+    height, width = ink.shape
+    pieces, count = _pieces(ink)
+    areas = np.bincount(pieces.ravel(), minlength=count) / PX_PER_MM**2
+    in_cell = np.bincount(pieces[cell].ravel(), minlength=count) / PX_PER_MM**2
+    in_cell[0] = areas[0] = 0.0
+    at_home = np.where(in_cell >= least_share * areas, areas, 0.0)
+    if count <= 1 or at_home.max() == 0.0:
+        return np.zeros_like(ink), float(in_cell[in_cell >= SMALLEST_MM2].sum())
+    rows, columns = np.ogrid[:height, :width]
+    near = (columns + 0.5 - anchor_px[0]) ** 2 + (rows + 0.5 - anchor_px[1]) ** 2 <= (NEAR_MM * PX_PER_MM) ** 2
+    touches = np.bincount(pieces[near], minlength=count) > 0
+    candidates = np.flatnonzero(touches & (at_home > 0.0) & (at_home >= NEAR_SHARE * at_home.max()))
+    main = int(candidates[np.argmax(at_home[candidates])]) if candidates.size else int(np.argmax(at_home))
+    in_cell[main] = 0.0
+    return pieces == main, float(in_cell[in_cell >= SMALLEST_MM2].sum())
+
+
+def _pieces(ink: Mask) -> tuple[np.ndarray[tuple[int, int], np.dtype[np.int32]], int]:
+    """(h, w) number of the piece that each inked pixel belongs to, 0 = paper, and how many numbers there are."""
+    height, width = ink.shape
+    small = (max(width // COARSE, 1), max(height // COARSE, 1))
+    share = cv2.resize(ink.astype(np.float32), small, interpolation=cv2.INTER_AREA)
+    side = round(JOIN_MM * PX_PER_MM / COARSE) | 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    joined = cv2.morphologyEx(np.pad((share > 0.0).astype(np.uint8), side), cv2.MORPH_CLOSE, kernel)
+    count, labels = cv2.connectedComponents(np.ascontiguousarray(joined[side:-side, side:-side]), connectivity=8)
+    rows = np.arange(height, dtype=np.int64) * small[1] // height
+    columns = np.arange(width, dtype=np.int64) * small[0] // width
+    fine = np.asarray(labels, np.int32)[rows[:, None], columns[None, :]]
+    return np.where(ink, fine, 0).astype(np.int32), int(count)

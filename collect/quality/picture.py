@@ -1,0 +1,102 @@
+"""Is the photograph itself sound? Exposure, blur and glare need no ink; a cut stroke does."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.preprocess import PX_PER_MM, Gray, Mask
+from calibrate.scale import Floats, PlaneFit, apply
+
+FINE_PX, WIDE_PX = 1.0, 2.0
+"""Two blurs put on top; how much the second weakens an edge more than the first tells the edge's own blur."""
+EDGE_SHARE = 0.02
+"""Share of the pixels of the frame, the steepest, that are taken for edges."""
+LEAST_EDGE = 3.0
+"""Gray levels per pixel below which nothing is an edge."""
+FEWEST_EDGES = 50
+SLOPE_PX2 = 1.0 / 3.0
+"""Variance of the blur that a difference over two pixels is itself."""
+BRIGHT_PX_PER_MM = 2.5
+"""Glare is looked for on a raster as coarse as this."""
+INK_WIDTH_MM = 12.0
+"""Strokes are thinner than this: closing fills them with the paper beside them."""
+SPOT_MM = 36.0
+"""Brightness that is wider than this is the light and no glare."""
+SATURATED = 252
+
+
+def paper_level(image: Gray) -> float:
+    """Gray level of what is bright in the frame: its paper."""
+    small = image[::4, ::4]
+    otsu, _ = cv2.threshold(np.ascontiguousarray(small), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    bright = small[small > otsu]
+    return float(np.median(bright)) if bright.size else float(np.median(small))
+
+
+def blur_px(image: Gray) -> float | None:
+    """Standard deviation of the blur of the steepest edges, the worse of both directions; None without any edge.
+
+    After S. Zhuo and T. Sim, "Defocus map estimation from a single image", Pattern Recognition 44(9), 2011: the
+    gradient of a step of blur s, blurred again by a, is proportional to 1 / sqrt(s^2 + a^2). Two such blurs give s,
+    whatever the contrast.
+    """
+    found = [s for s in (_blur_along(image, 1, 0), _blur_along(image, 0, 1)) if s is not None]
+    return max(found) if found else None
+
+
+def _blur_along(image: Gray, dx: int, dy: int) -> float | None:
+    fine = _slope(image, FINE_PX, dx, dy)
+    # a line's own thickness does not matter at the crest of its edge, only its blur
+    crest = fine == cv2.dilate(fine, np.ones((1, 7) if dx else (7, 1), np.uint8))
+    steep = fine[crest & (fine > LEAST_EDGE)]
+    if steep.size < FEWEST_EDGES:
+        return None
+    least = np.quantile(steep, 1.0 - min(1.0, max(EDGE_SHARE, 500 / steep.size)))
+    chosen = crest & (fine >= max(float(least), LEAST_EDGE))
+    wide = _slope(image, WIDE_PX, dx, dy)
+    ratio = np.maximum(fine[chosen] / np.maximum(wide[chosen], 1e-3), 1.0 + 1e-6)
+    wide2, fine2 = WIDE_PX**2 + SLOPE_PX2, FINE_PX**2 + SLOPE_PX2
+    own2 = (wide2 - ratio**2 * fine2) / (ratio**2 - 1.0)
+    return float(np.sqrt(np.median(np.maximum(own2, 0.0))))
+
+
+def _slope(image: Gray, sigma_px: float, dx: int, dy: int) -> NDArray[np.float32]:
+    smooth = (
+        cv2.GaussianBlur(image, (0, 0), sigma_px)
+        if False
+        else cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma_px)
+    )
+    kernel = np.array([[-0.5, 0.0, 0.5]], np.float32)
+    return np.abs(cv2.filter2D(smooth, cv2.CV_32F, kernel if dx else kernel.T)).astype(np.float32)
+
+
+def edge_mm(points_mm: Floats, plane: PlaneFit, shape: tuple[int, ...]) -> float:
+    """Distance of the outermost of (n, 2) points of the paper from the edge of the frame; negative beyond it."""
+    pixels = apply(np.asarray(np.linalg.inv(plane.image_to_paper), np.float64), points_mm)
+    most = np.array([shape[1], shape[0]]) - 1.0
+    return float(min(pixels.min(), (most - pixels).min()) * plane.mm_per_px)
+
+
+def glare(raster: Gray, share: float) -> Mask:
+    """Where a rectified window at 20 px/mm glares, at 2.5 px/mm: saturated, or a spot brighter than its surroundings.
+
+    A spot is what a morphological opening takes away; slopes and steps of the light, such as a shadow's edge, stay.
+    """
+    height, width = (round(side * BRIGHT_PX_PER_MM / PX_PER_MM) for side in raster.shape)
+    small = np.asarray(cv2.resize(raster, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    full = cv2.erode(raster, np.ones((5, 5), np.uint8)) >= SATURATED
+    saturated = cv2.resize(full.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
+    level = _morph(np.asarray(cv2.medianBlur(small, 3), np.uint8), cv2.MORPH_CLOSE, INK_WIDTH_MM)
+    base = _morph(level, cv2.MORPH_OPEN, SPOT_MM)
+    spot = level.astype(np.float32) > (1.0 + share) * np.maximum(base.astype(np.float32), 1.0)
+    return saturated | spot
+
+
+def _morph(image: NDArray[np.uint8], operation: int, width_mm: float) -> NDArray[np.uint8]:
+    side = round(width_mm * BRIGHT_PX_PER_MM) | 1
+    # Really padded: a border rule acts on each half of the operation alone, and a bright strip by the border would go.
+    padded = cv2.copyMakeBorder(image, side, side, side, side, cv2.BORDER_REPLICATE)
+    changed = cv2.morphologyEx(padded, operation, np.ones((side, side), np.uint8))
+    return np.asarray(changed[side:-side, side:-side], np.uint8)

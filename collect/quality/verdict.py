@@ -1,0 +1,102 @@
+"""What a quality check says: a number, its limit, and what an operator should do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Family(StrEnum):
+    """What a failure spoils, and so what must be done again."""
+
+    PICTURE = "picture"
+    """The photograph, not the stroke: mend the cause and photograph again, the stroke on the paper may be sound."""
+    PLACE = "place"
+    """The ink is not where it belongs: the cell is lost, press on a new one."""
+    INK = "ink"
+    """Too little ink: dip again and press on a new cell."""
+    SHAPE = "shape"
+    """The hairs lay wrong: comb or wipe the brush, dip, and press on a new cell."""
+
+
+class Failure(StrEnum):
+    """The failures in the order in which they are judged; the first that is found is the cause.
+
+    What a picture shows can only be judged as far as the picture is sound, a stroke only where it is told from other
+    ink, its place and tone only where hairs carried ink, and its shape last.
+    """
+
+    EXPOSURE = "exposure"
+    BLURRED = "blurred"
+    CUT = "cut"
+    GLARE = "glare"
+    NEIGHBOUR = "neighbour"
+    BLANK = "blank"
+    DRY = "dry"
+    MISPLACED = "misplaced"
+    FAINT = "faint"
+    SPLIT = "split"
+    BENT = "bent"
+
+    @property
+    def family(self) -> Family:
+        """What it spoils."""
+        return _FAMILIES[self]
+
+
+_FAMILIES = {
+    Failure.EXPOSURE: Family.PICTURE,
+    Failure.BLURRED: Family.PICTURE,
+    Failure.CUT: Family.PICTURE,
+    Failure.GLARE: Family.PICTURE,
+    Failure.NEIGHBOUR: Family.PLACE,
+    Failure.MISPLACED: Family.PLACE,
+    Failure.BLANK: Family.INK,
+    Failure.DRY: Family.INK,
+    Failure.FAINT: Family.INK,
+    Failure.SPLIT: Family.SHAPE,
+    Failure.BENT: Family.SHAPE,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One measured property of a capture."""
+
+    name: Failure
+    score: float
+    unit: str
+    threshold: float
+    passed: bool
+    reason: str
+    """What was seen and what to do about it; empty where it passed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """All checks of one capture that could be measured, in the order of `Failure`."""
+
+    checks: tuple[Check, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether the capture is sound."""
+        return self.cause is None
+
+    @property
+    def cause(self) -> Check | None:
+        """The dominant failure: the first in the order of `Failure`; None where all passed."""
+        return next((check for check in self.checks if not check.passed), None)
+
+    @property
+    def reason(self) -> str:
+        """The cause in words, with the other failures named; empty where all passed."""
+        failed = [check for check in self.checks if not check.passed]
+        if not failed:
+            return ""
+        others = f" Also: {', '.join(check.name for check in failed[1:])}." if failed[1:] else ""
+        return failed[0].reason + others
+
+    def check(self, name: Failure) -> Check | None:
+        """The check of that name; None where it could not be measured."""
+        return next((check for check in self.checks if check.name is name), None)

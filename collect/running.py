@@ -1,0 +1,125 @@
+"""One session from the first retreat to the last stroke: walks the protocol, and does what the policy says."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Protocol as Interface
+
+from collect.asking import Asker
+from collect.errors import ForceTooHigh, StepError, told
+from collect.perform import Performer
+from collect.policy import Action, decide
+from collect.progress import Progress
+from collect.questions import STOP, question
+from collect.rig import Rig
+from collect.states import State
+from collect.steps import Protocol, Result, Step
+from drivers.errors import DeviceError, MotionError, RpcError
+from sessions.errors import SessionError
+from sessions.store import SessionStore
+
+
+class Control(Interface):
+    """What a run needs of the engine around it: its state, and the pause and stop keys."""
+
+    def move_to(self, new: State) -> None:
+        """Change the state. Raises `CancelledError` where the stop key was faster."""
+        ...
+
+    def running(self) -> State:
+        """The state to go on in: running, or pausing where that was asked for."""
+        ...
+
+    async def pause_point(self) -> None:
+        """Between two steps: wait here while paused."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Everything that one session in one process works with."""
+
+    rig: Rig
+    store: SessionStore
+    performer: Performer
+    progress: Progress
+    asker: Asker
+    control: Control
+
+    async def protocol(self, protocol: Protocol) -> None:
+        """Power on, retreat, then every step that the journal does not hold yet."""
+        self.progress.doing("power on")
+        await self._willing(self.rig.robot.enable)
+        await self._willing(self._recover)
+        step = next(protocol)
+        with contextlib.suppress(StopIteration):
+            while True:
+                step = protocol.send(await self._result(step))
+
+    async def _willing(self, act: Callable[[], Awaitable[None]]) -> None:
+        """Between steps: an arm that is held by its safety system may be released while somebody watches."""
+        while True:
+            try:
+                return await act()
+            except DeviceError as error:
+                if not self.asker.watched or not isinstance(error, MotionError):
+                    raise
+                await self._ask(None, error)
+
+    async def _result(self, step: Step) -> Result:
+        known = self.store.state.done.get(step.key)
+        if known is not None and not step.run_scoped:
+            return known["result"]
+        failures = 0
+        while True:
+            await self.control.pause_point()
+            try:
+                return await self.performer.perform(step)
+            except (StepError, DeviceError) as error:
+                failures += 1
+                action = decide(step, error, failures)
+                self.progress.log(f"{step.kind}: {error} -> {action}", warning=True)
+                if action is Action.ABORT or (action is Action.ASK and not self.asker.watched):
+                    await self._lift(error)
+                    raise
+                if action is Action.ASK:
+                    await self._ask(step, error)
+                    failures = 0
+                await self._willing(self._recover)
+            except SessionError as error:
+                await self._lift(error)  # the disk is at fault, the arm is in order
+                raise
+
+    async def _ask(self, step: Step | None, error: StepError | DeviceError) -> None:
+        """Let a person decide; raises `error` again where the answer is to stop."""
+        if not isinstance(error, MotionError | RpcError | ForceTooHigh):
+            with contextlib.suppress(StepError, DeviceError):
+                await self._recover()  # a person is about to reach under the arm
+        self.control.move_to(State.ASKING)
+        self.progress.doing("wait for an answer")
+        asked = question(error, self.store.state.sheet)
+        answer = await self.asker.ask(asked, self.rig.clock.now_ns())
+        self.progress.log(f"{asked.question} -> {answer}")
+        if answer == STOP.key:
+            raise error
+        self.performer.answered(error)
+        if isinstance(error, MotionError) and step is not None:
+            await self._willing(self.rig.robot.enable)
+
+    async def _lift(self, error: StepError | DeviceError | SessionError) -> None:
+        """Leave no brush in the paper, where the arm itself is in order: not after its own trouble, nor where the brush
+        met something hard that a person must look at first."""
+        if isinstance(error, MotionError | RpcError | ForceTooHigh) or getattr(error, "device", "") == "robot":
+            return
+        try:
+            await self._recover()
+        except (StepError, DeviceError) as failure:
+            error.add_note(f"The brush could not be lifted: {told(failure)}")
+
+    async def _recover(self) -> None:
+        self.control.move_to(State.RECOVERING)
+        self.progress.doing("retreat")
+        await self.performer.retreat()
+        self.control.move_to(self.control.running())

@@ -1,0 +1,51 @@
+"""One run of `brushloop collect`: reads, checks, opens, and hands over to a screen or a progress bar."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import tempfile
+from pathlib import Path
+
+from collect.engine import Engine
+from collect.headless import run_headless
+from collect.live import LiveView
+from collect.opening import Opening, check_writable, find_resumable, open_store
+from collect.plan import check_plan
+from drivers.clock import HostClock
+
+
+def start(opening: Opening, *, on_screen: bool, live: LiveView | None = None) -> int:
+    """Run to the end and return how many strokes had to be given up. Raises what ended the run."""
+    check_plan(opening.rig_path, opening.protocol_path, opening.rig, opening.protocol)
+    resume = find_resumable(opening)
+    check_writable(resume or opening.root)
+    clock = HostClock()
+    engine = Engine(
+        opening.rig,
+        opening.protocol,
+        lambda rig: open_store(opening, resume, rig, clock),
+        clock,
+        watched=on_screen,
+        armed=opening.armed,
+        live=live,
+    )
+    with contextlib.ExitStack() as stack:
+        if live is not None:
+            live.start()
+            stack.callback(live.close)
+        if on_screen:
+            from collect.tui.app import run_screen
+
+            run_screen(engine)
+        else:
+            run_headless(engine)
+    return engine.snapshot().given_up
+
+
+def dry_run(config: Path, protocol: Path, height_mm: float, *, armed: bool, on_screen: bool) -> None:
+    """Walk through the protocol in the air; what is recorded is thrown away, so that no cell counts as used."""
+    with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:
+        opening = Opening.load(Path(folder), config, protocol, armed=armed, dry_run_mm=height_mm)
+        start(opening, on_screen=on_screen)
+    sys.stdout.write("dry run done; nothing was kept\n")

@@ -1,0 +1,187 @@
+"""Zero touch by first ink: rows of touches at fresh places, each a little lower, and where the ink begins."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.errors import CalibrationError
+from calibrate.scale import see_board
+from collect.errors import StepError
+from collect.plane import PaperPlane, fit_plane
+from collect.rig import Rig
+from collect.touch.arm import TouchArm
+from collect.touch.config import CameraTouchConfig, TouchConfig
+from collect.touch.contact import first_ink
+from collect.touch.ink import gray, ink_at
+from collect.touch.reach import Known, Reach
+from collect.touch.results import PointTouches, Touch, at_one_point
+from drivers.samples import Frame
+
+Spot = tuple[float, float, float]
+"""x and y in the paper frame, z of the tip in the base frame."""
+WINDOW_SHARE = 0.75
+"""Of the pitch: how much of a spot's surroundings counts for it."""
+SLACK_STEPS = 2
+"""Fine steps beyond the coarse one, on either side: the coarse answer is no better than its step."""
+
+
+class Hands(Protocol):
+    """What a rig's procedures do besides moving: both begin and end at travel height."""
+
+    async def dip(self) -> None:
+        """Fill the brush."""
+        ...
+
+    async def capture(self) -> Frame:
+        """Park, and photograph."""
+        ...
+
+
+class Patch:
+    """The places of one point's spots, from its lower left: to and fro, so that neighbours in time are neighbours."""
+
+    def __init__(self, at_mm: tuple[float, float], config: CameraTouchConfig, sheet_mm: tuple[float, float]) -> None:
+        self._at_mm = at_mm
+        self._sheet_mm = sheet_mm
+        self._config = config
+        self._next = 0
+
+    def take(self) -> tuple[float, float]:
+        """The next fresh place. Raises `StepError` where the patch has outgrown the sheet."""
+        row, column = divmod(self._next, self._config.columns)
+        self._next += 1
+        column = self._config.columns - 1 - column if row % 2 else column
+        pitch_mm = self._config.pitch_mm
+        x_mm, y_mm = self._at_mm[0] + column * pitch_mm, self._at_mm[1] + row * pitch_mm
+        if not (0.0 <= x_mm <= self._sheet_mm[0] and 0.0 <= y_mm <= self._sheet_mm[1]):
+            raise StepError(
+                f"the touches at ({self._at_mm[0]:g}, {self._at_mm[1]:g}) mm do not fit on the sheet: "
+                f"spot {self._next} would lie at ({x_mm:g}, {y_mm:g}) mm"
+            )
+        return x_mm, y_mm
+
+
+def fine_count(config: CameraTouchConfig) -> int:
+    """Spots of one fine row."""
+    return 1 + 2 * SLACK_STEPS + math.ceil(config.coarse_step_mm / config.fine_step_mm)
+
+
+def coarse_count(config: CameraTouchConfig, reach: Reach) -> int:
+    """Spots of a whole coarse row; it ends where ink is seen."""
+    return math.ceil((reach.start_z_mm - reach.lowest_z_mm) / config.coarse_step_mm) + 1
+
+
+class FirstInkTouch:
+    """Touches by camera on one rig. The sheet must be blank where it touches."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        hands: Hands,
+        arm: TouchArm,
+        config: TouchConfig,
+    ) -> None:
+        self._rig = rig
+        self._hands = hands
+        self._arm = arm
+        self._config = config
+        self._since_dip: int | None = None
+        self._last: Frame | None = None
+
+    async def measure(self, points_mm: list[tuple[float, float]]) -> list[PointTouches]:
+        """Every point coarsely, then finely in rounds, each along the plane through the round before.
+
+        Along a row the sheet's lean would else pass for height. Raises `StepError`.
+        """
+        known = Known(self._rig.config.paper, self._config)
+        patches = [Patch(point, self._config.camera, self._rig.config.paper.size_mm) for point in points_mm]
+        rough: list[Touch] = []
+        for patch, point in zip(patches, points_mm, strict=True):
+            rough.append(
+                await self._coarse(
+                    patch, known.reach(*point, (self._config.camera.columns - 1) * self._config.camera.pitch_mm)
+                )
+            )
+            known.add(rough[-1].x_mm, rough[-1].y_mm, rough[-1].z_mm)
+        rounds = [rough]
+        for k in range(self._config.touches):
+            lean = _plane(rounds[-1])
+            # staggered by parts of a step: equal heights would only repeat the same answer
+            lower_mm = k / self._config.touches * self._config.camera.fine_step_mm
+            rounds.append(
+                [await self._fine(p, around, lean, lower_mm) for p, around in zip(patches, rough, strict=True)]
+            )
+        touches = [list(point) for point in zip(*rounds[1:], strict=True)]
+        lean = _plane([touch for point in touches for touch in point])
+        return [at_one_point(point, self._config, lean) for point in touches]
+
+    async def _coarse(self, patch: Patch, reach: Reach) -> Touch:
+        """Down until a photograph shows ink."""
+        camera = self._config.camera
+        count = coarse_count(camera, reach)
+        before = await self._photograph()
+        spots: list[Spot] = []
+        for k in range(count):
+            spots.append((*patch.take(), max(reach.start_z_mm - k * camera.coarse_step_mm, reach.lowest_z_mm)))
+            await self._touch(spots[-1])
+            if len(spots) % camera.spots_per_photo == 0 or k + 1 == count:
+                ink = await self._ink(before, spots)
+                if (ink >= camera.least_ink_mm2).any():
+                    return self._between(spots, ink, camera.coarse_step_mm)
+        raise StepError(f"nothing was touched down to {spots[-1][2]:.2f} mm: no spot of the row left ink")
+
+    async def _fine(self, patch: Patch, around: Touch, lean: PaperPlane, lower_mm: float) -> Touch:
+        camera = self._config.camera
+        before, spots = await self._photograph(), list[Spot]()
+        highest_mm = 0.5 * camera.fine_step_mm * (fine_count(camera) - 1) - lower_mm
+        for k in range(fine_count(camera)):
+            x, y = patch.take()
+            along_mm = lean.touch_z_mm(x, y) - lean.touch_z_mm(around.x_mm, around.y_mm)
+            spots.append((x, y, around.z_mm + along_mm + highest_mm - k * camera.fine_step_mm))
+            await self._touch(spots[-1])
+        return self._between(spots, await self._ink(before, spots), camera.fine_step_mm)
+
+    def _between(self, spots: list[Spot], ink_mm2: NDArray[np.float64], step_mm: float) -> Touch:
+        """Half way between the last clean spot and the first inked one; any height between them is as likely."""
+        edge = first_ink(ink_mm2, self._config.camera.least_ink_mm2)
+        x, y, z = (0.5 * (a + b) for a, b in zip(spots[edge.clean], spots[edge.inked], strict=True))
+        return Touch(x, y, z, step_mm / math.sqrt(12.0))
+
+    async def _touch(self, spot: Spot) -> None:
+        if self._since_dip is None or self._since_dip >= self._config.camera.spots_per_dip:
+            await self._hands.dip()
+            self._since_dip = 0
+        x, y, z = spot
+        await self._arm.over(x, y)
+        await self._arm.near(x, y, z + self._config.above_mm)
+        await self._arm.to(x, y, z)
+        await self._arm.lift()
+        self._since_dip += 1
+        self._last = None
+
+    async def _photograph(self) -> Frame:
+        if self._last is None:
+            self._last = await self._hands.capture()
+        return self._last
+
+    async def _ink(self, before: Frame, spots: list[Spot]) -> NDArray[np.float64]:
+        after = await self._photograph()
+        return await asyncio.to_thread(self._measure_ink, before, after, spots)
+
+    def _measure_ink(self, before: Frame, after: Frame, spots: list[Spot]) -> NDArray[np.float64]:
+        first, second = gray(before.image), gray(after.image)
+        try:
+            plane = see_board(second, self._rig.config.board)
+        except CalibrationError as error:
+            raise StepError(f"the board is not seen: {error.what}") from None
+        side_mm = WINDOW_SHARE * self._config.camera.pitch_mm
+        return ink_at(first, second, plane.image_to_paper, [(x, y) for x, y, _ in spots], side_mm)
+
+
+def _plane(touches: list[Touch]) -> PaperPlane:
+    return fit_plane([(t.x_mm, t.y_mm, t.z_mm) for t in touches]).plane

@@ -1,0 +1,98 @@
+"""Zero touch as one step: the plane from which H is counted, by the method of the configuration."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from collect.errors import StepError
+from collect.plane import PaperPlane
+from collect.rig import Rig
+from collect.touch.arm import TouchArm
+from collect.touch.camera import FirstInkTouch, Hands
+from collect.touch.config import TouchConfig
+from collect.touch.force import touch_by_force
+from collect.touch.jog import NextJog, touch_by_jog
+from collect.touch.reach import Known
+from collect.touch.results import PlaneResult, PointTouches, Touch, at_one_point, through
+from collect.touch.tap import ForceTap, RigProbe
+
+
+class TouchHands(Hands, Protocol):
+    """What a rig's procedures do for zero touch."""
+
+    async def zero_touch(self) -> float:
+        """Visit the taught height; returns where the arm rests."""
+        ...
+
+
+async def measure_plane(
+    rig: Rig, hands: TouchHands, config: TouchConfig, *, tap: ForceTap | None = None, next_jog: NextJog | None = None
+) -> PlaneResult:
+    """Touch as configured and fit the plane. The arm begins and ends at travel height.
+
+    `tap` must be handed every sample of the force sensor; without one it listens to the sensor itself. `next_jog` is
+    the operator. The force must have been set to zero with nothing touching. Raises `StepError`, with the figures,
+    where nothing is touched, touches do not repeat, or the points do not lie in a plane; the brush is lifted then too.
+    """
+    if config.method == "taught":
+        return await _taught(rig, hands)
+    arm = TouchArm(rig, config.speed_mm_s)
+    points_mm = config.points_mm or [rig.config.paper.touch_point_mm]
+    async with arm.lifted_after():
+        match config.method:
+            case "camera":
+                return through(await FirstInkTouch(rig, hands, arm, config).measure(points_mm), config)
+            case "force":
+                return through(await _by_force(rig, arm, config, points_mm, tap), config)
+            case "jog":
+                if next_jog is None:
+                    raise StepError("zero touch by jog needs an operator at a screen")
+                return through(await _by_jog(rig, arm, config, points_mm, next_jog), config)
+
+
+async def _taught(rig: Rig, hands: TouchHands) -> PlaneResult:
+    touch = Touch(*rig.config.paper.touch_point_mm, await hands.zero_touch())
+    return PlaneResult(PaperPlane(rig.config.paper.touch_z_mm), "taught", (PointTouches((touch,), 0.0),), (0.0,))
+
+
+async def _by_force(
+    rig: Rig, arm: TouchArm, config: TouchConfig, points_mm: list[tuple[float, float]], tap: ForceTap | None
+) -> list[PointTouches]:
+    if rig.force is None:
+        raise StepError("zero touch by force needs a force sensor: [force] is missing")
+    heard = tap or ForceTap()
+    if tap is None:
+        rig.force.listen(heard.take)
+    try:
+        known, found = Known(rig.config.paper, config), list[PointTouches]()
+        for point in points_mm:
+            reach, near_z_mm, touches = known.reach(*point), None, list[Touch]()
+            await arm.over(*point)
+            await arm.near(*point, reach.start_z_mm)
+            probe = RigProbe(arm, heard, rig.clock, point, config.force)
+            for _ in range(config.touches):
+                contact = await touch_by_force(probe, reach, config.force, near_z_mm)
+                near_z_mm = contact.z_mm
+                touches.append(Touch(*point, contact.z_mm, contact.sigma_mm))
+            await arm.lift()
+            found.append(at_one_point(touches, config))
+            known.add(*found[-1].mean)
+        return found
+    finally:
+        if tap is None:
+            rig.force.listen(None)
+
+
+async def _by_jog(
+    rig: Rig, arm: TouchArm, config: TouchConfig, points_mm: list[tuple[float, float]], next_jog: NextJog
+) -> list[PointTouches]:
+    known, found = Known(rig.config.paper, config), list[PointTouches]()
+    for point in points_mm:
+        reach = known.reach(*point)
+        await arm.over(*point)
+        await arm.near(*point, reach.start_z_mm)
+        touches = [await touch_by_jog(arm, point, reach, config.jog, next_jog) for _ in range(config.touches)]
+        await arm.lift()
+        found.append(at_one_point(touches, config))
+        known.add(*found[-1].mean)
+    return found

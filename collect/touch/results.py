@@ -1,0 +1,100 @@
+"""What zero touch found: touches, the plane through them, and the form in which a journal keeps them."""
+
+from __future__ import annotations
+
+import statistics
+from dataclasses import dataclass
+
+from collect.errors import StepError
+from collect.plane import PaperPlane, fit_plane
+from collect.touch.config import Method, TouchConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Touch:
+    """One touch: where (paper frame), the height of the tip (base frame), and its standard error where one is known."""
+
+    x_mm: float
+    y_mm: float
+    z_mm: float
+    sigma_mm: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PointTouches:
+    """The touches at one point of the sheet, and their mean."""
+
+    touches: tuple[Touch, ...]
+    span_mm: float
+    """Largest less smallest height, each taken from the first plane where the touches lie apart."""
+
+    @property
+    def mean(self) -> tuple[float, float, float]:
+        """x, y in the paper frame, z in the base frame."""
+        return (
+            statistics.fmean(t.x_mm for t in self.touches),
+            statistics.fmean(t.y_mm for t in self.touches),
+            statistics.fmean(t.z_mm for t in self.touches),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class PlaneResult:
+    """The plane from which H is counted, and everything that it was made of."""
+
+    plane: PaperPlane
+    method: Method
+    points: tuple[PointTouches, ...]
+    residuals_mm: tuple[float, ...]
+    """Point less plane, in the order of the points; zeros where three points leave no freedom."""
+
+    def as_dict(self) -> dict[str, object]:
+        """For the journal: plain numbers, texts and lists."""
+        return {
+            "method": self.method,
+            "touch_z_mm": self.plane.z0_mm,
+            "slope_x": self.plane.slope_x,
+            "slope_y": self.plane.slope_y,
+            "slope_deg": self.plane.slope_deg,
+            "residuals_mm": list(self.residuals_mm),
+            "points": [
+                {
+                    "x_mm": point.mean[0],
+                    "y_mm": point.mean[1],
+                    "z_mm": point.mean[2],
+                    "span_mm": point.span_mm,
+                    "touches_mm": [t.z_mm for t in point.touches],
+                    "sigma_mm": [t.sigma_mm for t in point.touches],
+                }
+                for point in self.points
+            ],
+        }
+
+
+def at_one_point(touches: list[Touch], config: TouchConfig, guide: PaperPlane | None = None) -> PointTouches:
+    """Hold the touches of one point against each other. Raises `StepError` where they span too much.
+
+    `guide` is what is known of the sheet's lean, for touches that lie some millimetres apart.
+    """
+    lean = guide or PaperPlane(0.0)
+    heights = [t.z_mm - lean.touch_z_mm(t.x_mm, t.y_mm) for t in touches]
+    span_mm = max(heights) - min(heights)
+    if span_mm > config.repeatability_mm:
+        listed = ", ".join(f"{t.z_mm:.3f}" for t in touches)
+        raise StepError(
+            f"zero touch does not repeat at ({touches[0].x_mm:.0f}, {touches[0].y_mm:.0f}) mm: the heights {listed} mm "
+            f"span {span_mm:.3f} mm, limit {config.repeatability_mm:g} mm. Is the paper flat and the brush firm?"
+        )
+    return PointTouches(tuple(touches), span_mm)
+
+
+def through(points: list[PointTouches], config: TouchConfig) -> PlaneResult:
+    """The plane through the points. Raises `StepError` where one lies too far from it, or it is no plane of a sheet."""
+    fit = fit_plane([point.mean for point in points])
+    if fit.worst_mm > config.residual_mm:
+        listed = ", ".join(f"{r:+.3f}" for r in fit.residuals_mm)
+        raise StepError(
+            f"the touched points do not lie in a plane: residuals {listed} mm, limit {config.residual_mm:g} mm. "
+            "Does the sheet lie flat?"
+        )
+    return PlaneResult(fit.plane, config.method, tuple(points), fit.residuals_mm)

@@ -1,0 +1,190 @@
+"""Before a session: press three marks at an uneven triangle, find them, refuse a rig that is mirrored, turned or off.
+
+A stroke library can be flipped for months before anybody sees it; three marks show it in a minute.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.errors import CalibrationError
+from calibrate.scale import see_board
+from collect.errors import StepError
+from collect.plane import PaperPlane
+from collect.rig import Rig
+from collect.sheet import Cell
+from collect.touch.arm import TouchArm
+from collect.touch.camera import Hands
+from collect.touch.config import SelfCheckConfig
+from collect.touch.ink import gray
+from collect.touch.marks import new_marks
+from drivers.samples import Frame
+
+Floats = NDArray[np.float64]
+Triangle = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+UNEVEN = 0.2
+"""How badly the second best order of the marks must fit, or a mirror image could pass for a turn."""
+APPROACH_MM = 4.0
+"""Height above the paper at which a mark's slow approach begins."""
+MIRRORS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
+    "mirrored in x": ((-1.0, 0.0), (0.0, 1.0)),
+    "mirrored in y": ((1.0, 0.0), (0.0, -1.0)),
+    "mirrored: x and y are swapped": ((0.0, 1.0), (1.0, 0.0)),
+    "mirrored: x and y are swapped and negated": ((0.0, -1.0), (-1.0, 0.0)),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SelfCheck:
+    """What the three marks say of arm, camera and configuration together."""
+
+    commanded_mm: Floats
+    """(3, 2) in the paper frame."""
+    found_mm: Floats
+    """(3, 2), in the same order."""
+    offset_mm: tuple[float, float]
+    """Mean of found less commanded: the bend of the tip, and errors of the frame's origin."""
+    turn_deg: float
+    scale: tuple[float, float]
+    """Found over commanded length, along paper x and y."""
+    residuals_mm: tuple[float, float, float]
+    """What is left at each mark once offset and turn are taken out."""
+
+    def as_dict(self) -> dict[str, object]:
+        """For the journal: plain numbers and lists."""
+        return {
+            "commanded_mm": self.commanded_mm.tolist(),
+            "found_mm": self.found_mm.tolist(),
+            "offset_mm": list(self.offset_mm),
+            "turn_deg": self.turn_deg,
+            "scale": list(self.scale),
+            "residuals_mm": list(self.residuals_mm),
+        }
+
+
+def triangle_in(cell: Cell, config: SelfCheckConfig) -> Triangle:
+    """The three places in the middle of one spare cell: quick, but a scale is known only as well as a mark's place."""
+    x_mm, y_mm = config.legs_mm
+    if x_mm > cell.width_mm or y_mm > cell.height_mm:
+        raise StepError(f"a triangle of {x_mm:g} by {y_mm:g} mm does not fit into cell {cell.index}")
+    left, bottom = cell.x_mm + 0.5 * (cell.width_mm - x_mm), cell.y_mm + 0.5 * (cell.height_mm - y_mm)
+    return (left, bottom), (left + x_mm, bottom), (left, bottom + y_mm)
+
+
+def triangle_of(cells: tuple[Cell, Cell, Cell]) -> Triangle:
+    """One place in each of three spare cells far apart, as at three corners of the sheet: the longer, the surer."""
+    a, b, c = (cell.anchor_mm for cell in cells)
+    return a, b, c
+
+
+async def self_check(
+    rig: Rig, hands: Hands, config: SelfCheckConfig, places_mm: Triangle, plane: PaperPlane, slow_mm_s: float = 5.0
+) -> SelfCheck:
+    """Press the marks, photograph them and judge. The arm begins and ends at travel height; the places are burnt.
+
+    Raises `StepError` with the figures where the marks are not found, mirrored, turned, of another scale or displaced.
+    """
+    commanded = np.array(places_mm, np.float64)
+    if abs(float(np.linalg.det(commanded[1:] - commanded[0]))) < 1.0 or _second_best(commanded) < UNEVEN:
+        raise StepError("the self-check's triangle is too even, or too flat, to tell a mirror image")
+    arm = TouchArm(rig, slow_mm_s)
+    async with arm.lifted_after():
+        before = await hands.capture()
+        for x_mm, y_mm in places_mm:
+            await hands.dip()
+            surface_z_mm = plane.touch_z_mm(x_mm, y_mm)
+            await arm.over(x_mm, y_mm)
+            await arm.near(x_mm, y_mm, surface_z_mm + APPROACH_MM)
+            await arm.to(x_mm, y_mm, surface_z_mm - config.depth_mm)
+            await arm.lift()
+        after = await hands.capture()
+    found_mm = await asyncio.to_thread(_find, rig, before, after, config)
+    return judge(commanded, found_mm, config)
+
+
+def _find(rig: Rig, before: Frame, after: Frame, config: SelfCheckConfig) -> Floats:
+    first, second = gray(before.image), gray(after.image)
+    try:
+        plane = see_board(second, rig.config.board)
+    except CalibrationError as error:
+        # a board that is seen in a mirror is not seen
+        raise StepError(f"self-check: the board is not seen: {error.what}") from None
+    marks = new_marks(first, second, plane.image_to_paper, config.least_ink_mm2)
+    if len(marks) != 3:
+        listed = "; ".join(f"{m.ink_mm2:.1f} mm2 at ({m.x_mm:.0f}, {m.y_mm:.0f})" for m in marks[:6])
+        raise StepError(
+            f"self-check: 3 marks were pressed, {len(marks)} new ones are seen ({listed or 'none'}). "
+            "Is there ink on the brush, and does the camera see where the arm presses?"
+        )
+    return np.array([(m.x_mm, m.y_mm) for m in marks], np.float64)
+
+
+def judge(commanded_mm: Floats, found_mm: Floats, config: SelfCheckConfig) -> SelfCheck:
+    """Hold three found marks, in any order, against the commanded ones, (3, 2) both.
+
+    Three points have one affine map for each order; the order is right whose map keeps angles best. Raises `StepError`
+    with words and figures where the map is a mirror, or turns, stretches or displaces by more than the limits.
+    """
+    orders = [found_mm[list(order)] for order in itertools.permutations(range(3))]
+    found, linear = min(((f, _linear(commanded_mm, f)) for f in orders), key=lambda pair: _unlike(pair[1]))
+    if np.linalg.det(linear) < 0.0:
+        name = max(MIRRORS, key=lambda n: float((np.array(MIRRORS[n]) * linear).sum()))
+        raise _refused(
+            f"the marks are {name}", found, "Check paper.origin_mm, paper.yaw_deg, the board's origin and the mounting"
+        )
+    turn = math.atan2(linear[1, 0] - linear[0, 1], linear[0, 0] + linear[1, 1])
+    if abs(math.degrees(turn)) > config.turn_deg:
+        what = f"the marks are turned by {math.degrees(turn):+.2f} deg, limit {config.turn_deg:g}"
+        raise _refused(what, found, "Check paper.yaw_deg and how the board lies")
+    scale = float(np.linalg.norm(linear[:, 0])), float(np.linalg.norm(linear[:, 1]))
+    spans = np.ptp(commanded_mm, axis=0)
+    if any(abs(s - 1.0) > config.scale + config.mark_mm / span for s, span in zip(scale, spans, strict=True)):
+        listed = " and ".join(f"{100.0 * (s - 1.0):+.2f} % along {axis}" for s, axis in zip(scale, "xy", strict=True))
+        raise _refused(
+            f"lengths are off by {listed}, limit {100.0 * config.scale:g} %", found, "Check the board's square_mm"
+        )
+    offset = (found - commanded_mm).mean(axis=0)
+    if float(np.linalg.norm(offset)) > config.offset_mm:
+        what = f"the marks lie off by ({offset[0]:+.2f}, {offset[1]:+.2f}) mm, limit {config.offset_mm:g} mm"
+        raise _refused(what, found, "Check paper.origin_mm and the board's origin")
+    rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    left = (found - found.mean(axis=0)) - (commanded_mm - commanded_mm.mean(axis=0)) @ rotation.T
+    first, second, third = (float(v) for v in np.linalg.norm(left, axis=1))
+    return SelfCheck(
+        commanded_mm,
+        found,
+        (float(offset[0]), float(offset[1])),
+        math.degrees(turn),
+        scale,
+        (first, second, third),
+    )
+
+
+def _linear(commanded_mm: Floats, found_mm: Floats) -> Floats:
+    """(2, 2): the linear part of the affine map from one triangle to the other."""
+    (ax, ay), (bx, by) = commanded_mm[1:] - commanded_mm[0]
+    inverse = np.array([[by, -ay], [-bx, ax]], np.float64) / (ax * by - ay * bx)
+    return np.asarray((inverse @ (found_mm[1:] - found_mm[0])).T, np.float64)
+
+
+def _second_best(commanded_mm: Floats) -> float:
+    """How badly the best wrong order of a triangle's corners keeps its angles."""
+    wrong = list(itertools.permutations(range(3)))[1:]
+    return min(_unlike(_linear(commanded_mm, commanded_mm[list(order)])) for order in wrong)
+
+
+def _unlike(linear: Floats) -> float:
+    """How far a map is from one that keeps angles; 0 for turns, mirrors and even scales."""
+    area = abs(float(np.linalg.det(linear)))
+    return math.inf if area < 1e-9 else float(np.abs(linear.T @ linear / area - np.eye(2)).max())
+
+
+def _refused(what: str, found_mm: Floats, remedy: str) -> StepError:
+    listed = ", ".join(f"({x:.1f}, {y:.1f})" for x, y in found_mm)
+    return StepError(f"self-check: {what}. Found at {listed} mm. {remedy}.")

@@ -1,0 +1,120 @@
+"""Photographs a mark, judges it, and decides whether it counts."""
+
+from __future__ import annotations
+
+from collect.asking import Choice, Prompt
+from collect.errors import BadPicture, NeedsOperator, StepError
+from collect.quality.check import check_capture
+from collect.quality.verdict import Family, Verdict
+from collect.sheet import Cell
+from collect.steps import Result
+from collect.work.context import Bench, Job
+from collect.work.looking import Gray, image_plane, photograph
+from collect.work.waiting import uninterrupted
+from sessions.schemas import Check, Quality, Stroke
+
+KEEP, AGAIN, SKIP = Choice("k", "keep it"), Choice("r", "press it again"), Choice("n", "go on without it")
+PICTURE_MARGIN_PX = 40
+
+
+async def capture(job: Job) -> Result:
+    """The CAPTURE step: `kept` where the stroke counts, `retake` where it is to be made again on another cell.
+
+    Raises `BadPicture` where the photograph, not the stroke, is at fault.
+    """
+    bench, stroke_id = job.bench, str(job.step.params["stroke_id"])
+    if int(job.number("sheet")) != bench.store.state.sheet:
+        raise StepError(f"{stroke_id} lies on another sheet than the one that is in")
+    cell = bench.sheet.cell(int(job.number("cell")))
+    image = await photograph(job)
+    verdict = None if job.step.params.get("drawn") else await _judged(job, image, cell)
+    bench.known.sound_frame = image
+    kept, retake = True, False
+    if verdict is not None and not verdict.passed:
+        kept, retake = await _decide(job, verdict, image, cell)
+    if kept:
+        job.recorder.stroke(_stroke(job, cell))
+    return {
+        "stroke_id": stroke_id,
+        "still": job.attempt.serial,
+        "height_mm": job.number("height_mm"),
+        "tilt_deg": job.number("tilt_deg"),
+        "kept": kept,
+        "retake": retake,
+        "verdict": "" if verdict is None or verdict.cause is None else str(verdict.cause.name),
+    }
+
+
+async def _judged(job: Job, image: Gray, cell: Cell) -> Verdict | None:
+    bench = job.bench
+    if not bench.rig.config.quality.enabled:
+        return None
+    with job.recorder.sections.timed("judge the capture"):
+        verdict = await uninterrupted(_judge, bench, image, cell, job.number("height_mm"))
+    checks = tuple(
+        Check(name=c.name, score=c.score, threshold=c.threshold, passed=c.passed, reason=c.reason)
+        for c in verdict.checks
+    )
+    stroke_id = str(job.step.params["stroke_id"])
+    job.recorder.quality(Quality(stroke_id=stroke_id, checks=checks), job.attempt.serial)
+    if verdict.cause is not None:
+        bench.progress.log(f"{stroke_id}: {verdict.reason}", warning=True)
+        if verdict.cause.name.family is Family.PICTURE:
+            raise BadPicture(verdict.cause.reason)
+    return verdict
+
+
+def _judge(bench: Bench, image: Gray, cell: Cell, height_mm: float) -> Verdict:
+    config = bench.rig.config
+    return check_capture(
+        image,
+        image_plane(bench, image),
+        cell,
+        height_mm=height_mm,
+        limits=config.quality,
+        previous=bench.known.sound_frame,
+        sheet_mm=config.paper.size_mm,
+    )
+
+
+async def _decide(job: Job, verdict: Verdict, image: Gray, cell: Cell) -> tuple[bool, bool]:
+    """(kept, retake): again while takes are left, then a person decides; unwatched, the stroke is given up."""
+    bench = job.bench
+    if int(job.step.params.get("take") or 1) <= bench.rig.config.quality.retakes:
+        return False, True
+    stroke_id = str(job.step.params["stroke_id"])
+    prompt = Prompt(f"{stroke_id}: {verdict.reason}", (KEEP, AGAIN, SKIP), SKIP.key, image=_cut_out(bench, image, cell))
+    try:
+        answer = await bench.asker.ask(prompt, bench.rig.clock.now_ns())
+    except NeedsOperator:
+        bench.progress.log(f"{stroke_id}: given up", warning=True)
+        return False, False
+    return answer == KEEP.key, answer == AGAIN.key
+
+
+def _cut_out(bench: Bench, image: Gray, cell: Cell) -> Gray:
+    """The cell and a little around it."""
+    import numpy as np
+
+    plane = bench.known.image_plane
+    assert plane is not None
+    x_mm, y_mm, width_mm, height_mm = cell.rect_mm
+    corners = np.array([[x, y, 1.0] for x in (x_mm, x_mm + width_mm) for y in (y_mm, y_mm + height_mm)])
+    seen = corners @ np.linalg.inv(plane.image_to_paper).T
+    px = seen[:, :2] / seen[:, 2:]
+    (left, top), (right, bottom) = px.min(axis=0).astype(int), px.max(axis=0).astype(int)
+    m = PICTURE_MARGIN_PX
+    return image[max(0, top - m) : bottom + m, max(0, left - m) : right + m]
+
+
+def _stroke(job: Job, cell: Cell) -> Stroke:
+    return Stroke(
+        stroke_id=str(job.step.params["stroke_id"]),
+        kind="drag" if job.step.params.get("drawn") else "press",
+        still=job.attempt.serial,
+        height_mm=job.number("height_mm"),
+        tilt_deg=job.number("tilt_deg"),
+        cell_mm=cell.rect_mm,
+        anchor_mm=cell.anchor_mm,
+        again_of=None if job.step.params.get("again_of") is None else str(job.step.params["again_of"]),
+    )

@@ -1,0 +1,99 @@
+"""Finds the paper: what every run sets anew, zero touch, single touches of a calibration, and the self-check."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from collect.errors import ConfigError, StepError
+from collect.plane import PaperPlane
+from collect.planning.limits import check_poses
+from collect.planning.moves import touch_moves
+from collect.steps import Result
+from collect.touch.config import TouchConfig
+from collect.touch.jog import asked
+from collect.touch.measure import measure_plane
+from collect.touch.results import PlaneResult
+from collect.touch.selfcheck import self_check, triangle_in
+from collect.touch.tap import ForceTap
+from collect.work.context import Job
+from collect.work.dipping import fill_brush
+from drivers.samples import Frame
+from sessions.messages import Transform
+
+
+async def zero_touch(job: Job) -> Result:
+    """The ZERO_TOUCH step: light, force bias, the plane, and that every planned pose still lies within the limits."""
+    bench = job.bench
+    rig = bench.rig
+    await bench.inking.begin()
+    if rig.force is not None and rig.config.force is not None:
+        await rig.force.bias(rig.config.force.bias_s)
+    found = await _measured(job, rig.config.touch)
+    _check_plane(job, found.plane)
+    bench.procedures.plane = found.plane
+    origin_mm, quaternion = found.plane.frame(rig.config.paper)
+    job.recorder.frames([Transform("base", "paper", origin_mm, quaternion)])
+    return found.as_dict()
+
+
+async def touch(job: Job) -> Result:
+    """The TOUCH step: one point, by the method of the rig. Raises `StepError` by camera, which needs three."""
+    bench, point = job.bench, (job.number("x_mm"), job.number("y_mm"))
+    config = bench.rig.config.touch
+    if config.method == "camera":
+        raise StepError("single touches cannot be found by camera: use force, jog or taught in [touch]")
+    if config.method == "taught":
+        *down, up = touch_moves(bench.rig.config, bench.procedures.plane, *point)
+        for move in down:
+            await bench.procedures.go(move)
+        z_mm = (await bench.rig.robot.where()).z_mm
+        await bench.procedures.go(up)
+        return {"x_mm": point[0], "y_mm": point[1], "z_mm": z_mm, "method": "taught"}
+    found = await _measured(job, config.model_copy(update={"points_mm": [point]}))
+    x_mm, y_mm, z_mm = found.points[0].mean
+    return {"x_mm": x_mm, "y_mm": y_mm, "z_mm": z_mm, "span_mm": found.points[0].span_mm, "method": found.method}
+
+
+async def check_rig(job: Job) -> Result:
+    """The SELF_CHECK step: an uneven triangle on a cell of its own tells a mirrored, turned or stretched rig."""
+    bench, cell = job.bench, job.cell
+    assert cell is not None
+    config = bench.rig.config.self_check
+    places_mm = triangle_in(cell, config)
+    checked = await job.guard.guarded(self_check(bench.rig, _Hands(job), config, places_mm, bench.procedures.plane))
+    return {**checked.as_dict(), "sheet": bench.store.state.sheet, "cell": cell.index}
+
+
+class _Hands:
+    """What touches and self-check ask of the rig's procedures; a dip keeps the well filled."""
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+
+    async def zero_touch(self) -> float:
+        """Visit the taught height."""
+        return await self._job.bench.procedures.zero_touch()
+
+    async def dip(self) -> None:
+        """Into the well and out again."""
+        await fill_brush(self._job)
+
+    async def capture(self) -> Frame:
+        """Park, and a fresh frame."""
+        return await self._job.bench.procedures.capture()
+
+
+async def _measured(job: Job, config: TouchConfig) -> PlaneResult:
+    bench = job.bench
+    tap = ForceTap()
+    with job.guard.also(tap.take):
+        jog = asked(bench.asker, bench.rig.clock, config.jog)
+        return await job.guard.guarded(measure_plane(bench.rig, _Hands(job), config, tap=tap, next_jog=jog))
+
+
+def _check_plane(job: Job, plane: PaperPlane) -> None:
+    bench = job.bench
+    try:
+        check_poses(Path("rig.toml"), bench.rig.config, bench.protocol, plane)
+    except ConfigError as error:
+        raise StepError(f"over the paper as it was touched, {error.what}") from None

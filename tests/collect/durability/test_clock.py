@@ -1,0 +1,97 @@
+"""A host clock that is set back in mid-session: one process does not notice, the next one notes it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import pytest
+
+from collect.engine import Engine
+from collect.errors import CollectAborted
+from collect.snapshot import Snapshot
+from sessions import container
+from sessions.journal import JOURNAL_NAME, read_lines
+from sessions.reader import Recording
+from sessions.verify import verify_session
+from tests.collect.durability.conftest import the_session
+
+if TYPE_CHECKING:
+    from tests.collect.conftest import Lab
+
+HOUR_S = 3600
+
+
+class WallClock:
+    """What the operating system tells of the time of day."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.ahead_s = 0
+        seconds, nanoseconds = time.time, time.time_ns
+        monkeypatch.setattr(time, "time", lambda: seconds() + self.ahead_s)
+        monkeypatch.setattr(time, "time_ns", lambda: nanoseconds() + self.ahead_s * 1_000_000_000)
+
+
+@pytest.fixture
+def wall(monkeypatch: pytest.MonkeyPatch) -> WallClock:
+    return WallClock(monkeypatch)
+
+
+def until(engine: Engine, condition: Callable[[Snapshot], bool]) -> None:
+    deadline = time.monotonic() + 60
+    while not condition(engine.snapshot()):
+        assert time.monotonic() < deadline
+        assert not engine.finished, engine.snapshot().error
+        time.sleep(0.002)
+
+
+@pytest.mark.parametrize("jump_s", [-HOUR_S, HOUR_S])
+def test_a_clock_that_is_set_within_a_step_and_between_two_moves_no_stamp(
+    lab: Lab, wall: WallClock, jump_s: int
+) -> None:
+    engine = lab.engine()
+    engine.start()
+    until(engine, lambda now: now.step.startswith("press"))
+    wall.ahead_s += jump_s
+    until(engine, lambda now: now.strokes_done == 1)
+    engine.pause()
+    until(engine, lambda now: now.step == "paused")
+    wall.ahead_s += jump_s
+    engine.resume()
+    engine.join()
+
+    folder = the_session(lab)
+    lines = list(read_lines(folder / JOURNAL_NAME))
+    times_ns = [line["t_ns"] for line in lines]
+    assert times_ns == sorted(times_ns)
+    assert "clock" not in [line["event"] for line in lines]
+    stamps_ns = [message.log_time for _, _, message in container.messages(folder / f"{folder.name}.mcap")]
+    assert max(stamps_ns) - min(stamps_ns) < 60e9
+    assert engine.snapshot().elapsed_s < 60.0
+    assert verify_session(folder).sound
+
+
+def test_a_clock_that_was_set_back_between_two_processes_is_noted_and_reorders_nothing(
+    lab: Lab, wall: WallClock
+) -> None:
+    engine = lab.engine()
+    engine.start()
+    until(engine, lambda now: now.strokes_done == 2)
+    engine.stop()
+    with pytest.raises(CollectAborted):
+        engine.join()
+
+    wall.ahead_s -= HOUR_S
+    again = lab.engine()
+    again.start()
+    again.join()
+    folder = the_session(lab)
+    lines = list(read_lines(folder / JOURNAL_NAME))
+    [noted] = [line for line in lines if line["event"] == "clock"]
+    assert noted["back_s"] == pytest.approx(HOUR_S, abs=60.0)
+    assert lines[lines.index(noted) + 1]["event"] == "process"
+    captured = [line["result"]["stroke_id"] for line in lines if line["event"] == "done" and line["kind"] == "capture"]
+    assert [capture.stroke.stroke_id for capture in Recording(folder).captures()] == captured
+    assert len(set(captured)) == 4
+    assert verify_session(folder).sound

@@ -1,0 +1,79 @@
+"""A disk that is really full, and one that may really not be written, under `brushloop collect` as a process."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from sessions.journal import JOURNAL_NAME, read_lines, replay
+from sessions.reader import Recording
+from sessions.verify import verify_session
+from tests.collect.durability.conftest import Disk, parked, the_session
+
+if TYPE_CHECKING:
+    from tests.collect.conftest import Lab
+
+
+def wait_for_a_file(lab: Lab, pattern: str) -> None:
+    deadline = time.monotonic() + 60
+    while not any(lab.sessions.glob(f"*/{pattern}")):
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+
+
+def run(lab: Lab) -> tuple[int, str]:
+    process = lab.process()
+    _, stderr = process.communicate(timeout=60)
+    assert "Traceback" not in stderr
+    return process.returncode, stderr.splitlines()[-1]
+
+
+def test_a_disk_that_fills_up_in_mid_step_parks_the_arm_and_with_room_the_same_command_goes_on(
+    lab: Lab, disk: Disk
+) -> None:
+    first = lab.process()
+    wait_for_a_file(lab, "*-press-*.mcap.part")
+    disk.fill()
+    _, stderr = first.communicate(timeout=60)
+    assert first.returncode == 4, stderr
+    assert "Traceback" not in stderr
+    assert "No space left on device" in stderr.splitlines()[-1] or "make room" in stderr.splitlines()[-1]
+    assert parked(lab)
+    folder = the_session(lab)
+    finished = {line["file"]: line["sha256"] for line in replay(folder / JOURNAL_NAME).segments}
+
+    assert run(lab)[0] == 4, "there is no more room than before"
+    disk.make_room()
+    assert run(lab)[0] == 0
+    assert finished.items() <= {(line["file"], line["sha256"]) for line in replay(folder / JOURNAL_NAME).segments}
+    assert len({capture.stroke.stroke_id for capture in Recording(folder).captures()}) == 4
+    begun = [line for line in read_lines(folder / JOURNAL_NAME) if line["event"] == "begin"]
+    cells = [line["cell"] for line in begun if line["cell"] is not None]
+    assert len(cells) == len(set(cells))
+    assert verify_session(folder).sound
+
+
+def test_a_folder_that_may_not_be_written_is_refused_before_anything_is_connected(lab: Lab, disk: Disk) -> None:
+    disk.read_only(True)
+    code, told = run(lab)
+    assert (code, told) == (2, f"brushloop: {lab.sessions}: may not be written: it is read-only, or another user's")
+    assert lab.rig.arcs.mode == "PowerOff"
+
+    disk.read_only(False)
+    first = lab.process()
+    wait_for_a_file(lab, "*-press-*.mcap")
+    first.kill()
+    first.communicate()
+    disk.read_only(True)
+    code, told = run(lab)
+    folder = the_session(lab)
+    assert (code, told) == (2, f"brushloop: {folder}: may not be written: it is read-only, or another user's")
+    assert verify_session(folder).sound, "looking needs no right to write"
+    disk.read_only(False)
+    assert run(lab)[0] == 0
+
+
+def test_a_file_in_place_of_the_folder_is_refused(lab: Lab) -> None:
+    lab.sessions.write_text("not a folder", encoding="utf-8")
+    assert run(lab) == (2, f"brushloop: {lab.sessions}: is a file; a folder for sessions is needed")
+    assert lab.rig.arcs.mode == "PowerOff"

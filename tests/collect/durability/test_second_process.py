@@ -1,0 +1,53 @@
+"""Two rigs, one session: the second process is refused and powers nothing; the first does not notice."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+import tomllib
+from typing import TYPE_CHECKING
+
+from drivers.sim.config import SimConfig
+from drivers.sim.rig import LoopbackRig
+from sessions.verify import verify_session
+from tests.collect.conftest import SMALL_VIEW, serving
+from tests.collect.durability.conftest import the_session
+
+if TYPE_CHECKING:
+    from tests.collect.conftest import Lab
+
+
+def where(rig: LoopbackRig) -> dict[str, str]:
+    """The environment that points a configuration at this rig's devices: machine names may differ in a session."""
+    devices = tomllib.loads(rig.toml())
+    return {
+        "BRUSHLOOP_ROBOT__PORT": str(devices["robot"]["port"]),
+        "BRUSHLOOP_ROBOT__RTDE_PORT": str(devices["robot"]["rtde_port"]),
+        "BRUSHLOOP_CAMERA__SOURCE": devices["camera"]["source"],
+        "BRUSHLOOP_FORCE__PORT": str(devices["force"]["port"]),
+        "BRUSHLOOP_INK__DEVICE__PORT": devices["ink"]["device"]["port"],
+    }
+
+
+def test_a_session_that_is_open_elsewhere_is_refused_before_anything_is_powered(lab: Lab) -> None:
+    lab.write_protocol(repeats=4)
+    first = lab.process()
+    deadline = time.monotonic() + 60
+    while len(lab.rig.world.presses) < 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    with serving(SimConfig(rate=60.0, view=SMALL_VIEW)) as rig:
+        command = [sys.executable, "-m", "brushloop", "collect", "--no-tui", "--out", str(lab.sessions)]
+        command += ["--config", str(lab.folder / "rig.toml"), "--protocol", str(lab.folder / "protocol.toml")]
+        second = subprocess.run(
+            command, env={**os.environ, **where(rig)}, capture_output=True, text=True, timeout=60, check=False
+        )
+        assert second.returncode == 2, second.stderr
+        assert second.stderr.splitlines()[-1].endswith("another brushloop has this session open")
+        assert rig.arcs.mode == "PowerOff"
+        assert not rig.world.presses
+    _, stderr = first.communicate(timeout=120)
+    assert first.returncode == 0, stderr
+    assert verify_session(the_session(lab)).sound

@@ -1,0 +1,314 @@
+"""Ten faults in ten phases of a session: each cell has its outcome, and in every one the arm ends at rest.
+
+A run is fast up to its phase. As that begins, simulated time slows to half the pace of life, and the fault strikes a
+move that is under way. docs/faults.md holds the same table.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from collect.engine import Engine
+from collect.states import State
+from drivers.arcs.codes import SafetyMode
+from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, MotionFailed, ProtocolViolation, RobotNotSafe
+from drivers.geometry import distance
+from drivers.samples import Pose
+from drivers.sim.faults.phases import Phase
+from drivers.sim.faults.vocabulary import ALWAYS, Fault
+from sessions.journal import read_lines, replay
+from sessions.store import SessionStore
+
+if TYPE_CHECKING:
+    from conftest import Stage
+
+SLOW, FAST = 0.5, 300.0
+BOUND_S = 20.0
+"""Every run is over within this time, on a machine that is busy with other tests."""
+LINE, POLL = "rob1.MotionControl.moveLine", "getSafetyModeType"
+STRUCK = {"on": POLL, "nth": 3}
+"""In a move: the third time that the driver asks while it waits, some hundredths of a second after the start."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When a phase begins: with a call of `method`, in a step, with the arm on its way as `phase` says."""
+
+    method: str
+    step: str = ""
+    phase: Phase | None = None
+    deep: bool = False
+    """Only the line that really goes into the paper."""
+
+
+PHASES: dict[str, Moment] = {
+    "connecting": Moment("getRobotNames"),
+    "powering": Moment("rob1.RobotManage.poweron"),
+    "retreat": Moment(LINE, "retreat"),
+    "zero touch": Moment(LINE, "zero touch", Phase.DESCENDING),
+    "dip": Moment(LINE, "dip", Phase.DIPPING),
+    "travel": Moment(LINE, "press", Phase.TRAVELLING),
+    "descent": Moment(LINE, "press", Phase.DESCENDING, deep=True),
+    "at depth": Moment(LINE, "press", Phase.DESCENDING, deep=True),
+    "lift": Moment(LINE, "press", Phase.LIFTING),
+    "parking": Moment(LINE, "capture"),
+}
+STILL = ("connecting", "powering")
+"""Phases in which nothing moves: there the fault strikes the request that begins the phase."""
+
+FAULTS: dict[str, dict[str, Any]] = {
+    "mute": {"kind": "mute", "count": ALWAYS},
+    "late": {"kind": "late", "late_s": 1.2},
+    "split": {"kind": "split", "count": ALWAYS},
+    "duplicate": {"kind": "duplicate", "count": ALWAYS},
+    "wrong id": {"kind": "wrong-id"},
+    "malformed": {"kind": "malformed"},
+    "drop": {"kind": "drop", "for_s": 0.3},
+    "protective stop": {"kind": "protective-stop"},
+    "emergency stop": {"kind": "emergency-stop"},
+    "frozen camera": {"device": "camera", "kind": "frozen", "count": ALWAYS},
+}
+SINGLE = ("late", "wrong id", "malformed", "protective stop", "emergency stop")
+"""What strikes one request of the driver's own wait; the others strike whoever asks."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ends."""
+
+    words: str
+    error: type[DeviceError] | None = None
+    device: str = ""
+    alarm: bool = False
+    """The operator is told that the arm may still be moving, and to use the emergency stop."""
+
+
+DONE = Outcome("goes on, done")
+SILENT = Outcome("`MotionFailed`: may still be moving", MotionFailed, "robot", alarm=True)
+TIMEOUT = Outcome("`DeviceTimeout`, stopped", DeviceTimeout, "robot")
+VIOLATION = Outcome("`ProtocolViolation`, stopped", ProtocolViolation, "robot")
+LOST = Outcome("`ConnectionLost`, stopped", ConnectionLost, "robot")
+UNSAFE = Outcome("`RobotNotSafe`, stopped", RobotNotSafe, "robot")
+BLIND = Outcome("camera `DeviceTimeout`, parked", DeviceTimeout, "camera")
+
+TABLE: dict[str, list[Outcome]] = {
+    # connecting and powering, then the eight phases in which the arm moves or has just moved
+    "mute": [TIMEOUT] * 2 + [SILENT] * 8,
+    "late": [TIMEOUT] * 10,
+    "split": [DONE] * 10,
+    "duplicate": [DONE] * 10,
+    "wrong id": [TIMEOUT] * 10,
+    "malformed": [VIOLATION] * 10,
+    "drop": [LOST] * 10,
+    "protective stop": [UNSAFE] * 10,
+    "emergency stop": [UNSAFE] * 10,
+    "frozen camera": [BLIND] * 10,
+}
+
+CUT: dict[str, tuple[list[str], str | None]] = {
+    # the steps that are done and kept, and the one whose attempt is void; a void press has burnt its cell
+    "connecting": ([], None),
+    "powering": ([], None),
+    "retreat": ([], None),
+    "zero touch": ([], "zero_touch"),
+    "dip": (["zero_touch", "board"], "dip"),
+    "travel": (["zero_touch", "board", "dip"], "press"),
+    "descent": (["zero_touch", "board", "dip"], "press"),
+    "at depth": (["zero_touch", "board", "dip"], "press"),
+    "lift": (["zero_touch", "board", "dip"], "press"),
+    "parking": (["zero_touch", "board", "dip", "press"], "capture"),
+}
+"""For the faults of the robot. A frozen camera shows at the next photograph: at the board, or at the capture."""
+ALL_DONE = ["zero_touch", "board", "dip", "press", "capture"]
+
+
+def cells() -> list[Any]:
+    """Two phases of each fault by default, each phase twice; the other eighty in the soak."""
+    chosen: list[Any] = []
+    for row, fault in enumerate(FAULTS):
+        for column, phase in enumerate(PHASES):
+            default = (column - row) % 10 in (0, 4)
+            chosen.append(pytest.param(fault, phase, marks=() if default else pytest.mark.soak, id=f"{fault}, {phase}"))
+    return chosen
+
+
+def fault_at(name: str, phase: str) -> Fault:
+    fields: dict[str, Any] = {"device": "robot"} | FAULTS[name]
+    if phase not in STILL and fields["device"] == "robot":
+        if phase == "at depth":
+            fields |= {"phase": Phase.PRESSED} | ({"on": POLL} if name in SINGLE else {})
+        elif name in SINGLE:
+            fields |= STRUCK
+        else:
+            fields |= {"nth": 10}
+    return Fault.model_validate(fields)
+
+
+def arm_the_fault(stage: Stage, engine: Engine, name: str, phase: str) -> list[Pose | None]:
+    """Hang the fault as the phase begins, and slow down where a move is to be struck.
+
+    The list will hold where that move was to end.
+    """
+    moment, fault, rig = PHASES[phase], fault_at(name, phase), stage.rig
+    methods = rig.arcs._methods
+    original: Callable[[dict[str, Any]], Any] = methods[moment.method]
+    targets: list[Pose | None] = []
+
+    def now() -> bool:
+        if not engine.snapshot().step.startswith(moment.step):
+            return False
+        to = rig.faults.truth.target()
+        if moment.method == LINE and to is None:
+            return False  # already there
+        if moment.deep and (to is None or to.z_mm > rig.config.table.paper_z_mm - 1.0):
+            return False
+        return moment.phase is None or rig.faults.truth.phase() is moment.phase
+
+    def watched(params: dict[str, Any]) -> Any:
+        if targets:
+            return original(params)
+        stage.gears.shift(SLOW)  # or a line would be over before anyone has looked at it
+        result = original(params)
+        if now():
+            targets.append(rig.faults.truth.target())
+            rig.faults.hang(fault)
+        if not targets or moment.method != LINE or name == "frozen camera":
+            stage.gears.shift(FAST)
+        elif TABLE[name][0] is DONE:
+            stage.loop.call_later(2.5 if phase == "at depth" else 0.3, stage.gears.shift, FAST)
+        return result
+
+    methods[moment.method] = watched
+    return targets
+
+
+def over_within(engine: Engine, bound_s: float) -> BaseException | None:
+    """What ended the run, once it is over."""
+    deadline = time.monotonic() + bound_s
+    while not engine.finished:
+        assert time.monotonic() < deadline, f"still runs: {engine.snapshot()}"
+        time.sleep(0.01)
+    try:
+        engine.join()
+    except Exception as error:
+        return error
+    return None
+
+
+@pytest.mark.parametrize(("name", "phase"), cells())
+def test_a_fault_in_a_phase_ends_as_the_table_says(stage: Stage, name: str, phase: str) -> None:
+    expected = TABLE[name][list(PHASES).index(phase)]
+    engine = stage.engine()
+    targets = arm_the_fault(stage, engine, name, phase)
+    engine.start()
+    ended = over_within(engine, BOUND_S)
+
+    board = stage.rig.faults.board
+    assert any(hung.struck for hung in (*board.hanging, *board.over)), "the fault has struck"
+    now = engine.snapshot()
+    assert now.state is (State.DONE if expected is DONE else State.FAILED), now
+    assert type(ended) is (expected.error or type(None)), repr(ended)
+    assert not isinstance(ended, DeviceError) or ended.device == expected.device
+    assert ("may still be moving. Use the emergency stop" in now.error) is expected.alarm, now.error
+    if isinstance(ended, RobotNotSafe):
+        assert ended.remedy in now.error
+        assert stage.rig.arcs.safety != SafetyMode.NORMAL, "nothing is ever cleared automatically"
+
+    assert stage.at_rest
+    [target] = targets
+    if expected in (DONE, BLIND):
+        assert stage.rig.faults.truth.phase() is Phase.PARKED
+    elif target is not None and phase != "at depth":
+        assert sum(distance(stage.rig.world.tool(), target)) > 0.5, "stopped on its way"
+    assert_it_stays_at_rest(stage)
+    assert_the_session_is_whole(stage, name, phase)
+
+
+def assert_it_stays_at_rest(stage: Stage) -> None:
+    """Not when the fault is over, not when a person has ended the stop, not when requests come late."""
+    before = stage.rig.world.tool()
+    stage.rig.faults.board.clear()
+    stage.rig.faults.release()
+    stage.gears.shift(FAST)
+    stage.ask("rob1.MotionControl.startMove", "RuntimeMachine.resume", "rob1.MotionControl.getExecId")
+    time.sleep(0.1)  # half a minute of the arm's time
+    assert stage.rig.world.tool() == before
+    assert stage.at_rest
+
+
+def assert_the_session_is_whole(stage: Stage, name: str, phase: str) -> None:
+    outcome = TABLE[name][list(PHASES).index(phase)]
+    folders = list(stage.sessions.iterdir()) if stage.sessions.is_dir() else []
+    if phase == "connecting" and outcome.device == "robot" and outcome is not UNSAFE:
+        assert not folders, "an arm that was not reached begins no session"
+        return
+    [folder] = folders
+    lines, state = list(read_lines(folder / "journal.jsonl")), replay(folder / "journal.jsonl")
+    done = [line["kind"] for line in lines if line["event"] == "done"]
+    begun = {(line["key"], line["attempt"]): line for line in lines if line["event"] == "begin"}
+    voids = [begun[line["key"], line["attempt"]] for line in lines if line["event"] == "void"]
+    if outcome is DONE:
+        assert (done, voids) == (ALL_DONE, [])
+        assert state.closed is not None
+        return
+    if outcome is BLIND:
+        early = list(PHASES).index(phase) < list(PHASES).index("dip")
+        assert done == (["zero_touch"] if early else ALL_DONE[:-1])
+        assert [line["kind"] for line in voids] == (["board"] if early else ["capture"]) * 3
+    else:
+        kept, cut = CUT[phase]
+        assert done == kept
+        assert [line["kind"] for line in voids] == ([] if cut is None else [cut])
+    for line in voids:
+        assert (line["cell"] is not None) is (line["kind"] == "press")
+        assert line["cell"] is None or (line["sheet"], line["cell"]) in state.used_cells, "burnt"
+        assert (folder / f"{line['file']}.part").is_file(), "its evidence is kept"
+    store = SessionStore(folder, None, time.time_ns)
+    store.verify()
+    store.release()
+
+
+@pytest.mark.parametrize(("name", "phase"), [("drop", "descent"), ("protective stop", "lift")])
+def test_once_the_cause_is_mended_the_same_command_goes_on(stage: Stage, name: str, phase: str) -> None:
+    engine = stage.engine()
+    arm_the_fault(stage, engine, name, phase)
+    engine.start()
+    assert over_within(engine, BOUND_S) is not None
+    stage.rig.faults.board.clear()
+    stage.rig.faults.release()
+    stage.gears.shift(FAST)
+
+    again = stage.engine()
+    again.start()
+    assert over_within(again, BOUND_S) is None
+    [folder] = stage.sessions.iterdir()
+    state = replay(folder / "journal.jsonl")
+    assert len(state.used_cells) == 2, "the press that was cut lies on one, its repetition on another"
+
+
+def test_the_documentation_holds_this_table() -> None:
+    text = (Path(__file__).parents[3] / "docs" / "faults.md").read_text(encoding="utf-8")
+    for row in rendered():
+        assert row in text
+
+
+def rendered() -> list[str]:
+    """The table as Markdown: phases down, faults across would be too wide, so equal neighbours are one entry."""
+    rows: list[str] = []
+    for name, outcomes in TABLE.items():
+        spans: list[str] = []
+        phases = list(PHASES)
+        begin = 0
+        for k in range(1, len(phases) + 1):
+            if k == len(phases) or outcomes[k] is not outcomes[begin]:
+                where = phases[begin] if k == begin + 1 else f"{phases[begin]} to {phases[k - 1]}"
+                spans.append(f"{where}: {outcomes[begin].words}")
+                begin = k
+        rows.append(f"| {name} | {'; '.join(spans)} |")
+    return rows

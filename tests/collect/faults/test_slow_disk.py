@@ -1,0 +1,121 @@
+"""A disk that is slow, cannot keep up, or fills up: the recorder's side of a session, the arm's safety included.
+
+The disk belongs to the process that records, so it is no fault of the rig. What the writer alone does is in
+tests/sessions/test_writer.py.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from collect.states import State
+from drivers.sim.faults.phases import Phase
+from sessions.errors import SessionError
+from sessions.journal import read_lines, replay
+from sessions.reader import Recording
+from sessions.writer import ChannelTable
+
+if TYPE_CHECKING:
+    from conftest import Stage
+
+BOUND_S = 40.0
+
+
+@dataclass
+class Disk:
+    """What every file of the session is written to."""
+
+    message_s: float = 0.0
+    """Time that one message takes."""
+    sync_s: float = 0.0
+    full_after: int | None = None
+    """Messages after which nothing more fits."""
+    written: int = 0
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
+    disk, add, fsync = Disk(), ChannelTable.add, os.fsync
+
+    def slow_add(table: ChannelTable, outgoing: Any) -> None:
+        time.sleep(disk.message_s)
+        disk.written += 1
+        if disk.full_after is not None and disk.written > disk.full_after:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        add(table, outgoing)
+
+    def slow_fsync(handle: int) -> None:
+        time.sleep(disk.sync_s)
+        fsync(handle)
+
+    monkeypatch.setattr(ChannelTable, "add", slow_add)
+    monkeypatch.setattr(os, "fsync", slow_fsync)
+    return disk
+
+
+def run(stage: Stage) -> tuple[BaseException | None, State]:
+    engine = stage.engine()
+    engine.start()
+    deadline = time.monotonic() + BOUND_S
+    while not engine.finished:
+        assert time.monotonic() < deadline, engine.snapshot()
+        time.sleep(0.01)
+    try:
+        engine.join()
+    except Exception as error:
+        return error, engine.snapshot().state
+    return None, engine.snapshot().state
+
+
+def test_a_slow_disk_is_waited_for_and_loses_nothing(stage: Stage, disk: Disk) -> None:
+    disk.message_s, disk.sync_s = 0.012, 0.05  # a pose comes every 0.010 s
+    assert run(stage) == (None, State.DONE)
+    [folder] = stage.sessions.iterdir()
+    recorded = sum(sum(line["counts"].values()) for line in replay(folder / "journal.jsonl").segments)
+    assert recorded == disk.written
+    assert len(list(Recording(folder).captures())) == 1
+
+
+def test_a_disk_that_does_not_keep_up_ends_the_run_and_says_so(
+    stage: Stage, disk: Disk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A queue of five stands for the 20 000 messages that a slower disk would take minutes to fill."""
+    monkeypatch.setattr("sessions.store.QUEUE_LIMIT", 5)
+    disk.message_s = 0.1
+    error, state = run(stage)
+    assert isinstance(error, SessionError)
+    assert "the disk does not keep up" in str(error)
+    assert state is State.FAILED
+    assert_stopped_clear_of_the_paper(stage)
+
+
+@pytest.mark.parametrize("full_after", [0, 3, 60])
+def test_a_disk_that_fills_up_ends_the_run_and_with_room_the_same_command_goes_on(
+    stage: Stage, disk: Disk, full_after: int
+) -> None:
+    disk.full_after = full_after
+    error, state = run(stage)
+    assert isinstance(error, SessionError)
+    assert "No space left on device" in str(error)
+    assert state is State.FAILED
+    assert_stopped_clear_of_the_paper(stage)
+    [folder] = stage.sessions.iterdir()
+    lines = list(read_lines(folder / "journal.jsonl"))
+    assert [line["event"] for line in lines].count("void") == 1
+    assert len(list(folder.glob("*.part"))) == 1, "the evidence is kept"
+
+    disk.full_after = None
+    assert run(stage) == (None, State.DONE)
+    assert len(list(Recording(folder).captures())) == 1
+
+
+def assert_stopped_clear_of_the_paper(stage: Stage) -> None:
+    assert stage.at_rest
+    assert stage.rig.faults.truth.phase() in (Phase.PARKED, Phase.RESTING)
+    assert stage.rig.world.tool().z_mm >= stage.rig.config.table.paper_z_mm + 8.0

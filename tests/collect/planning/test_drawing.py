@@ -1,0 +1,105 @@
+"""A stroke that is drawn on the loopback rig lies where its trajectory says."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from collect.config import RigConfig, load_rig
+from collect.drawing import Drawn, check_drawn, draw_stroke, stroke_moves
+from collect.plane import PaperPlane
+from collect.planning.walk import sheet_of, walk
+from collect.protocols.loading import load_protocol
+from collect.rig import limits_of, make_robot
+from collect.steps import StepKind
+from drivers.arcs.robot import AuboArcs
+from drivers.clock import HostClock
+from drivers.errors import LimitExceeded
+from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.config import SimConfig
+from drivers.sim.rig_toml import Addresses, rig_toml
+from drivers.sim.world import World
+
+WRITE = Path(__file__).parents[3] / "examples" / "protocol-write.toml"
+PLANE = PaperPlane(120.0)
+
+
+@dataclass
+class Desk:
+    arm: AuboArcs
+    world: World
+    config: RigConfig
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> RigConfig:
+    (tmp_path / "rig.toml").write_text(rig_toml(SimConfig(), Addresses("127.0.0.1", 1, 2, 3, 4, "x")))
+    return load_rig(tmp_path / "rig.toml")
+
+
+@pytest.fixture
+async def desk(config: RigConfig) -> AsyncIterator[Desk]:
+    server = ArcsServer(World(SimConfig(rate=20.0)))
+    await server.start("127.0.0.1", 0)
+    here = config.robot.model_copy(update={"port": server.port, "rtde_port": None})
+    arm = make_robot(config.model_copy(update={"robot": here}), HostClock(), lambda _: None)
+    await arm.connect()
+    await arm.enable()
+    yield Desk(arm, server._world, config)
+    await arm.close()
+    await server.stop()
+
+
+def first_drawn(config: RigConfig) -> Drawn:
+    return Drawn.of(next(w.step for w in walk(config, load_protocol(WRITE)) if w.step.kind == StepKind.DRAW))
+
+
+async def test_a_drawn_stroke_is_one_drag_through_its_points(desk: Desk) -> None:
+    drawn = first_drawn(desk.config)
+    cell = sheet_of(desk.config, load_protocol(WRITE)).cell(0)
+    depth_mm = await draw_stroke(desk.arm, desk.config, PLANE, cell, drawn.strokes[0], speed_mm_s=15.0, blend_mm=1.0)
+    assert depth_mm == pytest.approx(drawn.strokes[0][0][2], abs=0.05)
+    [drag] = desk.world.drags
+    assert not desk.world.presses
+    for x_mm, y_mm, height_mm, *_ in drawn.strokes[0]:
+        near = min(
+            abs(w.x_mm - cell.x_mm - x_mm) + abs(w.y_mm - cell.y_mm - y_mm) + abs(w.depth_mm - height_mm)
+            for w in drag.path
+        )
+        assert near < 0.8
+    assert drag.heading_deg % 360.0 == pytest.approx(180.0, abs=0.1)
+    assert desk.world.tool().z_mm == pytest.approx(desk.config.motion.safe_z_mm, abs=0.05)
+
+
+async def test_a_stroke_that_leaves_the_limits_somewhere_moves_nothing(desk: Desk) -> None:
+    cell = sheet_of(desk.config, load_protocol(WRITE)).cell(0)
+    points = [*first_drawn(desk.config).strokes[0], (30.0, 30.0, 40.0, 0.0, 0.0)]
+    with pytest.raises(LimitExceeded):
+        await draw_stroke(desk.arm, desk.config, PLANE, cell, points, speed_mm_s=15.0, blend_mm=1.0)
+    assert desk.world.motion._next_id == 0
+
+
+def test_a_stroke_may_come_down_on_its_way(config: RigConfig) -> None:
+    """Points above the paper: a flying start. The brush is as far above it as asked when the way begins."""
+    cell = sheet_of(config, load_protocol(WRITE)).cell(0)
+    points = [(10.0, 10.0, -4.0, 3.0, 0.0), (20.0, 10.0, 5.0, 3.0, 0.0), (30.0, 10.0, -4.0, 3.0, 0.0)]
+    moves = stroke_moves(config, PLANE, cell, points, 15.0)
+    assert [move.target.z_mm for move in moves.down] == pytest.approx([180.0, 132.0, 132.0, 124.0])
+    assert [pose.z_mm for pose in moves.way] == pytest.approx([115.0, 124.0])
+
+
+def test_the_wrist_turns_where_the_brush_is_upright_and_high(config: RigConfig) -> None:
+    cell = sheet_of(config, load_protocol(WRITE)).cell(0)
+    [high, clear, *_] = stroke_moves(config, PLANE, cell, first_drawn(config).strokes[1], 15.0).down
+    assert high.target.quaternion == pytest.approx(clear.target.quaternion)
+
+
+def test_all_of_a_figure_is_checked(config: RigConfig) -> None:
+    drawn, sheet = first_drawn(config), sheet_of(config, load_protocol(WRITE))
+    check_drawn(config, PLANE, limits_of(config), sheet.corners, drawn)
+    drawn.strokes[1][-1] = (40.0, 12.0, 1.0, 20.0, 90.0)
+    with pytest.raises(LimitExceeded, match="tilt"):
+        check_drawn(config, PLANE, limits_of(config), sheet.corners, drawn)

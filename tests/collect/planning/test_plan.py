@@ -1,0 +1,244 @@
+"""A plan is walked without a rig: limits, sheets, dips, ink, time, warnings."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import pytest
+
+from collect.config import RigConfig, load_rig
+from collect.drawing import Drawn
+from collect.errors import ConfigError
+from collect.plan import check_plan
+from collect.plane import PaperPlane
+from collect.planning.ink import bundle_ml, ink_need
+from collect.planning.limits import all_poses, check_poses
+from collect.planning.marks import reach_of
+from collect.planning.moves import Way, moves_of
+from collect.planning.summary import Plan, make_plan
+from collect.planning.timing import _apart, move_s, trapezoid_s, way_s
+from collect.planning.walk import sheet_of, walk
+from collect.procedures import Move
+from collect.protocols.config import ProtocolConfig
+from collect.protocols.loading import load_protocol
+from collect.rig import limits_of
+from collect.steps import MARKING, StepKind
+from drivers.geometry import brush_pose, distance
+from drivers.sim.config import SimConfig
+from drivers.sim.rig_toml import Addresses, rig_toml
+
+EXAMPLES = Path(__file__).parents[3] / "examples"
+RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
+PUMP = rig_toml(SimConfig(ink_device="pump"), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
+
+
+def rig(folder: Path, old: str = "", new: str = "", text: str = RIG) -> RigConfig:
+    assert old in text
+    (folder / "rig.toml").write_text(text.replace(old, new) if old else text)
+    return load_rig(folder / "rig.toml")
+
+
+def protocol(folder: Path, text: str) -> ProtocolConfig:
+    (folder / "protocol.toml").write_text(text)
+    return load_protocol(folder / "protocol.toml")
+
+
+def example(name: str) -> ProtocolConfig:
+    return load_protocol(EXAMPLES / name)
+
+
+@pytest.fixture
+def grid_plan(tmp_path: Path) -> Plan:
+    return make_plan(rig(tmp_path), example("protocol.toml"))
+
+
+def test_the_grid_of_the_paper_needs_four_sheets_and_a_dip_for_each_press(grid_plan: Plan) -> None:
+    assert (len(grid_plan.placed), grid_plan.cells_per_sheet, grid_plan.sheets, grid_plan.dips) == (150, 42, 4, 150)
+    assert [p.order for p in grid_plan.placed] == list(range(1, 151))
+    assert len({(p.sheet, p.cell) for p in grid_plan.placed}) == 150
+    assert list(grid_plan.sheet_changes) == [grid_plan.placed[i].stroke_id for i in (42, 84, 126)]
+    assert sum(grid_plan.seconds_by_kind.values()) == pytest.approx(grid_plan.seconds)
+    assert grid_plan.warnings == ()
+
+
+def test_a_plan_as_json_is_json(grid_plan: Plan) -> None:
+    read = json.loads(json.dumps(grid_plan.as_json()))
+    assert read["sheets"] == 4
+    assert read["steps"] == {"zero_touch": 1, "board": 1, "dip": 150, "press": 150, "capture": 150}
+
+
+def test_every_example_passes_and_is_walked(tmp_path: Path) -> None:
+    config = rig(tmp_path)
+    for path in EXAMPLES.glob("*.toml"):
+        wanted = load_protocol(path)
+        check_plan(tmp_path / "rig.toml", path, config, wanted)
+        assert make_plan(config, wanted).seconds > 10.0
+
+
+def test_figures_take_cells_of_their_own_size_and_dip_between_strokes(tmp_path: Path) -> None:
+    plan = make_plan(rig(tmp_path), example("protocol-write.toml"))
+    assert (plan.cells_per_sheet, plan.dips, plan.steps["dip"]) == (6, 4, 2)
+    assert all(p.drawn for p in plan.placed)
+
+
+def test_a_calibration_marks_nothing_and_shows_where_it_touches(tmp_path: Path) -> None:
+    plan = make_plan(rig(tmp_path), example("protocol-calibration.toml"))
+    assert (plan.placed, plan.dips, plan.ink.ml) == ((), 0, 0.0)
+    assert len(plan.touches_mm) == 6
+
+
+def figure(*points: list[float], cell: str = "[60.0, 60.0]") -> str:
+    return f'kind = "write"\ncell_mm = {cell}\n[[figures]]\nname = "a"\n[[figures.strokes]]\npoints = {list(points)}\n'
+
+
+HERE, THERE = [9.0, 9.0, 9.0, 0.0, 0.0], [20.0, 9.0, 9.0, 0.0, 0.0]
+NEAR_TOUCH, TOO_DEEP, TOO_TILTED = [1.0, 0.0, 9.0, 0.0, 0.0], [20.0, 9.0, 23.0, 0.0, 0.0], [20.0, 9.0, 9.0, 20.0, 0.0]
+TOUCH = ("touch_point_mm = [2.0, 2.0]", "touch_point_mm = [4.0, 26.0]")
+NARROW = ("y_mm = [-260.0, 260.0]", "y_mm = [-260.0, 100.0]")
+
+
+@pytest.mark.parametrize(
+    ("text", "change", "message"),
+    [
+        ('kind = "list"\npresses = [{height_mm = 23.0}]\n', (), r"presses: 001-H23-a0-r01: 23 mm is deeper"),
+        (
+            'kind = "replay"\nof = "s"\npresses = [{stroke_id = "b", height_mm = 23.0, tilt_deg = 1.0}]\n',
+            (),
+            r"b~1: 23",
+        ),
+        (figure(HERE, TOO_DEEP), (), r"figures: a: 23 mm is deeper than brush.max_depth_mm = 22 mm"),
+        (figure(HERE, THERE, cell="[300.0, 60.0]"), (), r"protocol.toml: cell_mm: .* does not fit"),
+        (figure(HERE, TOO_TILTED), (), r"tilt = 20.000 deg is outside .*\(a-r01 on cell 0\)"),
+        (figure(NEAR_TOUCH, THERE), TOUCH, r"\[4.0, 26.0\] lies within 5 mm of a drawn point at \[3.0, 26.0\]"),
+        ('kind = "calibration"\ntouches_mm = [[250.0, 9.0]]\n', (), r"touches_mm: \[250, 9\] lies off the sheet"),
+        ('kind = "calibration"\ntouches_mm = [[240.0, 9.0]]\n', NARROW, r"y = 130.000 mm is outside .*\(touch\)"),
+    ],
+)
+def test_what_cannot_be_done_is_named_before_anything_is_connected(
+    tmp_path: Path, text: str, change: tuple[str, ...], message: str
+) -> None:
+    config = rig(tmp_path, *change)
+    with pytest.raises(ConfigError, match=message):
+        check_plan(tmp_path / "rig.toml", tmp_path / "protocol.toml", config, protocol(tmp_path, text))
+
+
+def test_the_outermost_cells_stand_for_all(tmp_path: Path) -> None:
+    config, wanted, plane = rig(tmp_path), example("protocol.toml"), PaperPlane(120.0, 0.01, -0.02)
+    corners = [pose for pose, _, _ in all_poses(config, wanted, plane)]
+    everywhere = [pose for pose, _, _ in all_poses(config, wanted, plane, every_cell=True)]
+    assert len(everywhere) > 8 * len(corners)
+    for axis in range(3):
+        for extreme in (min, max):
+            assert extreme(p.position_mm[axis] for p in everywhere) == pytest.approx(
+                extreme(p.position_mm[axis] for p in corners), abs=1e-9
+            )
+
+
+def test_a_sheet_that_leans_is_checked_as_it_lies(tmp_path: Path) -> None:
+    config, wanted = rig(tmp_path), example("protocol.toml")
+    check_poses(tmp_path / "rig.toml", config, wanted, PaperPlane(120.0))
+    with pytest.raises(ConfigError, match=r"z = 88\.\d+ mm is outside .* on cell \d+\)"):
+        check_poses(tmp_path / "rig.toml", config, wanted, PaperPlane(120.0, -0.05))
+
+
+def test_the_walk_goes_where_the_steps_say(tmp_path: Path) -> None:
+    config, wanted = rig(tmp_path), example("protocol.toml")
+    walked = list(walk(config, wanted))
+    for before, after in itertools.pairwise(walked):
+        if before.step.kind in MARKING:
+            assert after.step.kind == StepKind.CAPTURE
+            assert (after.cell, after.sheet) == (before.cell, before.sheet)
+    press = next(w for w in walked if w.step.kind == StepKind.PRESS)
+    deepest = min(pose.z_mm for pose, _ in press.moves.poses)
+    assert deepest == pytest.approx(config.paper.touch_z_mm - float(press.step.params["height_mm"] or 0))
+
+
+def test_a_drawn_stroke_goes_through_its_points_at_its_depths(tmp_path: Path) -> None:
+    config, wanted = rig(tmp_path), example("protocol-write.toml")
+    [draw, *_] = [w for w in walk(config, wanted) if w.step.kind == StepKind.DRAW]
+    ways = [part for part in draw.moves.parts if isinstance(part, Way)]
+    drawn = Drawn.of(draw.step)
+    assert [len(way.poses) for way in ways] == [len(stroke) - 1 for stroke in drawn.strokes]
+    cell = sheet_of(config, wanted).cell(0)
+    # paper x is base y, paper y is base -x
+    x_mm, y_mm, depth_mm, *_ = drawn.strokes[0][1]
+    assert ways[0].poses[0].position_mm == pytest.approx(
+        (460.0 - cell.y_mm - y_mm, -110.0 + cell.x_mm + x_mm, config.paper.touch_z_mm - depth_mm)
+    )
+    assert draw.moves.dips == 1
+
+
+def test_trapezoids_and_triangles() -> None:
+    assert trapezoid_s(100.0, 20.0, 200.0) == pytest.approx(5.1)
+    assert trapezoid_s(0.5, 20.0, 200.0) == pytest.approx(0.1)
+    assert trapezoid_s(2.0, 20.0, 200.0) == pytest.approx(0.2)
+
+
+def test_a_turn_on_the_spot_is_read_in_radians(tmp_path: Path) -> None:
+    limits = limits_of(rig(tmp_path))
+    upright, tilted = brush_pose(300.0, 0.0, 200.0), brush_pose(300.0, 0.0, 200.0, tilt_deg=10.0)
+    assert move_s(upright, tilted, 20.0, 800.0, limits) == pytest.approx(0.17453 / 0.02 + 0.025, abs=1e-3)
+    assert way_s(upright, Way([brush_pose(310.0, 0.0, 200.0), brush_pose(320.0, 0.0, 200.0)], 20.0), 800.0, limits) == (
+        pytest.approx(1.025)
+    )
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 0.05, 5.0, 90.0, 180.0])
+def test_the_quick_distance_is_the_distance(turn_deg: float) -> None:
+    a = brush_pose(300.0, 0.0, 200.0, heading_deg=10.0, tilt_deg=3.0)
+    b = brush_pose(310.0, 4.0, 190.0, heading_deg=10.0 + turn_deg, tilt_deg=3.0)
+    assert _apart(a, b) == pytest.approx(distance(a, b), abs=1e-5)
+
+
+def test_ink_is_an_upper_estimate_and_a_pump_knows_better(tmp_path: Path) -> None:
+    config = rig(tmp_path)
+    assert bundle_ml(config.brush) == pytest.approx(1.8096, abs=1e-4)
+    assert ink_need(config, 10).ml == pytest.approx(5.43, abs=0.01)
+    pumped = rig(tmp_path, text=PUMP)
+    assert ink_need(pumped, 12).ml == pytest.approx(2 * 0.3)
+    assert "pump" in ink_need(pumped, 12).why
+
+
+def test_the_reach_of_a_mark_is_that_of_the_model_at_the_paper_s_own_numbers(tmp_path: Path) -> None:
+    reach = reach_of(rig(tmp_path).brush, 20.0, 10.0)
+    assert (reach.ahead_mm, reach.behind_mm) == (pytest.approx(2.522, abs=1e-3), pytest.approx(22.547, abs=1e-3))
+    assert 2.0 * reach.side_mm == pytest.approx(15.950, abs=1e-3)
+
+
+def test_marks_that_leave_their_cells_and_columns_that_are_not_used_are_told(tmp_path: Path) -> None:
+    narrow = rig(tmp_path, "cell_mm = [40.0, 24.0]", "cell_mm = [24.0, 24.0]")
+    [warning] = make_plan(narrow, example("protocol.toml")).warnings
+    assert warning.startswith("H20-a0-r")
+    assert "beyond its cell of 24 x 24 mm" in warning
+    assert make_plan(rig(tmp_path), example("protocol-replay.toml")).warnings == (
+        "recovered.csv: columns that are not used: height_sd_mm",
+    )
+    edge = protocol(tmp_path, figure([9.0, 1.0, 9.0, 0.0, 0.0], [20.0, 1.0, 9.0, 0.0, 0.0]))
+    assert "a may reach 2.5 mm beyond" in make_plan(rig(tmp_path), edge).warnings[0]
+
+
+def test_a_self_check_takes_a_cell_before_the_first_stroke(tmp_path: Path) -> None:
+    config = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\n\n[motion]")
+    check_plan(tmp_path / "rig.toml", EXAMPLES / "protocol.toml", config, example("protocol.toml"))
+    plan = make_plan(config, example("protocol.toml"))
+    assert [step.step.kind for step in walk(config, example("protocol.toml"))][:4] == [
+        StepKind.ZERO_TOUCH,
+        StepKind.BOARD,
+        StepKind.SELF_CHECK,
+        StepKind.DIP,
+    ]
+    assert (len(plan.placed), plan.placed[0].cell, plan.placed[41].sheet, plan.dips) == (150, 1, 2, 153)
+    assert "self_check" not in make_plan(config, example("protocol-calibration.toml")).steps
+    small = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\nlegs_mm = [50.0, 15.0]\n\n[motion]")
+    with pytest.raises(ConfigError, match=r"rig.toml: self_check.legs_mm: a triangle of 50 by 15 mm does not fit"):
+        check_plan(tmp_path / "rig.toml", EXAMPLES / "protocol.toml", small, example("protocol.toml"))
+
+
+def test_moves_of_a_touch_end_above_where_they_began(tmp_path: Path) -> None:
+    config = rig(tmp_path)
+    walked = next(w for w in walk(config, example("protocol-calibration.toml")) if w.step.kind == StepKind.TOUCH)
+    moves = [part for part in moves_of(config, PaperPlane(120.0), walked.step, None).parts if isinstance(part, Move)]
+    assert moves[0].target == moves[-1].target
+    assert min(move.target.z_mm for move in moves) == 120.0

@@ -1,0 +1,162 @@
+"""`brushloop collect plan`: tables, JSON, a picture, the controller's word on reach; and `collect` as it was."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import cv2
+import pytest
+from typer.testing import CliRunner
+
+import collect.cli
+from collect.config import RigConfig, load_rig
+from collect.errors import ConfigError
+from collect.plane import PaperPlane
+from collect.planning.asking import ask_reach
+from collect.planning.limits import all_poses
+from collect.planning.picture import draw_plan
+from collect.planning.summary import make_plan
+from collect.protocols.loading import load_protocol
+from drivers.arcs.codes import RobotMode
+from drivers.errors import ConnectionLost
+from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.config import SimConfig
+from drivers.sim.rig_toml import Addresses, rig_toml
+from drivers.sim.world import World
+
+EXAMPLES = Path(__file__).parents[3] / "examples"
+HERE = "127.0.0.1"
+
+
+@pytest.fixture
+def rig_path(tmp_path: Path) -> Path:
+    path = tmp_path / "rig.toml"
+    path.write_text(rig_toml(SimConfig(), Addresses(HERE, 1, 2, 3, 4, "/dev/ttyUSB0")))
+    return path
+
+
+@pytest.fixture
+async def cabinet() -> AsyncIterator[ArcsServer]:
+    server = ArcsServer(World(SimConfig(rate=20.0)))
+    await server.start(HERE, 0)
+    yield server
+    await server.stop()
+
+
+def at(rig_path: Path, port: int) -> RigConfig:
+    rig_path.write_text(rig_path.read_text().replace("port = 1\n", f"port = {port}\n"))
+    return load_rig(rig_path)
+
+
+def plan(rig_path: Path, name: str, *options: str) -> str:
+    arguments = ["plan", "--config", str(rig_path), "--protocol", str(EXAMPLES / name), *options]
+    ran = CliRunner().invoke(collect.cli.app, arguments, catch_exceptions=False)
+    assert ran.exit_code == 0
+    return ran.stdout
+
+
+def test_the_table_says_what_it_takes(rig_path: Path) -> None:
+    words = " ".join(plan(rig_path, "protocol.toml").split())
+    for expected in ("4 of 42 cells", "a fresh one before", "150 press", "not counting", "at most"):
+        assert expected in words
+
+
+def test_json_is_one_object(rig_path: Path) -> None:
+    made = json.loads(plan(rig_path, "protocol-write.toml", "--json"))
+    assert (made["kind"], made["dips"], made["poses_in_reach"]) == ("write", 4, None)
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.toml")))
+def test_every_kind_has_a_picture(rig_path: Path, tmp_path: Path, name: str) -> None:
+    path = tmp_path / "plan.png"
+    wanted = load_protocol(EXAMPLES / name)
+    draw_plan(load_rig(rig_path), wanted, make_plan(load_rig(rig_path), wanted), path)
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    assert min(image.shape) > 400
+    assert image.std() > 10.0
+
+
+def test_a_picture_shows_names_that_no_font_here_has(rig_path: Path, tmp_path: Path) -> None:
+    text = (EXAMPLES / "protocol-write.toml").read_text().replace('"shi"', '"永$x"')
+    (tmp_path / "protocol.toml").write_text(text)
+    (tmp_path / "shi-1.csv").write_text((EXAMPLES / "shi-1.csv").read_text())
+    wanted = load_protocol(tmp_path / "protocol.toml")
+    draw_plan(load_rig(rig_path), wanted, make_plan(load_rig(rig_path), wanted), tmp_path / "plan.png")
+    assert (tmp_path / "plan.png").stat().st_size > 0
+
+
+async def test_the_controller_is_asked_for_every_pose_and_nothing_is_powered_set_or_moved(
+    rig_path: Path, cabinet: ArcsServer
+) -> None:
+    config, asked = at(rig_path, cabinet.port), list[str]()
+    cabinet.cabinet.tcp_offset = [0.01, 0.0, 0.05, 0.0, 0.0, 0.4]  # another tool than ours is set there
+    for name, method in list(cabinet._methods.items()):
+        cabinet._methods[name] = lambda p, name=name, method=method: (asked.append(name), method(p))[1]
+    wanted = load_protocol(EXAMPLES / "protocol-write.toml")
+    count = await ask_reach(rig_path, config, all_poses(config, wanted, PaperPlane(120.0)))
+    assert count > 40
+    assert {name.split(".")[-1] for name in asked} == {
+        "getRobotNames",
+        "getTcpOffset",
+        "getJointPositions",
+        "inverseKinematics",
+    }
+    assert cabinet.mode == RobotMode.POWER_OFF
+    assert cabinet.cabinet.tcp_offset[0] == 0.01
+
+
+async def test_the_first_pose_out_of_reach_is_named(rig_path: Path, cabinet: ArcsServer) -> None:
+    config = at(rig_path, cabinet.port)
+    far = config.model_copy(update={"paper": config.paper.model_copy(update={"origin_mm": (1200.0, -110.0)})})
+    wanted = load_protocol(EXAMPLES / "protocol.toml")
+    with pytest.raises(ConfigError, match=r"rig.toml: paper: the controller finds no joints for zero_touch: x = 1198"):
+        await ask_reach(rig_path, far, all_poses(far, wanted, PaperPlane(120.0)))
+
+
+async def test_reach_is_that_of_our_tool_whatever_is_set_on_the_controller(rig_path: Path, cabinet: ArcsServer) -> None:
+    """The same pose is as far away with either tool set; only a wrong conversion would bring it into reach."""
+    config, edges = at(rig_path, cabinet.port), list[float]()
+    wanted = load_protocol(EXAMPLES / "protocol-calibration.toml")
+    for offset in ([0.0] * 6, [0.0, 0.0, 0.18, 0.0, 0.0, 0.0], [0.05, -0.1, 0.3, 0.0, 0.0, 1.0]):
+        cabinet.cabinet.tcp_offset = offset
+        x_mm = 700.0
+        while x_mm < 1200.0:
+            far = config.model_copy(update={"paper": config.paper.model_copy(update={"origin_mm": (x_mm, -110.0)})})
+            try:
+                await ask_reach(rig_path, far, all_poses(far, wanted, PaperPlane(120.0)))
+            except ConfigError:
+                break
+            x_mm += 20.0
+        edges.append(x_mm)
+    assert 700.0 < edges[0] < 1200.0
+    assert edges == [edges[0]] * 3
+
+
+async def test_a_controller_that_does_not_answer_is_an_error_of_the_device(rig_path: Path) -> None:
+    with pytest.raises(ConnectionLost):
+        await ask_reach(rig_path, load_rig(rig_path), [])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("collect",), 2, "Missing option '--config'"),
+        (("collect", "--config", "no.toml"), 2, "Missing option '--protocol'"),
+        (("collect", "--config", "no.toml", "--protocol", "no.toml", "--no-tui"), 2, "no.toml: no such file"),
+        (("collect", "plan"), 2, "Missing option '--config'"),
+        (("collect", "plan", "--config", "no.toml", "--protocol", "no.toml"), 2, "no.toml: no such file"),
+    ],
+)
+def test_the_command_line_says_what_is_missing(
+    tmp_path: Path, arguments: tuple[str, ...], code: int, words: str
+) -> None:
+    ran = subprocess.run(
+        [sys.executable, "-m", "brushloop", *arguments], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert ran.returncode == code
+    assert words in ran.stderr

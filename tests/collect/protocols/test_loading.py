@@ -1,0 +1,155 @@
+"""A protocol that cannot be used is one line that names file, line, field and range; nothing huge or odd is read."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from collect.errors import ConfigError
+from collect.protocols import loading, table
+from collect.protocols.config import GridConfig, ListConfig, WriteConfig
+from collect.protocols.loading import load_protocol
+
+EXAMPLES = Path(__file__).parents[3] / "examples"
+LIST = 'kind = "list"\nfile = "p.csv"\n'
+REPLAY = 'kind = "replay"\nof = "old"\nfile = "p.csv"\n'
+WRITE = 'kind = "write"\ncell_mm = [60.0, 60.0]\n[[figures]]\nname = "a"\n[[figures.strokes]]\n'
+POINTS = "points = [[10.0, 10.0, 5.0, 0.0, 0.0], [20.0, 10.0, 5.0, 0.0, 0.0]]\n"
+CALIBRATION = 'kind = "calibration"\n'
+
+
+def load(folder: Path, protocol: str, csv: str | bytes | None = None):
+    (folder / "protocol.toml").write_text(protocol, encoding="utf-8")
+    if csv is not None:
+        (folder / "p.csv").write_bytes(csv if isinstance(csv, bytes) else csv.encode())
+    return load_protocol(folder / "protocol.toml")
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.stem)
+def test_the_examples_are_valid(path: Path) -> None:
+    assert load_protocol(path).kind in path.stem or isinstance(load_protocol(path), GridConfig)
+
+
+@pytest.mark.parametrize(
+    ("protocol", "csv", "message"),
+    [
+        (LIST, "height_mm\n11\nx\n", r"p.csv: line 3: height_mm: .*, more than 0 and at most 100 \(given: 'x'\)$"),
+        (LIST, "height_mm,tilt_deg\n11,31\n", r"p.csv: line 2: tilt_deg: must be a number, at least 0 and at most 30"),
+        (LIST, "height_mm\nnan\n", r"line 2: height_mm: must be a number"),
+        (LIST, "height_mm\ninf\n", r"line 2: height_mm: must be a number"),
+        (LIST, "height_mm\n0\n", r"line 2: height_mm: must be a number, more than 0"),
+        (LIST, "height_mm,dwell_s\n11,61\n", r"line 2: dwell_s: must be a number, at least 0 and at most 60"),
+        (LIST, "height_mm,tilt_deg\n,5\n", r"line 2: height_mm: is empty"),
+        (LIST, "height_mm,tilt_deg\n11\n", r"line 2: 1 cells under 2 columns"),
+        (LIST, "height_mm,tilt\n11,5\n", r"p.csv: line 1: tilt: no such column; there are height_mm, tilt_deg"),
+        (LIST, "tilt_deg\n5\n", r"line 1: the column height_mm is missing"),
+        (LIST, "height_mm,height_mm\n5,5\n", r"line 1: the column height_mm is there twice"),
+        (LIST, "height_mm\n", r"p.csv: has no rows"),
+        (LIST, "", r"p.csv: line 1: the column height_mm is missing"),
+        (LIST, b"height_mm\n\xff\n", r"p.csv: is not UTF-8 at byte 10"),
+        (LIST, 'height_mm\n"11', r"p.csv: line 2: is not CSV"),
+        (LIST, "height_mm,stroke_id\n11,a/b\n", r"line 2: stroke_id: a name has no .*slashes"),
+        (LIST, "height_mm,stroke_id\n11,\x1b[2J\n", r"line 2: stroke_id: .*control"),
+        (LIST, "height_mm,stroke_id\n11,a\n12,a\n", r"presses: 'a' is there twice"),
+        (LIST, None, r"p.csv: no such file"),
+        (LIST.replace("p.csv", "../p.csv"), None, r"protocol.toml: file: must be the plain name of a file next to it"),
+        (LIST.replace("p.csv", "/etc/passwd"), None, r"file: must be the plain name"),
+        (LIST.replace('"p.csv"', "3"), None, r"file: must be the plain name"),
+        (LIST + "presses = []\n", "height_mm\n11\n", r"presses: a file is named too"),
+        ('kind = "list"\n', None, r"protocol.toml: presses: Field required"),
+        ('kind = "list"\npresses = []\n', None, r"presses: .*at least 1"),
+        (REPLAY, "stroke_id,height_mm\na,11\n", r"line 1: the column tilt_deg is missing"),
+        (REPLAY, "stroke_id,height_mm,tilt_deg\na,11,-0.2\n", r"line 2: tilt_deg: must be a number, at least 0"),
+        (REPLAY + 'ignored_columns = ["x"]\n', "stroke_id,height_mm,tilt_deg\na,11,0\n", r"ignored_columns: a file"),
+        (REPLAY.replace("old", "a b"), "stroke_id,height_mm,tilt_deg\na,11,0\n", r"of = 'a b'"),
+        (WRITE + 'file = "p.csv"\n' + POINTS, None, r"figures.0.strokes.0.file: points are given too"),
+        (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,height_mm\n1,1,3\n70,1,3\n", r"the point \[70, 1\] lies outside"),
+        (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,height_mm\n1,1,3\n1.5,1,3\n", r"point 2 lies less than 1 mm from"),
+        (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,height_mm\n1,1,3\n", r"figures.0.strokes.0.points: .*at least 2"),
+        (WRITE + POINTS.replace("5.0,", "-1.0,"), None, r"nothing would be drawn"),
+        (WRITE + POINTS.replace("20.0", "nan"), None, r"figures.0.strokes.0.points.1.0: "),
+        (WRITE.replace('"a"', '"a b"') + POINTS, None, r"figure 'a b': .*spaces"),
+        ('kind = "write"\ncell_mm = [60.0, 60.0]\nfigures = 3\n', None, r"figures: "),
+        (CALIBRATION + "touches_mm = [[1.0, 1.0], [1.0, 1.0]]\n", None, r"touches_mm has the same point twice"),
+        (CALIBRATION + "board_every = 3\n", None, r"use board_views"),
+        ('kind = "teapot"\n', None, r"protocol.toml: kind: .*'grid', 'list', 'replay', 'write', 'calibration'"),
+        ("x = 1\n", None, r"protocol.toml: kind: "),
+        ('kind = "grid"\nheights_mm = [11.0]\ntilts_deg = [0.0]\nspeed = 3\n', None, r"speed: Extra inputs"),
+        ('kind = "grid"\nheights_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 0\n', None, r"repeats: .*1 \(given: 0\)$"),
+        ("kind = ", None, r"is not TOML"),
+        ("x = " + "[" * 5000, None, r"is not TOML"),
+    ],
+)  # fmt: skip
+def test_a_protocol_that_cannot_be_used_is_one_line(
+    tmp_path: Path, protocol: str, csv: str | bytes | None, message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message) as refused:
+        load(tmp_path, protocol, csv)
+    assert refused.value.exit_code == 2
+    assert "\n" not in str(refused.value)
+    assert len(str(refused.value)) < 600
+
+
+def test_rows_become_part_of_the_protocol_and_an_empty_cell_is_left_out(tmp_path: Path) -> None:
+    listed = load(tmp_path, LIST, "\ufeffheight_mm , tilt_deg,stroke_id\r\n 11.5,,deep\r\n\r\n12,3,\r\n")
+    assert isinstance(listed, ListConfig)
+    assert [(row.height_mm, row.tilt_deg, row.stroke_id) for row in listed.presses] == [
+        (11.5, 0, "deep"),
+        (12, 3, None),
+    ]
+    assert '"height_mm":11.5' in listed.model_dump_json()
+    (tmp_path / "p.csv").write_text("height_mm\n13\n")
+    assert load_protocol(tmp_path / "protocol.toml").model_dump_json() != listed.model_dump_json()
+
+
+def test_rows_and_bytes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError, match=r"p.csv: line 10002: more than 10000 rows"):
+        load(tmp_path, LIST, "height_mm\n" + "11\n" * 10_001)
+    monkeypatch.setattr(table, "MAX_TABLE_BYTES", 1000)
+    with pytest.raises(ConfigError, match=r"p.csv: is larger than 1000 bytes"):
+        load(tmp_path, LIST, "height_mm\n" + "11\n" * 1000)
+    monkeypatch.setattr(loading, "MAX_PROTOCOL_BYTES", 100)
+    with pytest.raises(ConfigError, match=r"protocol.toml: is larger than 100 bytes"):
+        load(tmp_path, LIST + "#" * 200, "height_mm\n11\n")
+
+
+def test_strokes_and_points_are_bounded_over_the_whole_protocol(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"12000 strokes with repeats, at most 10000"):
+        load(tmp_path, LIST + "repeats = 1000\n", "height_mm\n" + "11\n" * 12)
+    rows = "".join(f"{1 + k % 50},{1 + k // 50 % 50},5\n" for k in range(900))
+    figures = "".join(f'[[figures]]\nname = "f{k}"\n[[figures.strokes]]\nfile = "p.csv"\n' for k in range(12))
+    with pytest.raises(ConfigError, match=r"more than \d+ rows"):
+        load(tmp_path, f'kind = "write"\ncell_mm = [60.0, 60.0]\n{figures}', "x_mm,y_mm,height_mm\n" + rows)
+
+
+def test_what_is_no_file_is_not_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "p.csv")
+    with pytest.raises(ConfigError, match=r"p.csv: is not a file"):
+        load(tmp_path, LIST)
+    with pytest.raises(ConfigError, match=r"is not a file"):
+        load_protocol(tmp_path)
+
+
+def test_names_of_a_list_may_not_meet_those_of_its_own_repeats(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"'a-r02' is there twice"):
+        load(tmp_path, LIST + "repeats = 2\n", "height_mm,stroke_id\n11,a\n12,a-r02\n")
+
+
+def test_chinese_names_are_names(tmp_path: Path) -> None:
+    assert isinstance(load(tmp_path, WRITE.replace('"a"', '"永"') + POINTS), WriteConfig)
+
+
+@given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_whatever_stands_in_the_files_is_read_or_refused(tmp_path: Path, rubbish: bytes) -> None:
+    for csv in (rubbish, b"height_mm,stroke_id\n" + rubbish):
+        with contextlib.suppress(ConfigError):
+            load(tmp_path, LIST, csv)
+    (tmp_path / "protocol.toml").write_bytes(rubbish)
+    with pytest.raises(ConfigError):
+        load_protocol(tmp_path / "protocol.toml")

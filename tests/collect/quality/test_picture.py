@@ -1,0 +1,142 @@
+"""Blur, glare, light and frame on made-up pictures, where the right answer is known."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from calibrate.scale import PlaneFit
+from collect.quality.check import cell_is_blank, check_capture, check_frame
+from collect.quality.config import QualityConfig
+from collect.quality.picture import blur_px, glare, paper_level
+from collect.quality.verdict import Failure, Family
+from collect.sheet import Cell
+
+LIMITS = QualityConfig()
+PX = 8.0
+CELL = Cell(0, 20.0, 15.0, 40.0, 24.0)
+Gray = NDArray[np.uint8]
+
+
+def plane(height_px: int = 480) -> PlaneFit:
+    """8 px/mm, the paper's lower left corner at the picture's."""
+    step = 1.0 / PX
+    to_paper = np.array([[step, 0.0, 0.5 * step], [0.0, -step, height_px * step - 0.5 * step], [0.0, 0.0, 1.0]])
+    return PlaneFit(to_paper, step, (step, step), 0.0, 0, 0)
+
+
+def paper(*, seed: int = 0) -> Gray:
+    noise = np.random.default_rng(seed).normal(0.0, 1.5, (480, 640))
+    return np.clip(200.0 + noise, 0.0, 255.0).astype(np.uint8)
+
+
+def stroke(image: Gray, x_mm: float, y_mm: float, length_mm: float = 18.0, level: int = 20) -> Gray:
+    """A lens-shaped mark that ends at (x, y) and runs toward -x."""
+    middle = (round((x_mm - length_mm / 2) * PX), round(480 - y_mm * PX))
+    cv2.ellipse(image, middle, (round(length_mm / 2 * PX), round(3.0 * PX)), 0.0, 0.0, 360.0, level, -1, cv2.LINE_AA)
+    return image
+
+
+@given(sigma=st.floats(0.8, 4.0), contrast=st.integers(40, 200))
+@settings(max_examples=15, deadline=None)
+def test_blur_is_measured_whatever_the_contrast(sigma: float, contrast: int) -> None:
+    sharp = np.full((400, 400), 220, np.uint8)
+    sharp[:, 200:] -= np.uint8(contrast)
+    sharp[:200, :100] -= np.uint8(contrast)
+    blurred = cv2.GaussianBlur(sharp.astype(np.float32), (0, 0), sigma)
+    found = blur_px(np.rint(blurred).astype(np.uint8))
+    assert found is not None
+    assert found == pytest.approx(sigma, abs=0.1 + 0.1 * sigma)
+
+
+def test_a_shake_along_one_direction_counts_as_blur() -> None:
+    image = stroke(stroke(paper(), 40.0, 20.0), 60.0, 40.0)
+    shaken = cv2.blur(image, (15, 1)).astype(np.uint8)
+    sharp, dragged = blur_px(image), blur_px(shaken)
+    assert sharp is not None
+    assert dragged is not None
+    assert dragged > 3.0 * sharp
+
+
+def test_a_bare_sheet_has_no_edge_to_measure_and_is_not_called_blurred() -> None:
+    assert blur_px(paper()) is None
+    assert check_frame(paper(), plane(), LIMITS).passed
+
+
+@pytest.mark.parametrize(("gain", "word"), [(0.2, "too dark"), (1.6, "too bright")])
+def test_exposure_is_told_in_words(gain: float, word: str) -> None:
+    image = np.clip(stroke(paper(), 50.0, 27.0) * gain, 0.0, 255.0).astype(np.uint8)
+    verdict = check_frame(image, plane(), LIMITS)
+    assert verdict.cause is not None
+    assert verdict.cause.name is Failure.EXPOSURE
+    assert word in verdict.reason
+    assert paper_level(paper()) == pytest.approx(200.0, abs=2.0)
+
+
+def test_a_lamp_is_glare_and_the_edge_of_a_shadow_is_not() -> None:
+    y, x = np.mgrid[0:480, 0:640]
+    shadow = paper() * np.where(x > 330, 0.7, 1.0)
+    assert not glare(np.asarray(shadow, np.uint8), 0.1).any()
+    lamp = paper() + 80.0 * np.exp(-0.5 * ((x - 320.0) ** 2 + (y - 240.0) ** 2) / 50.0**2)
+    assert glare(np.clip(lamp, 0, 255).astype(np.uint8), 0.1).any()
+
+
+def test_a_sound_mark_passes_and_its_place_is_measured() -> None:
+    anchor = CELL.anchor_mm
+    image = stroke(paper(), anchor[0] + 0.7, anchor[1])
+    verdict = check_capture(image, plane(), CELL, height_mm=14.0, limits=LIMITS, previous=paper(seed=1))
+    assert verdict.passed, verdict.reason
+    moved = stroke(paper(), anchor[0] + 0.7, anchor[1] + 3.0)
+    verdict = check_capture(moved, plane(), CELL, height_mm=14.0, limits=LIMITS, previous=paper(seed=1))
+    assert verdict.cause is not None
+    assert verdict.cause.name is Failure.MISPLACED
+    assert verdict.cause.score == pytest.approx(3.0, abs=0.2)
+
+
+def test_a_brush_that_lies_down_the_other_way_is_sound_too() -> None:
+    anchor = CELL.anchor_mm
+    image = stroke(paper(), anchor[0] - 0.7 + 9.0, anchor[1], length_mm=9.0)
+    assert check_capture(image, plane(), CELL, height_mm=11.0, limits=LIMITS).passed
+
+
+def test_a_press_in_another_cell_is_misplaced_and_not_blank_where_the_still_before_is_known() -> None:
+    before = stroke(paper(seed=1), 50.0, 8.0)
+    image = stroke(stroke(paper(), 50.0, 8.0), 50.0, 48.0)
+    verdict = check_capture(image, plane(), CELL, height_mm=14.0, limits=LIMITS, previous=before, sheet_mm=(80.0, 60.0))
+    assert verdict.cause is not None
+    assert verdict.cause.name is Failure.MISPLACED
+    assert verdict.cause.score == pytest.approx(18.0, abs=1.0)
+    alone = check_capture(image, plane(), CELL, height_mm=14.0, limits=LIMITS, sheet_mm=(80.0, 60.0))
+    assert alone.cause is not None
+    assert alone.cause.name is Failure.BLANK
+
+
+def test_a_mark_at_the_edge_of_the_frame_is_cut_and_nothing_else_is_said_of_it() -> None:
+    cell = Cell(3, -22.0, 15.0, 40.0, 24.0)
+    image = stroke(paper(), cell.anchor_mm[0] + 0.7, cell.anchor_mm[1])
+    verdict = check_capture(image, plane(), cell, height_mm=14.0, limits=LIMITS)
+    assert verdict.cause is not None
+    assert verdict.cause.name is Failure.CUT
+    assert {check.name.family for check in verdict.checks} == {Family.PICTURE}
+
+
+def test_a_cell_that_is_not_wholly_seen_is_not_called_blank() -> None:
+    hidden = cell_is_blank(paper(), plane(), Cell(3, -10.0, 15.0, 40.0, 24.0), limits=LIMITS)
+    assert not hidden.passed
+    assert "not wholly in the picture" in hidden.reason
+    inked = cell_is_blank(stroke(paper(), 50.0, 27.0), plane(), CELL, limits=LIMITS)
+    assert not inked.passed
+    assert "Cell 0 is not blank" in inked.reason
+    assert cell_is_blank(paper(), plane(), CELL, limits=LIMITS).passed
+
+
+def test_limits_that_contradict_each_other_are_refused() -> None:
+    with pytest.raises(ValidationError, match="dark_level"):
+        QualityConfig(dark_level=200.0, bright_level=150.0)
+    with pytest.raises(ValidationError, match="split_m"):
+        QualityConfig.model_validate({"split_m": 1.0})

@@ -1,0 +1,102 @@
+"""A small set of captures with a label, every failure at least twice: each must be called by its name."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+import pytest
+
+from bench.quality import Score, score
+from bench.quality_set import SPOTLESS_MM2, Bench, Patch, Sample
+from collect.quality.check import cell_is_blank, check_capture
+from collect.quality.config import QualityConfig
+from collect.quality.verdict import Failure
+
+EACH, SOUND = 2, 10
+LIMITS = QualityConfig()
+
+
+def draw() -> Iterator[Sample | Patch]:
+    wanted: list[Failure | None] = [*itertools.chain(*[Failure] * EACH), *[None] * SOUND]
+    for sheet in itertools.count():
+        bench = Bench(41, sheet)
+        for index in range(bench.sheet.capacity):
+            cell = bench.sheet.cell(index)
+            if not wanted:
+                return
+            there_mm2 = bench.ink_mm2(cell)
+            if there_mm2 > SPOTLESS_MM2:
+                continue
+            yield Patch(True, bench.still, bench.plane, cell)
+            sample = bench.capture(cell, wanted[0])
+            if sample is None:
+                continue
+            if sample.label is wanted[0]:
+                del wanted[0]
+            yield sample
+            if sample.label is None:
+                yield Patch(False, bench.still, bench.plane, cell)
+
+
+@pytest.fixture(scope="module")
+def drawn() -> list[Sample | Patch]:
+    return list(draw())
+
+
+@pytest.fixture(scope="module")
+def told(drawn: list[Sample | Patch]) -> Score:
+    return score(drawn, LIMITS)
+
+
+@pytest.mark.parametrize("failure", list(Failure))
+def test_a_failure_is_called_by_its_name(told: Score, failure: Failure) -> None:
+    assert told.of(failure) >= EACH
+    assert told.recall(failure) == 1.0, told.confused(failure)
+    assert told.precision(failure) >= 0.66
+
+
+def test_a_sound_stroke_is_left_alone(told: Score) -> None:
+    assert told.of(None) >= SOUND
+    assert told.false_alarms == 0.0, told.confused(None)
+
+
+def test_a_cell_is_called_blank_only_where_it_is(told: Score) -> None:
+    assert told.patches[True, False] == 0
+    assert told.patches[False, True] == 0
+    assert told.patches[False, False] >= SOUND
+
+
+def test_without_a_still_from_before_the_stroke_itself_is_judged_the_same(drawn: list[Sample | Patch]) -> None:
+    bristles = {None, Failure.DRY, Failure.FAINT, Failure.SPLIT, Failure.BENT, Failure.BLANK}
+    told = score([s for s in drawn if isinstance(s, Sample) and s.label in bristles], LIMITS, with_previous=False)
+    assert told.false_alarms == 0.0
+    assert sum(told.counts[label, label] for label in bristles) >= len(told.seconds) - 1
+
+
+def test_a_verdict_tells_the_operator_what_was_seen_and_what_to_do(drawn: list[Sample | Patch]) -> None:
+    split = next(s for s in drawn if isinstance(s, Sample) and s.label is Failure.SPLIT)
+    verdict = check_capture(
+        split.image, split.plane, split.cell, height_mm=split.height_mm, limits=LIMITS, previous=split.before
+    )
+    assert verdict.cause is not None
+    assert verdict.cause.score > verdict.cause.threshold == LIMITS.split_mm
+    assert "mm" in verdict.reason
+    assert "Comb the brush" in verdict.reason
+    told = verdict.check(Failure.FAINT)
+    assert told is not None
+    assert told.passed
+    assert told.reason == ""
+
+
+def test_limits_come_from_the_configuration(drawn: list[Sample | Patch]) -> None:
+    sound = next(s for s in drawn if isinstance(s, Sample) and s.label is None)
+    strict = LIMITS.model_copy(update={"faint_tone": 0.99})
+    verdict = check_capture(
+        sound.image, sound.plane, sound.cell, height_mm=sound.height_mm, limits=strict, previous=sound.before
+    )
+    assert verdict.cause is not None
+    assert verdict.cause.name is Failure.FAINT
+    inked = next(p for p in drawn if isinstance(p, Patch) and not p.blank)
+    lax = LIMITS.model_copy(update={"foreign_mm2": 900.0})
+    assert cell_is_blank(inked.image, inked.plane, inked.cell, limits=lax).passed

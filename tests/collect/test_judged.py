@@ -1,0 +1,117 @@
+"""Captures are judged as they come: a bad stroke is made again elsewhere, then a person decides."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import pytest
+
+from collect.errors import CollectAborted, NeedsOperator
+from collect.states import State
+from drivers.sim.flaws import Flaw
+from sessions.journal import replay
+from sessions.reader import Recording
+
+if TYPE_CHECKING:
+    from conftest import Lab
+
+    from collect.engine import Engine
+    from collect.snapshot import Snapshot
+
+
+def run(engine: Engine) -> None:
+    engine.start()
+    engine.join()
+
+
+def answered(engine: Engine, answer: str, *, over: Callable[[Snapshot], bool]) -> list[str]:
+    """Run, answering every question the same way; the questions."""
+    engine.start()
+    asked: dict[int, str] = {}
+    deadline = time.monotonic() + 60.0
+    while not over(now := engine.snapshot()) and not engine.finished:
+        assert time.monotonic() < deadline, now
+        if now.prompt is not None and now.prompt.number not in asked:
+            asked[now.prompt.number] = now.prompt.question
+            assert engine.answer(now.prompt.number, answer)
+        time.sleep(0.01)
+    engine.join()
+    return list(asked.values())
+
+
+def used(lab: Lab) -> int:
+    [folder] = lab.sessions.iterdir()
+    return len(replay(folder / "journal.jsonl").used_cells)
+
+
+def test_a_split_stroke_is_pressed_again_on_a_new_cell_and_only_the_sound_one_counts(sharp_lab: Lab) -> None:
+    sharp_lab.rig.world.flaws[0] = (Flaw.SPLIT, 1.0)
+    engine = sharp_lab.engine()
+    run(engine)
+
+    now = engine.snapshot()
+    assert (now.state, now.strokes_done, now.given_up) == (State.DONE, 1, 0)
+    assert any("split" in line.lower() for line in now.messages), now.messages
+    assert used(sharp_lab) == 2 + now.voids
+    [folder] = sharp_lab.sessions.iterdir()
+    [capture] = Recording(folder).captures()
+    assert capture.stroke.stroke_id == "H13-a0-r01"
+    assert capture.stroke.anchor_mm == pytest.approx(
+        (sharp_lab.rig.world.presses[-1].x_mm, sharp_lab.rig.world.presses[-1].y_mm), abs=0.1
+    )
+
+
+def test_a_stroke_that_fails_every_time_is_given_up_where_nobody_watches(sharp_lab: Lab) -> None:
+    sharp_lab.rig.world.flaws.update(dict.fromkeys(range(20), (Flaw.SPLIT, 1.0)))
+    engine = sharp_lab.engine()
+    run(engine)
+    now = engine.snapshot()
+    assert (now.state, now.strokes_done, now.given_up) == (State.DONE, 0, 1)
+    assert used(sharp_lab) == 3 + now.voids
+
+
+def test_an_operator_who_watches_may_keep_it(sharp_lab: Lab) -> None:
+    sharp_lab.rig.world.flaws.update(dict.fromkeys(range(20), (Flaw.SPLIT, 1.0)))
+    engine = sharp_lab.engine(watched=True)
+    [question] = answered(engine, "k", over=lambda now: now.state is State.DONE)
+    assert question.startswith("H13-a0-r01: ")
+    assert (engine.snapshot().strokes_done, engine.snapshot().given_up) == (1, 0)
+
+
+def test_ink_on_a_cell_that_should_be_blank_is_seen_before_the_press(sharp_lab: Lab) -> None:
+    world = sharp_lab.rig.world
+    world.paper.lay(world.brush.press(13.0, 0.0, ink_load=1.0, press_seed=5), 31.0, 159.0, 0.0)
+    world.version += 1
+    with pytest.raises(NeedsOperator, match=r"cells? of sheet 1 that should be blank"):
+        run(sharp_lab.engine())
+    assert not [press for press in world.presses if press.depth_mm > 1.0]
+
+
+def test_a_full_sheet_is_changed_on_the_screen_and_the_run_goes_on(sharp_lab: Lab) -> None:
+    text = (sharp_lab.folder / "rig.toml").read_text(encoding="utf-8")
+    (sharp_lab.folder / "rig.toml").write_text(
+        text.replace("cell_mm = [40.0, 24.0]", "cell_mm = [200.0, 120.0]"), encoding="utf-8"
+    )
+    sharp_lab.write_protocol("[13.0, 15.0]", "[0.0]")
+    engine = sharp_lab.engine(watched=True)
+    engine.start()
+    deadline = time.monotonic() + 60.0
+    while (prompt := engine.snapshot().prompt) is None:
+        assert not engine.finished, engine.snapshot()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert "Sheet 1 is full" in prompt.question
+    sharp_lab.rig.world.fresh_sheet()
+    assert engine.answer(prompt.number, "g")
+    engine.join()
+    assert engine.snapshot().strokes_done == 2
+
+
+def test_saying_no_to_real_hardware_leaves_it_as_it_is(sharp_lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.arcs.robot.LOOPBACK_CONTROL_BOX", "something else")
+    engine = sharp_lab.engine(watched=True)
+    with pytest.raises(CollectAborted, match="nothing moved"):
+        answered(engine, "x", over=lambda now: now.state in (State.STOPPED, State.FAILED))
+    assert sharp_lab.rig.arcs.mode == "PowerOff"

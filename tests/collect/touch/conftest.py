@@ -1,0 +1,175 @@
+"""A rig without wires: the loopback world moved, felt and photographed directly, so that a touch takes milliseconds."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from collect.config import load_rig
+from collect.procedures import Procedures
+from collect.rig import Rig, limits_of
+from collect.touch.tap import ForceTap
+from drivers.force.samples import ForceSample
+from drivers.geometry import brush_pose
+from drivers.samples import Frame, Identity, Pose, PoseSample, Stamp
+from drivers.sim.config import SimConfig, Table, View
+from drivers.sim.rig_toml import Addresses, rig_toml
+from drivers.sim.scene import Scene
+from drivers.sim.world import World
+
+SMALL_TABLE = Table(
+    sheet_mm=(110.0, 80.0),
+    board_origin_mm=(-20.0, -20.0),
+    board_squares=(15, 12),
+    board_square_mm=10.0,
+    board_marker_mm=7.0,
+    well_mm=(150.0, 20.0),
+)
+SMALL_VIEW = View(width_px=480, height_px=360, px_per_mm=2.8, centre_mm=(55.0, 40.0))
+IDENTITY = Identity("bench", "world without wires", "", True)
+
+
+class OwnClock:
+    """Time that passes only when the arm moves."""
+
+    rate = 1.0
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def now_s(self) -> float:
+        return self.seconds
+
+    def now_ns(self) -> int:
+        return round(self.seconds * 1e9)
+
+
+@dataclass
+class Bench:
+    """`Robot`, `Camera`, `ForceSensor` and `Clock` over one world, and the rig that they are."""
+
+    sim: SimConfig
+    folder: Path
+    world: World = field(init=False)
+    clock: OwnClock = field(default_factory=OwnClock)
+    bent: Callable[[Pose], Pose] = lambda pose: pose
+    """What the arm makes of a target: for arms that are mounted wrong."""
+
+    def __post_init__(self) -> None:
+        self.world = World(self.sim)
+        self.world.clock = self.clock  # pyright: ignore[reportAttributeAccessIssue]
+        self.scene = Scene(self.world)
+        self.rng = np.random.default_rng(self.sim.seed)
+        self.target = brush_pose(*self.sim.home_mm)
+        self.on_sample: Callable[[ForceSample], None] | None = None
+
+        text = rig_toml(self.sim, Addresses("127.0.0.1", 1, 1, 1, 1, None))
+        text = re.sub(r"touch_z_mm = .*", "touch_z_mm = 120.0", text)
+        (self.folder / "rig.toml").write_text(text)
+        config = load_rig(self.folder / "rig.toml")
+        self.limits = limits_of(config)
+        devices: Any = self
+        self.rig = Rig(config, devices, devices, devices, IDENTITY, IDENTITY, force=devices)
+        self.hands = BenchHands(self)
+        self.tap = BenchTap(self)
+
+    def truth_mm(self, x_mm: float, y_mm: float) -> float:
+        """The height of the sheet."""
+        return self.sim.table.surface_z_mm(x_mm, y_mm)
+
+    @property
+    def lifted(self) -> bool:
+        """Whether the tip is at travel height or above."""
+        return self.target.z_mm >= self.rig.config.motion.safe_z_mm
+
+    # Clock
+    def now_ns(self) -> int:
+        return self.clock.now_ns()
+
+    # Robot
+    async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
+        self.limits.check("robot", target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
+        self.target = target
+        self.world.motion.add(self.bent(target), speed_mm_s, acc_mm_s2, self.clock.seconds)
+        self.clock.seconds += 1e3
+        self.world.motion.advance(self.clock.seconds)
+
+    async def where(self) -> Pose:
+        return self.target
+
+    def latest(self) -> PoseSample:
+        return PoseSample(Stamp(self.clock.now_ns()), self.target)
+
+    # Camera
+    async def fresh(self, after: Stamp) -> Frame:
+        return Frame(Stamp(self.clock.now_ns()), after.host_ns, self.photograph())
+
+    def photograph(self) -> NDArray[np.uint8]:
+        return self.scene.render(tool=self.world.tool())
+
+    # ForceSensor
+    def listen(self, on_sample: Callable[[ForceSample], None] | None) -> None:
+        self.on_sample = on_sample
+
+
+class BenchTap(ForceTap):
+    """Averages of the world's own force with the rig's noise, drawn at once."""
+
+    def __init__(self, bench: Bench) -> None:
+        super().__init__()
+        self._bench = bench
+        self._weight_n = bench.world.wrench()[2]
+
+    async def average(
+        self, samples: int, push_axis: tuple[float, float, float], after_ns: int
+    ) -> tuple[float, float, int]:
+        push_n = self._weight_n - self._bench.world.wrench()[2]
+        drawn = self._bench.rng.normal(push_n, self._bench.sim.force_noise_n, samples)
+        return float(drawn.mean()), float(drawn.std(ddof=1)), samples
+
+
+class BenchHands(Procedures):
+    """A rig's procedures beside a person who keeps the well full."""
+
+    def __init__(self, bench: Bench) -> None:
+        super().__init__(bench.rig)
+        self._well = bench.world.well
+
+    async def dip(self) -> None:
+        self._well.add(5.0)
+        await super().dip()
+
+
+class MakeBench(Protocol):
+    def __call__(
+        self,
+        slope_deg: tuple[float, float] = (0.0, 0.0),
+        *,
+        paper_z_mm: float = 120.0,
+        seed: int = 1,
+        bent: Callable[[Pose], Pose] = lambda pose: pose,
+    ) -> Bench: ...
+
+
+@pytest.fixture
+def make_bench(tmp_path: Path) -> MakeBench:
+    """A small sheet that leans so, at that height; the operator taught 120 mm whatever it is."""
+
+    def make(
+        slope_deg: tuple[float, float] = (0.0, 0.0),
+        *,
+        paper_z_mm: float = 120.0,
+        seed: int = 1,
+        bent: Callable[[Pose], Pose] = lambda pose: pose,
+    ) -> Bench:
+        table = replace(SMALL_TABLE, slope_deg=slope_deg, paper_z_mm=paper_z_mm)
+        return Bench(SimConfig(seed=seed, table=table, view=SMALL_VIEW), tmp_path, bent=bent)
+
+    return make

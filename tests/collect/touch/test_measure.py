@@ -1,0 +1,201 @@
+"""Zero touch as a whole on the loopback world: planes of sheets that lean, what is refused, and where the brush is."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from collect.asking import Asker
+from collect.errors import NeedsOperator, StepError
+from collect.touch.config import TouchConfig
+from collect.touch.jog import asked
+from collect.touch.measure import measure_plane
+from collect.touch.results import PlaneResult
+from drivers.samples import Pose
+
+if TYPE_CHECKING:
+    from conftest import Bench, MakeBench
+
+CORNERS = [(0.0, 0.0), (110.0, 0.0), (0.0, 80.0), (110.0, 80.0)]
+THREE: dict[str, Any] = {"points_mm": [(6.0, 4.0), (104.0, 4.0), (50.0, 76.0)]}
+PATCHES: dict[str, Any] = {"points_mm": [(4.0, 4.0), (70.0, 4.0), (36.0, 40.0)], "camera": {"pitch_mm": 4.0}}
+
+
+async def measured(bench: Bench, **config: Any) -> PlaneResult:
+    return await measure_plane(bench.rig, bench.hands, TouchConfig(**config), tap=bench.tap)
+
+
+def errors_mm(bench: Bench, result: PlaneResult) -> list[float]:
+    return [t.z_mm - bench.truth_mm(t.x_mm, t.y_mm) for point in result.points for t in point.touches]
+
+
+def worst_corner_mm(bench: Bench, result: PlaneResult) -> float:
+    return max(abs(result.plane.touch_z_mm(x, y) - bench.truth_mm(x, y)) for x, y in CORNERS)
+
+
+@pytest.mark.parametrize("slope_deg", [(0.0, 0.0), (1.0, 0.0), (0.0, -1.0), (-0.7, 0.7)])
+async def test_the_plane_of_a_leaning_sheet_is_found_by_force(
+    make_bench: MakeBench, slope_deg: tuple[float, float]
+) -> None:
+    bench = make_bench(slope_deg, paper_z_mm=119.6)
+    result = await measured(bench, method="force", **THREE)
+    assert max(map(abs, errors_mm(bench, result))) < 0.06
+    assert worst_corner_mm(bench, result) < 0.06
+    assert result.plane.slope_deg == pytest.approx(math.hypot(*slope_deg), abs=0.05)
+    assert bench.lifted
+
+
+@pytest.mark.timeout(300)
+async def test_200_touches_by_camera_lie_within_150_um_of_the_truth_at_3_sigma(make_bench: MakeBench) -> None:
+    rng, errors = np.random.default_rng(0), list[float]()
+    for seed in range(9):
+        towards = rng.uniform(0.0, 2.0 * math.pi)
+        lean_deg = 1.0 if seed % 2 else rng.uniform(0.0, 1.0)
+        slope_deg = (lean_deg * math.cos(towards), lean_deg * math.sin(towards))
+        bench = make_bench(slope_deg, paper_z_mm=120.0 + rng.uniform(-1.5, 1.5), seed=seed)
+        places = {"points_mm": [(3.0, 3.0), (75.0, 3.0), (35.0, 36.0)], "camera": {"pitch_mm": 3.5}}
+        errors += errors_mm(bench, await measured(bench, method="camera", touches=8, **places))
+    assert len(errors) >= 200
+    assert abs(float(np.mean(errors))) + 3.0 * float(np.std(errors)) < 0.15
+    assert abs(float(np.mean(errors))) < 0.02
+
+
+async def test_the_plane_of_a_leaning_sheet_is_found_by_camera(make_bench: MakeBench) -> None:
+    bench = make_bench((0.7, -0.7), paper_z_mm=120.8)
+    result = await measured(bench, method="camera", **PATCHES)
+    assert worst_corner_mm(bench, result) < 0.15
+    assert bench.lifted
+
+
+async def test_the_result_goes_into_a_journal_with_its_residuals(make_bench: MakeBench) -> None:
+    bench = make_bench((0.5, 0.5))
+    four = [*THREE["points_mm"], (104.0, 76.0)]
+    result = await measured(bench, method="force", touches=2, points_mm=four, force={"sigma_mm": 0.03})
+    told = json.loads(json.dumps(result.as_dict()))
+    assert told["method"] == "force"
+    assert len(told["residuals_mm"]) == 4
+    assert 0.0 < max(map(abs, told["residuals_mm"])) < 0.1
+    assert [len(point["touches_mm"]) for point in told["points"]] == [2, 2, 2, 2]
+    assert all(0.0 < sigma <= 0.03 for point in told["points"] for sigma in point["sigma_mm"])
+
+
+async def test_touches_that_do_not_repeat_are_refused_with_their_heights(make_bench: MakeBench) -> None:
+    bench, worn_mm = make_bench(), 0.0
+
+    def wearing(pose: Pose) -> Pose:
+        nonlocal worn_mm
+        worn_mm += 0.005
+        return replace(pose, z_mm=pose.z_mm + worn_mm)
+
+    bench.bent = wearing
+    with pytest.raises(StepError, match=r"not repeat at \(2, 2\) mm: the heights 1.*span 0\.\d+ mm, limit 0\.15"):
+        await measured(bench, method="force", force={"sigma_mm": 0.03})
+    assert bench.lifted
+
+
+@pytest.mark.parametrize(("method", "deeper_mm"), [("force", 2.5), ("camera", 4.5)])
+async def test_nothing_within_the_travel_ends_with_the_brush_lifted(
+    make_bench: MakeBench, method: str, deeper_mm: float
+) -> None:
+    bench = make_bench(paper_z_mm=120.0 - deeper_mm)
+    with pytest.raises(StepError, match="nothing was touched down to"):
+        await measured(bench, method=method, **PATCHES)
+    assert bench.lifted
+    assert not bench.world.presses
+
+
+async def test_a_bump_under_the_sheet_is_refused(make_bench: MakeBench) -> None:
+    bench = make_bench()
+    four = [*THREE["points_mm"], (104.0, 76.0)]
+
+    def lower_over_the_bump(pose: Pose) -> Pose:
+        away_mm = math.dist(bench.world.to_paper(pose.x_mm, pose.y_mm), four[-1])
+        return replace(pose, z_mm=pose.z_mm - 1.5) if away_mm < 10.0 else pose
+
+    bench.bent = lower_over_the_bump
+    with pytest.raises(StepError, match="do not lie in a plane: residuals"):
+        await measured(bench, method="force", touches=1, points_mm=four, force={"sigma_mm": 0.05})
+    assert bench.lifted
+
+
+async def test_an_arm_that_was_stopped_is_left_where_it_is(make_bench: MakeBench) -> None:
+    bench = make_bench()
+
+    async def stopped(_samples: int, _axis: tuple[float, float, float], _after_ns: int) -> tuple[float, float, int]:
+        raise asyncio.CancelledError
+
+    bench.tap.average = stopped  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(asyncio.CancelledError):
+        await measured(bench, method="force")
+    assert not bench.lifted
+
+
+async def test_the_taught_height_is_visited_as_ever(make_bench: MakeBench) -> None:
+    bench = make_bench()
+    result = await measured(bench)
+    assert (result.method, result.plane.z0_mm, result.plane.slope_deg) == ("taught", 120.0, 0.0)
+
+
+def test_by_camera_three_points_are_needed() -> None:
+    with pytest.raises(ValidationError, match="by camera three are needed"):
+        TouchConfig(method="camera", points_mm=[(4.0, 4.0)])
+
+
+async def test_a_patch_that_does_not_fit_on_the_sheet_is_refused(make_bench: MakeBench) -> None:
+    bench = make_bench()
+    with pytest.raises(StepError, match=r"do not fit on the sheet: spot \d+ would lie at"):
+        await measured(bench, method="camera", points_mm=[(90.0, 4.0), (4.0, 4.0), (4.0, 40.0)])
+    assert bench.lifted
+
+
+class Operator:
+    """Jogs by what he sees: down in large steps, then smaller ones, until the tip touches."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+        self.asked = 0
+
+    async def __call__(self, above_mm: float) -> float | None:
+        self.asked += 1
+        table, tip = self._bench.sim.table, self._bench.target
+        gap_mm = table.above_mm(*self._bench.world.to_paper(tip.x_mm, tip.y_mm), tip.z_mm)
+        return next((-step for step in (1.0, 0.1, 0.02) if gap_mm > step), None)
+
+
+async def test_the_operator_jogs_until_it_touches(make_bench: MakeBench) -> None:
+    bench = make_bench((0.5, 0.5), paper_z_mm=120.4)
+    operator = Operator(bench)
+    config = TouchConfig(method="jog", **THREE)
+    result = await measure_plane(bench.rig, bench.hands, config, next_jog=operator)
+    assert max(map(abs, errors_mm(bench, result))) < 0.021
+    assert operator.asked > 9
+    assert bench.lifted
+
+
+@pytest.mark.parametrize(("step_mm", "why"), [(-1.0, "nothing was touched down to 118.00"), (-5.0, "none of 0.02")])
+async def test_a_jog_ends_at_the_travel_limit(make_bench: MakeBench, step_mm: float, why: str) -> None:
+    bench = make_bench(paper_z_mm=110.0)
+
+    async def down(above_mm: float) -> float | None:
+        assert above_mm >= -2.0
+        return step_mm
+
+    with pytest.raises(StepError, match=why):
+        await measure_plane(bench.rig, bench.hands, TouchConfig(method="jog"), next_jog=down)
+    assert bench.lifted
+
+
+async def test_a_jog_that_nobody_watches_asks_for_an_operator(make_bench: MakeBench) -> None:
+    bench = make_bench()
+    config = TouchConfig(method="jog")
+    nobody = asked(Asker(watched=False), bench.rig.clock, config.jog)
+    with pytest.raises(NeedsOperator, match="Jog until the tip just touches"):
+        await measure_plane(bench.rig, bench.hands, config, next_jog=nobody)
+    assert bench.lifted

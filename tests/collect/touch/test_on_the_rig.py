@@ -1,0 +1,43 @@
+"""Zero touch by force over the loopback rig's own wires: ARCS for the arm, CAN rounds for the force."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from collect.config import load_rig
+from collect.procedures import Procedures
+from collect.rig import connected
+from collect.touch.config import TouchConfig
+from collect.touch.measure import measure_plane
+from drivers.clock import HostClock
+from drivers.sim.config import SimConfig, Table, View
+from drivers.sim.rig import LoopbackRig
+
+VIEW = View(width_px=512, height_px=384, px_per_mm=1.56, fps=50.0)
+QUICK = {"fast_samples": 12, "medium_samples": 25, "slow_samples": 150, "sigma_mm": 0.03}
+"""For a sensor five times quieter than the rig's: averages take real time, whatever the rate of the simulation."""
+
+
+async def test_a_sheet_that_lies_lower_than_taught_is_found_and_the_brush_is_lifted(tmp_path: Path) -> None:
+    table = replace(Table(), paper_z_mm=119.3, slope_deg=(0.5, -0.5))
+    sim = SimConfig(rate=60.0, table=table, view=VIEW, force_noise_n=0.0004)
+    async with LoopbackRig(sim) as loopback:
+        text = loopback.toml().replace("latency_ms = 250.0", "latency_ms = 60.0")
+        (tmp_path / "rig.toml").write_text(text.replace("touch_z_mm = 119.330", "touch_z_mm = 120.0"), encoding="utf-8")
+        config = load_rig(tmp_path / "rig.toml")
+        async with connected(config, HostClock(), lambda _notice: None) as rig:
+            assert rig.force is not None
+            await rig.robot.enable()
+            await rig.force.bias(0.5)
+            touch = TouchConfig(method="force", touches=2, force=QUICK)  # pyright: ignore[reportArgumentType]
+            result = await measure_plane(rig, Procedures(rig), touch)
+            at_mm = (await rig.robot.where()).position_mm
+
+    [point] = result.points
+    truth_mm = table.surface_z_mm(*config.paper.touch_point_mm)
+    assert [t.z_mm for t in point.touches] == pytest.approx([truth_mm] * 2, abs=0.12)
+    assert all(t.sigma_mm is not None and t.sigma_mm <= 0.03 for t in point.touches)
+    assert at_mm[2] == pytest.approx(config.motion.safe_z_mm, abs=0.01)
