@@ -51,6 +51,28 @@ class PaperConfig(Config):
     """Where the taught height is visited at the start of each run, in the paper frame; off every cell's ink."""
 
 
+class WipeConfig(Config):
+    """Wiping off a drop at the rim of the well, after each dip."""
+
+    rim_mm: tuple[Finite, Finite]
+    """Where the tip goes from the middle of the well: past the rim, in the paper frame; off the sheet."""
+    z_mm: Finite
+    """Height of the tip on the way, in the base frame: a little below the rim."""
+
+
+class WashConfig(Config):
+    """A pot of water, for a brush that dries in a long session."""
+
+    pot_mm: tuple[Finite, Finite]
+    """Its centre, in the paper frame; off the sheet."""
+    dip_z_mm: Finite
+    """Height of the tip at the bottom, in the base frame."""
+    every_dips: Annotated[int, Field(ge=1, le=1000)] = 30
+    """Washed before every so many dips into the ink."""
+    strokes: Annotated[int, Field(ge=1, le=20)] = 3
+    """How often down and up."""
+
+
 class InkConfig(Config):
     """The ink well."""
 
@@ -59,6 +81,8 @@ class InkConfig(Config):
     """Centre, in the paper frame."""
     dip_z_mm: Finite
     """Height of the tip at the bottom of a dip, in the base frame."""
+    wipe: WipeConfig | None = None
+    wash: WashConfig | None = None
     device: InkDeviceConfig | None = None
     """What keeps the well filled; left out, the operator does."""
 
@@ -104,9 +128,18 @@ class RigConfig(BaseSettings):
         if self.motion.park_mm[2] < self.motion.safe_z_mm:
             raise ValueError(f"motion.park_mm[2] = {self.motion.park_mm[2]:g} is below motion.safe_z_mm")
         width, height = self.paper.size_mm
-        x, y = self.ink.well_mm
-        if 0.0 <= x <= width and 0.0 <= y <= height:
-            raise ValueError(f"ink.well_mm = [{x:g}, {y:g}] lies on the sheet: dips would press on it")
+        wipe, wash = self.ink.wipe, self.ink.wash
+        places = {"ink.well_mm": self.ink.well_mm}
+        places |= {"ink.wipe.rim_mm": wipe.rim_mm} if wipe is not None else {}
+        places |= {"ink.wash.pot_mm": wash.pot_mm} if wash is not None else {}
+        for name, (x, y) in places.items():
+            if 0.0 <= x <= width and 0.0 <= y <= height:
+                raise ValueError(f"{name} = [{x:g}, {y:g}] lies on the sheet: dips would press on it")
+        if wipe is not None and not self.ink.dip_z_mm <= wipe.z_mm < self.motion.safe_z_mm:
+            raise ValueError(
+                f"ink.wipe.z_mm = {wipe.z_mm:g} is outside [{self.ink.dip_z_mm:g}, {self.motion.safe_z_mm:g}): "
+                "between the dip and travel"
+            )
         self.touch.check_points(self.paper.size_mm)
         x, y = self.paper.touch_point_mm
         if not (0.0 <= x <= width and 0.0 <= y <= height):

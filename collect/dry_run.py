@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collect.config import TRAVEL_CLEARANCE_MM, RigConfig
+from collect.config import TRAVEL_CLEARANCE_MM, InkConfig, RigConfig
 from collect.errors import ConfigError
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.plans import planned
@@ -28,9 +28,15 @@ def lifted(rig: RigConfig, protocol: ProtocolConfig, by_mm: float) -> RigConfig:
     return rig.model_copy(
         update={
             "paper": rig.paper.model_copy(update={"touch_z_mm": rig.paper.touch_z_mm + by_mm}),
-            "ink": rig.ink.model_copy(update={"dip_z_mm": rig.ink.dip_z_mm + by_mm, "device": None}),
+            "ink": _lifted_ink(rig.ink, by_mm),
             "touch": rig.touch.model_copy(update={"method": "taught", "points_mm": []}),
             "self_check": rig.self_check.model_copy(update={"enabled": False}),
             "quality": rig.quality.model_copy(update={"enabled": False}),
         }
     )
+
+
+def _lifted_ink(ink: InkConfig, by_mm: float) -> InkConfig:
+    wipe = None if ink.wipe is None else ink.wipe.model_copy(update={"z_mm": ink.wipe.z_mm + by_mm})
+    wash = None if ink.wash is None else ink.wash.model_copy(update={"dip_z_mm": ink.wash.dip_z_mm + by_mm})
+    return ink.model_copy(update={"dip_z_mm": ink.dip_z_mm + by_mm, "wipe": wipe, "wash": wash, "device": None})

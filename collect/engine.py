@@ -229,7 +229,8 @@ class Engine:
         with self._lock:
             if self._state == State.STOPPING:
                 raise asyncio.CancelledError  # the stop key was faster than this step
-            self._set(new)
+            if new is not self._state:  # one question after another
+                self._set(new)
 
     def _set(self, new: State) -> None:
         check_transition(self._state, new)

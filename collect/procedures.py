@@ -6,7 +6,7 @@ import asyncio
 import math
 from dataclasses import dataclass
 
-from collect.config import RigConfig
+from collect.config import RigConfig, WashConfig
 from collect.errors import StepVoid
 from collect.plane import PaperPlane
 from collect.rig import Rig, limits_of
@@ -39,6 +39,7 @@ class Procedures:
         self._config = rig.config
         self.plane = PaperPlane(rig.config.paper.touch_z_mm)
         """The taught height, level, until touches say better."""
+        self._dips = 0
 
     async def retreat(self) -> None:
         """Lift along the tool axis to safe height, then park. A killed process may have left the brush down."""
@@ -63,9 +64,14 @@ class Procedures:
         return rests_mm
 
     async def dip(self) -> None:
-        """Into the well and out again."""
+        """Into the well and out again, wiped; washed before, where it is time for that."""
+        wash = self._config.ink.wash
+        if wash is not None and self._dips % wash.every_dips == wash.every_dips - 1:
+            for move in wash_moves(self._config, wash):
+                await self.go(move)
         for move in dip_moves(self._config):
             await self.go(move)
+        self._dips += 1
 
     async def press(self, cell: Cell, height_mm: float, tilt_deg: float, dwell_s: float) -> float:
         """Press once; returns the depth reached below the paper along its normal, in mm."""
@@ -129,15 +135,33 @@ def zero_touch_moves(config: RigConfig) -> list[Move]:
 
 
 def dip_moves(config: RigConfig) -> list[Move]:
-    """Over the well, down into the ink, and up slowly."""
-    motion = config.motion
-    x_mm, y_mm = to_base(config.paper, *config.ink.well_mm)
-    above = _upright(config, x_mm, y_mm, motion.safe_z_mm)
-    return [
+    """Over the well, down into the ink, up slowly; with a wipe, across the rim on the way up."""
+    motion, wipe = config.motion, config.ink.wipe
+    at = to_base(config.paper, *config.ink.well_mm)
+    above = _upright(config, *at, motion.safe_z_mm)
+    moves = [
         Move(above, motion.travel_speed_mm_s),
-        Move(_upright(config, x_mm, y_mm, config.ink.dip_z_mm), motion.press_speed_mm_s),
-        Move(above, motion.press_speed_mm_s),
+        Move(_upright(config, *at, config.ink.dip_z_mm), motion.press_speed_mm_s),
     ]
+    if wipe is not None:
+        rim = to_base(config.paper, *wipe.rim_mm)
+        moves += [
+            Move(_upright(config, *at, wipe.z_mm), motion.press_speed_mm_s),
+            Move(_upright(config, *rim, wipe.z_mm), motion.press_speed_mm_s),
+        ]
+        above = _upright(config, *rim, motion.safe_z_mm)
+    return [*moves, Move(above, motion.press_speed_mm_s)]
+
+
+def wash_moves(config: RigConfig, wash: WashConfig) -> list[Move]:
+    """Over the pot, down and up so many times, and up."""
+    motion = config.motion
+    at = to_base(config.paper, *wash.pot_mm)
+    above = _upright(config, *at, motion.safe_z_mm)
+    bottom = _upright(config, *at, wash.dip_z_mm)
+    half = _upright(config, *at, 0.5 * (wash.dip_z_mm + motion.safe_z_mm))
+    swirl = [Move(pose, motion.press_speed_mm_s) for _ in range(wash.strokes) for pose in (bottom, half)]
+    return [Move(above, motion.travel_speed_mm_s), *swirl, Move(above, motion.travel_speed_mm_s)]
 
 
 def press_moves(

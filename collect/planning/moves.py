@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from collect.config import RigConfig
 from collect.drawing import Drawn, stroke_moves
 from collect.plane import PaperPlane
-from collect.procedures import CLEARANCE_MM, Move, dip_moves, park_moves, press_moves, zero_touch_moves
+from collect.procedures import CLEARANCE_MM, Move, dip_moves, park_moves, press_moves, wash_moves, zero_touch_moves
 from collect.sheet import Cell, to_base
 from collect.steps import Step, StepKind
 from collect.touch.selfcheck import triangle_in
@@ -53,7 +53,9 @@ def moves_of(config: RigConfig, plane: PaperPlane, step: Step, cell: Cell | None
         case StepKind.TOUCH:
             return StepMoves([*touch_moves(config, plane, _number(step, "x_mm"), _number(step, "y_mm"))])
         case StepKind.DIP:
-            return StepMoves([*dip_moves(config)], dips=1)
+            wash = config.ink.wash
+            washed = [] if wash is None or step.index % wash.every_dips else wash_moves(config, wash)
+            return StepMoves([*washed, *dip_moves(config)], dips=1)
         case StepKind.BOARD | StepKind.CAPTURE:
             return StepMoves([*park_moves(config)], captures=1)
         case StepKind.PRESS:

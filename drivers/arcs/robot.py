@@ -95,7 +95,11 @@ class AuboArcs:
         self._enabled = True
         if not await self._motion.at_rest():
             # A process that was killed may have left a line in the queue; nothing is set or computed meanwhile.
-            await self.stop()
+            try:
+                await self.stop()
+            except MotionFailed:
+                await self._motion.require_safe("power on")  # a safety stop holds its path: that is what to tell
+                raise
         await make_ready(self._motion, self._options, self._notice)
         await self._motion.require_safe("power on")
         if await self._motion.mode() != RobotMode.RUNNING:

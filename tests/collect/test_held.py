@@ -1,0 +1,126 @@
+"""A run that is held: by the arm's safety system, by an empty reservoir; and one that only moves."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from collect.errors import ConfigError
+from collect.opening import Opening
+from collect.states import State
+from drivers.arcs.codes import SafetyMode
+from drivers.errors import RobotNotSafe
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from conftest import Lab
+
+    from collect.asking import Prompt
+    from collect.engine import Engine
+
+
+def slowly(lab: Lab) -> None:
+    path = lab.folder / "rig.toml"
+    path.write_text(path.read_text(encoding="utf-8").replace("press_speed_mm_s = 20.0", "press_speed_mm_s = 2.0"))
+    lab.write_protocol("[11.0]", "[0.0]")
+
+
+def asked(engine: Engine, timeout_s: float = 60.0) -> Prompt:
+    deadline = time.monotonic() + timeout_s
+    while (prompt := engine.snapshot().prompt) is None:
+        assert not engine.finished, engine.snapshot()
+        assert time.monotonic() < deadline, engine.snapshot()
+        time.sleep(0.01)
+    return prompt
+
+
+def pressing(lab: Lab, engine: Engine) -> None:
+    deadline = time.monotonic() + 60.0
+    while lab.rig.world.tool().z_mm > 117.0:
+        assert not engine.finished, engine.snapshot()
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+
+
+@pytest.mark.parametrize("mode", [SafetyMode.PROTECTIVE_STOP, SafetyMode.SAFEGUARD_STOP])
+def test_a_safety_stop_holds_the_session_until_a_person_has_released_it(lab: Lab, mode: SafetyMode) -> None:
+    slowly(lab)
+    engine = lab.engine(watched=True)
+    engine.start()
+    pressing(lab, engine)
+    lab.rig.arcs.protective_stop(mode)
+
+    prompt = asked(engine)
+    assert mode in prompt.question
+    assert prompt.default == "x"
+    assert engine.snapshot().state is State.ASKING
+    lab.rig.arcs.safety = SafetyMode.NORMAL  # a person, at the pendant
+    assert engine.answer(prompt.number, "g")
+    engine.join()
+    now = engine.snapshot()
+    assert (now.state, now.strokes_done, now.voids) == (State.DONE, 1, 1)
+
+
+def test_an_answer_before_the_stop_is_released_is_asked_again_and_moves_nothing(lab: Lab) -> None:
+    slowly(lab)
+    engine = lab.engine(watched=True)
+    engine.start()
+    pressing(lab, engine)
+    lab.rig.arcs.protective_stop()
+    first = asked(engine)
+    where = lab.rig.world.tool()
+    assert engine.answer(first.number, "g")
+    deadline = time.monotonic() + 30.0
+    while (second := engine.snapshot().prompt) is None or second.number == first.number:
+        assert not engine.finished, engine.snapshot()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert "ProtectiveStop" in second.question
+    assert lab.rig.world.tool() == where
+    assert engine.answer(second.number, "x")
+    with pytest.raises(RobotNotSafe):
+        engine.join()
+    assert lab.rig.world.tool() == where
+
+
+def test_a_refilled_reservoir_lets_the_run_go_on(lab: Lab) -> None:
+    lab.write_protocol("[11.0]", "[0.0]")
+    lab.rig.world.well.ml = 4.0
+    assert lab.rig.ink is not None
+    firmware = lab.rig.ink.instrument
+    firmware.reservoir_ml = 0.2  # pyright: ignore[reportAttributeAccessIssue]
+    engine = lab.engine(watched=True)
+    engine.start()
+    prompt = asked(engine)
+    assert "Refill the reservoir" in prompt.question
+    assert lab.rig.world.tool().z_mm > 170.0  # a person is about to reach under the arm
+    firmware.reservoir_ml = 100.0  # pyright: ignore[reportAttributeAccessIssue]
+    assert engine.answer(prompt.number, "g")
+    engine.join()
+    assert engine.snapshot().strokes_done == 1
+
+
+def test_a_dry_run_moves_all_the_way_and_leaves_neither_ink_nor_session(lab: Lab) -> None:
+    lab.write_protocol("[11.0, 20.0]", "[0.0, 10.0]")
+    well_ml = lab.rig.world.well.ml
+    command = [sys.executable, "-m", "brushloop", "collect", "--no-tui", "--out", str(lab.sessions), "--dry-run", "30"]
+    command += ["--config", str(lab.folder / "rig.toml"), "--protocol", str(lab.folder / "protocol.toml")]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout == "dry run done; nothing was kept\n"
+    assert not lab.sessions.exists()
+    assert not lab.rig.world.presses
+    assert lab.rig.world.well.ml == well_ml
+    assert lab.rig.world.motion.exec_id(lab.rig.world.clock.now_s()) == -1
+
+
+@pytest.mark.parametrize("height_mm", [24.0, 46.0])
+def test_a_dry_run_too_low_or_too_high_is_refused_with_the_range(lab: Lab, tmp_path: Path, height_mm: float) -> None:
+    lab.write_protocol("[20.0]", "[0.0]")
+    with pytest.raises(ConfigError, match=r"--dry-run.*outside \[25, 44.97\] mm"):
+        Opening.load(tmp_path / "out", lab.folder / "rig.toml", lab.folder / "protocol.toml", dry_run_mm=height_mm)
