@@ -49,7 +49,9 @@ class RunView(Vertical):
         background: $panel; color: $text;
     }
     RunView #state.-running { background: $success; }
-    RunView #state.-recovering, RunView #state.-pausing, RunView #state.-stopping { background: $warning; }
+    RunView #state.-recovering, RunView #state.-pausing, RunView #state.-stopping, RunView #state.-asking {
+        background: $warning;
+    }
     RunView #state.-paused { background: $primary; }
     RunView #state.-stopped, RunView #state.-failed { background: $error; }
     RunView #state.-done { background: $success-darken-2; }
@@ -135,12 +137,18 @@ def _facts_content(now: Snapshot, width: int) -> Content:
     time = f"elapsed {minutes_text(now.elapsed_s)}"
     if now.state not in FINAL:
         time += f"   {eta_text(now) or 'no ETA yet'}"
+    voids = f"{now.voids}   left out {now.given_up}" if now.given_up else str(now.voids)
+    tip = tip_text(now.tip_mm)
+    if now.force_n is not None:
+        tip += f"   force {now.force_n:.3f} N"
+    if now.ink_level is not None:
+        tip += f"   ink {now.ink_level:.0%}"
     rows = (
         ("Step", one_line(now.step) or "-", "bold"),
         ("Strokes", bar, ""),
         ("Time", time, ""),
-        ("Voids", str(now.voids), "bold $text-warning" if now.voids else ""),
-        ("Tip", tip_text(now.tip_mm), "" if now.tip_mm else "bold $text-warning"),
+        ("Voids", voids, "bold $text-warning" if now.voids or now.given_up else ""),
+        ("Tip", tip, "" if now.tip_mm else "bold $text-warning"),
     )
     lines = [Content.assemble((label.ljust(LABEL), "dim"), (text, style)) for label, text, style in rows]
     return Content("\n").join(lines)

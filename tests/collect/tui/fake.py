@@ -68,6 +68,10 @@ class FakeEngine:
     def resume(self) -> None:
         self.calls.append("resume")
 
+    def answer(self, number: int, key: str) -> bool:
+        self.calls.append(f"answer {number} {key}")
+        return True
+
     def stop(self) -> None:
         self.calls.append("stop")
         self._over.set()
