@@ -8,13 +8,14 @@ from __future__ import annotations
 import argparse
 import sys
 
-from bench import quality, raster, recorder, rpc, startup
+from bench import overhead, quality, raster, recorder, rpc, startup
 from bench.harness import Bench, BenchError, results_of
 
 
 def benches() -> dict[str, Bench]:
     """Every benchmark by name; a new one is added here."""
     return {
+        "overhead": overhead.run,
         "quality": quality.run,
         "raster": raster.run,
         "recorder": recorder.run,

@@ -22,5 +22,5 @@ async def arm(rig: Rig, asker: Asker, *, armed: bool) -> None:
         raise ConfigError(
             "rig.toml", "robot", f"{what}: look at the cell, keep a hand at the emergency stop, then add --arm"
         )
-    if await asker.ask(Prompt(f"{what}. May it move?", (ARM, LEAVE), LEAVE.key), rig.clock.now_ns()) != ARM.key:
+    if await asker.ask(Prompt(f"{what}. May it move?", (ARM, LEAVE), LEAVE.key)) != ARM.key:
         raise CollectAborted("not armed; nothing was powered and nothing moved")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from dataclasses import dataclass, field
+import time
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from collect.errors import NeedsOperator
@@ -34,7 +35,8 @@ class Prompt:
     """None waits for ever."""
     image: NDArray[np.uint8] | None = field(default=None, compare=False)
     number: int = 0
-    asked_ns: int = 0
+    asked_s: float = 0.0
+    """By `time.monotonic`: a clock that is set must not change how long the default waits."""
 
 
 class Asker:
@@ -57,7 +59,7 @@ class Asker:
         with self._lock:
             return None if self._open is None else self._open[0]
 
-    async def ask(self, prompt: Prompt, now_ns: int) -> str:
+    async def ask(self, prompt: Prompt) -> str:
         """The key of the answer. Raises `NeedsOperator` where nobody is there to answer."""
         if not self._watched:
             raise NeedsOperator(prompt.question)
@@ -65,9 +67,7 @@ class Asker:
         answered: asyncio.Future[str] = loop.create_future()
         with self._lock:
             self._count += 1
-            asked = Prompt(
-                prompt.question, prompt.choices, prompt.default, prompt.timeout_s, prompt.image, self._count, now_ns
-            )
+            asked = replace(prompt, number=self._count, asked_s=time.monotonic())
             self._open = (asked, loop, answered)
         try:
             async with asyncio.timeout(prompt.timeout_s):

@@ -100,7 +100,7 @@ class Run:
         self.control.move_to(State.ASKING)
         self.progress.doing("wait for an answer")
         asked = question(error, self.store.state.sheet)
-        answer = await self.asker.ask(asked, self.rig.clock.now_ns())
+        answer = await self.asker.ask(asked)
         self.progress.log(f"{asked.question} -> {answer}")
         if answer == STOP.key:
             raise error

@@ -10,7 +10,6 @@ from collect.touch.arm import TouchArm
 from collect.touch.config import JogTouchConfig
 from collect.touch.reach import Reach
 from collect.touch.results import Touch
-from drivers.clock import Clock
 
 NextJog = Callable[[float], Awaitable[float | None]]
 """Told where the tip is above the expected height, in mm; the step to make, up being positive, or None: it touches."""
@@ -37,7 +36,7 @@ async def touch_by_jog(
     return Touch(*at_mm, rests_mm)
 
 
-def asked(asker: Asker, clock: Clock, config: JogTouchConfig) -> NextJog:
+def asked(asker: Asker, config: JogTouchConfig) -> NextJog:
     """Jogs that are asked for on the screen, one prompt a step. An asker that nobody watches raises `NeedsOperator`."""
     small, middle, large = config.steps_mm
     keys = {"1": -large, "2": -middle, "3": -small, "8": small, "9": middle, "0": large}
@@ -48,7 +47,7 @@ def asked(asker: Asker, clock: Clock, config: JogTouchConfig) -> NextJog:
 
     async def next_jog(above_mm: float) -> float | None:
         question = f"Jog until the tip just touches the paper. It is {above_mm:+.2f} mm from the expected height."
-        key = await asker.ask(Prompt(question, choices, "t"), clock.now_ns())
+        key = await asker.ask(Prompt(question, choices, "t"))
         return keys.get(key)
 
     return next_jog

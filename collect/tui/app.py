@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
 from typing import ClassVar
 
 from textual.app import App, ComposeResult
@@ -119,7 +118,7 @@ class RunApp(App[None]):
     def _ask(self, prompt: Prompt | None) -> None:
         shown = next((screen for screen in self.screen_stack if isinstance(screen, AskScreen)), None)
         if shown is not None and prompt is not None and shown.prompt.number == prompt.number:
-            shown.tell_time(time.time_ns())
+            shown.tell_time()
             return
         if shown is not None and shown is self.screen:
             self.pop_screen()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 from textual import events
 from textual.app import ComposeResult
 from textual.containers import Vertical
@@ -35,7 +37,8 @@ class AskScreen(ModalScreen[None]):
         with Vertical():
             yield Static(self.prompt.question, id="question", markup=False)
             for choice in self.prompt.choices:
-                mark = "   (if nobody answers)" if choice.key == self.prompt.default else ""
+                timed = self.prompt.timeout_s is not None and choice.key == self.prompt.default
+                mark = "   (if nobody answers)" if timed else ""
                 yield Static(f"{choice.key}  {choice.label}{mark}", markup=False)
             yield Static("s  stop the arm now. The red button is the emergency stop.", markup=False)
             yield Static("", id="left", markup=False)
@@ -46,8 +49,8 @@ class AskScreen(ModalScreen[None]):
             event.stop()
             self._engine.answer(self.prompt.number, str(event.character))
 
-    def tell_time(self, now_ns: int) -> None:
+    def tell_time(self) -> None:
         """How long the default still waits."""
         if self.prompt.timeout_s is not None:
-            left_s = max(0.0, self.prompt.timeout_s - (now_ns - self.prompt.asked_ns) / 1e9)
+            left_s = max(0.0, self.prompt.timeout_s - (time.monotonic() - self.prompt.asked_s))
             self.query_one("#left", Static).update(f"{left_s:.0f} s left")

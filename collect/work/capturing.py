@@ -85,7 +85,7 @@ async def _decide(job: Job, verdict: Verdict, image: Gray, cell: Cell) -> tuple[
     stroke_id = str(job.step.params["stroke_id"])
     prompt = Prompt(f"{stroke_id}: {verdict.reason}", (KEEP, AGAIN, SKIP), SKIP.key, image=_cut_out(bench, image, cell))
     try:
-        answer = await bench.asker.ask(prompt, bench.rig.clock.now_ns())
+        answer = await bench.asker.ask(prompt)
     except NeedsOperator:
         bench.progress.log(f"{stroke_id}: given up", warning=True)
         return False, False

@@ -87,7 +87,7 @@ async def _measured(job: Job, config: TouchConfig) -> PlaneResult:
     bench = job.bench
     tap = ForceTap()
     with job.guard.also(tap.take):
-        jog = asked(bench.asker, bench.rig.clock, config.jog)
+        jog = asked(bench.asker, config.jog)
         return await job.guard.guarded(measure_plane(bench.rig, _Hands(job), config, tap=tap, next_jog=jog))
 
 

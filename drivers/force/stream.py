@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import math
 import threading
 import time
@@ -128,6 +129,8 @@ class RoundStream:
     def _open(self) -> can.BusABC:
         settings = self._settings
         # Only what was asked for: python-can would also read can.ini, the environment and the home folder.
+        # A frame that comes in two pieces is none of the operator's business; a lost one shows in the counts.
+        logging.getLogger("can").setLevel(logging.ERROR)
         gateway: dict[str, Any] = {} if settings.host is None else {"host": settings.host, "port": settings.port}
         return can.Bus(settings.channel, settings.interface, ignore_config=True, bitrate=settings.bitrate, **gateway)
 

@@ -195,7 +195,7 @@ async def test_a_jog_ends_at_the_travel_limit(make_bench: MakeBench, step_mm: fl
 async def test_a_jog_that_nobody_watches_asks_for_an_operator(make_bench: MakeBench) -> None:
     bench = make_bench()
     config = TouchConfig(method="jog")
-    nobody = asked(Asker(watched=False), bench.rig.clock, config.jog)
+    nobody = asked(Asker(watched=False), config.jog)
     with pytest.raises(NeedsOperator, match="Jog until the tip just touches"):
         await measure_plane(bench.rig, bench.hands, config, next_jog=nobody)
     assert bench.lifted
