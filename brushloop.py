@@ -8,8 +8,14 @@ from typing import Annotated
 
 import typer
 
+import calibrate.brushfit.cli
+import calibrate.camera.cli
 import calibrate.cli
+import calibrate.invert_cli
+import calibrate.prepare.cli
+import calibrate.write_plan_cli
 import collect.cli
+import model.train.cli
 import sessions.cli
 
 app = typer.Typer(
@@ -19,9 +25,14 @@ app = typer.Typer(
 )
 app.add_typer(collect.cli.app, name="collect")
 app.command("doctor")(collect.cli.doctor)
-app.command("calibrate")(calibrate.cli.calibrate)
+app.add_typer(calibrate.prepare.cli.app, name="calibrate")
+app.add_typer(calibrate.camera.cli.app, name="camera")
 app.command("validate")(calibrate.cli.validate)
+app.command("fit")(calibrate.brushfit.cli.fit)
+app.command("invert")(calibrate.invert_cli.invert)
 app.add_typer(sessions.cli.app, name="sessions")
+app.add_typer(calibrate.write_plan_cli.app, name="write")
+app.add_typer(model.train.cli.app, name="train")
 
 
 @app.command()

@@ -8,16 +8,33 @@ from __future__ import annotations
 import argparse
 import sys
 
-from bench import overhead, quality, raster, recorder, rpc, startup
+from bench import (
+    brushfit,
+    generator,
+    inversion,
+    overhead,
+    preprocess,
+    quality,
+    raster,
+    realink,
+    recorder,
+    rpc,
+    startup,
+)
 from bench.harness import Bench, BenchError, results_of
 
 
 def benches() -> dict[str, Bench]:
     """Every benchmark by name; a new one is added here."""
     return {
+        "brushfit": brushfit.run,
+        "generator": generator.run,
+        "inversion": inversion.run,
         "overhead": overhead.run,
+        "preprocess": preprocess.run,
         "quality": quality.run,
         "raster": raster.run,
+        "realink": realink.run,
         "recorder": recorder.run,
         "rpc": rpc.run,
         "startup": startup.run,

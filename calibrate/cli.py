@@ -31,6 +31,7 @@ def validate(
     model: Annotated[list[str] | None, typer.Option(help="Only these models; all by default.")] = None,
     mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = 0.3,
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the session's newest by default.")] = None,
+    fit: Annotated[Path | None, typer.Option(help="Brush fit; the session's newest by default.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for reports; <session>/validation by default.")] = None,
 ) -> None:
     """Compare every model with every captured stroke; writes a self-contained HTML report and a CSV."""
@@ -49,7 +50,7 @@ def validate(
     for one in session:
         Recording(one)  # all of them can be read, before anything is written for the first
     for one in session:
-        validation = validate_recording(one, model or [], Field(mm_per_px=mm_per_px), calibration)
+        validation = validate_recording(one, model or [], Field(mm_per_px=mm_per_px), calibration, fit)
         folder = out / validation.header.session_id if out else validation.recording.parent / "validation"
         report = write_report(validation, folder, command)
         rich.print(*summary(validation), sep="\n")

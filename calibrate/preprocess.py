@@ -10,37 +10,40 @@ from typing import cast
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calibrate.errors import CaptureRefused
+from calibrate.prepare.components import Chosen, choose, components, fill_holes
+from calibrate.prepare.light import flatten, light_surface
+from calibrate.prepare.params import PX_PER_MM, Floats, Gray, Mask, Params, Soft
 
-Gray = NDArray[np.uint8]
-Soft = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-Floats = NDArray[np.float64]
+__all__ = [
+    "PX_PER_MM",
+    "Floats",
+    "Gray",
+    "Level",
+    "Mask",
+    "Params",
+    "Prepared",
+    "Soft",
+    "choose",
+    "flatten",
+    "light_surface",
+    "on_raster",
+    "prepare",
+    "rectify",
+    "rescale",
+]
 
-PX_PER_MM = 20.0
-"""The raster that strokes are measured on (0.05 mm a pixel)."""
+
 MAX_RASTER_PX = 8192
 MIN_WINDOW_PX = 40
-LIGHT_ROUNDS = 5
 GATE_MM2 = 1.0
-PAPER_ABOVE = 0.85
-"""Share of the fitted light above which a pixel counts as paper."""
-
-
-@dataclass(frozen=True, slots=True)
-class Params:
-    """Named parameters of the preprocessing; they go into the calibration's artefact."""
-
-    background_mm: float = 32.0
-    """Size of the window that follows the light; a stroke thicker than this would be taken for shadow."""
-    contrast_gate: float = 0.25
-    """Darkest ink must lie this far below paper, else the capture is blank: Otsu would call paper ink."""
-    speck_share: float = 0.01
-    """Components below this share of the main one are specks."""
-    join_mm: float = 1.5
-    """Components farther than this from the main one belong to somebody else."""
+SATURATED = 254
+MOST_SATURATED = 0.5
+OTHER_MM2 = 2.0
+"""Foreign ink from which a component is somebody else's stroke and no splash."""
+GLARE_ABOVE, GLARE_MM2 = 1.12, 2.0
+"""Fibres, noise and the edge of a shadow stay below this share of the light; more of it is a lamp's reflection."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +60,18 @@ class Prepared:
     """Reflectance below which a pixel counts as ink."""
     cut: bool
     """True where the stroke reaches the edge of its photograph or cell: its length and area are lower bounds."""
+    flags: tuple[str, ...] = ()
+    """What is not as it should be, though a stroke was found."""
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """Where ink ends and paper begins, as fitted on one capture."""
+
+    darkest: float
+    """Reflectance that `GATE_MM2` of ink stays under."""
+    threshold: float
+    """By Otsu's method, on 256 levels."""
 
 
 def rectify(image: Gray, image_to_paper: Floats, window_mm: tuple[float, float, float, float]) -> Gray:
@@ -104,88 +119,61 @@ def prepare(
     # Only the cell: neighbours' ink and the table's edge are no paper to measure the light by.
     reflectance = np.ones(raster.shape, np.float32)
     reflectance[window] = flatten(raster[window], params)
+    level = find_level(reflectance[window], where, params)
+    chosen = components(to_levels(reflectance) <= round(255.0 * level.threshold), anchor_px, params)
+    if not chosen.mask.any():
+        raise CaptureRefused(where, "holds no stroke after specks and neighbours were removed")
+    mask = fill_holes(chosen.mask, params)
+    soft = soft_ink(reflectance, chosen.mask)
+    flags = raise_flags(raster[window], mask[window], chosen)
+    return Prepared(mask, soft, anchor_px, level.threshold, touches_edge(mask[window]), flags)
+
+
+def find_level(reflectance: Soft, where: str, params: Params) -> Level:
+    """The contrast gate, then Otsu's threshold. Raises `CaptureRefused` where there is no ink to speak of."""
     # The reflectance that at least GATE_MM2 of ink stays under: an area, so that the picture's size does not matter.
-    pixels = reflectance[window].ravel()
+    pixels = reflectance.ravel()
     kth = min(round(GATE_MM2 * PX_PER_MM**2), pixels.size - 1)
     darkest = float(np.partition(pixels, kth)[kth])
     if 1.0 - darkest < params.contrast_gate:
         raise CaptureRefused(
             where, f"is blank: darkest ink {1.0 - darkest:.2f} below paper, gate {params.contrast_gate}"
         )
-    levels = np.clip(reflectance * 255.0, 0.0, 255.0).astype(np.uint8)
-    otsu, _ = cv2.threshold(levels, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    threshold = otsu / 255.0
-    mask = choose(levels <= otsu, anchor_px, params)
-    if not mask.any():
-        raise CaptureRefused(where, "holds no stroke after specks and neighbours were removed")
+    otsu, _ = cv2.threshold(to_levels(reflectance), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    return Level(darkest, otsu / 255.0)
+
+
+def to_levels(reflectance: Soft) -> Gray:
+    """Reflectance 0 to 1 on 256 levels."""
+    return np.clip(reflectance * 255.0, 0.0, 255.0).astype(np.uint8)
+
+
+def soft_ink(reflectance: Soft, mask: Mask) -> Soft:
+    """Ink from 0 (paper) to 1 (the stroke's median), zero more than four pixels away from the stroke."""
     ink = float(np.median(reflectance[mask]))
     near = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     soft = np.clip((1.0 - reflectance) / max(1.0 - ink, 1e-3), 0.0, 1.0)
-    return Prepared(
-        mask, np.where(near, soft, 0.0).astype(np.float32), anchor_px, threshold, _touches_edge(mask[window])
-    )
+    return np.where(near, soft, 0.0).astype(np.float32)
 
 
-def flatten(raster: Gray, params: Params) -> Soft:
-    """Reflectance relative to the paper around it: 1 is paper, whatever the light does."""
-    # At an eighth of the size: the light is smooth, and a window of 32 mm is 640 px at full size.
-    shrink = 8
-    small = cv2.resize(raster, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
-    # The slope of the light first: closing alone would take the dark end of a slope for a stroke at the edge.
-    slope = light_surface(cast("Gray", small))
-    level = (cv2.medianBlur(small, 5) / slope).astype(np.float32)
-    side = round(params.background_mm * PX_PER_MM / shrink) | 1
-    # Closing fills whatever is darker than its surroundings and thinner than the window.
-    kernel = np.ones((side, side), np.uint8)
-    closed = cv2.morphologyEx(level, cv2.MORPH_CLOSE, kernel, borderType=cv2.BORDER_REPLICATE)
-    smooth = cv2.GaussianBlur(closed, (0, 0), side / 8.0) * slope
-    height, width = raster.shape
-    paper = cv2.resize(smooth.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
-    return cast("Soft", raster.astype(np.float32) / np.maximum(paper, 1.0))
-
-
-def light_surface(small: Gray) -> Floats:
-    """A quadratic surface through the paper, (h, w), at least 1: pixels well below it are ink and left out."""
-    height, width = small.shape
-    y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
-    basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1).reshape(-1, 6)
-    values = small.astype(np.float64).ravel()
-    paper = np.ones(values.size, np.bool_)
-    surface = values
-    for _ in range(LIGHT_ROUNDS):
-        coefficients, *_rest = np.linalg.lstsq(basis[paper], values[paper], rcond=None)
-        surface = np.maximum(basis @ coefficients, 1.0)
-        paper = values > PAPER_ABOVE * surface
-        if np.count_nonzero(paper) < 6 * basis.shape[1]:
-            return np.full(small.shape, max(float(np.median(values)), 1.0))
-    return surface.reshape(small.shape)
-
-
-def choose(ink: Mask, anchor_px: tuple[float, float] | None, params: Params) -> Mask:
-    """The stroke among the components: the main one, and parts that are no specks and lie close to it.
-
-    The main component is the largest; with an anchor, the largest of those that come within `join_mm` of it, if any.
-    """
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(ink.astype(np.uint8), connectivity=8)
-    if count <= 1:
-        return np.zeros_like(ink)
-    areas = np.asarray(stats[1:, cv2.CC_STAT_AREA], np.int64)
-    candidates = np.arange(1, count)
-    if anchor_px is not None:
-        near = _within(labels.astype(np.int32), anchor_px, params.join_mm * PX_PER_MM)
-        near = near[areas[near - 1] >= params.speck_share * areas.max()]
-        candidates = near if near.size else candidates
-    main = int(candidates[np.argmax(areas[candidates - 1])])
-    stroke = labels == main
-    others = [k for k in range(1, count) if k != main and areas[k - 1] >= params.speck_share * areas[main - 1]]
-    if not others:
-        return stroke
-    away = np.asarray(cv2.distanceTransform((~stroke).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
-    for label in others:
-        part = labels == label
-        if float(away[part].min()) <= params.join_mm * PX_PER_MM:
-            stroke |= part
-    return stroke
+def raise_flags(raster: Gray, mask: Mask, chosen: Chosen) -> tuple[str, ...]:
+    """What an operator should know of a capture that can be used."""
+    told: list[str] = []
+    saturated = float(np.count_nonzero(raster >= SATURATED)) / raster.size
+    if saturated > MOST_SATURATED:
+        told.append(f"saturated: {100 * saturated:.0f} % of the pixels are white, the light cannot be judged")
+    if touches_edge(mask):
+        told.append("cut: the stroke reaches the edge of its photograph or cell")
+    others = [area for area in chosen.others_mm2 if area >= OTHER_MM2]
+    if others:
+        told.append(f"others: {len(others)} more strokes of {sum(others):.0f} mm2 in the crop")
+    shrink = 16
+    small = cast("Gray", cv2.resize(raster, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA))
+    bright = np.count_nonzero(small > GLARE_ABOVE * light_surface(small))
+    glare = float(bright) * (shrink / PX_PER_MM) ** 2
+    if glare > GLARE_MM2:
+        told.append(f"glare: {glare:.1f} mm2 are brighter than paper under this light")
+    return tuple(told)
 
 
 def _window(raster: Gray, cell_px: tuple[int, int, int, int] | None, where: str) -> tuple[slice, slice]:
@@ -197,16 +185,6 @@ def _window(raster: Gray, cell_px: tuple[int, int, int, int] | None, where: str)
     return rows, columns
 
 
-def _touches_edge(mask: Mask) -> bool:
+def touches_edge(mask: Mask) -> bool:
+    """Whether ink lies in the outermost rows or columns."""
     return bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
-
-
-def _within(labels: NDArray[np.int32], point: tuple[float, float], radius: float) -> NDArray[np.int64]:
-    height, width = labels.shape
-    reach = int(radius) + 1
-    rows = slice(max(int(point[1]) - reach, 0), min(int(point[1]) + reach + 1, height))
-    columns = slice(max(int(point[0]) - reach, 0), min(int(point[0]) + reach + 1, width))
-    ys, xs = np.ogrid[rows, columns]
-    close = (xs + 0.5 - point[0]) ** 2 + (ys + 0.5 - point[1]) ** 2 <= radius**2
-    found = np.unique(labels[rows, columns][close]).astype(np.int64)
-    return found[found > 0]

@@ -63,7 +63,7 @@ class PressResults:
     predicted: dict[tuple[str, float, float], Image] = field(default_factory=dict[tuple[str, float, float], Image])
     """(model, H, alpha) -> gray image on the millimetre field."""
     refused: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
-    """(stroke, why), never dropped in silence."""
+    """(stroke, why), never dropped in silence; with the name of a model where only that one cannot predict it."""
 
 
 def validate_presses(
@@ -79,7 +79,7 @@ def validate_presses(
     for capture in captures:
         stroke = capture.stroke
         try:
-            prepared = _prepare(capture, calibration, params, view)
+            prepared = prepare_press(capture, calibration, params, view)
         except (CaptureRefused, SessionDamaged) as error:
             results.refused.append((stroke.stroke_id, error.what))
             continue
@@ -89,8 +89,8 @@ def validate_presses(
         try:
             compared = _compared(stroke.stroke_id, stroke.height_mm, stroke.tilt_deg, prepared)
             scores = _score_models(results, compared, models, view, cache)
-        except (CaptureRefused, DomainError) as error:
-            results.refused.append((stroke.stroke_id, getattr(error, "what", str(error))))
+        except CaptureRefused as error:
+            results.refused.append((stroke.stroke_id, error.what))
             continue
         results.strokes.append(compared)
         results.scores += scores
@@ -98,8 +98,11 @@ def validate_presses(
     return results
 
 
-def _prepare(capture: Capture, calibration: Calibration | None, params: Params, view: Field) -> Prepared:
-    """The stroke on the millimetre field, rectified by the calibration or by the import's own scale."""
+def prepare_press(capture: Capture, calibration: Calibration | None, params: Params, view: Field) -> Prepared:
+    """The stroke on the millimetre field, rectified by the calibration or by the import's own scale.
+
+    Raises `CaptureRefused` for a capture that cannot be used, `SessionDamaged` for a picture that cannot be read.
+    """
     stroke, image = capture.stroke, capture.image()
     left, top = (v * PX_PER_MM for v in view.anchor_mm)
     if stroke.anchor_mm is not None and calibration is not None:
@@ -158,15 +161,23 @@ def _score_models(
     cache: dict[tuple[str, float, float, Key], Image],
 ) -> list[Score]:
     scores: list[Score] = []
+    outside: list[tuple[str, str]] = []
     for name, model in models.items():
-        for key in KEYS:
-            ident = (name, stroke.height_mm, stroke.tilt_deg, key)
-            if ident not in cache:
-                cache[ident] = simulated(model, stroke.height_mm, stroke.tilt_deg, *key, view)
-            scores.append(_score(stroke, name, key, cache[ident]))
+        try:
+            for key in KEYS:
+                ident = (name, stroke.height_mm, stroke.tilt_deg, key)
+                if ident not in cache:
+                    cache[ident] = simulated(model, stroke.height_mm, stroke.tilt_deg, *key, view)
+        except DomainError as error:
+            outside.append((name, str(error)))
+            continue
+        scores += [_score(stroke, name, key, cache[(name, stroke.height_mm, stroke.tilt_deg, key)]) for key in KEYS]
         results.predicted[(name, stroke.height_mm, stroke.tilt_deg)] = cache[
             (name, stroke.height_mm, stroke.tilt_deg, (Alignment.MM, Tone.GRAY))
         ]
+    if outside and not scores:
+        raise CaptureRefused(stroke.stroke_id, f"no model predicts it: {outside[0][1]}")
+    results.refused += [(stroke.stroke_id, f"{name} does not predict it: {why}") for name, why in outside]
     return scores
 
 

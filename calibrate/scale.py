@@ -62,7 +62,7 @@ class PlaneFit:
 
 def find_corners(image: NDArray[np.uint8], spec: BoardSpec, where: str) -> tuple[Floats, Floats]:
     """((n, 2) pixels, (n, 2) mm in the paper frame) of the board's inner corners. Raises `CalibrationError`."""
-    board = _board(spec, where)
+    board = charuco_board(spec, where)
     # Sub-pixel corners matter: the scale's error is the corner error over the board's length.
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -91,7 +91,7 @@ def fit_plane(pixels: Floats, paper_mm: Floats, where: str, seed: int = 0) -> Pl
     if dropped > MOST_OUTLIERS * len(pixels):
         raise CalibrationError(where, f"{dropped} of {len(pixels)} board corners do not lie on one plane")
     pixels, paper_mm = pixels[kept], paper_mm[kept]
-    image_to_paper = _homography(pixels, paper_mm, where)
+    image_to_paper = homography(pixels, paper_mm, where)
     rms_px = float(np.sqrt((_residuals_px(image_to_paper, pixels, paper_mm) ** 2).mean()))
     if rms_px > WORST_RMS_PX:
         raise CalibrationError(where, f"board residual {rms_px:.2f} px exceeds {WORST_RMS_PX} px: is it this board?")
@@ -101,7 +101,7 @@ def fit_plane(pixels: Floats, paper_mm: Floats, where: str, seed: int = 0) -> Pl
     for _ in range(BOOTSTRAP_DRAWS):
         chosen = rng.integers(0, len(pixels), len(pixels))
         if len(np.unique(chosen)) >= MIN_CORNERS // 2 + 1:
-            draws.append(local_scale(_homography(pixels[chosen], paper_mm[chosen], where), middle))
+            draws.append(local_scale(homography(pixels[chosen], paper_mm[chosen], where), middle))
     low, high = (float(v) for v in np.quantile(draws, [0.025, 0.975]))
     return PlaneFit(image_to_paper, local_scale(image_to_paper, middle), (low, high), rms_px, len(pixels), dropped)
 
@@ -140,14 +140,16 @@ def _residuals_px(image_to_paper: Floats, pixels: Floats, paper_mm: Floats) -> F
     return np.linalg.norm(back - pixels, axis=1)
 
 
-def _homography(pixels: Floats, paper_mm: Floats, where: str) -> Floats:
+def homography(pixels: Floats, paper_mm: Floats, where: str) -> Floats:
+    """(3, 3) from (n, 2) to (n, 2) points by least squares. Raises `CalibrationError` where they lie on a line."""
     found, _ = cv2.findHomography(pixels, paper_mm, 0)
     if found is None or not np.all(np.isfinite(found)):  # pyright: ignore[reportUnnecessaryComparison]
         raise CalibrationError(where, "the board's corners lie on a line: no plane can be had from them")
     return np.asarray(found, np.float64)
 
 
-def _board(spec: BoardSpec, where: str) -> cv2.aruco.CharucoBoard:
+def charuco_board(spec: BoardSpec, where: str) -> cv2.aruco.CharucoBoard:
+    """OpenCV's board. Raises `CalibrationError` where there is none like it: more markers than the dictionary has."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
     try:
         return cv2.aruco.CharucoBoard(spec.squares, spec.square_mm, spec.marker_mm, dictionary)

@@ -10,12 +10,14 @@ from pathlib import Path
 
 from calibrate import artefact
 from calibrate.artefact import Calibration
+from calibrate.brushfit import artefact as fits
 from calibrate.drags import DragResults, validate_drags
 from calibrate.errors import CalibrationError
 from calibrate.field import Field
 from calibrate.preprocess import Params
 from calibrate.presses import PressResults, Score, validate_presses
 from model.ccdbsm import Brush
+from model.fitted_shape import NAME, fitted_model
 from model.registry import StrokeModel, stroke_models
 from sessions.reader import Recording
 from sessions.schemas import Header, Stroke
@@ -35,8 +37,13 @@ class Validation:
     software: str
 
 
-def validate_recording(session: Path, names: list[str], view: Field, calibration_path: Path | None) -> Validation:
-    """Validate one session. Raises `CalibrationError` where it was not calibrated or a model is unknown."""
+def validate_recording(
+    session: Path, names: list[str], view: Field, calibration_path: Path | None, fit_path: Path | None = None
+) -> Validation:
+    """Validate one session. Raises `CalibrationError` where it was not calibrated or a model is unknown.
+
+    The fitted brush at `fit_path`, or the session's newest, is one more model.
+    """
     recording = Recording(session)
     digest = recording.sha256
     strokes = list(recording.stroke_records())
@@ -45,8 +52,8 @@ def validate_recording(session: Path, names: list[str], view: Field, calibration
         raise CalibrationError(str(recording.path), "holds no strokes")
     if len(kinds) > 1:
         raise CalibrationError(str(recording.path), "mixes presses and drags; validate them as two sessions")
-    calibration = _calibration(recording, strokes[0], digest, calibration_path)
-    models = _models(recording.header, names)
+    calibration = calibration_of(recording, strokes[0], digest, calibration_path)
+    models = _models(recording, digest, names, fit_path)
     params = Params(**calibration.preprocess) if calibration else Params()
     results = (
         validate_presses(recording.captures(), models, calibration, params, view)
@@ -103,9 +110,13 @@ def drags_csv(results: DragResults, source: str) -> str:
     return out.getvalue()
 
 
-def _calibration(recording: Recording, first: Stroke, digest: str, given: Path | None) -> Calibration | None:
+def calibration_of(recording: Recording, first: Stroke, digest: str, given: Path | None) -> Calibration | None:
+    """The artefact given, or the session's newest; None for an import, which brings its own scale.
+
+    Raises `CalibrationError` where there is none, or it belongs to another recording.
+    """
     if first.px_per_mm is not None:
-        return None  # an import brings its own scale
+        return None
     path = given or artefact.newest(recording.path.parent)
     if path is None:
         raise CalibrationError(
@@ -117,13 +128,22 @@ def _calibration(recording: Recording, first: Stroke, digest: str, given: Path |
     return calibration
 
 
-def _models(header: Header, names: list[str]) -> dict[str, StrokeModel]:
-    # The nominal bundle of the paper stands in where a source does not tell its brush; reports say which was used.
+def brush_of(header: Header) -> Brush:
+    """The brush that a recording names; the nominal bundle of the paper stands in where it tells none."""
     nominal = Brush()
-    brush = Brush(
+    return Brush(
         radius_mm=header.brush_radius_mm or nominal.radius_mm, length_mm=header.brush_length_mm or nominal.length_mm
     )
-    known = stroke_models(brush)
+
+
+def _models(recording: Recording, digest: str, names: list[str], fit_path: Path | None) -> dict[str, StrokeModel]:
+    known = stroke_models(brush_of(recording.header))
+    path = fit_path or fits.newest(recording.path.parent)
+    if path is not None:
+        fit = fits.load(path)
+        # A score on the very strokes that were fitted says nothing about others: the label tells.
+        seen = "in sample" if fit.recording_sha256 == digest else f"on {fit.session_id}"
+        known[NAME] = fitted_model(fit.press(), f"CCD-BSM fitted ({seen})")
     for name in names:
         if name not in known:
             raise CalibrationError("--model", f"{name!r} is not one of: {', '.join(known)}")

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sessions import cli_care, cli_share
+from sessions import cli_care, cli_import, cli_share
 
 app = typer.Typer(help="Inspect, check, repair, import and export recordings.", no_args_is_help=True)
 
@@ -31,3 +31,5 @@ def list_(
 for command in (cli_care.show, cli_care.verify, cli_care.repair, cli_care.close, cli_share.merge, cli_share.export):
     app.command()(command)
 app.command("import")(cli_share.import_)
+app.command("import-sequence")(cli_import.import_sequence)
+app.command("import-scans")(cli_import.import_scans)

@@ -41,6 +41,14 @@ def import_photographs(
     folder: Path, table: Path, out: Path, options: ImportOptions, software: str, now_ns: Callable[[], int]
 ) -> Path:
     """Import into the session folder `out` (new); returns its MCAP file. Raises `InputError`, then nothing is left."""
+    check_target(folder, table, out, options)
+    rows = read_table(folder, table, "press" if options.kind == "press" else "drag", options.px_per_mm)
+    protocol = f"import of {len(rows)} {options.kind} strokes"
+    return store_rows(rows, folder, table, out, options, protocol, software, now_ns)
+
+
+def check_target(folder: Path, table: Path, out: Path, options: ImportOptions) -> None:
+    """Raises `InputError` for a folder, a target or a kind that cannot be."""
     if not folder.is_dir():
         raise InputError(folder, "is not a folder of photographs")
     if out.exists():
@@ -49,14 +57,37 @@ def import_photographs(
         raise InputError(out, "a session's name is letters, digits, '.', '_' and '-', at most 100 of them")
     if options.kind not in ("press", "drag"):
         raise InputError(table, f"--kind is {options.kind!r}, allowed: press, drag")
-    rows = read_table(folder, table, "press" if options.kind == "press" else "drag", options.px_per_mm)
-    digests = [_check_image(row.image) for row in rows]
+
+
+def store_rows(
+    rows: list[Row],
+    folder: Path,
+    table: Path,
+    out: Path,
+    options: ImportOptions,
+    protocol: str,
+    software: str,
+    now_ns: Callable[[], int],
+    *,
+    opening: Path | None = None,
+    encoded: Callable[[Row], bytes] | None = None,
+) -> Path:
+    """Write strokes with their photographs into the session folder `out`; returns its MCAP file.
+
+    `opening` is a photograph without a stroke that comes first. `encoded` gives a stroke's PNG or JPEG, its file as it
+    is when left out. Raises `InputError`, then nothing is left.
+    """
+    encoded = encoded or _whole
+    digests = [_check(encoded(row), row.image) for row in rows]
+    first = None if opening is None else _read_bytes(opening)
+    if first is not None and opening is not None:
+        _check(first, opening)
     header = Header(
         session_id=out.name,
         source=Source.IMPORT,
         software=software,
         brush=options.brush,
-        protocol=f"import of {len(rows)} {options.kind} strokes",
+        protocol=protocol,
         licence=options.licence,
         origin=options.origin or f"{folder.resolve().name}, {table.name}",
     )
@@ -64,7 +95,7 @@ def import_photographs(
     try:
         shutil.rmtree(stage, ignore_errors=True)  # left by an import that was killed: a copy, nothing recorded
         stage.mkdir(parents=True)
-        _write(rows, digests, stage / f"{out.name}.mcap", header, now_ns)
+        _write(rows, digests, stage / f"{out.name}.mcap", header, now_ns, first, encoded)
         stage.rename(out)
         fsync_folder(out.parent)
     except OSError as error:
@@ -76,26 +107,43 @@ def import_photographs(
     return out / f"{out.name}.mcap"
 
 
-def _write(rows: list[Row], digests: list[bytes], final: Path, header: Header, now_ns: Callable[[], int]) -> None:
+def _write(
+    rows: list[Row],
+    digests: list[bytes],
+    final: Path,
+    header: Header,
+    now_ns: Callable[[], int],
+    first: bytes | None,
+    encoded: Callable[[Row], bytes],
+) -> None:
     writer = SegmentWriter(final, header, QUEUE_LIMIT)
     try:
-        for index, (row, digest) in enumerate(zip(rows, digests, strict=True)):
-            data = _read_bytes(row.image)
+        if first is not None:
+            t_ns = now_ns()
+            writer.write(Outgoing(Topic.STILL, t_ns, t_ns, 0, image_message(t_ns, first, _kind(first))), WAIT_S)
+        for row, digest in zip(rows, digests, strict=True):
+            data, still = encoded(row), row.stroke.still
             if hashlib.sha256(data).digest() != digest:
                 raise InputError(row.image, "changed while it was imported")
             t_ns = now_ns()
-            kind = "png" if data.startswith(PNG_START) else "jpeg"
-            writer.write(Outgoing(Topic.STILL, t_ns, t_ns, index, image_message(t_ns, data, kind)), WAIT_S)
-            writer.write(Outgoing(Topic.STROKE, t_ns, t_ns, index, row.stroke), WAIT_S)
+            writer.write(Outgoing(Topic.STILL, t_ns, t_ns, still, image_message(t_ns, data, _kind(data))), WAIT_S)
+            writer.write(Outgoing(Topic.STROKE, t_ns, t_ns, still, row.stroke), WAIT_S)
     except BaseException:
         writer.abandon()
         raise
     writer.finish()
 
 
-def _check_image(path: Path) -> bytes:
+def _kind(data: bytes) -> str:
+    return "png" if data.startswith(PNG_START) else "jpeg"
+
+
+def _whole(row: Row) -> bytes:
+    return _read_bytes(row.image)
+
+
+def _check(data: bytes, path: Path) -> bytes:
     """Decode it once; the digest lets it be read again without decoding. Raises `InputError`."""
-    data = _read_bytes(path)
     try:
         decode_gray(data, str(path))
     except SessionDamaged as error:

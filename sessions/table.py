@@ -20,8 +20,9 @@ ANGLE_UNITS = {"deg": 1.0, "rad": 180.0 / math.pi}
 FRACTIONS = ("frac", "px", "nominal", "ratio")
 """Suffixes that are kept as they are: shares, pixels, and values that the source itself calls nominal."""
 PAIRS = (("px_per_mm_x", "px_per_mm_y"), ("start_x_px", "start_y_px"))
-SPECIAL = {"file", "px_per_mm", "height_mm", "tilt_deg", *PAIRS[0], *PAIRS[1]}
+SPECIAL = {"file", "name", "px_per_mm", "height_mm", "tilt_deg", *PAIRS[0], *PAIRS[1]}
 """Columns that become fields of a stroke; all others are kept in `commanded`."""
+MAX_NAME_CHARS = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,14 @@ class _Columns:
 
 def read_table(folder: Path, table: Path, kind: Literal["press", "drag"], px_per_mm: float | None) -> list[Row]:
     """Every line, checked. Raises `InputError` naming line and column; the photographs are not looked into."""
-    lines = csv.reader(io.StringIO(_read_text(table), newline=""), strict=True)
+    return parse_table(folder, table, read_text(table), kind, px_per_mm)
+
+
+def parse_table(
+    folder: Path, table: Path, text: str, kind: Literal["press", "drag"], px_per_mm: float | None
+) -> list[Row]:
+    """The same for a table whose text is `text`; `table` is what errors name."""
+    lines = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: list[Row] = []
     seen: set[str] = set()
     no_names: list[str] = []
@@ -68,7 +76,8 @@ def read_table(folder: Path, table: Path, kind: Literal["press", "drag"], px_per
     return rows
 
 
-def _read_text(table: Path) -> str:
+def read_text(table: Path) -> str:
+    """A table's text. Raises `InputError` where it is not there, too large or not UTF-8."""
     if not table.is_file():
         raise InputError(table, "no such table")
     try:
@@ -147,7 +156,9 @@ def _row(columns: _Columns, line: int, cells: list[str], still: int) -> Row:
     if scale is None or not all(MIN_PX_PER_MM <= s <= MAX_PX_PER_MM for s in scale):
         raise InputError(table, f"line {line}: px_per_mm = {scale}, allowed: {MIN_PX_PER_MM} to {MAX_PX_PER_MM}")
     stroke = Stroke(
-        stroke_id=image.relative_to(columns.folder).with_suffix("").as_posix(),
+        stroke_id=_name(columns, line, fields["name"])
+        if "name" in fields
+        else image.relative_to(columns.folder).with_suffix("").as_posix(),
         kind=columns.kind,
         still=still,
         height_mm=value("height_mm") if "height_mm" in fields else None,
@@ -157,6 +168,13 @@ def _row(columns: _Columns, line: int, cells: list[str], still: int) -> Row:
         commanded={stored: value(name, factor) for name, (stored, factor) in columns.commanded.items()},
     )
     return Row(image, stroke)
+
+
+def _name(columns: _Columns, line: int, name: str) -> str:
+    if not name or not name.isprintable() or len(name) > MAX_NAME_CHARS:
+        allowed = f"allowed are 1 to {MAX_NAME_CHARS} printable characters"
+        raise InputError(columns.table, f"line {line}, column `name`: {name[:80]!r} is no name; {allowed}")
+    return name
 
 
 def _image(columns: _Columns, line: int, name: str) -> Path:

@@ -170,3 +170,15 @@ def test_the_field_holds_every_cell_of_the_grid() -> None:
             area_mm2 = float(MODELS["ccd-bsm"].profile(height_mm, tilt_deg).area_mm2[0])
             assert image.sum() * 0.3**2 == pytest.approx(area_mm2, rel=1e-5)
     assert cv2.countNonZero(image) > 0
+
+
+def test_a_press_outside_one_models_domain_is_scored_by_the_others() -> None:
+    stubby = stroke_models(Brush(radius_mm=6.0, length_mm=18.0))["ccd-bsm"]  # H = 20 mm is deeper than its bundle
+    models = {"stubby": stubby, "line": MODELS["line"]}
+    shown = [capture("one", drawn(20.0, 0.0), 20.0, 0.0)]
+    results = validate_presses(iter(shown), models, CALIBRATION, Params(), Field())
+    [(stroke, why)] = results.refused
+    assert stroke == "one"
+    assert why.startswith("stubby does not predict it: height_mm = 20")
+    assert {score.model for score in results.scores} == {"line"}
+    assert len(results.strokes) == 1

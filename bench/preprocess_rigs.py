@@ -1,0 +1,189 @@
+"""Five brushes with five cameras, and what they see: frozen before any score of preprocessing or scale was looked at.
+
+Everything is drawn straight from the loopback rig's `World` and `Scene`, without its servers. Nothing here may be
+changed to make a figure better; a new set gets a new name.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.scale import BoardSpec
+from drivers.geometry import brush_pose
+from drivers.sim.brush import BrushSpec
+from drivers.sim.config import SimConfig, Table, View
+from drivers.sim.optics import Optics
+from drivers.sim.paper import PX_PER_MM as SHEET_PX_PER_MM
+from drivers.sim.scene import Scene
+from drivers.sim.world import World
+
+Gray = NDArray[np.uint8]
+Floats = NDArray[np.float64]
+INK = 0.5
+"""Ink per area from which a place of the sheet counts as inked: half of what a full stroke has."""
+
+BRUSHES = (
+    BrushSpec(radius_mm=6.0, length_mm=48.0, stiffness_n_mm2=200.0, friction=0.22, set_deg=8.0, seed=11),
+    BrushSpec(radius_mm=5.2, length_mm=44.0, stiffness_n_mm2=160.0, friction=0.18, set_deg=6.5, seed=12),
+    BrushSpec(radius_mm=6.4, length_mm=51.0, stiffness_n_mm2=250.0, friction=0.26, set_deg=10.0, seed=13),
+    BrushSpec(radius_mm=5.6, length_mm=46.0, stiffness_n_mm2=180.0, friction=0.20, set_deg=9.0, seed=14),
+    BrushSpec(radius_mm=6.0, length_mm=50.0, stiffness_n_mm2=220.0, friction=0.24, set_deg=7.5, seed=15),
+)
+CAMERAS = (
+    View(),
+    View(k1=-0.08, shadow=0.20, noise=1.5, keystone=0.004, turn_deg=-1.0),
+    View(k1=0.05, shadow=0.35, noise=3.0, keystone=0.020, turn_deg=1.2, shade=0.25),
+    View(k1=-0.15, shadow=0.10, noise=2.5, px_per_mm=6.0, shade=0.30, blur_px=0.9),
+    View(k1=-0.03, shadow=0.45, noise=1.0, keystone=0.010, turn_deg=-0.4, blur_px=0.5, px_per_mm=6.1),
+)
+HEIGHTS_MM = (11.0, 13.0, 15.0, 17.0, 20.0)
+TILTS_DEG = (0.0, 5.0, 10.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """A photograph of a sheet, and what is true of it."""
+
+    image: Gray
+    optics: Optics
+    board: BoardSpec
+    anchors_mm: tuple[tuple[float, float], ...]
+    """Where each press really touched, in the paper frame."""
+    ink: NDArray[np.float32]
+    """(rows, columns) ink per area of the sheet at 10 px/mm; row 0 is its far edge."""
+    sheet_mm: tuple[float, float]
+
+
+def board_of(table: Table) -> BoardSpec:
+    """The rig's board as a configuration names it."""
+    return BoardSpec(
+        squares=table.board_squares,
+        square_mm=table.board_square_mm,
+        marker_mm=table.board_marker_mm,
+        dictionary=table.board_dictionary,
+        origin_mm=table.board_origin_mm,
+    )
+
+
+def aimed(view: View, rng: np.random.Generator) -> View:
+    """The same camera, set up anew: its place, turn and slant differ a little, its lens and light do not."""
+    x, y = view.centre_mm
+    return dataclasses.replace(
+        view,
+        centre_mm=(x + rng.uniform(-3.0, 3.0), y + rng.uniform(-3.0, 3.0)),
+        turn_deg=view.turn_deg + rng.uniform(-0.3, 0.3),
+        px_per_mm=view.px_per_mm * rng.uniform(0.99, 1.01),
+        keystone=view.keystone + rng.uniform(-0.002, 0.002),
+    )
+
+
+def boards(rig: int, draws: int, seed: int = 0) -> Iterator[Shot]:
+    """Blank sheets on the board, the camera aimed anew for each."""
+    for draw in range(draws):
+        rng = np.random.default_rng([seed, rig, draw])
+        config = SimConfig(seed=int(rng.integers(1, 2**30)), view=aimed(CAMERAS[rig], rng))
+        yield _photographed(World(config), ())
+
+
+def sheet(rig: int, presses: int, seed: int = 0) -> Shot:
+    """One sheet with so many presses (at most 15, one of each H and alpha at most) by this rig's brush."""
+    rng = np.random.default_rng([seed, rig, 10_000])
+    config = SimConfig(seed=int(rng.integers(1, 2**30)), view=aimed(CAMERAS[rig], rng), brush=BRUSHES[rig])
+    world = World(config)
+    cells = [(h, a) for h in HEIGHTS_MM for a in TILTS_DEG]
+    anchors: list[tuple[float, float]] = []
+    for index, cell in enumerate(rng.permutation(len(cells))[:presses]):
+        height_mm, tilt_deg = cells[cell]
+        # 40 x 34 mm apart: no mark reaches into the window of another.
+        place = (36.0 + 40.0 * (index % 5) + rng.uniform(-1, 1), 30.0 + 44.0 * (index // 5) + rng.uniform(-1, 1))
+        mark = world.brush.press(height_mm, tilt_deg, ink_load=rng.uniform(0.85, 1.0), press_seed=1000 * rig + index)
+        world.paper.lay(mark, *place, 0.0)
+        anchors.append(place)
+    return _photographed(world, tuple(anchors))
+
+
+def lens_views(rig: int, count: int, seed: int = 0) -> list[Gray]:
+    """Photographs of the rig's board held at many slants before this camera's lens, for its intrinsics."""
+    rng = np.random.default_rng([seed, rig, 20_000])
+    view = CAMERAS[rig]
+    optics, table = Optics(view, 1), Table()
+    board = board_of(table)
+    px = 5.0
+    size = (round(board.squares[0] * board.square_mm * px), round(board.squares[1] * board.square_mm * px))
+    drawn = cv2.aruco.CharucoBoard(
+        board.squares,
+        board.square_mm,
+        board.marker_mm,
+        cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary)),
+    )
+    picture = cv2.copyMakeBorder(drawn.generateImage(size), 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255)
+    middle_mm = np.array([board.squares[0], board.squares[1]]) * board.square_mm / 2
+    # picture pixel (centres on integers) -> mm from the board's middle
+    to_mm = np.array(
+        [[1 / px, 0, (0.5 - 40) / px - middle_mm[0]], [0, 1 / px, (0.5 - 40) / px - middle_mm[1]], [0, 0, 1]]
+    )
+    views: list[Gray] = []
+    for _ in range(count):
+        turn, _jacobian = cv2.Rodrigues(np.array([rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-3, 3)]))
+        away_mm = np.array([rng.uniform(-60, 60), rng.uniform(-50, 50), rng.uniform(330, 480)])
+        pose = np.column_stack([turn[:, 0], turn[:, 1], away_mm])
+        straight = cv2.warpPerspective(
+            picture, optics.camera_matrix @ pose @ to_mm, (view.width_px, view.height_px), borderValue=150
+        )
+        bent = cv2.GaussianBlur(optics.distort(straight.astype(np.uint8)), (0, 0), view.blur_px).astype(np.float32)
+        noisy = bent * 0.85 + rng.normal(0.0, view.noise, bent.shape)
+        views.append(np.clip(noisy, 0, 255).astype(np.uint8))
+    return views
+
+
+def true_scale(shot: Shot, pixel: tuple[float, float]) -> float:
+    """mm per pixel of the photograph as it was taken, at one of its pixels: from the true optics, by differences."""
+    step = 0.5
+    start = shot.optics.homography
+    around = np.array(pixel) + step * np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+    straight = cv2.undistortPointsIter(
+        around[:, None],
+        shot.optics.camera_matrix,
+        shot.optics.distortion,
+        np.eye(3),
+        shot.optics.camera_matrix,
+        (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12),
+    ).reshape(-1, 2)
+    mapped = np.column_stack([straight, np.ones(4)]) @ np.linalg.inv(start).T
+    left, right, up, down = mapped[:, :2] / mapped[:, 2:]
+    across, along = right - left, down - up
+    return float(np.sqrt(abs(across[0] * along[1] - across[1] * along[0]))) / (2 * step)
+
+
+def true_mask(shot: Shot, window_mm: tuple[float, float, float, float], px_per_mm: float) -> NDArray[np.bool_]:
+    """Which pixels of a window (x, y, width, height of the paper frame) hold ink, row 0 at its far edge."""
+    x, y, width, height = window_mm
+    step = SHEET_PX_PER_MM / px_per_mm
+    left, top = x * SHEET_PX_PER_MM, (shot.sheet_mm[1] - y - height) * SHEET_PX_PER_MM
+    move = np.array([[step, 0.0, left + 0.5 * step - 0.5], [0.0, step, top + 0.5 * step - 0.5]])
+    size = (round(width * px_per_mm), round(height * px_per_mm))
+    window = cv2.warpAffine(shot.ink, move, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    return np.asarray(window, np.float32) >= INK
+
+
+def heading_free_window(anchor_mm: tuple[float, float]) -> tuple[float, float, float, float]:
+    """38 x 38 mm around a press: the field that strokes are compared on."""
+    side = 38.0
+    return anchor_mm[0] - 0.76 * side, anchor_mm[1] - 0.5 * side, side, side
+
+
+def _photographed(world: World, anchors: tuple[tuple[float, float], ...]) -> Shot:
+    scene = Scene(world)
+    world.version += 1
+    table = world.config.table
+    image = scene.render(0, brush_pose(*world.config.home_mm))
+    # The arm stands where it hides no corner.
+    assert math.isfinite(float(image.mean()))
+    return Shot(image, scene.optics, board_of(table), anchors, world.paper.density, table.sheet_mm)

@@ -1,0 +1,93 @@
+"""`brushloop fit`: a brush's own stroke model. Heavy imports wait until the command runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from calibrate.brushfit.captures import Captures
+    from calibrate.brushfit.run import Correction, Fitted
+
+
+def fit(
+    session: Annotated[Path, typer.Argument(help="A session of presses: its folder or its .mcap file.")],
+    mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = 0.3,
+    calibration: Annotated[Path | None, typer.Option(help="Artefact; the session's newest by default.")] = None,
+    correction: Annotated[bool, typer.Option("--correction", help="Print the zero-touch offset for rig.toml.")] = False,
+    reference: Annotated[Path | None, typer.Option(help="An earlier fit of this brush, for --correction.")] = None,
+) -> None:
+    """Fit the stroke model to a session's presses; writes an immutable brushfit/<hash>.json."""
+    import rich
+    from rich.markup import escape
+
+    from calibrate.brushfit.artefact import load
+    from calibrate.brushfit.captures import read_presses
+    from calibrate.brushfit.run import correction as corrected
+    from calibrate.brushfit.run import fit_session, save
+    from calibrate.field import Field
+    from sessions.reader import Recording
+
+    before = load(reference) if reference is not None else None
+    view = Field(mm_per_px=mm_per_px)
+    captures = read_presses(session, view, calibration)
+    fitted = fit_session(captures, view)
+    path = save(fitted, Recording(session).path.parent)
+    rich.print(*_tables(captures, fitted), sep="\n")
+    if correction:
+        rich.print("\n".join(_correction(corrected(captures, fitted.artefact, before))))
+    rich.print(f"Fit: {escape(str(path))}")
+
+
+def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
+    from rich.markup import escape
+    from rich.table import Table
+
+    from calibrate.brushfit.fit import WORST_CONDITION
+    from calibrate.brushfit.run import NAMES
+    from calibrate.wording import source_note
+    from model.fitted import PARAMETERS
+
+    artefact = fitted.artefact
+    yield f"{escape(source_note(captures.header.source))}; {len(captures.strokes)} presses fitted"
+    for name, why in captures.refused:
+        yield f"left out: {escape(name)}: {escape(why)}"
+    out = Table("parameter", "unit", "published", "fitted", "95 %", title="brush")
+    for name, parameter in zip(NAMES, PARAMETERS, strict=True):
+        found = artefact.parameters[name]
+        interval = "not fitted" if found.low is None else f"{found.low:.3f} to {found.high:.3f}"
+        out.add_row(name, parameter.unit, f"{parameter.start:.3f}", f"{found.value:.3f}", interval)
+    yield out
+    out = Table("stage", "condition", "", title=f"stages, refused beyond {WORST_CONDITION:g}")
+    for stage in artefact.stages:
+        condition = "infinite" if stage.condition is None else f"{stage.condition:.1f}"
+        out.add_row(stage.name, condition, "refused: the strokes do not tell it" if stage.refused else "fitted")
+    yield out
+    if not fitted.held_out:
+        yield "One cell only: nothing can be held out."
+        return
+    out = Table("model", "n", "CSIM", "SSIM", title="leave one cell out, mm, binary, percent")
+    for row in fitted.held_out:
+        out.add_row(row.model, str(row.n), f"{row.csim:.2f}", f"{row.ssim:.2f}")
+    yield out
+
+
+def _correction(found: Correction) -> Iterator[str]:
+    low, high = found.lift_interval_mm
+    if found.reference:
+        yield f"Zero touch against the fit of {found.reference}, everything else of the brush held:"
+    else:
+        yield (
+            "Zero touch, absolutely: where the sizes of the marks, taken as proportional to depth, come to nothing. "
+            "Ink that spreads, or a brush that does not open evenly, is taken for an offset: with an earlier fit of "
+            "the same brush (--reference) it is not."
+        )
+    yield f"  paper.touch_z_mm: add {found.lift_mm:+.2f} mm (95 % {low:+.2f} to {high:+.2f})"
+    low, high = found.along_interval_mm
+    yield f"  along the heading: the ink lies off by {found.along_mm:+.2f} mm (95 % {low:+.2f} to {high:+.2f})"
+    if found.lift_interval_mm[0] <= 0.0 <= found.lift_interval_mm[1]:
+        yield "  The interval holds 0: leave rig.toml as it is."

@@ -1,0 +1,170 @@
+"""Fit bristle lag and width of `model.drag` to dragged strokes, and what is left over by kernel ridge regression.
+
+The fit minimises the squared difference between captured ink and the chance of ink that the model gives, where the
+edge strays by `SPREAD_MM` from stroke to stroke: the image that is best in the mean, and so in cosine similarity.
+Optional columns of the strokes (their place on the page) shift a whole stroke, which is how far the calibration of
+arm against camera is off there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.drag import DragModel, distances, ink, trails
+
+Floats = NDArray[np.float64]
+Masks = NDArray[np.bool_]
+
+SPREAD_MM = 0.9
+"""Scale of the logistic: an edge that strays by 1.6 mm (standard deviation)."""
+INK_ABOVE = 0.42
+"""A pixel is called ink above this chance: half of the Dice score to be had maximises its expectation."""
+PRIOR = (2.0, 0.2, 0.01, 3.0, 1.0, 4.0, 1.5, 1.5, 0.2, 0.2, 3.0, 3.0, 0.5, 0.5)
+"""How far each parameter may be from its start before it costs as much as one pixel of wrong ink."""
+PLACE_PRIOR_MM = 1.5
+ROUNDS = 25
+
+
+@dataclass(frozen=True, slots=True)
+class DragFit:
+    """A drag model fitted to strokes, and how it was got."""
+
+    model: DragModel
+    place_mm: Floats
+    """(q, 2): shift in x and y of a stroke by each column of its place."""
+    condition: float
+    """Condition number of the scaled normal equations: above some 1e4 parameters stand in for each other."""
+    cost: float
+    rounds: int
+
+    def distance(self, paths: Sequence[Floats], x_mm: Floats, y_mm: Floats, place: Floats | None = None) -> Floats:
+        """Signed distances of the marks of these paths, (B, len(y_mm), len(x_mm)) mm, positive in ink."""
+        nodes, starts = trails(paths, self.model.vector())
+        return distances(_shifted(nodes, starts, place, self.place_mm), starts, x_mm, y_mm)
+
+
+def fit_drags(
+    paths: Sequence[Floats],
+    target: NDArray[np.generic],
+    x_mm: Floats,
+    y_mm: Floats,
+    place: Floats | None = None,
+    *,
+    start: DragModel | None = None,
+    lag: bool = True,
+) -> DragFit:
+    """Levenberg-Marquardt over (B, len(y_mm), len(x_mm)) ink; `place` (B, q). Without `lag` the disc is at the tip.
+
+    Raises ValueError where paths, ink and place do not belong together.
+    """
+    from model import drag_kernel
+
+    kernel: Any = drag_kernel
+
+    images = np.ascontiguousarray(target, np.float32)
+    if images.shape != (len(paths), len(y_mm), len(x_mm)) or (place is not None and len(place) != len(paths)):
+        raise ValueError(f"{len(paths)} paths, ink {images.shape}, grid ({len(y_mm)}, {len(x_mm)}): not alike")
+    columns = np.zeros((len(paths), 0)) if place is None else np.asarray(place, np.float64)
+    begin = start or (DragModel() if lag else DragModel(leash_mm=0.0, leash_per_mm=0.0, settle_mm=0.0, front=0.0))
+    first = np.concatenate([begin.vector(), np.zeros(2 * columns.shape[1])])
+    scale = np.concatenate([np.array(PRIOR), np.full(2 * columns.shape[1], PLACE_PRIOR_MM)])
+    free = np.ones(len(first), np.bool_)
+    if not lag:
+        held = ("leash_mm", "leash_per_mm", "settle_mm", "land_mm", "back_mm", "front", "front_width")
+        free[[DragModel.names().index(name) for name in held]] = False
+
+    def equations(vector: Floats) -> tuple[float, Floats, Floats]:
+        nodes, starts, slopes = _linearised(paths, vector, scale, columns)
+        square, gradient = np.zeros((len(vector), len(vector))), np.zeros(len(vector))
+        cost = float(kernel.normal_equations(nodes, starts, slopes, x_mm, y_mm, images, SPREAD_MM, square, gradient))
+        off = (vector - first) / scale
+        square = np.tril(square) + np.tril(square, -1).T + np.eye(len(vector))
+        return cost + 0.5 * float(off @ off), square[np.ix_(free, free)], (gradient + off)[free]
+
+    vector, damping = first.copy(), 1e-2
+    cost, square, gradient = equations(vector)
+    done = 0
+    for _ in range(ROUNDS):
+        done += 1
+        step = np.linalg.solve(square + damping * np.diag(np.diag(square)), -gradient)
+        trial = vector.copy()
+        trial[free] += scale[free] * np.clip(step, -2.0, 2.0)
+        found = equations(trial)
+        if found[0] < cost:
+            gain = (cost - found[0]) / cost
+            vector, (cost, square, gradient), damping = trial, found, max(damping / 5.0, 1e-6)
+            if gain < 1e-4:
+                break
+        else:
+            damping *= 6.0
+            if damping > 1e4:
+                break
+    spread = np.sqrt(np.diag(square))
+    condition = float(np.linalg.cond(square / np.outer(spread, spread)))
+    return DragFit(DragModel.of(vector[:14]), vector[14:].reshape(-1, 2), condition, cost, done)
+
+
+@dataclass(frozen=True, slots=True)
+class Residual:
+    """What the lag model misses, as a function of the stroke's command: kernel ridge on clipped signed distance."""
+
+    commands: Floats
+    weights: Floats
+    scales: Floats
+    REACH_MM = 6.0
+
+    @staticmethod
+    def fit(commands: Floats, base_mm: Floats, captured_mm: Floats, scales: Floats, ridge: float = 1.0) -> Residual:
+        """From (B, d) commands, the model's and the captured signed distances (B, h, w)."""
+        scaled = commands / scales
+        miss = (clipped(captured_mm) - clipped(base_mm)).reshape(len(commands), -1)
+        kernel = _kernel(scaled, scaled) + ridge * np.eye(len(commands))
+        return Residual(scaled, np.asarray(np.linalg.solve(kernel, miss), np.float64), scales)
+
+    def add(self, commands: Floats, base_mm: Floats) -> Floats:
+        """The corrected signed distances, (B, h, w)."""
+        kernel = _kernel(commands / self.scales, self.commands)
+        return clipped(base_mm) + (kernel @ self.weights).reshape(base_mm.shape)
+
+
+def chance(distance_mm: Floats) -> Floats:
+    """The chance of ink that a signed distance stands for."""
+    return ink(distance_mm, SPREAD_MM)
+
+
+def clipped(distance_mm: Floats) -> Floats:
+    """Signed distance that levels off at `Residual.REACH_MM`: far from the edge it says nothing."""
+    return Residual.REACH_MM * np.tanh(distance_mm / Residual.REACH_MM)
+
+
+def _kernel(a: Floats, b: Floats) -> Floats:
+    return np.exp(-0.5 * ((a[:, None] - b[None]) ** 2).sum(axis=-1))
+
+
+def _shifted(nodes: Floats, starts: NDArray[np.int64], place: Floats | None, by: Floats) -> Floats:
+    if place is None or not len(by):
+        return nodes
+    out = nodes.copy()
+    out[:, :2] += np.repeat(place @ by, np.diff(starts), axis=0)
+    return out
+
+
+def _linearised(
+    paths: Sequence[Floats], vector: Floats, scale: Floats, columns: Floats
+) -> tuple[Floats, NDArray[np.int64], Floats]:
+    """The trails and their derivatives by the scaled parameters, (nodes, 3, P)."""
+    nodes, starts = trails(paths, vector[:14])
+    slopes = np.zeros((len(nodes), 3, len(vector)))
+    for k in range(14):
+        ahead = vector[:14].copy()
+        ahead[k] += 1e-5 * scale[k]
+        slopes[:, :, k] = (trails(paths, ahead)[0] - nodes) / 1e-5
+    spread = np.repeat(columns, np.diff(starts), axis=0)
+    for q in range(columns.shape[1]):
+        slopes[:, 0, 14 + 2 * q] = slopes[:, 1, 15 + 2 * q] = PLACE_PRIOR_MM * spread[:, q]
+    return _shifted(nodes, starts, columns, vector[14:].reshape(-1, 2)), starts, slopes

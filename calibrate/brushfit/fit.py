@@ -1,0 +1,253 @@
+"""Staged least squares of `model.fitted` on coverage images, with a condition number for each stage. No torch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.fitted import MODES, NAMES, PARAMETERS, FittedPress, command_terms, modes
+
+Floats = NDArray[np.float64]
+
+SPREAD_MM = 0.15
+"""How far an edge strays from press to press (scale of a logistic)."""
+STAGES: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("scale and place", ("lam", "tip_gain", "origin_mm")),
+    ("heel", ("heel_gain",)),
+    ("zero offset", ("h0_mm", "origin_gain")),
+    ("profile", ("heel_power", "heel_round", "tip_power", "tip_round", "core_mm")),
+    ("growth", ("width_power", "length_power")),
+    ("tilt", ("width_tilt", "length_tilt")),
+)
+"""Each stage frees its parameters beside all that were freed before."""
+WORST_CONDITION = 300.0
+"""Of the Jacobian with columns of unit length: beyond it, captures this noisy do not tell the parameters apart."""
+ROUNDS = 40
+EDGE_SPREAD_MM = (1.2, 0.4, 0.3, 0.15, 0.15)
+"""How large an edge's terms may be; the k-th sine's share of it falls as 1 / k."""
+EDGE_NOISE_MM = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Pixel centres of an image around the point of touch, mm: x toward the heel, y upward."""
+
+    x_mm: Floats
+    y_mm: Floats
+
+    @property
+    def px_mm(self) -> float:
+        """The pixel's side."""
+        return float(self.x_mm[1] - self.x_mm[0])
+
+
+@dataclass(frozen=True, slots=True)
+class Pressed:
+    """One captured press: its command and its ink, (len(y_mm), len(x_mm)) from 0 to 1."""
+
+    height_mm: float
+    tilt_deg: float
+    ink: NDArray[np.floating]
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """What became of one stage."""
+
+    name: str
+    parameters: tuple[str, ...]
+    condition: float
+    """Of everything free in it; inf where a column of the Jacobian is zero."""
+    refused: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A brush fitted to presses, and what its intervals and the next press are reckoned from."""
+
+    press: FittedPress
+    free: tuple[str, ...]
+    stages: tuple[Stage, ...]
+    squares: Floats
+    """(strokes, P, P): J'J of each stroke at the end, scaled by the parameters' spreads; P is free parameters."""
+    gradients: Floats
+    """(strokes, P)."""
+    strokes: int
+
+
+def fit_presses(
+    strokes: Sequence[Pressed],
+    grid: Grid,
+    radius_mm: float,
+    length_mm: float,
+    *,
+    edges: bool = True,
+    stages: Sequence[tuple[str, tuple[str, ...]]] = STAGES,
+) -> Fit:
+    """Fit all stages that the strokes can tell, then the edges. Raises ValueError without a stroke."""
+    if not strokes:
+        raise ValueError("a fit needs at least one stroke")
+    press = FittedPress(radius_mm, length_mm)
+    free: tuple[str, ...] = ()
+    made: list[Stage] = []
+    for name, parameters in stages:
+        wanted = (*free, *parameters)
+        # Judged where the stage's fit ends, as the published start is far from any brush.
+        fitted = _minimise(press, wanted, strokes, grid)
+        condition = condition_number(_normal(fitted, wanted, strokes, grid)[0].sum(axis=0))
+        refused = not condition <= WORST_CONDITION
+        made.append(Stage(name, parameters, condition, refused))
+        if not refused:
+            press, free = fitted, wanted
+    squares, gradients, _ = _normal(press, free, strokes, grid)
+    if edges:
+        press = replace(press, edges=fit_edges(press, strokes, grid))
+    return Fit(press, free, tuple(made), squares, gradients, len(strokes))
+
+
+def refit(fit: Fit, strokes: Sequence[Pressed], grid: Grid) -> Fit:
+    """The same parameters fitted to other strokes of the same brush, from where the fit stands. Raises ValueError as
+    `fit_presses`."""
+    if not strokes:
+        raise ValueError("a fit needs at least one stroke")
+    bare = replace(fit.press, edges=FittedPress(fit.press.radius_mm, fit.press.length_mm).edges)
+    press = _minimise(bare, fit.free, strokes, grid)
+    squares, gradients, _ = _normal(press, fit.free, strokes, grid)
+    press = replace(press, edges=fit_edges(press, strokes, grid))
+    return replace(fit, press=press, squares=squares, gradients=gradients, strokes=len(strokes))
+
+
+def zero_touch(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> tuple[FittedPress, Floats]:
+    """Only depth and place of the zero touch, all else of the brush held: what changed since `press` was fitted.
+
+    Returns the brush and the standard errors of (h0_mm, origin_mm), by bootstrap over strokes.
+    """
+    free = ("h0_mm", "origin_mm")
+    edges = press.edges
+    held = _minimise(replace(press, edges=np.zeros_like(edges)), free, strokes, grid)
+    squares, gradients, _ = _normal(held, free, strokes, grid)
+    errors = bootstrap(held, free, squares, gradients).std(axis=0)
+    return replace(held, edges=edges), errors
+
+
+def bootstrap(
+    press: FittedPress, free: Sequence[str], squares: Floats, gradients: Floats, draws: int = 500, seed: int = 0
+) -> Floats:
+    """(draws, P) values of the free parameters when the strokes are drawn again with replacement.
+
+    Each draw takes one Gauss-Newton step from the fit instead of a whole fit, which keeps 500 of them within a
+    second; with fewer than some 8 strokes the intervals are too short.
+    """
+    at = [NAMES.index(name) for name in free]
+    spread = np.array([PARAMETERS[k].spread for k in at])
+    off = (press.values[at] - np.array([PARAMETERS[k].start for k in at])) / spread
+    count = len(squares)
+    weights = np.random.default_rng(seed).multinomial(count, np.full(count, 1.0 / count), draws).astype(np.float64)
+    square = np.tensordot(weights, squares, 1) + np.eye(len(at))
+    steps = np.asarray(np.linalg.solve(square, -(weights @ gradients + off)[..., None]), np.float64)[..., 0]
+    low, high = (np.array([getattr(PARAMETERS[k], end) for k in at]) for end in ("low", "high"))
+    return np.clip(press.values[at] + spread * steps, low, high)
+
+
+def condition_number(square: Floats) -> float:
+    """Of a Jacobian with unit columns, from its J'J; inf where a column is zero."""
+    length = np.sqrt(np.diag(square))
+    if not len(square) or not np.all(length > 1e-6):
+        return float("inf")
+    values = np.linalg.eigvalsh(square / np.outer(length, length))
+    return float(np.sqrt(values[-1] / values[0])) if values[0] > 1e-12 else float("inf")
+
+
+def jacobian(
+    press: FittedPress, free: Sequence[str], height_mm: float, tilt_deg: float, grid: Grid
+) -> tuple[Floats, Floats]:
+    """The chance of ink (pixels,) and its derivatives by the free parameters over their spreads, (pixels, P)."""
+    base = press.chance(height_mm, tilt_deg, grid.x_mm, grid.y_mm, SPREAD_MM).ravel()
+    columns = np.empty((base.size, len(free)))
+    for k, name in enumerate(free):
+        at = NAMES.index(name)
+        step = 1e-4 * PARAMETERS[at].spread
+        values = press.values.copy()
+        values[at] += step
+        ahead = replace(press, values=values).chance(height_mm, tilt_deg, grid.x_mm, grid.y_mm, SPREAD_MM)
+        columns[:, k] = (ahead.ravel() - base) * 1e4
+    return base, columns
+
+
+def fit_edges(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> Floats:
+    """(2, MODES, TERMS): what the captured edges leave of the profile, by ridge regression."""
+    weights = np.outer(1.0 / np.arange(1, MODES + 1), EDGE_SPREAD_MM).ravel()
+    square = np.eye(len(weights))
+    right = np.zeros((len(weights), 2))
+    above = grid.y_mm > 0.0
+    for stroke in strokes:
+        s = press.sizes(stroke.height_mm, stroke.tilt_deg)
+        share = (grid.x_mm - s.widest + s.tip) / (s.tip + s.heel)
+        on = (share > 0.0) & (share < 1.0)
+        design = np.einsum("xk,t->xkt", modes(share[on]), command_terms(stroke.height_mm, stroke.tilt_deg))
+        design = design.reshape(int(on.sum()), -1) * weights / EDGE_NOISE_MM
+        width = press.half_width(stroke.height_mm, stroke.tilt_deg, grid.x_mm[on])
+        square += design.T @ design
+        for side, rows in enumerate((above, ~above)):
+            edge = stroke.ink[rows][:, on].sum(axis=0) * grid.px_mm
+            right[:, side] += design.T @ ((edge - width) / EDGE_NOISE_MM)
+    return (np.linalg.solve(square, right) * weights[:, None]).T.reshape(2, MODES, -1)
+
+
+def _minimise(press: FittedPress, free: tuple[str, ...], strokes: Sequence[Pressed], grid: Grid) -> FittedPress:
+    """Levenberg-Marquardt from the brush given, each parameter held to its spread as by one pixel of ink."""
+    at = [NAMES.index(name) for name in free]
+    spread = np.array([PARAMETERS[k].spread for k in at])
+    start = np.array([PARAMETERS[k].start for k in at])
+    low, high = (np.array([getattr(PARAMETERS[k], end) for k in at]) for end in ("low", "high"))
+
+    def equations(trial: FittedPress) -> tuple[float, Floats, Floats]:
+        squares, gradients, cost = _normal(trial, free, strokes, grid)
+        off = (trial.values[at] - start) / spread
+        return cost + 0.5 * float(off @ off), squares.sum(axis=0) + np.eye(len(at)), gradients.sum(axis=0) + off
+
+    cost, square, gradient = equations(press)
+    damping = 1e-2
+    for _ in range(ROUNDS):
+        step = np.linalg.solve(square + damping * np.diag(np.diag(square)), -gradient)
+        values = press.values.copy()
+        values[at] = np.clip(values[at] + spread * np.clip(step, -1.0, 1.0), low, high)
+        trial = replace(press, values=values)
+        if any(s.height_mm + values[1] <= 0.1 for s in strokes):
+            damping *= 8.0
+            continue
+        found = equations(trial)
+        if found[0] < cost:
+            gain = (cost - found[0]) / max(cost, 1e-9)
+            press, (cost, square, gradient), damping = trial, found, max(damping / 6.0, 1e-7)
+            if gain < 1e-4:
+                break
+        else:
+            damping *= 8.0
+            if damping > 1e5:
+                break
+    return press
+
+
+def _normal(
+    press: FittedPress, free: Sequence[str], strokes: Sequence[Pressed], grid: Grid
+) -> tuple[Floats, Floats, float]:
+    """J'J and J'r of each stroke, and half the sum of squares. A cell is drawn once for all its strokes."""
+    drawn: dict[tuple[float, float], tuple[Floats, Floats, Floats]] = {}
+    squares: list[Floats] = []
+    gradients: list[Floats] = []
+    cost = 0.0
+    for stroke in strokes:
+        cell = (stroke.height_mm, stroke.tilt_deg)
+        if cell not in drawn:
+            base, columns = jacobian(press, free, *cell, grid)
+            drawn[cell] = base, columns, columns.T @ columns
+        base, columns, square = drawn[cell]
+        miss = base - stroke.ink.ravel()
+        squares.append(square)
+        gradients.append(columns.T @ miss)
+        cost += 0.5 * float(miss @ miss)
+    return np.array(squares), np.array(gradients), cost

@@ -1,0 +1,149 @@
+"""What was measured of a camera, as immutable files named after the hash of their contents."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from calibrate.artefact import HASH_CHARS, MAX_BYTES
+from calibrate.camera.intrinsics import Fitted
+from calibrate.camera.lens import Lens
+from calibrate.errors import CalibrationError
+from calibrate.files import write_whole
+
+
+class Artefact(BaseModel):
+    """Base: frozen, nothing unknown is let in, saved under the hash of its canonical JSON."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @property
+    def digest(self) -> str:
+        """The first characters of the sha256 of the canonical JSON."""
+        return hashlib.sha256(self._canonical()).hexdigest()[:HASH_CHARS]
+
+    def _canonical(self) -> bytes:
+        return self.model_dump_json(indent=2).encode() + b"\n"
+
+    def save(self, folder: Path) -> Path:
+        """Write `<digest>.json` into `folder`; where it is there already, it is the same and stays. Raises OSError."""
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{self.digest}.json"
+        if not path.exists():
+            write_whole(path, self._canonical().decode())
+        return path
+
+
+class LensFile(Artefact):
+    """Intrinsics with everything that is needed to judge them."""
+
+    kind: Literal["lens"] = "lens"
+    schema_version: int = 1
+    software: str
+    photographs: dict[str, str]
+    """Name of every photograph that was given, and the sha256 of its bytes."""
+    board: str
+    """In words: kind, size in squares or corners, mm."""
+    size_px: tuple[int, int]
+    matrix: tuple[float, float, float, float]
+    """fx, fy, cx, cy in pixels, pixel centres on integers."""
+    distortion: tuple[float, float, float, float, float]
+    """k1, k2, p1, p2, k3 of OpenCV's model."""
+    focal_se_px: tuple[float, float]
+    rms_px: float
+    rms_limit_px: float
+    residuals_px: dict[str, float]
+    dropped: dict[str, float]
+    """Outlier views and their residuals."""
+    unusable: dict[str, str]
+    """Photographs without a usable board, and why."""
+    guidance: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    def lens(self) -> Lens:
+        """To look through."""
+        fx, fy, cx, cy = self.matrix
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return Lens(matrix, np.array(self.distortion), self.size_px)
+
+
+def lens_file(
+    fitted: Fitted,
+    board: str,
+    photographs: dict[str, str],
+    unusable: dict[str, str],
+    rms_limit_px: float,
+    software: str,
+) -> LensFile:
+    """The file of a fitted lens."""
+    matrix, d = fitted.lens.matrix, fitted.lens.distortion
+    return LensFile(
+        software=software,
+        photographs=photographs,
+        board=board,
+        size_px=fitted.lens.size_px,
+        matrix=(float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])),
+        distortion=(float(d[0]), float(d[1]), float(d[2]), float(d[3]), float(d[4])),
+        focal_se_px=fitted.focal_se_px,
+        rms_px=fitted.rms_px,
+        rms_limit_px=rms_limit_px,
+        residuals_px=fitted.residuals_px,
+        dropped=fitted.dropped,
+        unusable=unusable,
+        guidance=fitted.guidance,
+        warnings=fitted.warnings,
+    )
+
+
+class RegistrationFile(Artefact):
+    """Where the robot's points lie on the paper, with what each of them says."""
+
+    kind: Literal["registration"] = "registration"
+    schema_version: int = 1
+    software: str
+    source: str
+    """The table of points, or the session, and its sha256."""
+    model: Literal["rigid", "similarity", "affine"]
+    robot_to_paper: tuple[float, float, float, float, float, float]
+    """(2, 3) row by row: mm in the robot's base frame to mm in the paper frame."""
+    turn_deg: float
+    scale: float
+    rms_mm: float
+    left_out_rms_mm: float
+    """Of every point, predicted by the others."""
+    residuals_mm: dict[str, tuple[float, float]]
+    dropped: dict[str, tuple[float, float]]
+
+
+F = TypeVar("F", LensFile, RegistrationFile)
+
+
+def load(path: Path, kind: type[F]) -> F:
+    """Read an artefact of this kind. Raises `CalibrationError` where it is none or was edited."""
+    data = _bytes(path)
+    artefact = _parsed(path, data, lambda text: kind.model_validate_json(text))
+    if hashlib.sha256(data).hexdigest()[:HASH_CHARS] != path.stem:
+        raise CalibrationError(str(path), "was edited: its name is not the hash of its contents")
+    return artefact
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise CalibrationError(str(path), f"is larger than {MAX_BYTES} bytes")
+        return path.read_bytes()
+    except OSError as error:
+        raise CalibrationError(str(path), error.strerror or str(error)) from None
+
+
+def _parsed(path: Path, data: bytes, parse: Callable[[bytes], F]) -> F:
+    try:
+        return parse(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise CalibrationError(str(path), f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None

@@ -1,0 +1,240 @@
+"""`brushloop camera ...`: board, lens, plane, drift, registration. Heavy imports wait until a command runs."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from calibrate.camera.boards import Board
+    from calibrate.camera.lens import Gray
+
+
+class Kind(StrEnum):
+    """What a registration may fit."""
+
+    RIGID = "rigid"
+    SIMILARITY = "similarity"
+    AFFINE = "affine"
+
+
+app = typer.Typer(help="The camera: print a board, calibrate lens and plane, register the robot.", no_args_is_help=True)
+
+Corners = Annotated[str, typer.Option("--checkerboard", help="Inner corners of a checkerboard, as 9x6.")]
+Squares = Annotated[str, typer.Option("--charuco", help="Squares of a ChArUco board, as 26x20.")]
+Square = Annotated[float, typer.Option(min=0.5, max=1000.0, help="Side of a square, measured on the print.")]
+Marker = Annotated[float, typer.Option(min=0.0, max=1000.0, help="Side of a marker; 0: three quarters of a square.")]
+Dictionary = Annotated[str, typer.Option(help="Markers of the ChArUco board.")]
+LensOption = Annotated[Path | None, typer.Option("--lens", help="Lens file of `camera intrinsics`.")]
+
+
+@app.command()
+def board(
+    out: Annotated[Path, typer.Argument(help="The new PDF.")],
+    checkerboard: Corners = "",
+    charuco: Squares = "",
+    square_mm: Square = 12.0,
+    marker_mm: Marker = 0.0,
+    dictionary: Dictionary = "DICT_5X5_1000",
+    page: Annotated[str, typer.Option(help="a4, a3, a2 or letter.")] = "a4",
+) -> None:
+    """Write a printable board as a PDF at true scale, with a ruler to check the print."""
+    from calibrate.camera.pdf import describe, write_pdf
+
+    made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
+    typer.echo(f"{write_pdf(made, out, page)}: {describe(made)}")
+
+
+@app.command()
+def intrinsics(
+    photographs: Annotated[list[Path], typer.Argument(help="Photographs of one board, held in many ways.")],
+    checkerboard: Corners = "",
+    charuco: Squares = "",
+    square_mm: Square = 12.0,
+    marker_mm: Marker = 0.0,
+    dictionary: Dictionary = "DICT_5X5_1000",
+    limit_px: Annotated[float, typer.Option(min=0.01, max=10.0, help="Residual above which it warns.")] = 0.5,
+    out: Annotated[Path, typer.Option(help="Folder for the lens file.")] = Path("camera"),
+) -> None:
+    """Fit the lens; says what each photograph contributes, which were dropped, and what to photograph besides."""
+    import hashlib
+    from importlib.metadata import version
+
+    from calibrate.camera.artefact import lens_file
+    from calibrate.camera.boards import View, see
+    from calibrate.camera.intrinsics import fit_lens
+    from calibrate.camera.pdf import describe
+    from calibrate.errors import CalibrationError
+
+    made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
+    seen, unusable, digests = list[View](), dict[str, str](), dict[str, str]()
+    for path in photographs:
+        image = _gray(path)
+        digests[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        try:
+            seen.append(see(image, made, path.name))
+        except CalibrationError as error:
+            unusable[path.name] = error.what
+    try:
+        fitted = fit_lens(seen, limit_px)
+    except CalibrationError as error:
+        raise CalibrationError(
+            error.where, "; ".join([error.what, *(f"{n} {why}" for n, why in unusable.items())])
+        ) from None
+    file = lens_file(fitted, describe(made), digests, unusable, limit_px, f"brushloop {version('brushloop')}")
+    for name, residual in file.residuals_px.items():
+        typer.echo(f"{name}: {residual:.3f} px, slanted by {fitted.slants_deg[name]:.0f} deg")
+    for name, residual in file.dropped.items():
+        typer.echo(f"{name}: {residual:.3f} px, dropped: it does not fit the others")
+    for name, why in unusable.items():
+        typer.echo(f"{name}: {why}")
+    fx, fy, cx, cy = file.matrix
+    typer.echo(
+        f"fx {fx:.2f} +- {file.focal_se_px[0]:.2f} px, fy {fy:.2f} +- {file.focal_se_px[1]:.2f} px, "
+        f"centre {cx:.1f}, {cy:.1f} px, k1 {file.distortion[0]:+.4f}\n"
+        f"residual {file.rms_px:.3f} px over {len(file.residuals_px)} views"
+    )
+    for line in (*(f"warning: {w}" for w in file.warnings), *(f"to do: {g}" for g in file.guidance)):
+        typer.echo(line)
+    typer.echo(str(file.save(out)))
+
+
+@app.command()
+def check(
+    photograph: Annotated[Path, typer.Argument(help="A photograph of the board as it will lie.")],
+    charuco: Squares = "26x20",
+    square_mm: Square = 12.0,
+    marker_mm: Marker = 0.0,
+    dictionary: Dictionary = "DICT_5X5_1000",
+    lens: LensOption = None,
+    limit_px: Annotated[float, typer.Option(min=0.01, max=10.0, help="Residual above which it warns.")] = 0.5,
+) -> None:
+    """Pre-flight: pix2len with its interval from one photograph of the board, and warnings. Exit code 5 with any."""
+    from calibrate.camera.artefact import LensFile, load
+    from calibrate.camera.check import preflight
+    from calibrate.scale import BoardSpec
+
+    spec = _board("", charuco, square_mm, marker_mm, dictionary)
+    assert isinstance(spec, BoardSpec)
+    plane, warnings = preflight(_gray(photograph), spec, load(lens, LensFile) if lens else None, limit_px)
+    low, high = plane.interval_mm_per_px
+    typer.echo(
+        f"pix2len {plane.mm_per_px:.5f} mm/px (95 %: {low:.5f} to {high:.5f}), residual {plane.rms_px:.3f} px over "
+        f"{plane.corners} corners, k1 {float(plane.lens.distortion[0]):+.4f}"
+    )
+    for warning in warnings:
+        typer.echo(f"warning: {warning}")
+    if warnings:
+        raise typer.Exit(5)
+
+
+@app.command()
+def drift(
+    session: Annotated[Path, typer.Argument(help="A session's folder or its .mcap file.")],
+    lens: LensOption = None,
+) -> None:
+    """pix2len each time that the board was seen in a session, its trend, and whether the camera was touched."""
+    from calibrate.camera.artefact import LensFile, load
+    from calibrate.camera.drift import board_of, board_over_session
+
+    spec = board_of(session)
+    found = board_over_session(session, spec, load(lens, LensFile).lens() if lens else None)
+    for seen in found.seen:
+        low, high = seen.plane.interval_mm_per_px
+        after_s = (seen.t_ns - found.seen[0].t_ns) / 1e9
+        typer.echo(
+            f"{after_s:8.0f} s: {seen.plane.mm_per_px:.5f} mm/px (95 %: {low:.5f} to {high:.5f}), "
+            f"residual {seen.plane.rms_px:.3f} px, board moved {seen.moved_px:.2f} px"
+        )
+    if found.trend is not None:
+        low, high = found.trend.interval
+        typer.echo(f"trend {100 * found.trend.slope:+.4f} % per hour (95 %: {100 * low:+.4f} to {100 * high:+.4f})")
+    for warning in found.warnings:
+        typer.echo(f"warning: {warning}")
+
+
+@app.command()
+def register(
+    table: Annotated[Path, typer.Argument(help="CSV with name, robot_x_mm, robot_y_mm, image_x_px, image_y_px.")],
+    photograph: Annotated[Path, typer.Option(help="Photograph of the board, taken as the marks were.")],
+    charuco: Squares = "26x20",
+    square_mm: Square = 12.0,
+    marker_mm: Marker = 0.0,
+    dictionary: Dictionary = "DICT_5X5_1000",
+    lens: LensOption = None,
+    model: Annotated[
+        Kind, typer.Option(help="rigid; similarity: scale too; affine: x and y on their own.")
+    ] = Kind.RIGID,
+    out: Annotated[Path, typer.Option(help="Folder for the registration file.")] = Path("camera"),
+) -> None:
+    """Where the robot's points lie on the paper, from marks that it touched or pressed; with residuals."""
+    from importlib.metadata import version
+
+    from calibrate.camera.artefact import LensFile, load
+    from calibrate.camera.drift import see_plane
+    from calibrate.camera.points import read_points, registration_file
+    from calibrate.camera.register import register as fit
+    from calibrate.scale import BoardSpec
+
+    spec = _board("", charuco, square_mm, marker_mm, dictionary)
+    assert isinstance(spec, BoardSpec)
+    points = read_points(table)
+    plane = see_plane(_gray(photograph), spec, load(lens, LensFile).lens() if lens else None, str(photograph))
+    fitted = fit(points.names, points.robot_mm, plane.to_paper(points.image_px), model.value)
+    for name, (dx, dy) in zip(fitted.names, fitted.residuals_mm.tolist(), strict=True):
+        out_of_it = ", dropped: it does not fit the others" if name in fitted.dropped else ""
+        typer.echo(f"{name}: {dx:+.3f}, {dy:+.3f} mm{out_of_it}")
+    file = registration_file(fitted, f"{table.name}, sha256 {points.sha256}", f"brushloop {version('brushloop')}")
+    typer.echo(
+        f"turned by {file.turn_deg:.3f} deg, scale {file.scale:.5f}, residual {file.rms_mm:.3f} mm, "
+        f"{file.left_out_rms_mm:.3f} mm for a point that was left out\n{file.save(out)}"
+    )
+
+
+def _board(checkerboard: str, charuco: str, square_mm: float, marker_mm: float, dictionary: str) -> Board:
+    from pydantic import ValidationError
+
+    from calibrate.camera.boards import Checkerboard
+    from calibrate.errors import CalibrationError
+    from calibrate.scale import BoardSpec
+
+    if bool(checkerboard) == bool(charuco):
+        raise CalibrationError("board", "give one of --checkerboard (inner corners) and --charuco (squares), as 9x6")
+    try:
+        if checkerboard:
+            return Checkerboard(inner_corners=_pair(checkerboard), square_mm=square_mm)
+        return BoardSpec(
+            squares=_pair(charuco),
+            square_mm=square_mm,
+            marker_mm=marker_mm or 0.75 * square_mm,
+            dictionary=dictionary,
+            origin_mm=(0.0, 0.0),
+        )
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise CalibrationError("board", f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+
+
+def _pair(text: str) -> tuple[int, int]:
+    from calibrate.errors import CalibrationError
+
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdigit() and len(part) < 4 for part in parts):
+        raise CalibrationError("board", f"{text!r} is no size like 9x6")
+    return int(parts[0]), int(parts[1])
+
+
+def _gray(path: Path) -> Gray:
+    from calibrate.errors import CalibrationError
+    from sessions.errors import SessionDamaged
+    from sessions.messages import decode_gray
+
+    try:
+        return decode_gray(path.read_bytes(), str(path))
+    except OSError as error:
+        raise CalibrationError(str(path), error.strerror or str(error)) from None
+    except SessionDamaged as error:
+        raise CalibrationError(str(path), error.what) from None

@@ -1,0 +1,62 @@
+"""A lens: where a pixel would lie if the lens were straight, and the way back (OpenCV's five-parameter model)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Gray = NDArray[np.uint8]
+Floats = NDArray[np.float64]
+ROUNDS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """Camera matrix and distortion of one camera at one focus and one image size."""
+
+    matrix: Floats
+    """(3, 3) in pixels, pixel centres on integers."""
+    distortion: Floats
+    """(5,) k1, k2, p1, p2, k3."""
+    size_px: tuple[int, int]
+    """Width and height."""
+
+    def straight(self, pixels: Floats) -> Floats:
+        """(n, 2) pixels of a photograph -> where they lie in the straightened one."""
+        none = np.eye(3)
+        found = cv2.undistortPointsIter(
+            pixels.reshape(-1, 1, 2).astype(np.float64), self.matrix, self.distortion, none, self.matrix, ROUNDS
+        )
+        return np.asarray(found, np.float64).reshape(-1, 2)
+
+    def bent(self, pixels: Floats) -> Floats:
+        """(n, 2) pixels of the straightened photograph -> where they lie in the photograph as it was taken."""
+        focal, centre = np.array([self.matrix[0, 0], self.matrix[1, 1]]), self.matrix[:2, 2]
+        return distort((pixels - centre) / focal, self.distortion) * focal + centre
+
+    def straighten(self, image: Gray) -> Gray:
+        """The photograph as a lens without distortion would have taken it, same size and camera matrix."""
+        return cast("Gray", cv2.undistort(image, self.matrix, self.distortion))
+
+
+def distort(rays: Floats, distortion: Floats) -> Floats:
+    """(n, 2) points at distance 1 through Brown's model as OpenCV has it; `distortion` is k1, k2, p1, p2, k3."""
+    k1, k2, p1, p2, k3 = distortion
+    x, y = rays[:, 0], rays[:, 1]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    across = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    along = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return np.column_stack([across, along])
+
+
+def unknown_lens(size_px: tuple[int, int]) -> Lens:
+    """What is assumed of a camera without intrinsics: no distortion, axis in the middle, one image width of focus."""
+    width, height = size_px
+    focal = float(max(width, height))
+    matrix = np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
+    return Lens(matrix, np.zeros(5), size_px)

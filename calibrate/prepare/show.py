@@ -1,0 +1,88 @@
+"""One capture of a session, or one photograph, through all stages into a picture and a file of numbers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from calibrate.camera.drift import board_of, see_plane
+from calibrate.camera.lens import Gray
+from calibrate.errors import CalibrationError
+from calibrate.field import Field
+from calibrate.files import write_whole
+from calibrate.prepare.difference import new_stroke
+from calibrate.prepare.params import Params
+from calibrate.prepare.picture import contact_sheet
+from calibrate.prepare.stages import Trace, trace_scaled, trace_seen
+from sessions.errors import SessionDamaged
+from sessions.messages import decode_gray
+from sessions.reader import Capture, Recording
+from sessions.sequence import SEQUENCE
+
+PAPER = 255
+
+
+def show_stroke(session: Path, stroke: str, out: Path, params: Params | None = None) -> Trace:
+    """A stroke of a session by its name, the first where that is empty. Raises `CalibrationError`."""
+    recording = Recording(session)
+    before: Capture | None = None
+    for capture in recording.captures():
+        if stroke in ("", capture.stroke.stroke_id):
+            break
+        before = capture
+    else:
+        raise CalibrationError(str(recording.path), f"holds no stroke {stroke!r}")
+    one, image, where = capture.stroke, capture.image(), f"{recording.path.name} {capture.stroke.stroke_id}"
+    if one.anchor_mm is not None:
+        boards = list(recording.stills_of("board"))
+        if not boards:
+            raise CalibrationError(str(recording.path), "holds no view of the board (a `board` step)")
+        plane = see_plane(decode_gray(boards[-1], where), board_of(session), None, where)
+        trace = trace_seen(image, plane, Field().window_mm(one.anchor_mm), one.anchor_mm, where, params or Params())
+    elif one.px_per_mm is not None:
+        if recording.header.protocol.startswith(SEQUENCE) and before is not None:
+            image = only_new(before.image(), image, float(np.mean(one.px_per_mm)), where)
+        trace = trace_scaled(image, one.px_per_mm, one.anchor_px, where, params or Params())
+    else:
+        raise CalibrationError(where, "has neither an anchor on the sheet nor a scale of its own")
+    return _written(trace, params or Params(), out)
+
+
+def show_photograph(
+    path: Path, px_per_mm: float | None, before: Path | None, out: Path, params: Params | None = None
+) -> Trace:
+    """A flat photograph of known scale. Raises `CalibrationError`."""
+    if px_per_mm is None:
+        raise CalibrationError(str(path), "is a photograph: give --px-per-mm")
+    image = _gray(path)
+    if before is not None:
+        image = only_new(_gray(before), image, px_per_mm, str(path))
+    trace = trace_scaled(image, (px_per_mm, px_per_mm), None, str(path), params or Params())
+    return _written(trace, params or Params(), out)
+
+
+def only_new(before: Gray, after: Gray, px_per_mm: float, where: str) -> Gray:
+    """A page with nothing on it but what came since `before`, black on white. Raises `CaptureRefused`."""
+    new = new_stroke(before, after, px_per_mm, where)
+    return np.rint(PAPER * (1.0 - new.soft)).astype(np.uint8)
+
+
+def _written(trace: Trace, params: Params, out: Path) -> Trace:
+    _, data = cv2.imencode(".png", contact_sheet(trace))
+    out.write_bytes(data.tobytes())
+    told = {"where": trace.where, "params": asdict(params), "fitted": trace.log, "flags": list(trace.flags)}
+    write_whole(out.with_suffix(".json"), json.dumps(told, indent=2) + "\n")
+    return trace
+
+
+def _gray(path: Path) -> Gray:
+    try:
+        return decode_gray(path.read_bytes(), str(path))
+    except OSError as error:
+        raise CalibrationError(str(path), error.strerror or str(error)) from None
+    except SessionDamaged as error:
+        raise CalibrationError(str(path), error.what) from None

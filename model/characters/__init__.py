@@ -1,0 +1,1 @@
+"""Characters: strokes of a font or a hand to trajectories of the brush, and trajectories to an image."""

@@ -1,0 +1,102 @@
+"""From a character to trajectories: along the median, as deep as the stroke is wide there, heading where it goes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.characters.brush import Reach, behind_of, depth_of
+from model.characters.glyph import FOOT_UNITS, SIDE_UNITS, Glyph
+from model.protocol import StrokeModel
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """The square patch that a character is written on: its side, and the margin around the font's square."""
+
+    side_mm: float = 70.0
+    margin_mm: float = 6.0
+
+    def __post_init__(self) -> None:
+        if not 10.0 <= self.side_mm <= 500.0 or not 0 <= self.margin_mm < 0.4 * self.side_mm:
+            given = f"cell of {self.side_mm:g} mm with a margin of {self.margin_mm:g} mm"
+            raise ValueError(f"{given}: expected 10 to 500 mm, the margin less than 0.4 of it")
+
+    @property
+    def mm_per_unit(self) -> float:
+        """Size of a font unit."""
+        return (self.side_mm - 2 * self.margin_mm) / SIDE_UNITS
+
+    def to_mm(self, units: Floats) -> Floats:
+        """Font units (..., 2) to mm from the cell's lower left corner, y upward."""
+        return self.margin_mm + self.mm_per_unit * (units - np.array([0.0, FOOT_UNITS]))
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """A way on the cell with a half width along it: `points` (N, 2) mm, `half_width_mm` (N,)."""
+
+    points: Floats
+    half_width_mm: Floats
+
+
+def paths_of(glyph: Glyph, cell: Cell, step_mm: float) -> list[Path]:
+    """The medians of a character, resampled, each with the distance to its own outline."""
+    out: list[Path] = []
+    for stroke in glyph.strokes:
+        points = resampled(cell.to_mm(stroke.median), step_mm)
+        out.append(Path(points, distance_to(cell.to_mm(stroke.polyline()), points)))
+    return out
+
+
+def trajectory(path: Path, model: StrokeModel, reach: Reach, cell: Cell, tilt_deg: float) -> Floats:
+    """Points (N, 5) of x, y, H, alpha, heading along a path; the convention is in `model.characters.brush`.
+
+    The tip trails behind the axis, so near the beginning the depth is held so small that it stays within the stroke.
+    """
+    points, half = path.points, path.half_width_mm
+    height = depth_of(model, reach, tilt_deg, half)
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    along = np.concatenate(([0.0], np.cumsum(steps)))
+    back = behind_of(model, tilt_deg, float(np.median(height)))
+    height = np.minimum(height, (along + half[0]) / back)
+    heading = tangents(points)
+    ahead = (height * np.tan(np.radians(tilt_deg)))[:, None]
+    way = np.column_stack((np.cos(np.radians(heading)), np.sin(np.radians(heading))))
+    made = np.column_stack((points - ahead * way, height, np.full(len(points), tilt_deg), heading))
+    return reach.within(made, cell.side_mm)
+
+
+def tangents(points: Floats) -> Floats:
+    """Headings along (N, 2) points in degrees, counter-clockwise from x, unwrapped, the first within 180 of 0."""
+    ahead = np.diff(points, axis=0)
+    middle = np.concatenate((ahead[:1], ahead[1:] + ahead[:-1], ahead[-1:]))
+    return np.degrees(np.unwrap(np.arctan2(middle[:, 1], middle[:, 0])))
+
+
+def resampled(points: Floats, step_mm: float) -> Floats:
+    """(N, 2) points at even steps along a polyline, near `step_mm`, both ends kept; at least three."""
+    along = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
+    count = max(3, round(along[-1] / step_mm) + 1)
+    at = np.linspace(0, along[-1], count)
+    return np.column_stack([np.interp(at, along, points[:, k]) for k in range(2)])
+
+
+def distance_to(loop: Floats, points: Floats) -> Floats:
+    """The distance of (N, 2) points to a closed polyline (M, 2), (N,); 0 outside of it."""
+    start, end = loop, np.roll(loop, -1, axis=0)
+    side = end - start
+    length = np.maximum(np.sum(side**2, axis=1), 1e-18)
+    off = points[:, None] - start
+    share = np.clip(np.sum(off * side, axis=2) / length, 0, 1)
+    nearest = np.linalg.norm(off - share[..., None] * side, axis=2).min(axis=1)
+    x, y = points[:, :1], points[:, 1:]
+    crosses = (start[:, 1] > y) != (end[:, 1] > y)
+    rise = np.where(side[:, 1] == 0, 1.0, side[:, 1])
+    left = x < start[:, 0] + (y - start[:, 1]) / rise * side[:, 0]
+    inside = np.count_nonzero(crosses & left, axis=1) % 2 == 1
+    return np.where(inside, nearest, 0.0)

@@ -1,0 +1,114 @@
+"""Dragged strokes with bristle lag: the footprint trails behind the tip, so the ink is not where the command was.
+
+A stamp laid along the commanded path cuts no corner and starts at full width; real ink does neither (a path-tangent
+stamp of any shape scores like plain circles). Here the footprint is a disc whose centre p follows the tip q over the
+length s of the path as a first-order lag,
+
+    dp/ds = (q - p) / leash,    leash = leash_mm + leash_per_mm * depth,
+
+and whose half width follows the depth with a lag of its own, `settle_mm`. Sideways drift stands for how the brush is
+set. The mark is the union of the discs between neighbouring nodes. Lengths are mm, x and y in the frame of the path,
+y upward, depth into the paper. No torch here: numpy and, at the first call, numba.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class DragModel:
+    """One brush drawn along the paper. The defaults are a start for a fit, not a brush."""
+
+    half_mm: float = 3.0
+    """Half width at depth 0, extrapolated; ink ends where the half width falls below 0."""
+    half_per_mm: float = 0.25
+    """Growth of the half width by depth."""
+    half_per_mm2: float = 0.0
+    leash_mm: float = 2.0
+    """How far the footprint trails behind the tip at depth 0."""
+    leash_per_mm: float = 0.35
+    """Growth of the leash by depth."""
+    settle_mm: float = 3.0
+    """Path length over which the footprint's width follows the depth."""
+    drift_x_mm: float = 0.0
+    drift_y_mm: float = 0.0
+    drift_x_per_mm: float = 0.0
+    """Growth of the drift by depth."""
+    drift_y_per_mm: float = 0.0
+    land_mm: float = 0.0
+    """Where the footprint lands, ahead of the tip along the path's first direction."""
+    back_mm: float = 0.0
+    """How far the mark reaches behind the place of landing."""
+    front: float = 0.3
+    """Share of the last gap between footprint and tip that ink still bridges while the brush lifts off."""
+    front_width: float = 0.5
+    """Half width there, as a share of the last footprint's."""
+
+    def vector(self) -> Floats:
+        """The parameters in order, (14,)."""
+        return np.array(astuple(self), np.float64)
+
+    @staticmethod
+    def names() -> tuple[str, ...]:
+        """The parameters' names, in the order of `vector`."""
+        return tuple(field.name for field in fields(DragModel))
+
+    @staticmethod
+    def of(vector: Floats) -> DragModel:
+        """The model of a (14,) vector."""
+        return DragModel(*(float(value) for value in vector))
+
+    def trail(self, path: Floats) -> Floats:
+        """Where the footprint goes: (n, 3) nodes x, y, depth of the tip -> (n + 2, 3) x, y, half width, mm.
+
+        The first and the last row are the mark's reach behind the landing and ahead of the lift-off. Raises
+        ValueError for a path of another shape, or of fewer than 2 nodes.
+        """
+        return trails([path], self.vector())[0]
+
+    def distance(self, path: Floats, x_mm: Floats, y_mm: Floats) -> Floats:
+        """Signed distance in mm to the mark's edge, positive in ink, at the grid (len(y_mm), len(x_mm))."""
+        nodes, starts = trails([path], self.vector())
+        return distances(nodes, starts, x_mm, y_mm)[0]
+
+    def coverage(self, path: Floats, x_mm: Floats, y_mm: Floats, softness_mm: float) -> Floats:
+        """Ink from 0 to 1 at the grid, falling from .88 to .12 over `softness_mm` about the edge. Raises ValueError
+        unless the softness is positive."""
+        if not softness_mm > 0.0:
+            raise ValueError(f"softness_mm = {softness_mm:g}: must be positive")
+        return ink(self.distance(path, x_mm, y_mm), softness_mm / 4.0)
+
+
+def ink(distance_mm: Floats, spread_mm: float) -> Floats:
+    """Signed distance to the chance of ink, if the edge strays by `spread_mm` (logistic)."""
+    return 1.0 / (1.0 + np.exp(-np.clip(distance_mm / spread_mm, -40.0, 40.0)))
+
+
+def trails(paths: Sequence[Floats], vector: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """All paths' trails after each other, (sum(n + 2), 3), and where each begins and the last ends, (B + 1,)."""
+    for path in paths:
+        if path.ndim != 2 or path.shape[1] != 3 or len(path) < 2:
+            raise ValueError(f"a path is (n, 3) with n >= 2, got {path.shape}")
+    from model.drag_kernel import follow  # numba takes a fifth of a second to import
+
+    ends = np.cumsum([0, *(len(path) for path in paths)])
+    starts = ends + 2 * np.arange(len(ends))
+    out = np.empty((int(starts[-1]), 3))
+    follow(np.ascontiguousarray(np.concatenate(paths), np.float64), ends, np.asarray(vector, np.float64), out, starts)
+    return out, starts
+
+
+def distances(nodes: Floats, starts: NDArray[np.int64], x_mm: Floats, y_mm: Floats) -> Floats:
+    """Signed distance of every trail on one grid, (B, len(y_mm), len(x_mm)) mm, positive in ink."""
+    from model.drag_kernel import signed
+
+    out = np.empty((len(starts) - 1, len(y_mm), len(x_mm)))
+    signed(nodes, starts, np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64), out)
+    return out

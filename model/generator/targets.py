@@ -1,0 +1,143 @@
+"""What a generator is trained on: a stroke model's exact coverage over ranges of its parameters, in one placement."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+import torch
+from torch import Tensor
+
+from model.ccdbsm import DomainError
+from model.coverage import centred_origin
+from model.profile import Shape
+from model.protocol import ParameterSpec, StrokeModel
+from model.raster.compiled import coverage_numpy
+from model.raster.frame import SIZE_PX
+
+ANCHOR_SHARE = (0.76, 0.5)
+"""Where a zero-touch point lies in the field, from the left and from the top: that of the validation's mm field."""
+_BLOCK = 64  # candidates that are tried at a time
+
+
+class Placement(StrEnum):
+    """How a stroke is put into the image, at heading 0."""
+
+    CENTRED = "centred"
+    """The bounding box in the middle: the longest press of the paper's grid just fits at 0.2 mm/px."""
+    ZERO_TOUCH = "zero-touch"
+    """The zero-touch point at ANCHOR_SHARE; O3 lies H tan(alpha) from it. Needs height_mm and tilt_deg."""
+    BASE = "base"
+    """O3 at (base_x_mm, base_y_mm) from the left and the top: the paper's (x0, y0), fixed or inputs."""
+
+
+BASE_SPECS = (
+    ParameterSpec("base_x_mm", "mm", -400, 400, 29.2, "x0, O3 from the image's left edge"),
+    ParameterSpec("base_y_mm", "mm", -400, 400, 19.2, "y0, O3 from the image's top edge"),
+)
+"""The paper's starting point (x0, y0). Not called x0_mm: a QBC's first control point is."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Target:
+    """A stroke model, the ranges of the inputs, what stays fixed, and where strokes are put.
+
+    `inputs` carry the trained ranges as low and high. Raises ValueError for an unknown parameter, a range outside
+    the model's own, or a placement without what it needs.
+    """
+
+    model: StrokeModel
+    ranges: Mapping[str, tuple[float, float]]
+    fixed: Mapping[str, float] = field(default_factory=dict[str, float])
+    placement: Placement = Placement.CENTRED
+    px_mm: float = 0.2
+    size_px: int = SIZE_PX
+    inputs: tuple[ParameterSpec, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        known = {spec.name: spec for spec in self.model.parameters}
+        if self.placement is Placement.BASE:
+            known |= {spec.name: spec for spec in BASE_SPECS}
+        if self.placement is Placement.ZERO_TOUCH and not {"height_mm", "tilt_deg"} <= known.keys():
+            raise ValueError(f"placement zero-touch needs height_mm and tilt_deg, which {self.model.name} has not")
+        if not self.ranges:
+            raise ValueError("ranges is empty: a generator needs an input")
+        specs: list[ParameterSpec] = []
+        for name, (low, high) in self.ranges.items():
+            if name not in known:
+                raise ValueError(f"ranges.{name}: {self.model.name} knows {', '.join(known)}")
+            spec = known[name]
+            if not spec.low <= low < high <= spec.high:
+                raise ValueError(f"ranges.{name} = [{low:g}, {high:g}] must grow within [{spec.low:g}, {spec.high:g}]")
+            default = min(max(spec.default, low), high)
+            specs.append(replace(spec, low=low, high=high, default=default))
+        for name, value in self.fixed.items():
+            if name not in known or name in self.ranges:
+                raise ValueError(f"fixed.{name}: not a parameter that is left to fix")
+            if not known[name].low <= value <= known[name].high:
+                raise ValueError(f"fixed.{name} = {value:g} is outside [{known[name].low:g}, {known[name].high:g}]")
+        object.__setattr__(self, "inputs", tuple(specs))
+
+    def values(self, inputs: Tensor) -> dict[str, Tensor]:
+        """(N, P) inputs as the model's named parameters and the base, in float64, each (N,)."""
+        wide = inputs.detach().double().cpu()
+        named = {spec.name: wide[:, k] for k, spec in enumerate(self.inputs)}
+        rest = self.model.parameters + (BASE_SPECS if self.placement is Placement.BASE else ())
+        fixed = {spec.name: self.fixed.get(spec.name, spec.default) for spec in rest if spec.name not in named}
+        return named | {name: torch.full((len(wide),), value, dtype=torch.float64) for name, value in fixed.items()}
+
+    def shape(self, inputs: Tensor) -> Shape:
+        """The exact shapes of (N, P) inputs; may raise DomainError."""
+        values = self.values(inputs)
+        return self.model.shape({spec.name: values[spec.name] for spec in self.model.parameters})
+
+    def origin_mm(self, inputs: Tensor, shape: Shape) -> Tensor:
+        """Where O3 lies in each image, (N, 2) from the left and the top."""
+        values = self.values(inputs)
+        match self.placement:
+            case Placement.CENTRED:
+                return centred_origin(shape, size_px=self.size_px, px_mm=self.px_mm)
+            case Placement.ZERO_TOUCH:
+                side_mm = self.size_px * self.px_mm
+                x = ANCHOR_SHARE[0] * side_mm + values["height_mm"] * torch.tan(values["tilt_deg"] * (math.pi / 180))
+                return torch.stack((x, torch.full_like(x, ANCHOR_SHARE[1] * side_mm)), dim=-1)
+            case Placement.BASE:
+                return torch.stack((values["base_x_mm"], values["base_y_mm"]), dim=-1)
+
+    def images(self, inputs: Tensor, threads: int = 1) -> Tensor:
+        """Exact coverage of (N, P) inputs, (N, size_px, size_px) float32 on the CPU; may raise DomainError."""
+        shape = self.shape(inputs)
+        origin = self.origin_mm(inputs, shape)
+        images = coverage_numpy(shape, origin, size_px=self.size_px, px_mm=self.px_mm, threads=threads)
+        return torch.from_numpy(images)
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """`count` inputs drawn evenly from the ranges, without those that the model refuses, (count, P) float32.
+
+        Raises ValueError where the model refuses more than nine of ten.
+        """
+        low = torch.tensor([spec.low for spec in self.inputs])
+        span = torch.tensor([spec.high - spec.low for spec in self.inputs])
+        found: list[Tensor] = []
+        have = tried = 0
+        while have < count:
+            candidates = low + span * torch.rand((_BLOCK, len(self.inputs)), generator=generator)
+            good = candidates[self._accepted(candidates)]
+            found.append(good)
+            have, tried = have + len(good), tried + _BLOCK
+            if tried >= 20 * _BLOCK and have < tried / 10:
+                raise ValueError(f"{self.model.name} refuses nine of ten strokes in these ranges")
+        return torch.cat(found)[:count]
+
+    def _accepted(self, inputs: Tensor) -> Tensor:
+        """Which inputs the model draws, (N,) bool: halves what is refused until the culprits are found."""
+        try:
+            self.shape(inputs)
+        except DomainError:
+            if len(inputs) == 1:
+                return torch.zeros(1, dtype=torch.bool)
+            half = len(inputs) // 2
+            return torch.cat((self._accepted(inputs[:half]), self._accepted(inputs[half:])))
+        return torch.ones(len(inputs), dtype=torch.bool)

@@ -1,0 +1,258 @@
+"""`Inverter`: images of presses to depth H, tilt alpha and place, each with its interval and what to think of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.inversion.forward import PARAMETERS, Forward, Images, Outlines, Render, Rendered
+from model.inversion.jets import Jets, analytic, of_model
+from model.inversion.levenberg import Limits, fit
+from model.inversion.noise import Noise, covariance
+from model.inversion.start import MIN_INK_MM2, Table, moments_of
+from model.protocol import Basis, StrokeModel
+from model.raster.frame import PX_MM, SIZE_PX
+
+Floats = NDArray[np.float64]
+EDGE_INK = 0.3
+"""More ink than this in a pixel on the image's edge, and the mark may go on beyond it."""
+_STEP: dict[str, float] = dict(zip(PARAMETERS, (2.0, 4.0, 2.0, 2.0, 10.0), strict=True))
+_STILL: dict[str, float] = dict(zip(PARAMETERS, (1e-4, 1e-3, 1e-4, 1e-4, 1e-3), strict=True))
+_TABLE_DEPTHS, _TABLE_TILTS = 32, 7
+
+
+class Flag(StrEnum):
+    """What a reader of a recovered press has to know."""
+
+    ALPHA_UNKNOWN = "alpha_unknown"
+    """No zero-touch anchor: shape alone does not tell alpha, since 1 % error of R or lambda moves it by 4.4 deg."""
+    AT_BOUND = "at_bound"
+    """H, alpha or place lies on the edge of what was allowed; its interval holds for one side at most."""
+    DID_NOT_CONVERGE = "did_not_converge"
+    CUT = "cut"
+    """The mark reaches the edge of the image: ink beyond it is not known."""
+    BLANK = "blank"
+    """Too little ink to be a mark; the values are NaN."""
+
+
+class Known(StrEnum):
+    """What is known of a press's place."""
+
+    ANCHOR = "anchor"
+    """The zero-touch point, where the tip met the paper, and the heading: alpha moves the mark away from it."""
+    ORIGIN = "origin"
+    """Where the brush axis meets the paper, and the heading. Of a simulation; no rig knows it without alpha."""
+    NOTHING = "nothing"
+    """Place and heading are fitted too."""
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """The depths and tilts that are looked for."""
+
+    height_mm: tuple[float, float] = (2.0, 30.0)
+    tilt_deg: tuple[float, float] = (0.0, 30.0)
+
+    def __post_init__(self) -> None:
+        for name, (low, high), least in (("height_mm", self.height_mm, 1e-3), ("tilt_deg", self.tilt_deg, 0.0)):
+            if not (least <= low < high < math.inf):
+                raise ValueError(f"{name} = ({low:g}, {high:g}): expected {least:g} <= low < high")
+
+
+@dataclass(frozen=True, slots=True)
+class Recovered:
+    """B recovered presses. `values` (B, 5) are H, alpha, x, y, heading (`PARAMETERS`), mm and degrees.
+
+    `sigma` are standard deviations, 0 for what was known and NaN where the image does not tell; `covariance`
+    (B, P, P) is that of the fitted ones, `fitted`. x and y are the anchor's or the origin's place in the image.
+    """
+
+    values: Floats
+    sigma: Floats
+    covariance: Floats
+    fitted: tuple[str, ...]
+    rms: Floats
+    """Root mean square of target - predicted, (B,)."""
+    iterations: NDArray[np.int64]
+    flags: tuple[frozenset[Flag], ...]
+
+    @property
+    def height_mm(self) -> Floats:
+        """H, (B,)."""
+        return self.values[:, 0]
+
+    @property
+    def tilt_deg(self) -> Floats:
+        """alpha, (B,). Read the flags before believing it."""
+        return self.values[:, 1]
+
+    def interval(self, name: str, z: float = 1.96) -> tuple[Floats, Floats]:
+        """Ends of the interval of a parameter, each (B,); z = 1.96 is 95 % of a normal distribution."""
+        k = PARAMETERS.index(name)
+        return self.values[:, k] - z * self.sigma[:, k], self.values[:, k] + z * self.sigma[:, k]
+
+
+@dataclass(frozen=True, slots=True)
+class Inverter:
+    """Recovers presses from images of one model, raster and kind of knowledge. Made once, used for many batches.
+
+    `anchor_sigma_mm` above 0 says how well the anchor is known, along either axis; its place is then fitted with that
+    as a prior. `tilt_deg`, where given, holds alpha there: what else to do without an anchor.
+    """
+
+    jets: Jets
+    within: Range = field(default_factory=Range)
+    known: Known = Known.ANCHOR
+    noise: Noise = Noise.PIXEL
+    size_px: int = SIZE_PX
+    px_mm: float = PX_MM
+    anchor_sigma_mm: float = 0.0
+    tilt_deg: float | None = None
+    table: Table = field(init=False)
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.anchor_sigma_mm < math.inf):
+            raise ValueError(f"anchor_sigma_mm = {self.anchor_sigma_mm:g}: expected at least 0")
+        low, high = self.within.tilt_deg
+        if self.tilt_deg is not None and not low <= self.tilt_deg <= high:
+            raise ValueError(f"tilt_deg = {self.tilt_deg:g}: expected {low:g} to {high:g}")
+        side = self.size_px * self.px_mm
+        # Twice the image at half the resolution: a mark is then never cut, wherever its origin lies.
+        place = (side, side)
+        held = np.array([[0.0, 0.0, *place, 0.0]])
+        coarse = Outlines(self.jets, PARAMETERS[:2], held, self.known is Known.ANCHOR, self.size_px, 2 * self.px_mm)
+        heights = np.geomspace(*self.within.height_mm, _TABLE_DEPTHS)
+        tilts = np.array([self.tilt_deg]) if self.tilt_deg is not None else np.linspace(low, high, _TABLE_TILTS)
+        object.__setattr__(self, "table", Table.of(coarse, heights, tilts, place, 2 * self.px_mm))
+
+    @classmethod
+    def of_brush(cls, basis: Basis, **options: object) -> Inverter:
+        """For CCD-BSM of a brush, with derivatives in closed form."""
+        radius, length = float(basis.brush.radius_mm), float(basis.brush.length_mm)
+        return cls(analytic(radius, length, basis.lam), **options)  # pyright: ignore[reportArgumentType]
+
+    @classmethod
+    def of_model(cls, model: StrokeModel, **options: object) -> Inverter:
+        """For any stroke model, with derivatives by forward-mode differentiation."""
+        return cls(of_model(model), **options)  # pyright: ignore[reportArgumentType]
+
+    def __call__(
+        self,
+        images: NDArray[np.floating],  # pyright: ignore[reportMissingTypeArgument]
+        place_mm: Floats | tuple[float, float] | None = None,
+        heading_deg: Floats | float | None = None,
+    ) -> Recovered:
+        """Recover the presses of (B, N, N) coverage images, ink = 1.
+
+        `place_mm` (2,) or (B, 2) is the known anchor or origin, as mm from the left and top edge; `heading_deg` the
+        known heading, 0 where left out. Raises ValueError for images of another size or values outside [0, 1].
+        """
+        target = self._checked(images)
+        count = len(target)
+        seen = moments_of(target, self.px_mm)
+        free_place = self.known is Known.NOTHING
+        if free_place is not (place_mm is None):
+            raise ValueError(f"place_mm: expected {'none' if free_place else 'one'} where {self.known} is known")
+        place = None if place_mm is None else np.broadcast_to(np.asarray(place_mm, np.float64), (count, 2))
+        known = np.asarray(0.0 if heading_deg is None else heading_deg, np.float64)
+        heading = seen.heading_deg() if free_place else np.broadcast_to(known, (count,))
+        start = np.column_stack((self.table.nearest(seen, place, heading), heading))
+        names = self._names()
+        forward = Outlines(self.jets, names, start, self.known is Known.ANCHOR, self.size_px, self.px_mm)
+        return _recover(forward, target, start, self._limits(names), self.noise, seen.area < MIN_INK_MM2,
+                        alpha_known=self.known is Known.ANCHOR, near_mm=self.px_mm)  # fmt: skip
+
+    def assuming(self, tilt_deg: float) -> Inverter:
+        """The same with alpha held there."""
+        return replace(self, tilt_deg=tilt_deg)
+
+    def _checked(self, images: NDArray[np.floating]) -> Images:  # pyright: ignore[reportMissingTypeArgument]
+        target = np.ascontiguousarray(images, np.float32)
+        wanted = (self.size_px, self.size_px)
+        if target.ndim != 3 or target.shape[1:] != wanted:
+            raise ValueError(f"images are {target.shape}, expected (B, {self.size_px}, {self.size_px})")
+        return target
+
+    def _names(self) -> tuple[str, ...]:
+        names = ["height_mm"] if self.tilt_deg is not None else ["height_mm", "tilt_deg"]
+        if self.known is Known.NOTHING:
+            names += PARAMETERS[2:]
+        elif self.anchor_sigma_mm > 0:
+            names += PARAMETERS[2:4]
+        return tuple(names)
+
+    def _limits(self, names: tuple[str, ...]) -> Limits:
+        # Beyond the image on every side: an anchor may lie outside it.
+        reach = (-self.size_px * self.px_mm, 2 * self.size_px * self.px_mm)
+        box = {"height_mm": self.within.height_mm, "tilt_deg": self.within.tilt_deg}
+        box |= {"x_mm": reach, "y_mm": reach, "heading_deg": (-720.0, 720.0)}
+        precision: dict[str, float] = {}
+        if self.known is Known.ANCHOR and self.anchor_sigma_mm > 0:
+            precision = dict.fromkeys(("x_mm", "y_mm"), self.anchor_sigma_mm ** (-2))
+        return limits_of(names, box, precision)
+
+
+def limits_of(
+    names: tuple[str, ...], box: dict[str, tuple[float, float]], precision: dict[str, float] | None = None
+) -> Limits:
+    """The limits of a fit in these parameters, with the steps of this module."""
+    known = precision or {}
+    columns = [(*box[n], _STEP.get(n, 1.0), _STILL.get(n, 1e-5), known.get(n, 0.0)) for n in names]
+    return Limits(*np.array(columns, np.float64).T)
+
+
+def invert_rendered(
+    render: Render,
+    images: NDArray[np.floating],  # pyright: ignore[reportMissingTypeArgument]
+    within: Range,
+    *,
+    anchored: bool = False,
+    noise: Noise = Noise.PIXEL,
+    px_mm: float = PX_MM,
+) -> Recovered:
+    """Recover (H, alpha) through any differentiable renderer, (B, 2) to (B, N, N), such as a trained generator.
+
+    The targets must be aligned as the renderer draws; `anchored` says that this alignment is on the zero-touch point.
+    The start is the nearest of a table that the renderer draws, by area, place and spread.
+    """
+    target = np.ascontiguousarray(images, np.float32)
+    seen = moments_of(target, px_mm)
+    forward = Rendered(render)
+    heights = np.linspace(*within.height_mm, _TABLE_DEPTHS)
+    table = Table.of(forward, heights, np.linspace(*within.tilt_deg, _TABLE_TILTS), (0.0, 0.0), px_mm)
+    none = np.zeros(len(target))
+    start = table.nearest(seen, np.zeros((len(target), 2)), none)[:, :2]
+    full = np.column_stack((start, np.zeros((len(target), 3))))
+    limits = limits_of(PARAMETERS[:2], {"height_mm": within.height_mm, "tilt_deg": within.tilt_deg})
+    return _recover(forward, target, full, limits, noise, seen.area < MIN_INK_MM2, alpha_known=anchored, near_mm=px_mm)
+
+
+def _recover(
+    forward: Forward, target: Images, start: Floats, limits: Limits, noise: Noise, blank: NDArray[np.bool_],
+    *, alpha_known: bool, near_mm: float,
+) -> Recovered:  # fmt: skip
+    columns = [PARAMETERS.index(name) for name in forward.names]
+    found = fit(forward, target, start[:, columns], limits)
+    near = np.array([1.5 * near_mm, 1.5, near_mm, near_mm, 1.0])[columns]
+    spread = covariance(noise, forward, found, limits, near)
+    values, sigma = start.copy(), np.zeros(start.shape)
+    values[:, columns] = found.values
+    sigma[:, columns] = np.sqrt(np.einsum("bii->bi", spread))
+    values[blank] = sigma[blank] = np.nan
+    bound = ((found.values <= limits.low) | (found.values >= limits.high)).any(axis=1)
+    held = "tilt_deg" not in forward.names
+    raised = {
+        Flag.ALPHA_UNKNOWN: np.full(len(target), held or not alpha_known),
+        Flag.AT_BOUND: bound & ~blank,
+        Flag.DID_NOT_CONVERGE: ~found.converged & ~blank,
+        Flag.CUT: found.normal.cut > EDGE_INK,
+        Flag.BLANK: blank,
+    }
+    flags = tuple(frozenset(flag for flag, of in raised.items() if of[n]) for n in range(len(target)))
+    return Recovered(
+        values, sigma, spread, forward.names, np.sqrt(found.normal.cost / found.pixels), found.iterations, flags
+    )

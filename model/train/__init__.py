@@ -1,0 +1,1 @@
+"""Training the generator: `brushloop train`. Only this part of `model` touches files."""

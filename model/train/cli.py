@@ -1,0 +1,103 @@
+"""`brushloop train`: train, tune and export the generator. Heavy imports wait until a command runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+app = typer.Typer(help="Train the neural stroke generator, tune it on captures, export it.")
+
+
+@app.callback(invoke_without_command=True)
+def train(
+    context: typer.Context,
+    out: Annotated[Path, typer.Option(help="Folder of this training; the same command goes on there.")] = Path(
+        "generator"
+    ),
+    target: Annotated[str, typer.Option(help="press, anchored, all, qbc or bezier.")] = "press",
+    config: Annotated[Path | None, typer.Option(help="A train.toml instead of a target's defaults.")] = None,
+    steps: Annotated[int | None, typer.Option(help="G, the most steps.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of weights and images.")] = None,
+    threads: Annotated[int | None, typer.Option(help="Threads of each process.")] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda.")] = None,
+    tensorboard: Annotated[bool, typer.Option(help="Write TensorBoard's event files too.")] = False,
+) -> None:
+    """Train on exact images of a stroke model (Algorithm 1). Under torchrun, its processes share each batch."""
+    if context.invoked_subcommand is not None:
+        return
+    from model.train import config as configs
+    from model.train.console import run
+
+    changes = {"steps": steps, "seed": seed, "threads": threads, "device": device}
+    changes = {name: value for name, value in changes.items() if value is not None}
+    if config is None:
+        chosen = configs.preset(target, **changes)
+    else:
+        chosen = configs.checked(config, configs.load_config(config).model_dump() | changes)
+    run(chosen, out, None, tensorboard)
+
+
+@app.command()
+def tune(
+    generator: Annotated[Path, typer.Argument(help="The generator.safetensors to start from.")],
+    captures: Annotated[Path, typer.Argument(help="Captured strokes, a safetensors file.")],
+    out: Annotated[Path, typer.Option(help="Folder of this training.")] = Path("generator-tuned"),
+    steps: Annotated[int, typer.Option(min=1, help="How many steps.")] = 300,
+    learning_rate: Annotated[float, typer.Option(min=0, max=1, help="The highest rate.")] = 3e-4,
+    held_out: Annotated[float, typer.Option(min=0, max=1, help="Share of captures to validate on.")] = 0.2,
+    seed: Annotated[int, typer.Option(min=0, help="Which captures are held out, and the order of the rest.")] = 0,
+    tensorboard: Annotated[bool, typer.Option(help="Write TensorBoard's event files too.")] = False,
+) -> None:
+    """Fine-tune a generator on captured strokes; some are held out to validate on."""
+    from model.train.captures import load_captures
+    from model.train.checkpoint import load_weights, sha256
+    from model.train.config import checked
+    from model.train.console import run
+    from model.train.run import Tuning
+
+    before = load_weights(generator)[0]
+    _, source = load_captures(captures, before)
+    fields: dict[str, Any] = before.model_dump() | {
+        "steps": steps,
+        "learning_rate": learning_rate,
+        "seed": seed,
+        "validate_every": max(1, steps // 20),
+        "tuning": {
+            "start_sha256": sha256(generator),
+            "captures_sha256": sha256(captures),
+            "source": source,
+            "held_out": held_out,
+        },
+    }
+    run(checked("tune", fields), out, Tuning(generator, captures), tensorboard)
+
+
+@app.command()
+def export(
+    generator: Annotated[Path, typer.Argument(help="A generator.safetensors.")],
+    form: Annotated[str, typer.Option(help="onnx, or pt2 for torch.export.")] = "onnx",
+) -> None:
+    """Write a generator for other programs, checked against the network, with its card."""
+    import rich
+    from rich.markup import escape
+
+    from model.train.export import export as write
+
+    path, worst = write(generator, form)
+    rich.print(f"{escape(str(path))}: at most {worst:.1e} off the network in any pixel")
+
+
+@app.command()
+def basis(
+    target: Annotated[str, typer.Option(help="press or anchored.")] = "press",
+    validation_images: Annotated[int, typer.Option(min=1, max=100_000, help="Images to compare with.")] = 2000,
+    out: Annotated[Path | None, typer.Option(help="Write its coefficients as safetensors here.")] = None,
+) -> None:
+    """Fit the field basis, an interpolator beside the network, by least squares in seconds, and say how close it is."""
+    import rich
+
+    from model.train.basis_file import fit_and_compare
+
+    rich.print(fit_and_compare(target, validation_images, out))

@@ -1,0 +1,195 @@
+"""What a training is, as a file: frozen, checked, and kept inside every checkpoint."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from model.ccdbsm import Brush, DomainError
+from model.generator.network import Generator, Layers
+from model.generator.presets import PRESETS
+from model.generator.targets import Placement, Target
+from model.registry import UnknownModelError, stroke_model
+from model.train.errors import TrainError
+
+MAX_BYTES = 64 * 1024
+MAX_WEIGHTS = 50_000_000
+Range = tuple[float, float]
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class LayerConfig(_Frozen):
+    """Sizes of the network; see `model.generator.network.Layers`."""
+
+    degree: Annotated[int, Field(ge=1, le=16)] = 4
+    width: Annotated[int, Field(ge=1, le=2048)] = 256
+    depth: Annotated[int, Field(ge=1, le=8)] = 2
+    channels: Annotated[int, Field(ge=1, le=128)] = 16
+    hidden_channels: Annotated[int, Field(ge=0, le=256)] = 0
+    side: Literal[8, 16, 32, 64] = 16
+
+
+class TargetConfig(_Frozen):
+    """Which strokes are drawn; see `model.generator.targets.Target`."""
+
+    model: Annotated[str, Field(max_length=64)] = "ccd-bsm"
+    radius_mm: Annotated[float, Field(gt=0, le=100)] = 6.0
+    length_mm: Annotated[float, Field(gt=0, le=400)] = 48.0
+    lam: Annotated[float, Field(gt=0, le=10)] = math.pi
+    fitted_brush: bool = False
+    """Whether lambda or the brush were fitted to captures; every report then says so."""
+    ranges: Annotated[dict[str, Range], Field(min_length=1, max_length=16)]
+    fixed: Annotated[dict[str, float], Field(max_length=16)] = {}
+    placement: Placement = Placement.CENTRED
+    px_mm: Annotated[float, Field(ge=0.01, le=10)] = 0.2
+    size_px: Literal[32, 64, 128, 256] = 128
+
+
+class TuningConfig(_Frozen):
+    """Fine-tuning on captured strokes: what it started from and what it learned from, by content."""
+
+    start_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    captures_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    source: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\r\n]*$")]
+    """What kind of ink the captures are of, as `loopback rig`."""
+    held_out: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    """The share of captures that is validated on and never learned from."""
+
+
+class TrainConfig(_Frozen):
+    """A whole training. The defaults are the paper's where it gives a number."""
+
+    target: TargetConfig
+    layers: LayerConfig = LayerConfig()
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    training_images: Annotated[int, Field(ge=1, le=1_000_000)] = 20_000
+    validation_images: Annotated[int, Field(ge=1, le=1_000_000)] = 2_000
+    batch: Annotated[int, Field(ge=1, le=4_096)] = 64
+    """Images a step, over all processes."""
+    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 6_000
+    """G of Algorithm 1."""
+    picture_every: Annotated[int, Field(ge=1)] = 1_000
+    """m of Algorithm 1."""
+    validate_every: Annotated[int, Field(ge=1)] = 250
+    checkpoint_every: Annotated[int, Field(ge=1)] = 250
+    learning_rate: Annotated[float, Field(gt=0, le=1)] = 5e-3
+    """At its highest: it rises over `warmup_steps`, then falls to 0 at the last step along half a cosine."""
+    warmup_steps: Annotated[int, Field(ge=0)] = 50
+    ink_weight: Annotated[float, Field(ge=1, le=1000)] = 1.0
+    """w of Eq. 6 where the target is ink; 1 where it is paper."""
+    target_mse: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Converged when the validation MSE is at most this; 0 never."""
+    patience: Annotated[int, Field(ge=0)] = 0
+    """Converged when so many validations in a row brought no gain of 1 %; 0 never."""
+    blank_after: Annotated[int, Field(ge=1)] = 2
+    """Validations in a row with blank output that end the training."""
+    tuning: TuningConfig | None = None
+    """Where the weights and the images come from, when captures are what is learned from."""
+    threads: Annotated[int, Field(ge=1, le=256)] = 1
+    """Threads of torch in each process; another number changes the last bits of the weights."""
+    device: Literal["cpu", "cuda"] = "cpu"
+
+    @model_validator(mode="after")
+    def _build(self) -> TrainConfig:
+        self.build_target()
+        if self.target.size_px % self.layers.side:
+            raise ValueError(f"layers.side = {self.layers.side} does not divide size_px = {self.target.size_px}")
+        if self.weight_count() > MAX_WEIGHTS:
+            raise ValueError(f"layers: {self.weight_count():,} weights; at most {MAX_WEIGHTS:,}")
+        return self
+
+    def weight_count(self) -> int:
+        """How many numbers the network has, without building it."""
+        n, upscale = self.layers, self.target.size_px // self.layers.side
+        sizes = [n.degree * len(self.target.ranges), *[n.width] * n.depth, n.channels * n.side**2]
+        fully = sum((a + 1) * b for a, b in pairwise(sizes))
+        planes = [n.channels, *([n.hidden_channels] if n.hidden_channels else []), upscale**2]
+        return fully + sum((9 * a + 1) * b for a, b in pairwise(planes))
+
+    def build_target(self) -> Target:
+        """The target; ValueError where it makes no sense."""
+        t = self.target
+        try:
+            basis = stroke_model(t.model, Brush(t.radius_mm, t.length_mm), t.lam, fitted=t.fitted_brush)
+        except (UnknownModelError, DomainError) as error:
+            raise ValueError(str(error)) from error
+        fixed = dict(t.fixed)
+        own = {"radius_mm": t.radius_mm, "length_mm": t.length_mm, "lam": t.lam} if t.model == "ccd-bsm" else {}
+        fixed = {name: value for name, value in own.items() if name not in t.ranges} | fixed
+        return Target(basis, t.ranges, fixed, t.placement, t.px_mm, t.size_px)
+
+    def build_network(self) -> Generator:
+        """The network with the weights of `seed`; the state of torch's generator is left as it was."""
+        import torch
+
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.seed)
+            return Generator(self.build_target().inputs, self.build_layers())
+
+    def build_layers(self) -> Layers:
+        """The sizes as the network takes them."""
+        return Layers(**self.layers.model_dump(), size_px=self.target.size_px)
+
+
+def preset(name: str, **changes: Any) -> TrainConfig:
+    """The configuration of a preset, with fields changed. Raises TrainError for an unknown name or a bad field."""
+    if name not in PRESETS:
+        raise TrainError(name, f"no such target; known: {', '.join(PRESETS)}")
+    chosen = PRESETS[name]
+    sizes = {field: getattr(chosen.layers, field) for field in LayerConfig.model_fields}
+    target = {
+        "model": chosen.model,
+        "ranges": chosen.ranges,
+        "fixed": chosen.fixed,
+        "placement": chosen.placement,
+        "px_mm": chosen.px_mm,
+    }
+    return checked(f"target {name}", {"target": target, "layers": sizes, "learning_rate": chosen.rate} | changes)
+
+
+def load_config(path: Path) -> TrainConfig:
+    """Read a TOML file; raises TrainError with file, field and what is allowed."""
+    try:
+        data = path.read_bytes()[: MAX_BYTES + 1]
+    except OSError as error:
+        raise TrainError(path, error.strerror or "cannot be read") from error
+    if len(data) > MAX_BYTES:
+        raise TrainError(path, f"is larger than {MAX_BYTES} bytes")
+    try:
+        return checked(path, tomllib.loads(data.decode("utf-8")))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise TrainError(path, f"is no TOML: {error}") from error
+
+
+def checked(where: Path | str, fields: Any) -> TrainConfig:
+    """A configuration from plain data; raises TrainError that names the first bad field."""
+    try:
+        return TrainConfig.model_validate(fields)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        field = ".".join(str(part) for part in first["loc"])
+        words = first["msg"].removeprefix("Value error, ")
+        raise TrainError(where, f"{field}: {words}" if field else words) from error
+
+
+def differences(old: TrainConfig, new: TrainConfig) -> list[str]:
+    """What two configurations disagree on, as `field: old -> new`."""
+    found: list[str] = []
+
+    def walk(a: Any, b: Any, path: str) -> None:
+        if isinstance(a, dict) and isinstance(b, dict):
+            for key in sorted(a.keys() | b.keys()):
+                walk(a.get(key), b.get(key), f"{path}.{key}" if path else key)
+        elif a != b:
+            found.append(f"{path}: {a} -> {b}")
+
+    walk(old.model_dump(mode="json"), new.model_dump(mode="json"), "")
+    return found

@@ -1,0 +1,107 @@
+"""A generator for other programs: ONNX, and torch.export's own format; each is checked against the network itself."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from model.generator.network import Generator
+from model.train.card import write_card
+from model.train.checkpoint import load_weights
+from model.train.config import TrainConfig
+from model.train.errors import MissingExtra, TrainError
+
+TOLERANCE = 1e-4
+"""The most that any pixel of a check may differ; float32 sums in another order differ by less."""
+_CHECKED = (1, 5, 64)
+
+
+def export(path: Path, form: str) -> tuple[Path, float]:
+    """Write `<stem>.onnx` or `<stem>.pt2` beside a generator, with a card; returns it and the largest difference seen.
+
+    Any batch size goes in; inputs are in the units of the card. Raises TrainError for an unknown form or where the
+    exported file draws something else, which is then removed, and MissingExtra without onnx.
+    """
+    writers = {"onnx": _onnx, "pt2": _program}
+    if form not in writers:
+        raise TrainError(path, f"form {form!r} is not known; known: {', '.join(writers)}")
+    config, network, report = load_weights(path)
+    out = path.with_suffix(f".{form}")
+    part = out.with_name(f"{out.stem}.part.{form}")
+    try:
+        draw = writers[form](network, _samples(config, 3), part)
+        worst = 0.0
+        for count in _CHECKED:
+            inputs = _samples(config, count)
+            with torch.no_grad():
+                worst = max(worst, float((network(inputs) - draw(inputs)).abs().max()))
+        if not worst <= TOLERANCE:
+            raise TrainError(out, f"draws pixels {worst:g} away from the network; at most {TOLERANCE:g}")
+        part.replace(out)
+    finally:
+        part.unlink(missing_ok=True)
+    batches = ", ".join(map(str, _CHECKED))
+    write_card(out, config, report, (f"Checked against the network in batches of {batches}: at most {worst:.1e} off.",))
+    return out, worst
+
+
+def _samples(config: TrainConfig, count: int) -> Tensor:
+    """Inputs spread over the trained ranges, both ends included, (count, P)."""
+    low = torch.tensor([spec.low for spec in config.build_target().inputs])
+    high = torch.tensor([spec.high for spec in config.build_target().inputs])
+    share = torch.linspace(0, 1, count).unsqueeze(-1)
+    return low + (high - low) * (share * torch.arange(1, len(low) + 1) % 1.0001).clamp(max=1)
+
+
+def _program(network: Generator, inputs: Tensor, path: Path) -> Any:
+    """torch.export: the traced network with its weights; read back and run."""
+    exported = torch.export.export(network, (inputs,), dynamic_shapes=({0: torch.export.Dim("batch")},))
+    with warnings.catch_warnings():
+        # Strided weights are views of one storage, all of them on the CPU.
+        warnings.filterwarnings("ignore", "No complete tensor found", UserWarning)
+        torch.export.save(exported, path)
+    return torch.export.load(path).module()
+
+
+def _onnx(network: Generator, inputs: Tensor, path: Path) -> Any:
+    """ONNX, run by onnxruntime."""
+    for package in ("onnx", "onnxscript", "onnxruntime"):
+        if importlib.util.find_spec(package) is None:
+            raise MissingExtra(package, "export")
+    import onnxruntime
+
+    with warnings.catch_warnings(), _quiet("torch.onnx._internal.exporter._registration"):
+        warnings.filterwarnings("ignore", ".*LeafSpec.* is deprecated", FutureWarning)
+        program = torch.onnx.export(
+            network,
+            (inputs,),
+            dynamo=True,
+            input_names=["inputs"],
+            output_names=["coverage"],
+            dynamic_shapes=({0: torch.export.Dim("batch")},),
+            verbose=False,
+        )
+    untyped: Any = program
+    untyped.save(str(path), external_data=False)
+    session: Any = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    return lambda values: torch.from_numpy(session.run(None, {"inputs": values.numpy()})[0])
+
+
+@contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """Hold a logger to errors: without torchvision, torch says for each of its operators that it skips it."""
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)

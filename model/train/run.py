@@ -1,0 +1,183 @@
+"""One training in one folder: start or go on, write what Algorithm 1 puts out, finish with a generator and its card.
+
+A folder holds `checkpoint.safetensors` while and after training, `generator.safetensors` with `generator.md` at the
+end, `loss.png`, `loss.csv`, `validation.csv`, `pictures/`, and `tensorboard/` where asked for.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from filelock import FileLock, Timeout
+from torch import Tensor
+
+from model.generator.metrics import SSIM_SETTINGS, quality
+from model.train.captures import load_captures
+from model.train.card import write_card
+from model.train.checkpoint import (
+    State,
+    load_checkpoint,
+    load_weights,
+    put_weights,
+    save_checkpoint,
+    save_generator,
+    sha256,
+)
+from model.train.config import TrainConfig, differences
+from model.train.curves import Events, write_curves, write_pictures
+from model.train.data import Images, exact_sets, split
+from model.train.distributed import Group
+from model.train.errors import TrainError
+from model.train.loop import Validation, converged, new_state, train
+
+
+@dataclass(frozen=True, slots=True)
+class Tuning:
+    """The files of a fine-tuning: the generator to start from, and the captures."""
+
+    start: Path
+    captures: Path
+
+
+class Progress(Protocol):
+    """What the command line shows."""
+
+    def stepped(self, step: int, loss: float) -> None:
+        """A step was done."""
+        ...
+
+    def validated(self, validation: Validation) -> None:
+        """A validation was done."""
+        ...
+
+
+def run_training(
+    config: TrainConfig,
+    folder: Path,
+    group: Group,
+    progress: Progress,
+    stopping: Callable[[], bool],
+    *,
+    tuning: Tuning | None = None,
+    events: bool = False,
+) -> Path:
+    """Train to the end, from the folder's checkpoint where there is one; returns the generator's path.
+
+    Raises TrainError where the folder holds another training, or is in use, and as `model.train.loop.train`.
+    """
+    with ExitStack() as held:
+        if group.first:
+            folder.mkdir(parents=True, exist_ok=True)
+            try:
+                held.enter_context(FileLock(folder / ".lock", timeout=0))
+            except Timeout as error:
+                raise TrainError(folder, "another training writes here") from error
+        group.wait()
+        state = _start(config, folder, tuning)
+        done = state.step == config.steps or converged(config, state.validations.tolist())
+        path = folder / "generator.safetensors"
+        finished = done and path.exists()
+        group.wait()  # nobody writes before all have read
+        if finished:
+            return path
+        sets = _sets(config, tuning)
+        shown = held.enter_context(Events(folder / "tensorboard", state.step)) if events and group.first else None
+        files = _Files(config, folder, progress, shown)
+        began = time.process_time()
+        state = train(config, state, sets, files, group, stopping)
+        if group.first:
+            _finish(config, folder, state, sets[1], time.process_time() - began)
+        group.wait()
+        return path
+
+
+def _start(config: TrainConfig, folder: Path, tuning: Tuning | None) -> State:
+    """The folder's checkpoint, the generator to tune, or step 0."""
+    path = folder / "checkpoint.safetensors"
+    if path.exists():
+        before, state = load_checkpoint(path)
+        for difference in differences(before, config):
+            raise TrainError(path, f"was trained with another configuration: {difference}; use a new folder")
+        return state
+    state = new_state(config)
+    if tuning is None:
+        return state
+    before, network, _ = load_weights(tuning.start)
+    for difference in differences(before, before.model_copy(update={"target": config.target, "layers": config.layers})):
+        raise TrainError(tuning.start, f"is another generator: {difference}")
+    weights = {name: value.detach().clone() for name, value in network.named_parameters()}
+    return State(weights, state.moments)
+
+
+def _sets(config: TrainConfig, tuning: Tuning | None) -> tuple[Images, Images]:
+    """What is learned from and what is validated on."""
+    if config.tuning is None:
+        return exact_sets(config)
+    if tuning is None:
+        raise TrainError("captures", "this training learns from captures; name their file")
+    if sha256(tuning.captures) != config.tuning.captures_sha256:
+        raise TrainError(tuning.captures, "is not the file that this training learns from")
+    captures, _ = load_captures(tuning.captures, config)
+    return split(captures, config.seed, config.tuning.held_out)
+
+
+@dataclass(slots=True, eq=False)
+class _Files:
+    """Writes what the loop hands out."""
+
+    config: TrainConfig
+    folder: Path
+    progress: Progress
+    events: Events | None
+    specs: Any = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.specs = self.config.build_target().inputs
+
+    def stepped(self, step: int, loss: float) -> None:
+        self.progress.stepped(step, loss)
+        if self.events and step % 10 == 0:
+            self.events.scalar("loss/training", loss, step)
+
+    def validated(self, validation: Validation) -> None:
+        self.progress.validated(validation)
+        if self.events:
+            self.events.scalar("loss/validation", validation.mse, validation.step)
+            self.events.scalar("validation/iou", validation.iou, validation.step)
+            self.events.scalar("validation/csim", validation.csim, validation.step)
+
+    def pictures(self, step: int, inputs: Tensor, targets: Tensor, drawn: Tensor) -> None:
+        (self.folder / "pictures").mkdir(exist_ok=True)
+        write_pictures(self.folder / "pictures" / f"step-{step:07d}.png", self.specs, inputs, targets, drawn)
+
+    def checkpoint(self, state: State) -> None:
+        save_checkpoint(self.folder / "checkpoint.safetensors", self.config, state)
+
+
+def _finish(config: TrainConfig, folder: Path, state: State, images: Images, cpu_s: float) -> None:
+    """Write the generator, its card and the curves."""
+    import torch
+
+    network = config.build_network().eval()
+    put_weights(network, state.weights)
+
+    def pairs() -> Any:
+        for numbers in torch.arange(len(images)).split(config.batch):
+            inputs, target = images.pick(numbers)
+            with torch.no_grad():
+                yield network(inputs), target
+
+    found = quality(pairs(), with_ssim=True)
+    rows = state.validations.tolist()
+    end = "converged" if converged(config, rows) else "all steps done"
+    report: dict[str, Any] = asdict(found) | {"psnr_db": found.psnr_db, "ssim_settings": SSIM_SETTINGS}
+    report |= {"steps": state.step, "end": end, "cpu_s": round(cpu_s, 1), "torch": torch.__version__}
+    write_curves(folder, state, f"{config.target.model}, seed {config.seed}")
+    path = folder / "generator.safetensors"
+    save_generator(path, config, state.weights, report)
+    write_card(path, config, report)

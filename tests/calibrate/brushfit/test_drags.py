@@ -1,0 +1,82 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrate.brushfit.drags import INK_ABOVE, Residual, chance, fit_drags
+from drivers.sim.brush import Brush, BrushSpec, Waypoint
+from model.drag import DragModel
+
+X_MM, Y_MM = np.arange(-10.0, 50.0, 1.0), np.arange(-18.0, 18.0, 1.0)
+TRUTH = DragModel(half_mm=1.5, half_per_mm=0.4, leash_mm=3.0, leash_per_mm=0.5, drift_y_mm=0.5, settle_mm=2.0)
+
+
+def arcs(count: int, seed: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0.0, 1.0, 15)
+    out = []
+    for _ in range(count):
+        length, bend, depth = rng.uniform(20.0, 35.0), rng.uniform(-9.0, 9.0), rng.uniform(3.0, 9.0)
+        out.append(np.column_stack([length * t, 4.0 * bend * t * (1.0 - t), np.full(15, depth)]))
+    return out
+
+
+def drawn(model: DragModel, paths: list[np.ndarray]) -> np.ndarray:
+    return np.array([chance(model.distance(path, X_MM, Y_MM)) for path in paths])
+
+
+def test_lag_and_width_are_found_again() -> None:
+    paths = arcs(12, 1)
+    fit = fit_drags(paths, drawn(TRUTH, paths), X_MM, Y_MM)
+    for depth in (4.0, 8.0):
+        assert fit.model.leash_mm + fit.model.leash_per_mm * depth == pytest.approx(3.0 + 0.5 * depth, rel=0.15)
+    others = arcs(4, 2)
+    assert np.abs(drawn(fit.model, others) - drawn(TRUTH, others)).mean() < 0.01
+    assert fit.condition < 1e5
+
+
+def test_the_place_on_a_page_is_told_from_the_brush() -> None:
+    paths = arcs(12, 3)
+    place = np.linspace(-1.0, 1.0, 12)[:, None]
+    moved = [path + np.array([0.0, 1.5 * float(p[0]), 0.0]) for path, p in zip(paths, place, strict=True)]
+    fit = fit_drags(paths, drawn(TRUTH, moved), X_MM, Y_MM, place)
+    assert fit.place_mm[0] == pytest.approx([0.0, 1.5], abs=0.25)
+
+
+def test_what_the_model_lacks_is_learned_from_neighbours() -> None:
+    commands = np.linspace(0.0, 1.0, 20)[:, None]
+    base = np.zeros((20, 4, 4))
+    captured = base + np.sin(3.0 * commands)[:, :, None]
+    residual = Residual.fit(commands[::2], base[::2], captured[::2], np.array([0.5]), ridge=0.01)
+    assert np.abs(residual.add(commands[1:-1:2], base[1:-1:2]) - captured[1:-1:2]).max() < 0.05
+
+
+def test_the_simulated_brush_trails_and_the_fit_sees_it() -> None:
+    """On the loopback rig: a brush drawn along an L stays away from the corner, and circles at the tip do not."""
+    brush = Brush(BrushSpec())
+    paths, images = [], []
+    for k, (depth, turn) in enumerate([(4.0, -1.0), (7.0, -1.0), (4.0, 1.0), (7.0, 1.0)]):
+        corners = [(0.0, 0.0), (25.0, 0.0), (25.0, 14.0 * turn)]
+        mark = brush.drag([Waypoint(x, y, depth) for x, y in corners], 0.0, 0.0, ink_load=1.0, press_seed=k)
+        leg, rise = np.linspace(0.0, 25.0, 15), np.linspace(0.0, 14.0 * turn, 9)[1:]
+        xy = np.concatenate([np.column_stack([leg, 0 * leg]), np.column_stack([0 * rise + 25.0, rise])])
+        paths.append(np.column_stack([xy, np.full(len(xy), depth)]))
+        column = np.round(mark.origin_px[0] + X_MM * mark.px_per_mm).astype(int)
+        row = np.round(mark.origin_px[1] - Y_MM * mark.px_per_mm).astype(int)
+        padded = np.pad(mark.density, 400)
+        images.append(padded[np.ix_(row + 400, column + 400)] > 0.3)
+    target = np.array(images)
+    lagging = fit_drags(paths, target, X_MM, Y_MM)
+    stamps = fit_drags(paths, target, X_MM, Y_MM, lag=False)
+    assert lagging.cost < 0.8 * stamps.cost
+    assert 1.0 < lagging.model.leash_mm + 7.0 * lagging.model.leash_per_mm < 15.0
+    seen = chance(lagging.distance(paths, X_MM, Y_MM)) > INK_ABOVE
+    assert np.count_nonzero(seen & target) / np.count_nonzero(seen | target) > 0.7
+
+
+def test_what_does_not_belong_together_is_refused() -> None:
+    paths = arcs(2, 1)
+    with pytest.raises(ValueError, match="not alike"):
+        fit_drags(paths, np.zeros((3, len(Y_MM), len(X_MM))), X_MM, Y_MM)
+    with pytest.raises(ValueError, match="not alike"):
+        fit_drags(paths, drawn(replace(TRUTH), paths), X_MM, Y_MM, np.zeros((3, 1)))

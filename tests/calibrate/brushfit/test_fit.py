@@ -1,0 +1,101 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrate.brushfit.fit import STAGES, Grid, Pressed, bootstrap, condition_number, fit_presses, refit, zero_touch
+from calibrate.brushfit.heldout import CEILING, FITTED, leave_cell_out, predictor
+from model.fitted import NAMES, FittedPress, published
+
+PX_MM = 0.4
+GRID = Grid((np.arange(100) + 0.5) * PX_MM - 31.0, 8.0 - (np.arange(40) + 0.5) * PX_MM)
+CELLS = [(11.0, 0.0), (11.0, 10.0), (15.0, 5.0), (20.0, 0.0), (20.0, 10.0)]
+
+
+def a_brush(**changed: float) -> FittedPress:
+    values = published()
+    known = {"lam": 1.7, "heel_gain": 4.0, "tip_gain": 0.8, "origin_gain": -0.4, "core_mm": 0.4, "tip_power": 1.6}
+    for name, value in (known | changed).items():
+        values[NAMES.index(name)] = value
+    return FittedPress(6.0, 48.0, values)
+
+
+def presses(brush: FittedPress, cells: list[tuple[float, float]], noise: float = 0.0, seed: int = 0) -> list[Pressed]:
+    rng = np.random.default_rng(seed)
+    out = []
+    for height, tilt in cells:
+        y = GRID.y_mm + noise * rng.normal()
+        out.append(Pressed(height, tilt, brush.chance(height, tilt, GRID.x_mm + noise * rng.normal(), y, 0.15)))
+    return out
+
+
+def value(press: FittedPress, name: str) -> float:
+    return float(press.values[NAMES.index(name)])
+
+
+def test_a_brush_of_the_family_is_found_again() -> None:
+    truth = a_brush(h0_mm=1.0, width_power=1.2)
+    fit = fit_presses(presses(truth, CELLS), GRID, 6.0, 48.0, edges=False)
+    for height, tilt in [(13.0, 5.0), (17.0, 10.0)]:
+        seen, wanted = (np.maximum(b.half_width(height, tilt, GRID.x_mm), 0.0) for b in (fit.press, truth))
+        assert seen.max() == pytest.approx(wanted.max(), rel=0.03)
+        assert np.abs(seen - wanted).mean() < 0.05
+
+
+def test_one_depth_hides_the_zero_offset_and_one_tilt_hides_the_tilt() -> None:
+    fit = fit_presses(presses(a_brush(), [(15.0, 0.0)] * 3, noise=0.05), GRID, 6.0, 48.0)
+    refused = {stage.name: stage.condition for stage in fit.stages if stage.refused}
+    assert {"zero offset", "tilt"} <= refused.keys()
+    assert refused["tilt"] == math.inf
+    assert value(fit.press, "h0_mm") == 0.0
+
+
+def test_the_condition_number_is_that_of_unit_columns() -> None:
+    jacobian = np.array([[1.0, 100.0], [0.0, 1.0]])
+    scaled = jacobian / np.linalg.norm(jacobian, axis=0)
+    assert condition_number(jacobian.T @ jacobian) == pytest.approx(np.linalg.cond(scaled), rel=1e-6)
+    assert condition_number(np.diag([1.0, 0.0])) == math.inf
+
+
+def test_a_zero_touch_that_moved_is_told_from_an_earlier_fit() -> None:
+    brush = a_brush()
+    moved = replace(brush, values=brush.values.copy())
+    moved.values[NAMES.index("h0_mm")] = 0.6
+    now, error = zero_touch(brush, presses(moved, CELLS[:3], noise=0.05), GRID)
+    assert value(now, "h0_mm") == pytest.approx(0.6, abs=0.1)
+    assert error[0] < 0.2
+
+
+def test_intervals_narrow_with_strokes() -> None:
+    def width(repeats: int) -> float:
+        strokes = presses(a_brush(), CELLS * repeats, noise=0.15)
+        fit = fit_presses(strokes, GRID, 6.0, 48.0, edges=False, stages=STAGES[:2])
+        draws = bootstrap(fit.press, fit.free, fit.squares, fit.gradients)
+        return float(np.ptp(np.quantile(draws[:, fit.free.index("origin_mm")], [0.025, 0.975])))
+
+    assert width(6) < 0.8 * width(1)
+
+
+def test_edges_that_the_profile_lacks_are_found() -> None:
+    truth = replace(a_brush(), edges=np.zeros_like(a_brush().edges))
+    truth.edges[0, 1, 0] = 0.5
+    fit = fit_presses(presses(truth, CELLS), GRID, 6.0, 48.0)
+    assert fit.press.edges[0, 1, 0] - fit.press.edges[1, 1, 0] == pytest.approx(0.5, abs=0.15)
+
+
+def test_held_out_cells_are_scored_beside_the_template() -> None:
+    strokes = presses(a_brush(), CELLS * 3, noise=0.05)
+    fit = fit_presses(strokes, GRID, 6.0, 48.0, stages=STAGES[:4])
+    rows = {row.model: row for row in leave_cell_out(fit, strokes, GRID, predictor(FittedPress(6.0, 48.0), GRID))}
+    assert rows[FITTED].n == rows[CEILING].n == 15
+    assert rows["uncalibrated"].csim + 5.0 < rows[FITTED].csim <= 100.0
+    assert rows[FITTED].csim > rows[CEILING].csim - 2.0
+
+
+def test_a_fit_needs_a_stroke() -> None:
+    with pytest.raises(ValueError, match="at least one stroke"):
+        fit_presses([], GRID, 6.0, 48.0)
+    fit = fit_presses(presses(a_brush(), CELLS), GRID, 6.0, 48.0, stages=STAGES[:1])
+    with pytest.raises(ValueError, match="at least one stroke"):
+        refit(fit, [], GRID)

@@ -1,0 +1,88 @@
+"""From photographs of presses to an artefact, a table and one more model in `validate`; loopback brush."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from brushloop import app
+from calibrate.brushfit import artefact
+from calibrate.brushfit.captures import read_presses
+from calibrate.brushfit.run import correction, fit_session
+from calibrate.errors import CalibrationError
+from calibrate.field import Field
+from calibrate.validation import validate_recording
+from drivers.sim.brush import Brush, BrushSpec
+from model.fitted_shape import NAME
+from sessions.importer import ImportOptions, import_photographs
+
+CELLS = [(11.0, 0.0), (11.0, 10.0), (15.0, 5.0), (20.0, 0.0), (20.0, 10.0)]
+VIEW = Field(mm_per_px=0.4)
+
+
+def photograph(path: Path, height_mm: float, tilt_deg: float, seed: int) -> tuple[float, float]:
+    """A press on white paper at 10 px/mm; returns where the tip touched, in pixels."""
+    mark = Brush(BrushSpec()).press(height_mm, tilt_deg, ink_load=1.0, press_seed=seed)
+    page = np.full((300, 480), 235, np.uint8)
+    rows, columns = mark.density.shape
+    left, top = 380 - round(mark.origin_px[0]), 150 - round(mark.origin_px[1])
+    page[top : top + rows, left : left + columns] = 235 - np.rint(200 * np.clip(mark.density, 0, 1)).astype(np.uint8)
+    cv2.imwrite(str(path), page)
+    return 380.0, 150.0
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photos")
+    lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
+    for k, (height, tilt) in enumerate(CELLS):
+        x, y = photograph(folder / f"{k}.png", height, tilt, k)
+        lines.append(f"{k}.png,{height},{tilt},10.0,{x},{y}")
+    table = folder / "strokes.csv"
+    table.write_text("\n".join(lines) + "\n")
+    out = tmp_path_factory.mktemp("sessions") / "presses"
+    import_photographs(folder, table, out, ImportOptions(kind="press"), "test", lambda: 1)
+    return out
+
+
+def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> None:
+    ran = CliRunner().invoke(app, ["fit", str(session), "--mm-per-px", "0.4", "--correction"])
+    assert ran.exit_code == 0, ran.output
+    said = " ".join(ran.output.split())
+    for words in ("leave one cell out", "refitted Bezier", "uncalibrated", "condition", "paper.touch_z_mm: add"):
+        assert words in said
+    path = artefact.newest(session)
+    assert path is not None
+    fit = artefact.load(path)
+    assert fit.strokes == 5
+    assert fit.csim_percent["fitted"] > fit.csim_percent["uncalibrated"] + 3.0
+    validation = validate_recording(session, ["ccd-bsm", NAME], VIEW, None)
+    assert "in sample" in validation.models[NAME].label
+    mean = {
+        name: np.mean([s.csim for s in validation.results.scores if (s.model, s.alignment) == (name, "mm")])
+        for name in ("ccd-bsm", NAME)
+    }
+    assert mean[NAME] > mean["ccd-bsm"] + 0.05
+
+    captures = read_presses(session, VIEW)
+    same = correction(captures, fit, fit)
+    assert same.lift_mm == pytest.approx(0.0, abs=0.3)
+    assert same.reference == "presses"
+
+    edited = path.with_name("0" * 16 + ".json")
+    edited.write_bytes(path.read_bytes())
+    with pytest.raises(CalibrationError, match="was edited"):
+        artefact.load(edited)
+
+
+def test_one_press_alone_says_what_it_cannot_tell(session: Path) -> None:
+    captures = read_presses(session, VIEW)
+    del captures.strokes[1:]
+    fitted = fit_session(captures, VIEW)
+    assert fitted.held_out == []
+    assert {"zero offset", "tilt"} <= {stage.name for stage in fitted.artefact.stages if stage.refused}
+    assert fitted.artefact.parameters["h0_mm"].low is None

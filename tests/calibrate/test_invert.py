@@ -1,0 +1,146 @@
+"""Presses of a session come back as a CSV and a protocol that the rig can press again."""
+
+from __future__ import annotations
+
+import csv
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calibrate.errors import CalibrationError
+from calibrate.field import Field
+from calibrate.invert import Row, Settings, invert_recording, lay, off_command
+from calibrate.invert_write import PROTOCOL, write_inversion
+from collect.protocols.config import ReplayConfig
+from collect.protocols.loading import load_protocol
+from model.ccdbsm import Brush, ccdbsm
+from model.coverage import coverage
+from model.inversion.press import Range
+from sessions.importer import ImportOptions, import_photographs
+from sessions.messages import encode_png
+from sessions.reader import Capture
+from sessions.schemas import Stroke
+
+PRESSES = [(12.0, 3.0), (15.0, 6.0), (18.5, 9.0)]
+PX = 12.0  # of the pretended scan, per mm
+START = (34.0, 20.0)  # mm from the left and top edge
+
+
+def photograph(height_mm: float, tilt_deg: float) -> np.ndarray:
+    """A 50 x 40 mm photograph at 12 px/mm of CCD-BSM's own mark, touched at START, ferrule to the right."""
+    origin = (START[0] + height_mm * math.tan(math.radians(tilt_deg)), START[1])
+    ink = coverage(ccdbsm(Brush(), height_mm, tilt_deg), origin, size_px=600, px_mm=1 / PX)[0].numpy()[:480]
+    return np.rint(230.0 * (1.0 - 0.92 * ink)).astype(np.uint8)
+
+
+def session(folder: Path, *, anchored: bool = True, kind: str = "press") -> Path:
+    photos = folder / "photos"
+    photos.mkdir()
+    rows = ["file,height_mm,tilt_deg,px_per_mm" + (",start_x_px,start_y_px" if anchored else "")]
+    for k, (height, tilt) in enumerate(PRESSES):
+        cv2.imwrite(str(photos / f"p{k}.png"), photograph(height, tilt))
+        rows.append(f"p{k}.png,{height},{tilt},{PX}" + (f",{START[0] * PX},{START[1] * PX}" if anchored else ""))
+    (photos / "strokes.csv").write_text("\n".join(rows) + "\n")
+    out = folder / "sessions" / "shots"
+    import_photographs(photos, photos / "strokes.csv", out, ImportOptions(kind=kind), "test", lambda: 1)
+    return out
+
+
+def test_a_session_is_inverted_and_can_be_replayed(tmp_path: Path) -> None:
+    made = invert_recording(session(tmp_path), Settings(anchor_sigma_mm=0.05), None)
+    assert made.refused == []
+    for row, (height, tilt) in zip(made.rows, PRESSES, strict=True):
+        # The preprocessing's own threshold is what is left: .03 mm of depth.
+        assert row.height_mm == pytest.approx(height, abs=0.08)
+        assert row.tilt_deg == pytest.approx(tilt, abs=0.6)
+        assert 0 < row.height_sd_mm < 0.2
+    protocol = load_protocol(write_inversion(made, tmp_path / "out" / "recovered.csv"))
+    assert isinstance(protocol, ReplayConfig)
+    assert protocol.of == "shots"
+    assert [press.stroke_id for press in protocol.presses] == ["p0", "p1", "p2"]
+    assert protocol.presses[1].height_mm == pytest.approx(made.rows[1].height_mm, abs=1e-3)
+    assert "height_sd_mm" in protocol.ignored_columns
+    with (tmp_path / "out" / "recovered.csv").open() as file:
+        first = next(csv.DictReader(file))
+    assert first["commanded_height_mm"] == "12"
+    assert first["source"] == "imported photographs"
+
+
+def test_without_an_anchor_alpha_is_what_was_commanded_and_flagged(tmp_path: Path) -> None:
+    made = invert_recording(session(tmp_path, anchored=False), Settings(), None)
+    assert made.refused == []
+    for row, (height, tilt) in zip(made.rows, PRESSES, strict=True):
+        assert "alpha_unknown" in row.flags
+        assert row.tilt_sd_deg is None
+        assert row.tilt_deg == tilt
+        assert row.height_mm == pytest.approx(height, abs=0.1)
+    assert load_protocol(write_inversion(made, tmp_path / "recovered.csv")).kind == "replay"
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
+def test_another_model_inverts_the_same_session(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match="unknown stroke model 'x'"):
+        invert_recording(session(tmp_path), Settings(model="x"), None)
+    made = invert_recording(tmp_path / "sessions" / "shots", Settings(model="ellipse"), None)
+    # The ellipse is regressed on CCD-BSM's marks: it has their length, so their depth, nearly.
+    for row, (height, _) in zip(made.rows, PRESSES, strict=True):
+        assert row.height_mm == pytest.approx(height, abs=3.0)
+        assert row.rms > 0.05
+
+
+def test_drags_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match="only presses are inverted"):
+        invert_recording(session(tmp_path, kind="drag"), Settings(), None)
+
+
+def test_a_stroke_that_cannot_be_used_is_named(tmp_path: Path) -> None:
+    settings = Settings(view=Field(mm_per_px=0.12))
+    made = invert_recording(session(tmp_path), settings, None)
+    assert made.rows == []
+    assert made.refused[0] == ("p0", "is cut by the edge of its photograph, cell or field")
+    with pytest.raises(CalibrationError, match="no stroke could be recovered: p0: is cut"):
+        write_inversion(made, tmp_path / "recovered.csv")
+    assert not (tmp_path / "recovered.csv").exists()
+
+
+def test_a_capture_without_any_scale_is_refused() -> None:
+    stroke = Stroke(stroke_id="s", kind="press", still=0, anchor_mm=(3.0, 4.0))
+    capture = Capture(stroke, encode_png(photograph(12.0, 3.0)), "s")
+    with pytest.raises(CalibrationError, match="neither a calibration nor a scale"):
+        lay(capture, None, Field())
+
+
+def test_a_name_that_no_protocol_can_hold_is_not_written(tmp_path: Path) -> None:
+    made = invert_recording(session(tmp_path), Settings(within=Range((5.0, 25.0))), None)
+    with pytest.raises(CalibrationError, match="give a plain name"):
+        write_inversion(made, tmp_path / PROTOCOL)
+
+
+def test_the_summary_compares_with_what_was_commanded() -> None:
+    rows = [Row("a", 10.1, 4.0, 0.1, 0.5, 0.1, (), 10.0, 5.0), Row("b", 12.5, 4.0, 0.1, None, 0.1, (), 12.0, None)]
+    summary = {name: values for name, *values in off_command(rows)}
+    assert summary["H"][0] == pytest.approx(0.3)
+    assert summary["H"][2:] == [0.5, 2]
+    assert summary["alpha"][0] == pytest.approx(-1.0)
+    assert summary["alpha"][3] == 1
+
+
+def test_the_command_says_what_came_out(tmp_path: Path) -> None:
+    session(tmp_path)
+    command = [sys.executable, "-m", "brushloop", "invert", "sessions/shots", "--out", "again/recovered.csv"]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    words = " ".join(ran.stdout.split())
+    assert "3 presses recovered by ccd-bsm (imported photographs)" in words
+    assert "H: recovered - commanded" in words
+    assert load_protocol(tmp_path / "again" / PROTOCOL).kind == "replay"
+    bad = subprocess.run(
+        [*command, "--tilt-range", "0", "50"], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert bad.returncode == 2
+    assert bad.stderr.count("\n") == 1

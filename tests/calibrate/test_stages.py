@@ -1,0 +1,93 @@
+"""Every stage of the preprocessing can be looked at, and says what is wrong with a capture that it can still use."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from calibrate.errors import CaptureRefused
+from calibrate.prepare.cli import app
+from calibrate.prepare.params import Params
+from calibrate.prepare.stages import trace_scaled
+
+
+def photograph(*strokes: tuple[int, int], glare: tuple[int, int] | None = None, paper: int = 225) -> np.ndarray:
+    """Strokes of 12 x 4 mm at these places (px, 10 px/mm) on 80 x 60 mm."""
+    image = np.full((600, 800), paper, np.float32)
+    for place in strokes:
+        cv2.ellipse(image, place, (60, 20), 0, 0, 360, 25, -1)
+    image = cv2.GaussianBlur(image, (0, 0), 1.0) + np.random.default_rng(0).normal(0, 1.5, image.shape)
+    if glare is not None:
+        ys, xs = np.ogrid[:600, :800]
+        image += 120 * np.exp(-((xs - glare[0]) ** 2 + (ys - glare[1]) ** 2) / 2 / 25**2)
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def trace(image: np.ndarray, anchor: tuple[float, float] | None = None, params: Params | None = None):
+    return trace_scaled(image, (10.0, 10.0), anchor, "photograph", params or Params())
+
+
+def test_a_stroke_comes_out_at_a_fifth_of_a_millimetre_with_its_anchor() -> None:
+    found = trace(photograph((400, 300)), (430.0, 310.0))
+    assert found.binary.shape == (128, 128)
+    assert found.binary.sum() * 0.04 == pytest.approx(np.pi * 6 * 2, rel=0.03)
+    assert found.anchor_px == pytest.approx((64 + 15, 64 + 5), abs=1.0)
+    assert found.log["components.others"] == 0
+    assert found.flags == ()
+
+
+def test_eight_strokes_in_one_crop_are_flagged() -> None:
+    places = [(150 + 165 * (k % 4), 150 + 250 * (k // 4)) for k in range(8)]
+    assert any(flag.startswith("others: 7 more strokes") for flag in trace(photograph(*places)).flags)
+
+
+def test_a_saturated_frame_is_flagged_and_a_blank_one_refused() -> None:
+    assert any(flag.startswith("saturated") for flag in trace(photograph((400, 300), paper=300)).flags)
+    with pytest.raises(CaptureRefused, match="is blank"):
+        trace(photograph())
+    with pytest.raises(CaptureRefused, match="is blank"):
+        trace(photograph(paper=300))
+
+
+def test_glare_and_cut_strokes_are_flagged() -> None:
+    assert any(flag.startswith("glare") for flag in trace(photograph((400, 300), glare=(400, 318), paper=170)).flags)
+    assert any(flag.startswith("cut") for flag in trace(photograph((790, 300))).flags)
+
+
+def test_a_stroke_longer_than_the_field_is_flagged() -> None:
+    image = photograph()
+    cv2.line(image, (100, 300), (700, 300), 25, 30)
+    assert any(flag.startswith("too long") for flag in trace(image).flags)
+
+
+def test_holes_of_glare_are_filled_where_that_is_asked_for() -> None:
+    image = photograph((400, 300))
+    cv2.circle(image, (400, 300), 5, 225, -1)
+    kept, filled = trace(image), trace(image, params=Params(hole_mm2=1.0))
+    assert filled.binary.sum() - kept.binary.sum() == pytest.approx(np.pi * 0.25 / 0.04, abs=6)
+
+
+def test_the_command_shows_every_stage_and_writes_the_numbers(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), photograph((200, 150)))
+    cv2.imwrite(str(tmp_path / "b.png"), photograph((200, 150), (500, 400)))
+    out = tmp_path / "stages.png"
+    told = ["preprocess", str(tmp_path / "b.png"), "--px-per-mm", "10", "--out", str(out)]
+    ran = CliRunner().invoke(app, [*told, "--before", str(tmp_path / "a.png")])
+    assert ran.exit_code == 0, ran.output
+    assert cv2.imread(str(out), 0).shape[1] > 1000
+    numbers = json.loads(out.with_suffix(".json").read_text())
+    assert numbers["fitted"]["components.others"] == 0
+    assert numbers["params"]["join_mm"] == 1.5
+    CliRunner().invoke(app, told)
+    assert json.loads(out.with_suffix(".json").read_text())["fitted"]["components.others"] == 1
+
+
+def test_the_command_still_takes_a_session_as_it_did(tmp_path: Path) -> None:
+    ran = CliRunner().invoke(app, [str(tmp_path / "nosuch")])
+    assert "no such session" in str(ran.exception)
+    assert CliRunner().invoke(app, []).exit_code == 2

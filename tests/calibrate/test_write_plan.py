@@ -1,0 +1,140 @@
+"""`brushloop write plan`: what it writes can be drawn by the rig, and bad input is one line."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from calibrate.errors import CalibrationError
+from calibrate.write_plan import Settings, plan, wanted_of
+from calibrate.write_plan_cli import app
+from calibrate.write_plan_files import PICTURE, PROTOCOL, write_plan, write_toml
+from collect.protocols.config import WriteConfig
+from collect.protocols.loading import load_protocol
+from model.ccdbsm import Brush
+from model.characters.brush import Reach
+from model.registry import stroke_model
+
+MODEL = stroke_model("ccd-bsm", Brush())
+QUICK = Settings(steps=4)
+BAR = {"strokes": ["M 100 400 L 900 400 L 900 480 L 100 480 Z"], "medians": [[[110, 440], [890, 440]]]}
+
+
+def brushloop(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "brushloop", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)
+
+
+def test_the_command_writes_a_protocol_and_a_picture(tmp_path: Path) -> None:
+    ran = brushloop("write", "plan", "子", "--out", "plan", "--steps", "3", "--repeats", "2", cwd=tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    assert "not ink" in ran.stdout
+    protocol = load_protocol(tmp_path / "plan" / PROTOCOL)
+    assert isinstance(protocol, WriteConfig)
+    assert protocol.repeats == 2
+    assert [figure.name for figure in protocol.figures] == ["子"]
+    assert len(protocol.figures[0].strokes) == 3
+    picture = cv2.imread(str(tmp_path / "plan" / PICTURE))
+    assert picture is not None
+    assert picture.shape[1] == 1200
+
+
+def test_every_shipped_character_becomes_a_protocol_within_reach(tmp_path: Path) -> None:
+    reach = Reach(height_mm=(1.0, 5.0), tilt_deg=(0.0, 6.0))
+    figures = plan("字永", None, MODEL, Settings(reach=reach, steps=2))
+    (tmp_path / "p.toml").write_text(write_toml(figures, Settings(reach=reach), 15.0, 1), encoding="utf-8")
+    protocol = load_protocol(tmp_path / "p.toml")
+    assert isinstance(protocol, WriteConfig)
+    for figure in protocol.figures:
+        for stroke in figure.strokes:
+            points = np.array(stroke.points)
+            assert points[:, 2].min() >= 1.0
+            assert points[:, 2].max() <= 5.0
+            assert points[:, 3].max() <= 6.0
+            turned = np.abs(np.diff(points[:, 4]))
+            assert np.all(turned <= reach.turn_deg_mm * np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1) + 0.05)
+
+
+def test_refinement_raises_both_scores() -> None:
+    (figure,) = plan("永", None, MODEL, Settings(steps=20))
+    first_csim, first_ssim, last_csim, last_ssim = figure.scores()
+    assert last_csim > max(first_csim, 0.98)
+    assert last_ssim > max(first_ssim, 0.97)
+
+
+def test_a_whole_data_set_is_read_from_a_folder_or_a_file_of_lines(tmp_path: Path) -> None:
+    (tmp_path / "一.json").write_text(json.dumps(BAR), encoding="utf-8")
+    lines = [
+        json.dumps({"character": name} | BAR, ensure_ascii=ascii_) for name, ascii_ in (("二", False), ("一", True))
+    ]
+    (tmp_path / "graphics.txt").write_text("\n".join(lines), encoding="utf-8")
+    for data in (tmp_path, tmp_path / "graphics.txt", tmp_path / "一.json"):
+        (wanted,) = wanted_of("一", data, QUICK)
+        assert len(wanted.ways) == 1
+        assert wanted.image.max() == 1.0
+
+
+def test_a_hand_is_planned_with_the_widths_it_asks_for(tmp_path: Path) -> None:
+    rows = ["x_mm,y_mm,width_mm", "10,35,3", "60,35,3"]
+    (tmp_path / "my line.csv").write_text("\n".join(rows))
+    (figure,) = plan(str(tmp_path / "my line.csv"), None, MODEL, QUICK)
+    protocol = write_plan([figure], QUICK, 15.0, 1, tmp_path / "out")
+    loaded = load_protocol(protocol)
+    assert isinstance(loaded, WriteConfig)
+    assert loaded.figures[0].name == "my-line"
+    middle = figure.strokes[0][len(figure.strokes[0]) // 2]
+    assert MODEL.profile(float(middle[2]), float(middle[3])).width_mm[0] == pytest.approx(3.0, abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("一",), "is not shipped (子 字 永)"),
+        (("一", "--data", "nowhere"), "nowhere: No such file"),
+        (("字字",), "the same character twice"),
+        (("no.csv",), "no.csv: No such file"),
+        (("字", "--tilt-range", "0", "45"), "tilts end at 30 deg"),
+        (("字", "--tilt", "12"), "--tilt: 12 deg is outside 0 to 10"),
+        (("字", "--height-range", "5", "5"), "height_mm = (5, 5)"),
+        (("字", "--height-range", "1", "60"), "height_mm = 60 is outside"),
+        (("字", "--model", "x"), "unknown stroke model 'x'"),
+    ],
+)
+def test_bad_input_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], words: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ran = CliRunner().invoke(app, ["plan", *arguments])
+    assert isinstance(ran.exception, CalibrationError)
+    assert words in str(ran.exception)
+    assert "\n" not in str(ran.exception)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_front_door_tells_it_in_one_line_and_exits_with_2(tmp_path: Path) -> None:
+    ran = brushloop("write", "plan", "一", cwd=tmp_path)
+    assert ran.returncode == 2
+    assert ran.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("一.json", b"\xff\xfe", "is no UTF-8 text"),
+        ("一.json", b"{}", "strokes: expected a list"),
+        ("graphics.txt", b'{"character": "\xe4\xb8\x80"', "is neither a folder, a .json nor a graphics.txt"),
+        ("graphics.txt", b"nothing", "holds no character"),
+    ],
+)
+def test_bad_data_names_its_file(tmp_path: Path, name: str, content: bytes, words: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(CalibrationError, match=name) as caught:
+        wanted_of("一", tmp_path / name, QUICK)
+    assert words in str(caught.value)

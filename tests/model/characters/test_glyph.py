@@ -1,0 +1,163 @@
+"""Characters are read as they are, and hostile data is one line."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from model.characters.glyph import GlyphError, parse_glyph, parse_path
+from model.characters.hand import parse_csv, parse_json
+from model.characters.ink import reference
+from model.characters.plan import Cell, distance_to, paths_of, resampled, tangents
+
+SQUARE = "M 100 100 L 100 300 L 300 300 L 300 100 Z"
+
+
+def shipped(name: str) -> str:
+    return (files("model.characters") / "data" / f"{name}.json").read_text("utf-8")
+
+
+def glyph_text(**changes: object) -> str:
+    return json.dumps({"strokes": [SQUARE], "medians": [[[100, 200], [300, 200]]]} | changes)
+
+
+@pytest.mark.parametrize(("name", "strokes"), [("字", 6), ("子", 3), ("永", 5)])
+def test_the_shipped_characters_can_be_read(name: str, strokes: int) -> None:
+    glyph = parse_glyph(shipped(name), name)
+    assert len(glyph.strokes) == strokes
+    ink = reference(glyph, Cell(60.0, 0.0))
+    assert 0.05 < ink.mean() < 0.3
+    assert ink.max() == 1.0
+
+
+def test_the_licence_is_shipped_with_them() -> None:
+    text = (files("model.characters") / "data" / "ARPHICPL.TXT").read_text("utf-8")
+    assert text.startswith("ARPHIC PUBLIC LICENSE")
+    assert "retain this license file (ARPHICPL.TXT) unaltered" in text
+
+
+def test_an_outline_is_a_closed_loop_counter_clockwise_whichever_way_it_was_drawn() -> None:
+    for path in (SQUARE, "M 100 100 L 300 100 L 300 300 L 100 300 Z", "M100,100 300,100 300,300 100,300"):
+        arcs = parse_path(path, "strokes.0")
+        assert np.allclose(arcs[:, 2], np.roll(arcs[:, 0], -1, axis=0))
+        corners = arcs[:, 0]
+        x, y = corners.T
+        assert 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) == pytest.approx(200.0**2)
+
+
+def test_curves_of_both_kinds_are_drawn_alike() -> None:
+    """A quadratic curve raised to a cubic is the same curve."""
+    quadratic = parse_path("M 0 0 Q 300 600 600 0 Z", "")
+    cubic = parse_path("M 0 0 C 200 400 400 400 600 0 Z", "")
+    for arcs in (quadratic, cubic):
+        start, middle, end = arcs[:, 0], arcs[:, 1], arcs[:, 2]
+        polygon = 0.5 * np.sum(start[:, 0] * end[:, 1] - start[:, 1] * end[:, 0])
+        a, b = middle - start, end - start
+        assert polygon + np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 3 == pytest.approx(120_000.0, rel=1e-9)
+
+
+def test_the_half_width_of_a_bar_is_half_its_width() -> None:
+    loop = np.array([[0.0, 0.0], [40.0, 0.0], [40.0, 6.0], [0.0, 6.0]])
+    inside = distance_to(loop, np.array([[20.0, 3.0], [20.0, 1.0], [39.0, 3.0], [50.0, 3.0]]))
+    assert inside.tolist() == [3.0, 1.0, 1.0, 0.0]
+
+
+def test_ways_lie_on_the_cell_with_the_foot_of_the_font_at_its_margin() -> None:
+    cell = Cell(70.0, 6.0)
+    assert cell.to_mm(np.array([[0.0, -124.0], [1024.0, 900.0]])).tolist() == [[6.0, 6.0], [64.0, 64.0]]
+    for path in paths_of(parse_glyph(shipped("永"), "永"), cell, 2.0):
+        assert np.all(path.half_width_mm > 0)
+        steps = np.linalg.norm(np.diff(path.points, axis=0), axis=1)
+        assert steps.max() < 3.0
+
+
+def test_headings_are_unwrapped_along_a_spiral() -> None:
+    turn = np.linspace(0, 3 * np.pi, 60)
+    heading = tangents(resampled(np.column_stack((turn * np.cos(turn), turn * np.sin(turn))), 0.3))
+    assert np.abs(np.diff(heading)).max() < 60
+    assert heading[-1] - heading[0] > 360
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "is not JSON"),
+        ("[" * 100_000, "is not JSON"),
+        ("[]", "is no JSON object"),
+        (glyph_text(strokes=[]), "strokes: expected a list of 1 to 64"),
+        (glyph_text(medians=[]), "medians: expected a list of 1 to 64"),
+        (glyph_text(strokes=[SQUARE, SQUARE]), "medians: 1 for 2 strokes"),
+        (glyph_text(strokes=[7]), "strokes.0: is no text"),
+        (glyph_text(strokes=["M 0 0 L 5"]), "strokes.0: L takes 2 numbers"),
+        (glyph_text(strokes=["M 0 0 A 5 5 0 0 1 3 3 Z"]), "expected M first, then L, Q, C or Z"),
+        (glyph_text(strokes=["L 0 0"]), "expected M first"),
+        (glyph_text(strokes=["M 0 0 L 1e9 0 L 0 9 Z"]), "expected 4096 at most"),
+        (glyph_text(strokes=["M 0 0 L 9 0 Z"]), "strokes.0: encloses nothing"),
+        (glyph_text(strokes=["M 0 0 L 9 0 #"]), "is no path at character"),
+        (glyph_text(strokes=["M 0 0 " + "L 1 2 L 3 4 " * 2000]), "more than 1024 pieces"),
+        (glyph_text(medians=[[[0, 0]]]), "medians.0: expected 2 to 256 points"),
+        (glyph_text(medians=[[[0, 0], [0, "x"]]]), "medians.0.1: expected [x, y]"),
+        (glyph_text(medians=[[[0, 0], [0, float("nan")]]]), "medians.0.1: expected [x, y]"),
+        (glyph_text(medians=[[[0, 0], [True, 1]]]), "medians.0.1: expected [x, y]"),
+        (glyph_text(medians=[[[5, 5], [5, 5]]]), "medians.0: expected two different points"),
+        (" " * 300_000, "is longer than"),
+    ],
+)
+def test_hostile_characters_are_one_line(text: str, words: str) -> None:
+    with pytest.raises(GlyphError) as caught:
+        parse_glyph(text, "x")
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 200
+
+
+@given(st.text(alphabet="MLQCZ0123456789 .,-+eE", max_size=60))
+def test_any_path_is_arcs_or_a_glyph_error(path: str) -> None:
+    try:
+        arcs = parse_path(path, "strokes.0")
+    except GlyphError:
+        return
+    assert np.isfinite(arcs).all()
+
+
+def test_a_hand_gives_ways_and_widths() -> None:
+    text = "stroke,x_mm,y_mm,width_mm\n1,10,10,2\n1,30,10,4\n2,10,30,3\n2,10,50,3\n"
+    ways = parse_csv(text, Cell(), 2.0)
+    same = parse_json('{"strokes": [[[10,10,2],[30,10,4]],[[10,30,3],[10,50,3]]]}', Cell(), 2.0)
+    assert len(ways) == len(same) == 2
+    for one, other in zip(ways, same, strict=True):
+        assert np.allclose(one.points, other.points)
+        assert np.allclose(one.half_width_mm, other.half_width_mm)
+    assert ways[0].half_width_mm[[0, -1]].tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x_mm,y_mm\n1,2\n", "line 1: has no column width_mm"),
+        ("x_mm,y_mm,width_mm,z\n1,2,3,4\n", "line 1: unknown column 'z'"),
+        ("x_mm,y_mm,width_mm\n1,2\n", "line 2: 2 cells under 3 columns"),
+        ("x_mm,y_mm,width_mm\n1,900,3\n", "line 2: y_mm: must be a number, 0 to 70"),
+        ("x_mm,y_mm,width_mm\n1,nan,3\n", "line 2: y_mm: must be a number"),
+        ("x_mm,y_mm,width_mm\n", "holds no stroke"),
+        ("x_mm,y_mm,width_mm\n1,1,3\n2,1,3\n", "stroke 1: is 1 mm long"),
+        ('x_mm,y_mm,width_mm\n"1,1,3\n', "is not CSV"),
+    ],
+)
+def test_a_bad_hand_is_one_line(text: str, words: str) -> None:
+    with pytest.raises(GlyphError) as caught:
+        parse_csv(text, Cell(), 2.0)
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", '{"strokes": 3}', '{"strokes": [3]}', '{"strokes": [[[1,2]]]}', '{"strokes": [[[1,2,true]]]}']
+)
+def test_bad_json_of_a_hand_is_refused(text: str) -> None:
+    with pytest.raises(GlyphError):
+        parse_json(text, Cell(), 2.0)
