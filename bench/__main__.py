@@ -29,6 +29,7 @@ def benches() -> dict[str, Bench]:
     return {
         "brushfit": brushfit.run,
         "generator": generator.run,
+        "generator-qbc": generator.run_qbc,
         "inversion": inversion.run,
         "overhead": overhead.run,
         "preprocess": preprocess.run,

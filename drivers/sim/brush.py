@@ -20,6 +20,8 @@ from drivers.sim.spine import Bundle, SpineShape, Vector, press_spine, pull_spin
 __all__ = ["Brush", "BrushSpec", "Flaw", "Footprint", "Waypoint"]
 
 LINKS = 48
+LEAST_DEPTH_MM = 1e-6
+"""A drag less deep leaves nothing."""
 MAX_TILT_DEG = 30.0
 MAX_DEPTH = 0.9
 """Deepest press as a fraction of the ferrule's height at zero touch; beyond it the ferrule hits the paper."""
@@ -138,7 +140,7 @@ class Brush:
             raise ValueError("a drag needs at least one waypoint")
         deepest = max(w.depth_mm for w in path)
         self._check(deepest, tilt_deg, ink_load, press_seed, px_per_mm)
-        if deepest <= 0.0:
+        if deepest <= LEAST_DEPTH_MM:
             return blank_footprint(px_per_mm)
         return draw_drag(
             path,

@@ -39,11 +39,6 @@ class SocketcandServer(LoopbackServer):
         self._streaming: asyncio.Task[None] | None = None
         self._preparing: asyncio.Task[None] | None = None
 
-    async def start(self, host: str, port: int) -> None:
-        """Listen, and work out meanwhile how hard the brush pushes."""
-        await super().start(host, port)
-        self._preparing = asyncio.create_task(asyncio.to_thread(self._reaction.prepare), name="force table")
-
     async def stop(self) -> None:
         """Close the listener and every client, and end the stream."""
         await super().stop()
@@ -56,6 +51,8 @@ class SocketcandServer(LoopbackServer):
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Greet, then carry frames both ways until the client goes."""
+        prepared = self._preparing or asyncio.create_task(asyncio.to_thread(self._reaction.prepare), name="force table")
+        self._preparing = prepared
         writer.write(b"< hi >")
         try:
             while True:
@@ -64,8 +61,7 @@ class SocketcandServer(LoopbackServer):
                     case ["open", name]:
                         writer.write(b"< ok >" if name == LOOPBACK_CHANNEL else b"< error could not open bus >")
                     case ["rawmode"]:
-                        assert self._preparing is not None
-                        await asyncio.shield(self._preparing)
+                        await asyncio.shield(prepared)
                         writer.write(b"< ok >")
                         self._listeners.add(writer)
                     case ["send", can_id, length, *data]:

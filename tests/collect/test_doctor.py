@@ -39,7 +39,10 @@ async def test_a_rig_in_order_is_told_as_it_is_and_left_as_it_was(lab: Lab) -> N
     assert ink.notes == "well 71% full, simulated"
 
 
-async def test_an_instrument_that_was_unplugged_is_told_and_the_others_are_still_asked(lab: Lab) -> None:
+async def test_an_instrument_that_was_unplugged_is_told_and_the_others_are_still_asked(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("collect.rig.FORCE_CONNECT_S", 2.0)
     assert lab.rig.ink is not None
     assert lab.rig.force is not None
     lab.rig.ink.fail(*[InkFault.DEAF] * 100)

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 HOUR_S = 3600
 
+pytestmark = pytest.mark.soak
+
 
 class WallClock:
     """What the operating system tells of the time of day."""

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 ROWS, COLUMNS = 40, 120
 
+pytestmark = pytest.mark.soak
+
 
 @contextmanager
 def terminal() -> Iterator[tuple[int, int]]:

