@@ -59,6 +59,14 @@ class Asker:
         with self._lock:
             return None if self._open is None else self._open[0]
 
+    def abandon(self) -> None:
+        """Nobody looks any more: what is asked, and whatever will be, raises `NeedsOperator`. From any thread."""
+        with self._lock:
+            self._watched = False
+            if self._open is not None:
+                _, loop, answered = self._open
+                loop.call_soon_threadsafe(_give_up, answered)
+
     async def ask(self, prompt: Prompt) -> str:
         """The key of the answer. Raises `NeedsOperator` where nobody is there to answer."""
         if not self._watched:
@@ -88,6 +96,11 @@ class Asker:
                 return False
             loop.call_soon_threadsafe(_settle, answered, key)
             return True
+
+
+def _give_up(answered: asyncio.Future[str]) -> None:
+    if not answered.done():
+        answered.set_exception(NeedsOperator("nobody is at the screen any more"))
 
 
 def _settle(answered: asyncio.Future[str], key: str) -> None:

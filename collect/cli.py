@@ -72,15 +72,14 @@ def plan(
     import rich
 
     from collect.config import load_rig
-    from collect.plan import check_plan
     from collect.plane import PaperPlane
-    from collect.planning.limits import all_poses
+    from collect.planning.limits import all_poses, check_protocol
     from collect.planning.plan_table import plan_table
     from collect.planning.summary import make_plan
     from collect.protocols.loading import load_protocol
 
     rig, wanted = load_rig(config), load_protocol(protocol)
-    check_plan(config, protocol, rig, wanted)
+    check_protocol(config, protocol, rig, wanted)
     made = make_plan(rig, wanted)
     asked = None
     if ask:

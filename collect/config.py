@@ -5,7 +5,6 @@ Any value can be overridden from the environment: `BRUSHLOOP_ROBOT__HOST=192.0.2
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -17,6 +16,7 @@ from collect.config_base import Config, Finite, Positive
 from collect.config_devices import CameraConfig, ForceConfig, InkDeviceConfig, RobotConfig
 from collect.errors import ConfigError
 from collect.quality.config import QualityConfig
+from collect.reading import read_toml, refusal
 from collect.touch.config import SelfCheckConfig, TouchConfig
 
 MAX_CONFIG_BYTES = 1024 * 1024
@@ -164,20 +164,7 @@ _M = TypeVar("_M", bound=BaseModel)
 
 def load_rig(path: Path) -> RigConfig:
     """Read `rig.toml`, with overrides from the environment. Raises `ConfigError`."""
-    return _validate(path, RigConfig, _read_toml(path))
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        if path.stat().st_size > MAX_CONFIG_BYTES:
-            raise ConfigError(path, "", f"is larger than {MAX_CONFIG_BYTES} bytes")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError(path, "", "no such file") from None
-    except OSError as error:
-        raise ConfigError(path, "", error.strerror or str(error)) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(path, "", f"is not TOML: {error}") from None
+    return _validate(path, RigConfig, read_toml(path, MAX_CONFIG_BYTES))
 
 
 def _validate(path: Path, kind: type[_M], values: dict[str, Any]) -> _M:
@@ -189,9 +176,4 @@ def _validate(path: Path, kind: type[_M], values: dict[str, Any]) -> _M:
     except SettingsError as error:
         raise ConfigError("environment", "", f"{error}".splitlines()[0]) from None
     except ValidationError as error:
-        # An unknown key first: it is often the misspelt name of one that is missing.
-        first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-        field = ".".join(str(part) for part in first["loc"])
-        given = f" (given: {first['input']!r})" if first["type"] not in ("missing", "value_error") else ""
-        more = f"; and {error.error_count() - 1} more" if error.error_count() > 1 else ""
-        raise ConfigError(path, field, first["msg"] + given + more) from None
+        raise refusal(path, error) from None

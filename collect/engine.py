@@ -12,24 +12,32 @@ import contextlib
 import math
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 
 from collect.arming import arm
 from collect.asking import Asker
 from collect.config import RigConfig
-from collect.errors import CollectAborted, told
+from collect.errors import CollectAborted, Parked, told
 from collect.live import LiveView, watching
 from collect.perform import Performer
-from collect.planning.walk import steps_on
+from collect.planning.walk import layout_of, sheet_of, steps_on
+from collect.preview import previewing
 from collect.progress import Progress
 from collect.protocols.config import ProtocolConfig
 from collect.rig import Rig, connected
 from collect.running import Run
+from collect.setting_up import SetUpStep, board_first, listed
 from collect.snapshot import Snapshot
 from collect.states import FINAL, State, check_transition
+from collect.telemetry import NotedRobot, Telemetry
+from collect.wishes import Wish, Wishes
 from collect.work.waiting import uninterrupted
 from drivers.clock import Clock
 from drivers.errors import DeviceError, NotConnected
 from sessions.store import SessionStore
+
+PARKED_MM = 2.0
+"""How near to the park position counts as parked."""
 
 OpenStore = Callable[[Rig], SessionStore]
 """Makes or resumes the session, once the devices have said who they are and before anything is powered."""
@@ -48,16 +56,24 @@ class Engine:
         watched: bool = False,
         armed: bool = False,
         live: LiveView | None = None,
+        guided: bool = False,
+        preview: bool = False,
     ) -> None:
-        """`watched`: a screen can answer. `armed`: the operator has let real hardware move. `live` has been started."""
+        """`watched`: a screen can answer. `armed`: the operator has let real hardware move. `live` has been started.
+        `guided`: a person accepts each set-up step. `preview`: snapshots carry what the camera sees."""
         self._rig_config = rig
         self._protocol_config = protocol
         self._open_store = open_store
-        self._progress = Progress(protocol, clock)
+        self._progress = Progress(protocol, clock, layout_of(rig, protocol))
         self._clock = clock
         self._asker = Asker(watched=watched)
         self._armed = armed
         self._live = live
+        self._guided = guided
+        self._preview = preview
+        self._telemetry = Telemetry()
+        self._wishes = Wishes()
+        self._park_wanted = False
         self._state = State.IDLE
         self._lock = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -93,10 +109,41 @@ class Engine:
         tip_mm = force_n = None
         if (rig := self._rig) is not None:
             with contextlib.suppress(DeviceError):
-                tip_mm = rig.robot.latest().pose.position_mm
+                tip_mm = self._telemetry.tip_mm = rig.robot.latest().pose.position_mm
             with contextlib.suppress(DeviceError):
                 force_n = math.hypot(*rig.force.latest_n()) if rig.force is not None else None
-        return self._progress.snapshot(self._state, tip_mm, force_n, self._asker.prompt)
+        if force_n is not None:
+            self._telemetry.note_force(force_n, self._clock.now_ns())
+        return replace(
+            self._progress.snapshot(self._state, tip_mm, force_n, self._asker.prompt),
+            target_mm=self._telemetry.target_mm,
+            parked=self._parked(),
+            trace_n=self._telemetry.trace_n(),
+            picture=self._telemetry.picture,
+            wishes=self._wishes.open,
+            set_up=self._set_up(),
+        )
+
+    def _parked(self) -> bool:
+        tip_mm, motion = self._telemetry.tip_mm, self._rig_config.motion
+        return tip_mm is not None and math.dist(tip_mm, motion.park_mm) < PARKED_MM
+
+    def _set_up(self) -> tuple[SetUpStep, ...]:
+        if not self._guided or self._progress.strokes_begun:
+            return ()
+        return listed(self._rig_config, self._progress.found, self._progress.set_up)
+
+    def wish(self, wish: Wish) -> None:
+        """Ask for something, or take it back; granted at the next moment that allows it. From any thread."""
+        self._wishes.toggle(wish)
+
+    def park(self) -> None:
+        """End the run after this step, the arm lifted and parked; nobody is asked any more. From any thread."""
+        with self._lock:
+            self._park_wanted = True
+            self._asker.abandon()
+            if self._loop is not None and self._state not in FINAL:
+                self._loop.call_soon_threadsafe(self._go_on.set)
 
     def answer(self, number: int, key: str) -> bool:
         """Answer the prompt of that number; False where it is over. From any thread."""
@@ -162,6 +209,9 @@ class Engine:
             await self._task
         except asyncio.CancelledError:
             await self._stopped()
+        except Parked as error:
+            self._end(State.STOPPED, told(error))
+            raise
         except Exception as error:
             self._end(State.FAILED, told(error))
             raise
@@ -184,12 +234,16 @@ class Engine:
     async def _session(self) -> None:
         self._progress.doing("connect")
         async with connected(self._rig_config, self._clock, self._progress.log) as rig:
+            rig = replace(rig, robot=NotedRobot(rig.robot, self._telemetry))
             self._rig = rig
             await arm(rig, self._asker, armed=self._armed)
             store = self._open_store(rig)
             try:
-                self._progress.opened(store)
-                async with watching(self._live, rig.camera, self._progress.log):
+                self._progress.opened(store, sheet_of(self._rig_config, self._protocol_config))
+                async with (
+                    watching(self._live, rig.camera, self._progress.log),
+                    previewing(self._telemetry, rig.camera, wanted=self._preview),
+                ):
                     await self._protocol(rig, store)
                 with self._lock:
                     if self._state == State.STOPPING:
@@ -204,9 +258,24 @@ class Engine:
             self._set(State.DONE)
 
     async def _protocol(self, rig: Rig, store: SessionStore) -> None:
-        performer = Performer(rig, store, self._protocol_config, self._progress, self._asker, self._live)
-        run = Run(rig, store, performer, self._progress, self._asker, self)
-        await run.protocol(steps_on(self._rig_config, self._protocol_config))
+        performer = Performer(
+            rig,
+            store,
+            self._protocol_config,
+            self._progress,
+            self._asker,
+            self._live,
+            telemetry=self._telemetry,
+            wishes=self._wishes,
+        )
+        run = Run(rig, store, performer, self._progress, self._asker, self, self._wishes, self._guided)
+        steps = steps_on(self._rig_config, self._protocol_config)
+        await run.protocol(board_first(steps) if self._guided else steps)
+
+    @property
+    def park_wanted(self) -> bool:
+        """Whether the run is to end before the next step."""
+        return self._park_wanted
 
     async def pause_point(self) -> None:
         """Between two steps: wait here while paused."""
@@ -215,7 +284,7 @@ class Engine:
                 return
             self._set(State.PAUSED)
         self._progress.doing("paused")
-        while self._pause_wanted:
+        while self._pause_wanted and not self._park_wanted:
             self._go_on.clear()
             await self._go_on.wait()
         self.move_to(State.RUNNING)

@@ -8,6 +8,7 @@ StepError              a step failed in a way that is understood; says what it l
  +-- NeedsOperator     something that only a person can put right
  +-- SheetFull         no free cell is left on the sheet
 CollectAborted         the session stopped before its protocol was finished; it can be resumed
+ +-- Parked            between two steps, as was asked for, with the arm parked
 """
 
 from __future__ import annotations
@@ -74,6 +75,10 @@ class CollectAborted(Exception):
     """Stopped before the end; the same command goes on from here."""
 
     exit_code: ClassVar[int] = 4
+
+
+class Parked(CollectAborted):
+    """Ended between two steps because that was asked for, with the arm lifted and parked."""
 
 
 def told(error: BaseException) -> str:

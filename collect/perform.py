@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 
 from collect.asking import Asker
 from collect.errors import SheetFull, StepError, told
@@ -17,6 +18,8 @@ from collect.recorder import Recorder
 from collect.rig import Rig
 from collect.sheet import Sheet
 from collect.steps import MARKING, Result, Step, StepKind
+from collect.telemetry import Telemetry
+from collect.wishes import Wish, Wishes
 from collect.work import capturing, dipping, looking, marking, touching
 from collect.work.context import Bench, Job
 from collect.work.waiting import uninterrupted
@@ -36,7 +39,11 @@ class Performer:
         progress: Progress,
         asker: Asker,
         live: LiveView | None = None,
+        *,
+        telemetry: Telemetry | None = None,
+        wishes: Wishes | None = None,
     ) -> None:
+        """`telemetry` is handed every force; `wishes` are what an operator asks for by key."""
         self._show = None if live is None else live.offer
         self._bench = Bench(
             rig,
@@ -47,7 +54,9 @@ class Performer:
             Inking(rig),
             Sheet(rig.config.paper, cell_mm(protocol)),
             protocol,
+            wishes=wishes or Wishes(),
         )
+        self._telemetry = telemetry
 
     async def retreat(self) -> None:
         """Bring the arm up and away from wherever it is; belongs to no step and is not recorded."""
@@ -57,8 +66,13 @@ class Performer:
     def answered(self, error: StepError | DeviceError) -> None:
         """A person has put right what `error` said: a full sheet was changed."""
         if isinstance(error, SheetFull):
-            self._bench.store.fresh_sheet()
-            self._bench.known.sound_frame = None
+            self.fresh_sheet()
+
+    def fresh_sheet(self) -> None:
+        """A person has put a fresh sheet in."""
+        self._bench.store.fresh_sheet()
+        self._bench.known.sound_frame = None
+        self._bench.progress.sheet_in(self._bench.store.state.sheet)
 
     async def perform(self, step: Step) -> Result:
         """Do the step once. If it is cut, the attempt is voided and its cell stays used. Raises `SheetFull` first."""
@@ -71,6 +85,8 @@ class Performer:
         )
         force = rig.config.force
         recorder = Recorder(attempt.writer, rig.clock, None if force is None else force.rate_hz, self._show)
+        place = None if cell is None else (store.state.sheet, cell.index)
+        progress.begun(step, place)
         guard = ForceGuard(rig, recorder.force)
         event = StepEvent(
             key=step.key,
@@ -85,7 +101,8 @@ class Performer:
             rig.robot.listen(recorder.pose)
             guard.listen()
             try:
-                result = await self._do(Job(bench, step, cell, attempt, recorder, guard))
+                with guard.also(self._telemetry.force) if self._telemetry is not None else contextlib.nullcontext():
+                    result = await self._do(Job(bench, step, cell, attempt, recorder, guard))
             finally:
                 guard.deafen()
                 rig.robot.listen(None)
@@ -93,11 +110,14 @@ class Performer:
             recorder.step(event.model_copy(update={"phase": "end"}))
         except BaseException as error:
             bench.known.inked = False
-            progress.voided()
+            progress.cut(place)
             why = "stopped by the operator" if isinstance(error, asyncio.CancelledError) else told(error)
             await uninterrupted(store.void, attempt, why)
             raise
+        if step.kind == StepKind.DIP and bench.wishes.take(Wish.SKIP):
+            result = {**result, **progress.skipped(step)}
         await uninterrupted(store.done, attempt, result)
+        progress.finished(step, result)
         if step.kind == StepKind.CAPTURE:
             progress.captured(result)
         return result

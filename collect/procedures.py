@@ -12,7 +12,6 @@ from collect.plane import PaperPlane
 from collect.rig import Rig, limits_of
 from collect.sheet import Cell, to_base
 from drivers.geometry import brush_pose, lean
-from drivers.limits import Limits
 from drivers.samples import Frame, Pose, Stamp
 
 CLEARANCE_MM = 8.0
@@ -189,19 +188,6 @@ def press_moves(
         Move(above, motion.travel_speed_mm_s),
     ]
     return down, up
-
-
-def check_all(
-    config: RigConfig, plane: PaperPlane, limits: Limits, cells: list[Cell], presses: set[tuple[float, float]]
-) -> None:
-    """Check every pose that a protocol can ask for, before the first motion. Raises `LimitExceeded`."""
-    moves = park_moves(config) + zero_touch_moves(config) + dip_moves(config)
-    for cell in cells:
-        for height_mm, tilt_deg in presses:
-            down, up = press_moves(config, plane, cell, height_mm, tilt_deg)
-            moves += down + up
-    for move in moves:
-        limits.check("robot", move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=config.motion.acc_mm_s2)
 
 
 def _upright(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Pose:

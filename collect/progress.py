@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, deque
+from dataclasses import replace
 
 from collect.asking import Prompt
+from collect.last_capture import LastCapture
+from collect.protocols.planned import Layout
 from collect.protocols.plans import ProtocolConfig, planned
+from collect.sheet import Sheet
 from collect.snapshot import CellCount, Snapshot
 from collect.states import State
-from collect.steps import Result, StepKind
+from collect.steps import MARKING, Result, Step, StepKind
+from collect.tally import Place, Tally
 from drivers.clock import Clock
 from sessions.store import SessionStore
 
@@ -19,10 +24,12 @@ LOG_LINES = 200
 class Progress:
     """Written by the engine's thread, read from any."""
 
-    def __init__(self, protocol: ProtocolConfig, clock: Clock) -> None:
+    def __init__(self, protocol: ProtocolConfig, clock: Clock, layout: Layout | None = None) -> None:
+        """`layout` is the sheet's: it balances the order in which strokes come."""
         self._clock = clock
         self._lock = threading.Lock()
-        self._plan = planned(protocol)
+        self._plan = planned(protocol, layout)
+        self._by_index = {p.index: p for p in self._plan}
         self._planned = Counter((p.height_mm, p.tilt_deg) for p in self._plan)
         self._done: Counter[tuple[float, float]] = Counter()
         self._at_start = 0
@@ -39,24 +46,93 @@ class Progress:
         self._logged = 0
         self._over_ns: int | None = None
         self._messages: deque[str] = deque(maxlen=LOG_LINES)
+        self._tally = Tally()
+        self._in_hand: int | None = None
+        self._sheet = 0
+        self._folder = ""
+        self._last: LastCapture | None = None
+        self.found: dict[StepKind, Result] = {}
+        """What the set-up steps of this process, or of the session before it, found."""
+        self.set_up: StepKind | None = None
+        """The set-up step that is being done."""
 
-    def opened(self, store: SessionStore) -> None:
-        """A session was made or resumed: count what it already holds."""
+    def opened(self, store: SessionStore, sheet: Sheet | None = None) -> None:
+        """A session was made or resumed: count what it already holds. `sheet` is how the paper is divided."""
+        if sheet is not None:
+            self._tally.opened(store.state, sheet.columns, sheet.rows)
         with self._lock:
+            self._folder = str(store.folder)
+            self._sheet = store.state.sheet
             self._session_id = store.header.session_id
             self._source = store.header.source
             self._voids = store.state.voids
             for line in store.state.done.values():
                 if line["kind"] == StepKind.CAPTURE:
                     self._take(line["result"])
+                elif line["kind"] == StepKind.DIP and line["result"].get("skipped"):
+                    self._given_up += 1
+                elif line["kind"] == StepKind.BOARD:
+                    self.found[StepKind.BOARD] = line["result"]
             self._at_start = self._done.total()
         verb = f"resumed with {self._at_start} strokes" if self._at_start else "session"
         self.log(f"{verb}: {store.folder}")
+
+    @property
+    def strokes_begun(self) -> bool:
+        """Whether this process has come to the strokes."""
+        return self._in_hand is not None
 
     def doing(self, what: str) -> None:
         """A step, in words."""
         with self._lock:
             self._step = what
+
+    def begun(self, step: Step, place: Place | None) -> None:
+        """A step begins; `place` is the sheet and cell that it marks."""
+        self._tally.begun(step, place)
+        with self._lock:
+            if step.kind in (StepKind.DIP, StepKind.CAPTURE) or step.kind in MARKING - {StepKind.SELF_CHECK}:
+                self._in_hand = step.index
+            elif step.kind in (StepKind.BOARD, StepKind.ZERO_TOUCH, StepKind.SELF_CHECK):
+                self.set_up = step.kind
+
+    def finished(self, step: Step, result: Result) -> None:
+        """A step is done."""
+        self._tally.finished(step.kind, result)
+        with self._lock:
+            self.set_up = None
+            if step.kind in (StepKind.BOARD, StepKind.ZERO_TOUCH, StepKind.SELF_CHECK):
+                self.found[step.kind] = result
+            if result.get("skipped"):
+                self._given_up += 1
+
+    def cut(self, place: Place | None) -> None:
+        """A step was cut."""
+        self._tally.voided(place)
+        with self._lock:
+            self.set_up = None
+        self.voided()
+
+    def skipped(self, step: Step) -> Result:
+        """What a dip tells whose stroke is left out."""
+        stroke = self._by_index[step.index]
+        named = {"stroke_id": stroke.stroke_id, "height_mm": stroke.height_mm, "tilt_deg": stroke.tilt_deg}
+        return {"skipped": True, **named}
+
+    def sheet_in(self, sheet: int) -> None:
+        """A sheet was put in, counted from 0."""
+        with self._lock:
+            self._sheet = sheet
+
+    def show(self, last: LastCapture) -> None:
+        """The newest capture."""
+        with self._lock:
+            self._last = last
+
+    def looked_at(self, *, kept: bool) -> None:
+        """What was decided about the newest capture."""
+        with self._lock:
+            self._last = None if self._last is None else replace(self._last, kept=kept)
 
     def captured(self, result: Result) -> None:
         """A mark was photographed and judged."""
@@ -103,9 +179,24 @@ class Progress:
     ) -> Snapshot:
         """One consistent picture."""
         with self._lock:
+            in_hand = None if self._in_hand is None else self._by_index.get(self._in_hand)
+            if in_hand is not None and in_hand.stroke_id in self._tally.over:
+                in_hand = None
+            coming = (p for p in self._plan if p.stroke_id not in self._tally.over and p is not in_hand)
+            following = next(coming, None)
             grid = tuple(
-                CellCount(h, a, self._done[(h, a)], planned) for (h, a), planned in sorted(self._planned.items())
+                CellCount(
+                    *cell,
+                    self._done[cell],
+                    planned,
+                    self._tally.bad.get(cell, 0),
+                    self._tally.left_out.get(cell, 0),
+                    in_hand is not None and cell == (in_hand.height_mm, in_hand.tilt_deg),
+                    following is not None and cell == (following.height_mm, following.tilt_deg),
+                )
+                for cell, planned in sorted(self._planned.items())
             )
+            sheet = self._tally.sheet(self._sheet) if self._folder else None
             return Snapshot(
                 session_id=self._session_id,
                 source=self._source,
@@ -125,6 +216,10 @@ class Progress:
                 messages=tuple(self._messages),
                 error=self._error,
                 messages_before=self._logged - len(self._messages),
+                sheet=sheet,
+                last=self._last,
+                stroke="" if in_hand is None else in_hand.stroke_id,
+                folder=self._folder,
             )
 
     def _take(self, result: Result) -> None:

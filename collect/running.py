@@ -7,15 +7,18 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Protocol as Interface
 
-from collect.asking import Asker
-from collect.errors import ForceTooHigh, StepError, told
+from collect.asking import Asker, Choice, Prompt
+from collect.errors import ForceTooHigh, Parked, StepError, told
 from collect.perform import Performer
 from collect.policy import Action, decide
 from collect.progress import Progress
-from collect.questions import STOP, question
+from collect.questions import GO_ON, STOP, question
 from collect.rig import Rig
+from collect.setting_up import SET_UP, again
+from collect.setting_up import question as set_up_question
 from collect.states import State
-from collect.steps import Protocol, Result, Step
+from collect.steps import Protocol, Result, Step, StepKind
+from collect.wishes import Wish, Wishes
 from drivers.errors import DeviceError, MotionError, RpcError
 from sessions.errors import SessionError
 from sessions.store import SessionStore
@@ -36,6 +39,14 @@ class Control(Interface):
         """Between two steps: wait here while paused."""
         ...
 
+    @property
+    def park_wanted(self) -> bool:
+        """Whether the run is to end before the next step."""
+        ...
+
+
+KEEP_SHEET = Choice("k", "keep the one that is in")
+
 
 @dataclass(frozen=True, slots=True)
 class Run:
@@ -47,6 +58,9 @@ class Run:
     progress: Progress
     asker: Asker
     control: Control
+    wishes: Wishes
+    guided: bool = False
+    """A person looks at what each set-up step measured before it counts."""
 
     async def protocol(self, protocol: Protocol) -> None:
         """Power on, retreat, then every step that the journal does not hold yet."""
@@ -74,12 +88,20 @@ class Run:
             return known["result"]
         failures = 0
         while True:
-            await self.control.pause_point()
+            await self._between(step)
             try:
-                return await self.performer.perform(step)
+                result = await self.performer.perform(step)
+                if not self.guided or step.kind not in SET_UP:
+                    return result
+                answer = await self._ask_about(step, result)
+                if answer == GO_ON:
+                    return result
+                step = again(step, answer)
             except (StepError, DeviceError) as error:
                 failures += 1
                 action = decide(step, error, failures)
+                if self.guided and step.kind in SET_UP and self.asker.watched:
+                    action = Action.ASK  # whoever sets up is there to mend it
                 self.progress.log(f"{step.kind}: {error} -> {action}", warning=True)
                 if action is Action.ABORT or (action is Action.ASK and not self.asker.watched):
                     await self._lift(error)
@@ -91,6 +113,50 @@ class Run:
             except SessionError as error:
                 await self._lift(error)  # the disk is at fault, the arm is in order
                 raise
+
+    async def _between(self, step: Step) -> None:
+        """Before each step: park or pause where that was asked for; before a stroke, a new sheet and a new touch."""
+        if self.control.park_wanted:
+            await self._park()
+        await self.control.pause_point()
+        if self.control.park_wanted:
+            await self._park()
+        if step.kind is StepKind.DIP and self.wishes.take(Wish.NEW_SHEET):
+            await self._new_sheet()
+        if step.kind is StepKind.DIP and self.wishes.take(Wish.JOG):
+            await self._touch_again(step)
+
+    async def _park(self) -> None:
+        await self._willing(self._recover)
+        raise Parked("parked as was asked; the same command goes on from here")
+
+    async def _new_sheet(self) -> None:
+        sheet = self.store.state.sheet
+        words = f"Put a new sheet in for sheet {sheet + 1}, then go on."
+        choices = (Choice(GO_ON, f"sheet {sheet + 2} is in, and blank"), KEEP_SHEET)
+        await self._willing(self._recover)
+        self.control.move_to(State.ASKING)
+        if await self.asker.ask(Prompt(words, choices, KEEP_SHEET.key)) == GO_ON:
+            self.performer.fresh_sheet()
+        await self._willing(self._recover)
+
+    async def _touch_again(self, step: Step) -> None:
+        """Zero touch by jog between two strokes; where it fails, the plane stays as it was."""
+        touch = Step(StepKind.ZERO_TOUCH, step.index + 1, {"method": "jog"})
+        try:
+            await self.performer.perform(touch)
+        except StepError as error:
+            self.progress.log(f"zero touch by jog: {error} The paper stays where it was found before.", warning=True)
+        await self._willing(self._recover)
+
+    async def _ask_about(self, step: Step, result: Result) -> str:
+        """What a set-up step measured, for a person to accept. Raises `Parked` where the answer is to stop."""
+        self.control.move_to(State.ASKING)
+        answer = await self.asker.ask(set_up_question(step.kind, result, self.rig.config))
+        self.control.move_to(self.control.running())
+        if answer == STOP.key:
+            await self._park()
+        return answer
 
     async def _ask(self, step: Step | None, error: StepError | DeviceError) -> None:
         """Let a person decide; raises `error` again where the answer is to stop."""

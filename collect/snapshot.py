@@ -6,7 +6,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from collect.asking import Prompt
+from collect.last_capture import LastCapture
+from collect.setting_up import SetUpStep
 from collect.states import State
+from collect.tally import SheetMap
+from collect.telemetry import Picture
+from collect.wishes import Wish
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,6 +22,19 @@ class CellCount:
     tilt_deg: float
     done: int
     planned: int
+    bad: int = 0
+    """Captures that came out badly."""
+    left_out: int = 0
+    """Strokes that were given up."""
+    now: bool = False
+    """One of its strokes is being made."""
+    next: bool = False
+    """The next stroke is one of its."""
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing more is to come."""
+        return self.done + self.left_out >= self.planned
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +69,29 @@ class Snapshot:
     """What waits for an answer."""
     messages_before: int = 0
     """How many older lines of the log are not in `messages` any more."""
+    target_mm: tuple[float, float, float] | None = None
+    """Where the arm was last sent."""
+    parked: bool = False
+    """Whether the tip was last seen at the park position."""
+    trace_n: tuple[float, ...] = ()
+    """Peaks of the force by tenth of a second, oldest first."""
+    picture: Picture | None = None
+    """What the camera sees; None where no preview is wanted."""
+    sheet: SheetMap | None = None
+    last: LastCapture | None = None
+    """The newest capture of this process."""
+    stroke: str = ""
+    """The stroke in hand."""
+    wishes: tuple[Wish, ...] = ()
+    """What was asked for by key and still waits."""
+    set_up: tuple[SetUpStep, ...] = ()
+    """Of a guided set-up; empty once it is over, and where there is none."""
+    folder: str = ""
+    """Of the session, once there is one."""
 
 
 class EngineView(Protocol):
-    """What a screen may do: look, pause, go on, stop."""
+    """What a screen may do: look, pause, go on, wish, park, stop."""
 
     def snapshot(self) -> Snapshot:
         """The engine now; never blocks."""
@@ -70,6 +107,14 @@ class EngineView(Protocol):
 
     def answer(self, number: int, key: str) -> bool:
         """Answer the prompt of that number; False where it is over. From any thread."""
+        ...
+
+    def wish(self, wish: Wish) -> None:
+        """Ask for something, or take it back; from any thread."""
+        ...
+
+    def park(self) -> None:
+        """End the run after this step with the arm lifted and parked; from any thread. Nobody is asked any more."""
         ...
 
     def stop(self) -> None:

@@ -11,13 +11,13 @@ from collect.engine import Engine
 from collect.headless import run_headless
 from collect.live import LiveView
 from collect.opening import Opening, check_writable, find_resumable, open_store
-from collect.plan import check_plan
+from collect.planning.limits import check_protocol
 from drivers.clock import HostClock
 
 
 def start(opening: Opening, *, on_screen: bool, live: LiveView | None = None) -> int:
     """Run to the end and return how many strokes had to be given up. Raises what ended the run."""
-    check_plan(opening.rig_path, opening.protocol_path, opening.rig, opening.protocol)
+    check_protocol(opening.rig_path, opening.protocol_path, opening.rig, opening.protocol)
     resume = find_resumable(opening)
     check_writable(resume or opening.root)
     clock = HostClock()

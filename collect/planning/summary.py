@@ -61,7 +61,7 @@ class Plan:
 
 
 def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
-    """Walk it. `check_plan` must have passed."""
+    """Walk it. `check_protocol` must have passed."""
     sheet = sheet_of(config, protocol)
     placed: list[Placed] = []
     changes: list[str] = []

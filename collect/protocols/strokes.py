@@ -22,7 +22,9 @@ def stroke_steps(plan: Iterable[Planned], *, board_every: int | None, write: Wri
         for take in itertools.count(1):
             # Only a second take has a number: the keys of first ones are those of older sessions.
             taken: Params = {} if take == 1 else {"take": take}
-            yield Step(StepKind.DIP, stroke.index, taken)
+            dipped = yield Step(StepKind.DIP, stroke.index, taken)
+            if dipped.get("skipped"):
+                break
             if stroke.figure is None:
                 marked = yield Step(StepKind.PRESS, stroke.index, _press_params(stroke) | taken)
             else:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import stat
 from pathlib import Path
 from typing import TypeVar
 
@@ -12,6 +11,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, ValidationError
 
 from collect.errors import ConfigError
+from collect.reading import read_text
 
 MAX_TABLE_BYTES = 4 * 1024 * 1024
 MAX_COLUMNS = 100
@@ -28,7 +28,7 @@ def read_rows(
     Raises `ConfigError`.
     """
     path = _beside(protocol, field, name)
-    lines = csv.reader(io.StringIO(_text(path), newline=""), strict=True)
+    lines = csv.reader(io.StringIO(read_text(path, MAX_TABLE_BYTES, "utf-8-sig"), newline=""), strict=True)
     rows: list[_R] = []
     try:
         header = _header(path, next(lines, list[str]()), row, ignore_others=ignore_others)
@@ -83,22 +83,6 @@ def _beside(protocol: Path, field: str, name: object) -> Path:
     if not isinstance(name, str) or not name or Path(name).name != name or not name.isprintable() or "\\" in name:
         raise ConfigError(protocol, field, f"must be the plain name of a file next to it (given: {name!r:.80})")
     return protocol.parent / name
-
-
-def _text(path: Path) -> str:
-    try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise ConfigError(path, "", "is not a file")
-        if status.st_size > MAX_TABLE_BYTES:
-            raise ConfigError(path, "", f"is larger than {MAX_TABLE_BYTES} bytes")
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise ConfigError(path, "", "no such file") from None
-    except OSError as error:
-        raise ConfigError(path, "", error.strerror or str(error)) from None
-    except UnicodeDecodeError as error:
-        raise ConfigError(path, "", f"is not UTF-8 at byte {error.start}") from None
 
 
 def _header(path: Path, cells: list[str], row: type[BaseModel], *, ignore_others: bool) -> list[str]:

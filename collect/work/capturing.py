@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+
 from collect.asking import Choice, Prompt
 from collect.errors import BadPicture, NeedsOperator, StepError
+from collect.last_capture import LastCapture, pictures_of
 from collect.quality.check import check_capture
 from collect.quality.verdict import Family, Verdict
 from collect.sheet import Cell
 from collect.steps import Result
+from collect.wishes import Wish
 from collect.work.context import Bench, Job
 from collect.work.looking import Gray, image_plane, photograph
 from collect.work.waiting import uninterrupted
@@ -29,9 +33,17 @@ async def capture(job: Job) -> Result:
     image = await photograph(job)
     verdict = None if job.step.params.get("drawn") else await _judged(job, image, cell)
     bench.known.sound_frame = image
+    if bench.asker.watched:
+        await uninterrupted(_show, job, verdict, image, cell, True)
     kept, retake = True, False
-    if verdict is not None and not verdict.passed:
+    if bench.wishes.take(Wish.RETAKE):
+        kept, retake = False, True
+    elif bench.wishes.take(Wish.SKIP):
+        kept = False
+    elif verdict is not None and not verdict.passed:
         kept, retake = await _decide(job, verdict, image, cell)
+    if not kept:
+        bench.progress.looked_at(kept=False)
     if kept:
         job.recorder.stroke(_stroke(job, cell))
     return {
@@ -90,6 +102,15 @@ async def _decide(job: Job, verdict: Verdict, image: Gray, cell: Cell) -> tuple[
         bench.progress.log(f"{stroke_id}: given up", warning=True)
         return False, False
     return answer == KEEP.key, answer == AGAIN.key
+
+
+def _show(job: Job, verdict: Verdict | None, image: Gray, cell: Cell, kept: bool) -> None:
+    photo = binary = None
+    with contextlib.suppress(BadPicture):
+        photo, binary = pictures_of(image, image_plane(job.bench, image), cell)
+    stroke_id, still = str(job.step.params["stroke_id"]), job.attempt.serial
+    height_mm, tilt_deg = job.number("height_mm"), job.number("tilt_deg")
+    job.bench.progress.show(LastCapture(stroke_id, height_mm, tilt_deg, still, kept, verdict, photo, binary))
 
 
 def _cut_out(bench: Bench, image: Gray, cell: Cell) -> Gray:

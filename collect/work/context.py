@@ -17,6 +17,7 @@ from collect.rig import Rig
 from collect.sheet import Cell, Sheet
 from collect.steps import Step
 from collect.touch.places import used_cells as touched_cells
+from collect.wishes import Wishes
 from sessions.store import Attempt, SessionStore
 
 if TYPE_CHECKING:
@@ -35,7 +36,6 @@ class Known:
     """The newest gray photograph of the sheet that is in."""
     looked_at_sheet: int | None = None
     """The sheet whose free cells were seen to be blank."""
-    self_checked: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +51,7 @@ class Bench:
     sheet: Sheet
     protocol: ProtocolConfig
     known: Known = field(default_factory=Known)
+    wishes: Wishes = field(default_factory=Wishes)
 
     def used_cells(self) -> set[int]:
         """Cells of the sheet that is in on which a mark was ever begun, or that zero touch may ink."""

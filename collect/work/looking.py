@@ -7,6 +7,7 @@ from calibrate.preprocess import Gray
 from calibrate.scale import PlaneFit, see_board
 from collect.errors import BadPicture, NeedsOperator, StepError
 from collect.quality.check import cell_is_blank, check_frame
+from collect.quality.verdict import Check
 from collect.steps import Result
 from collect.touch.ink import gray
 from collect.work.context import Bench, Job
@@ -17,8 +18,16 @@ async def board(job: Job) -> Result:
     """The BOARD step. Raises `StepError` where the board is not seen: nothing that follows could be measured."""
     image = await photograph(job)
     with job.recorder.sections.timed("see the board"):
-        plane = await uninterrupted(_board, job.bench, image)
-    return {"still": job.attempt.serial, "corners": plane.corners, "mm_per_px": plane.mm_per_px}
+        plane, checks = await uninterrupted(_board, job.bench, image)
+    return {
+        "still": job.attempt.serial,
+        "corners": plane.corners,
+        "mm_per_px": plane.mm_per_px,
+        "rms_px": plane.rms_px,
+        "checks": [
+            {"name": str(c.name), "score": c.score, "threshold": c.threshold, "passed": c.passed} for c in checks
+        ],
+    }
 
 
 async def look_at_sheet(job: Job) -> None:
@@ -59,16 +68,17 @@ def image_plane(bench: Bench, image: Gray) -> PlaneFit:
     return bench.known.image_plane
 
 
-def _board(bench: Bench, image: Gray) -> PlaneFit:
+def _board(bench: Bench, image: Gray) -> tuple[PlaneFit, tuple[Check, ...]]:
     try:
         plane = see_board(image, bench.rig.config.board)
     except CalibrationError as error:
         raise StepError(f"the board is not seen: {error.what}") from None
     bench.known.image_plane = plane
     limits = bench.rig.config.quality
-    if limits.enabled and (cause := check_frame(image, plane, limits).cause) is not None:
-        raise BadPicture(cause.reason)
-    return plane
+    frame = check_frame(image, plane, limits)
+    if limits.enabled and frame.cause is not None:
+        raise BadPicture(frame.cause.reason)
+    return plane, frame.checks
 
 
 def _inked_cells(bench: Bench, image: Gray, begun: int | None) -> list[str]:

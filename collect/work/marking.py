@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 from collect.drawing import Drawn, check_drawn, draw_stroke
 from collect.rig import limits_of
 from collect.sheet import Cell
@@ -25,7 +27,8 @@ async def draw(job: Job) -> Result:
     bench, drawn = job.bench, Drawn.of(job.step)
     cell = await _ready(job)
     plane = bench.procedures.plane
-    check_drawn(bench.rig.config, plane, limits_of(bench.rig.config), [cell], drawn)
+    config = bench.rig.config
+    await asyncio.to_thread(check_drawn, config, plane, limits_of(config), [cell], drawn)
     depths_mm: list[float] = []
     for number, points in enumerate(drawn.strokes):
         if drawn.dips_before(number):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 
 from collect.errors import ConfigError, StepError
@@ -28,8 +29,12 @@ async def zero_touch(job: Job) -> Result:
     await bench.inking.begin()
     if rig.force is not None and rig.config.force is not None:
         await rig.force.bias(rig.config.force.bias_s)
-    found = await _measured(job, rig.config.touch)
-    _check_plane(job, found.plane)
+    config = rig.config.touch
+    if (method := job.step.params.get("method")) is not None:
+        # Asked for by the operator, who may also measure where a taught height is configured.
+        config = TouchConfig.model_validate(config.model_dump() | {"method": method})
+    found = await _measured(job, config)
+    await _check_plane(job, found.plane)
     bench.procedures.plane = found.plane
     origin_mm, quaternion = found.plane.frame(rig.config.paper)
     job.recorder.frames([Transform("base", "paper", origin_mm, quaternion)])
@@ -91,9 +96,10 @@ async def _measured(job: Job, config: TouchConfig) -> PlaneResult:
         return await job.guard.guarded(measure_plane(bench.rig, _Hands(job), config, tap=tap, next_jog=jog))
 
 
-def _check_plane(job: Job, plane: PaperPlane) -> None:
+async def _check_plane(job: Job, plane: PaperPlane) -> None:
     bench = job.bench
     try:
-        check_poses(Path("rig.toml"), bench.rig.config, bench.protocol, plane)
+        # Seconds for a long protocol: beside the loop, so that a stop is heard meanwhile.
+        await asyncio.to_thread(check_poses, Path("rig.toml"), bench.rig.config, bench.protocol, plane)
     except ConfigError as error:
         raise StepError(f"over the paper as it was touched, {error.what}") from None

@@ -82,8 +82,9 @@ async def feed(
             try:
                 await controller.move_line(leg.target, leg.speed_mm_s, acc_mm_s2, leg.blend_mm)
             except QueueFull:
-                # Refused, so it may be sent again: the controller holds fewer lines than we thought.
-                if sent == 0 or await controller.queue() == EMPTY:
+                # Refused, so it may be sent again: the controller holds fewer lines than we thought. One that
+                # goes on to refuse with nothing queued ends below, as an arm that does not advance.
+                if sent == 0:
                     raise  # none of them is ours
                 break
             sent, room = sent + 1, room - 1

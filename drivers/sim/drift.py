@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drivers.samples import Pose
-from drivers.sim.kinematics import Joints, Matrix, forward, pose_of
+from drivers.sim.kinematics import Joints, Matrix
+from drivers.sim.paths import InJoints, InSpace
 
 Vector = tuple[float, ...]
 FOREVER_S = 3600.0
@@ -17,7 +18,7 @@ STRETCH_MM = 5.0
 
 
 @dataclass(frozen=True)
-class Drift:
+class Drift(InSpace):
     """Of the tip: [mm/s x3, rad/s x3] in the base frame, from `v0` to `v1` at `acc` mm/s2."""
 
     start: Pose
@@ -52,13 +53,9 @@ class Drift:
         qx, qy, qz, qw = (float(v) for v in turn.as_quat())
         return Pose(float(x), float(y), float(z), qx, qy, qz, qw)
 
-    def joints(self, done: float) -> Joints | None:
-        """None: not given in joints."""
-        return None
-
 
 @dataclass(frozen=True)
-class JointDrift:
+class JointDrift(InJoints):
     """Of the joints: rad/s, from `v0` to `v1` at `acc` rad/s2."""
 
     start: Joints
@@ -88,10 +85,6 @@ class JointDrift:
         """The joints after so many seconds."""
         q = [a + b for a, b in zip(self.start, _way(self.v0, self.v1, self.turn_s, done), strict=True)]
         return (q[0], q[1], q[2], q[3], q[4], q[5])
-
-    def pose(self, done: float) -> Pose:
-        """Where the tip is."""
-        return pose_of(forward(self.joints(done)) @ self.tool)
 
 
 def _velocity(v0: Vector, v1: Vector, turn_s: float, t: float) -> Vector:

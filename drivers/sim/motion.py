@@ -104,6 +104,11 @@ class MotionQueue:
         """Moves that are queued or running; one that decelerates to a stop counts."""
         return len({segment.ident for segment in self._queue})
 
+    @property
+    def running(self) -> Segment | None:
+        """The piece of the path that runs now; None at rest."""
+        return self._queue[0] if self._queue else None
+
     def add(
         self,
         target: Pose,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -47,8 +48,30 @@ class Path(Protocol):
         ...
 
 
+class InSpace:
+    """A way that is given in space alone."""
+
+    def joints(self, done: float) -> Joints | None:
+        """None: not given in joints."""
+        return None
+
+
+class InJoints(ABC):
+    """A way that is given in joints: the tip follows from them and the tool."""
+
+    tool: Matrix
+
+    @abstractmethod
+    def joints(self, done: float) -> Joints:
+        """The joints after `done`."""
+
+    def pose(self, done: float) -> Pose:
+        """Where the tip is."""
+        return pose_of(forward(self.joints(done)) @ self.tool)
+
+
 @dataclass(frozen=True)
-class Line:
+class Line(InSpace):
     """Straight for the tool centre point that was configured; `fix` leads from there to the true tip (None: same)."""
 
     start: Pose
@@ -86,13 +109,9 @@ class Line:
         """Where the true tip is."""
         return fixed(self.along(done), self.fix)
 
-    def joints(self, done: float) -> Joints | None:
-        """None: not given in joints."""
-        return None
-
 
 @dataclass(frozen=True)
-class Corner:
+class Corner(InSpace):
     """The parabola that leaves `a` at `cut` before its end and meets `b` at `cut` after its start; turns go along."""
 
     a: Line
@@ -119,13 +138,9 @@ class Corner:
         there = interpolate(interpolate(start, self.a.end, u), interpolate(self.b.start, end, u), u)
         return fixed(there, self.a.fix)
 
-    def joints(self, done: float) -> Joints | None:
-        """None: not given in joints."""
-        return None
-
 
 @dataclass(frozen=True)
-class JointLine:
+class JointLine(InJoints):
     """Straight in joints; its length is that of the joint that turns farthest."""
 
     start: Joints
@@ -148,10 +163,6 @@ class JointLine:
         if done >= self.length:
             return self.end
         return mixed(self.start, self.end, max(done, 0.0) / self.length)
-
-    def pose(self, done: float) -> Pose:
-        """Where the tip is."""
-        return pose_of(forward(self.joints(done)) @ self.tool)
 
 
 @dataclass(frozen=True)

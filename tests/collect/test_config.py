@@ -8,7 +8,7 @@ import pytest
 
 from collect.config import load_rig
 from collect.errors import ConfigError
-from collect.plan import check_plan
+from collect.planning.limits import check_protocol
 from collect.protocols.loading import load_protocol
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml
@@ -33,7 +33,7 @@ def protocol_file(tmp_path: Path, text: str = PROTOCOL) -> Path:
 def test_the_rig_that_the_simulator_writes_is_valid(tmp_path: Path) -> None:
     rig = load_rig(rig_file(tmp_path))
     assert rig.paper.touch_z_mm == pytest.approx(120.03)
-    check_plan(tmp_path / "rig.toml", protocol_file(tmp_path), rig, load_protocol(protocol_file(tmp_path)))
+    check_protocol(tmp_path / "rig.toml", protocol_file(tmp_path), rig, load_protocol(protocol_file(tmp_path)))
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 def plan(tmp_path: Path, protocol: str = PROTOCOL, old: str = "", new: str = "") -> None:
     rig_path, protocol_path = rig_file(tmp_path, old, new), protocol_file(tmp_path, protocol)
-    check_plan(rig_path, protocol_path, load_rig(rig_path), load_protocol(protocol_path))
+    check_protocol(rig_path, protocol_path, load_rig(rig_path), load_protocol(protocol_path))
 
 
 def test_a_press_deeper_than_the_brush_survives_is_refused_before_anything_is_connected(tmp_path: Path) -> None:

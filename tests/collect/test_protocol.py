@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from collect.config import PaperConfig
-from collect.protocol import grid, plan_grid
+from collect.protocols import grid
 from collect.protocols.config import GridConfig
 from collect.sheet import Sheet, to_base
 from collect.steps import Step, StepKind
@@ -27,7 +27,7 @@ def config(heights_mm: list[float], tilts_deg: list[float], repeats: int, seed: 
 def test_every_cell_is_pressed_as_often_as_asked_and_once_a_round(
     heights_mm: list[float], tilts_deg: list[float], repeats: int, seed: int
 ) -> None:
-    planned = plan_grid(config(heights_mm, tilts_deg, repeats, seed))
+    planned = grid.planned(config(heights_mm, tilts_deg, repeats, seed))
     cells = Counter((p.height_mm, p.tilt_deg) for p in planned)
     assert set(cells.values()) == {repeats}
     assert len(cells) == len(heights_mm) * len(tilts_deg)
@@ -36,7 +36,7 @@ def test_every_cell_is_pressed_as_often_as_asked_and_once_a_round(
 
 
 def test_steps_of_a_stroke_follow_each_other_and_a_capture_belongs_to_the_cell_that_was_pressed() -> None:
-    protocol = grid(config([11.0], [0.0], 1))
+    protocol = grid.steps(config([11.0], [0.0], 1))
     kinds: list[str] = []
     step = next(protocol)
     try:

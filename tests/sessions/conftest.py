@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import errno
 import functools
 import itertools
+import os
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -200,3 +202,16 @@ def refusal(make: Make, tmp_path: Path, run: Callable[..., Path]) -> Callable[..
         return str(caught.value).removeprefix(f"{tmp_path}/")
 
     return refusal
+
+
+@pytest.fixture
+def read_only_disk(monkeypatch) -> Callable[[], None]:
+    """Called, it makes every opening for writing fail, until the test ends."""
+    open_ = os.open
+
+    def read_only(path, flags, *more, **options):
+        if flags & (os.O_WRONLY | os.O_RDWR):
+            raise OSError(errno.EROFS, "Read-only file system", str(path))
+        return open_(path, flags, *more, **options)
+
+    return lambda: monkeypatch.setattr(os, "open", read_only)

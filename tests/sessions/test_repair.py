@@ -1,7 +1,6 @@
 """Repair, case by case: what it does, what it says, and how the session goes on afterwards."""
 
 import errno
-import os
 import shutil
 
 import pytest
@@ -289,16 +288,9 @@ def test_a_full_disk_leaves_the_damaged_file_with_its_name(make, folder, repair,
     assert repair(folder).lossless
 
 
-def test_a_folder_that_may_not_be_written_is_a_session_error(folder, repair, monkeypatch):
+def test_a_folder_that_may_not_be_written_is_a_session_error(folder, repair, read_only_disk):
     cut(file_of(folder, "H13-a05-r00 capture"), 0.3)
-    open_ = os.open
-
-    def read_only(path, flags, *more, **options):
-        if flags & (os.O_WRONLY | os.O_RDWR):
-            raise OSError(errno.EROFS, "Read-only file system", str(path))
-        return open_(path, flags, *more, **options)
-
-    monkeypatch.setattr(os, "open", read_only)
+    read_only_disk()
     with pytest.raises(SessionError, match="Read-only file system"):
         repair(folder)
 

@@ -112,17 +112,10 @@ def test_a_disk_that_fills_up_during_a_step_ends_the_attempt_and_nothing_finishe
     assert verify_session(store.folder).sound
 
 
-def test_a_read_only_folder_is_told_in_one_line(make, store, monkeypatch):
+def test_a_read_only_folder_is_told_in_one_line(make, store, read_only_disk):
     make.perform(store, "a")
     store.release()
-    open_ = os.open
-
-    def read_only(path, flags, *more, **options):
-        if flags & (os.O_WRONLY | os.O_RDWR):
-            raise OSError(errno.EROFS, "Read-only file system", str(path))
-        return open_(path, flags, *more, **options)
-
-    monkeypatch.setattr(os, "open", read_only)
+    read_only_disk()
     with pytest.raises(SessionError, match="Read-only file system"):
         SessionStore(store.folder, None, make.clock())
     assert verify_session(store.folder).sound, "looking needs no right to write"

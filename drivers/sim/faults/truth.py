@@ -26,8 +26,8 @@ class Truth:
         """Where the piece of the path that runs now ends; None at rest."""
         queue = self._world.motion
         queue.advance(self.now_s())
-        lines = queue._queue  # pyright: ignore[reportPrivateUsage]
-        return lines[0].pose(lines[0].end_s) if lines else None
+        line = queue.running
+        return None if line is None else line.pose(line.end_s)
 
     def phase(self) -> Phase:
         """What the arm does now."""

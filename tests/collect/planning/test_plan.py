@@ -11,10 +11,9 @@ import pytest
 from collect.config import RigConfig, load_rig
 from collect.drawing import Drawn
 from collect.errors import ConfigError
-from collect.plan import check_plan
 from collect.plane import PaperPlane
 from collect.planning.ink import bundle_ml, ink_need
-from collect.planning.limits import all_poses, check_poses
+from collect.planning.limits import all_poses, check_poses, check_protocol
 from collect.planning.marks import reach_of
 from collect.planning.moves import Way, moves_of
 from collect.planning.summary import Plan, make_plan
@@ -73,7 +72,7 @@ def test_every_example_passes_and_is_walked(tmp_path: Path) -> None:
     config = rig(tmp_path)
     for path in EXAMPLES.glob("*.toml"):
         wanted = load_protocol(path)
-        check_plan(tmp_path / "rig.toml", path, config, wanted)
+        check_protocol(tmp_path / "rig.toml", path, config, wanted)
         assert make_plan(config, wanted).seconds > 10.0
 
 
@@ -121,7 +120,7 @@ def test_what_cannot_be_done_is_named_before_anything_is_connected(
 ) -> None:
     config = rig(tmp_path, *change)
     with pytest.raises(ConfigError, match=message):
-        check_plan(tmp_path / "rig.toml", tmp_path / "protocol.toml", config, protocol(tmp_path, text))
+        check_protocol(tmp_path / "rig.toml", tmp_path / "protocol.toml", config, protocol(tmp_path, text))
 
 
 def test_the_outermost_cells_stand_for_all(tmp_path: Path) -> None:
@@ -221,7 +220,7 @@ def test_marks_that_leave_their_cells_and_columns_that_are_not_used_are_told(tmp
 
 def test_a_self_check_takes_a_cell_before_the_first_stroke(tmp_path: Path) -> None:
     config = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\n\n[motion]")
-    check_plan(tmp_path / "rig.toml", EXAMPLES / "protocol.toml", config, example("protocol.toml"))
+    check_protocol(tmp_path / "rig.toml", EXAMPLES / "protocol.toml", config, example("protocol.toml"))
     plan = make_plan(config, example("protocol.toml"))
     assert [step.step.kind for step in walk(config, example("protocol.toml"))][:4] == [
         StepKind.ZERO_TOUCH,
@@ -233,7 +232,7 @@ def test_a_self_check_takes_a_cell_before_the_first_stroke(tmp_path: Path) -> No
     assert "self_check" not in make_plan(config, example("protocol-calibration.toml")).steps
     small = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\nlegs_mm = [50.0, 15.0]\n\n[motion]")
     with pytest.raises(ConfigError, match=r"rig.toml: self_check.legs_mm: a triangle of 50 by 15 mm does not fit"):
-        check_plan(tmp_path / "rig.toml", EXAMPLES / "protocol.toml", small, example("protocol.toml"))
+        check_protocol(tmp_path / "rig.toml", EXAMPLES / "protocol.toml", small, example("protocol.toml"))
 
 
 def test_moves_of_a_touch_end_above_where_they_began(tmp_path: Path) -> None:

@@ -173,6 +173,17 @@ async def test_a_queue_that_somebody_else_fills_is_an_error(arm: AuboArcs, cabin
         await arm.follow(line(5), **WAY)
 
 
+async def test_a_queue_that_stays_full_in_mid_path_ends_it(
+    arm: AuboArcs, cabinet: ArcsServer, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(following, "STUCK_S", 0.2)
+    move_line = cabinet._methods["rob1.MotionControl.moveLine"]
+    cabinet._methods["rob1.MotionControl.moveLine"] = lambda p: 2 if sent(cabinet) >= 3 else move_line(p)
+    with pytest.raises(MotionFailed, match="does not advance"):
+        await arm.follow(line(5), **WAY)
+    assert await rests_short(cabinet)
+
+
 async def test_a_line_that_is_refused_in_mid_path_ends_it(arm: AuboArcs, cabinet: ArcsServer):
     move_line = cabinet._methods["rob1.MotionControl.moveLine"]
     cabinet._methods["rob1.MotionControl.moveLine"] = lambda p: -5 if sent(cabinet) == 5 else move_line(p)
