@@ -69,7 +69,7 @@ def plan(
     import json
     import sys
 
-    import rich
+    from rich.console import Console
 
     from collect.config import load_rig
     from collect.plane import PaperPlane
@@ -94,9 +94,9 @@ def plan(
     if as_json:
         sys.stdout.write(json.dumps(made.as_json() | {"poses_in_reach": asked}) + "\n")
         return
-    rich.print(plan_table(made))
+    Console().print(plan_table(made))
     if asked is not None:
-        rich.print(f"The controller finds joints for all {asked} poses.")
+        Console().print(f"The controller finds joints for all {asked} poses.")
 
 
 def doctor(
@@ -116,10 +116,10 @@ def doctor(
     if as_json:
         sys.stdout.writelines(json.dumps(finding.as_json()) + "\n" for finding in findings)
     else:
-        import rich
+        from rich.console import Console
 
         from collect.doctor_table import doctor_table
 
-        rich.print(doctor_table(findings))
+        Console().print(doctor_table(findings))
     if not all(finding.well for finding in findings):
         raise typer.Exit(4)

@@ -28,12 +28,12 @@ def show(
     if as_json:
         typer.echo(json.dumps(asdict(told), ensure_ascii=False))
         return
-    import rich
+    from rich.console import Console
 
     from sessions.show_text import renderables
 
     for part in renderables(told):
-        rich.print(part)
+        Console().print(part)
 
 
 def verify(session: Annotated[Path, SESSION]) -> None:
