@@ -21,7 +21,7 @@ from sessions.schemas import Topic
 from sessions.store import SessionStore
 from sessions.verify import verify_session
 
-PLACES = 500
+PLACES = 200
 """Random places in each of the two sessions, open and closed."""
 
 
@@ -150,15 +150,15 @@ def run(make, whole, root, chosen, count):
     return ends
 
 
-@pytest.mark.timeout(600)  # a thousand repairs: ten seconds of work, on a machine that may be busy
+@pytest.mark.timeout(600)  # four hundred repairs, on a machine that may be busy
 def test_whatever_is_damaged_the_rest_is_given_back(make, whole, tmp_path):
     ends = run(make, whole, tmp_path, random.Random(11), PLACES)
-    assert ends[True] > 50, "hardly a repair was lossless"
-    assert whole.closed or ends[False] > 50, "hardly a repair was lossy"
+    assert ends[True] > 20, "hardly a repair was lossless"
+    assert whole.closed or ends[False] > 20, "hardly a repair was lossy"
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("seed", range(10))
-def test_damage_at_ten_times_as_many_places(make, whole, tmp_path, seed):
+def test_damage_at_many_times_as_many_places(make, whole, tmp_path, seed):
     run(make, whole, tmp_path, random.Random(seed), 1000)
