@@ -23,8 +23,6 @@ ROBOT = "rob1"
 IK_NO_CONVERGE = -23
 HARD_STOP_M_S2 = 10.0
 SOFT_STOP_M_S2 = 2.0
-BRISTLES_N_MM = 0.05
-"""How hard the brush pushes back: enough to be seen, far from what stops an arm."""
 
 Params = dict[str, Any]
 
@@ -127,11 +125,7 @@ class Cabinet:
 
     def force(self) -> list[float]:
         """[Fx, Fy, Fz N, Mx, My, Mz Nm] in the base frame: the bristles' push while the tip is below the paper."""
-        tip, table = self.world.tool(), self.world.config.table
-        x_mm, y_mm = self.world.to_paper(tip.x_mm, tip.y_mm)
-        on_sheet = 0.0 <= x_mm <= table.sheet_mm[0] and 0.0 <= y_mm <= table.sheet_mm[1]
-        depth_mm = max(table.paper_z_mm - tip.z_mm, 0.0) if on_sheet else 0.0
-        return [0.0, 0.0, BRISTLES_N_MM * depth_mm, 0.0, 0.0, 0.0]
+        return [*self.world.push_n(), 0.0, 0.0, 0.0]
 
     def fk(self, q: list[float], *, tip: bool) -> list[Any]:
         """[pose, return code]."""

@@ -43,6 +43,7 @@ class LoopbackRig:
 
     async def __aenter__(self) -> LoopbackRig:
         try:
+            await asyncio.to_thread(self.world.reaction.prepare)  # both the cabinet and the sensor tell the push
             await self.arcs.start(HOST, self.config.arcs_port)
             await self.rtde.start(HOST, self.config.rtde_port)
             await self.camera.start(HOST, self.config.camera_port)

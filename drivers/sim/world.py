@@ -107,6 +107,12 @@ class World:
         x_mm, y_mm, depth_mm = self._on_sheet(tip)
         return self.reaction.wrench(tip, 0.0 if self._in_well(x_mm, y_mm) else depth_mm, self._normal)
 
+    def push_n(self) -> tuple[float, float, float]:
+        """Force of the paper on the bundle, in the base frame."""
+        tip = self.tool()
+        x_mm, y_mm, depth_mm = self._on_sheet(tip)
+        return self.reaction.push(tip, 0.0 if self._in_well(x_mm, y_mm) else depth_mm, self._normal)
+
     def to_paper(self, x_mm: float, y_mm: float) -> tuple[float, float]:
         """Base frame to paper frame, in the plane."""
         table = self.config.table

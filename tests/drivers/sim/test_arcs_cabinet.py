@@ -285,7 +285,10 @@ def test_the_brush_pushes_back_only_while_it_is_on_the_paper(on: Any):
     x, y = table.origin_mm[0] - 80.0, table.origin_mm[1] + 100.0
     on.line(brush_pose(x, y, table.paper_z_mm - 10.0), v=1.0)
     on.clock.s += 20.0
-    assert on.ask("RobotState.getTcpForce")[2] == pytest.approx(0.5)
+    *push, mx, my, mz = on.ask("RobotState.getTcpForce")
+    assert push == pytest.approx([0.0, 0.0, on.world.reaction.push_n(10.0, 0.0)])
+    assert push[2] > 0.05
+    assert [mx, my, mz] == [0.0] * 3
 
 
 async def test_a_watchdog_that_is_not_fed_bites_and_one_that_is_fed_does_not(on: Any):
