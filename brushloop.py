@@ -10,11 +10,15 @@ import typer
 
 import calibrate.brushfit.cli
 import calibrate.camera.cli
-import calibrate.cli
 import calibrate.invert_cli
+import calibrate.loop.cli
 import calibrate.prepare.cli
+import calibrate.validate.cli
 import calibrate.write_plan_cli
+import calibrate.written.cli
 import collect.cli
+import collect.loop.cli
+import collect.written.cli
 import model.train.cli
 import sessions.cli
 
@@ -27,11 +31,26 @@ app.add_typer(collect.cli.app, name="collect")
 app.command("doctor")(collect.cli.doctor)
 app.add_typer(calibrate.prepare.cli.app, name="calibrate")
 app.add_typer(calibrate.camera.cli.app, name="camera")
-app.command("validate")(calibrate.cli.validate)
+app.add_typer(calibrate.validate.cli.app, name="validate")
 app.command("fit")(calibrate.brushfit.cli.fit)
 app.command("invert")(calibrate.invert_cli.invert)
+loop = typer.Typer(
+    cls=calibrate.prepare.cli.SessionOrCommand,
+    help="Recover the presses of a SESSION, press them again and compare (`brushloop loop SESSION`), or only compare.",
+)
+loop.command(calibrate.prepare.cli.SESSION)(collect.loop.cli.loop)
+loop.command("compare")(calibrate.loop.cli.compare)
+app.add_typer(loop, name="loop")
 app.add_typer(sessions.cli.app, name="sessions")
-app.add_typer(calibrate.write_plan_cli.app, name="write")
+write = typer.Typer(
+    cls=collect.written.cli.CharactersOrCommand,
+    help="Write characters on the rig and compare them (`brushloop write 字 --config ...`), or only plan or compare.",
+)
+write.command(collect.written.cli.CHARACTERS)(collect.written.cli.write)
+write.command("plan")(calibrate.write_plan_cli.plan)
+write.command("compare")(calibrate.written.cli.compare)
+write.command("learn")(calibrate.written.cli.learn)
+app.add_typer(write, name="write")
 app.add_typer(model.train.cli.app, name="train")
 
 
@@ -99,7 +118,13 @@ def demo(
 def main() -> None:
     """Run the app; an error of ours is one line on stderr and its exit code, anything else a traceback."""
     try:
-        app()
+        if len(sys.argv) == 1 and sys.stdin.isatty() and sys.stdout.isatty():
+            from collect.desk import Paths
+            from collect.tui.running import run_desk
+
+            run_desk(Paths())
+        else:
+            app()
     except Exception as error:
         # A path of the user's that cannot be read or written is no defect of ours.
         code = 2 if isinstance(error, OSError) and error.filename else None

@@ -12,6 +12,7 @@ from bench import (
     brushfit,
     generator,
     inversion,
+    loop,
     overhead,
     preprocess,
     quality,
@@ -20,6 +21,8 @@ from bench import (
     recorder,
     rpc,
     startup,
+    tui,
+    validate,
 )
 from bench.harness import Bench, BenchError, results_of
 
@@ -31,6 +34,7 @@ def benches() -> dict[str, Bench]:
         "generator": generator.run,
         "generator-qbc": generator.run_qbc,
         "inversion": inversion.run,
+        "loop": loop.run,
         "overhead": overhead.run,
         "preprocess": preprocess.run,
         "quality": quality.run,
@@ -39,6 +43,8 @@ def benches() -> dict[str, Bench]:
         "recorder": recorder.run,
         "rpc": rpc.run,
         "startup": startup.run,
+        "validate": validate.run,
+        "tui": tui.run,
     }
 
 

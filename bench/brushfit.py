@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.brushfit_brushes import FROZEN
+from bench.brushfit_brushes import DEVELOPMENT, FROZEN
 from bench.harness import Result, machine
 from calibrate.brushfit.adaptive import next_press
 from calibrate.brushfit.bezier import RefittedBezier, refit_bezier
@@ -45,14 +45,18 @@ def grid() -> Grid:
 
 
 def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
-    """The gap to the ceiling in CSIM points from 5 and 9 strokes over the first `n` brushes (default all five), and
-    from strokes chosen one by one beside twice as many of the shuffled grid.
+    """`measure` over the first `n` frozen brushes (default all five)."""
+    return measure(FROZEN[: len(FROZEN) if n is None else n], "frozen", seed)
+
+
+def measure(brushes: Sequence[BrushSpec], called: str, seed: int) -> Sequence[Result]:
+    """The gap to the ceiling in CSIM points from 5 and 9 strokes, and from strokes chosen one by one beside twice as
+    many of the shuffled grid. Raises ValueError without a brush.
 
     ratio = the goal over the gap; the refitted Bezier's gap over ours; the shuffled grid's gap over ours.
     """
-    brushes = FROZEN[: len(FROZEN) if n is None else n]
     if not brushes:
-        raise ValueError(f"n = {n}: at least one brush is needed")
+        raise ValueError("at least one brush is needed")
     gaps: dict[str, list[float]] = {}
     seconds: dict[int, list[float]] = {size: [] for size in DESIGNS}
     for spec in brushes:
@@ -77,7 +81,7 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     for size, goal in GOALS.items():
         mine, peer, none = (gaps[f"{kind}.{size}"] for kind in ("fitted", "bezier", "uncalibrated"))
         where = (
-            f"loopback rig, {len(brushes)} frozen brushes; gap of each {_list(mine)}; refitted Bezier {_list(peer)}; "
+            f"loopback rig, {len(brushes)} {called} brushes; gap of each {_list(mine)}; refitted Bezier {_list(peer)}; "
             f"uncalibrated {_list(none)}; fit {np.mean(seconds[size]):.1f} s; {machine()}"
         )
         mean, count = float(np.mean(mine)), len(brushes)
@@ -188,6 +192,12 @@ def _list(values: Sequence[float]) -> str:
     return ", ".join(f"{value:.2f}" for value in values)
 
 
-if __name__ == "__main__":
-    for line in run(n=int(sys.argv[1]) if len(sys.argv) > 1 else None):
+def main(arguments: Sequence[str]) -> None:
+    """`python -m bench.brushfit [--development]`: the frozen brushes, or those that the fit is developed on."""
+    develop = "--development" in arguments
+    for line in measure(DEVELOPMENT, "development", 0) if develop else run():
         sys.stdout.write(f"# {line.conditions}\n{line.to_line()}\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

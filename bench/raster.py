@@ -4,86 +4,142 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Iterator, Sequence
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from bench.harness import Result, interleave, machine
+from bench.harness import Result, machine
 from model.ccdbsm import Brush, CcdBsm, ccdbsm
 from model.coverage import PX_MM, SIZE_PX, centred_origin, coverage
 from model.raster.compiled import coverage_numpy
 from model.raster.exact import coverage_at
+from model.raster.frame import to_pixels
 
 BATCH = 64
 BULK = 1024  # 64 MiB of images: more than a cache holds, as in making a training set
 SCALE = 4
 POINTS = 64  # along each side of an outline
 SHIFT = 4  # fractional bits of fillPoly's fixed-point corners
+LEAST = 0.1  # of the rounds: the share whose times count, see `_quick`
+
+
+@dataclass(frozen=True, slots=True)
+class Presses:
+    """What is drawn: presses at any heading, each in the middle of its image."""
+
+    height_mm: Tensor
+    tilt_deg: Tensor
+    heading_deg: Tensor
+
+    def mark(self, count: int) -> CcdBsm:
+        """The first `count` marks."""
+        return ccdbsm(Brush(), self.height_mm[:count], self.tilt_deg[:count])
+
+    def origin(self, mark: CcdBsm) -> Tensor:
+        """The `origin_mm` that puts the marks' middles in the middle of the image, (B, 2)."""
+        middle = 0.5 * (mark.x_min_mm + mark.x_max_mm)
+        turn = torch.deg2rad(self.heading_deg[: len(middle)])
+        half = 0.5 * SIZE_PX * PX_MM
+        return torch.stack((half - middle * torch.cos(turn), half + middle * torch.sin(turn)), dim=-1)
 
 
 def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """Images per second of exact CCD-BSM coverage, 128 x 128, beside cv2.fillPoly at 4x with resize, and a memset.
 
-    ratio = our images/s over the peer's. Presses are drawn from H 11-20 mm, alpha 0-10 deg and any heading. Ours
-    counts everything from (H, alpha, heading) to float32 images; fillPoly gets its outlines ready made, is not
+    ratio = our images/s over the peer's. Presses are drawn from H 11-20 mm, alpha 0-10 deg and any heading, each in the
+    middle of its image; both sides draw the same ones, `raster` and its peer at heading 0. Ours counts everything from
+    (H, alpha, heading) to float32 images; fillPoly gets its outlines ready made and gives 8-bit images, is not
     exact (it paints its boundary pixels whole, so its marks come out about 1 % too large, and at 4x it knows 17
-    levels of gray). `raster` is torch at heading 0, `raster-any-heading` torch at any, both on one thread like
-    their peer. `raster-compiled` and fillPoly run on one thread; `raster-compiled-bulk` and the memset of as many
-    bytes on as many threads as there are cores.
+    levels of gray), and each of its images is a zeroed canvas, a fill and an area mean. `raster` is torch at heading 0,
+    `raster-any-heading` torch at any, 64 images a call on one thread. `raster-compiled` draws 1024 a call on one thread
+    into images that are used again; `raster-compiled-bulk` does so on as many threads as there are cores, as do
+    `raster-compiled-cores`' fillPoly (whole images on each thread) and `raster-compiled-bulk`'s memset of the same
+    64 MiB. `raster-compiled-kernel` is `-bulk` from outlines in memory, without the model.
+    Times are CPU seconds of all threads, and means of the quickest tenth of the rounds: other work on the machine
+    only ever slows.
     """
-    rounds = 40 if n is None else n
+    rounds = 60 if n is None else n
     generator = torch.Generator().manual_seed(seed)
-    heights_mm, tilts_deg, headings_deg = (
-        low + span * torch.rand(BULK, generator=generator) for low, span in ((11, 9), (0, 10), (-180, 360))
+    drawn = Presses(
+        *(low + span * torch.rand(BULK, generator=generator) for low, span in ((11, 9), (0, 10), (-180, 360)))
     )
-    brush, few = Brush(), slice(0, BATCH)
-    polygons = outlines(ccdbsm(brush, heights_mm[few], tilts_deg[few], dtype=torch.float64))
     images = np.empty((BULK, SIZE_PX, SIZE_PX), np.float32)
     cores = os.cpu_count() or 1
+    whole = drawn.mark(BULK)
+    place = drawn.origin(whole)
+    ready = whole.outline()
+    level_polygons = outlines(drawn.mark(BATCH))
+    polygons = outlines(drawn.mark(BATCH), drawn.origin(drawn.mark(BATCH)), drawn.heading_deg[:BATCH])
 
     def level() -> object:
-        mark = ccdbsm(brush, heights_mm[few], tilts_deg[few])
+        mark = drawn.mark(BATCH)
         return coverage(mark, centred_origin(mark))
 
     def turned() -> object:
-        mark = ccdbsm(brush, heights_mm[few], tilts_deg[few])
-        return coverage_at(mark, centred_origin(mark), headings_deg[few])
+        mark = drawn.mark(BATCH)
+        return coverage_at(mark, drawn.origin(mark), drawn.heading_deg[:BATCH])
 
     def compiled(threads: int) -> object:
-        mark = ccdbsm(brush, heights_mm, tilts_deg)
-        return coverage_numpy(mark, centred_origin(mark), headings_deg, threads=threads, out=images)
+        mark = drawn.mark(BULK)
+        return coverage_numpy(mark, drawn.origin(mark), drawn.heading_deg, threads=threads, out=images)
 
-    def filled() -> object:
-        return [fill(polygon) for polygon in polygons]
+    def kernel() -> object:
+        return coverage_numpy(ready, place, drawn.heading_deg, threads=cores, out=images)
+
+    def filled(which: NDArray[np.int32]) -> object:
+        return [fill(polygon) for polygon in which]
 
     with _one_thread(), ThreadPoolExecutor(cores) as pool:
-        per_image = {
-            "raster": [s / BATCH for s in interleave(level, filled, rounds)],
-            "raster-any-heading": [s / BATCH for s in interleave(turned, filled, rounds)],
-        }
-        ours_s, peer_s = interleave(lambda: compiled(1), filled, rounds)
-        per_image["raster-compiled"] = [ours_s / BULK, peer_s / BATCH]
-        ours_s, peer_s = interleave(lambda: compiled(cores), lambda: clear(images, pool, cores), rounds)
-        per_image["raster-compiled-bulk"] = [ours_s / BULK, peer_s / BULK]
-    fillpoly = f"cv2.fillPoly at {SCALE}x"
-    return tuple(
-        Result(
-            name=name,
-            value=1 / ours_s,
-            unit="images/s",
-            peer=f"memset on {cores} threads" if name.endswith("bulk") else fillpoly,
-            ratio=peer_s / ours_s,
-            n=rounds,
-            seed=seed,
-            conditions=machine(),
-        )
-        for name, (ours_s, peer_s) in per_image.items()
-    )
+
+        def filled_on_cores() -> object:
+            return [done.result() for done in [pool.submit(filled, part) for part in np.array_split(polygons, cores)]]
+
+        def cleared() -> object:
+            return clear(images, pool, cores)
+
+        contests = (
+            ("raster", level, BATCH, lambda: filled(level_polygons), BATCH, "cv2.fillPoly at 4x"),
+            ("raster-any-heading", turned, BATCH, lambda: filled(polygons), BATCH, "cv2.fillPoly at 4x"),
+            ("raster-compiled", lambda: compiled(1), BULK, lambda: filled(polygons), BATCH, "cv2.fillPoly at 4x"),
+            ("raster-compiled-cores", lambda: compiled(cores), BULK, filled_on_cores, BATCH,
+             f"cv2.fillPoly at 4x on {cores} threads"),
+            ("raster-compiled-bulk", lambda: compiled(cores), BULK, cleared, BULK, f"memset on {cores} threads"),
+            ("raster-compiled-kernel", kernel, BULK, cleared, BULK, f"memset on {cores} threads"),
+        )  # fmt: skip
+        return [
+            _result(name, _quick(ours, peer, rounds), many, peers, of, rounds, seed)
+            for name, ours, many, peer, peers, of in contests
+        ]
+
+
+def _result(name: str, seconds: tuple[float, float], many: int, peers: int, peer: str, n: int, seed: int) -> Result:
+    ours_s, peer_s = seconds[0] / many, seconds[1] / peers
+    # Of all threads' seconds: on two threads a second has two of them.
+    return Result(name, 1 / ours_s, "images/s", peer, peer_s / ours_s, n, seed, machine())
+
+
+def _quick(ours: Callable[[], object], peer: Callable[[], object], n: int) -> tuple[float, float]:
+    """The mean CPU seconds of the quickest tenth of n rounds of ours, peer, ours, peer...; each runs once before."""
+    if n < 1:
+        raise ValueError(f"n = {n}: at least one round is needed")
+    taken: tuple[list[float], list[float]] = ([], [])
+    for round_ in range(n + 1):
+        for work, times in zip((ours, peer), taken, strict=True):
+            start = time.process_time()
+            work()
+            if round_:
+                times.append(time.process_time() - start)
+    few = max(1, round(LEAST * n))
+    return statistics.fmean(sorted(taken[0])[:few]), statistics.fmean(sorted(taken[1])[:few])
 
 
 def clear(images: NDArray[np.float32], pool: ThreadPoolExecutor, threads: int) -> None:
@@ -94,16 +150,18 @@ def clear(images: NDArray[np.float32], pool: ThreadPoolExecutor, threads: int) -
         done.result()
 
 
-def outlines(mark: CcdBsm) -> NDArray[np.int32]:
+def outlines(mark: CcdBsm, origin_mm: Tensor | None = None, heading_deg: float | Tensor = 0.0) -> NDArray[np.int32]:
     """The marks as polygons in fillPoly's fixed-point pixels at 4x, (B, 2 POINTS, 2)."""
     # Points crowd at both ends, where the outline turns fastest.
-    share = 0.5 - 0.5 * torch.cos(torch.linspace(0, torch.pi, POINTS, dtype=torch.float64))
+    share = 0.5 - 0.5 * torch.cos(torch.linspace(0, torch.pi, POINTS))
     x = mark.x_min_mm[:, None] + share * mark.length_mm[:, None]
     w = mark.half_width(x)
-    upper, lower = torch.stack((x, -w), dim=-1), torch.stack((x, w), dim=-1).flip(1)
-    points_mm = torch.cat((upper, lower), dim=1) + centred_origin(mark)[:, None, :]
+    x, y = torch.cat((x, x.flip(1)), dim=1), torch.cat((w, -w.flip(1)), dim=1)
+    origin = centred_origin(mark) if origin_mm is None else origin_mm
+    m = to_pixels(origin, heading_deg, PX_MM / SCALE, x)[:, :, None].unbind(1)
+    points = torch.stack((m[0] * x + m[1] * y + m[2], m[3] * x + m[4] * y + m[5]), dim=-1)
     # fillPoly counts from pixel centres, images from pixel edges.
-    return ((points_mm * (SCALE / PX_MM) - 0.5) * 2**SHIFT).round().to(torch.int32).numpy()
+    return ((points - 0.5) * 2**SHIFT).round().to(torch.int32).numpy()
 
 
 def fill(polygon: NDArray[np.int32]) -> NDArray[np.uint8]:

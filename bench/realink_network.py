@@ -1,8 +1,9 @@
 """A network of the shape of FRIDA's stroke renderer, written here: four numbers to a 64 x 128 picture of ink.
 
 Layers as its source gives them: BN, FC 4-20, LReLU .2, BN, FC 20-8192, LReLU .2; BN, conv 5x5 1-20, LReLU .2, BN,
-conv 5x5 20-1, sigmoid. Trained as there: Adam 1e-3 on the full set, a fifth held back for early stopping, 15 % noise on
-the parameters, L2 over the best of a few shifts plus L1. One thread.
+conv 5x5 20-1, sigmoid. Trained as there: Adam 1e-3, a fifth held back for early stopping, 15 % noise on the
+parameters, L2 over the best of a few shifts plus L1. The source takes the full set at each step, here it is at most
+`BATCH` strokes. From 147 strokes CSIM is .832 after 400 steps and .831 after 900: more steps do not help. One thread.
 """
 
 from __future__ import annotations
@@ -17,7 +18,10 @@ from torch.nn import functional
 
 ROWS, COLUMNS = 64, 128
 NOISE = 0.15
-PATIENCE = 200
+PATIENCE = 150
+BATCH = 32
+EVERY = 10
+"""Steps between two looks at the strokes that are held back."""
 SHIFTS = ((0, 0), (-1, 0), (1, 0), (0, -2), (0, 2))
 """Rows and columns: about 2 % of the picture, as in the source, but fewer of them."""
 Images = NDArray[np.float32]
@@ -63,21 +67,25 @@ def train_and_predict(
 
 
 def _train(net: nn.Module, given: Tensor, target: Tensor, held: Tensor, held_target: Tensor, steps: int) -> nn.Module:
+    # 2.6 times as fast as the default on one core; torch has no overload of this name for it.
+    net = net.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     optimiser = torch.optim.Adam(net.parameters(), lr=1e-3)
     noise = NOISE * given.std(dim=0)
     best, least, waited = copy.deepcopy(net).eval(), float("inf"), 0
     for step in range(steps):
         net.train()
         optimiser.zero_grad()
-        loss = _loss(net(given + noise * torch.randn_like(given)), target)
+        pick = torch.randperm(len(given))[:BATCH]
+        some = given[pick]
+        loss = _loss(net(some + noise * torch.randn_like(some)), target[pick])
         loss.backward()
         optimiser.step()
-        if step % 5:
+        if (step + 1) % EVERY:
             continue
         net.eval()
         with torch.no_grad():
             value = float(_loss(net(held), held_target))
-        waited += 5
+        waited += EVERY
         if value < least and step > 50:
             best, least, waited = copy.deepcopy(net).eval(), value, 0
         if waited >= PATIENCE and step > PATIENCE:

@@ -1,37 +1,40 @@
-"""Calibrate a session: find the board in its stills, fit the plane, write the artefact."""
+"""Calibrate a session: undo its lens, find the board in its stills, fit the plane, write the artefact."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
+import hashlib
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
-from pydantic import ValidationError
-
-from calibrate.artefact import FOLDER, Calibration
+from calibrate.artefact import FOLDER, Calibration, LensUsed
+from calibrate.camera.session import NO_BOARD, board_of, known_lens, sheet_of
+from calibrate.camera.view import see_straight
 from calibrate.errors import CalibrationError
 from calibrate.preprocess import Params
-from calibrate.scale import BoardSpec, see_board
 from sessions.messages import decode_gray
 from sessions.reader import Recording
 from sessions.schemas import Source
 
-EFFECTIVE = "rig.effective.json"
+FITTED = "k1 fitted on the board"
 
 
-def calibrate_session(session: Path) -> Path:
-    """Calibrate and save beside the recording; returns the artefact's path. Raises `CalibrationError`."""
+def calibrate_session(session: Path, lens: Path | None = None) -> Path:
+    """Calibrate and save beside the recording; returns the artefact's path.
+
+    The lens is the file that is given, else the one that the session was collected with. Raises `CalibrationError`,
+    also for a lens that visibly bends and is not known.
+    """
     recording = Recording(session)
     if recording.header.source == Source.IMPORT:
         raise CalibrationError(str(recording.path), "is an import and brings its own scale: go on with `validate`")
     where = str(recording.path)
-    spec = _board_of(recording)
+    spec, known = board_of(recording), known_lens(recording, lens)
     stills = list(recording.stills_of("board"))
     if not stills:
-        raise CalibrationError(where, "holds no view of the board (a `board` step)")
-    plane = see_board(decode_gray(stills[-1], where), spec, where)
+        raise CalibrationError(where, NO_BOARD)
+    image, straight = decode_gray(stills[-1], where), known.lens() if known else None
+    plane, flags = see_straight(image, spec, straight, where, sheet_of(recording))
     low, high = plane.interval_mm_per_px
     calibration = Calibration(
         session_id=recording.header.session_id,
@@ -44,20 +47,12 @@ def calibrate_session(session: Path) -> Path:
         mm_per_px_high=high,
         rms_px=plane.rms_px,
         corners=plane.corners,
-        corners_dropped=plane.dropped,
+        corners_dropped=len(plane.dropped),
         preprocess=dataclasses.asdict(Params()),
+        lens=LensUsed.of(plane.lens, known.source if known else FITTED),
+        middle_px=plane.middle_px,
+        board=spec,
+        flags=flags,
+        still_sha256=hashlib.sha256(stills[-1]).hexdigest(),
     )
     return calibration.save(recording.path.parent / FOLDER)
-
-
-def _board_of(recording: Recording) -> BoardSpec:
-    # The effective one: what the environment changed on top of rig.toml is in it.
-    where = f"{recording.path} {EFFECTIVE}"
-    try:
-        rig: Any = json.loads(recording.attachment(EFFECTIVE))
-        return BoardSpec.model_validate(rig["board"])
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        if isinstance(error, ValidationError):
-            first = error.errors()[0]
-            raise CalibrationError(where, f"board.{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
-        raise CalibrationError(where, "holds no board") from None

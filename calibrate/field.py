@@ -6,6 +6,7 @@ length and then takes the best shift. The second is how the paper's spread comes
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import cast
@@ -36,6 +37,11 @@ class Tone(StrEnum):
 
     BINARY = "binary"
     GRAY = "gray"
+
+
+Key = tuple[Alignment, Tone]
+KEYS: tuple[Key, ...] = tuple(itertools.product(Alignment, Tone))
+"""Every way in which two images are compared."""
 
 
 @dataclass(frozen=True, slots=True)

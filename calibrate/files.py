@@ -1,8 +1,19 @@
-"""Writing files that are whole or not there."""
+"""Writing files that are whole or not there, and reading files that may be anything."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calibrate.errors import CalibrationError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+MAX_BYTES = 1024 * 1024
+"""Of a file that people or this software write: a table, an artefact."""
+MAX_PHOTOGRAPH_BYTES = 256 * 1024 * 1024
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -14,3 +25,31 @@ def write_whole(path: Path, text: str) -> None:
     except OSError:
         part.unlink(missing_ok=True)
         raise
+
+
+def read_bounded(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
+    """The bytes of a file of at most so many. Raises `CalibrationError` where it is larger or cannot be read.
+
+    What grows while it is read, or tells no size as a pipe does, is cut off all the same.
+    """
+    try:
+        if not path.is_file() and path.exists():
+            raise CalibrationError(str(path), "is no file")
+        with path.open("rb") as file:
+            data = file.read(most_bytes + 1)
+    except OSError as error:
+        raise CalibrationError(str(path), error.strerror or str(error)) from None
+    if len(data) > most_bytes:
+        raise CalibrationError(str(path), f"is larger than {most_bytes} bytes")
+    return data
+
+
+def read_gray(path: Path) -> NDArray[np.uint8]:
+    """(h, w) gray of a photograph, PNG or JPEG. Raises `CalibrationError` where it is none, or absurdly large."""
+    from sessions.errors import SessionDamaged
+    from sessions.messages import decode_gray
+
+    try:
+        return decode_gray(read_bounded(path, MAX_PHOTOGRAPH_BYTES), str(path))
+    except SessionDamaged as error:
+        raise CalibrationError(str(path), error.what) from None

@@ -15,12 +15,13 @@ from typing import cast
 import cv2
 import numpy as np
 
-from calibrate import artefact
 from calibrate.artefact import Calibration
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.field import SIZE_PX, Field, Image
-from calibrate.preprocess import PX_PER_MM, Params, Prepared, on_raster, prepare, rectify, rescale
-from model.ccdbsm import Brush, DomainError
+from calibrate.preprocess import PX_PER_MM, Params, Prepared, prepare, rescale
+from calibrate.presses import prepare_press
+from calibrate.validation import brush_of, calibration_of
+from model.ccdbsm import DomainError
 from model.inversion.noise import Noise
 from model.inversion.press import Flag, Inverter, Known, Range, Recovered
 from model.protocol import Basis, StrokeModel
@@ -97,7 +98,7 @@ def invert_recording(session: Path, settings: Settings, calibration_path: Path |
         raise CalibrationError(str(recording.path), "holds no strokes")
     if any(stroke.kind != "press" for stroke in strokes):
         raise CalibrationError(str(recording.path), "holds drags: only presses are inverted")
-    calibration = _calibration(recording, strokes[0], digest, calibration_path)
+    calibration = calibration_of(recording, strokes[0], digest, calibration_path)
     made = Inversion(recording.header, recording.path, digest, settings, [], [])
     anchored, loose = _inverters(recording.header, settings)
     waiting: dict[bool, list[Laid]] = {True: [], False: []}
@@ -121,26 +122,15 @@ def invert_recording(session: Path, settings: Settings, calibration_path: Path |
 
 def lay(capture: Capture, calibration: Calibration | None, view: Field) -> Laid:
     """A capture on the field, by the calibration or by the import's own scale. Raises `CaptureRefused`."""
-    stroke, image = capture.stroke, capture.image()
+    stroke = capture.stroke
     params = Params(**calibration.preprocess) if calibration else Params()
-    if stroke.anchor_mm is not None and calibration is not None:
-        window = view.window_mm(stroke.anchor_mm)
-        raster = rectify(image, calibration.homography(), window)
-        left, top = (v * PX_PER_MM for v in view.anchor_mm)
-        prepared = prepare(raster, (left, top), capture.where, params, _cell_px(stroke, window))
-        return _laid(stroke, prepared, (0, 0), view)
-    if stroke.px_per_mm is None:
-        raise CaptureRefused(stroke.stroke_id, "has neither a calibration nor a scale of its own")
-    raster = rescale(image, stroke.px_per_mm, capture.where)
-    anchor = None if stroke.anchor_px is None else on_raster(stroke.anchor_px, stroke.px_per_mm)
-    prepared = prepare(raster, anchor, capture.where, params)
+    if stroke.px_per_mm is None or stroke.anchor_px is not None:
+        return _laid(stroke, prepare_press(capture, calibration, params, view), (0, 0), view)
+    # An import that tells no anchor: the field is laid around the stroke.
+    prepared = prepare(rescale(capture.image(), stroke.px_per_mm, capture.where), None, capture.where, params)
+    rows, columns = np.flatnonzero(prepared.mask.any(axis=1)), np.flatnonzero(prepared.mask.any(axis=0))
     side = round(view.side_mm * PX_PER_MM)
-    if anchor is None:
-        rows, columns = np.flatnonzero(prepared.mask.any(axis=1)), np.flatnonzero(prepared.mask.any(axis=0))
-        corner = (int(columns[0] + columns[-1] + 1 - side) // 2, int(rows[0] + rows[-1] + 1 - side) // 2)
-    else:
-        x, y = view.anchor_mm
-        corner = (round(anchor[0] - x * PX_PER_MM), round(anchor[1] - y * PX_PER_MM))
+    corner = (int(columns[0] + columns[-1] + 1 - side) // 2, int(rows[0] + rows[-1] + 1 - side) // 2)
     return _laid(stroke, prepared, corner, view)
 
 
@@ -151,8 +141,6 @@ def _laid(stroke: Stroke, prepared: Prepared, corner: tuple[int, int], view: Fie
     height, width = prepared.mask.shape
     left, top = corner
     columns, rows = slice(max(left, 0), min(left + side, width)), slice(max(top, 0), min(top + side, height))
-    if rows.stop <= rows.start or columns.stop <= columns.start:
-        raise CaptureRefused(stroke.stroke_id, "anchor: lies so far from the stroke that none of it is in the field")
     part = prepared.mask[rows, columns]
     if prepared.cut or np.count_nonzero(part) < np.count_nonzero(prepared.mask):
         raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph, cell or field")
@@ -211,8 +199,7 @@ def _unnameable(ident: str, taken: set[str]) -> str:
 
 def _inverters(header: Header, settings: Settings) -> tuple[Inverter, Inverter]:
     """With a known anchor, and without."""
-    nominal = Brush()
-    brush = Brush(header.brush_radius_mm or nominal.radius_mm, header.brush_length_mm or nominal.length_mm)
+    brush = brush_of(header)
     basis = Basis(brush) if settings.lam is None else Basis(brush, settings.lam)
     options = {"within": settings.within, "noise": Noise.BLOCKS, "px_mm": settings.view.mm_per_px}
     known = options | {"anchor_sigma_mm": settings.anchor_sigma_mm}
@@ -226,28 +213,6 @@ def _inverters(header: Header, settings: Settings) -> tuple[Inverter, Inverter]:
         raise CalibrationError("--model", str(error)) from None
     except DomainError as error:
         raise CalibrationError("--height-range, --tilt-range", str(error)) from None
-
-
-def _calibration(recording: Recording, first: Stroke, digest: str, given: Path | None) -> Calibration | None:
-    if first.px_per_mm is not None:
-        return None  # an import brings its own scale
-    path = given or artefact.newest(recording.path.parent)
-    if path is None:
-        where = recording.path.parent
-        raise CalibrationError(str(recording.path), f"is not calibrated: run `brushloop calibrate {where}`")
-    calibration = artefact.load(path)
-    if calibration.recording_sha256 != digest:
-        raise CalibrationError(str(path), f"belongs to another recording ({calibration.session_id})")
-    return calibration
-
-
-def _cell_px(stroke: Stroke, window: tuple[float, float, float, float]) -> tuple[int, int, int, int] | None:
-    if stroke.cell_mm is None:
-        return None
-    x, y, width, height = stroke.cell_mm
-    top = window[1] + window[3] - (y + height)
-    scaled = ((x - window[0]) * PX_PER_MM, top * PX_PER_MM, width * PX_PER_MM, height * PX_PER_MM)
-    return round(scaled[0]), round(scaled[1]), round(scaled[2]), round(scaled[3])
 
 
 def off_command(rows: list[Row]) -> Iterator[tuple[str, float, float, float, int]]:

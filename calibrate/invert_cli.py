@@ -22,6 +22,8 @@ def invert(
     assume_tilt: Annotated[float, typer.Option(min=0, max=30, help="alpha where there is no anchor, deg.")] = 0.0,
     mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = 0.3,
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the session's newest by default.")] = None,
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often the protocol presses each again.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Of the order in which the protocol presses.")] = 1,
 ) -> None:
     """Recover depth and tilt of every captured press; writes a CSV and a protocol that presses them again."""
     import rich
@@ -43,11 +45,12 @@ def invert(
         raise CalibrationError("--height-range, --tilt-range, --assume-tilt", str(error)) from None
     fitted = None
     if fit is not None:
-        from calibrate.brushfit import artefact
+        from calibrate.artefact import load_artefact
+        from calibrate.brushfit.artefact import BrushFit
         from model.fitted import NAMES
         from model.fitted_shape import fitted_model
 
-        press = artefact.load(fit).press()
+        press = load_artefact(fit, BrushFit).press()
         fitted = fitted_model(press)
         model = fitted.name
         # A fitted brush marks nothing above its zero offset.
@@ -57,7 +60,7 @@ def invert(
         within = Range((least, within.height_mm[1]), within.tilt_deg)
     settings = Settings(model, fitted, lam, within, anchor_sd, assume_tilt, Field(mm_per_px=mm_per_px))
     made = invert_recording(session, settings, calibration)
-    protocol = write_inversion(made, out)
+    protocol = write_inversion(made, out, repeats, seed)
     rich.print(
         escape(f"{made.header.session_id}: {len(made.rows)} presses recovered by {model} ({made.header.source})")
     )

@@ -19,19 +19,23 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def write_inversion(made: Inversion, out: Path) -> Path:
-    """Write `out` and the protocol beside it; returns the protocol's path. Raises `CalibrationError` and OSError."""
+def write_inversion(made: Inversion, out: Path, repeats: int = 1, seed: int = 1) -> Path:
+    """Write `out` and the protocol beside it, which presses each stroke `repeats` times in an order by `seed`.
+
+    Returns the protocol's path. Raises `CalibrationError` and OSError.
+    """
     if not made.rows:
         why = f": {made.refused[0][0]}: {made.refused[0][1]}" if made.refused else ""
         raise CalibrationError(str(made.recording), f"no stroke could be recovered{why}")
-    if len(made.rows) > MAX_ROWS:
-        raise CalibrationError(str(made.recording), f"{len(made.rows)} strokes, a protocol holds at most {MAX_ROWS}")
+    if len(made.rows) * repeats > MAX_ROWS:
+        told = f"{len(made.rows) * repeats} strokes with repeats, a protocol holds at most {MAX_ROWS}"
+        raise CalibrationError(str(made.recording), told)
     if out.name == PROTOCOL or not out.name.isprintable() or "\\" in out.name or len(out.name) > 200:
         raise CalibrationError(str(out), "a protocol cannot name this file: give a plain name, as recovered.csv")
     out.parent.mkdir(parents=True, exist_ok=True)
     write_whole(out, recovered_csv(made))
     protocol = out.parent / PROTOCOL
-    write_whole(protocol, replay_toml(made, out.name))
+    write_whole(protocol, replay_toml(made, out.name, repeats, seed))
     return protocol
 
 
@@ -48,7 +52,7 @@ def recovered_csv(made: Inversion) -> str:
     return out.getvalue()
 
 
-def replay_toml(made: Inversion, name: str) -> str:
+def replay_toml(made: Inversion, name: str, repeats: int = 1, seed: int = 1) -> str:
     """The `replay` protocol of that CSV."""
     return (
         f"# Recovered by {made.settings.model} from {made.header.session_id} ({made.header.source}), "
@@ -56,5 +60,6 @@ def replay_toml(made: Inversion, name: str) -> str:
         'kind = "replay"\n'
         f"of = {json.dumps(made.header.session_id, ensure_ascii=False)}\n"
         f"file = {json.dumps(name, ensure_ascii=False)}\n"
-        "seed = 1\n"
+        f"repeats = {repeats}\n"
+        f"seed = {seed}\n"
     )

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.drags import DragResults
-from calibrate.field import Alignment, Image, Tone
-from calibrate.presses import PressResults
+from calibrate.field import Image
 
 
 def data_uri(image: NDArray[np.uint8]) -> str:
@@ -37,25 +36,6 @@ def difference(captured: Image, predicted: Image) -> str:
         + only_predicted[..., None] * np.array([77.0, 141.0, 255.0])
     )
     return data_uri(np.clip(np.rint(colour), 0, 255).astype(np.uint8))
-
-
-def score_plot(results: PressResults, source: str) -> str:
-    """CSIM of every stroke by model, both alignments; the ceiling beside them."""
-    figure, axes = _figure(1, 2, (10.0, 3.4))
-    for axis, alignment in zip(axes, (Alignment.SIZE_NORMALISED, Alignment.MM), strict=True):
-        chosen = [s for s in results.scores if s.alignment is alignment and s.tone is Tone.BINARY]
-        names = list(dict.fromkeys(s.model for s in chosen))
-        rng = np.random.default_rng(0)  # jitter only, so that points do not hide each other
-        for place, name in enumerate(names):
-            values = [100.0 * s.csim for s in chosen if s.model == name]
-            jitter = place + 0.12 * rng.uniform(-1, 1, len(values))
-            axis.plot(jitter, values, ".", ms=4, alpha=0.6, color="#0072B2")
-            axis.plot([place - 0.25, place + 0.25], [np.mean(values)] * 2, color="#D55E00", lw=2)
-        axis.set_xticks(range(len(names)), names, rotation=20)
-        axis.set_ylabel("CSIM, %")
-        axis.set_title(f"{alignment} ({source})", fontsize=10)
-        axis.grid(axis="y", alpha=0.3)
-    return _png(figure)
 
 
 def drag_plot(results: DragResults) -> str:

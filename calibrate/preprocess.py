@@ -115,7 +115,7 @@ def prepare(
 
     Raises `CaptureRefused` for a blank raster, or where nothing is left after cleaning.
     """
-    window = _window(raster, cell_px, where)
+    window = cell_window(raster, cell_px, where)
     # Only the cell: neighbours' ink and the table's edge are no paper to measure the light by.
     reflectance = np.ones(raster.shape, np.float32)
     reflectance[window] = flatten(raster[window], params)
@@ -176,7 +176,18 @@ def raise_flags(raster: Gray, mask: Mask, chosen: Chosen) -> tuple[str, ...]:
     return tuple(told)
 
 
-def _window(raster: Gray, cell_px: tuple[int, int, int, int] | None, where: str) -> tuple[slice, slice]:
+def on_window(
+    cell_mm: tuple[float, float, float, float], window_mm: tuple[float, float, float, float]
+) -> tuple[int, int, int, int]:
+    """A paper cell (x, y, width, height in mm) as pixels of the raster of a window: x, y, width, height."""
+    x, y, width, height = cell_mm
+    top = window_mm[1] + window_mm[3] - (y + height)
+    scaled = ((x - window_mm[0]) * PX_PER_MM, top * PX_PER_MM, width * PX_PER_MM, height * PX_PER_MM)
+    return round(scaled[0]), round(scaled[1]), round(scaled[2]), round(scaled[3])
+
+
+def cell_window(raster: Gray, cell_px: tuple[int, int, int, int] | None, where: str) -> tuple[slice, slice]:
+    """Rows and columns of the raster that show the paper cell; all where there is none. Raises `CaptureRefused`."""
     height, width = raster.shape
     x, y, w, h = cell_px if cell_px is not None else (0, 0, width, height)
     rows, columns = slice(max(y, 0), min(y + h, height)), slice(max(x, 0), min(x + w, width))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from calibrate.camera.lens import Lens
 from calibrate.errors import CalibrationError
 
 Floats = NDArray[np.float64]
@@ -20,6 +21,13 @@ OUTLIER_MEDIANS = 6.0
 MOST_OUTLIERS = 0.1
 WORST_RMS_PX = 1.0
 """Above this the board was not flat, not seen sharply, or is not the board of the configuration."""
+BENT_SHARE = 0.85
+"""Of the squared residuals. One radial term explains 0.7 of a board that is curled along its length, more of a lens."""
+BENT = (
+    "the lens bends straight lines: calibrate it with `brushloop camera intrinsics`, then name the lens file as "
+    "camera.lens_file in rig.toml, or with --lens"
+)
+OTHER_LENS = "the lens still bends once it was straightened: the lens file is of another camera, or of another focus"
 
 
 class BoardSpec(BaseModel):
@@ -72,6 +80,9 @@ def find_corners(image: NDArray[np.uint8], spec: BoardSpec, where: str) -> tuple
     found = 0 if ids is None else len(ids)  # pyright: ignore[reportUnnecessaryComparison]
     if found < MIN_CORNERS:
         total = (spec.squares[0] - 1) * (spec.squares[1] - 1)
+        _, mirrored, _, _ = detector.detectBoard(np.ascontiguousarray(image[:, ::-1]))
+        if mirrored is not None and len(mirrored) >= MIN_CORNERS:  # pyright: ignore[reportUnnecessaryComparison]
+            raise CalibrationError(where, "the photograph is mirrored: the board can only be read the other way round")
         raise CalibrationError(where, f"{found} of {total} board corners found, at least {MIN_CORNERS} are needed")
     on_board = np.asarray(board.getChessboardCorners(), np.float64)[np.ravel(ids).astype(np.int64), :2]
     height_mm = spec.squares[1] * spec.square_mm
@@ -106,9 +117,49 @@ def fit_plane(pixels: Floats, paper_mm: Floats, where: str, seed: int = 0) -> Pl
     return PlaneFit(image_to_paper, local_scale(image_to_paper, middle), (low, high), rms_px, len(pixels), dropped)
 
 
-def see_board(image: NDArray[np.uint8], spec: BoardSpec, where: str = "camera") -> PlaneFit:
-    """Find the board and fit its plane. Raises `CalibrationError`."""
-    return fit_plane(*find_corners(image, spec, where), where)
+def see_board(image: NDArray[np.uint8], spec: BoardSpec, where: str = "camera", lens: Lens | None = None) -> PlaneFit:
+    """Find the board and fit its plane. Raises `CalibrationError`; where the lens bends, it says how to undo that.
+
+    With a lens the corners are straightened first: the plane's pixels are then those of `lens.straighten(image)`.
+    """
+    if lens is not None:
+        lens.check_size(image, where)
+    pixels, paper_mm = find_corners(image, spec, where)
+    if lens is not None:
+        pixels = lens.straight(pixels)
+    try:
+        return fit_plane(pixels, paper_mm, where)
+    except CalibrationError as error:
+        middle = np.array([image.shape[1] - 1, image.shape[0] - 1]) / 2.0
+        if bent_share(pixels, paper_mm, middle, where) > BENT_SHARE:
+            raise CalibrationError(where, f"{error.what}; {BENT if lens is None else OTHER_LENS}") from None
+        raise
+
+
+def bent_share(pixels: Floats, paper_mm: Floats, middle_px: Floats, where: str) -> float:
+    """Share of a flat board's squared residuals that a radial distortion about the middle of the image explains.
+
+    Linear: the displacement field of k1 (r^2 times the place, Brown's model), less what a homography takes up.
+    """
+    to_image = homography(paper_mm, pixels, where)
+    left = (apply(to_image, paper_mm) - pixels).ravel()
+    away = pixels - middle_px
+    basis, _ = np.linalg.qr(_homography_slopes(to_image, paper_mm))
+    field: Floats = ((away**2).sum(axis=1, keepdims=True) * away).ravel()
+    field = field - basis @ (basis.T @ field)
+    left = left - basis @ (basis.T @ left)
+    total = float((left @ left) * (field @ field))
+    return float(field @ left) ** 2 / total if total > 0.0 else 0.0
+
+
+def _homography_slopes(to_image: Floats, paper_mm: Floats) -> Floats:
+    """(2n, 8): how far each pixel moves with each of the first eight numbers of a homography whose ninth is fixed."""
+    ones = np.column_stack([paper_mm, np.ones(len(paper_mm))])
+    u, v, w = (ones @ to_image.T).T
+    none = np.zeros_like(ones)
+    across = np.column_stack([ones / w[:, None], none, -paper_mm * (u / w**2)[:, None]])
+    along = np.column_stack([none, ones / w[:, None], -paper_mm * (v / w**2)[:, None]])
+    return np.stack([across, along], axis=1).reshape(-1, 8)
 
 
 def local_scale(image_to_paper: Floats, pixel: Floats) -> float:

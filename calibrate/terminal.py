@@ -1,4 +1,4 @@
-"""What `brushloop validate` prints: the short of the report."""
+"""What `brushloop validate` prints of strokes that travel: the short of the report."""
 
 from __future__ import annotations
 
@@ -8,37 +8,18 @@ from rich.markup import escape
 from rich.table import Table
 
 from calibrate.drags import DEPTH_NAMES, LENGTH_NAME, DragResults
-from calibrate.field import Alignment, Tone
-from calibrate.presses import PressResults
-from calibrate.tables import table
-from calibrate.validation import Validation
 from calibrate.wording import fit_sentences, source_note
+from calibrate.write import DragValidation
 
 
-def summary(validation: Validation) -> Iterator[Table | str]:
+def summary(validation: DragValidation) -> Iterator[Table | str]:
     """Renderables for the terminal."""
     results = validation.results
     yield escape(f"{validation.header.session_id}: {source_note(validation.header.source)}")
-    if isinstance(results, PressResults):
-        for alignment in (Alignment.SIZE_NORMALISED, Alignment.MM):
-            yield _scores(results, alignment, f"{alignment}, binary, ink = 1, percent ({validation.header.source})")
-    else:
-        yield _drags(results)
-        yield from (escape(sentence) for sentence in fit_sentences(results))
+    yield _drags(results)
+    yield from (escape(sentence) for sentence in fit_sentences(results))
     for stroke_id, why in results.refused:
         yield escape(f"not used: {stroke_id}: {why}")
-
-
-def _scores(results: PressResults, alignment: Alignment, title: str) -> Table:
-    # The paper's numbers stand beside the table that was made as its own was, as far as it tells.
-    beside = alignment is Alignment.SIZE_NORMALISED
-    columns = ["model", "n", "CSIM max", "min", "avg", "SSIM max", "min", "avg", *(["paper's avg"] if beside else [])]
-    out = Table(*columns, title=escape(title))
-    for row in table(results.scores, alignment, Tone.BINARY):
-        paper = "" if row.paper_csim_avg is None else f"{row.paper_csim_avg:.2f} / {row.paper_ssim_avg:.2f}"
-        cells = [row.model, str(row.n), *(f"{v:.2f}" for v in (*row.csim, *row.ssim))]
-        out.add_row(*cells, *([paper] if beside else []))
-    return out
 
 
 def _drags(results: DragResults) -> Table:

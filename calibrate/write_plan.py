@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.errors import CalibrationError
+from calibrate.files import read_bounded
 from calibrate.similarity import csim, ssim
 from model.characters.brush import Reach
 from model.characters.glyph import MAX_CHARS, Glyph, GlyphError, parse_glyph
@@ -21,12 +21,14 @@ from model.characters.ink import Image, reference, swept, written
 from model.characters.plan import Cell, paths_of, trajectory
 from model.characters.plan import Path as Way
 from model.characters.refine import refine
+from model.drag import DragModel
 from model.protocol import StrokeModel
 
 Floats = NDArray[np.float64]
 SHIPPED_SOURCE = "hanzi-writer-data 2.0.1, from Make Me a Hanzi; outlines of Arphic PL fonts, ARPHIC PUBLIC LICENSE"
 MAX_FILE_BYTES = 4 * 1024 * 1024
-MAX_GRAPHICS_BYTES = 256 * 1024 * 1024
+MAX_GRAPHICS_BYTES = 64 * 1024 * 1024
+"""makemeahanzi's file has 30 MB."""
 MAX_FIGURES = 20
 
 
@@ -41,6 +43,8 @@ class Settings:
     """Distance of neighbouring points, about."""
     steps: int = 60
     """Of refinement; 0 keeps the first plan."""
+    drag: DragModel | None = None
+    """Draws strokes that travel, with bristle lag; None lays presses over each other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,12 +103,12 @@ def _planned(wanted: Wanted, model: StrokeModel, settings: Settings) -> Planned:
     low, high = reach.tilt_deg
     if not low <= settings.tilt_deg <= high:
         raise CalibrationError("--tilt", f"{settings.tilt_deg:g} deg is outside {low:g} to {high:g}")
-    first = [trajectory(way, model, reach, cell, settings.tilt_deg) for way in wanted.ways]
+    first = [trajectory(way, model, reach, cell, settings.tilt_deg, settings.drag) for way in wanted.ways]
     if not wanted.image.any():
         raise CalibrationError(wanted.name, "has no width anywhere: nothing would be written")
-    better = refine(model, first, wanted.image, cell.side_mm, reach, settings.steps)
+    better = refine(model, first, wanted.image, cell.side_mm, reach, settings.steps, drag=settings.drag)
     strokes = [reach.spaced(np.round(reach.within(stroke, cell.side_mm), 3)) for stroke in better.strokes]
-    before, after = (written(model, one, cell.side_mm) for one in (first, strokes))
+    before, after = (written(model, one, cell.side_mm, drag=settings.drag) for one in (first, strokes))
     return Planned(wanted, strokes, before, after)
 
 
@@ -136,7 +140,7 @@ def _from(data: Path, name: str) -> Glyph:
         return _parsed(str(path), _text(path, MAX_CHARS), name)
     if data.suffix == ".json":
         return _parsed(str(data), _text(data, MAX_CHARS), name)
-    for line in _lines(data):
+    for line in _text(data, MAX_GRAPHICS_BYTES).splitlines():
         if name in line or f"\\u{ord(name):04x}" in line.lower():
             try:
                 entry = json.loads(line)
@@ -154,30 +158,8 @@ def _parsed(where: str, text: str, name: str) -> Glyph:
         raise CalibrationError(where, str(error)) from None
 
 
-def _lines(path: Path) -> Iterator[str]:
-    _regular(path, MAX_GRAPHICS_BYTES)
-    try:
-        with path.open(encoding="utf-8") as file:
-            while line := file.readline(MAX_CHARS):
-                yield line
-    except UnicodeDecodeError:
-        raise CalibrationError(str(path), "is no UTF-8 text") from None
-
-
 def _text(path: Path, most_bytes: int) -> str:
-    _regular(path, most_bytes)
     try:
-        return path.read_text(encoding="utf-8")
+        return read_bounded(path, most_bytes).decode("utf-8")
     except UnicodeDecodeError:
         raise CalibrationError(str(path), "is no UTF-8 text") from None
-
-
-def _regular(path: Path, most_bytes: int) -> None:
-    try:
-        status = path.stat()
-    except OSError as error:
-        raise CalibrationError(str(path), error.strerror or str(error)) from None
-    if not stat.S_ISREG(status.st_mode):
-        raise CalibrationError(str(path), "is not a file")
-    if status.st_size > most_bytes:
-        raise CalibrationError(str(path), f"is larger than {most_bytes} bytes")

@@ -7,15 +7,7 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(help="Write characters: trajectories for the brush, with a simulated image.", no_args_is_help=True)
 
-
-@app.callback()
-def write() -> None:
-    """Write characters: trajectories for the brush, with a simulated image."""
-
-
-@app.command()
 def plan(
     what: Annotated[str, typer.Argument(help="Characters (字 子 永 are shipped), or a .csv or .json trajectory.")],
     out: Annotated[Path, typer.Option(help="Folder for protocol-write.toml and plan.png.")] = Path("write-plan"),
@@ -23,6 +15,9 @@ def plan(
     model: Annotated[str, typer.Option(help="The stroke model that plans and draws.")] = "ccd-bsm",
     radius_mm: Annotated[float, typer.Option(min=0.5, max=50, help="R of the brush.")] = 6.0,
     length_mm: Annotated[float, typer.Option(min=5, max=200, help="L of the brush.")] = 48.0,
+    drag: Annotated[
+        Path | None, typer.Option(help="Artefact of `fit --drags`: strokes that travel are drawn with its bristle lag.")
+    ] = None,
     lam: Annotated[float | None, typer.Option(min=0.1, max=10, help="lambda of CCD-BSM; pi when left out.")] = None,
     cell_mm: Annotated[float, typer.Option(min=10, max=500, help="Side of the character's paper cell.")] = 70.0,
     margin_mm: Annotated[float, typer.Option(min=0, max=200, help="Margin around the font's square.")] = 6.0,
@@ -40,27 +35,46 @@ def plan(
     import rich
     from rich.markup import escape
 
+    from calibrate.artefact import load_artefact
+    from calibrate.brushfit.drag_run import DragArtefact
     from calibrate.errors import CalibrationError
     from calibrate.write_plan import Settings
     from calibrate.write_plan import plan as planned
     from calibrate.write_plan_files import PICTURE, write_plan
+    from calibrate.written.record import PlannedBy
     from model.ccdbsm import Brush, DomainError
     from model.characters.brush import Reach
     from model.characters.plan import Cell
     from model.registry import UnknownModelError, stroke_model
 
+    lagging = load_artefact(drag, DragArtefact) if drag is not None else None
     try:
         if tilt_range[1] > 30 or height_range[0] <= 0:
             raise ValueError("tilts end at 30 deg, depths begin above 0 mm")
         reach = Reach(height_range, tilt_range, turn_deg_mm=wrist_deg_s / speed_mm_s)
-        settings = Settings(Cell(cell_mm, margin_mm), reach, tilt, steps=steps)
+        seen = lagging.model() if lagging is not None else None
+        settings = Settings(Cell(cell_mm, margin_mm), reach, tilt, steps=steps, drag=seen)
         of = stroke_model(model, Brush(radius_mm, length_mm), math.pi if lam is None else lam)
         of.profile(height_range[1], tilt_range[1])
     except (ValueError, UnknownModelError, DomainError) as error:
         raise CalibrationError("write plan", str(error)) from None
     figures = planned(what, data, of, settings)
-    protocol = write_plan(figures, settings, speed_mm_s, repeats, out)
-    rich.print(f"simulated by {escape(model)}, marks laid over each other along the way: not ink")
+    by = PlannedBy(
+        model=model,
+        radius_mm=radius_mm,
+        length_mm=length_mm,
+        lam=lam,
+        height_range_mm=height_range,
+        tilt_range_deg=tilt_range,
+        turn_deg_mm=reach.turn_deg_mm,
+        speed_mm_s=speed_mm_s,
+        drag_fit=lagging.digest if lagging is not None else "",
+    )
+    protocol = write_plan(figures, settings, by, of.label, repeats, out)
+    if lagging is None:
+        rich.print(f"simulated by {escape(model)}, marks laid over each other along the way: not ink")
+    else:
+        rich.print(f"simulated with the bristle lag of {escape(lagging.session_id)}, {lagging.source}: not ink")
     for figure in figures:
         first_csim, first_ssim, last_csim, last_ssim = figure.scores()
         points = sum(len(stroke) for stroke in figure.strokes)

@@ -1,44 +1,74 @@
-"""The files of a written plan: the protocol that draws it, and a picture of wanted, simulated and both."""
+"""The files of a plan: the protocol that draws it, its images as data, and a picture of wanted and simulated."""
 
 from __future__ import annotations
 
 import json
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from calibrate.files import write_whole
 from calibrate.write_plan import Planned, Settings
+from calibrate.written.record import FILE as RECORD
+from calibrate.written.record import PlannedBy, PlanRecord, figure_record
 
 PROTOCOL, PICTURE = "protocol-write.toml", "plan.png"
 PAPER, WANTED, DRAWN = "#fbf9f4", "#2d72ff", "#d1341f"
 
 
-def write_plan(figures: list[Planned], settings: Settings, speed_mm_s: float, repeats: int, folder: Path) -> Path:
-    """Write the protocol and the picture into a folder; returns the protocol's path. Raises OSError."""
-    folder.mkdir(parents=True, exist_ok=True)
-    protocol = folder / PROTOCOL
-    write_whole(protocol, write_toml(figures, settings, speed_mm_s, repeats))
-    draw(figures, settings, folder / PICTURE)
+def write_plan(figures: list[Planned], settings: Settings, by: PlannedBy, label: str, repeats: int, out: Path) -> Path:
+    """Write picture, plan.json and protocol into a folder; returns the protocol's path. Raises OSError.
+
+    `label` names the model that planned for people. The protocol is written last: where it is, the rest is.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    draw(figures, settings, out / PICTURE)
+    records = tuple(
+        figure_record(
+            one.wanted.name,
+            one.wanted.source,
+            one.strokes,
+            one.strokes,
+            wanted=one.wanted.image,
+            simulated=one.simulated,
+        )
+        for one in figures
+    )
+    record = PlanRecord(
+        model=label,
+        planned_by=by,
+        cell_mm=settings.cell.side_mm,
+        software=f"brushloop {version('brushloop')}",
+        figures=records,
+    )
+    return write_record(record, repeats, out)
+
+
+def write_record(record: PlanRecord, repeats: int, out: Path) -> Path:
+    """Write plan.json, then the protocol that draws it; returns the protocol's path. Raises OSError."""
+    protocol = out / PROTOCOL
+    write_whole(out / RECORD, record.model_dump_json(indent=2) + "\n")
+    write_whole(protocol, write_toml(record, repeats))
     return protocol
 
 
-def write_toml(figures: list[Planned], settings: Settings, speed_mm_s: float, repeats: int) -> str:
+def write_toml(record: PlanRecord, repeats: int) -> str:
     """The `write` protocol."""
-    side = settings.cell.side_mm
+    side = record.cell_mm
     lines = [
         'kind = "write"',
         f"cell_mm = [{side!r}, {side!r}]",
-        f"speed_mm_s = {speed_mm_s!r}",
+        f"speed_mm_s = {record.planned_by.speed_mm_s!r}",
         "blend_mm = 1.0",
         f"repeats = {repeats}",
     ]
-    for figure in figures:
-        source = " ".join(figure.wanted.source.split())
+    for figure in record.figures:
+        source = " ".join(figure.source.split())
         lines += ["", f"# From {json.dumps(source)}", "[[figures]]"]
-        lines.append(f"name = {json.dumps(figure.wanted.name, ensure_ascii=False)}")
-        for stroke in figure.strokes:
+        lines.append(f"name = {json.dumps(figure.name, ensure_ascii=False)}")
+        for stroke in figure.commanded:
             lines += ["", "[[figures.strokes]]", "points = ["]
-            lines += ["    [" + ", ".join(f"{value:.3f}" for value in point) + "]," for point in stroke.tolist()]
+            lines += ["    [" + ", ".join(f"{value:.3f}" for value in point) + "]," for point in stroke]
             lines.append("]")
     return "\n".join(lines) + "\n"
 

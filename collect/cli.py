@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+
+class Preview(StrEnum):
+    """How the screen shows the camera."""
+
+    CELLS = "cells"
+    AUTO = "auto"
+    OFF = "off"
+
 
 app = typer.Typer(invoke_without_command=True, pretty_exceptions_enable=False)
 
@@ -29,6 +39,12 @@ def collect(
     tui: Annotated[
         bool | None, typer.Option("--tui/--no-tui", help="Screen; by default where there is a terminal.")
     ] = None,
+    set_up: Annotated[
+        bool, typer.Option("--set-up", help="On the screen: accept what each set-up step measured, or measure again.")
+    ] = False,
+    preview: Annotated[
+        Preview, typer.Option(help="Camera on the screen: half-cells; auto: pixels where the terminal has them.")
+    ] = Preview.CELLS,
     live: Annotated[bool, typer.Option("--live", help="Let a Foxglove viewer on this machine look on.")] = False,
     live_port: Annotated[int, typer.Option(min=0, max=65535, help="Where it listens; 0: any.")] = 8765,
 ) -> None:
@@ -48,7 +64,13 @@ def collect(
         start.dry_run(config, protocol, dry_run, armed=arm, on_screen=on_screen)
         return
     opening = Opening.load(out, config, protocol, new=new, sheet=sheet, armed=arm)
-    given_up = start.start(opening, on_screen=on_screen, live=LiveView(live_port) if live else None)
+    given_up = start.start(
+        opening,
+        on_screen=on_screen,
+        live=LiveView(live_port) if live else None,
+        guided=set_up and on_screen,
+        preview=preview.value,
+    )
     if given_up:
         typer.echo(f"finished; {given_up} strokes came out badly every time and were left out", err=True)
         raise typer.Exit(3)

@@ -15,6 +15,7 @@ from calibrate.scale import BoardSpec
 from collect.config_base import Config, Finite, Positive
 from collect.config_devices import CameraConfig, ForceConfig, InkDeviceConfig, RobotConfig
 from collect.errors import ConfigError
+from collect.optics import with_optics
 from collect.quality.config import QualityConfig
 from collect.reading import read_toml, refusal
 from collect.touch.config import SelfCheckConfig, TouchConfig
@@ -163,8 +164,9 @@ _M = TypeVar("_M", bound=BaseModel)
 
 
 def load_rig(path: Path) -> RigConfig:
-    """Read `rig.toml`, with overrides from the environment. Raises `ConfigError`."""
-    return _validate(path, RigConfig, read_toml(path, MAX_CONFIG_BYTES))
+    """Read `rig.toml` and its lens file, with overrides from the environment. Raises `ConfigError`."""
+    rig = _validate(path, RigConfig, read_toml(path, MAX_CONFIG_BYTES))
+    return rig.model_copy(update={"camera": with_optics(path, rig.camera)})
 
 
 def _validate(path: Path, kind: type[_M], values: dict[str, Any]) -> _M:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from calibrate.artefact import LensUsed
 from collect.config_base import Config, Finite, Positive, Range
 
 
@@ -78,6 +80,11 @@ class CameraConfig(Config):
     """Longest time from exposure to arrival; frames that may be older than a request are not used for it."""
     timeout_s: Annotated[float, Field(gt=0.0, le=120.0)] = 10.0
     lens: str = ""
+    """Its name, for the record."""
+    lens_file: Path | None = None
+    """Of `brushloop camera intrinsics`, beside rig.toml: what the lens bends is undone before anything is measured."""
+    optics: LensUsed | None = None
+    """What stands in that file; filled in when rig.toml is read, so that the session holds it."""
     locked: LockedConfig = LockedConfig()
 
 

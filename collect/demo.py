@@ -23,7 +23,7 @@ IDLE_EXIT_S = 60.0
 
 
 def run_demo(out: Path, repeats: int, rate: float, seed: int) -> None:
-    """Collect, calibrate, validate under `out`; prints the path of the report and of the MCAP at the end."""
+    """Collect, calibrate, fit, validate under `out`; prints the path of the report and of the MCAP at the end."""
     out.mkdir(parents=True, exist_ok=True)
     rig_toml, protocol_toml, sessions = out / "rig.toml", out / "protocol.toml", out / "sessions"
     protocol = (
@@ -41,6 +41,7 @@ def run_demo(out: Path, repeats: int, rate: float, seed: int) -> None:
             sys.stderr.write(f"the loopback rig ended with {rig.returncode}; see {out / 'rig.log'}\n")
     session = max(sessions.iterdir(), key=lambda path: path.stat().st_mtime_ns)
     _run("calibrate", session)
+    _run("fit", session)
     _run("validate", session)
     if rig is not None:
         rig.terminate()

@@ -14,6 +14,7 @@ from calibrate.errors import CalibrationError
 from calibrate.scale import see_board
 from collect.config import RigConfig
 from collect.config_devices import ForceConfig, InkDeviceConfig
+from collect.optics import lens_of
 from collect.rig import make_camera, make_force, make_ink, make_robot
 from drivers.arcs.codes import MOVING_ALLOWED, RobotMode
 from drivers.clock import Clock
@@ -99,7 +100,7 @@ async def _camera(config: RigConfig, clock: Clock) -> Finding:
 
 def _board(config: RigConfig, image: Any) -> tuple[str, str, str]:
     try:
-        plane = see_board(image, config.board)
+        plane = see_board(image, config.board, lens=lens_of(config.camera))
     except CalibrationError as error:
         return "", f"board: {error.what}", "Put the configured board into view, in focus and evenly lit."
     return f"board: {plane.corners} corners, residual {plane.rms_px:.2f} px, {plane.mm_per_px:.4f} mm/px", "", ""

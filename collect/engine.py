@@ -26,7 +26,8 @@ from collect.progress import Progress
 from collect.protocols.config import ProtocolConfig
 from collect.rig import Rig, connected
 from collect.running import Run
-from collect.setting_up import SetUpStep, board_first, listed
+from collect.set_up_steps import SetUpStep
+from collect.setting_up import board_first, listed
 from collect.snapshot import Snapshot
 from collect.states import FINAL, State, check_transition
 from collect.telemetry import NotedRobot, Telemetry

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from typing import Any
 
 from collect.asking import Asker
 from collect.errors import SheetFull, StepError, told
@@ -19,8 +20,9 @@ from collect.rig import Rig
 from collect.sheet import Sheet
 from collect.steps import MARKING, Result, Step, StepKind
 from collect.telemetry import Telemetry
+from collect.touch.selfcheck import partners
 from collect.wishes import Wish, Wishes
-from collect.work import capturing, dipping, looking, marking, touching
+from collect.work import capturing, choosing, dipping, looking, marking, touching
 from collect.work.context import Bench, Job
 from collect.work.waiting import uninterrupted
 from drivers.errors import DeviceError
@@ -79,10 +81,13 @@ class Performer:
         bench = self._bench
         rig, store, progress = bench.rig, bench.store, bench.progress
         progress.doing(_in_words(step))
-        cell = bench.sheet.free(bench.used_cells(), store.state.sheet + 1) if step.kind in MARKING else None
-        attempt = store.begin(
-            step.key, step.kind, cell=cell.index if cell else None, notes={"params": dict(step.params)}
-        )
+        used = bench.used_cells()
+        cell = bench.sheet.free(used, store.state.sheet + 1) if step.kind in MARKING else None
+        more = partners(bench.sheet, cell, used) if cell is not None and step.kind == StepKind.SELF_CHECK else ()
+        notes: dict[str, Any] = {"params": dict(step.params)}
+        if more:
+            notes["more_cells"] = [other.index for other in more]
+        attempt = store.begin(step.key, step.kind, cell=cell.index if cell else None, notes=notes)
         force = rig.config.force
         recorder = Recorder(attempt.writer, rig.clock, None if force is None else force.rate_hz, self._show)
         place = None if cell is None else (store.state.sheet, cell.index)
@@ -102,7 +107,7 @@ class Performer:
             guard.listen()
             try:
                 with guard.also(self._telemetry.force) if self._telemetry is not None else contextlib.nullcontext():
-                    result = await self._do(Job(bench, step, cell, attempt, recorder, guard))
+                    result = await self._do(Job(bench, step, cell, more, attempt, recorder, guard))
             finally:
                 guard.deafen()
                 rig.robot.listen(None)
@@ -116,6 +121,7 @@ class Performer:
             raise
         if step.kind == StepKind.DIP and bench.wishes.take(Wish.SKIP):
             result = {**result, **progress.skipped(step)}
+            progress.log(f"{result['stroke_id']}: is left out, as the operator asked")
         await uninterrupted(store.done, attempt, result)
         progress.finished(step, result)
         if step.kind == StepKind.CAPTURE:
@@ -140,6 +146,8 @@ class Performer:
                 return await marking.draw(job)
             case StepKind.CAPTURE:
                 return await capturing.capture(job)
+            case StepKind.CHOOSE:
+                return await choosing.choose(job)
 
 
 def _in_words(step: Step) -> str:

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from collect.asking import Prompt
 from collect.last_capture import LastCapture
+from collect.protocols.adaptive import with_choice
 from collect.protocols.planned import Layout
 from collect.protocols.plans import ProtocolConfig, planned
 from collect.sheet import Sheet
@@ -71,6 +72,8 @@ class Progress:
                     self._take(line["result"])
                 elif line["kind"] == StepKind.DIP and line["result"].get("skipped"):
                     self._given_up += 1
+                elif line["kind"] == StepKind.CHOOSE:
+                    self._chosen(line["result"])
                 elif line["kind"] == StepKind.BOARD:
                     self.found[StepKind.BOARD] = line["result"]
             self._at_start = self._done.total()
@@ -100,6 +103,8 @@ class Progress:
         """A step is done."""
         self._tally.finished(step.kind, result)
         with self._lock:
+            if step.kind is StepKind.CHOOSE:
+                self._chosen(result)
             self.set_up = None
             if step.kind in (StepKind.BOARD, StepKind.ZERO_TOUCH, StepKind.SELF_CHECK):
                 self.found[step.kind] = result
@@ -112,6 +117,12 @@ class Progress:
         with self._lock:
             self.set_up = None
         self.voided()
+
+    def _chosen(self, result: Result) -> None:
+        """Take a choice of an adaptive protocol into the plan, which is the worst case until then."""
+        self._plan = with_choice(self._plan, result)
+        self._by_index = {p.index: p for p in self._plan}
+        self._planned = Counter((p.height_mm, p.tilt_deg) for p in self._plan)
 
     def skipped(self, step: Step) -> Result:
         """What a dip tells whose stroke is left out."""
@@ -179,7 +190,8 @@ class Progress:
     ) -> Snapshot:
         """One consistent picture."""
         with self._lock:
-            in_hand = None if self._in_hand is None else self._by_index.get(self._in_hand)
+            at_work = self._in_hand is not None and self._over_ns is None
+            in_hand = self._by_index.get(self._in_hand) if at_work and self._in_hand is not None else None
             if in_hand is not None and in_hand.stroke_id in self._tally.over:
                 in_hand = None
             coming = (p for p in self._plan if p.stroke_id not in self._tally.over and p is not in_hand)

@@ -13,6 +13,7 @@ from drivers.samples import Frame, PoseSample, Stamp
 from sessions.errors import SessionError
 from sessions.messages import (
     Transform,
+    calibration_message,
     encode_png,
     image_message,
     joints_message,
@@ -25,6 +26,8 @@ from sessions.writer import Outgoing, SegmentWriter
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
+
+    from calibrate.artefact import LensUsed
 
 POSE_HZ = 100.0
 """What the driver asks of the arm."""
@@ -74,6 +77,12 @@ class Recorder:
         """Where the frames lie."""
         now_ns = self._clock.now_ns()
         self._put(Topic.TRANSFORMS, now_ns, now_ns, 0, transforms_message(now_ns, transforms))
+
+    def optics(self, used: LensUsed) -> None:
+        """The lens that photographs are straightened by before they are judged."""
+        now_ns = self._clock.now_ns()
+        message = calibration_message(now_ns, used.size_px, used.lens().matrix.tolist(), used.distortion)
+        self._put(Topic.CALIBRATION, now_ns, now_ns, 0, message)
 
     def quality(self, quality: Quality, number: int) -> None:
         """The checks of the stroke that still `number` shows."""

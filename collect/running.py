@@ -14,7 +14,8 @@ from collect.policy import Action, decide
 from collect.progress import Progress
 from collect.questions import GO_ON, STOP, question
 from collect.rig import Rig
-from collect.setting_up import SET_UP, again
+from collect.set_up_steps import SET_UP
+from collect.setting_up import again
 from collect.setting_up import question as set_up_question
 from collect.states import State
 from collect.steps import Protocol, Result, Step, StepKind

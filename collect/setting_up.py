@@ -3,59 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from dataclasses import replace
 
 from calibrate.scale import WORST_RMS_PX
 from collect.asking import Choice, Prompt
 from collect.config import RigConfig
 from collect.questions import GO_ON, STOP
+from collect.set_up_steps import SET_UP, TITLES, Fact, SetUpStep, Standing
 from collect.steps import Protocol, Result, Step, StepKind
 
-SET_UP = (StepKind.BOARD, StepKind.ZERO_TOUCH, StepKind.SELF_CHECK)
-TITLES = {
-    StepKind.BOARD: "Camera, board, scale",
-    StepKind.ZERO_TOUCH: "Zero touch and plane",
-    StepKind.SELF_CHECK: "Self-check",
-}
 AGAIN = Choice("a", "measure again")
 BY_JOG, BY_FORCE = Choice("b", "measure by jog"), Choice("f", "measure by force")
 METHODS = {BY_JOG.key: "jog", BY_FORCE.key: "force"}
-
-
-class Standing(StrEnum):
-    """How far a set-up step is."""
-
-    TO_COME = "to come"
-    NOW = "now"
-    GOOD = "good"
-    DOUBTFUL = "look"
-    """Measured, and outside what it should be."""
-
-
-@dataclass(frozen=True, slots=True)
-class Fact:
-    """One thing that was measured."""
-
-    name: str
-    value: str
-    limit: str = ""
-    good: bool | None = None
-    """None where there is no limit."""
-
-
-@dataclass(frozen=True, slots=True)
-class SetUpStep:
-    """One step of the set-up, as a screen lists it."""
-
-    kind: StepKind
-    standing: Standing
-    facts: tuple[Fact, ...] = ()
-
-    @property
-    def title(self) -> str:
-        """What it is about."""
-        return TITLES[self.kind]
 
 
 def facts_of(kind: StepKind, result: Result, config: RigConfig) -> tuple[Fact, ...]:

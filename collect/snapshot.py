@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from collect.asking import Prompt
-from collect.last_capture import LastCapture
-from collect.setting_up import SetUpStep
-from collect.states import State
-from collect.tally import SheetMap
-from collect.telemetry import Picture
-from collect.wishes import Wish
+if TYPE_CHECKING:
+    # A screen is up before what it shows is imported.
+    from collect.asking import Prompt
+    from collect.last_capture import LastCapture
+    from collect.set_up_steps import SetUpStep
+    from collect.states import State
+    from collect.tally import SheetMap
+    from collect.telemetry import Picture
+    from collect.wishes import Wish
 
 
 @dataclass(frozen=True, slots=True)

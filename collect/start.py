@@ -6,6 +6,7 @@ import contextlib
 import sys
 import tempfile
 from pathlib import Path
+from typing import Literal
 
 from collect.engine import Engine
 from collect.headless import run_headless
@@ -14,30 +15,44 @@ from collect.opening import Opening, check_writable, find_resumable, open_store
 from collect.planning.limits import check_protocol
 from drivers.clock import HostClock
 
+Kind = Literal["auto", "cells", "off"]
+"""How the camera is shown on a screen: in pixels where the terminal has them, in half-cells, or not at all."""
 
-def start(opening: Opening, *, on_screen: bool, live: LiveView | None = None) -> int:
-    """Run to the end and return how many strokes had to be given up. Raises what ended the run."""
+
+def engine_for(
+    opening: Opening, *, watched: bool, live: LiveView | None = None, guided: bool = False, preview: bool = False
+) -> Engine:
+    """An engine that goes on with the open session, or makes a new one. Raises `ConfigError`; connects nothing yet."""
     check_protocol(opening.rig_path, opening.protocol_path, opening.rig, opening.protocol)
     resume = find_resumable(opening)
     check_writable(resume or opening.root)
     clock = HostClock()
-    engine = Engine(
+    return Engine(
         opening.rig,
         opening.protocol,
         lambda rig: open_store(opening, resume, rig, clock),
         clock,
-        watched=on_screen,
+        watched=watched,
         armed=opening.armed,
         live=live,
+        guided=guided,
+        preview=preview,
     )
+
+
+def start(
+    opening: Opening, *, on_screen: bool, live: LiveView | None = None, guided: bool = False, preview: Kind = "cells"
+) -> int:
+    """Run to the end and return how many strokes had to be given up. Raises what ended the run."""
+    engine = engine_for(opening, watched=on_screen, live=live, guided=guided, preview=on_screen and preview != "off")
     with contextlib.ExitStack() as stack:
         if live is not None:
             live.start()
             stack.callback(live.close)
         if on_screen:
-            from collect.tui.app import run_screen
+            from collect.tui.running import run_screen
 
-            run_screen(engine)
+            run_screen(engine, preview)
         else:
             run_headless(engine)
     return engine.snapshot().given_up

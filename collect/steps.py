@@ -27,6 +27,8 @@ class StepKind(StrEnum):
     TOUCH = "touch"
     """Bring the tip down on a named point of the sheet and tell how high it lies there."""
     CAPTURE = "capture"
+    CHOOSE = "choose"
+    """Fit the brush to what is captured, and choose the next press or to stop; nothing moves."""
     SELF_CHECK = "self_check"
     """An uneven triangle of marks that a mirrored, turned or stretched rig does not reproduce."""
 

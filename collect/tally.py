@@ -5,9 +5,12 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import TYPE_CHECKING
 
 from collect.steps import MARKING, Result, Step, StepKind
-from sessions.journal import Replay
+
+if TYPE_CHECKING:
+    from sessions.journal import Replay
 
 Place = tuple[int, int]
 """Sheet and cell, both from 0."""
@@ -82,7 +85,8 @@ class Tally:
                     self._marks[place] = Mark.WAITING
                     self._stroke_at[str(result["stroke_id"])] = place
                 case StepKind.SELF_CHECK if "cell" in result:
-                    self._marks[(int(result["sheet"]), int(result["cell"]))] = Mark.CHECK
+                    for cell in result.get("cells", [result["cell"]]):
+                        self._marks[(int(result["sheet"]), int(cell))] = Mark.CHECK
                 case StepKind.CAPTURE:
                     self._captured(result)
                 case _:

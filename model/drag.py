@@ -6,9 +6,10 @@ length s of the path as a first-order lag,
 
     dp/ds = (q - p) / leash,    leash = leash_mm + leash_per_mm * depth,
 
-and whose half width follows the depth with a lag of its own, `settle_mm`. Sideways drift stands for how the brush is
-set. The mark is the union of the discs between neighbouring nodes. Lengths are mm, x and y in the frame of the path,
-y upward, depth into the paper. No torch here: numpy and, at the first call, numba.
+and whose half width follows the depth with a lag of its own, `settle_mm`. Drift stands for how the brush is set: it
+turns with the brush, where the path tells its heading. The mark is the union of the discs between neighbouring nodes.
+Lengths are mm, x and y in the frame of the path, y upward, depth into the paper. No torch here: numpy and, at the first
+call, numba.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ class DragModel:
     settle_mm: float = 3.0
     """Path length over which the footprint's width follows the depth."""
     drift_x_mm: float = 0.0
+    """Where the footprint lies from its lagging place, toward the heading; the x axis where a path has none."""
     drift_y_mm: float = 0.0
     drift_x_per_mm: float = 0.0
     """Growth of the drift by depth."""
@@ -66,7 +68,8 @@ class DragModel:
         return DragModel(*(float(value) for value in vector))
 
     def trail(self, path: Floats) -> Floats:
-        """Where the footprint goes: (n, 3) nodes x, y, depth of the tip -> (n + 2, 3) x, y, half width, mm.
+        """Where the footprint goes: (n, 3) nodes x, y, depth of the tip, or (n, 4) with the heading in degrees,
+        counter-clockwise from x -> (n + 2, 3) x, y, half width, mm.
 
         The first and the last row are the mark's reach behind the landing and ahead of the lift-off. Raises
         ValueError for a path of another shape, or of fewer than 2 nodes.
@@ -94,21 +97,34 @@ def ink(distance_mm: Floats, spread_mm: float) -> Floats:
 def trails(paths: Sequence[Floats], vector: Floats) -> tuple[Floats, NDArray[np.int64]]:
     """All paths' trails after each other, (sum(n + 2), 3), and where each begins and the last ends, (B + 1,)."""
     for path in paths:
-        if path.ndim != 2 or path.shape[1] != 3 or len(path) < 2:
-            raise ValueError(f"a path is (n, 3) with n >= 2, got {path.shape}")
+        if path.ndim != 2 or path.shape[1] not in (3, 4) or len(path) < 2:
+            raise ValueError(f"a path is (n, 3) or (n, 4) with n >= 2, got {path.shape}")
     from model.drag_kernel import follow  # numba takes a fifth of a second to import
 
     ends = np.cumsum([0, *(len(path) for path in paths)])
     starts = ends + 2 * np.arange(len(ends))
-    out = np.empty((int(starts[-1]), 3))
-    follow(np.ascontiguousarray(np.concatenate(paths), np.float64), ends, np.asarray(vector, np.float64), out, starts)
+    out, nodes = np.empty((int(starts[-1]), 3)), np.zeros((int(ends[-1]), 4))
+    for path, end in zip(paths, ends[1:], strict=True):
+        nodes[end - len(path) : end, : path.shape[1]] = path
+    nodes[:, 3] = np.radians(nodes[:, 3])
+    follow(nodes, ends, np.asarray(vector, np.float64), out, starts)
     return out, starts
 
 
-def distances(nodes: Floats, starts: NDArray[np.int64], x_mm: Floats, y_mm: Floats) -> Floats:
-    """Signed distance of every trail on one grid, (B, len(y_mm), len(x_mm)) mm, positive in ink."""
+def distances(
+    nodes: Floats,
+    starts: NDArray[np.int64],
+    x_mm: Floats,
+    y_mm: Floats,
+    groups: NDArray[np.int64] | None = None,
+) -> Floats:
+    """Signed distance of every trail on one grid, (B, len(y_mm), len(x_mm)) mm, positive in ink.
+
+    Where an image shows several strokes, image i is that of trails `groups[i]` to `groups[i + 1]`, (B + 1,).
+    """
     from model.drag_kernel import signed
 
-    out = np.empty((len(starts) - 1, len(y_mm), len(x_mm)))
-    signed(nodes, starts, np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64), out)
+    each = np.arange(len(starts)) if groups is None else groups
+    out = np.empty((len(each) - 1, len(y_mm), len(x_mm)))
+    signed(nodes, starts, each, np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64), out)
     return out

@@ -11,7 +11,7 @@ _FAR = 6.0  # edge spreads from the edge beyond which a pixel's slope is below 3
 
 @_compile
 def follow(path, ends, p, out, starts):
-    """Fill `out` with the trails of the paths between `ends`; `p` is `DragModel.vector()`."""
+    """Fill `out` with the trails of paths (x, y, depth, heading in rad) between `ends`; `p` is `DragModel.vector()`."""
     for i in range(len(ends) - 1):
         first, last, at = ends[i], ends[i + 1] - 1, starts[i]
         x, y, depth = path[first, 0], path[first, 1], path[first, 2]
@@ -36,8 +36,9 @@ def follow(path, ends, p, out, starts):
                     x = path[k, 0] - lag_x - (path[k - 1, 0] - x - lag_x) * keep
                     y = path[k, 1] - lag_y - (path[k - 1, 1] - y - lag_y) * keep
             n = at + 1 + k - first
-            out[n, 0] = x + p[6] + p[8] * depth
-            out[n, 1] = y + p[7] + p[9] * depth
+            along, across = p[6] + p[8] * depth, p[7] + p[9] * depth
+            out[n, 0] = x + math.cos(path[k, 3]) * along - math.sin(path[k, 3]) * across
+            out[n, 1] = y + math.sin(path[k, 3]) * along + math.cos(path[k, 3]) * across
             out[n, 2] = p[0] + p[1] * depth + p[2] * depth * depth
         out[at, 0] = out[at + 1, 0] - p[11] * ux
         out[at, 1] = out[at + 1, 1] - p[11] * uy
@@ -66,16 +67,28 @@ def _nearest(nodes, a, b, gx, gy):
 
 
 @_compile
-def signed(nodes, starts, x, y, out):
-    """Fill `out` (B, len(y), len(x)) with signed distances, positive in ink."""
-    for i in range(len(starts) - 1):
-        for r in range(len(y)):
-            for c in range(len(x)):
-                out[i, r, c] = _nearest(nodes, starts[i], starts[i + 1], x[c], y[r])[0]
+def _nearest_of(nodes, starts, first, last, gx, gy):
+    """The same over several trails."""
+    found = _nearest(nodes, starts[first], starts[first + 1], gx, gy)
+    for i in range(first + 1, last):
+        other = _nearest(nodes, starts[i], starts[i + 1], gx, gy)
+        if other[0] > found[0]:
+            found = other
+    return found
 
 
 @_compile
-def normal_equations(nodes, starts, slopes, x, y, target, spread, square, gradient):
+def signed(nodes, starts, groups, x, y, out):
+    """Fill `out` (B, len(y), len(x)) with signed distances, positive in ink; trails `groups[i]` to `groups[i + 1]` make
+    image i."""
+    for i in range(len(groups) - 1):
+        for r in range(len(y)):
+            for c in range(len(x)):
+                out[i, r, c] = _nearest_of(nodes, starts, groups[i], groups[i + 1], x[c], y[r])[0]
+
+
+@_compile
+def normal_equations(nodes, starts, groups, slopes, x, y, target, spread, square, gradient):
     """Add J'J and J'r of ink minus target over every pixel; returns half the sum of squares.
 
     `slopes` (nodes, 3, P) are the nodes' derivatives. The place t of the nearest disc is held while differentiating.
@@ -83,10 +96,10 @@ def normal_equations(nodes, starts, slopes, x, y, target, spread, square, gradie
     count = slopes.shape[2]
     j = np.empty(count)
     cost = 0.0
-    for i in range(len(starts) - 1):
+    for i in range(len(groups) - 1):
         for r in range(len(y)):
             for c in range(len(x)):
-                value, k, t, ux, uy = _nearest(nodes, starts[i], starts[i + 1], x[c], y[r])
+                value, k, t, ux, uy = _nearest_of(nodes, starts, groups[i], groups[i + 1], x[c], y[r])
                 u = value / spread
                 seen = 1.0 / (1.0 + math.exp(-min(max(u, -40.0), 40.0)))
                 miss = seen - target[i, r, c]

@@ -1,12 +1,14 @@
 """CCD-BSM with the numbers of one brush: its lengths keep the geometry of Eq. 2-5, and what the paper fixes is fitted.
 
 With h = H + h0, c = h / 15 mm, and CCD-BSM's own O3A, O4O3 and O3C at (h, alpha):
-    heel = heel_gain O3A c^(length_power - 1) (1 + length_tilt alpha),   tip the same with O4O3,
+    tip = tip_gain O4O3 c^(length_power - 1) (1 + length_tilt alpha),
+    heel the same with heel_gain O3A, times (1 + heel_tilt alpha),
     half width = lam O3C c^(width_power - 1) (1 + width_tilt alpha),
     profile = core sqrt(1 - u^6) + half width (1 - u^round)^power on either side (the paper: no core, u^2, power 1/2 at
     the heel and 1 at the tip).
-The widest place lies at H tan(alpha) + origin_mm + origin_gain h from the point where the tip touched, toward the side
-that the ferrule leans to. The defaults are CCD-BSM as published. No torch here: a rig PC evaluates it too.
+The widest place lies at lean H tan(alpha) + origin_mm + origin_gain h from the point where the tip touched, toward the
+side that the ferrule leans to: friction holds the tip back, so that only part of the lean may reach the ink (lean < 1).
+The defaults are CCD-BSM as published. No torch here: a rig PC evaluates it too.
 """
 
 from __future__ import annotations
@@ -56,12 +58,16 @@ PARAMETERS = (
     Parameter("length_power", "1", 1.0, 0.4, 0.2, 2.5, "growth of the length with depth"),
     Parameter("width_tilt", "1/deg", 0.0, 0.02, -0.1, 0.1, "growth of the width with tilt"),
     Parameter("length_tilt", "1/deg", 0.0, 0.02, -0.1, 0.1, "growth of the length with tilt"),
+    Parameter("lean", "1", 1.0, 0.5, -2.0, 3.0, "share of H tan(alpha) by which the widest place moves with tilt"),
+    Parameter(
+        "heel_tilt", "1/deg", 0.0, 0.03, -0.09, 0.2, "growth of the heel side with tilt, beside that of the length"
+    ),
 )
 NAMES = tuple(parameter.name for parameter in PARAMETERS)
 
 
 def published() -> Floats:
-    """The parameters of CCD-BSM as published, (15,)."""
+    """The parameters of CCD-BSM as published, (17,)."""
     return np.array([parameter.start for parameter in PARAMETERS])
 
 
@@ -77,7 +83,7 @@ class Sizes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedPress:
-    """A calibrated brush: `values` (15,) in the order of `PARAMETERS`, `edges` (2, MODES, TERMS) mm.
+    """A calibrated brush: `values` (17,) in the order of `PARAMETERS`, `edges` (2, MODES, TERMS) mm.
 
     The edges are what the profile leaves of the upper and the lower edge: sines along the mark, each with the terms of
     `command_terms`.
@@ -103,8 +109,9 @@ class FittedPress:
         share = h / DEPTH_MM
         long = share ** (p["length_power"] - 1.0) * max(0.05, 1.0 + p["length_tilt"] * tilt_deg)
         wide = share ** (p["width_power"] - 1.0) * max(0.05, 1.0 + p["width_tilt"] * tilt_deg)
-        widest = height_mm * math.tan(alpha) + p["origin_mm"] + p["origin_gain"] * h
-        return Sizes(widest, p["tip_gain"] * o4o3 * long, p["heel_gain"] * o3a * long, p["lam"] * o3c * wide)
+        widest = p["lean"] * height_mm * math.tan(alpha) + p["origin_mm"] + p["origin_gain"] * h
+        heel = p["heel_gain"] * o3a * long * max(0.05, 1.0 + p["heel_tilt"] * tilt_deg)
+        return Sizes(widest, p["tip_gain"] * o4o3 * long, heel, p["lam"] * o3c * wide)
 
     def half_width(self, height_mm: float, tilt_deg: float, x_mm: Floats) -> Floats:
         """The profile's half width at x from the point of touch, mm, any shape; beyond the ends minus the distance."""

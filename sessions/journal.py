@@ -158,7 +158,7 @@ def _begin(state: Replay, line: Line) -> None:
     state.attempts[key] = max(state.attempts.get(key, 0), int(line["attempt"]))
     state.sheet = max(state.sheet, sheet)
     if line["cell"] is not None:
-        state.used_cells.add((sheet, int(line["cell"])))
+        state.used_cells |= {(sheet, int(cell)) for cell in (line["cell"], *line.get("more_cells", ()))}
 
 
 def _next_serial(line: Line) -> int:

@@ -134,7 +134,7 @@ class SessionStore:
         self.state.attempts[key] = attempt
         self.state.begun += 1
         if cell is not None:
-            self.state.used_cells.add((self.state.sheet, cell))
+            self.state.used_cells |= {(self.state.sheet, one) for one in (cell, *notes.get("more_cells", ()))}
         begun = {"t_ns": t_ns, "header": self.header.model_dump(mode="json"), "line": line}
         writer = SegmentWriter(self.folder / name, self.header, QUEUE_LIMIT, begun)
         return Attempt(key, kind, serial, attempt, writer, cell)

@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator, Iterator
 
 import pytest
 
-TOLERATED = ("asyncio_", "pytest_timeout", "ThreadPoolExecutor", "tqdm")
+TOLERATED = ("asyncio_", "pytest_timeout", "ThreadPoolExecutor", "tqdm", "fsspecIO")
 """Pools that live as long as their loop or process; nothing of ours is called that."""
 
 

@@ -24,8 +24,9 @@ Cell = tuple[float, float]
 
 NOISE = 1.0
 """Variance of a pixel of the edge times the number of pixels that stray together."""
-ENOUGH_POINTS = 0.3
-"""Stop when fewer points of CSIM (percent) than this are expected to be won by pressing on."""
+ENOUGH_POINTS = 1.0
+"""Stop when fewer points of CSIM (percent) than this are expected to be won by pressing on. About twice what really is:
+the parameters' prior is wide."""
 
 
 @dataclass(frozen=True, slots=True)

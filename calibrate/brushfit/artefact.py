@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-from pathlib import Path
+from typing import Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, model_validator
 
-from calibrate.errors import CalibrationError
-from calibrate.files import write_whole
+from calibrate.artefact import Artefact
 from model.fitted import MODES, NAMES, TERMS, FittedPress
 
 SCHEMA_VERSION = 1
 FOLDER = "brushfit"
-MAX_BYTES = 1024 * 1024
-HASH_CHARS = 16
 
 
 class FittedValue(BaseModel):
@@ -39,10 +35,8 @@ class FittedStage(BaseModel):
     refused: bool
 
 
-class BrushFit(BaseModel):
+class BrushFit(Artefact):
     """What was fitted, to which strokes, with which software. Equal inputs give an equal file."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     schema_version: int = SCHEMA_VERSION
     session_id: str
@@ -69,44 +63,9 @@ class BrushFit(BaseModel):
         values = np.array([self.parameters[name].value for name in NAMES])
         return FittedPress(self.radius_mm, self.length_mm, values, np.array(self.edges_mm))
 
-    @property
-    def digest(self) -> str:
-        """The first characters of the sha256 of the canonical JSON: the file's name."""
-        return hashlib.sha256(self._canonical()).hexdigest()[:HASH_CHARS]
-
-    def _canonical(self) -> bytes:
-        return self.model_dump_json(indent=2).encode() + b"\n"
-
-    def save(self, folder: Path) -> Path:
-        """Write `<digest>.json` into `folder`; where it is there already, it is the same and stays."""
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"{self.digest}.json"
-        if not path.exists():
-            write_whole(path, self._canonical().decode())
-        return path
-
-
-def load(path: Path) -> BrushFit:
-    """Read an artefact. Raises `CalibrationError` where it is none, was edited, or is of another version."""
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise CalibrationError(str(path), f"is larger than {MAX_BYTES} bytes")
-        data = path.read_bytes()
-        fit = BrushFit.model_validate_json(data)
-    except OSError as error:
-        raise CalibrationError(str(path), error.strerror or str(error)) from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise CalibrationError(str(path), f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
-    if hashlib.sha256(data).hexdigest()[:HASH_CHARS] != path.stem:
-        raise CalibrationError(str(path), "was edited: its name is not the hash of its contents")
-    shape = (2, MODES, TERMS)
-    if set(fit.parameters) != set(NAMES) or np.array(fit.edges_mm).shape != shape:
-        raise CalibrationError(str(path), f"parameters: expected {', '.join(NAMES)}, and edges of shape {shape}")
-    return fit
-
-
-def newest(session: Path) -> Path | None:
-    """The artefact written last in a session's folder, if there is one."""
-    found = sorted((session / FOLDER).glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
-    return found[-1] if found else None
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        shape = (2, MODES, TERMS)
+        if set(self.parameters) != set(NAMES) or np.array(self.edges_mm).shape != shape:
+            raise ValueError(f"parameters: expected {', '.join(NAMES)}, and edges of shape {shape}")
+        return self

@@ -16,24 +16,35 @@ if TYPE_CHECKING:
 
 def fit(
     session: Annotated[Path, typer.Argument(help="A session of presses: its folder or its .mcap file.")],
-    mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = 0.3,
+    mm_per_px: Annotated[
+        float | None, typer.Option(min=0.1, max=1.0, help="Scale of the images; 0.3, with --drags 0.6.")
+    ] = None,
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the session's newest by default.")] = None,
     correction: Annotated[bool, typer.Option("--correction", help="Print the zero-touch offset for rig.toml.")] = False,
     reference: Annotated[Path | None, typer.Option(help="An earlier fit of this brush, for --correction.")] = None,
+    drags: Annotated[
+        bool, typer.Option("--drags", help="Fit bristle lag to strokes that travel; writes dragfit/<hash>.json.")
+    ] = False,
 ) -> None:
     """Fit the stroke model to a session's presses; writes an immutable brushfit/<hash>.json."""
+    if drags:
+        if correction or reference is not None:
+            raise typer.BadParameter("--correction and --reference are for presses, not for --drags")
+        _fit_drags(session, mm_per_px or 0.6, calibration)
+        return
     import rich
     from rich.markup import escape
 
-    from calibrate.brushfit.artefact import load
+    from calibrate.artefact import load_artefact
+    from calibrate.brushfit.artefact import BrushFit
     from calibrate.brushfit.captures import read_presses
     from calibrate.brushfit.run import correction as corrected
     from calibrate.brushfit.run import fit_session, save
     from calibrate.field import Field
     from sessions.reader import Recording
 
-    before = load(reference) if reference is not None else None
-    view = Field(mm_per_px=mm_per_px)
+    before = load_artefact(reference, BrushFit) if reference is not None else None
+    view = Field(mm_per_px=mm_per_px or 0.3)
     captures = read_presses(session, view, calibration)
     fitted = fit_session(captures, view)
     path = save(fitted, Recording(session).path.parent)
@@ -41,6 +52,39 @@ def fit(
     if correction:
         rich.print("\n".join(_correction(corrected(captures, fitted.artefact, before))))
     rich.print(f"Fit: {escape(str(path))}")
+
+
+def _fit_drags(session: Path, mm_per_px: float, calibration: Path | None) -> None:
+    import rich
+    from rich.markup import escape
+    from rich.table import Table
+
+    from calibrate.brushfit.drag_captures import read_drags
+    from calibrate.brushfit.drag_run import fit_drawn, save
+    from calibrate.wording import source_note
+    from sessions.reader import Recording
+
+    drawn = read_drags(session, mm_per_px, calibration)
+    fitted = fit_drawn(drawn)
+    artefact = fitted.artefact
+    rich.print(
+        f"{escape(source_note(drawn.header.source))}; {artefact.strokes} dragged strokes in {artefact.images} images; "
+        f"condition number {artefact.condition:.3g}"
+    )
+    for name, why in drawn.refused:
+        rich.print(f"left out: {escape(name)}: {escape(why)}")
+    out = Table("parameter", "fitted", "95 %", title="drag model, mm")
+    for name, found in artefact.parameters.items():
+        out.add_row(name, f"{found.value:.3f}", f"{found.low:.3f} to {found.high:.3f}")
+    rich.print(out)
+    if artefact.held_out:
+        out = Table("model", "n", "CSIM", "IoU", title="a fifth left out in turn, where the command put it, percent")
+        for name, score in artefact.held_out.items():
+            out.add_row(name, str(score.images), f"{score.csim_percent:.2f}", f"{score.iou_percent:.2f}")
+        rich.print(out)
+    else:
+        rich.print("Fewer than five images: none can be left out.")
+    rich.print(f"Fit: {escape(str(save(fitted, Recording(session).path.parent)))}")
 
 
 def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:

@@ -9,7 +9,7 @@ arm against camera is off there.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from model.drag import DragModel, distances, ink, trails
 
 Floats = NDArray[np.float64]
-Masks = NDArray[np.bool_]
+Indices = NDArray[np.int64]
 
 SPREAD_MM = 0.9
-"""Scale of the logistic: an edge that strays by 1.6 mm (standard deviation)."""
+"""Scale of the logistic, unless told otherwise: an edge that strays by 1.6 mm (standard deviation)."""
 INK_ABOVE = 0.42
 """A pixel is called ink above this chance: half of the Dice score to be had maximises its expectation."""
 PRIOR = (2.0, 0.2, 0.01, 3.0, 1.0, 4.0, 1.5, 1.5, 0.2, 0.2, 3.0, 3.0, 0.5, 0.5)
@@ -41,11 +41,27 @@ class DragFit:
     """Condition number of the scaled normal equations: above some 1e4 parameters stand in for each other."""
     cost: float
     rounds: int
+    spread_mm: float = SPREAD_MM
+    """How far an edge strays."""
 
-    def distance(self, paths: Sequence[Floats], x_mm: Floats, y_mm: Floats, place: Floats | None = None) -> Floats:
+    squares: Floats = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    """(images, P, P): J'J of each image at the end, scaled; P is the parameters that were free."""
+    gradients: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    free: tuple[str, ...] = ()
+
+    def distance(
+        self,
+        paths: Sequence[Floats],
+        x_mm: Floats,
+        y_mm: Floats,
+        place: Floats | None = None,
+        groups: Indices | None = None,
+    ) -> Floats:
         """Signed distances of the marks of these paths, (B, len(y_mm), len(x_mm)) mm, positive in ink."""
         nodes, starts = trails(paths, self.model.vector())
-        return distances(_shifted(nodes, starts, place, self.place_mm), starts, x_mm, y_mm)
+        each = _each(paths, groups)
+        along = None if place is None else np.repeat(place, np.diff(each), axis=0)
+        return distances(_shifted(nodes, starts, along, self.place_mm), starts, x_mm, y_mm, each)
 
 
 def fit_drags(
@@ -57,8 +73,13 @@ def fit_drags(
     *,
     start: DragModel | None = None,
     lag: bool = True,
+    spread_mm: float = SPREAD_MM,
+    groups: Indices | None = None,
 ) -> DragFit:
-    """Levenberg-Marquardt over (B, len(y_mm), len(x_mm)) ink; `place` (B, q). Without `lag` the disc is at the tip.
+    """Levenberg-Marquardt over (B, len(y_mm), len(x_mm)) ink; `place` (B, q). Paths `groups[i]` to `groups[i + 1]` are
+    the strokes of image i; left out, each image shows one.
+
+    Without `lag` the disc is at the tip, drift apart; its width still settles along the path.
 
     Raises ValueError where paths, ink and place do not belong together.
     """
@@ -67,21 +88,25 @@ def fit_drags(
     kernel: Any = drag_kernel
 
     images = np.ascontiguousarray(target, np.float32)
-    if images.shape != (len(paths), len(y_mm), len(x_mm)) or (place is not None and len(place) != len(paths)):
-        raise ValueError(f"{len(paths)} paths, ink {images.shape}, grid ({len(y_mm)}, {len(x_mm)}): not alike")
-    columns = np.zeros((len(paths), 0)) if place is None else np.asarray(place, np.float64)
-    begin = start or (DragModel() if lag else DragModel(leash_mm=0.0, leash_per_mm=0.0, settle_mm=0.0, front=0.0))
+    each = _each(paths, groups)
+    shown = len(each) - 1
+    if images.shape != (shown, len(y_mm), len(x_mm)) or (place is not None and len(place) != shown):
+        raise ValueError(f"{shown} strokes or figures, ink {images.shape}, grid ({len(y_mm)}, {len(x_mm)}): not alike")
+    columns = np.zeros((len(paths), 0)) if place is None else np.repeat(place, np.diff(each), axis=0).astype(np.float64)
+    begin = start or (DragModel() if lag else DragModel(leash_mm=0.0, leash_per_mm=0.0, front=0.0))
     first = np.concatenate([begin.vector(), np.zeros(2 * columns.shape[1])])
     scale = np.concatenate([np.array(PRIOR), np.full(2 * columns.shape[1], PLACE_PRIOR_MM)])
     free = np.ones(len(first), np.bool_)
     if not lag:
-        held = ("leash_mm", "leash_per_mm", "settle_mm", "land_mm", "back_mm", "front", "front_width")
+        held = ("leash_mm", "leash_per_mm", "land_mm", "back_mm", "front", "front_width")
         free[[DragModel.names().index(name) for name in held]] = False
 
     def equations(vector: Floats) -> tuple[float, Floats, Floats]:
         nodes, starts, slopes = _linearised(paths, vector, scale, columns)
         square, gradient = np.zeros((len(vector), len(vector))), np.zeros(len(vector))
-        cost = float(kernel.normal_equations(nodes, starts, slopes, x_mm, y_mm, images, SPREAD_MM, square, gradient))
+        cost = float(
+            kernel.normal_equations(nodes, starts, each, slopes, x_mm, y_mm, images, spread_mm, square, gradient)
+        )
         off = (vector - first) / scale
         square = np.tril(square) + np.tril(square, -1).T + np.eye(len(vector))
         return cost + 0.5 * float(off @ off), square[np.ix_(free, free)], (gradient + off)[free]
@@ -106,7 +131,34 @@ def fit_drags(
                 break
     spread = np.sqrt(np.diag(square))
     condition = float(np.linalg.cond(square / np.outer(spread, spread)))
-    return DragFit(DragModel.of(vector[:14]), vector[14:].reshape(-1, 2), condition, cost, done)
+    squares, gradients = _by_image(paths, each, images, x_mm, y_mm, vector, scale, columns, spread_mm)
+    names = tuple(name for name, is_free in zip(DragModel.names(), free, strict=False) if is_free)
+    return DragFit(
+        DragModel.of(vector[:14]),
+        vector[14:].reshape(-1, 2),
+        condition,
+        cost,
+        done,
+        spread_mm,
+        squares[:, free][:, :, free],
+        gradients[:, free],
+        names,
+    )
+
+
+def bootstrap(fit: DragFit, draws: int = 500, seed: int = 0, start: DragModel | None = None) -> Floats:
+    """(draws, P) values of the free parameters when the images are drawn again with replacement, one Gauss-Newton step
+    from the fit each. With fewer than some 8 images the intervals are too short."""
+    at = [DragModel.names().index(name) for name in fit.free]
+    scale, found = np.array(PRIOR)[at], fit.model.vector()[at]
+    off = (found - (start or DragModel()).vector()[at]) / scale
+    count, total = len(fit.squares), fit.squares.shape[1]
+    weights = np.random.default_rng(seed).multinomial(count, np.full(count, 1.0 / count), draws).astype(np.float64)
+    prior = np.zeros((draws, total))
+    prior[:, : len(at)] = off
+    square = np.tensordot(weights, fit.squares, 1) + np.eye(total)
+    steps = np.asarray(np.linalg.solve(square, -(weights @ fit.gradients + prior)[..., None]), np.float64)[..., 0]
+    return found + scale * steps[:, : len(at)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,14 +184,44 @@ class Residual:
         return clipped(base_mm) + (kernel @ self.weights).reshape(base_mm.shape)
 
 
-def chance(distance_mm: Floats) -> Floats:
+def chance(distance_mm: Floats, spread_mm: float = SPREAD_MM) -> Floats:
     """The chance of ink that a signed distance stands for."""
-    return ink(distance_mm, SPREAD_MM)
+    return ink(distance_mm, spread_mm)
 
 
 def clipped(distance_mm: Floats) -> Floats:
     """Signed distance that levels off at `Residual.REACH_MM`: far from the edge it says nothing."""
     return Residual.REACH_MM * np.tanh(distance_mm / Residual.REACH_MM)
+
+
+def _each(paths: Sequence[Floats], groups: Indices | None) -> Indices:
+    return np.arange(len(paths) + 1) if groups is None else np.asarray(groups, np.int64)
+
+
+def _by_image(
+    paths: Sequence[Floats],
+    each: Indices,
+    images: NDArray[np.float32],
+    x_mm: Floats,
+    y_mm: Floats,
+    vector: Floats,
+    scale: Floats,
+    columns: Floats,
+    spread_mm: float,
+) -> tuple[Floats, Floats]:
+    from model import drag_kernel
+
+    kernel: Any = drag_kernel
+    nodes, starts, slopes = _linearised(paths, vector, scale, columns)
+    size = len(vector)
+    squares, gradients = np.zeros((len(images), size, size)), np.zeros((len(images), size))
+    for i in range(len(images)):
+        one = each[i : i + 2]
+        kernel.normal_equations(
+            nodes, starts, one, slopes, x_mm, y_mm, images[i : i + 1], spread_mm, squares[i], gradients[i]
+        )
+        squares[i] = np.tril(squares[i]) + np.tril(squares[i], -1).T
+    return squares, gradients
 
 
 def _kernel(a: Floats, b: Floats) -> Floats:

@@ -21,6 +21,7 @@ STAGES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("profile", ("heel_power", "heel_round", "tip_power", "tip_round", "core_mm")),
     ("growth", ("width_power", "length_power")),
     ("tilt", ("width_tilt", "length_tilt")),
+    ("lean", ("lean", "heel_tilt")),
 )
 """Each stage frees its parameters beside all that were freed before."""
 WORST_CONDITION = 300.0

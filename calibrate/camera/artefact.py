@@ -2,41 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable
-from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
-import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
-
-from calibrate.artefact import HASH_CHARS, MAX_BYTES
+from calibrate.artefact import Artefact
 from calibrate.camera.intrinsics import Fitted
-from calibrate.camera.lens import Lens
-from calibrate.errors import CalibrationError
-from calibrate.files import write_whole
-
-
-class Artefact(BaseModel):
-    """Base: frozen, nothing unknown is let in, saved under the hash of its canonical JSON."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    @property
-    def digest(self) -> str:
-        """The first characters of the sha256 of the canonical JSON."""
-        return hashlib.sha256(self._canonical()).hexdigest()[:HASH_CHARS]
-
-    def _canonical(self) -> bytes:
-        return self.model_dump_json(indent=2).encode() + b"\n"
-
-    def save(self, folder: Path) -> Path:
-        """Write `<digest>.json` into `folder`; where it is there already, it is the same and stays. Raises OSError."""
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"{self.digest}.json"
-        if not path.exists():
-            write_whole(path, self._canonical().decode())
-        return path
+from calibrate.camera.lens import Lens, lens_of
 
 
 class LensFile(Artefact):
@@ -67,9 +37,7 @@ class LensFile(Artefact):
 
     def lens(self) -> Lens:
         """To look through."""
-        fx, fy, cx, cy = self.matrix
-        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        return Lens(matrix, np.array(self.distortion), self.size_px)
+        return lens_of(self.matrix, self.distortion, self.size_px)
 
 
 def lens_file(
@@ -118,32 +86,3 @@ class RegistrationFile(Artefact):
     """Of every point, predicted by the others."""
     residuals_mm: dict[str, tuple[float, float]]
     dropped: dict[str, tuple[float, float]]
-
-
-F = TypeVar("F", LensFile, RegistrationFile)
-
-
-def load(path: Path, kind: type[F]) -> F:
-    """Read an artefact of this kind. Raises `CalibrationError` where it is none or was edited."""
-    data = _bytes(path)
-    artefact = _parsed(path, data, lambda text: kind.model_validate_json(text))
-    if hashlib.sha256(data).hexdigest()[:HASH_CHARS] != path.stem:
-        raise CalibrationError(str(path), "was edited: its name is not the hash of its contents")
-    return artefact
-
-
-def _bytes(path: Path) -> bytes:
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise CalibrationError(str(path), f"is larger than {MAX_BYTES} bytes")
-        return path.read_bytes()
-    except OSError as error:
-        raise CalibrationError(str(path), error.strerror or str(error)) from None
-
-
-def _parsed(path: Path, data: bytes, parse: Callable[[bytes], F]) -> F:
-    try:
-        return parse(data)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise CalibrationError(str(path), f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None

@@ -66,13 +66,17 @@ class View:
     """What is not as it should be, though corners were found."""
 
 
-def see(image: Gray, board: Board, name: str) -> View:
-    """The corners of the board in a gray photograph. Raises `CalibrationError` that says what is wrong."""
+def see(image: Gray, board: Board, name: str, expected: int | None = None) -> View:
+    """The corners of the board in a gray photograph. Raises `CalibrationError` that says what is wrong.
+
+    `expected` is how many corners can be seen where a sheet lies on the board; all of them by default.
+    """
     flags = _exposure(image)
     found = _checkerboard(image, board, name) if isinstance(board, Checkerboard) else _charuco(image, board, name)
     pixels, ids, board_mm, total = found
-    if len(ids) < PARTLY_HIDDEN * total:
-        flags = (*flags, f"only {len(ids)} of {total} corners are seen: the board is partly hidden or out of view")
+    wanted = total if expected is None else expected
+    if len(ids) < PARTLY_HIDDEN * wanted:
+        flags = (*flags, f"only {len(ids)} of {wanted} corners are seen: the board is partly hidden or out of view")
     return View(name, (image.shape[1], image.shape[0]), pixels, board_mm, ids, flags)
 
 

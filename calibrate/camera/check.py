@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from calibrate.camera.artefact import LensFile
-from calibrate.camera.boards import see
-from calibrate.camera.drift import see_plane
 from calibrate.camera.intrinsics import RMS_LIMIT_PX
 from calibrate.camera.lens import Gray
 from calibrate.camera.plane import Plane
+from calibrate.camera.view import bend, see_flagged
 from calibrate.scale import BoardSpec
 
 LEAST_PX_PER_MM = 4.0
@@ -25,10 +24,12 @@ def preflight(
 
     Raises `CalibrationError` where the board is not seen at all.
     """
-    told = list(see(image, spec, "camera").flags)
-    plane = see_plane(image, spec, lens.lens() if lens else None)
+    plane, flags = see_flagged(image, spec, lens.lens() if lens else None)
+    told = list(flags)
     if lens is not None and lens.rms_px > rms_limit_px:
         told.append(f"the lens was calibrated with a residual of {lens.rms_px:.2f} px, limit {rms_limit_px:g} px")
+    if (bent := bend(plane, known=lens is not None)) != "":
+        told.append(bent)
     if plane.rms_px > rms_limit_px:
         told.append(f"the board's residual is {plane.rms_px:.2f} px, limit {rms_limit_px:g} px: is the board flat?")
     if lens is not None and abs(float(plane.lens.distortion[0]) - lens.distortion[0]) > REFOCUSED:

@@ -10,7 +10,6 @@ import typer
 
 if TYPE_CHECKING:
     from calibrate.camera.boards import Board
-    from calibrate.camera.lens import Gray
 
 
 class Kind(StrEnum):
@@ -68,12 +67,13 @@ def intrinsics(
     from calibrate.camera.intrinsics import fit_lens
     from calibrate.camera.pdf import describe
     from calibrate.errors import CalibrationError
+    from calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
 
     made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
     seen, unusable, digests = list[View](), dict[str, str](), dict[str, str]()
     for path in photographs:
-        image = _gray(path)
-        digests[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        image = read_gray(path)
+        digests[path.name] = hashlib.sha256(read_bounded(path, MAX_PHOTOGRAPH_BYTES)).hexdigest()
         try:
             seen.append(see(image, made, path.name))
         except CalibrationError as error:
@@ -104,7 +104,7 @@ def intrinsics(
 
 @app.command()
 def check(
-    photograph: Annotated[Path, typer.Argument(help="A photograph of the board as it will lie.")],
+    photograph: Annotated[Path, typer.Argument(help="A photograph of the board as it will lie, no sheet on it.")],
     charuco: Squares = "26x20",
     square_mm: Square = 12.0,
     marker_mm: Marker = 0.0,
@@ -113,13 +113,15 @@ def check(
     limit_px: Annotated[float, typer.Option(min=0.01, max=10.0, help="Residual above which it warns.")] = 0.5,
 ) -> None:
     """Pre-flight: pix2len with its interval from one photograph of the board, and warnings. Exit code 5 with any."""
-    from calibrate.camera.artefact import LensFile, load
+    from calibrate.artefact import load_artefact
+    from calibrate.camera.artefact import LensFile
     from calibrate.camera.check import preflight
+    from calibrate.files import read_gray
     from calibrate.scale import BoardSpec
 
     spec = _board("", charuco, square_mm, marker_mm, dictionary)
     assert isinstance(spec, BoardSpec)
-    plane, warnings = preflight(_gray(photograph), spec, load(lens, LensFile) if lens else None, limit_px)
+    plane, warnings = preflight(read_gray(photograph), spec, load_artefact(lens, LensFile) if lens else None, limit_px)
     low, high = plane.interval_mm_per_px
     typer.echo(
         f"pix2len {plane.mm_per_px:.5f} mm/px (95 %: {low:.5f} to {high:.5f}), residual {plane.rms_px:.3f} px over "
@@ -136,17 +138,19 @@ def drift(
     session: Annotated[Path, typer.Argument(help="A session's folder or its .mcap file.")],
     lens: LensOption = None,
 ) -> None:
-    """pix2len each time that the board was seen in a session, its trend, and whether the camera was touched."""
-    from calibrate.camera.artefact import LensFile, load
-    from calibrate.camera.drift import board_of, board_over_session
+    """pix2len each time that the board was seen in a session, its trend, and warnings. Exit code 5 with any."""
+    from calibrate.camera.drift import board_over_session
+    from calibrate.camera.session import board_of, known_lens
+    from sessions.reader import Recording
 
-    spec = board_of(session)
-    found = board_over_session(session, spec, load(lens, LensFile).lens() if lens else None)
+    recording = Recording(session)
+    known = known_lens(recording, lens)
+    found = board_over_session(recording, board_of(recording), known.lens() if known else None)
     for seen in found.seen:
-        low, high = seen.plane.interval_mm_per_px
+        low, high = (seen.mm_per_px * (1.0 + side * seen.reach) for side in (-1.0, 1.0))
         after_s = (seen.t_ns - found.seen[0].t_ns) / 1e9
         typer.echo(
-            f"{after_s:8.0f} s: {seen.plane.mm_per_px:.5f} mm/px (95 %: {low:.5f} to {high:.5f}), "
+            f"{after_s:8.0f} s: {seen.mm_per_px:.5f} mm/px (95 %: {low:.5f} to {high:.5f}), "
             f"residual {seen.plane.rms_px:.3f} px, board moved {seen.moved_px:.2f} px"
         )
     if found.trend is not None:
@@ -154,6 +158,8 @@ def drift(
         typer.echo(f"trend {100 * found.trend.slope:+.4f} % per hour (95 %: {100 * low:+.4f} to {100 * high:+.4f})")
     for warning in found.warnings:
         typer.echo(f"warning: {warning}")
+    if found.warnings:
+        raise typer.Exit(5)
 
 
 @app.command()
@@ -171,23 +177,31 @@ def register(
     out: Annotated[Path, typer.Option(help="Folder for the registration file.")] = Path("camera"),
 ) -> None:
     """Where the robot's points lie on the paper, from marks that it touched or pressed; with residuals."""
+    import hashlib
     from importlib.metadata import version
 
-    from calibrate.camera.artefact import LensFile, load
-    from calibrate.camera.drift import see_plane
     from calibrate.camera.points import read_points, registration_file
     from calibrate.camera.register import register as fit
+    from calibrate.camera.session import read_lens
+    from calibrate.camera.view import see_straight
+    from calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
     from calibrate.scale import BoardSpec
 
     spec = _board("", charuco, square_mm, marker_mm, dictionary)
     assert isinstance(spec, BoardSpec)
     points = read_points(table)
-    plane = see_plane(_gray(photograph), spec, load(lens, LensFile).lens() if lens else None, str(photograph))
+    known = read_lens(lens) if lens else None
+    plane, flags = see_straight(read_gray(photograph), spec, known.lens() if known else None, str(photograph))
     fitted = fit(points.names, points.robot_mm, plane.to_paper(points.image_px), model.value)
     for name, (dx, dy) in zip(fitted.names, fitted.residuals_mm.tolist(), strict=True):
         out_of_it = ", dropped: it does not fit the others" if name in fitted.dropped else ""
         typer.echo(f"{name}: {dx:+.3f}, {dy:+.3f} mm{out_of_it}")
-    file = registration_file(fitted, f"{table.name}, sha256 {points.sha256}", f"brushloop {version('brushloop')}")
+    seen = hashlib.sha256(read_bounded(photograph, MAX_PHOTOGRAPH_BYTES)).hexdigest()
+    through = known.source if known else "no lens"
+    source = f"{table.name}, sha256 {points.sha256}; {photograph.name}, sha256 {seen}; {through}"
+    file = registration_file(fitted, source, f"brushloop {version('brushloop')}")
+    for flag in flags:
+        typer.echo(f"warning: {flag}")
     typer.echo(
         f"turned by {file.turn_deg:.3f} deg, scale {file.scale:.5f}, residual {file.rms_mm:.3f} mm, "
         f"{file.left_out_rms_mm:.3f} mm for a point that was left out\n{file.save(out)}"
@@ -225,16 +239,3 @@ def _pair(text: str) -> tuple[int, int]:
     if len(parts) != 2 or not all(part.isdigit() and len(part) < 4 for part in parts):
         raise CalibrationError("board", f"{text!r} is no size like 9x6")
     return int(parts[0]), int(parts[1])
-
-
-def _gray(path: Path) -> Gray:
-    from calibrate.errors import CalibrationError
-    from sessions.errors import SessionDamaged
-    from sessions.messages import decode_gray
-
-    try:
-        return decode_gray(path.read_bytes(), str(path))
-    except OSError as error:
-        raise CalibrationError(str(path), error.strerror or str(error)) from None
-    except SessionDamaged as error:
-        raise CalibrationError(str(path), error.what) from None

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.errors import CalibrationError
+
 Gray = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 ROUNDS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
@@ -24,6 +26,13 @@ class Lens:
     """(5,) k1, k2, p1, p2, k3."""
     size_px: tuple[int, int]
     """Width and height."""
+
+    def check_size(self, image: Gray, where: str) -> None:
+        """Raises `CalibrationError` for an (h, w) photograph of another size: the lens says nothing of it."""
+        size_px = (image.shape[1], image.shape[0])
+        if size_px != self.size_px:
+            is_px, was_px = (f"{width} x {height} px" for width, height in (size_px, self.size_px))
+            raise CalibrationError(where, f"is {is_px}, the lens was calibrated at {was_px}")
 
     def straight(self, pixels: Floats) -> Floats:
         """(n, 2) pixels of a photograph -> where they lie in the straightened one."""
@@ -41,6 +50,16 @@ class Lens:
     def straighten(self, image: Gray) -> Gray:
         """The photograph as a lens without distortion would have taken it, same size and camera matrix."""
         return cast("Gray", cv2.undistort(image, self.matrix, self.distortion))
+
+
+def lens_of(
+    matrix: tuple[float, float, float, float],
+    distortion: tuple[float, float, float, float, float],
+    size_px: tuple[int, int],
+) -> Lens:
+    """A lens from what files hold: fx, fy, cx, cy in pixels; k1, k2, p1, p2, k3; width and height."""
+    fx, fy, cx, cy = matrix
+    return Lens(np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.array(distortion), size_px)
 
 
 def distort(rays: Floats, distortion: Floats) -> Floats:

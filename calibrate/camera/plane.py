@@ -37,11 +37,20 @@ class Plane:
     interval_mm_per_px: tuple[float, float]
     """95 %: the noise of corners carried through homography and radial terms, not an error of the printed board."""
     rms_px: float
+    bend_px: float
+    """How much the lens as it was given leaves bent: root mean square of what the radial terms of this view explain."""
     middle_px: tuple[float, float]
     """Where pix2len holds, in the photograph as it was taken."""
     corners: int
     dropped: tuple[int, ...]
     """Corners, by their place among those given, that do not lie on the plane of the others."""
+
+    def scale_at(self, pixel: Floats) -> float:
+        """mm per pixel of the photograph as it was taken, at one of its pixels (2,)."""
+        around = pixel + STEP_PX * np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+        left, right, up, down = self.to_paper(around)
+        across, along = right - left, down - up
+        return float(np.sqrt(abs(across[0] * along[1] - across[1] * along[0]))) / (2.0 * STEP_PX)
 
     def to_paper(self, pixels: Floats) -> Floats:
         """(n, 2) pixels of the photograph as it was taken -> mm in the paper frame."""
@@ -87,12 +96,16 @@ def fit_bent_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, rad
     spread = _spread(pull, left.reshape(-1, 2), paper_mm[kept], float(left @ left) / free)
     reach = float(student.ppf(0.975, free)) * spread
     refined, image_to_paper = model.parts(fitted.x)
+    straight = lens.straight(pixels[kept])
+    flat = apply(homography(paper_mm[kept], straight, where), paper_mm[kept]) - straight
+    flat_rms_px = float(np.sqrt((flat**2).sum(axis=1).mean()))
     return Plane(
         refined,
         image_to_paper,
         float(np.exp(scale)),
         (float(np.exp(scale - reach)), float(np.exp(scale + reach))),
         rms_px,
+        float(np.sqrt(max(flat_rms_px**2 - rms_px**2, 0.0))),
         (float(middle[0]), float(middle[1])),
         int(kept.sum()),
         tuple(int(k) for k in dropped),

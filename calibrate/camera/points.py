@@ -15,9 +15,9 @@ from calibrate.camera.artefact import RegistrationFile
 from calibrate.camera.lens import Floats
 from calibrate.camera.register import Registration
 from calibrate.errors import CalibrationError
+from calibrate.files import read_bounded
 
 COLUMNS = ("name", "robot_x_mm", "robot_y_mm", "image_x_px", "image_y_px")
-MAX_BYTES = 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,13 +34,9 @@ class Points:
 
 def read_points(table: Path) -> Points:
     """Read `COLUMNS`. Raises `CalibrationError` naming line and column."""
+    data = read_bounded(table)
     try:
-        if table.stat().st_size > MAX_BYTES:
-            raise CalibrationError(str(table), f"is larger than {MAX_BYTES} bytes")
-        data = table.read_bytes()
         rows = list(csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True))
-    except OSError as error:
-        raise CalibrationError(str(table), error.strerror or str(error)) from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise CalibrationError(str(table), f"is no CSV table in UTF-8: {error}") from None
     missing = [name for name in COLUMNS if not rows or name not in rows[0]]

@@ -31,11 +31,51 @@ app.command(SESSION)(calibrate)
 
 
 @app.command()
+def show(
+    artefact: Annotated[Path, typer.Argument(help="A calibration, lens, registration or brush fit, or a session.")],
+) -> None:
+    """What an artefact holds, or a session's newest calibration."""
+    from calibrate.compare import described, read_any
+
+    path, made = read_any(artefact)
+    typer.echo("\n".join([str(path), *described(made)]))
+
+
+@app.command()
+def diff(
+    one: Annotated[Path, typer.Argument(help="An artefact, or a session: its newest calibration.")],
+    other: Annotated[Path, typer.Argument(help="Another of the same kind.")],
+) -> None:
+    """What is different in another artefact, and for calibrations what that means on the paper."""
+    from calibrate.compare import differences, read_any
+
+    lines = differences(read_any(one)[1], read_any(other)[1])
+    typer.echo("\n".join(lines) if lines else "they are equal")
+
+
+@app.command("apply")
+def apply_to(
+    calibration: Annotated[Path, typer.Argument(help="A calibration/<hash>.json.")],
+    session: Annotated[Path, typer.Argument(help="The session that it is to be used for.")],
+    force: Annotated[bool, typer.Option(help="Also another session's; every result is then labelled.")] = False,
+) -> None:
+    """Use a calibration for a session from now on; another session's only by force."""
+    from calibrate.apply import apply_calibration
+    from calibrate.artefact import Calibration, load_artefact
+
+    path = apply_calibration(calibration, session, force=force)
+    if label := load_artefact(path, Calibration).label:
+        typer.echo(f"warning: {label}")
+    typer.echo(str(path))
+
+
+@app.command()
 def preprocess(
     capture: Annotated[Path, typer.Argument(help="A session (folder or .mcap), or a photograph.")],
     stroke: Annotated[str, typer.Option(help="Stroke of the session, the first by default.")] = "",
     px_per_mm: Annotated[float | None, typer.Option(help="Scale of a photograph.")] = None,
     before: Annotated[Path | None, typer.Option(help="Photograph of the page before the stroke came.")] = None,
+    lens: Annotated[Path | None, typer.Option(help="Lens file; the session's own by default.")] = None,
     out: Annotated[Path, typer.Option(help="The picture; the numbers go beside it as .json.")] = Path("stages.png"),
 ) -> None:
     """Show every stage of one capture as one picture, and write down each number that was fitted on the way."""
@@ -44,7 +84,7 @@ def preprocess(
     if capture.suffix.lower() in (".png", ".jpg", ".jpeg"):
         trace = show_photograph(capture, px_per_mm, before, out)
     else:
-        trace = show_stroke(capture, stroke, out)
+        trace = show_stroke(capture, stroke, out, lens=lens)
     for name, value in trace.log.items():
         typer.echo(f"{name} {value:.6g}")
     for flag in trace.flags:

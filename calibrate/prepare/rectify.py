@@ -2,20 +2,43 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Protocol, cast
 
 import cv2
 import numpy as np
 
+from calibrate.artefact import Calibration
 from calibrate.camera.lens import Floats, Gray
-from calibrate.camera.plane import Plane
-from calibrate.preprocess import PX_PER_MM
+from calibrate.errors import CaptureRefused
+from calibrate.preprocess import PX_PER_MM, rectify
 
 KNOTS = 8
 """The lens bends so little that its map is worked out at every eighth pixel and interpolated."""
 
 
-def rectify_bent(image: Gray, plane: Plane, window_mm: tuple[float, float, float, float]) -> Gray:
+class SeenPlane(Protocol):
+    """A plane of paper that a photograph shows."""
+
+    def to_image(self, paper_mm: Floats) -> Floats:
+        """(n, 2) mm in the paper frame -> (n, 2) pixels of the photograph as it was taken."""
+        ...
+
+
+def rectify_by(image: Gray, calibration: Calibration, window_mm: tuple[float, float, float, float], where: str) -> Gray:
+    """The window of the paper frame at 20 px/mm, by a calibration: straightened where it names a lens.
+
+    Raises `CaptureRefused` for a photograph of another size than the calibration's.
+    """
+    if calibration.lens is None:
+        return rectify(image, calibration.homography(), window_mm)
+    height, width = image.shape
+    if (width, height) != calibration.lens.size_px:
+        wanted = "{} x {}".format(*calibration.lens.size_px)
+        raise CaptureRefused(where, f"is {width} x {height} px, the calibration is for {wanted} px")
+    return rectify_bent(image, calibration, window_mm)
+
+
+def rectify_bent(image: Gray, plane: SeenPlane, window_mm: tuple[float, float, float, float]) -> Gray:
     """The window (x, y, width, height in the paper frame) at 20 px/mm, as `calibrate.preprocess.rectify` gives it.
 
     The photograph is as it was taken: what the lens bends is undone here.

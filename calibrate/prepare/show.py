@@ -9,16 +9,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibrate.camera.drift import board_of, see_plane
 from calibrate.camera.lens import Gray
+from calibrate.camera.session import NO_BOARD, board_of, known_lens
+from calibrate.camera.view import see_straight
 from calibrate.errors import CalibrationError
 from calibrate.field import Field
-from calibrate.files import write_whole
+from calibrate.files import read_gray, write_whole
 from calibrate.prepare.difference import new_stroke
 from calibrate.prepare.params import Params
 from calibrate.prepare.picture import contact_sheet
 from calibrate.prepare.stages import Trace, trace_scaled, trace_seen
-from sessions.errors import SessionDamaged
 from sessions.messages import decode_gray
 from sessions.reader import Capture, Recording
 from sessions.sequence import SEQUENCE
@@ -26,8 +26,11 @@ from sessions.sequence import SEQUENCE
 PAPER = 255
 
 
-def show_stroke(session: Path, stroke: str, out: Path, params: Params | None = None) -> Trace:
-    """A stroke of a session by its name, the first where that is empty. Raises `CalibrationError`."""
+def show_stroke(session: Path, stroke: str, out: Path, params: Params | None = None, lens: Path | None = None) -> Trace:
+    """A stroke of a session by its name, the first where that is empty; by a lens file, or the session's own lens.
+
+    Raises `CalibrationError`.
+    """
     recording = Recording(session)
     before: Capture | None = None
     for capture in recording.captures():
@@ -40,9 +43,12 @@ def show_stroke(session: Path, stroke: str, out: Path, params: Params | None = N
     if one.anchor_mm is not None:
         boards = list(recording.stills_of("board"))
         if not boards:
-            raise CalibrationError(str(recording.path), "holds no view of the board (a `board` step)")
-        plane = see_plane(decode_gray(boards[-1], where), board_of(session), None, where)
-        trace = trace_seen(image, plane, Field().window_mm(one.anchor_mm), one.anchor_mm, where, params or Params())
+            raise CalibrationError(str(recording.path), NO_BOARD)
+        known = known_lens(recording, lens)
+        photograph = decode_gray(boards[-1], where)
+        plane, _ = see_straight(photograph, board_of(recording), known.lens() if known else None, where)
+        window_mm, chosen = Field().window_mm(one.anchor_mm), params or Params()
+        trace = trace_seen(image, plane, window_mm, one.anchor_mm, where, chosen, one.cell_mm)
     elif one.px_per_mm is not None:
         if recording.header.protocol.startswith(SEQUENCE) and before is not None:
             image = only_new(before.image(), image, float(np.mean(one.px_per_mm)), where)
@@ -58,9 +64,9 @@ def show_photograph(
     """A flat photograph of known scale. Raises `CalibrationError`."""
     if px_per_mm is None:
         raise CalibrationError(str(path), "is a photograph: give --px-per-mm")
-    image = _gray(path)
+    image = read_gray(path)
     if before is not None:
-        image = only_new(_gray(before), image, px_per_mm, str(path))
+        image = only_new(read_gray(before), image, px_per_mm, str(path))
     trace = trace_scaled(image, (px_per_mm, px_per_mm), None, str(path), params or Params())
     return _written(trace, params or Params(), out)
 
@@ -77,12 +83,3 @@ def _written(trace: Trace, params: Params, out: Path) -> Trace:
     told = {"where": trace.where, "params": asdict(params), "fitted": trace.log, "flags": list(trace.flags)}
     write_whole(out.with_suffix(".json"), json.dumps(told, indent=2) + "\n")
     return trace
-
-
-def _gray(path: Path) -> Gray:
-    try:
-        return decode_gray(path.read_bytes(), str(path))
-    except OSError as error:
-        raise CalibrationError(str(path), error.strerror or str(error)) from None
-    except SessionDamaged as error:
-        raise CalibrationError(str(path), error.what) from None

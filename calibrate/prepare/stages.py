@@ -15,7 +15,17 @@ from calibrate.prepare.components import components, fill_holes
 from calibrate.prepare.light import flatten
 from calibrate.prepare.params import PX_PER_MM, Mask, Params, Soft
 from calibrate.prepare.rectify import rectify_bent
-from calibrate.preprocess import find_level, on_raster, raise_flags, rescale, soft_ink, to_levels, touches_edge
+from calibrate.preprocess import (
+    cell_window,
+    find_level,
+    on_raster,
+    on_window,
+    raise_flags,
+    rescale,
+    soft_ink,
+    to_levels,
+    touches_edge,
+)
 
 SIZE_PX = 128
 MM_PER_PX = 0.2
@@ -62,10 +72,11 @@ def trace_seen(
     anchor_mm: tuple[float, float],
     where: str,
     params: Params,
+    cell_mm: tuple[float, float, float, float] | None = None,
 ) -> Trace:
     """A photograph of a sheet whose plane is known; `window_mm` (x, y, width, height) holds the stroke.
 
-    Raises `CaptureRefused` as `prepare` does.
+    What lies outside the paper cell is hidden, as `prepare` hides it. Raises `CaptureRefused` as `prepare` does.
     """
     k1, k2, p1, p2, k3 = (float(v) for v in plane.lens.distortion)
     lens = {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
@@ -78,7 +89,8 @@ def trace_seen(
         ),
     )
     left, top = anchor_mm[0] - window_mm[0], window_mm[1] + window_mm[3] - anchor_mm[1]
-    return _from_raster(raster, (left * PX_PER_MM, top * PX_PER_MM), where, params, stages)
+    cell_px = None if cell_mm is None else on_window(cell_mm, window_mm)
+    return _from_raster(raster, (left * PX_PER_MM, top * PX_PER_MM), where, params, stages, cell_px)
 
 
 def trace_scaled(
@@ -96,10 +108,17 @@ def trace_scaled(
 
 
 def _from_raster(
-    raster: Gray, anchor_px: tuple[float, float] | None, where: str, params: Params, before: tuple[Stage, ...]
+    raster: Gray,
+    anchor_px: tuple[float, float] | None,
+    where: str,
+    params: Params,
+    before: tuple[Stage, ...],
+    cell_px: tuple[int, int, int, int] | None = None,
 ) -> Trace:
-    reflectance = flatten(raster, params)
-    level = find_level(reflectance, where, params)
+    window = cell_window(raster, cell_px, where)
+    reflectance = np.ones(raster.shape, np.float32)
+    reflectance[window] = flatten(raster[window], params)
+    level = find_level(reflectance[window], where, params)
     levels = to_levels(reflectance)
     ink = levels <= round(255.0 * level.threshold)
     chosen = components(ink, anchor_px, params)
@@ -107,7 +126,7 @@ def _from_raster(
         raise CaptureRefused(where, "holds no stroke after specks and neighbours were removed")
     mask = fill_holes(chosen.mask, params)
     soft = soft_ink(reflectance, chosen.mask)
-    flags = list(raise_flags(raster, mask, chosen))
+    flags = list(raise_flags(raster[window], mask[window], chosen))
     crop_mask, crop_soft, corner, whole = _crop(mask, soft)
     if not whole:
         flags.append(f"too long: the stroke does not fit {FIELD_PX / PX_PER_MM:g} mm, its ends are cut off")
@@ -116,7 +135,7 @@ def _from_raster(
     binary = np.asarray(coverage, np.float32) > HALF
     small_soft = cast("Soft", cv2.resize(crop_soft, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA))
     small_anchor = None if anchor is None else (anchor[0] / SHRINK, anchor[1] / SHRINK)
-    light = (raster / np.maximum(reflectance, 1e-3)).astype(np.float32)
+    light = (raster / np.maximum(reflectance, 1e-3)).astype(np.float32)[window]
     after = (
         Stage("light", np.clip(light, 0, 255).astype(np.uint8), _range(light, "gray_level")),
         Stage("flatten", levels, {"background_mm": params.background_mm}),

@@ -10,7 +10,7 @@ from collect.plane import PaperPlane
 from collect.procedures import CLEARANCE_MM, Move, dip_moves, park_moves, press_moves, wash_moves, zero_touch_moves
 from collect.sheet import Cell, to_base
 from collect.steps import Step, StepKind
-from collect.touch.selfcheck import triangle_in
+from collect.touch.selfcheck import triangle_on
 from drivers.geometry import brush_pose
 from drivers.samples import Pose
 
@@ -45,8 +45,10 @@ class StepMoves:
         return found
 
 
-def moves_of(config: RigConfig, plane: PaperPlane, step: Step, cell: Cell | None) -> StepMoves:
-    """`cell` is where a press or a figure goes."""
+def moves_of(
+    config: RigConfig, plane: PaperPlane, step: Step, cell: Cell | None, more: tuple[Cell, ...] = ()
+) -> StepMoves:
+    """`cell` is where a press or a figure goes; `more` are the others that a self-check marks."""
     match step.kind:
         case StepKind.ZERO_TOUCH:
             return StepMoves([*zero_touch_moves(config)])
@@ -56,6 +58,8 @@ def moves_of(config: RigConfig, plane: PaperPlane, step: Step, cell: Cell | None
             wash = config.ink.wash
             washed = [] if wash is None or step.index % wash.every_dips else wash_moves(config, wash)
             return StepMoves([*washed, *dip_moves(config)], dips=1)
+        case StepKind.CHOOSE:
+            return StepMoves()
         case StepKind.BOARD | StepKind.CAPTURE:
             return StepMoves([*park_moves(config)], captures=1)
         case StepKind.PRESS:
@@ -64,7 +68,7 @@ def moves_of(config: RigConfig, plane: PaperPlane, step: Step, cell: Cell | None
             return StepMoves([*down, *up], dwell_s=_number(step, "dwell_s"))
         case StepKind.SELF_CHECK:
             assert cell is not None
-            places_mm = triangle_in(cell, config.self_check)
+            places_mm = triangle_on((cell, *more), config.self_check)
             moves = [
                 move
                 for x_mm, y_mm in places_mm

@@ -14,6 +14,7 @@ from collect.planning.walk import sheet_of
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.plans import planned
 from collect.sheet import Sheet
+from collect.touch.selfcheck import partners
 
 Axes = Any
 """matplotlib's, whose types are incomplete."""
@@ -123,9 +124,10 @@ def _sheet(
             )
             axes.plot(*cell.anchor_mm, "+", color=ink, markersize=5, alpha=0.7)
     if number == 1 and plan.steps.get("self_check"):
-        cell = sheet.cell(0)
-        axes.add_patch(_outline(cell.rect_mm, GREY))
-        axes.text(cell.x_mm + 2.0, cell.y_mm + 0.5 * cell.height_mm, "self-check", fontsize=8, va="center")
+        first = sheet.cell(0)
+        for cell in (first, *partners(sheet, first, set())):
+            axes.add_patch(_outline(cell.rect_mm, GREY))
+            axes.text(cell.x_mm + 2.0, cell.y_mm + 0.5 * cell.height_mm, "self-check", fontsize=8, va="center")
     axes.plot(*zip(*plan.touches_mm, strict=True), "x", color=ORANGE, markersize=7, mew=2.0)
     axes.set_xlim(-3.0, config.paper.size_mm[0] + 3.0)
     axes.set_ylim(-3.0, config.paper.size_mm[1] + 3.0)

@@ -12,7 +12,7 @@ from collect.planning.marks import reach_of
 from collect.planning.timing import OMITTED, step_s
 from collect.planning.walk import sheet_of, walk
 from collect.procedures import park_moves
-from collect.protocols.config import ProtocolConfig, ReplayConfig, WriteConfig
+from collect.protocols.config import AdaptiveConfig, ProtocolConfig, ReplayConfig, WriteConfig
 from collect.protocols.plans import planned
 from collect.sheet import Cell, Sheet
 from collect.steps import StepKind
@@ -116,6 +116,11 @@ def _warnings(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list
     warnings: list[str] = []
     if isinstance(protocol, ReplayConfig) and protocol.ignored_columns:
         warnings.append(f"{protocol.file}: columns that are not used: {', '.join(protocol.ignored_columns)}")
+    if isinstance(protocol, AdaptiveConfig):
+        warnings.append(
+            f"the presses are chosen while they are made: this is the worst case, {protocol.most} presses; it stops "
+            f"after {protocol.least_presses} at the earliest"
+        )
     over_mm, worst = max(_overhangs(config, protocol, sheet), default=(0.0, ""))
     if over_mm > 0.0:
         warnings.append(

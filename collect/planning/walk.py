@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from collect.config import RigConfig
 from collect.plane import PaperPlane
@@ -14,6 +14,7 @@ from collect.protocols.plans import cell_mm, steps
 from collect.protocols.self_check import with_self_check
 from collect.sheet import Cell, Sheet
 from collect.steps import MARKING, Protocol, Result, Step, StepKind
+from collect.touch.selfcheck import partners
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +27,8 @@ class Walked:
     cell: Cell | None
     """That it marks or shows."""
     moves: StepMoves
+    more_cells: list[Cell] = field(default_factory=list[Cell])
+    """That it marks besides."""
 
 
 def sheet_of(config: RigConfig, protocol: ProtocolConfig) -> Sheet:
@@ -35,7 +38,11 @@ def sheet_of(config: RigConfig, protocol: ProtocolConfig) -> Sheet:
 
 def layout_of(config: RigConfig, protocol: ProtocolConfig) -> Layout:
     """For `steps` and `planned`: the sheet's columns and rows, and what the self-check takes of the first."""
-    return replace(sheet_of(config, protocol).layout, taken=int(config.self_check.enabled))
+    sheet = sheet_of(config, protocol)
+    if not config.self_check.enabled or not sheet.capacity:
+        return sheet.layout
+    first = sheet.cell(0)
+    return replace(sheet.layout, taken=frozenset({0} | {cell.index for cell in partners(sheet, first, set())}))
 
 
 def steps_on(config: RigConfig, protocol: ProtocolConfig) -> Protocol:
@@ -50,21 +57,27 @@ def walk(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
     The sheet must have room for a cell.
     """
     plane, sheet = PaperPlane(config.paper.touch_z_mm), sheet_of(config, protocol)
-    marks = 0
+    number = 0
+    used: set[int] = set()
     generator = steps_on(config, protocol)
     try:
         step = next(generator)
         while True:
-            number, index = divmod(marks, max(sheet.capacity, 1))
             answer: Result = {}
-            cell = None
+            cell, shown = None, number
+            more: tuple[Cell, ...] = ()
             if step.kind in MARKING:
-                cell, answer = sheet.cell(index), {"sheet": number, "cell": index}
-                marks += 1
+                if len(used) == sheet.capacity:
+                    number += 1
+                    used.clear()
+                cell, shown = sheet.free(used, number + 1), number
+                more = partners(sheet, cell, used) if step.kind == StepKind.SELF_CHECK else ()
+                used |= {one.index for one in (cell, *more)}
+                answer = {"sheet": number, "cell": cell.index}
             elif step.kind == StepKind.CAPTURE:
-                number = int(step.params["sheet"] or 0)
+                shown = int(step.params["sheet"] or 0)
                 cell = sheet.cell(int(step.params["cell"] or 0))
-            yield Walked(step, number + 1, cell, moves_of(config, plane, step, cell))
+            yield Walked(step, shown + 1, cell, moves_of(config, plane, step, cell, more), list(more))
             step = generator.send(answer)
     except StopIteration:
         return

@@ -8,6 +8,7 @@ press moves what follows by one cell: the balance is of the plan.
 
 from __future__ import annotations
 
+import itertools
 import random
 from collections.abc import Hashable, Sequence
 
@@ -27,10 +28,10 @@ def balanced(rounds: Sequence[Sequence[Hashable]], layout: Layout, seed: int) ->
     share = _shares(layout)
     seen: dict[Hashable, list[int]] = {}
     orders: list[list[int]] = []
-    place = layout.taken
+    places = (place for place in itertools.count() if place not in layout.taken)
     for conditions in rounds:
         order = list(range(len(conditions)))
-        bands = [_bands(layout, place + slot) for slot in range(len(order))]
+        bands = [_bands(layout, next(places)) for _ in order]
         for condition, at in zip(conditions, bands, strict=True):
             _count(seen.setdefault(condition, [0] * (2 * BANDS)), at, 1)
         for _ in range(TRIALS_PER_STROKE * len(order) if len(order) > 1 else 0):
@@ -45,7 +46,6 @@ def balanced(rounds: Sequence[Sequence[Hashable]], layout: Layout, seed: int) ->
             else:
                 _exchange(seen[a], seen[b], bands[k], bands[i])
         orders.append(order)
-        place += len(order)
     return orders
 
 

@@ -56,6 +56,51 @@ class GridConfig(ProtocolBase):
         return self
 
 
+class AdaptiveConfig(ProtocolBase):
+    """Presses chosen one by one, each where it tells most about the brush; stops where little is left to be won."""
+
+    kind: Literal["adaptive"]
+    heights_mm: Annotated[list[DeepMm], Field(min_length=1, max_length=100)]
+    """Depths H below the touch height."""
+    tilts_deg: Annotated[list[TiltDeg], Field(min_length=1, max_length=100)]
+    """Tilts alpha from the paper's normal."""
+    repeats: Repeats = 10
+    """Of the shuffled grid that it stands in for: what it saved is told against that grid's number of presses."""
+    most_presses: Annotated[int, Field(ge=1, le=MAX_STROKES)] | None = None
+    """Stop after so many at the latest; left out, as many as the grid has. No fewer than the cells: limits, ink and
+    sheets are planned for the worst case, and every cell may be chosen."""
+    least_presses: Annotated[int, Field(ge=3, le=1000)] = 5
+    """Do not stop before."""
+    enough_points: Annotated[float, Field(gt=0.0, le=50.0)] = 1.0
+    """Stop when fewer points of CSIM (percent), in the mean over all cells, are expected to be won by pressing on."""
+    dwell_s: DwellS = 0.2
+    """Time at full depth."""
+
+    @model_validator(mode="after")
+    def _whole(self) -> AdaptiveConfig:
+        for name in ("heights_mm", "tilts_deg"):
+            values = getattr(self, name)
+            if len(set(values)) != len(values):
+                raise ValueError(f"{name} has the same value twice: {values}")
+        _bounded(self.whole_grid)
+        cells = len(self.heights_mm) * len(self.tilts_deg)
+        if self.most < cells:
+            raise ValueError(f"most_presses = {self.most}: at least the {cells} cells of the grid")
+        if self.least_presses > self.most:
+            raise ValueError(f"least_presses = {self.least_presses}: at most most_presses = {self.most}")
+        return self
+
+    @property
+    def whole_grid(self) -> int:
+        """Presses of the grid that it stands in for."""
+        return len(self.heights_mm) * len(self.tilts_deg) * self.repeats
+
+    @property
+    def most(self) -> int:
+        """Presses in the worst case."""
+        return self.whole_grid if self.most_presses is None else self.most_presses
+
+
 class ListConfig(ProtocolBase):
     """Presses one by one, from a CSV next to `protocol.toml` or written out in it."""
 
@@ -194,7 +239,7 @@ class CalibrationConfig(ProtocolBase):
         return self
 
 
-ProtocolConfig = GridConfig | ListConfig | ReplayConfig | WriteConfig | CalibrationConfig
+ProtocolConfig = GridConfig | AdaptiveConfig | ListConfig | ReplayConfig | WriteConfig | CalibrationConfig
 TaggedProtocol = Annotated[ProtocolConfig, Field(discriminator="kind")]
 
 

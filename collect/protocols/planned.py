@@ -13,8 +13,8 @@ class Layout:
 
     columns: int
     rows: int
-    taken: int = 0
-    """Cells that are used before the first stroke."""
+    taken: frozenset[int] = frozenset()
+    """Cells of the first sheet that are used before the first stroke."""
 
     @property
     def capacity(self) -> int:

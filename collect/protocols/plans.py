@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collect.protocols import calibration, grid, listed, replay, write
+from collect.protocols import adaptive, calibration, grid, listed, replay, write
 from collect.protocols.config import (
+    AdaptiveConfig,
     CalibrationConfig,
     GridConfig,
     ListConfig,
@@ -16,10 +17,12 @@ from collect.steps import Protocol
 
 
 def planned(config: ProtocolConfig, layout: Layout | None = None) -> list[Planned]:
-    """Every stroke exactly once, in order. Empty for `calibration`."""
+    """Every stroke exactly once, in order; of `adaptive` the worst case. Empty for `calibration`."""
     match config:
         case GridConfig():
             return grid.planned(config, layout)
+        case AdaptiveConfig():
+            return adaptive.planned(config)
         case ListConfig():
             return listed.planned(config, layout)
         case ReplayConfig():
@@ -35,6 +38,8 @@ def steps(config: ProtocolConfig, layout: Layout | None = None) -> Protocol:
     match config:
         case GridConfig():
             return grid.steps(config, layout)
+        case AdaptiveConfig():
+            return adaptive.steps(config)
         case ListConfig():
             return listed.steps(config, layout)
         case ReplayConfig():

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterable
+from collections.abc import Generator, Iterable
 
 from collect.protocols.config import WriteConfig
 from collect.protocols.planned import Planned
 from collect.protocols.rows import TrajectoryPoint
-from collect.steps import Params, Protocol, Step, StepKind
+from collect.steps import Params, Protocol, Result, Step, StepKind
 
 
 def stroke_steps(plan: Iterable[Planned], *, board_every: int | None, write: WriteConfig | None = None) -> Protocol:
@@ -19,22 +19,31 @@ def stroke_steps(plan: Iterable[Planned], *, board_every: int | None, write: Wri
     for number, stroke in enumerate(plan):
         if board_every is not None and number > 0 and number % board_every == 0:
             yield Step(StepKind.BOARD, number // board_every)
-        for take in itertools.count(1):
-            # Only a second take has a number: the keys of first ones are those of older sessions.
-            taken: Params = {} if take == 1 else {"take": take}
-            dipped = yield Step(StepKind.DIP, stroke.index, taken)
-            if dipped.get("skipped"):
-                break
-            if stroke.figure is None:
-                marked = yield Step(StepKind.PRESS, stroke.index, _press_params(stroke) | taken)
-            else:
-                assert write is not None
-                marked = yield Step(StepKind.DRAW, stroke.index, _draw_params(stroke, write) | taken)
-            # A capture belongs to one cell: made again elsewhere, it is another step.
-            place = _capture_params(stroke, int(marked["sheet"]), int(marked["cell"]))
-            seen = yield Step(StepKind.CAPTURE, stroke.index, place | taken)
-            if not seen.get("retake"):
-                break
+        yield from takes(stroke, write=write)
+
+
+def takes(
+    stroke: Planned, *, write: WriteConfig | None = None, measured: bool = False
+) -> Generator[Step, Result, None]:
+    """Dip, press or draw, capture; again where the capture says so. `measured`: the capture also tells the ink."""
+    for take in itertools.count(1):
+        # Only a second take has a number: the keys of first ones are those of older sessions.
+        taken: Params = {} if take == 1 else {"take": take}
+        dipped = yield Step(StepKind.DIP, stroke.index, taken)
+        if dipped.get("skipped"):
+            break
+        if stroke.figure is None:
+            marked = yield Step(StepKind.PRESS, stroke.index, _press_params(stroke) | taken)
+        else:
+            assert write is not None
+            marked = yield Step(StepKind.DRAW, stroke.index, _draw_params(stroke, write) | taken)
+        # A capture belongs to one cell: made again elsewhere, it is another step.
+        place = _capture_params(stroke, int(marked["sheet"]), int(marked["cell"]))
+        if measured:
+            place["measured"] = True
+        seen = yield Step(StepKind.CAPTURE, stroke.index, place | taken)
+        if not seen.get("retake"):
+            break
 
 
 def strokes_text(strokes: Iterable[Iterable[TrajectoryPoint]]) -> str:

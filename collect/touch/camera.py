@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from calibrate.errors import CalibrationError
 from calibrate.scale import see_board
 from collect.errors import StepError
+from collect.optics import straightened
 from collect.plane import PaperPlane, fit_plane
 from collect.rig import Rig
 from collect.touch.arm import TouchArm
@@ -174,7 +175,8 @@ class FirstInkTouch:
         return await asyncio.to_thread(self._measure_ink, before, after, spots)
 
     def _measure_ink(self, before: Frame, after: Frame, spots: list[Spot]) -> NDArray[np.float64]:
-        first, second = gray(before.image), gray(after.image)
+        camera = self._rig.config.camera
+        first, second = (straightened(camera, gray(frame.image)) for frame in (before, after))
         try:
             plane = see_board(second, self._rig.config.board)
         except CalibrationError as error:

@@ -117,7 +117,8 @@ class SelfCheckConfig(Config):
     enabled: bool = False
     depth_mm: Annotated[float, Field(ge=0.5, le=10.0)] = 2.0
     legs_mm: tuple[Annotated[float, Field(ge=8.0, le=200.0)], Annotated[float, Field(ge=8.0, le=200.0)]] = (24.0, 15.0)
-    """Along paper x and y from the corner of the triangle; uneven, so that it tells which is which."""
+    """Along paper x and y from the corner of the triangle, on sheets without room for one over three cells; uneven, so
+    that it tells which is which."""
     offset_mm: Positive = 3.0
     """The marks may lie so far from where they were commanded, all together; a soft tip lands beside its axis."""
     turn_deg: Positive = 1.0

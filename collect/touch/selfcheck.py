@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import math
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +17,10 @@ from numpy.typing import NDArray
 from calibrate.errors import CalibrationError
 from calibrate.scale import see_board
 from collect.errors import StepError
+from collect.optics import straightened
 from collect.plane import PaperPlane
 from collect.rig import Rig
-from collect.sheet import Cell
+from collect.sheet import Cell, Sheet
 from collect.touch.arm import TouchArm
 from collect.touch.camera import Hands
 from collect.touch.config import SelfCheckConfig
@@ -30,6 +32,12 @@ Floats = NDArray[np.float64]
 Triangle = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 UNEVEN = 0.2
 """How badly the second best order of the marks must fit, or a mirror image could pass for a turn."""
+LEAST_SPAN_MM = 60.0
+"""Of a wide triangle along either axis."""
+MOST_OF_SHEET = 0.25
+"""Share of a sheet's cells that a check may take; smaller sheets are checked in one cell."""
+MOST_MARK_MM2 = 400.0
+"""Of ink: a brush that is pressed 10 mm deep leaves less."""
 APPROACH_MM = 4.0
 """Height above the paper at which a mark's slow approach begins."""
 MIRRORS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
@@ -77,10 +85,40 @@ def triangle_in(cell: Cell, config: SelfCheckConfig) -> Triangle:
     return (left, bottom), (left + x_mm, bottom), (left, bottom + y_mm)
 
 
-def triangle_of(cells: tuple[Cell, Cell, Cell]) -> Triangle:
+def triangle_of(cells: Sequence[Cell]) -> Triangle:
     """One place in each of three spare cells far apart, as at three corners of the sheet: the longer, the surer."""
     a, b, c = (cell.anchor_mm for cell in cells)
     return a, b, c
+
+
+def partners(sheet: Sheet, cell: Cell, used: Set[int]) -> tuple[Cell, ...]:
+    """Two free cells that make a wide triangle with this one, along its row and its column; none without room.
+
+    Wide enough, a triangle tells 2 % from 1 % by marks whose places are known to some tenths of a millimetre.
+    """
+    if sheet.capacity * MOST_OF_SHEET < 3:
+        return ()
+    row, column = divmod(cell.index, sheet.columns)
+    free = [sheet.cell(index) for index in range(sheet.capacity) if index not in used and index != cell.index]
+    x_mm, y_mm = cell.anchor_mm
+    along_row = [c for c in free if c.index // sheet.columns == row and abs(c.anchor_mm[0] - x_mm) >= LEAST_SPAN_MM]
+    along_column = [
+        c for c in free if c.index % sheet.columns == column and abs(c.anchor_mm[1] - y_mm) >= LEAST_SPAN_MM
+    ]
+    # The farthest first: a square sheet needs a nearer one on one side, or the triangle would be too even.
+    pairs = sorted(
+        itertools.product(along_row, along_column),
+        key=lambda pair: -abs(pair[0].anchor_mm[0] - x_mm) * abs(pair[1].anchor_mm[1] - y_mm),
+    )
+    for pair in pairs:
+        if _second_best(np.array(triangle_of((cell, *pair)))) >= UNEVEN:
+            return pair
+    return ()
+
+
+def triangle_on(cells: Sequence[Cell], config: SelfCheckConfig) -> Triangle:
+    """Over three cells where there are three, else in the one."""
+    return triangle_of(cells) if len(cells) == 3 else triangle_in(cells[0], config)
 
 
 async def self_check(
@@ -109,13 +147,20 @@ async def self_check(
 
 
 def _find(rig: Rig, before: Frame, after: Frame, config: SelfCheckConfig) -> Floats:
-    first, second = gray(before.image), gray(after.image)
+    camera = rig.config.camera
+    first, second = (straightened(camera, gray(frame.image)) for frame in (before, after))
     try:
         plane = see_board(second, rig.config.board)
     except CalibrationError as error:
         # a board that is seen in a mirror is not seen
         raise StepError(f"self-check: the board is not seen: {error.what}") from None
     marks = new_marks(first, second, plane.image_to_paper, config.least_ink_mm2)
+    if marks and marks[0].ink_mm2 > MOST_MARK_MM2:
+        large = marks[0]
+        raise StepError(
+            f"self-check: {large.ink_mm2:.0f} mm2 at ({large.x_mm:.0f}, {large.y_mm:.0f}) mm became dark, which no "
+            "mark does: is the arm, or its shadow, in the picture? See camera.latency_ms and motion.park_mm"
+        )
     if len(marks) != 3:
         listed = "; ".join(f"{m.ink_mm2:.1f} mm2 at ({m.x_mm:.0f}, {m.y_mm:.0f})" for m in marks[:6])
         raise StepError(

@@ -1,67 +1,92 @@
-"""The run screen: looks at the engine ten times a second; its keys pause, resume and stop."""
+"""The operator's app: looks at the engine ten times a second and shows it; its keys ask the engine for things."""
 
 from __future__ import annotations
 
-import contextlib
+import asyncio
 import threading
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import ClassVar
 
-from textual.app import App, ComposeResult
+from textual import events, work
+from textual.app import App, SystemCommand
 from textual.binding import Binding, BindingType
-from textual.widgets import Footer
+from textual.screen import Screen
 
-from collect.asking import Prompt
-from collect.errors import CollectAborted
-from collect.headless import REFRESH_S, RunnableEngine, stopping_signals
-from collect.snapshot import EngineView, Snapshot
-from collect.states import FINAL, State
+from collect.desk import Desk
+from collect.errors import ConfigError
+from collect.headless import REFRESH_S, RunnableEngine
+from collect.snapshot import Snapshot
+from collect.states import FINAL
 from collect.tui.ask import AskScreen
-from collect.tui.confirm import ConfirmQuit
+from collect.tui.confirm import AT_WORK, AT_WORK_KEYS, NOT_PARKED, NOT_PARKED_KEYS, Confirm
+from collect.tui.help import HelpScreen
+from collect.tui.pictures import Pictures
+from collect.tui.run import CAN_PAUSE, CAN_RESUME, RunScreen
+from collect.tui.set_up import SetUpScreen
+from collect.tui.start import StartScreen
 from collect.tui.terminal import TerminalDriver
-from collect.tui.view import RunView
+from collect.tui.text import plain
+from collect.wishes import Wish
+from sessions.errors import SessionError
 
-CAN_PAUSE = frozenset({State.IDLE, State.RECOVERING, State.RUNNING})
-CAN_RESUME = frozenset({State.PAUSING, State.PAUSED})
+STOP_KEYS = frozenset({"s", "ctrl+c"})
+COMMANDS = (
+    ("Stop the arm now", "A software stop; the red button is the emergency stop", "stop"),
+    ("Pause or go on", "Before the next step", "pause"),
+    ("Retake", "Press the stroke in hand again", "wish('RETAKE')"),
+    ("Skip", "Leave the stroke in hand out", "wish('SKIP')"),
+    ("New sheet", "Put a new sheet in before the next stroke", "wish('NEW_SHEET')"),
+    ("Jog", "Find the paper again by jog before the next stroke", "wish('JOG')"),
+    ("Review", "Look through the captures", "review"),
+    ("Leave", "Finish the step, park, leave", "quit"),
+)
 
 
-class ScreenCrashed(Exception):
-    """The screen ended by a defect of its own, which it has printed; the arm was stopped."""
+class OperatorApp(App[None]):
+    """One app for a whole day, or, handed an engine, for one run."""
 
-
-class RunApp(App[None]):
-    """The operator's screen for one run."""
-
-    CSS = """
-    Screen { layout: vertical; }
-    """
     TITLE = "brushloop"
-    ENABLE_COMMAND_PALETTE = False
     # A selection would be copied with ctrl+c, which is a stop key here.
     ALLOW_SELECT = False
-    AUTO_FOCUS = "#log-pane"
-    # The stop keys have priority: no focus, no dialog is ever between the operator and a stop.
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("p", "pause", "Pause"),
-        Binding("p", "resume", "Resume"),
-        Binding("s", "stop", "Stop arm", key_display="s, ctrl+c", priority=True),
-        Binding("ctrl+c", "stop", "Stop arm", show=False, priority=True),
-        Binding("q", "quit", "Quit"),
+        Binding("ctrl+c", "quit", "Leave", show=False, priority=True),
+        Binding("space,p", "pause", "Pause or go on"),
+        Binding("r", "wish('RETAKE')", "Retake"),
+        Binding("k", "wish('SKIP')", "Skip"),
+        Binding("n", "wish('NEW_SHEET')", "New sheet"),
+        Binding("j", "wish('JOG')", "Jog"),
+        Binding("v", "review", "Review"),
+        Binding("question_mark", "help", "Help"),
+        Binding("q", "quit", "Leave"),
     ]
 
-    def __init__(self, engine: EngineView) -> None:
+    def __init__(
+        self,
+        engine: RunnableEngine | None = None,
+        *,
+        desk: Desk | None = None,
+        pictures: Pictures | None = None,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """With an engine, that run; with a desk, the start screen first. `now_s` is the clock of questions."""
         super().__init__(driver_class=TerminalDriver)
-        self._engine = engine
-        self._now: Snapshot = engine.snapshot()
+        self.engine = engine
+        self._desk = desk
+        self._pictures = pictures or Pictures()
+        self._now_s = now_s
+        self._now: Snapshot | None = None if engine is None else engine.snapshot()
+        self._main: RunScreen | SetUpScreen | None = None
         self._leave = threading.Event()
-
-    def compose(self) -> ComposeResult:
-        """The view and the keys."""
-        yield RunView()
-        yield Footer()
+        self._leave_when_over = False
 
     def on_mount(self) -> None:
         """Look now, then at 10 Hz."""
-        self._view = self.query_one(RunView)
+        if self._desk is not None:
+            self.push_screen(StartScreen(self._desk, self._begin, self._review_named))
+        if self.engine is not None:
+            self._show_run()
         self.call_after_refresh(self._look)
         self.set_interval(REFRESH_S, self._look)
 
@@ -71,92 +96,181 @@ class RunApp(App[None]):
         return self._leave.is_set()
 
     def leave(self) -> None:
-        """End the screen soon, whatever the state; from any thread."""
+        """End the app soon, whatever the state; from any thread."""
         self._leave.set()
 
+    @property
+    def at_work(self) -> bool:
+        """Whether a run is on."""
+        return self._now is not None and self._now.state not in FINAL
+
+    async def on_event(self, event: events.Event) -> None:
+        """The stop keys first of all: textual would leave a letter to a field that takes text, as the palette has."""
+        if isinstance(event, events.Key) and event.key in STOP_KEYS and self.at_work:
+            self.action_stop()
+            return
+        await super().on_event(event)
+
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Hide the half of pause and resume that does not apply."""
+        """Without a run, the keys of a run do nothing."""
+        if action == "stop":
+            return self.at_work
         if action == "pause":
-            return self._now.state in CAN_PAUSE
-        if action == "resume":
-            return self._now.state in CAN_RESUME
+            return self._now is not None and self._now.state in CAN_PAUSE | CAN_RESUME
+        if action == "wish":
+            return self.at_work
         return super().check_action(action, parameters)
 
-    def action_pause(self) -> None:
-        """Pause before the next step."""
-        self._engine.pause()
-
-    def action_resume(self) -> None:
-        """Go on."""
-        self._engine.resume()
+    def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
+        """The keys by name, then light and dark."""
+        for title, what, action in COMMANDS:
+            if self.check_action(action.partition("(")[0], ()):
+                yield SystemCommand(title, what, lambda action=action: self.call_later(self.run_action, action))
+        dark = self.theme != "textual-light"
+        yield SystemCommand(
+            "Light colours" if dark else "Dark colours",
+            "For a bright room, or a dark one",
+            lambda: setattr(self, "theme", "textual-light" if dark else "textual-dark"),
+        )
 
     def action_stop(self) -> None:
-        """Stop the arm, without a question."""
-        self._engine.stop()
+        """Stop the arm, without a question; shown at once, whatever lies over the run."""
+        if self.engine is not None:
+            self.engine.stop()
+            if self._main is not None and self._main.is_mounted:
+                self._main.stop_sent()
+            if self.screen is not self._main:
+                self.notify("STOP SENT", severity="warning", timeout=2)
+
+    def action_pause(self) -> None:
+        """Pause before the next step, or go on."""
+        if self.engine is not None and self._now is not None:
+            (self.engine.resume if self._now.state in CAN_RESUME else self.engine.pause)()
+
+    def action_wish(self, name: str) -> None:
+        """Ask the engine for something, or take it back."""
+        if self.engine is not None:
+            self.engine.wish(Wish[name])
+            self._look()
+
+    def action_help(self) -> None:
+        """Every key."""
+        if not isinstance(self.screen, HelpScreen):
+            self.push_screen(HelpScreen())
+
+    def action_review(self) -> None:
+        """Look through the captures of the run that is shown."""
+        if self._now is not None and self._now.folder and self.screen is self._main:
+            self._review(Path(self._now.folder))
 
     async def action_quit(self) -> None:
-        """Leave; asks first while the run is on."""
-        if self._engine.snapshot().state in FINAL:
+        """Leave, but only with the arm parked, or after a word about it."""
+        if isinstance(self.screen, Confirm):
+            return
+        now = self._now
+        if now is None:
             self.exit()
-        elif not isinstance(self.screen, ConfirmQuit):
-            self.push_screen(ConfirmQuit(), self._answered)
+        elif now.state not in FINAL:
+            self.push_screen(Confirm(AT_WORK, AT_WORK_KEYS), self._park_answered)
+        elif now.parked or now.target_mm is None:
+            self._away()
+        else:
+            self.push_screen(Confirm(NOT_PARKED, NOT_PARKED_KEYS), self._leave_answered)
 
-    def _answered(self, yes: bool | None) -> None:
+    def _park_answered(self, yes: bool | None) -> None:
+        if yes and self.engine is not None:
+            self._leave_when_over = True
+            self.engine.park()
+
+    def _leave_answered(self, yes: bool | None) -> None:
         if yes:
-            self._engine.stop()
+            self._away()
+
+    def _away(self) -> None:
+        """Back to the start screen where there is one, else out."""
+        if self._desk is None:
             self.exit()
+            return
+        while len(self.screen_stack) > 2:
+            self.pop_screen()
+        self._main = self._now = None
+        self._leave_when_over = False
+
+    def _begin(self, session_id: str | None) -> None:
+        self._make_engine(session_id)
+
+    @work(exclusive=True, group="begin")
+    async def _make_engine(self, session_id: str | None) -> None:
+        """Read and check the files off the screen's loop, then start."""
+        assert self._desk is not None
+        preview = self._pictures.kind != "off"
+        try:
+            engine = await asyncio.to_thread(self._desk.engine, session_id, guided=True, preview=preview)
+        except (ConfigError, SessionError, OSError) as error:
+            if isinstance(self.screen, StartScreen):
+                self.screen.trouble(str(error))
+            return
+        self.engine = engine
+        engine.start()
+        self._now = engine.snapshot()
+        self._show_run()
+
+    def _review_named(self, session_id: str) -> None:
+        assert self._desk is not None
+        self._review(self._desk.paths.root / session_id)
+
+    def _review(self, folder: Path) -> None:
+        from collect.reviewing import Review
+        from collect.tui.review import ReviewScreen
+
+        try:
+            review = Review(folder)
+        except SessionError as error:
+            self.notify(plain(str(error)), severity="error")
+            return
+        self.push_screen(ReviewScreen(review, self._pictures, at_work=lambda: self.at_work))
+
+    def _show_run(self) -> None:
+        """The wizard while the set-up lasts, then the run."""
+        assert self.engine is not None
+        assert self._now is not None
+        wizard = bool(self._now.set_up) and self._now.state not in FINAL
+        if self._main is not None and isinstance(self._main, SetUpScreen) == wizard:
+            return
+        screen = SetUpScreen(self.engine, self._pictures) if wizard else RunScreen(self._pictures)
+        if self._main is None:
+            self.push_screen(screen)
+        elif self.screen is self._main:
+            self.switch_screen(screen)  # pyright: ignore[reportUnknownMemberType]
+        else:
+            return  # something lies over it; at the next look
+        self._main = screen
 
     def _look(self) -> None:
         if self.leaving:
             self.exit()
-        before, self._now = self._now, self._engine.snapshot()
-        self._view.show(self._now)
-        self._ask(self._now.prompt)
+        if self.engine is None or self._now is None:
+            return
+        before, self._now = self._now, self.engine.snapshot()
+        self._show_run()
+        if self._main is not None and self._main.is_mounted:
+            self._main.show(self._now)
+        self._ask(self._now)
         if self._now.state is not before.state:
             self.refresh_bindings()
+        if self._leave_when_over and self._now.state in FINAL:
+            if isinstance(self.screen, Confirm):
+                self.pop_screen()
+            self._away()
 
-    def _ask(self, prompt: Prompt | None) -> None:
+    def _ask(self, now: Snapshot) -> None:
+        prompt = None if isinstance(self._main, SetUpScreen) else now.prompt
         shown = next((screen for screen in self.screen_stack if isinstance(screen, AskScreen)), None)
         if shown is not None and prompt is not None and shown.prompt.number == prompt.number:
-            shown.tell_time()
+            if shown.is_mounted:
+                shown.tell_time()
             return
         if shown is not None and shown is self.screen:
             self.pop_screen()
-        if prompt is not None and not isinstance(self.screen, ConfirmQuit | AskScreen):
-            self.push_screen(AskScreen(prompt, self._engine))
-
-
-class _StopAndLeave:
-    """What signals may do: one may mean that nobody is there to press q."""
-
-    def __init__(self, engine: EngineView, app: RunApp) -> None:
-        self._engine = engine
-        self._app = app
-
-    def stop(self) -> None:
-        """Stop the arm first, then end the screen."""
-        self._engine.stop()
-        self._app.leave()
-
-
-def run_screen(engine: RunnableEngine) -> None:
-    """Run under the screen until the operator leaves; raises what ended the run."""
-    app = RunApp(engine)
-    with stopping_signals(_StopAndLeave(engine, app)):
-        engine.start()
-        intact = False
-        try:
-            app.run()
-            # A screen that lost its terminal was told to leave; that is no defect.
-            intact = app.leaving or not app.return_code
-        finally:
-            # However the screen ended, nobody watches the arm any more.
-            if not engine.finished:
-                engine.stop()
-            if not intact:
-                # The engine's thread dies with the process: let it bring the arm to rest and close the session first.
-                with contextlib.suppress(CollectAborted):
-                    engine.join()
-        if not intact:
-            raise ScreenCrashed("the screen crashed; the arm was stopped")
-        engine.join()
+        if prompt is not None and self.engine is not None and not isinstance(self.screen, Confirm | AskScreen):
+            self.push_screen(AskScreen(prompt, self.engine, self._pictures, self._now_s))

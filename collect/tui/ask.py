@@ -1,17 +1,25 @@
-"""A question of the engine, with its answers on keys. The stop keys go on working over it."""
+"""A question of the engine, with the picture that caused it and its answers on keys. The stop keys go on working over
+it."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 from textual import events
 from textual.app import ComposeResult
 from textual.containers import Vertical
+from textual.content import Content
 from textual.screen import ModalScreen
 from textual.widgets import Static
 
 from collect.asking import Prompt
 from collect.snapshot import EngineView
+from collect.tui.line import Line
+from collect.tui.pictures import Pictures
+from collect.tui.text import plain
+
+STOP_LINE = "s  stop the arm now (software stop; the red button is the emergency stop)"
 
 
 class AskScreen(ModalScreen[None]):
@@ -20,28 +28,36 @@ class AskScreen(ModalScreen[None]):
     DEFAULT_CSS = """
     AskScreen { align: center middle; }
     AskScreen Vertical {
-        width: 90%; max-width: 76; height: auto; max-height: 90%; padding: 1 2;
+        width: 90%; max-width: 76; height: auto; max-height: 95%; padding: 0 2;
         border: heavy $warning; background: $surface; overflow-y: auto;
     }
     AskScreen #question { text-style: bold; margin-bottom: 1; }
-    AskScreen #left { margin-top: 1; color: $text-muted; }
+    AskScreen #cause { height: 9; margin-bottom: 1; }
+    AskScreen #left { color: $text-muted; }
     """
 
-    def __init__(self, prompt: Prompt, engine: EngineView) -> None:
+    def __init__(
+        self, prompt: Prompt, engine: EngineView, pictures: Pictures, now_s: Callable[[], float] = time.monotonic
+    ) -> None:
         super().__init__()
         self.prompt = prompt
         self._engine = engine
+        self._pictures = pictures
+        self._now_s = now_s
+        self._left = Line("left")
+        self.tell_time()
 
     def compose(self) -> ComposeResult:
-        """The question, and a line for each answer."""
+        """The question, its picture, and a line for each answer."""
         with Vertical():
-            yield Static(self.prompt.question, id="question", markup=False)
-            for choice in self.prompt.choices:
-                timed = self.prompt.timeout_s is not None and choice.key == self.prompt.default
-                mark = "   (if nobody answers)" if timed else ""
-                yield Static(f"{choice.key}  {choice.label}{mark}", markup=False)
-            yield Static("s  stop the arm now. The red button is the emergency stop.", markup=False)
-            yield Static("", id="left", markup=False)
+            yield Static(plain(self.prompt.question), id="question", markup=False)
+            if self.prompt.image is not None:
+                picture = self._pictures.make("cause")
+                picture.show(self.prompt.image)
+                yield picture
+            yield Static(choices_content(self.prompt), markup=False)
+            yield Static(STOP_LINE, markup=False)
+            yield self._left
 
     def on_key(self, event: events.Key) -> None:
         """An answer's key answers."""
@@ -51,6 +67,21 @@ class AskScreen(ModalScreen[None]):
 
     def tell_time(self) -> None:
         """How long the default still waits."""
-        if self.prompt.timeout_s is not None:
-            left_s = max(0.0, self.prompt.timeout_s - (time.monotonic() - self.prompt.asked_s))
-            self.query_one("#left", Static).update(f"{left_s:.0f} s left")
+        self._left.show(timeout_text(self.prompt, self._now_s()))
+
+
+def choices_content(prompt: Prompt) -> Content:
+    """A line for each answer; the default is marked where it is taken by itself."""
+    lines: list[Content] = []
+    for choice in prompt.choices:
+        timed = prompt.timeout_s is not None and choice.key == prompt.default
+        mark = "   (if nobody answers)" if timed else ""
+        lines.append(Content.assemble((choice.key, "bold $text-accent"), f"  {plain(choice.label)}{mark}"))
+    return Content("\n").join(lines)
+
+
+def timeout_text(prompt: Prompt, now_s: float) -> str:
+    """How long the default still waits, or that it waits for ever."""
+    if prompt.timeout_s is None:
+        return "Waits until it is answered; the arm does not move meanwhile."
+    return f"{max(0.0, prompt.timeout_s - (now_s - prompt.asked_s)):.0f} s left"

@@ -1,4 +1,4 @@
-"""The grid of depths and tilts as a table of `done/planned`."""
+"""The grid of depths and tilts as a table that fills: `done/planned`, and a sign for each state besides its colour."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from textual.widget import Widget
 
 from collect.snapshot import CellCount
 
-COMPLETE = "✓"
+COMPLETE, NOW, NEXT, BAD, LEFT_OUT = "✓", "▶", "›", "!", "×"
+LEGEND = f"{COMPLETE} done {NOW} now {NEXT} next {BAD} bad takes {LEFT_OUT} left out"
 GAP = 2
 
 
@@ -66,13 +67,38 @@ def _table(cells: tuple[CellCount, ...], *, tilts_down: bool) -> list[Content]:
 
 
 def _cell_text(cell: CellCount | None) -> str:
-    # The mark has a column of its own, so that counts stay aligned.
+    # The sign has a column of its own, so that counts stay aligned.
     if cell is None:
         return "-  "
-    return f"{cell.done}/{cell.planned} {COMPLETE if cell.done >= cell.planned else ' '}"
+    return f"{cell.done}/{cell.planned} {cell_sign(cell)}"
+
+
+def cell_sign(cell: CellCount) -> str:
+    """What matters most about a cell, in one sign."""
+    if cell.now:
+        return NOW
+    if cell.left_out:
+        return LEFT_OUT
+    if cell.done >= cell.planned:
+        return BAD if cell.bad else COMPLETE
+    if cell.next:
+        return NEXT
+    return BAD if cell.bad else " "
 
 
 def _cell_style(cell: CellCount | None) -> str:
-    if cell is None or cell.done == 0:
+    if cell is None:
         return "dim"
-    return "bold $text-success" if cell.done >= cell.planned else ""
+    match cell_sign(cell):
+        case "▶":
+            return "bold reverse"
+        case "×":
+            return "bold $text-error"
+        case "!":
+            return "bold $text-warning"
+        case "✓":
+            return "bold $text-success"
+        case "›":
+            return "bold"
+        case _:
+            return "" if cell.done else "dim"

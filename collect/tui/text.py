@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 FULL, EMPTY = "█", "░"
+SOFTWARE_STOP = "s is a software stop. The red button is the emergency stop."
 
 
 def plain(text: str) -> str:
@@ -33,4 +34,4 @@ def tip_text(tip_mm: tuple[float, float, float] | None) -> str:
     if tip_mm is None:
         return "no pose"
     x, y, z = tip_mm
-    return f"x {x:8.2f}   y {y:8.2f}   z {z:8.2f} mm"
+    return f"x {x:7.2f}  y {y:7.2f}  z {z:7.2f} mm"

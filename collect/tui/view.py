@@ -2,35 +2,28 @@
 
 from __future__ import annotations
 
+from textual import events
 from textual.app import ComposeResult
 from textual.containers import Horizontal, ScrollableContainer, Vertical, VerticalScroll
 from textual.content import Content
-from textual.widgets import Static
 
-from collect.headless import eta_text
 from collect.snapshot import Snapshot
 from collect.states import FINAL, State
-from collect.tui.grid import COMPLETE, Grid
-from collect.tui.text import bar_text, minutes_text, one_line, plain, tip_text
+from collect.tui.capture import CapturePane
+from collect.tui.facts import facts_content
+from collect.tui.grid import LEGEND, Grid
+from collect.tui.line import Line
+from collect.tui.pictures import Pictures
+from collect.tui.sheet import sheet_content, sheet_title
+from collect.tui.text import SOFTWARE_STOP, one_line, plain
+from collect.tui.trace import plot
 
-SOFTWARE_STOP = "Stop is a software stop, not an emergency stop."
-OVER = "Run is over: press q"
+OVER = "Over: q leaves"
+STOP_SENT = "STOP SENT"
 WARNING = "warning: "
-LABEL = 9
-
-
-class Line(Static):
-    """Text that is drawn again only when it changed, and never read as markup."""
-
-    def __init__(self, place: str) -> None:
-        super().__init__(id=place, markup=False)
-        self._shown: Content | None = None
-
-    def show(self, content: Content) -> None:
-        """Draw, if new."""
-        if self._shown is None or not content.is_same(self._shown):
-            self._shown = content
-            self.update(content)
+NARROW_COLUMNS, TALL_ROWS = 110, 36
+PANES = ("overview", "capture", "camera")
+TRACE_ROWS = 4
 
 
 class RunView(Vertical):
@@ -43,9 +36,9 @@ class RunView(Vertical):
         width: auto; max-width: 50%; padding: 0 1; text-style: bold; text-wrap: nowrap; text-overflow: ellipsis;
         background: $accent; color: $text;
     }
-    RunView #band { height: 5; margin: 1 0; }
+    RunView #band { height: 7; }
     RunView #state {
-        width: 22; height: 5; margin: 0 1; content-align: center middle; text-align: center; text-style: bold;
+        width: 18; height: 7; margin: 0 1; content-align: center middle; text-align: center; text-style: bold;
         background: $panel; color: $text;
     }
     RunView #state.-running { background: $success; }
@@ -55,7 +48,7 @@ class RunView(Vertical):
     RunView #state.-paused { background: $primary; }
     RunView #state.-stopped, RunView #state.-failed { background: $error; }
     RunView #state.-done { background: $success-darken-2; }
-    RunView #facts { width: 1fr; height: 5; text-wrap: nowrap; text-overflow: ellipsis; }
+    RunView #facts { width: 1fr; height: 7; text-wrap: nowrap; text-overflow: ellipsis; }
     RunView #body { height: 1fr; }
     RunView .pane {
         border-top: solid $foreground 40%; border-title-style: bold; border-title-color: $foreground; padding: 0 1;
@@ -66,25 +59,50 @@ class RunView(Vertical):
         border-title-style: bold; padding: 0 1;
     }
     RunView.-wrong #why-pane { display: block; }
-    RunView #grid-pane { height: auto; max-height: 60%; }
-    RunView.-wrong #grid-pane { max-height: 40%; }
+    RunView #left { width: 1fr; }
+    RunView #right { width: 45%; }
+    RunView #top { height: auto; max-height: 60%; }
+    RunView.-wrong #top { max-height: 70%; }
+    RunView.-narrow.-wrong #sheet-pane { display: none; }
+    RunView #grid-pane { width: 1fr; height: auto; }
+    RunView #sheet-pane { width: auto; max-width: 40%; height: auto; min-width: 18; }
+    RunView #trace-pane { height: 6; display: none; }
+    RunView.-tall #trace-pane { display: block; }
+    RunView #legend { width: auto; display: none; }
+    RunView.-tall #legend { display: block; }
     RunView #log-pane { height: 1fr; }
     RunView #log { width: 1fr; height: auto; min-height: 100%; }
-    RunView #note { height: 1; padding: 0 1; background: $panel; }
+    RunView #camera-pane { height: 1fr; }
+    RunView.-narrow #right { display: none; }
+    RunView.-narrow.-capture #right, RunView.-narrow.-camera #right { display: block; width: 1fr; }
+    RunView.-narrow.-capture #left, RunView.-narrow.-camera #left { display: none; }
+    RunView.-narrow.-capture #camera-pane, RunView.-narrow.-camera #capture-pane { display: none; }
+    RunView #note { height: 1; padding: 0 1; background: $panel; text-wrap: nowrap; text-overflow: ellipsis; }
     """
 
-    def __init__(self) -> None:
+    def __init__(self, pictures: Pictures) -> None:
         super().__init__()
         # Held, not queried: a poll may come before the parts are mounted or after they are gone.
         self._session, self._source = Line("session"), Line("source")
         self._state, self._facts = Line("state"), Line("facts")
         self._why, self._why_pane = Line("why"), VerticalScroll(id="why-pane")
         self._grid, self._grid_pane = Grid(), ScrollableContainer(id="grid-pane", classes="pane")
+        self._sheet = Line("sheet-pane", classes="pane")
+        self._trace = Line("trace-pane", classes="pane")
         self._log, self._log_pane = Line("log"), VerticalScroll(id="log-pane", classes="pane")
+        self._capture = CapturePane(pictures)
+        self._camera, self._with_camera = pictures.make("camera-pane"), pictures.kind != "off"
         self._note = Line("note")
         self._messages: tuple[str, ...] = ()
-        self._grid_pane.border_title = f"Strokes done/planned by depth H and tilt α ({COMPLETE} complete)"
+        self._pane = 0
+        self._stop_sent = False
+        self._grid_pane.border_title = "Strokes done/planned by depth H and tilt α"
+        self._legend = Line("legend")
+        self._legend.show(Content.styled(LEGEND, "dim"))
         self._log_pane.border_title = "Log"
+        self._trace.border_title = "Force, peaks by tenth of a second"
+        self._camera.add_class("pane")
+        self._camera.border_title = "Camera"
 
     def compose(self) -> ComposeResult:
         """Top to bottom, by how soon the operator needs it."""
@@ -94,36 +112,74 @@ class RunView(Vertical):
         with Horizontal(id="band"):
             yield self._state
             yield self._facts
-        with Vertical(id="body"):
-            with self._why_pane:
-                yield self._why
-            with self._grid_pane:
-                yield self._grid
-            with self._log_pane:
-                yield self._log
+        with self._why_pane:
+            yield self._why
+        with Horizontal(id="body"):
+            with Vertical(id="left"):
+                with Horizontal(id="top"):
+                    with self._grid_pane:
+                        yield self._grid
+                        yield self._legend
+                    yield self._sheet
+                yield self._trace
+                with self._log_pane:
+                    yield self._log
+            with Vertical(id="right"):
+                yield self._capture
+                if self._with_camera:
+                    yield self._camera
         yield self._note
 
     def on_mount(self) -> None:
         """Stay at the newest line until the operator scrolls away."""
         self._log_pane.anchor()
 
+    def on_resize(self, event: events.Resize) -> None:
+        """What fits is decided by the terminal's size alone."""
+        self.set_class(event.size.width < NARROW_COLUMNS, "-narrow")
+        self.set_class(event.size.height >= TALL_ROWS, "-tall")
+
+    def next_pane(self) -> None:
+        """On a narrow screen: overview, last capture, camera in turn."""
+        shown = PANES if self._with_camera else PANES[:-1]
+        self._pane = (self._pane + 1) % len(shown)
+        for name in PANES:
+            self.set_class(name == shown[self._pane], f"-{name}")
+
+    def stop_sent(self) -> None:
+        """Show at once that the stop key was heard, before the engine has answered."""
+        self._stop_sent = True
+        self._state.show(STOP_SENT)
+        self._state.set_class(True, "-stopping")
+
     def show(self, now: Snapshot) -> None:
         """Draw what differs from the last snapshot."""
-        self._session.show(Content(f"brushloop  {one_line(now.session_id) or 'no session yet'}"))
-        self._source.show(Content(f"source: {one_line(now.source) or 'not known yet'}"))
-        self._state.show(_state_content(now.state))
-        for state in State:
-            self._state.set_class(state is now.state, f"-{state}")
-        self._facts.show(_facts_content(now, self._facts.content_size.width))
+        self._session.show(f"brushloop  {one_line(now.session_id) or 'no session yet'}")
+        self._source.show(f"source: {one_line(now.source) or 'not known yet'}")
+        self._show_state(now.state)
+        self._facts.show(facts_content(now, self._facts.content_size.width))
         self.set_class(bool(now.error), "-wrong")
         failed = now.state is State.FAILED
         self._why_pane.border_title = "Why it failed" if failed else "Why it stopped"
-        self._why.show(Content(plain(now.error)))
+        self._why.show(plain(now.error))
         self._grid.show(now.grid, self._grid_pane.scrollable_content_region.width)
+        self._sheet.show(sheet_content(now.sheet))
+        self._sheet.border_title = sheet_title(now.sheet)
+        if self._trace.display:
+            self._trace.show(plot(now.trace_n, self._trace.content_size.width, TRACE_ROWS))
         if now.messages != self._messages:
             self._messages = now.messages
             self._log.show(Content("\n").join(_message_content(line) for line in now.messages))
-        self._note.show(_note_content(now.state))
+        self._capture.show(now.last)
+        if now.picture is not None and self._camera.display:
+            self._camera.show(now.picture.image)
+        self._note.show(note_content(now))
+
+    def _show_state(self, state: State) -> None:
+        self._stop_sent = self._stop_sent and state not in FINAL | {State.STOPPING}
+        self._state.show(STOP_SENT if self._stop_sent else _state_content(state))
+        for known in State:
+            self._state.set_class(known is (State.STOPPING if self._stop_sent else state), f"-{known}")
 
 
 def _state_content(state: State) -> Content:
@@ -131,35 +187,15 @@ def _state_content(state: State) -> Content:
     return Content(f"{word}\nafter this step") if state is State.PAUSING else Content(word)
 
 
-def _facts_content(now: Snapshot, width: int) -> Content:
-    counts = bar_text(now.strokes_done, now.strokes_planned, 0)
-    bar = bar_text(now.strokes_done, now.strokes_planned, max(width - LABEL - len(counts) - 1, 4))
-    time = f"elapsed {minutes_text(now.elapsed_s)}"
-    if now.state not in FINAL:
-        time += f"   {eta_text(now) or 'no ETA yet'}"
-    voids = f"{now.voids}   left out {now.given_up}" if now.given_up else str(now.voids)
-    tip = tip_text(now.tip_mm)
-    if now.force_n is not None:
-        tip += f"   force {now.force_n:.3f} N"
-    if now.ink_level is not None:
-        tip += f"   ink {now.ink_level:.0%}"
-    rows = (
-        ("Step", one_line(now.step) or "-", "bold"),
-        ("Strokes", bar, ""),
-        ("Time", time, ""),
-        ("Voids", voids, "bold $text-warning" if now.voids or now.given_up else ""),
-        ("Tip", tip, "" if now.tip_mm else "bold $text-warning"),
-    )
-    lines = [Content.assemble((label.ljust(LABEL), "dim"), (text, style)) for label, text, style in rows]
-    return Content("\n").join(lines)
-
-
 def _message_content(line: str) -> Content:
     text = plain(line)
     return Content.styled(text, "bold $text-warning") if text.startswith(WARNING) else Content(text)
 
 
-def _note_content(state: State) -> Content:
-    if state not in FINAL:
-        return Content(SOFTWARE_STOP)
-    return Content.assemble((f" {OVER} ", "bold reverse"), f"  {SOFTWARE_STOP}")
+def note_content(now: Snapshot) -> Content:
+    """What was asked for by key and waits, and what the stop key is."""
+    if now.state in FINAL:
+        return Content.assemble((f" {OVER} ", "bold reverse"), f"  {SOFTWARE_STOP}")
+    if now.wishes:
+        return Content.assemble((f" asked: {'; '.join(now.wishes)} ", "bold reverse"), f"  {SOFTWARE_STOP}")
+    return Content(SOFTWARE_STOP)

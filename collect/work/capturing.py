@@ -12,6 +12,7 @@ from collect.quality.verdict import Family, Verdict
 from collect.sheet import Cell
 from collect.steps import Result
 from collect.wishes import Wish
+from collect.work.choosing import measured
 from collect.work.context import Bench, Job
 from collect.work.looking import Gray, image_plane, photograph
 from collect.work.waiting import uninterrupted
@@ -38,8 +39,10 @@ async def capture(job: Job) -> Result:
     kept, retake = True, False
     if bench.wishes.take(Wish.RETAKE):
         kept, retake = False, True
+        bench.progress.log(f"{stroke_id}: is pressed again, as the operator asked")
     elif bench.wishes.take(Wish.SKIP):
         kept = False
+        bench.progress.log(f"{stroke_id}: is left out, as the operator asked")
     elif verdict is not None and not verdict.passed:
         kept, retake = await _decide(job, verdict, image, cell)
     if not kept:
@@ -54,6 +57,7 @@ async def capture(job: Job) -> Result:
         "kept": kept,
         "retake": retake,
         "verdict": "" if verdict is None or verdict.cause is None else str(verdict.cause.name),
+        **(await measured(job, image, cell) if job.step.params.get("measured") else {}),
     }
 
 

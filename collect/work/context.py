@@ -67,6 +67,9 @@ class Job:
     bench: Bench
     step: Step
     cell: Cell | None
+    """That it marks."""
+    more_cells: tuple[Cell, ...]
+    """That it marks besides."""
     attempt: Attempt
     recorder: Recorder
     guard: ForceGuard

@@ -6,6 +6,7 @@ from calibrate.errors import CalibrationError
 from calibrate.preprocess import Gray
 from calibrate.scale import PlaneFit, see_board
 from collect.errors import BadPicture, NeedsOperator, StepError
+from collect.optics import straightened
 from collect.quality.check import cell_is_blank, check_frame
 from collect.quality.verdict import Check
 from collect.steps import Result
@@ -55,7 +56,7 @@ async def photograph(job: Job) -> Gray:
         frame = await job.bench.procedures.capture()
     with job.recorder.sections.timed("encode still"):
         await uninterrupted(job.recorder.still, frame, job.attempt.serial)
-    return gray(frame.image)
+    return await uninterrupted(straightened, job.bench.rig.config.camera, gray(frame.image))
 
 
 def image_plane(bench: Bench, image: Gray) -> PlaneFit:

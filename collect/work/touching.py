@@ -14,7 +14,7 @@ from collect.touch.config import TouchConfig
 from collect.touch.jog import asked
 from collect.touch.measure import measure_plane
 from collect.touch.results import PlaneResult
-from collect.touch.selfcheck import self_check, triangle_in
+from collect.touch.selfcheck import self_check, triangle_on
 from collect.touch.tap import ForceTap
 from collect.work.context import Job
 from collect.work.dipping import fill_brush
@@ -38,6 +38,8 @@ async def zero_touch(job: Job) -> Result:
     bench.procedures.plane = found.plane
     origin_mm, quaternion = found.plane.frame(rig.config.paper)
     job.recorder.frames([Transform("base", "paper", origin_mm, quaternion)])
+    if (optics := rig.config.camera.optics) is not None:
+        job.recorder.optics(optics)
     return found.as_dict()
 
 
@@ -60,13 +62,15 @@ async def touch(job: Job) -> Result:
 
 
 async def check_rig(job: Job) -> Result:
-    """The SELF_CHECK step: an uneven triangle on a cell of its own tells a mirrored, turned or stretched rig."""
+    """The SELF_CHECK step: an uneven triangle on cells of its own tells a mirrored, turned or stretched rig."""
     bench, cell = job.bench, job.cell
     assert cell is not None
     config = bench.rig.config.self_check
-    places_mm = triangle_in(cell, config)
+    cells = (cell, *job.more_cells)
+    places_mm = triangle_on(cells, config)
     checked = await job.guard.guarded(self_check(bench.rig, _Hands(job), config, places_mm, bench.procedures.plane))
-    return {**checked.as_dict(), "sheet": bench.store.state.sheet, "cell": cell.index}
+    marked = {"sheet": bench.store.state.sheet, "cell": cell.index, "cells": [one.index for one in cells]}
+    return {**checked.as_dict(), **marked}
 
 
 class _Hands:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from model.drag import DragModel
 from model.protocol import StrokeModel
 
 Floats = NDArray[np.float64]
@@ -83,6 +84,13 @@ def depth_of(model: StrokeModel, reach: Reach, tilt_deg: float, half_width_mm: F
     with torch.no_grad():
         widths = model.profile(torch.from_numpy(heights), tilt_deg).width_mm.numpy()
     return np.interp(2 * half_width_mm, np.maximum.accumulate(widths), heights)
+
+
+def dragged_depth_of(drag: DragModel, reach: Reach, half_width_mm: Floats) -> Floats:
+    """The same for a dragged mark, (N,) -> (N,) mm."""
+    heights = np.linspace(*reach.height_mm, _TABLE)
+    half = drag.half_mm + drag.half_per_mm * heights + drag.half_per_mm2 * heights**2
+    return np.interp(half_width_mm, np.maximum.accumulate(half), heights)
 
 
 def behind_of(model: StrokeModel, tilt_deg: float, height_mm: float) -> float:

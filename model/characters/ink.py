@@ -1,7 +1,8 @@
 """Images of trajectories: marks of presses laid over each other along the way, and outlines of characters.
 
 The image of the cell is square, row 0 at its far (upper) edge. A pixel is as dark as the darkest mark on it: ink on
-ink stays ink. What a drag adds to presses (bristles that lag, paint that runs dry) is not in it.
+ink stays ink. With a stroke model, bristles do not lag; with a drag model (`model.drag`, fitted to dragged strokes)
+they do. Paint that runs dry is in neither.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from model.characters.drag import dragged, is_dragged
 from model.characters.glyph import Glyph
 from model.characters.plan import Cell, Path
+from model.drag import DragModel
 from model.outline import Outline
 from model.protocol import StrokeModel
 from model.raster.compiled import coverage_numpy
@@ -55,10 +58,24 @@ def stamped(model: StrokeModel, points: Tensor, side_mm: float, size_px: int = S
     return canvas.unflatten(0, (wide, wide))[tile : tile + size_px, tile : tile + size_px]
 
 
-def written(model: StrokeModel, strokes: Sequence[Floats], side_mm: float, size_px: int = SIZE_PX) -> Image:
-    """The image of whole trajectories, each (N, 5), marks so dense that their edges join to a tenth of a pixel."""
+def written(
+    model: StrokeModel,
+    strokes: Sequence[Floats],
+    side_mm: float,
+    size_px: int = SIZE_PX,
+    *,
+    drag: DragModel | None = None,
+) -> Image:
+    """The image of whole trajectories, each (N, 5), marks so dense that their edges join to a tenth of a pixel.
+
+    With `drag`, strokes that travel are drawn by it.
+    """
     image = np.zeros((size_px, size_px), np.float32)
     for points in strokes:
+        if drag is not None and is_dragged(torch.from_numpy(points)):
+            with torch.no_grad():
+                image = np.maximum(image, dragged(drag, torch.from_numpy(points), side_mm, size_px).float().numpy())
+            continue
         longest = float(np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1).max())
         per_step = max(1, math.ceil(longest / (0.5 * side_mm / size_px)))
         with torch.no_grad():

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.characters.brush import Reach, behind_of, depth_of
+from model.characters.brush import Reach, behind_of, depth_of, dragged_depth_of
 from model.characters.glyph import FOOT_UNITS, SIDE_UNITS, Glyph
+from model.drag import DragModel
 from model.protocol import StrokeModel
 
 Floats = NDArray[np.float64]
@@ -53,13 +54,16 @@ def paths_of(glyph: Glyph, cell: Cell, step_mm: float) -> list[Path]:
     return out
 
 
-def trajectory(path: Path, model: StrokeModel, reach: Reach, cell: Cell, tilt_deg: float) -> Floats:
+def trajectory(
+    path: Path, model: StrokeModel, reach: Reach, cell: Cell, tilt_deg: float, drag: DragModel | None = None
+) -> Floats:
     """Points (N, 5) of x, y, H, alpha, heading along a path; the convention is in `model.characters.brush`.
 
     The tip trails behind the axis, so near the beginning the depth is held so small that it stays within the stroke.
+    With `drag` a depth is that at which a dragged mark is as wide.
     """
     points, half = path.points, path.half_width_mm
-    height = depth_of(model, reach, tilt_deg, half)
+    height = depth_of(model, reach, tilt_deg, half) if drag is None else dragged_depth_of(drag, reach, half)
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     along = np.concatenate(([0.0], np.cumsum(steps)))
     back = behind_of(model, tilt_deg, float(np.median(height)))

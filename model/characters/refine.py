@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from model.characters.brush import Reach
+from model.characters.drag import dragged, is_dragged
 from model.characters.ink import Image, dense, stamped
+from model.drag import DragModel
 from model.protocol import StrokeModel
 
 Floats = NDArray[np.float64]
@@ -35,9 +37,19 @@ class Refined:
 
 
 def refine(
-    model: StrokeModel, strokes: Sequence[Floats], wanted: Image, side_mm: float, reach: Reach, steps: int = 60
+    model: StrokeModel,
+    strokes: Sequence[Floats],
+    wanted: Image,
+    side_mm: float,
+    reach: Reach,
+    steps: int = 60,
+    *,
+    drag: DragModel | None = None,
 ) -> Refined:
-    """Adjust trajectories to an image (N, N) of the cell. `steps` = 0 leaves them as they are."""
+    """Adjust trajectories to an image (N, N) of the cell. `steps` = 0 leaves them as they are.
+
+    With `drag`, strokes that travel are seen through it: the plan then makes up for bristles that lag.
+    """
     size = wanted.shape[0]
     target = torch.from_numpy(wanted).double()
     points = torch.from_numpy(np.concatenate(strokes)) if strokes else torch.zeros(0, 5)
@@ -50,9 +62,7 @@ def refine(
     best, least = [stroke.copy() for stroke in strokes], float("inf")
     for step in range(steps + 1):
         parts = torch.tensor_split(points, ends)
-        per_step = [_per_step(part, px_mm) for part in parts]
-        marks = torch.cat([dense(part, n) for part, n in zip(parts, per_step, strict=True)])
-        image = stamped(model, marks, side_mm, size)
+        image = _image(model, drag, parts, side_mm, size)
         plain = float((image.detach() - target).square().mean())
         losses.append(plain)
         if plain < least:
@@ -72,6 +82,17 @@ def refine(
             feasible = [reach.within(part.numpy(), side_mm) for part in torch.tensor_split(moved, ends)]
             points = torch.from_numpy(np.concatenate(feasible)).requires_grad_()
     return Refined(best, losses)
+
+
+def _image(model: StrokeModel, drag: DragModel | None, parts: Sequence[Tensor], side_mm: float, size: int) -> Tensor:
+    lagging = [drag is not None and is_dragged(part) for part in parts]
+    pressed = [dense(p, _per_step(p, side_mm / size)) for p, lags in zip(parts, lagging, strict=True) if not lags]
+    layers = [stamped(model, torch.cat(pressed), side_mm, size)] if pressed else []
+    if drag is not None:
+        layers += [dragged(drag, p, side_mm, size) for p, lags in zip(parts, lagging, strict=True) if lags]
+    if not layers:
+        return torch.zeros(size, size, dtype=torch.float64)
+    return torch.stack(layers).amax(dim=0)
 
 
 def _per_step(part: Tensor, px_mm: float) -> int:

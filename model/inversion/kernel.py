@@ -8,13 +8,19 @@ Everything is in pixels: x is the column, y the row. Velocities are control poin
 """
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
 
-_compile = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+_compile = numba.njit(**_OPTIONS)
+# Without reference counts: views of arrays in inner loops would count up and down atomically, at half of the time.
+_INNER: dict[str, Any] = {**_OPTIONS, "_nrt": False}
+_inner = numba.njit(**_INNER)
 _GAUSS = 0.5 / math.sqrt(3.0)
 _FAINT = 0.25
+_SORT_PX = 8.0  # a parabola is taken in stretches about so long, because their crossings have to be sorted
 _CUT_PX = 3.0  # an arc of an ellipse is cut into pieces about so long, at least eight
 
 
@@ -63,7 +69,6 @@ def normal_equations(
     target[row[n]]. Fills hessian (B, P, P), gradient (B, P), cost (B,), meat (B, P, P); `cut` (B,) tells the largest
     share of ink in a pixel on the target's edge.
     """
-    count, arcs = points.shape[0], points.shape[1]
     size, p_count = predicted.shape[1], velocities.shape[1]
     rows = np.zeros((size * size, p_count))
     touched = np.empty(size * size, np.int64)
@@ -71,7 +76,22 @@ def normal_equations(
     times = np.empty(4 * size + 8)
     across = (size + block - 1) // block
     blocks = np.zeros((across * across, p_count))
-    v = np.empty((p_count, 3, 2))
+    v, on, moved, curve = np.empty((p_count, 3, 2)), np.empty((3, 2)), np.empty((p_count, 3, 2)), np.empty((3, 2))
+    _sums(
+        points, weights, velocities, rates, predicted, target, block, row, hessian, gradient, cost, meat, cut,
+        rows, touched, seen, times, blocks, v, on, moved, curve,
+    )  # fmt: skip
+
+
+@_inner
+def _sums(
+    points, weights, velocities, rates, predicted, target, block, row, hessian, gradient, cost, meat, cut,
+    rows, touched, seen, times, blocks, v, on, moved, curve,
+):  # fmt: skip
+    """The loop of `normal_equations`, with room for one image."""
+    count, arcs = points.shape[0], points.shape[1]
+    size, p_count = predicted.shape[1], velocities.shape[1]
+    across = (size + block - 1) // block
     for n in range(count):
         used = 0
         for k in range(arcs):
@@ -79,10 +99,16 @@ def normal_equations(
             w = weights[n, k]
             if w == 1.0:
                 for p in range(p_count):
-                    v[p] = velocities[n, p, k]
-                used = _piece(q, v, size, times, rows, touched, seen, used)
+                    for e in range(3):
+                        v[p, e, 0], v[p, e, 1] = velocities[n, p, k, e, 0], velocities[n, p, k, e, 1]
+                parts = math.ceil(_length(q) / _SORT_PX) + 1
+                for m in range(parts):
+                    used = _piece(q, v, m / parts, (m + 1) / parts, size, times, rows, touched, seen, used)
             else:
-                used = _conic(q, w, velocities[n, :, k], rates[n, :, k], size, times, rows, touched, seen, used)
+                used = _conic(
+                    q, w, velocities[n, :, k], rates[n, :, k], size, times, rows, touched, seen, used,
+                    on, moved, curve, v,
+                )  # fmt: skip
         t = target[row[n]]
         edge = 0.0
         for i in range(size):
@@ -125,16 +151,12 @@ def _square_sum(a, b):
     return total
 
 
-@_compile
-def _conic(q, w, velocity, rate, size, times, rows, touched, seen, used):
+@_inner
+def _conic(q, w, velocity, rate, size, times, rows, touched, seen, used, on, moved, curve, v):
     """An arc of an ellipse as parabolas through points at even angles, each with its velocities."""
     p_count = velocity.shape[0]
     half_angle = math.acos(w)
-    length = math.hypot(q[1, 0] - q[0, 0], q[1, 1] - q[0, 1]) + math.hypot(q[2, 0] - q[1, 0], q[2, 1] - q[1, 1])
-    pieces = max(8, math.ceil(length / _CUT_PX))
-    on = np.empty((3, 2))
-    moved = np.empty((p_count, 3, 2))
-    curve, v = np.empty((3, 2)), np.empty((p_count, 3, 2))
+    pieces = max(8, math.ceil(_length(q) / _CUT_PX))
     for piece in range(pieces):
         for end in range(3):
             share = (piece + 0.5 * end) / pieces
@@ -155,23 +177,40 @@ def _conic(q, w, velocity, rate, size, times, rows, touched, seen, used):
                 m = moved[p]
                 v[p, 0, c], v[p, 2, c] = m[0, c], m[2, c]
                 v[p, 1, c] = 2.0 * m[1, c] - 0.5 * (m[0, c] + m[2, c])
-        used = _piece(curve, v, size, times, rows, touched, seen, used)
+        used = _piece(curve, v, 0.0, 1.0, size, times, rows, touched, seen, used)
     return used
 
 
-@_compile
-def _piece(q, v, size, times, rows, touched, seen, used):
-    """Add the flow of one parabola to the rows of the pixels it passes; returns how many pixels are touched so far."""
+@_inner
+def _length(q):
+    """Of the polygon of an arc's control points."""
+    return math.hypot(q[1, 0] - q[0, 0], q[1, 1] - q[0, 1]) + math.hypot(q[2, 0] - q[1, 0], q[2, 1] - q[1, 1])
+
+
+@_inner
+def _sort(part):
+    """By insertion: a piece meets few edges."""
+    for k in range(1, len(part)):
+        t, m = part[k], k
+        while m > 0 and part[m - 1] > t:
+            part[m] = part[m - 1]
+            m -= 1
+        part[m] = t
+
+
+@_inner
+def _piece(q, v, t0, t1, size, times, rows, touched, seen, used):
+    """Add the flow of a parabola between two t to the rows of the pixels it passes; returns how many are touched."""
     x0, y0 = q[0, 0], q[0, 1]
     bx, by = 2.0 * (q[1, 0] - x0), 2.0 * (q[1, 1] - y0)
     ax, ay = x0 - 2.0 * q[1, 0] + q[2, 0], y0 - 2.0 * q[1, 1] + q[2, 1]
-    times[0] = 0.0
-    count = _crossings(x0, bx, ax, size, times, 1)
-    count = _crossings(y0, by, ay, size, times, count)
-    times[count] = 1.0
+    times[0] = t0
+    count = _crossings(x0, bx, ax, t0, t1, size, times, 1)
+    count = _crossings(y0, by, ay, t0, t1, size, times, count)
+    times[count] = t1
     count += 1
     part = times[:count]
-    part.sort()
+    _sort(part)
     for m in range(count - 1):
         low, high = part[m], part[m + 1]
         d = high - low
@@ -200,14 +239,14 @@ def _piece(q, v, size, times, rows, touched, seen, used):
     return used
 
 
-@_compile
-def _crossings(start, slope, bend, size, times, count):
-    """Put every t in (0, 1) at which a coordinate meets a pixel edge of the image into `times`."""
-    end = start + slope + bend
-    low, high = min(start, end), max(start, end)
+@_inner
+def _crossings(start, slope, bend, t0, t1, size, times, count):
+    """Put every t in (t0, t1) at which a coordinate meets a pixel edge of the image into `times`."""
+    begin, end = start + (slope + bend * t0) * t0, start + (slope + bend * t1) * t1
+    low, high = min(begin, end), max(begin, end)
     if bend != 0.0:
         turn = -0.5 * slope / bend
-        if 0.0 < turn < 1.0:
+        if t0 < turn < t1:
             peak = start + 0.5 * slope * turn
             low, high = min(low, peak), max(high, peak)
     for edge in range(max(0, math.ceil(low)), min(size, math.floor(high)) + 1):
@@ -216,12 +255,12 @@ def _crossings(start, slope, bend, size, times, count):
         both = slope + (root if slope >= 0.0 else -root)  # never cancels
         if both != 0.0:
             t = 2.0 * rise / both
-            if 0.0 < t < 1.0:
+            if t0 < t < t1:
                 times[count] = t
                 count += 1
         if bend != 0.0:
             t = -0.5 * both / bend
-            if 0.0 < t < 1.0:
+            if t0 < t < t1:
                 times[count] = t
                 count += 1
     return count

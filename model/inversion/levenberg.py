@@ -84,8 +84,11 @@ def fit(forward: Forward, target: Images, start: Floats, limits: Limits, prior: 
         left = np.sum((there.gradient + precision * (mean[active] - tried)) * step, axis=1)
         curved = 1.0 - left / np.maximum(np.sum(gradient * step, axis=1), 1e-300)
         longer = np.clip(stretch[active] / np.maximum(curved, 1e-3), 1.0, _MOST_STRETCH)
+        # A stretched step that failed says that it was stretched too far, not that more damping is needed: damping it
+        # as well would shorten the next one, whose secant then asks for the same stretch again.
+        change = np.where(better, 0.1, np.where(stretch[active] > 1, 1.0, 10.0))
+        damping[active] = np.clip(damping[active] * change, _LEAST_DAMPING, _MOST_DAMPING)
         stretch[active] = np.where(better & (curved < _SHORT), longer, 1.0)
-        damping[active] = np.clip(damping[active] * np.where(better, 0.1, 10.0), _LEAST_DAMPING, _MOST_DAMPING)
         converged[active[still]] = True
         active = active[~still & (damping[active] < _MOST_DAMPING)]
         if len(active) == 0:

@@ -1,203 +1,149 @@
 """The compiled rasteriser: loops of conic arcs to exact area coverage, one image at a time (numba).
 
-Everything is in pixels here: x is the column, y the row, both from the top left corner. A loop that runs
-counter-clockwise on the paper comes down on its left, so a piece that comes down adds the ink to its right and a
-piece that goes up takes it away again. Each piece is cut where it crosses pixel edges; what lies in one cell
-adds its area there and the rest of its height to the next cell, and a running sum along each row turns these
-steps into coverage (the accumulation buffer of font rasterisers, with parabolas instead of chords).
+A mark that lies inside the image goes by `octants` and `rows`, which is several times faster; any other outline is
+walked cell by cell (`walk`). Both are exact. Places are float64; the image is float32 or float64.
 
-numba compiles at the first call. Places are float64; the image is float32 or float64. Scalars and explicit loops
-throughout, because that is what compiles to fast code. Measured and left out: all crossings of a piece before the
-walk, as vector instructions (slower: most pieces cross few edges); a view of each row (slower); branches instead of
-min and max (slower: they are guessed wrong).
+numba compiles at the first call and keeps the machine code.
 """
 
-import math
+import zlib
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
-_ROUGHNESS = 3e-4  # px: longer half axis times angle^4 of a piece stays below this; 6e-7 of a pixel at most (measured)
-_ROUNDING = 5e-7  # a running sum this close to 0 or 1 between two boundaries is taken for it
-_TINY = 1e-300  # keeps 0 / 0 at a tangent from becoming NaN
-_compile = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+from model.raster.octants import FALLEN, OPTIONS, ellipse, parabola
+from model.raster.rows import add_steps, fill_rows, single
+from model.raster.walk import sum_rows, walk_ellipse, walk_parabola
+
+_MOST_ARCS = 16  # of an outline that is not walked: many arcs are short, and each costs as much as twenty pixels
+_PAGE = 4096
 
 
-@_compile
+class Work(NamedTuple):
+    """Room for one image at a time; see `octants` and `rows`."""
+
+    cuts: np.ndarray
+    low: np.ndarray
+    edge: np.ndarray
+    at: np.ndarray
+    next: np.ndarray
+    here: np.ndarray
+    there: np.ndarray
+    ends: np.ndarray
+    passed: np.ndarray
+    parts_at: np.ndarray
+    parts_by: np.ndarray
+    waiting: np.ndarray
+    spans: np.ndarray
+
+
 def rasterise(points, weights, placed, out):
     """Fill `out` (B, N, N) with the coverage of the loops `points` (B, K, 3, 2) and `weights` (B, K).
 
     `placed` (B, 6) maps a loop's mm to pixels: column = p0 x + p1 y + p2, row = p3 x + p4 y + p5.
     """
-    size = out.shape[1]
-    spans = np.empty((size, 4), np.int64)
-    for n in range(out.shape[0]):
-        out[n] = 0
-        for i in range(size):
-            spans[i, 0] = spans[i, 2] = size
-            spans[i, 1] = spans[i, 3] = -2
-        p = placed[n]
-        for k in range(points.shape[1]):
-            q = points[n, k]
-            x0, y0 = p[0] * q[0, 0] + p[1] * q[0, 1] + p[2], p[3] * q[0, 0] + p[4] * q[0, 1] + p[5]
-            x1, y1 = p[0] * q[1, 0] + p[1] * q[1, 1] + p[2], p[3] * q[1, 0] + p[4] * q[1, 1] + p[5]
-            x2, y2 = p[0] * q[2, 0] + p[1] * q[2, 1] + p[2], p[3] * q[2, 0] + p[4] * q[2, 1] + p[5]
-            if weights[n, k] == 1.0:
-                _parabola(out, n, spans, x0, y0, x1, y1, x2, y2)
-            else:
-                _ellipse(out, n, spans, x0, y0, x1, y1, x2, y2, weights[n, k])
-        _sum_rows(out, n, spans)
+    _rasterise(points, weights, placed, out, _work(out.shape[1], min(points.shape[1], _MOST_ARCS), out.dtype))
 
 
-@_compile
-def _ellipse(out, n, spans, x0, y0, x1, y1, x2, y2, w):
-    """An arc of an ellipse as parabolas that have the same ends and the same area under them."""
-    angle = math.acos(w)
-    sine = math.sin(angle)
-    mx, my = 0.5 * (x0 + x2), 0.5 * (y0 + y2)
-    cx, cy = x1 + (mx - x1) / (sine * sine), y1 + (my - y1) / (sine * sine)
-    ex, ey = (mx - cx) / w, (my - cy) / w
-    fx, fy = 0.5 * (x2 - x0) / sine, 0.5 * (y2 - y0) / sine
-    longer = math.sqrt(max(ex * ex + ey * ey, fx * fx + fy * fy))
-    pieces = max(1, math.ceil(2 * angle * (longer / _ROUGHNESS) ** 0.25))
-    half = angle / pieces
-    c, s = math.cos(half), math.sin(half)
-    # On the unit circle: two thirds of the triangle equal the segment, (2 half - sin 2 half) / 2.
-    reach = c + 1.5 * (half - s * c) / s
-    u, v = w * c + sine * s, w * s - sine * c  # the first piece's middle, at half - angle
-    for k in range(pieces):
-        xe, ye = x2, y2
-        if k < pieces - 1:
-            a, b = u * c - v * s, v * c + u * s
-            xe, ye = cx + ex * a + fx * b, cy + ey * a + fy * b
-        xm, ym = cx + reach * (ex * u + fx * v), cy + reach * (ey * u + fy * v)
-        _parabola(out, n, spans, x0, y0, xm, ym, xe, ye)
-        x0, y0 = xe, ye
-        u, v = u * (c * c - s * s) - 2 * v * s * c, v * (c * c - s * s) + 2 * u * s * c
+def _work(size, arcs, dtype):
+    """Every array on a page of its own: where they share pages the loops take half as long again."""
+    layout, room = _layout(size, arcs, dtype)
+    raw = np.empty(room + _PAGE, np.uint8)
+    start = -raw.ctypes.data % _PAGE
+    work = Work(*[np.ndarray(shape, kind, raw, start + at) for shape, kind, at in layout])
+    work.passed[:] = work.waiting[:] = 0
+    return work
 
 
-@_compile
-def _parabola(out, n, spans, x0, y0, x1, y1, x2, y2):
-    """A quadratic Bezier curve, cut where it turns back in x or y."""
-    turns_x, turns_y = (x1 - x0) * (x2 - x1) < 0, (y1 - y0) * (y2 - y1) < 0
-    if not turns_x and not turns_y:
-        _monotone(out, n, spans, x0, y0, x1, y1, x2, y2)
-        return
-    a = (x0 - x1) / (x0 - 2 * x1 + x2) if turns_x else 1.0
-    b = (y0 - y1) / (y0 - 2 * y1 + y2) if turns_y else 1.0
-    low, px, py = 0.0, x0, y0
-    for high in (min(a, b), max(a, b), 1.0):
-        if high <= low:
-            continue
-        h, g = 1 - high, 1 - low
-        xa, xb, ya, yb = h * x0 + high * x1, h * x1 + high * x2, h * y0 + high * y1, h * y1 + high * y2
-        qx, qy = h * xa + high * xb, h * ya + high * yb
-        if high == 1.0:
-            qx, qy = x2, y2
-        # The middle point of a monotone part lies between its ends; rounding must not undo that.
-        mx = min(max(g * xa + low * xb, min(px, qx)), max(px, qx))
-        my = min(max(g * ya + low * yb, min(py, qy)), max(py, qy))
-        _monotone(out, n, spans, px, py, mx, my, qx, qy)
-        low, px, py = high, qx, qy
+@cache
+def _layout(size, arcs, dtype):
+    """Shapes, types and places of the arrays of `Work`, and the bytes that they take."""
+    steps, parts = 5 * arcs * (size + 8), 5 * arcs + 2
+    shapes = (
+        ((4,), np.float64),
+        *(((size + 16,), np.int32),) * 2,
+        *(((steps,), np.int32),) * 2,
+        *(((steps,), dtype),) * 2,
+        *(((2, size), np.int32),) * 2,
+        ((size, parts), np.int32),
+        ((size, parts), np.float64),
+        ((size,), np.int32),
+        ((size, 4), np.int64),
+    )
+    layout, at = [], 0
+    for shape, kind in shapes:
+        layout.append((shape, kind, at))
+        at += -(-np.dtype(kind).itemsize * int(np.prod(shape)) // _PAGE) * _PAGE
+    return tuple(layout), at
 
 
-@_compile
-def _monotone(out, n, spans, x0, y0, x1, y1, x2, y2):
-    """A quadratic Bezier curve that turns back nowhere: row by row downwards, and in each row cell by cell."""
-    size = out.shape[1]
-    sign, side = 1.0, 0
-    if y2 < y0:
-        x0, y0, x2, y2 = x2, y2, x0, y0
-        sign, side = -1.0, 2
-    if y2 <= 0.0 or y0 >= size or y0 == y2:
-        return
-    bx, by = 2 * (x1 - x0), 2 * (y1 - y0)
-    ax, ay = x0 - 2 * x1 + x2, y0 - 2 * y1 + y2
-    # The integral of x dy between two t is that of the chord and this times the third power of their difference.
-    bulge = sign * (bx * ay - ax * by) / 6
-    right = x2 >= x0
-    way = 1.0 if right else -1.0
-    t, x, y = 0.0, x0, y0
-    if y0 < 0.0:
-        t = -2 * y0 / (by + math.sqrt(max(0.0, by * by - 4 * ay * y0)) + _TINY)
-        x, y = x0 + (ax * t + bx) * t, 0.0
-    j = math.floor(x)
-    for i in range(max(0, math.floor(y0)), min(size, math.ceil(y2))):
-        te, xe, ye = 1.0, x2, y2
-        if i + 1.0 < y2:
-            ye = i + 1.0
-            te = 2 * (ye - y0) / (by + math.sqrt(max(0.0, by * by + 4 * ay * (ye - y0))) + _TINY)
-            xe = x0 + (ax * te + bx) * te
-        je = math.floor(xe)
-        spans[i, side] = min(spans[i, side], min(j, je))
-        spans[i, side + 1] = max(spans[i, side + 1], max(j, je, 0))
-        carry = 0.0  # what the cell left behind owes the cell on its right (going right), or its own (going left)
-        while j != je:
-            xc = j + 1.0 if right else float(j)
-            tc = 2 * (xc - x0) / (bx + way * (math.sqrt(max(0.0, bx * bx + 4 * ax * (xc - x0))) + _TINY))
-            yc = min(max(y0 + (ay * tc + by) * tc, y), ye)
-            d, drop = tc - t, sign * (yc - y)
-            area = 0.5 * (x + xc) * drop + bulge * d * d * d - j * drop  # right of the cell's left edge
-            if right:
-                _add(out, n, i, j, carry + drop - area)
-                carry = area
-                j += 1
-            else:
-                _add(out, n, i, j + 1, carry + area)
-                carry = drop - area
-                j -= 1
-            t, x, y = tc, xc, yc
-        d, drop = te - t, sign * (ye - y)
-        area = 0.5 * (x + xe) * drop + bulge * d * d * d - j * drop
-        if right:
-            _add(out, n, i, j, carry + drop - area)
-            _add(out, n, i, j + 1, area)
+@numba.njit(**OPTIONS)
+def _pixels(q, p):
+    """An arc's control points in pixels."""
+    x0, y0 = p[0] * q[0, 0] + p[1] * q[0, 1] + p[2], p[3] * q[0, 0] + p[4] * q[0, 1] + p[5]
+    x1, y1 = p[0] * q[1, 0] + p[1] * q[1, 1] + p[2], p[3] * q[1, 0] + p[4] * q[1, 1] + p[5]
+    x2, y2 = p[0] * q[2, 0] + p[1] * q[2, 1] + p[2], p[3] * q[2, 0] + p[4] * q[2, 1] + p[5]
+    return x0, y0, x1, y1, x2, y2
+
+
+@numba.njit(**OPTIONS)
+def _stepped(points, weights, placed, image, work):
+    """Draw a mark that lies inside the image; False, and nothing drawn, where it does not or is too tightly bent."""
+    size = image.shape[0]
+    used = np.int64(0)  # a literal would be a type of its own and compile everything twice
+    for k in range(points.shape[0]):
+        x0, y0, x1, y1, x2, y2 = _pixels(points[k], placed)
+        if weights[k] == 1.0:
+            used = parabola(x0, y0, x1, y1, x2, y2, size, work, used)
         else:
-            _add(out, n, i, j + 1, carry + area)
-            _add(out, n, i, j, drop - area)
-        t, x, y = te, xe, ye
+            used = ellipse(x0, y0, x1, y1, x2, y2, weights[k], size, work, used)
+    if used == FALLEN or not single(size, work):
+        work.passed[:] = 0
+        work.waiting[:] = 0
+        return False
+    flat = image.reshape(-1)
+    flat[:] = 0
+    fill_rows(flat, size, work)
+    add_steps(flat, used, work)
+    return True
 
 
-@_compile
-def _add(out, n, i, j, step):
-    """Add a step of the running sum; what is left of the image steps up at its first column."""
-    if j < out.shape[2]:
-        out[n, i, max(j, 0)] += out.dtype.type(step)
-
-
-@_compile
-def _sum_rows(out, n, spans):
-    """Turn the steps of each row into coverage: cell by cell where pieces passed, in one go between and beyond."""
+@numba.njit(**OPTIONS)
+def _walked(points, weights, placed, out, n, spans):
     size = out.shape[1]
+    out[n] = 0
     for i in range(size):
-        a, b = max(spans[i, 0], 0), min(spans[i, 1] + 2, size)
-        c, d = max(spans[i, 2], 0), min(spans[i, 3] + 2, size)
-        if c < a:
-            a, b, c, d = c, d, a, b
-        if a >= b and c >= d:
-            continue
-        if a >= b:
-            a, b, c, d = c, d, size, size
-        elif c >= d:
-            c = d = size
-        elif c < b:
-            b, c, d = max(b, d), size, size
-        total = 0.0
-        for j in range(a, b):
-            total += out[n, i, j]
-            out[n, i, j] = min(max(total, 0.0), 1.0)
-        _fill(out, n, i, b, c, total)
-        for j in range(c, d):
-            total += out[n, i, j]
-            out[n, i, j] = min(max(total, 0.0), 1.0)
-        _fill(out, n, i, d, size, total)
+        spans[i, 0] = spans[i, 2] = size
+        spans[i, 1] = spans[i, 3] = -2
+    for k in range(points.shape[0]):
+        x0, y0, x1, y1, x2, y2 = _pixels(points[k], placed)
+        if weights[k] == 1.0:
+            walk_parabola(out, n, spans, x0, y0, x1, y1, x2, y2)
+        else:
+            walk_ellipse(out, n, spans, x0, y0, x1, y1, x2, y2, weights[k])
+    sum_rows(out, n, spans)
 
 
-@_compile
-def _fill(out, n, i, start, stop, total):
-    """Fill a stretch of a row that no piece passes."""
-    if stop > start and total > _ROUNDING:
-        value = out.dtype.type(total if total < 1 - _ROUNDING else 1.0)
-        part = out[n, i, start:stop]  # indices that cannot be negative become one wide store after another
-        for k in range(len(part)):
-            part[k] = value
+def _sources() -> int:
+    """A number that changes with any of the files that are compiled into one."""
+    names = ("kernel.py", "octants.py", "rows.py", "walk.py")
+    return zlib.crc32(b"".join(Path(__file__).with_name(name).read_bytes() for name in names))
+
+
+def _compiled(sources):
+    """numba keeps machine code by this file's date and by what a function closes over: so it hears of the others."""
+
+    @numba.njit(**OPTIONS, cache=True)
+    def rasterise_all(points, weights, placed, out, work):
+        arcs = points.shape[1]
+        for n in range(out.shape[0] if sources >= 0 else 0):
+            if arcs > _MOST_ARCS or not _stepped(points[n], weights[n], placed[n], out[n], work):
+                _walked(points[n], weights[n], placed[n], out, n, work.spans)
+
+    return rasterise_all
+
+
+_rasterise = _compiled(_sources())

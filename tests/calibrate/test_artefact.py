@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from calibrate.artefact import Calibration, load, newest
+from calibrate.artefact import Calibration, load_artefact, newest
 from calibrate.errors import CalibrationError
 
 MADE = Calibration(
@@ -28,7 +28,7 @@ MADE = Calibration(
 def test_it_reads_back_as_it_was_and_saving_again_changes_nothing(tmp_path: Path) -> None:
     path = MADE.save(tmp_path)
     before = path.stat().st_mtime_ns
-    assert load(path) == MADE
+    assert load_artefact(path, Calibration) == MADE
     assert MADE.save(tmp_path) == path
     assert path.stat().st_mtime_ns == before
     assert [p.name for p in tmp_path.iterdir()] == [f"{MADE.digest}.json"]
@@ -43,14 +43,14 @@ def test_an_edited_file_is_refused(tmp_path: Path) -> None:
     path = MADE.save(tmp_path)
     path.write_text(path.read_text().replace("loopback rig", "real capture"))
     with pytest.raises(CalibrationError, match="was edited"):
-        load(path)
+        load_artefact(path, Calibration)
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[1, 2]", '{"schema_version": "x"}'])
 def test_what_is_no_artefact_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     (tmp_path / "x.json").write_text(text)
     with pytest.raises(CalibrationError) as refused:
-        load(tmp_path / "x.json")
+        load_artefact(tmp_path / "x.json", Calibration)
     assert refused.value.exit_code == 2
     assert "\n" not in str(refused.value)
 

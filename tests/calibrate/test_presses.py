@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import pytest
 
 from calibrate.artefact import Calibration
-from calibrate.field import Alignment, Field, Tone, best_shift
-from calibrate.preprocess import Params
-from calibrate.presses import CEILING, validate_presses
-from calibrate.simulate import simulated
-from calibrate.tables import table
+from calibrate.field import KEYS, Alignment, Field, Tone, best_shift
+from calibrate.simulate import simulated, simulated_pixels
+from calibrate.validate.jobs import ABSENT, PrepareJob, Press, ScoreJob, prepare_job, score_job
+from calibrate.validate.pixels import pack
 from model.ccdbsm import Brush
 from model.coverage import coverage
 from model.registry import stroke_models
@@ -65,15 +64,47 @@ CALIBRATION = Calibration(
 )
 
 
-def validate(captures: Iterator[Capture] | list[Capture]):
-    return validate_presses(iter(captures), MODELS, CALIBRATION, Params(), Field())
+@dataclass(frozen=True)
+class Score:
+    model: str
+    alignment: Alignment
+    tone: Tone
+    csim: float
+    ssim: float
+
+
+CEILING = "another press"
+
+
+def validate(captures: list[Capture]) -> tuple[list[Press], list[Score]]:
+    """What was refused, and every score of the rest; all of one cell."""
+    presses = [prepare_job(PrepareJob(one, CALIBRATION, Field())) for one in captures]
+    used = [press for press in presses if not press.refused]
+    refused = [press for press in presses if press.refused]
+    if not used:
+        return refused, []
+    cell = used[0].height_mm, used[0].tilt_deg
+    pixels = tuple(press.pixels for press in used)
+    foretell = tuple(tuple(k for k in range(len(used)) if k != n) for n in range(len(used)))
+    predictions = tuple(pack(simulated_pixels(model, *cell, Field())) for model in MODELS.values())
+    found = score_job(ScoreJob(pixels, predictions, pixels, foretell, (ABSENT,) * len(used)))
+    names = [*MODELS, CEILING]
+    scores = [
+        Score(name, alignment, tone, *(float(v) for v in found[n, m, k]))
+        for n in range(len(used))
+        for m, name in enumerate(names)
+        for k, (alignment, tone) in enumerate(KEYS)
+        if np.isfinite(found[n, m, k, 0])
+    ]
+    return refused, scores
 
 
 @pytest.mark.parametrize("model", ["ccd-bsm", "ellipse", "line"])
 @pytest.mark.parametrize(("height_mm", "tilt_deg"), [(11.0, 0.0), (15.0, 5.0), (20.0, 10.0)])
 def test_a_mark_drawn_by_a_model_is_recognised_by_it(model: str, height_mm: float, tilt_deg: float) -> None:
-    results = validate([capture("one", drawn(height_mm, tilt_deg, model), height_mm, tilt_deg)])
-    for score in results.scores:
+    refused, scores = validate([capture("one", drawn(height_mm, tilt_deg, model), height_mm, tilt_deg)])
+    assert refused == []
+    for score in scores:
         if score.model == model and score.tone is Tone.BINARY:
             assert score.csim > 0.985, score
         elif score.alignment is Alignment.MM and score.tone is Tone.BINARY:
@@ -83,74 +114,62 @@ def test_a_mark_drawn_by_a_model_is_recognised_by_it(model: str, height_mm: floa
 @pytest.mark.parametrize("height_mm", [11.0, 13.0, 15.0, 17.0, 20.0])
 @pytest.mark.parametrize("tilt_deg", [0.0, 5.0, 10.0])
 def test_nothing_is_lost_by_moving_a_stroke_to_the_middle(height_mm: float, tilt_deg: float) -> None:
-    results = validate([capture("one", drawn(height_mm, tilt_deg), height_mm, tilt_deg)])
+    refused, scores = validate([capture("one", drawn(height_mm, tilt_deg), height_mm, tilt_deg)])
     [score] = [
-        s
-        for s in results.scores
-        if s.model == "ccd-bsm" and s.alignment is Alignment.SIZE_NORMALISED and s.tone is Tone.BINARY
+        s for s in scores if s.model == "ccd-bsm" and s.alignment is Alignment.SIZE_NORMALISED and s.tone is Tone.BINARY
     ]
+    assert refused == []
     assert score.csim > 0.993
     assert score.ssim > 0.96
 
 
-def test_a_press_that_no_model_can_predict_is_listed_by_name() -> None:
-    results = validate([capture("deep", drawn(20.0, 0.0), 60.0, 0.0)])
-    assert [name for name, _ in results.refused] == ["deep"]
-    assert results.scores == []
-
-
 def test_a_capture_shifted_by_a_millimetre_is_punished_in_mm_and_forgiven_when_normalised() -> None:
     moved = np.roll(drawn(15.0, 0.0), 10, axis=0)
-    results = validate([capture("moved", moved, 15.0, 0.0)])
-    scores = {s.alignment: s.csim for s in results.scores if s.model == "ccd-bsm" and s.tone is Tone.BINARY}
-    assert scores[Alignment.MM] < 0.95
-    assert scores[Alignment.SIZE_NORMALISED] > 0.985
+    refused, scores = validate([capture("moved", moved, 15.0, 0.0)])
+    found = {s.alignment: s.csim for s in scores if s.model == "ccd-bsm" and s.tone is Tone.BINARY}
+    assert refused == []
+    assert found[Alignment.MM] < 0.95
+    assert found[Alignment.SIZE_NORMALISED] > 0.985
 
 
 def test_a_press_twice_as_deep_scales_away_when_normalised_but_not_in_mm() -> None:
-    results = validate([capture("deep", drawn(20.0, 0.0), 10.0, 0.0)])
-    scores = {s.alignment: s.csim for s in results.scores if s.model == "ccd-bsm" and s.tone is Tone.BINARY}
-    assert scores[Alignment.SIZE_NORMALISED] > 0.985
-    assert scores[Alignment.MM] < 0.8
+    refused, scores = validate([capture("deep", drawn(20.0, 0.0), 10.0, 0.0)])
+    found = {s.alignment: s.csim for s in scores if s.model == "ccd-bsm" and s.tone is Tone.BINARY}
+    assert refused == []
+    assert found[Alignment.SIZE_NORMALISED] > 0.985
+    assert found[Alignment.MM] < 0.8
 
 
 def test_repeats_of_a_cell_give_the_ceiling() -> None:
     image = drawn(13.0, 5.0)
-    results = validate([capture("r1", image, 13.0, 5.0), capture("r2", image, 13.0, 5.0)])
-    ceiling = [s for s in results.scores if s.model == CEILING]
+    refused, scores = validate([capture("r1", image, 13.0, 5.0), capture("r2", image, 13.0, 5.0)])
+    ceiling = [s for s in scores if s.model == CEILING]
+    assert refused == []
     assert len(ceiling) == 2 * 4  # one a stroke, for each alignment and tone
     assert all(s.csim == pytest.approx(1.0) and s.ssim == pytest.approx(1.0) for s in ceiling)
 
 
 def test_a_blank_capture_is_listed_by_name_and_the_others_go_on() -> None:
     blank = np.full((800, 1000), 230, np.uint8)
-    results = validate([capture("blank", blank, 11.0, 0.0), capture("good", drawn(11.0, 0.0), 11.0, 0.0)])
-    assert [s.stroke_id for s in results.strokes] == ["good"]
-    [(name, why)] = results.refused
-    assert name == "blank"
-    assert "is blank" in why
+    refused, scores = validate([capture("blank", blank, 11.0, 0.0), capture("good", drawn(11.0, 0.0), 11.0, 0.0)])
+    [press] = refused
+    assert press.stroke_id == "blank"
+    assert "is blank" in press.refused
+    assert scores
 
 
 def test_a_still_that_is_no_image_is_listed_by_name() -> None:
     stroke = capture("torn", drawn(11.0, 0.0), 11.0, 0.0).stroke
-    results = validate([Capture(stroke, b"not an image", "test torn")])
-    [(name, why)] = results.refused
-    assert name == "torn"
-    assert "image" in why
+    refused, _ = validate([Capture(stroke, b"not an image", "test torn")])
+    [press] = refused
+    assert press.stroke_id == "torn"
+    assert "image" in press.refused
 
 
-def test_the_table_is_max_min_and_average_in_percent() -> None:
-    captures = [capture("a", drawn(11.0, 0.0), 11.0, 0.0), capture("b", drawn(20.0, 0.0, "circle"), 20.0, 0.0)]
-    results = validate(captures)
-    [row] = [r for r in table(results.scores, Alignment.MM, Tone.BINARY) if r.model == "ccd-bsm"]
-    values = [
-        100 * s.csim
-        for s in results.scores
-        if s.model == "ccd-bsm" and s.alignment is Alignment.MM and s.tone is Tone.BINARY
-    ]
-    assert row.n == 2
-    assert row.csim == pytest.approx((max(values), min(values), sum(values) / 2))
-    assert (row.paper_csim_avg, row.paper_ssim_avg) == (91.84, 87.71)
+def test_a_press_that_tells_no_depth_is_listed_by_name() -> None:
+    stroke = capture("mute", drawn(11.0, 0.0), 11.0, 0.0)
+    refused, _ = validate([Capture(stroke.stroke.model_copy(update={"tilt_deg": None}), stroke.still_png, "test")])
+    assert [(press.stroke_id, press.refused) for press in refused] == [("mute", "tells no depth or tilt")]
 
 
 def test_best_shift_finds_a_shift_of_up_to_six_pixels_and_no_more() -> None:
@@ -170,15 +189,3 @@ def test_the_field_holds_every_cell_of_the_grid() -> None:
             area_mm2 = float(MODELS["ccd-bsm"].profile(height_mm, tilt_deg).area_mm2[0])
             assert image.sum() * 0.3**2 == pytest.approx(area_mm2, rel=1e-5)
     assert cv2.countNonZero(image) > 0
-
-
-def test_a_press_outside_one_models_domain_is_scored_by_the_others() -> None:
-    stubby = stroke_models(Brush(radius_mm=6.0, length_mm=18.0))["ccd-bsm"]  # H = 20 mm is deeper than its bundle
-    models = {"stubby": stubby, "line": MODELS["line"]}
-    shown = [capture("one", drawn(20.0, 0.0), 20.0, 0.0)]
-    results = validate_presses(iter(shown), models, CALIBRATION, Params(), Field())
-    [(stroke, why)] = results.refused
-    assert stroke == "one"
-    assert why.startswith("stubby does not predict it: height_mm = 20")
-    assert {score.model for score in results.scores} == {"line"}
-    assert len(results.strokes) == 1

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bench.preprocess_rigs import BRUSHES, Shot, heading_free_window, sheet, true_mask
-from calibrate.camera.drift import see_plane
 from calibrate.camera.plane import Plane
+from calibrate.camera.view import see_plane
 from calibrate.prepare.params import PX_PER_MM, Params
 from calibrate.prepare.rectify import rectify_bent
 from calibrate.prepare.stages import MM_PER_PX, trace_seen

@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from calibrate.errors import CalibrationError
-from calibrate.scale import BoardSpec, apply, find_corners, fit_plane, local_scale
+from calibrate.scale import BENT_SHARE, BoardSpec, apply, bent_share, find_corners, fit_plane, local_scale
 
 SPEC = BoardSpec(squares=(7, 5), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_50", origin_mm=(-10.0, 5.0))
 
@@ -95,3 +95,18 @@ def test_corners_that_do_not_fit_one_plane_are_refused() -> None:
 def test_a_board_that_cannot_be_is_refused(change: dict[str, object], words: str) -> None:
     with pytest.raises(ValidationError, match=words):
         BoardSpec.model_validate(SPEC.model_dump() | change)
+
+
+def test_a_lens_is_told_from_a_board_that_is_curled_misread_or_noisy() -> None:
+    grid = np.array([(x, y) for x in range(0, 281, 20) for y in range(0, 201, 20)], np.float64)
+    ring = (grid[:, 0] < 40) | (grid[:, 0] > 240) | (grid[:, 1] < 40) | (grid[:, 1] > 160)
+    paper, middle = grid[ring], np.array([640.0, 480.0])
+    pixels = middle + 4.0 * (paper - np.array([140.0, 100.0])) * np.array([1.0, -1.0])
+    away = (pixels - middle) / 1280.0
+    r2 = (away**2).sum(axis=1, keepdims=True)
+    bent = middle + 1280.0 * away * (1.0 - 0.1 * r2)
+    curled = middle + 1280.0 * away * (1.0 + 0.1 * away[:, :1] ** 2)
+    noisy = pixels + np.random.default_rng(3).normal(0.0, 3.0, pixels.shape)
+    assert bent_share(bent, paper, middle, "lens") > 0.99 > BENT_SHARE
+    assert bent_share(curled, paper, middle, "board") < BENT_SHARE
+    assert bent_share(noisy, paper, middle, "noise") < 0.1

@@ -12,18 +12,33 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from brushloop import app
+from calibrate.brushfit.artefact import FittedValue
+from calibrate.brushfit.drag_run import DragArtefact
 from calibrate.errors import CalibrationError
 from calibrate.write_plan import Settings, plan, wanted_of
-from calibrate.write_plan_cli import app
-from calibrate.write_plan_files import PICTURE, PROTOCOL, write_plan, write_toml
+from calibrate.write_plan_files import PICTURE, PROTOCOL, write_plan
+from calibrate.written.record import PlannedBy, load_plan
 from collect.protocols.config import WriteConfig
 from collect.protocols.loading import load_protocol
 from model.ccdbsm import Brush
 from model.characters.brush import Reach
+from model.drag import DragModel
 from model.registry import stroke_model
 
 MODEL = stroke_model("ccd-bsm", Brush())
 QUICK = Settings(steps=4)
+LAG = DragModel(half_mm=0.4, half_per_mm=0.4, leash_mm=2.5, leash_per_mm=0.3, settle_mm=2.0).vector().tolist()
+BY = PlannedBy(
+    model="ccd-bsm",
+    radius_mm=6.0,
+    length_mm=48.0,
+    lam=None,
+    height_range_mm=(0.5, 20.0),
+    tilt_range_deg=(0.0, 10.0),
+    turn_deg_mm=12.0,
+    speed_mm_s=15.0,
+)
 BAR = {"strokes": ["M 100 400 L 900 400 L 900 480 L 100 480 Z"], "medians": [[[110, 440], [890, 440]]]}
 
 
@@ -49,8 +64,7 @@ def test_the_command_writes_a_protocol_and_a_picture(tmp_path: Path) -> None:
 def test_every_shipped_character_becomes_a_protocol_within_reach(tmp_path: Path) -> None:
     reach = Reach(height_mm=(1.0, 5.0), tilt_deg=(0.0, 6.0))
     figures = plan("字永", None, MODEL, Settings(reach=reach, steps=2))
-    (tmp_path / "p.toml").write_text(write_toml(figures, Settings(reach=reach), 15.0, 1), encoding="utf-8")
-    protocol = load_protocol(tmp_path / "p.toml")
+    protocol = load_protocol(write_plan(figures, Settings(reach=reach), BY, "CCD-BSM", 1, tmp_path))
     assert isinstance(protocol, WriteConfig)
     for figure in protocol.figures:
         for stroke in figure.strokes:
@@ -85,12 +99,39 @@ def test_a_hand_is_planned_with_the_widths_it_asks_for(tmp_path: Path) -> None:
     rows = ["x_mm,y_mm,width_mm", "10,35,3", "60,35,3"]
     (tmp_path / "my line.csv").write_text("\n".join(rows))
     (figure,) = plan(str(tmp_path / "my line.csv"), None, MODEL, QUICK)
-    protocol = write_plan([figure], QUICK, 15.0, 1, tmp_path / "out")
+    protocol = write_plan([figure], QUICK, BY, "CCD-BSM", 1, tmp_path / "out")
     loaded = load_protocol(protocol)
     assert isinstance(loaded, WriteConfig)
     assert loaded.figures[0].name == "my-line"
     middle = figure.strokes[0][len(figure.strokes[0]) // 2]
     assert MODEL.profile(float(middle[2]), float(middle[3])).width_mm[0] == pytest.approx(3.0, abs=0.5)
+
+
+def test_with_a_drag_fit_the_plan_makes_up_for_the_lag(tmp_path: Path) -> None:
+    values = {name: FittedValue(value=v, low=None, high=None) for name, v in zip(DragModel.names(), LAG, strict=True)}
+    fit = DragArtefact(
+        session_id="drags-01",
+        source="loopback rig",
+        recording_sha256="",
+        calibration="",
+        software="test",
+        images=3,
+        strokes=3,
+        mm_per_px=0.6,
+        spread_mm=0.9,
+        parameters=values,
+        condition=1.0,
+        held_out={},
+    ).save(tmp_path)
+    ran = brushloop("write", "plan", "子", "--out", "plan", "--steps", "25", "--drag", fit, cwd=tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    assert "bristle lag of drags-01, loopback rig: not ink" in " ".join(ran.stdout.split())
+    before, after = (float(word.strip(",")) for word in ran.stdout.split("CSIM ")[1].split(" SSIM")[0].split(" -> "))
+    assert after > before + 0.03
+    assert load_plan(tmp_path / "plan").planned_by.drag_fit == fit.stem
+    presses = brushloop("write", "plan", "子", "--out", "plan", "--steps", "0", "--drag", "none.json", cwd=tmp_path)
+    assert presses.returncode == 2
+    assert presses.stderr == "brushloop: none.json: No such file or directory\n"
 
 
 @pytest.mark.parametrize(
@@ -111,7 +152,7 @@ def test_bad_input_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], words: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    ran = CliRunner().invoke(app, ["plan", *arguments])
+    ran = CliRunner().invoke(app, ["write", "plan", *arguments])
     assert isinstance(ran.exception, CalibrationError)
     assert words in str(ran.exception)
     assert "\n" not in str(ran.exception)

@@ -102,10 +102,26 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
 @pytest.fixture
 def sharp_lab(tmp_path: Path) -> Iterator[Lab]:
     """With the camera's full sharpness, so that captures are judged; one stroke, and nothing splits by itself."""
-    with serving(SimConfig(rate=60.0, view=View(fps=20.0))) as rig:
+    with sharp(tmp_path, View(fps=20.0)) as made:
+        yield made
+
+
+@pytest.fixture
+def bent_lab(tmp_path: Path) -> Iterator[Lab]:
+    """The same with a lens that distorts by ten pixels and more; no lens file is named yet."""
+    with sharp(tmp_path, View(fps=20.0, k1=-0.08), latency_ms=500) as made:
+        yield made
+
+
+@contextmanager
+def sharp(tmp_path: Path, view: View, latency_ms: int = 100) -> Iterator[Lab]:
+    """A self-check photographs as soon as the arm has left; on a busy machine frames are older than usual."""
+    with serving(SimConfig(rate=60.0, view=view)) as rig:
         made = Lab(rig, tmp_path)
         text = (
-            rig.toml().replace("latency_ms = 250.0", "latency_ms = 100.0").replace("[force]", "[force]\nbias_s = 0.25")
+            rig.toml()
+            .replace("latency_ms = 250.0", f"latency_ms = {latency_ms}")
+            .replace("[force]", "[force]\nbias_s = 0.25")
         )
         (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
         made.write_protocol("[13.0]", "[0.0]")

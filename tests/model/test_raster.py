@@ -16,6 +16,7 @@ from model.ccdbsm import Brush, CcdBsm, ccdbsm
 from model.coverage import centred_origin, coverage
 from model.raster.compiled import coverage_numpy
 from model.raster.exact import coverage_at
+from model.raster.frame import to_pixels
 from model.raster.soft import soft_coverage
 from model.registry import stroke_models
 
@@ -105,6 +106,29 @@ def test_both_exact_paths_agree_wherever_a_mark_lies(
     assert abs(exact - compiled).max() < 1e-6
     assert exact.min() >= 0
     assert exact.max() <= 1
+
+
+def test_marks_on_pixel_edges_come_out_the_same_by_steps_and_cell_by_cell() -> None:
+    # Whole numbers of pixels and eighths of a turn put ends, turns and 45 degree points onto edges and corners.
+    from model.raster import kernel
+
+    rng = np.random.default_rng(0)
+    height_mm, tilt_deg = (
+        torch.from_numpy(rng.choice(of, 600)) for of in ((2.0, 8.0, 10.3125, 16.0), (0.0, 5.0, 20.0))
+    )
+    heading_deg = torch.from_numpy(45.0 * rng.integers(-4, 5, 600))
+    outline = ccdbsm(Brush(), height_mm, tilt_deg).outline()
+    placed = to_pixels(torch.from_numpy(0.25 * rng.integers(24, 104, (600, 2))), heading_deg, 0.25, outline.weights)
+    points, weights, maps = (part.numpy() for part in (outline.points, outline.weights, placed))
+    stepped, walked = np.empty((600, 128, 128)), np.empty((600, 128, 128))
+    work = kernel._work(128, 4, walked.dtype)
+    quick = [kernel._stepped(points[n], weights[n], maps[n], stepped[n], work) for n in range(600)]
+    for n in range(600):
+        kernel._walked(points[n], weights[n], maps[n], walked, n, work.spans)
+    assert 100 < sum(quick) < 600  # the others reach beyond the image
+    assert abs(stepped - walked)[quick].max() < 1e-6
+    assert stepped[quick].min() >= 0
+    assert stepped[quick].max() <= 1
 
 
 @given(presses, st.floats(-180, 180), st.sampled_from(sorted(MODELS)))

@@ -229,3 +229,9 @@ def test_session_ids_count_up_until_the_day_is_full(tmp_path):
         (tmp_path / f"2026-11-21-grid-{number:02d}").touch()
     with pytest.raises(InputError, match="999 sessions"):
         next_session_id(tmp_path, "grid", today)
+
+
+def test_an_attempt_that_marks_several_cells_burns_them_all(make, store, resume):
+    store.begin("check", "self_check", cell=0, notes={"more_cells": [5, 36]}).writer.abandon()
+    assert store.state.used_cells == {(0, 0), (0, 5), (0, 36)}
+    assert resume(store).state.used_cells == store.state.used_cells

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from bench.realink import predict, score, split
+from bench import realink
+from bench.realink import circles, predict, score, split
 from bench.realink_strokes import FOLDER, captured_distance, commanded_path, load
 
 real = pytest.mark.skipif(not FOLDER.is_dir(), reason="the folder of real strokes is not here")
@@ -28,7 +31,22 @@ def test_lag_beats_circle_stamps_on_strokes_that_were_never_fitted() -> None:
     chosen = np.random.default_rng(5).permutation(train)[:20]
     captured = captured_distance(strokes.ink)
     ours = score(strokes, test, predict(strokes, captured, chosen, test)[1])
-    circles = score(strokes, test, predict(strokes, captured, chosen, test, lag=False)[0])
+    stamps = circles(strokes, chosen, test)
     assert ours.csim > 0.82
     assert ours.iou > 0.70
-    assert ours.csim > circles.csim + 0.08
+    assert ours.csim > stamps.csim + 0.08
+
+
+def test_without_the_strokes_the_comparison_is_skipped_and_says_so(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(realink, "load", lambda: load(tmp_path))
+    assert realink.run(n=1) == []
+    assert "skipped: the real strokes" in capsys.readouterr().err
+
+
+def test_the_test_strokes_are_fixed_and_never_trained_on() -> None:
+    train, test = split(187)
+    assert len(test) == 40
+    assert not set(train.tolist()) & set(test.tolist())
+    assert split(187)[1].tolist() == test.tolist()

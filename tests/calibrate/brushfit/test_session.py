@@ -10,12 +10,13 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop import app
-from calibrate.brushfit import artefact
+from calibrate.artefact import load_artefact, newest
+from calibrate.brushfit.artefact import FOLDER, BrushFit
 from calibrate.brushfit.captures import read_presses
 from calibrate.brushfit.run import correction, fit_session
 from calibrate.errors import CalibrationError
-from calibrate.field import Field
-from calibrate.validation import validate_recording
+from calibrate.field import Alignment, Field, Tone
+from calibrate.validate.report import load_report
 from drivers.sim.brush import Brush, BrushSpec
 from model.fitted_shape import NAME
 from sessions.importer import ImportOptions, import_photographs
@@ -55,18 +56,18 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     said = " ".join(ran.output.split())
     for words in ("leave one cell out", "refitted Bezier", "uncalibrated", "condition", "paper.touch_z_mm: add"):
         assert words in said
-    path = artefact.newest(session)
+    path = newest(session, FOLDER)
     assert path is not None
-    fit = artefact.load(path)
+    fit = load_artefact(path, BrushFit)
     assert fit.strokes == 5
     assert fit.csim_percent["fitted"] > fit.csim_percent["uncalibrated"] + 3.0
-    validation = validate_recording(session, ["ccd-bsm", NAME], VIEW, None)
-    assert "in sample" in validation.models[NAME].label
-    mean = {
-        name: np.mean([s.csim for s in validation.results.scores if (s.model, s.alignment) == (name, "mm")])
-        for name in ("ccd-bsm", NAME)
-    }
-    assert mean[NAME] > mean["ccd-bsm"] + 0.05
+    ran = CliRunner().invoke(app, ["validate", str(session), "--mm-per-px", "0.4"])
+    assert ran.exit_code == 0, ran.output
+    report = load_report(session / "validation" / "report.json")
+    [rival] = [one for one in report.rivals if one.name == NAME]
+    assert rival.basis == "fitted, in sample"
+    mean = {name: report.stat(name, Alignment.MM, Tone.BINARY, "csim") for name in ("ccd-bsm", NAME)}
+    assert mean[NAME].avg > mean["ccd-bsm"].avg + 5.0
 
     captures = read_presses(session, VIEW)
     same = correction(captures, fit, fit)
@@ -76,7 +77,7 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     edited = path.with_name("0" * 16 + ".json")
     edited.write_bytes(path.read_bytes())
     with pytest.raises(CalibrationError, match="was edited"):
-        artefact.load(edited)
+        load_artefact(edited, BrushFit)
 
 
 def test_one_press_alone_says_what_it_cannot_tell(session: Path) -> None:

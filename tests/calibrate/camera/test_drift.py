@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from calibrate.camera.check import preflight
-from calibrate.camera.drift import drift, see_plane
+from calibrate.camera.drift import drift
+from calibrate.camera.view import see_plane
 from calibrate.errors import CalibrationError
 from calibrate.scale import BoardSpec, charuco_board
 

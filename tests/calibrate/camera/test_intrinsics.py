@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.camera.artefact import LensFile, lens_file, load
+from calibrate.artefact import load_artefact
+from calibrate.camera.artefact import LensFile, lens_file
 from calibrate.camera.boards import Checkerboard, View, see
 from calibrate.camera.intrinsics import fit_lens
 from calibrate.camera.lens import Lens
@@ -149,7 +150,7 @@ def test_what_is_seen_but_not_as_it_should_be_is_flagged() -> None:
 
 def test_a_lens_file_cannot_be_edited(tmp_path: Path) -> None:
     path = lens_file(fit_lens(views(8)), "a board", {"0.png": "ab"}, {}, 0.5, "test").save(tmp_path)
-    assert load(path, LensFile).lens().matrix[0, 0] == pytest.approx(800.0, rel=0.01)
+    assert load_artefact(path, LensFile).lens().matrix[0, 0] == pytest.approx(800.0, rel=0.01)
     path.write_text(path.read_text().replace('"a board"', '"another"'))
     with pytest.raises(CalibrationError, match="was edited"):
-        load(path, LensFile)
+        load_artefact(path, LensFile)

@@ -229,6 +229,8 @@ def test_a_self_check_takes_a_cell_before_the_first_stroke(tmp_path: Path) -> No
         StepKind.DIP,
     ]
     assert (len(plan.placed), plan.placed[0].cell, plan.placed[41].sheet, plan.dips) == (150, 1, 2, 153)
+    first = {placed.cell for placed in plan.placed if placed.sheet == 1}
+    assert first == set(range(42)) - {0, 5, 36}, "the self-check lies over three corners"
     assert "self_check" not in make_plan(config, example("protocol-calibration.toml")).steps
     small = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\nlegs_mm = [50.0, 15.0]\n\n[motion]")
     with pytest.raises(ConfigError, match=r"rig.toml: self_check.legs_mm: a triangle of 50 by 15 mm does not fit"):

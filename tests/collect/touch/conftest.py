@@ -33,6 +33,8 @@ SMALL_TABLE = Table(
     well_mm=(150.0, 20.0),
 )
 SMALL_VIEW = View(width_px=480, height_px=360, px_per_mm=2.8, centre_mm=(55.0, 40.0))
+WHOLE_VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125)
+"""Of a sheet of the usual size."""
 IDENTITY = Identity("bench", "world without wires", "", True)
 
 
@@ -155,12 +157,13 @@ class MakeBench(Protocol):
         paper_z_mm: float = 120.0,
         seed: int = 1,
         bent: Callable[[Pose], Pose] = lambda pose: pose,
+        whole: bool = False,
     ) -> Bench: ...
 
 
 @pytest.fixture
 def make_bench(tmp_path: Path) -> MakeBench:
-    """A small sheet that leans so, at that height; the operator taught 120 mm whatever it is."""
+    """A small sheet that leans so, at that height; the operator taught 120 mm whatever it is. Or a `whole` one."""
 
     def make(
         slope_deg: tuple[float, float] = (0.0, 0.0),
@@ -168,7 +171,10 @@ def make_bench(tmp_path: Path) -> MakeBench:
         paper_z_mm: float = 120.0,
         seed: int = 1,
         bent: Callable[[Pose], Pose] = lambda pose: pose,
+        whole: bool = False,
     ) -> Bench:
+        if whole:
+            return Bench(SimConfig(seed=seed, view=WHOLE_VIEW), tmp_path, bent=bent)
         table = replace(SMALL_TABLE, slope_deg=slope_deg, paper_z_mm=paper_z_mm)
         return Bench(SimConfig(seed=seed, table=table, view=SMALL_VIEW), tmp_path, bent=bent)
 

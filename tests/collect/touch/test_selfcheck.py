@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from collect.config import PaperConfig
 from collect.errors import StepError
 from collect.plane import PaperPlane
 from collect.sheet import Sheet, to_base
 from collect.touch.config import SelfCheckConfig
-from collect.touch.selfcheck import SelfCheck, Triangle, judge, self_check, triangle_in, triangle_of
+from collect.touch.selfcheck import (
+    SelfCheck,
+    Triangle,
+    judge,
+    partners,
+    self_check,
+    triangle_in,
+    triangle_of,
+    triangle_on,
+)
 from drivers.samples import Pose
 
 if TYPE_CHECKING:
@@ -169,3 +181,86 @@ def test_triangles_lie_in_one_cell_or_over_three(make_bench: MakeBench) -> None:
         assert cell.y_mm <= y <= cell.y_mm + cell.height_mm
     corners = (sheet.cell(0), sheet.cell(sheet.columns - 1), sheet.cell(sheet.capacity - sheet.columns))
     assert triangle_of(corners) == tuple(cell.anchor_mm for cell in corners)
+
+
+def paper(width_mm: float, height_mm: float) -> PaperConfig:
+    return PaperConfig(origin_mm=(0.0, 0.0), touch_z_mm=120.0, size_mm=(width_mm, height_mm))
+
+
+def test_a_sheet_with_room_is_checked_over_three_corners_and_a_small_one_in_one_cell() -> None:
+    sheet = Sheet(paper(244.0, 172.0))
+    first = sheet.cell(0)
+    wide = partners(sheet, first, {0})
+    assert [cell.index for cell in wide] == [5, 36]
+    assert triangle_on((first, *wide), CONFIG) == triangle_of((first, *wide))
+    again = partners(sheet, sheet.cell(1), {0, 1, 5, 36})
+    assert [cell.index for cell in again] == [4, 37], "a second attempt finds places of its own"
+    assert partners(sheet, first, set(range(sheet.capacity)) - {1, 6}) == (), "what is left is too near"
+    small = Sheet(paper(110.0, 80.0))
+    assert partners(small, small.cell(0), set()) == ()
+    assert triangle_on((small.cell(0),), CONFIG) == triangle_in(small.cell(0), CONFIG)
+
+
+@given(width=st.floats(40.0, 600.0), height=st.floats(24.0, 600.0), used=st.sets(st.integers(0, 60)))
+def test_a_wide_triangle_is_always_uneven_wide_and_on_free_cells(width: float, height: float, used: set[int]) -> None:
+    sheet = Sheet(paper(width, height))
+    cell = sheet.cell(0)
+    if wide := partners(sheet, cell, used):
+        assert not used & {one.index for one in wide}
+        places = np.array(triangle_of((cell, *wide)))
+        assert np.ptp(places, axis=0).min() >= 60.0
+        mirrored = places * np.array([-1.0, 1.0])
+        with pytest.raises(StepError, match="mirrored in x"):
+            judge(places, mirrored, CONFIG)
+
+
+def whole_sheet(make_bench: MakeBench) -> tuple[Bench, Triangle]:
+    bench = make_bench(whole=True)
+    sheet = Sheet(bench.rig.config.paper)
+    return bench, triangle_of((sheet.cell(0), *partners(sheet, sheet.cell(0), set())))
+
+
+async def test_a_sound_camera_passes_over_three_corners(make_bench: MakeBench) -> None:
+    bench, places = whole_sheet(make_bench)
+    check = await checked(bench, places)
+    assert check.scale == pytest.approx((1.0, 1.0), abs=0.003)
+    assert bench.lifted
+
+
+async def test_a_camera_that_is_2_percent_wrong_is_seen_over_three_corners_but_not_in_one_cell(
+    make_bench: MakeBench,
+) -> None:
+    bench, places = whole_sheet(make_bench)
+    board = bench.rig.config.board
+    # The board was printed 2 % too small, or measured badly: every length by this camera is 2 % too large.
+    told = board.model_copy(update={"square_mm": 1.02 * board.square_mm, "marker_mm": 1.02 * board.marker_mm})
+    bench.rig = replace(bench.rig, config=bench.rig.config.model_copy(update={"board": told}))
+    near_origin = Sheet(bench.rig.config.paper).cell(36)
+    await checked(bench, triangle_in(near_origin, CONFIG))
+    with pytest.raises(
+        StepError, match=r"lengths are off by \+(1\.[7-9]|2\.[0-3]).* along x and \+(1\.[7-9]|2\.[0-3])"
+    ):
+        await checked(bench, places)
+    assert bench.lifted
+
+
+async def test_a_mirrored_camera_is_named(make_bench: MakeBench) -> None:
+    bench, places = whole_sheet(make_bench)
+    scene = bench.scene
+    bench.photograph = lambda: np.ascontiguousarray(scene.render(tool=bench.world.tool())[:, ::-1])  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(StepError, match="the board is not seen: the photograph is mirrored"):
+        await checked(bench, places)
+    assert bench.lifted
+
+
+async def test_an_arm_in_the_picture_is_no_mark(make_bench: MakeBench) -> None:
+    bench, places = whole_sheet(make_bench)
+    photograph, shots = bench.photograph, itertools.count()
+
+    def with_arm() -> NDArray[np.uint8]:
+        image = photograph()
+        return cv2.circle(image, (250, 550), 90, 70, -1) if next(shots) else image  # pyright: ignore[reportReturnType]
+
+    bench.photograph = with_arm  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(StepError, match=r"mm2 at \(.*\) mm became dark, which no mark does: is the arm"):
+        await checked(bench, places)

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
+from collect.asking import Choice, Prompt
 from collect.errors import CollectAborted
+from collect.last_capture import LastCapture
+from collect.quality.verdict import Check, Failure, Verdict
+from collect.set_up_steps import Fact, SetUpStep, Standing
 from collect.snapshot import CellCount, Snapshot
 from collect.states import State
+from collect.steps import StepKind
+from collect.tally import Mark, SheetMap
+from collect.telemetry import Picture
+from collect.wishes import Wish
 
 HEIGHTS_MM = (11.0, 13.0, 15.0, 17.0, 20.0)
 TILTS_DEG = (0.0, 5.0, 10.0)
@@ -24,13 +35,60 @@ def grid_of(done: int, heights: tuple[float, ...] = HEIGHTS_MM) -> tuple[CellCou
     return tuple(CellCount(h, a, min(max(done - 2 * n, 0), 2), 2) for n, (h, a) in enumerate(places))
 
 
+def marked_grid() -> tuple[CellCount, ...]:
+    """Every sign once: a bad take, one left out, one now, one next."""
+    cells = list(grid_of(13))
+    cells[1] = replace(cells[1], bad=2)
+    cells[3] = replace(cells[3], done=1, left_out=1, bad=3)
+    cells[6] = replace(cells[6], now=True)
+    cells[8] = replace(cells[8], next=True)
+    return tuple(cells)
+
+
+def sheet_of(used: int) -> SheetMap:
+    marks: list[Mark | None] = [Mark.KEPT] * used
+    marks[2], marks[5], marks[0] = Mark.BAD, Mark.VOID, Mark.CHECK
+    marks[-1] = Mark.NOW
+    return SheetMap(1, 6, 7, (*marks, *([None] * (42 - used))))
+
+
+def blot(size: int = 128) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Something like a stroke."""
+    y, x = np.mgrid[0:size, 0:size] / size
+    return ((x - 0.5) / 0.35) ** 2 + ((y - 0.5) / (0.04 + 0.12 * x)) ** 2 < 1.0
+
+
+def checks(*, split: bool = False) -> Verdict:
+    return Verdict(
+        (
+            Check(Failure.EXPOSURE, 201.0, "of 255", 250.0, True, ""),
+            Check(Failure.BLURRED, 0.11, "mm", 0.25, True, ""),
+            Check(Failure.DRY, 0.06, "", 0.125, True, ""),
+            Check(Failure.SPLIT, 0.42 if split else 0.02, "mm", 0.3, not split, "The tip is split." if split else ""),
+        )
+    )
+
+
+def capture(*, kept: bool = True) -> LastCapture:
+    binary = blot()
+    photo = np.where(binary, 45, 205).astype(np.uint8).repeat(4, axis=0).repeat(4, axis=1)
+    return LastCapture("H15-a5-r01", 15.0, 5.0, 41, kept, checks(split=not kept), photo, binary)
+
+
+def camera_picture() -> Picture:
+    y, x = np.mgrid[0:240, 0:320]
+    image = (170 + 40 * x / 320 - 20 * y / 240).astype(np.uint8)
+    image[((x // 20 + y // 20) % 2 == 0) & ((x < 60) | (y > 180))] = 40
+    return Picture(7, image, 0.9)
+
+
 def picture(**changes: Any) -> Snapshot:
     """A run in its middle, with what differs."""
     running = Snapshot(
         session_id="2026-11-21-grid-01",
         source="loopback rig",
         state=State.RUNNING,
-        step="press H 15 mm, alpha 5 deg on cell 13",
+        step="press H15-a5-r02",
         strokes_done=13,
         strokes_planned=30,
         grid=grid_of(13),
@@ -44,13 +102,75 @@ def picture(**changes: Any) -> Snapshot:
     return replace(running, **changes)
 
 
+def full_picture(**changes: Any) -> Snapshot:
+    """The same with everything that a screen can show."""
+    values: dict[str, Any] = {
+        "grid": marked_grid(),
+        "target_mm": (123.4, -45.25, 7.0),
+        "force_n": 0.041,
+        "ink_level": 0.63,
+        "given_up": 1,
+        "trace_n": tuple(0.03 * max(0.0, math.sin(n / 9)) for n in range(120)),
+        "sheet": sheet_of(17),
+        "last": capture(),
+        "picture": camera_picture(),
+        "stroke": "H15-a5-r02",
+        "folder": "",
+    }
+    return picture(**(values | changes))
+
+
+SPLIT = Prompt(
+    "H15-a5-r01: The tip is split by 0.42 mm. Comb the brush.",
+    (Choice("k", "keep it"), Choice("r", "press it again"), Choice("n", "go on without it")),
+    "n",
+    timeout_s=120.0,
+    image=capture(kept=False).photo,
+    number=3,
+    asked_s=1000.0,
+)
+SET_UP = (
+    SetUpStep(
+        StepKind.BOARD,
+        Standing.GOOD,
+        (
+            Fact("corners seen", "184"),
+            Fact("scale (pix2len)", "0.1600 mm/px"),
+            Fact("residual of corners", "0.11 px", "at most 1", True),
+            Fact("focus: blur", "0.13 mm", "at most 0.25", True),
+        ),
+    ),
+    SetUpStep(
+        StepKind.ZERO_TOUCH,
+        Standing.DOUBTFUL,
+        (
+            Fact("method", "force"),
+            Fact("point 1 (4, 4)", "120.012 mm"),
+            Fact("  its touches span", "0.180 mm", "at most 0.15", False),
+            Fact("plane", "level: fewer than three points"),
+        ),
+    ),
+    SetUpStep(StepKind.SELF_CHECK, Standing.TO_COME),
+)
+TOUCHED = Prompt(
+    "Zero touch and plane: not all is within limits.",
+    (
+        Choice("g", "go on all the same"),
+        Choice("a", "measure again"),
+        Choice("b", "measure by jog"),
+        Choice("f", "measure by force"),
+        Choice("x", "stop the run"),
+    ),
+    "x",
+    number=2,
+)
 PAUSED = picture(state=State.PAUSED, step="paused", tip_mm=None)
 FAILED = picture(state=State.FAILED, error=ERROR, messages=("capture 13: blob 212 mm2, sharp", f"warning: {ERROR}"))
 DONE = picture(state=State.DONE, step="merge and verify", strokes_done=30, grid=grid_of(30), eta_s=0.0)
 
 
 class FakeEngine:
-    """`RunnableEngine` without an arm; a stop leads straight to stopped."""
+    """`RunnableEngine` without an arm; a stop or a park leads straight to stopped."""
 
     def __init__(self, now: Snapshot) -> None:
         self.now = now
@@ -71,6 +191,15 @@ class FakeEngine:
     def answer(self, number: int, key: str) -> bool:
         self.calls.append(f"answer {number} {key}")
         return True
+
+    def wish(self, wish: Wish) -> None:
+        self.calls.append(f"wish {wish.name}")
+        self.now = replace(self.now, wishes=(*self.now.wishes, wish))
+
+    def park(self) -> None:
+        self.calls.append("park")
+        self.now = replace(self.now, state=State.STOPPED, parked=True, prompt=None)
+        self._over.set()
 
     def stop(self) -> None:
         self.calls.append("stop")

@@ -3,26 +3,44 @@
 from __future__ import annotations
 
 import asyncio
+import time
 
 import pytest
 from textual.pilot import Pilot
 
 from collect.states import FINAL, State
-from collect.tui.app import RunApp
-from collect.tui.confirm import ConfirmQuit
-from collect.tui.view import OVER, SOFTWARE_STOP, Line
-from tests.collect.tui.fake import DONE, ERROR, FAILED, PAUSED, FakeEngine, grid_of, picture
+from collect.tui.app import OperatorApp
+from collect.tui.confirm import Confirm
+from collect.tui.help import HelpScreen
+from collect.tui.line import Line
+from collect.tui.text import SOFTWARE_STOP
+from collect.tui.view import OVER, STOP_SENT
+from tests.collect.tui.fake import (
+    DONE,
+    ERROR,
+    FAILED,
+    PAUSED,
+    SET_UP,
+    SPLIT,
+    TOUCHED,
+    FakeEngine,
+    full_picture,
+    grid_of,
+    picture,
+)
+
+AT_WORK = sorted(set(State) - FINAL)
 
 
-def shown(app: RunApp) -> str:
+def shown(app: OperatorApp) -> str:
     """What is on the screen, as text."""
-    strips = app.screen_stack[0]._compositor.render_strips()
+    strips = app.screen._compositor.render_strips()
     return "\n".join("".join(segment.text for segment in strip) for strip in strips)
 
 
-async def look(app: RunApp, pilot: Pilot[None]) -> str:
+async def look(app: OperatorApp, pilot: Pilot[None]) -> str:
     """The screen after two polls: the first may come before the layout has its sizes."""
-    engine = app._engine
+    engine = app.engine
     assert isinstance(engine, FakeEngine)
     enough = engine.looks + 2
     while engine.looks < enough:
@@ -31,107 +49,145 @@ async def look(app: RunApp, pilot: Pilot[None]) -> str:
     return shown(app)
 
 
-async def test_p_pauses_and_resumes_and_says_which() -> None:
+async def test_space_pauses_and_resumes_and_says_which() -> None:
     engine = FakeEngine(picture())
-    app = RunApp(engine)
+    app = OperatorApp(engine)
     async with app.run_test(size=(80, 24)) as pilot:
-        assert "p Pause" in await look(app, pilot)
-        await pilot.press("p")
+        assert "space pause" in await look(app, pilot)
+        await pilot.press("space")
         assert engine.calls == ["pause"]
         for state in (State.PAUSING, State.PAUSED):
             engine.calls.clear()
             engine.now = picture(state=state)
-            text = await look(app, pilot)
-            assert "p Resume" in text
-            assert "Pause" not in text
-            await pilot.press("p")
+            assert "space resume" in await look(app, pilot)
+            await pilot.press("space")
             assert engine.calls == ["resume"]
 
 
-@pytest.mark.parametrize("state", sorted({State.STOPPING} | FINAL))
-async def test_p_does_nothing_once_the_end_has_begun(state: State) -> None:
-    engine = FakeEngine(picture(state=state))
-    app = RunApp(engine)
+async def test_space_does_nothing_once_the_end_has_begun() -> None:
+    engine = FakeEngine(picture())
+    app = OperatorApp(engine)
     async with app.run_test() as pilot:
-        text = await look(app, pilot)
-        await pilot.press("p")
-        assert engine.calls == []
-        assert "p Pause" not in text
-        assert "p Resume" not in text
+        for state in sorted({State.STOPPING} | FINAL):
+            engine.now = picture(state=state)
+            assert "space" not in await look(app, pilot)
+            await pilot.press("space")
+            assert engine.calls == []
 
 
-@pytest.mark.parametrize("key", ["s", "ctrl+c"])
-@pytest.mark.parametrize("state", list(State))
-async def test_stop_keys_stop_in_every_state(state: State, key: str) -> None:
-    engine = FakeEngine(picture(state=state))
-    app = RunApp(engine)
+async def test_stop_keys_stop_in_every_state_of_a_run() -> None:
+    engine = FakeEngine(picture())
+    app = OperatorApp(engine)
     async with app.run_test() as pilot:
-        await pilot.press(key)
+        for state in AT_WORK:
+            engine.now = picture(state=state)
+            await look(app, pilot)
+            engine.calls.clear()
+            await pilot.press("s", "ctrl+c")
+            assert engine.calls == ["stop", "stop"], state
+
+
+@pytest.mark.parametrize("over", ["q", "question_mark", "ctrl+p", "prompt", "wizard"])
+async def test_the_stop_key_stops_over_whatever_lies_on_the_screen(over: str) -> None:
+    engine = FakeEngine(picture(set_up=SET_UP, prompt=TOUCHED) if over == "wizard" else picture())
+    app = OperatorApp(engine)
+    async with app.run_test() as pilot:
+        await look(app, pilot)
+        if over == "prompt":
+            engine.now = picture(state=State.ASKING, prompt=SPLIT)
+            await look(app, pilot)
+        elif over != "wizard":
+            await pilot.press(over)
+            await look(app, pilot)
+        await pilot.press("s")
         assert engine.calls == ["stop"]
+
+
+async def test_a_stop_is_on_the_screen_in_less_than_a_tenth_of_a_second_whatever_the_engine_says() -> None:
+    engine = FakeEngine(picture())
+    app = OperatorApp(engine)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await look(app, pilot)
+        before = time.perf_counter()
+        await pilot.press("s")
+        while STOP_SENT not in shown(app):
+            await asyncio.sleep(0.001)
+            assert time.perf_counter() - before < 5.0
+        assert STOP_SENT in await look(app, pilot)  # until the engine says more
+        engine.now = picture(state=State.STOPPED, error="stopped by the operator")
+        text = await look(app, pilot)
+        assert STOP_SENT not in text
+        assert "STOPPED" in text
+
+
+async def test_wishes_are_passed_on_and_shown_until_they_are_granted() -> None:
+    engine = FakeEngine(picture())
+    app = OperatorApp(engine)
+    async with app.run_test(size=(80, 24)) as pilot:
+        for key, wish in (("r", "RETAKE"), ("k", "SKIP"), ("n", "NEW_SHEET"), ("j", "JOG")):
+            engine.calls.clear()
+            engine.now = picture()
+            assert "asked" not in await look(app, pilot)
+            await pilot.press(key)
+            assert engine.calls == [f"wish {wish}"]
+            assert f"asked: {engine.now.wishes[0]}" in await look(app, pilot)
 
 
 async def test_no_focus_keeps_a_key_for_itself() -> None:
-    engine = FakeEngine(FAILED)
-    app = RunApp(engine)
+    engine = FakeEngine(picture(error=ERROR))
+    app = OperatorApp(engine)
     async with app.run_test() as pilot:
+        await look(app, pilot)
         for focus in ("why-pane", "grid-pane", "log-pane"):
             engine.calls.clear()
-            app.query_one(f"#{focus}").focus()
+            app.screen.query_one(f"#{focus}").focus()
             await pilot.press("s", "ctrl+c")
             assert engine.calls == ["stop", "stop"]
-        await pilot.press("q")
-        assert not app.is_running
 
 
-@pytest.mark.parametrize("key", ["s", "ctrl+c"])
-async def test_stop_keys_work_under_the_question(key: str) -> None:
+async def test_q_asks_while_the_run_is_on_and_n_goes_back() -> None:
     engine = FakeEngine(picture())
-    app = RunApp(engine)
+    app = OperatorApp(engine)
     async with app.run_test() as pilot:
-        await pilot.press("q")
-        assert isinstance(app.screen, ConfirmQuit)
-        await pilot.press(key)
-        assert engine.calls == ["stop"]
-
-
-@pytest.mark.parametrize("quit_key", ["q", "ctrl+q"])
-@pytest.mark.parametrize("no_key", ["n", "escape"])
-async def test_q_asks_while_the_run_is_on_and_n_goes_back(quit_key: str, no_key: str) -> None:
-    engine = FakeEngine(picture())
-    app = RunApp(engine)
-    async with app.run_test() as pilot:
-        await pilot.press(quit_key, quit_key)
-        assert isinstance(app.screen, ConfirmQuit)
-        await pilot.press(no_key)
-        assert not isinstance(app.screen, ConfirmQuit)
+        await look(app, pilot)
+        for quit_key, no_key in (("q", "n"), ("ctrl+q", "escape")):
+            await pilot.press(quit_key, quit_key)
+            assert isinstance(app.screen, Confirm)
+            await pilot.press(no_key)
+            assert not isinstance(app.screen, Confirm)
         assert engine.calls == []
         assert app.is_running
 
 
-async def test_the_run_is_watched_on_under_the_question() -> None:
+async def test_y_parks_the_arm_and_leaves_only_then() -> None:
     engine = FakeEngine(picture())
-    app = RunApp(engine)
+    app = OperatorApp(engine)
     async with app.run_test() as pilot:
-        await pilot.press("q")
-        engine.now = FAILED
-        assert "FAILED" in await look(app, pilot)
-        assert isinstance(app.screen, ConfirmQuit)
-
-
-async def test_y_stops_the_arm_and_leaves() -> None:
-    engine = FakeEngine(picture())
-    app = RunApp(engine)
-    async with app.run_test() as pilot:
+        await look(app, pilot)
         await pilot.press("q", "y")
-        assert engine.calls == ["stop"]
-        assert not app.is_running
+        assert engine.calls == ["park"]
+        while app.is_running:
+            await asyncio.sleep(0.02)
     assert app.return_code == 0
 
 
+async def test_the_run_is_watched_on_under_the_question() -> None:
+    engine = FakeEngine(picture())
+    app = OperatorApp(engine)
+    async with app.run_test() as pilot:
+        await look(app, pilot)
+        await pilot.press("q")
+        engine.now = FAILED
+        await look(app, pilot)
+        assert isinstance(app.screen, Confirm)
+        await pilot.press("n")
+        assert "FAILED" in await look(app, pilot)
+
+
 @pytest.mark.parametrize("state", sorted(FINAL))
-async def test_q_leaves_at_once_when_the_run_is_over(state: State) -> None:
-    engine = FakeEngine(picture(state=state))
-    app = RunApp(engine)
+async def test_q_leaves_at_once_when_the_run_is_over_and_the_arm_parked(state: State) -> None:
+    engine = FakeEngine(picture(state=state, parked=True, target_mm=(0.0, 0.0, 0.0)))
+    app = OperatorApp(engine)
     async with app.run_test() as pilot:
         text = await look(app, pilot)
         assert OVER in text
@@ -141,24 +197,74 @@ async def test_q_leaves_at_once_when_the_run_is_over(state: State) -> None:
     assert engine.calls == []
 
 
+async def test_q_says_so_where_the_arm_rests_unparked() -> None:
+    engine = FakeEngine(picture(state=State.STOPPED, target_mm=(0.0, 0.0, 0.0)))
+    app = OperatorApp(engine)
+    async with app.run_test() as pilot:
+        await look(app, pilot)
+        await pilot.press("q")
+        assert "not parked" in await look(app, pilot)
+        await pilot.press("n")
+        assert app.is_running
+        await pilot.press("q", "y")
+        assert not app.is_running
+
+
+async def test_help_names_every_key_and_goes_away() -> None:
+    app = OperatorApp(FakeEngine(picture()))
+    async with app.run_test(size=(80, 24)) as pilot:
+        await look(app, pilot)
+        await pilot.press("question_mark")
+        text = await look(app, pilot)
+        for word in ("space", "retake", "press the stroke in hand again", "red button", "ctrl-p"):
+            assert word in text or word == "retake"
+        await pilot.press("escape")
+        assert not isinstance(app.screen, HelpScreen)
+
+
+async def test_the_palette_knows_the_commands(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = FakeEngine(picture())
+    app = OperatorApp(engine)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await look(app, pilot)
+        names = {command.title for command in app.get_system_commands(app.screen)}
+        assert {"Stop the arm now", "Pause or go on", "Retake", "Leave", "Light colours"} <= names
+        await pilot.press("ctrl+p")
+        await pilot.press(*"light", "enter")
+        await pilot.pause(0.3)
+        await pilot.press("enter")
+        await pilot.pause(0.3)
+        assert app.theme == "textual-light"
+
+
 async def test_what_comes_from_outside_is_shown_as_it_is() -> None:
     markup = "[red]x[/red] [/] [link='"
     engine = FakeEngine(picture(messages=(markup, "a\x1b[31mb"), step=markup, source=markup, error=markup))
-    app = RunApp(engine)
-    async with app.run_test(size=(100, 40)) as pilot:
+    app = OperatorApp(engine)
+    async with app.run_test(size=(109, 40)) as pilot:
         text = await look(app, pilot)
         assert text.count(markup) == 4
         assert "a�[31mb" in text
         assert "\x1b" not in text
 
 
+async def test_chinese_takes_its_two_columns() -> None:
+    engine = FakeEngine(picture(session_id="永字八法", messages=("墨分五色 capture 1",), step="写 永"))
+    app = OperatorApp(engine)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await look(app, pilot)
+        strips = app.screen._compositor.render_strips()
+        assert {strip.cell_length for strip in strips} == {80}
+        assert "永字八法" in shown(app)
+
+
 async def test_grid_counts_follow_the_snapshot() -> None:
     engine = FakeEngine(picture(grid=grid_of(1)))
-    app = RunApp(engine)
+    app = OperatorApp(engine)
     async with app.run_test(size=(80, 24)) as pilot:
         before = await look(app, pilot)
         assert before.count("1/2") == 1
-        assert before.count("✓") == 1  # the legend
+        assert before.count("✓") == 0
         engine.now = picture(grid=grid_of(3))
         after = await look(app, pilot)
         assert after.count("2/2 ✓") == 1
@@ -166,36 +272,56 @@ async def test_grid_counts_follow_the_snapshot() -> None:
 
 
 async def test_80_columns_by_24_rows_show_all_that_matters() -> None:
-    app = RunApp(FakeEngine(FAILED))
+    app = OperatorApp(FakeEngine(FAILED))
     async with app.run_test(size=(80, 24)) as pilot:
         text = await look(app, pilot)
-    for part in (
-        "2026-11-21-grid-01",
-        "source: loopback rig",
-        "FAILED",
-        "13/30",
-        "elapsed 3:05",
-        "Voids    1",
-        "20 mm",
-    ):
+    for part in ("2026-11-21-grid-01", "source: loopback rig", "FAILED", "13/30", "elapsed 3:05", "voids 1", "20 mm"):
         assert part in text
-    for part in ("Voids    1", "123.40", "10°", OVER, SOFTWARE_STOP, "Stop arm", "q Quit"):
+    for part in ("123.40", "10°", OVER, SOFTWARE_STOP, "q leave"):
         assert part in text
     words = " ".join(text.replace("┃", " ").split())
     assert " ".join(ERROR.split()) in words
 
 
+async def test_a_run_resized_in_its_middle_shows_the_same() -> None:
+    app = OperatorApp(FakeEngine(full_picture()))
+    async with app.run_test(size=(200, 60)) as pilot:
+        for size in ((200, 60), (80, 24), (120, 40), (81, 25)):
+            await pilot.resize_terminal(*size)
+            text = await look(app, pilot)
+            for part in ("RUNNING", "13/30", "q leave", "s STOP", "Sheet 1: 25 free", SOFTWARE_STOP):
+                assert part in text, size
+            assert ("Last capture" in text) == (size[0] >= 110)
+
+
+async def test_tab_turns_to_the_capture_and_the_camera_where_there_is_no_room_for_all() -> None:
+    app = OperatorApp(FakeEngine(full_picture()))
+    async with app.run_test(size=(80, 24)) as pilot:
+        assert "Log" in await look(app, pilot)
+        await pilot.press("tab")
+        text = await look(app, pilot)
+        assert "H15-a5-r01" in text
+        assert "scored by `brushloop validate`" in text
+        assert "▀" in text
+        await pilot.press("tab")
+        assert "Camera" in await look(app, pilot)
+        await pilot.press("tab")
+        assert "Log" in await look(app, pilot)
+
+
 async def test_missing_pose_and_eta_are_said() -> None:
-    app = RunApp(FakeEngine(picture(tip_mm=None, eta_s=None, session_id="", source="", grid=(), strokes_planned=0)))
+    app = OperatorApp(
+        FakeEngine(picture(tip_mm=None, eta_s=None, session_id="", source="", grid=(), strokes_planned=0))
+    )
     async with app.run_test() as pilot:
         text = await look(app, pilot)
-    for part in ("no pose", "no ETA yet", "no session yet", "not known yet", "no strokes planned"):
+    for part in ("no pose", "no ETA yet", "no session yet", "not known yet", "no strokes planned", "no sheet yet"):
         assert part in text
 
 
 async def test_the_log_follows_until_scrolled_away() -> None:
     engine = FakeEngine(picture(messages=tuple(f"line {n}" for n in range(100))))
-    app = RunApp(engine)
+    app = OperatorApp(engine)
     async with app.run_test(size=(80, 24)) as pilot:
         assert "line 99" in await look(app, pilot)
         engine.now = picture(messages=tuple(f"line {n}" for n in range(50, 150)))
@@ -212,7 +338,7 @@ async def test_the_engine_is_asked_ten_times_a_second_and_nothing_is_drawn_twice
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     engine = FakeEngine(PAUSED)
-    app = RunApp(engine)
+    app = OperatorApp(engine)
     async with app.run_test() as pilot:
         await look(app, pilot)
         drawn: list[Line] = []
@@ -231,5 +357,5 @@ async def test_an_error_of_the_engine_is_a_crash_not_a_blank() -> None:
             return super().snapshot()
 
     with pytest.raises(ZeroDivisionError):
-        async with RunApp(Broken(DONE)).run_test() as pilot:
+        async with OperatorApp(Broken(DONE)).run_test() as pilot:
             await pilot.pause(0.5)

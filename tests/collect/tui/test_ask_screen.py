@@ -1,4 +1,4 @@
-"""A question on the screen: shown with its answers, answered by a key, gone when it is over."""
+"""A question on the screen: shown with its picture and answers, answered by a key, gone when it is over."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import pytest
 
 from collect.asking import Choice, Prompt
 from collect.states import State
-from collect.tui.app import RunApp
+from collect.tui.app import OperatorApp
 from collect.tui.ask import AskScreen
-from tests.collect.tui.fake import FakeEngine, picture
+from collect.tui.set_up import SetUpScreen
+from tests.collect.tui.fake import SET_UP, SPLIT, TOUCHED, FakeEngine, picture
+from tests.collect.tui.test_app import look
 
 PROMPT = Prompt(
     "Sheet 1 is full. Put a fresh one in, then go on.",
@@ -26,28 +28,48 @@ def engine() -> FakeEngine:
 
 
 async def test_a_key_answers_the_question_that_is_shown(engine: FakeEngine) -> None:
-    async with RunApp(engine).run_test(size=(80, 24)) as pilot:
-        await pilot.pause(0.3)
-        assert isinstance(pilot.app.screen, AskScreen)
+    app = OperatorApp(engine)
+    async with app.run_test(size=(80, 24)) as pilot:
+        assert "Waits until it is answered" in await look(app, pilot)
+        assert isinstance(app.screen, AskScreen)
         await pilot.press("q", "z", "g")
-        await pilot.pause(0.1)
         assert [call for call in engine.calls if call.startswith("answer")] == ["answer 7 g"]
 
 
-async def test_the_stop_key_works_over_a_question(engine: FakeEngine) -> None:
-    async with RunApp(engine).run_test(size=(80, 24)) as pilot:
-        await pilot.pause(0.3)
-        await pilot.press("s")
-        assert "stop" in engine.calls
-
-
 async def test_the_question_goes_when_it_is_over_and_the_next_one_comes(engine: FakeEngine) -> None:
-    async with RunApp(engine).run_test(size=(80, 24)) as pilot:
-        await pilot.pause(0.3)
+    app = OperatorApp(engine)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await look(app, pilot)
         engine.now = replace(engine.now, prompt=replace(PROMPT, question="Is there ink?", number=8))
-        await pilot.pause(0.5)
-        assert isinstance(pilot.app.screen, AskScreen)
-        assert pilot.app.screen.prompt.number == 8
+        assert "Is there ink?" in await look(app, pilot)
         engine.now = replace(engine.now, prompt=None, state=State.RUNNING)
-        await pilot.pause(0.5)
-        assert not isinstance(pilot.app.screen, AskScreen)
+        await look(app, pilot)
+        assert not isinstance(app.screen, AskScreen)
+
+
+async def test_a_bad_stroke_is_shown_with_its_picture_its_default_and_the_time_that_is_left() -> None:
+    now_s = [1010.0]
+    engine = FakeEngine(picture(state=State.ASKING, prompt=SPLIT))
+    app = OperatorApp(engine, now_s=lambda: now_s[0])
+    async with app.run_test(size=(80, 24)) as pilot:
+        text = await look(app, pilot)
+        for part in ("The tip is split", "▀", "n  go on without it   (if nobody answers)", "110 s left"):
+            assert part in text
+        now_s[0] = 1100.0
+        assert "20 s left" in await look(app, pilot)
+        await pilot.press("r")
+        assert engine.calls == ["answer 3 r"]
+
+
+async def test_the_wizard_shows_what_was_measured_and_asks_within_itself() -> None:
+    engine = FakeEngine(picture(state=State.ASKING, set_up=SET_UP, prompt=TOUCHED))
+    app = OperatorApp(engine)
+    async with app.run_test(size=(120, 40)) as pilot:
+        text = await look(app, pilot)
+        assert isinstance(app.screen, SetUpScreen)
+        for part in ("✓ Camera, board, scale", "0.11 px  (at most 1)", "!   its touches span", "b  measure by jog"):
+            assert part in text
+        await pilot.press("b")
+        assert engine.calls == ["answer 2 b"]
+        engine.now = picture()
+        assert "RUNNING" in await look(app, pilot)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collect.snapshot import CellCount
-from collect.tui.grid import grid_content
-from tests.collect.tui.fake import grid_of
+from collect.tui.grid import BAD, COMPLETE, LEFT_OUT, NEXT, NOW, grid_content
+from tests.collect.tui.fake import grid_of, marked_grid
 
 
 def test_tilts_go_down_where_the_width_allows() -> None:
@@ -24,6 +24,12 @@ def test_depths_go_down_where_only_that_fits() -> None:
 def test_before_the_width_is_known_and_where_nothing_fits_tilts_go_down() -> None:
     for room in (0, 10):
         assert len(grid_content(grid_of(5), room).plain.splitlines()) == 4
+
+
+def test_every_state_has_a_sign_of_its_own_besides_its_colour() -> None:
+    text = grid_content(marked_grid(), 78).plain
+    for sign in (COMPLETE, NOW, NEXT, BAD, LEFT_OUT):
+        assert text.count(sign) == (text.count("2/2") - 1 if sign is COMPLETE else 1), sign
 
 
 def test_a_cell_that_is_not_planned_is_a_dash() -> None:

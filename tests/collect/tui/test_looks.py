@@ -1,17 +1,28 @@
-"""What the run screen looks like, compared with accepted pictures (`--snapshot-update` takes new ones)."""
+"""What every screen looks like, compared with accepted pictures (`--snapshot-update` takes new ones)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
+from pathlib import Path
 
 import pytest
 from textual.pilot import Pilot
 
-from collect.snapshot import Snapshot
-from collect.tui.app import RunApp
-from tests.collect.tui.fake import DONE, FAILED, PAUSED, FakeEngine, picture
+from collect.states import State
+from collect.tui.app import OperatorApp
+from tests.collect.tui.desk import FakeDesk, a_review
+from tests.collect.tui.fake import DONE, FAILED, PAUSED, SET_UP, SPLIT, TOUCHED, FakeEngine, full_picture
 
-SMALL, LARGE = (80, 24), (120, 40)
+SIZES = {"80x24": (80, 24), "120x40": (120, 40), "200x60": (200, 60)}
+NOW = {
+    "running": full_picture(),
+    "paused": PAUSED,
+    "failed": FAILED,
+    "done": DONE,
+    "asking": full_picture(state=State.ASKING, prompt=SPLIT),
+    "set-up": full_picture(state=State.ASKING, step="zero touch", set_up=SET_UP, prompt=TOUCHED),
+}
+Press = Callable[[Pilot[None]], Awaitable[None]]
 
 
 @pytest.fixture(autouse=True)
@@ -19,19 +30,71 @@ def colours(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NO_COLOR", raising=False)
 
 
-async def settle(pilot: Pilot[None]) -> None:
-    await pilot.pause(0.25)
+def pressing(*keys: str) -> Press:
+    async def press(pilot: Pilot[None]) -> None:
+        await settled(pilot)
+        if keys:
+            await pilot.press(*keys)
+            await settled(pilot)
+
+    return press
+
+
+async def settled(pilot: Pilot[None]) -> None:
+    """Two polls, and every worker's work."""
+    engine = pilot.app.engine
+    enough = engine.looks + 3 if engine is not None else 0
+    while engine is not None and engine.looks < enough:
+        await pilot.pause(0.02)
+    await pilot.app.workers.wait_for_complete()
+    await pilot.pause()
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("name", ["running", "asking", "set-up"])
+def test_run(snap_compare: Callable[..., bool], name: str, size: str) -> None:
+    app = OperatorApp(FakeEngine(NOW[name]), now_s=lambda: 1010.0)
+    assert snap_compare(app, terminal_size=SIZES[size], run_before=pressing())
+
+
+@pytest.mark.parametrize("name", ["paused", "failed", "done"])
+def test_run_small(snap_compare: Callable[..., bool], name: str) -> None:
+    assert snap_compare(OperatorApp(FakeEngine(NOW[name])), terminal_size=(80, 24), run_before=pressing())
 
 
 @pytest.mark.parametrize(
-    ("now", "size"),
-    [
-        pytest.param(picture(), SMALL, id="running"),
-        pytest.param(PAUSED, SMALL, id="paused"),
-        pytest.param(FAILED, SMALL, id="failed"),
-        pytest.param(DONE, SMALL, id="done"),
-        pytest.param(picture(), LARGE, id="running-large"),
-    ],
+    ("name", "keys"), [("capture", ["tab"]), ("camera", ["tab", "tab"]), ("help", ["?"]), ("leave", ["q"])]
 )
-def test_run_screen(snap_compare: Callable[..., bool], now: Snapshot, size: tuple[int, int]) -> None:
-    assert snap_compare(RunApp(FakeEngine(now)), terminal_size=size, run_before=settle)
+def test_over_the_run(snap_compare: Callable[..., bool], name: str, keys: list[str]) -> None:
+    app = OperatorApp(FakeEngine(full_picture()))
+    assert snap_compare(app, terminal_size=(80, 24), run_before=pressing(*keys))
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("name", ["start", "review"])
+def test_without_a_run(snap_compare: Callable[..., bool], tmp_path: Path, name: str, size: str) -> None:
+    app = OperatorApp(desk=FakeDesk())
+    if name == "review":
+
+        async def review(pilot: Pilot[None]) -> None:
+            await settled(pilot)
+            app.push_screen(a_review(tmp_path))
+            await settled(pilot)
+            await pilot.pause(0.2)
+            await settled(pilot)
+
+        assert snap_compare(app, terminal_size=SIZES[size], run_before=review)
+    else:
+        assert snap_compare(app, terminal_size=SIZES[size], run_before=pressing("d"))
+
+
+def test_light(snap_compare: Callable[..., bool]) -> None:
+    app = OperatorApp(FakeEngine(full_picture()))
+    app.theme = "textual-light"
+    assert snap_compare(app, terminal_size=(120, 40), run_before=pressing())
+
+
+def test_no_colour(snap_compare: Callable[..., bool], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NO_COLOR", "1")
+    app = OperatorApp(FakeEngine(full_picture()))
+    assert snap_compare(app, terminal_size=(120, 40), run_before=pressing())

@@ -12,13 +12,14 @@ import pytest
 from textual.pilot import Pilot
 
 from collect.errors import CollectAborted
-from collect.tui.app import RunApp, ScreenCrashed, run_screen
+from collect.tui.app import OperatorApp
+from collect.tui.running import ScreenCrashed, run_screen
 from collect.tui.terminal import TerminalDriver, _Forgiving
 from tests.collect.tui.fake import FakeEngine, picture
 
 
 def without_terminal(monkeypatch: pytest.MonkeyPatch, pilot: object) -> None:
-    monkeypatch.setattr(RunApp, "run", functools.partialmethod(RunApp.run, headless=True, auto_pilot=pilot))
+    monkeypatch.setattr(OperatorApp, "run", functools.partialmethod(OperatorApp.run, headless=True, auto_pilot=pilot))
 
 
 async def until_over(pilot: Pilot[None]) -> None:
@@ -26,7 +27,7 @@ async def until_over(pilot: Pilot[None]) -> None:
         await asyncio.sleep(0.02)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_stops_the_arm_and_ends_the_screen(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     async def send(pilot: Pilot[None]) -> None:
         os.kill(os.getpid(), number)
@@ -41,15 +42,29 @@ def test_a_signal_stops_the_arm_and_ends_the_screen(number: int, monkeypatch: py
     assert signal.getsignal(number) == before
 
 
+def test_a_lost_terminal_parks_the_arm_and_ends_the_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def hang_up(pilot: Pilot[None]) -> None:
+        os.kill(os.getpid(), signal.SIGHUP)
+        await until_over(pilot)
+
+    without_terminal(monkeypatch, hang_up)
+    engine = FakeEngine(picture())
+    with pytest.raises(CollectAborted):
+        run_screen(engine)
+    assert engine.calls == ["start", "park", "join"]
+
+
 def test_y_ends_it_with_what_ended_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     async def press(pilot: Pilot[None]) -> None:
+        await pilot.pause(0.3)
         await pilot.press("q", "y")
+        await until_over(pilot)
 
     without_terminal(monkeypatch, press)
     engine = FakeEngine(picture())
     with pytest.raises(CollectAborted):
         run_screen(engine)
-    assert engine.calls == ["start", "stop", "join"]
+    assert engine.calls == ["start", "park", "join"]
 
 
 def test_a_screen_that_breaks_stops_the_arm(
@@ -70,10 +85,10 @@ def test_a_screen_that_breaks_stops_the_arm(
 
 
 def test_a_screen_that_cannot_begin_stops_the_arm(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_app: RunApp) -> None:
+    def refuse(_app: OperatorApp) -> None:
         raise OSError("no terminal")
 
-    monkeypatch.setattr(RunApp, "run", refuse)
+    monkeypatch.setattr(OperatorApp, "run", refuse)
     engine = FakeEngine(picture())
     with pytest.raises(OSError, match="no terminal"):
         run_screen(engine)

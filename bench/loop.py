@@ -1,0 +1,70 @@
+"""The loop closed on frozen brushes: re-pressed strokes against the brush's own repeatability; loopback rig.
+
+The brushes are those of `bench.brushfit_brushes`, frozen before any score was looked at. Each is collected, fitted,
+recovered and pressed again by the commands that an operator would use, on a rig in a process of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bench.brushfit_brushes import FROZEN
+from bench.harness import BenchError, Result, machine
+from bench.processes import ROOT, started
+
+HEIGHTS_MM = [11.0, 15.0, 20.0]
+TILTS_DEG = [0.0, 5.0, 10.0]
+REPEATS = 3
+RATE = 20.0
+GOAL_POINTS = 1.0
+LEFT_OUT = 3
+"""Exit code of a collection that finished without some strokes; fewer pairs are told as such."""
+
+
+def run(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
+    """Re-pressed minus another press, in points, of the first `n` frozen brushes (default two): the least and the mean
+    of eight comparisons each (two alignments, two tones, CSIM and SSIM). 27 presses, 27 again, some 4 minutes a brush.
+
+    ratio = the goal (1 point less) over the points that are lost. Raises BenchError where a command fails.
+    """
+    brushes = 2 if n is None else n
+    if not 1 <= brushes <= len(FROZEN):
+        raise ValueError(f"n = {brushes}: 1 to {len(FROZEN)} brushes")
+    results: list[Result] = []
+    for brush in range(brushes):
+        with tempfile.TemporaryDirectory() as scratch:
+            told = close_the_loop(Path(scratch), brush, seed)
+        lost = [-verdict["difference"] for verdict in told["verdicts"]]
+        conditions = f"{told['source']}, {told['pairs']} pairs, {len(told['refused'])} not compared; {machine()}"
+        for name, points in (("worst of 8", max(lost)), ("mean of 8", sum(lost) / len(lost))):
+            peer = f"the goal ({GOAL_POINTS:g} point)"
+            ratio = GOAL_POINTS / max(points, 0.01)
+            title = f"loop: brush {brush + 1}, {name}"
+            results.append(Result(title, points, "points lost", peer, ratio, told["pairs"], seed, conditions))
+    return results
+
+
+def close_the_loop(folder: Path, brush: int, seed: int) -> dict[str, Any]:
+    """Collect a grid, run `brushloop loop`; returns its loop.json."""
+    rig, protocol, sessions = folder / "rig.toml", folder / "protocol.toml", folder / "sessions"
+    grid = f'kind = "grid"\nheights_mm = {HEIGHTS_MM}\ntilts_deg = {TILTS_DEG}\nrepeats = {REPEATS}\nseed = {seed}\n'
+    protocol.write_text(grid, encoding="utf-8")
+    with started("bench.loop_rig", str(rig), str(brush), str(RATE)) as process:
+        _brushloop("collect", "--config", rig, "--protocol", protocol, "--out", sessions, "--no-tui")
+        [session] = sessions.iterdir()
+        process.ask()
+        _brushloop("loop", session, "--config", rig, "--sheet", "1", "--no-tui", "--seed", str(seed))
+    return json.loads((session / "loop" / "loop.json").read_text(encoding="utf-8"))
+
+
+def _brushloop(*words: str | Path) -> None:
+    command = [sys.executable, "-m", "brushloop", *map(str, words)]
+    ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if ran.returncode not in (0, LEFT_OUT):
+        raise BenchError(f"`{' '.join(command[2:])}` ended with {ran.returncode}: {ran.stderr.strip()[-400:]}")

@@ -1,0 +1,31 @@
+"""`python -m bench.loop_rig FILE NUMBER RATE`: a loopback rig with a frozen brush, until its input ends.
+
+Each line on its input puts a fresh sheet in and is answered.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+
+from bench.brushfit_brushes import FROZEN
+from bench.processes import lines_of_input, tell
+from drivers.sim.config import SimConfig
+from drivers.sim.rig import LoopbackRig
+
+
+async def serve(path: Path, brush: int, rate: float) -> None:
+    """Write rig.toml, say so, and serve."""
+    config = SimConfig(seed=FROZEN[brush].seed, rate=rate, brush=FROZEN[brush])
+    async with LoopbackRig(config) as rig:
+        path.write_text(rig.toml(), encoding="utf-8")
+        asked = await lines_of_input()
+        tell("ready")
+        while await asked.readline():
+            rig.world.fresh_sheet()
+            tell("fresh")
+
+
+if __name__ == "__main__":
+    asyncio.run(serve(Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])))

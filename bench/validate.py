@@ -1,0 +1,306 @@
+"""Validation beside a plain loop over scikit-image's SSIM, its memory by number of strokes, and Dask's second worker.
+
+Presses are of the simulated brush (loopback rig), photographed at 10 px/mm. `python -m bench.validate 20000` measures
+memory up to 20,000 strokes; by default it goes to 2,000.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import json
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.harness import BenchError, Result, interleave, machine
+from calibrate.field import BEST_SHIFT_PX, KEYS, SIZE_PX, Alignment, Field
+from calibrate.similarity import csim, ssim
+from calibrate.simulate import simulated_pixels
+from calibrate.validate.jobs import ABSENT, PrepareJob, Press, ScoreJob, prepare_job, score_job
+from calibrate.validate.pixels import Pixels, pack, unpack
+from calibrate.validate.pool import Dask, Threads
+from drivers.sim.brush import Brush, BrushSpec
+from model.ccdbsm import Brush as Bundle
+from model.registry import stroke_models
+from sessions.importer import ImportOptions, import_photographs
+from sessions.reader import Recording
+
+CELLS = tuple((height, tilt) for height in (11.0, 13.0, 15.0, 17.0, 20.0) for tilt in (0.0, 5.0, 10.0))
+PX_MM, TOUCH = 10.0, (380, 150)
+STROKES, FEW, DASK_STROKES = 2000, 100, 300
+SAME = 1e-6
+PHOTOGRAPHS = 30
+START_S = 60.0
+
+
+def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
+    """Scores a second over 12 presses of one cell; peak memory from 100 to `n` strokes (default 2,000); and Dask.
+
+    ratio = ours over the plain loop; strokes over memory growth; two workers over one. Raises BenchError where the
+    scores differ by more than 1e-6 from scikit-image's, or a run fails.
+    """
+    strokes = STROKES if n is None else n
+    if strokes < 1:
+        raise ValueError(f"n = {n}: at least one stroke is needed")
+    with tempfile.TemporaryDirectory() as folder:
+        under = Path(folder)
+        return [
+            *scoring(seed),
+            *threads(seed),
+            *memory(under, strokes, seed),
+            *cluster(under, min(strokes, DASK_STROKES), seed),
+        ]
+
+
+def scoring(seed: int, repeats: int = 12, rounds: int = 3) -> list[Result]:
+    """Presses scored against every model and against each other: compiled, and by a plain loop."""
+    presses = [one for one in pressed((15.0, 5.0), repeats, seed) if not one.refused]
+    models = stroke_models(Bundle())
+    cell = presses[0].height_mm, presses[0].tilt_deg
+    predicted = tuple(pack(simulated_pixels(model, *cell, Field())) for model in models.values())
+    pixels = tuple(press.pixels for press in presses)
+    others = tuple(tuple(k for k in range(len(presses)) if k != m)[:9] for m in range(len(presses)))
+    job = ScoreJob(pixels, predicted, pixels, others, (ABSENT,) * len(presses))
+    found, plain = score_job(job), plain_scores(job)
+    worst = float(np.nanmax(np.abs(found - plain)))
+    if worst > SAME:
+        raise BenchError(f"scores differ from scikit-image's by {worst:.1e}")
+    ours_s, peer_s = interleave(lambda: score_job(job), lambda: plain_scores(job), rounds)
+    prepare_s = min(_seconds(lambda: pressed((15.0, 5.0), 1, seed)) for _ in range(rounds))
+    where = (
+        f"loopback rig, one thread; {len(models)} models and 9 other presses, both alignments and tones; worst "
+        f"difference {worst:.1e}; simulating, photographing and finding a press takes {1e3 * prepare_s:.0f} ms; "
+        f"{machine()}"
+    )
+    peer = "a plain loop over scikit-image's SSIM"
+    return [Result("validate.scored", len(presses) / ours_s, "strokes/s", peer, peer_s / ours_s, rounds, seed, where)]
+
+
+def plain_scores(job: ScoreJob) -> NDArray[np.float64]:
+    """The same numbers, one pair of images at a time."""
+    out = np.full((len(job.presses), len(job.predictions) + 2, len(KEYS), 2), np.nan)
+    predictions = [unpack(packed) for packed in job.predictions]
+    others = [unpack(packed) for packed in job.others]
+    for n, packed in enumerate(job.presses):
+        captured = unpack(packed)
+        for k, (alignment, _tone) in enumerate(KEYS):
+            for m, images in enumerate(predictions):
+                out[n, m, k] = plain_score(captured[k], images[k], alignment)
+            foretold = [plain_score(captured[k], others[o][k], alignment) for o in job.foretell[n]]
+            out[n, -2, k] = np.mean(foretold, axis=0)
+    return out
+
+
+def plain_score(captured: Pixels, predicted: Pixels, alignment: Alignment) -> tuple[float, float]:
+    """CSIM and SSIM of two images, the second at its best shift where size and place do not count."""
+    a, b = captured / 255.0, predicted / 255.0
+    if alignment is Alignment.SIZE_NORMALISED:
+        b = _shifted(b, a)
+    return csim(a, b), ssim(a, b)
+
+
+def _shifted(moving: NDArray[np.float64], fixed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """At the largest overlap, of equals at the least shift."""
+    reach = BEST_SHIFT_PX
+    padded = np.pad(moving, reach).astype(np.float32)
+    overlap = cv2.matchTemplate(padded, fixed.astype(np.float32), cv2.TM_CCORR)
+    top = float(overlap.max())
+    # The correlation is rounded: whoever comes near the top is reckoned exactly.
+    near = [(int(r), int(c)) for r, c in np.argwhere(overlap > top - 1e-3 * max(top, 1.0))]
+    whole = np.rint(255 * np.pad(moving, reach)).astype(np.int64)
+    target = np.rint(255 * fixed).astype(np.int64)
+    sums = {(r, c): int((whole[r : r + SIZE_PX, c : c + SIZE_PX] * target).sum()) for r, c in near}
+    best = max(sums.values())
+    row, column = min(
+        (at for at, value in sums.items() if value == best), key=lambda at: (at[0] - reach) ** 2 + (at[1] - reach) ** 2
+    )
+    return np.pad(moving, reach)[row : row + SIZE_PX, column : column + SIZE_PX]
+
+
+def memory(under: Path, strokes: int, seed: int) -> list[Result]:
+    """Peak memory of the whole command over `FEW` strokes and over all of them."""
+    few, many = (session(under, f"of-{count}", count, seed) for count in (min(FEW, strokes), strokes))
+    small_mb, small_s = _measured(few, under / "few")
+    large_mb, large_s = _measured(many, under / "many")
+    grown = large_mb - small_mb
+    times = strokes / min(FEW, strokes)
+    where = (
+        f"loopback rig; {min(FEW, strokes)} strokes: {small_mb:.0f} MB, {small_s:.1f} s; {strokes} strokes: "
+        f"{large_mb:.0f} MB, {large_s:.1f} s; {machine()}"
+    )
+    peer = f"{times:.0f} times as many strokes in {large_mb / small_mb:.2f} times the memory"
+    rates = strokes / large_s, min(FEW, strokes) / small_s
+    return [
+        Result("validate.memory", grown, "MB more", peer, times * small_mb / large_mb, 1, seed, where),
+        Result(
+            "validate.whole",
+            rates[0],
+            "strokes/s",
+            f"the whole command over {min(FEW, strokes)} strokes",
+            rates[0] / rates[1],
+            1,
+            seed,
+            where,
+        ),
+    ]
+
+
+def threads(seed: int, strokes: int = 60) -> list[Result]:
+    """Finding strokes on photographs by threads, beside as many processes that have already started."""
+    with tempfile.TemporaryDirectory() as folder:
+        place = session(Path(folder), "threads", strokes, seed)
+        jobs = [PrepareJob(capture, None, Field()) for capture in Recording(place).captures()]
+    with Threads() as pool, ProcessPoolExecutor(pool.workers, multiprocessing.get_context("spawn")) as processes:
+        began = time.perf_counter()
+        list(processes.map(prepare_job, jobs[: 4 * pool.workers]))
+        start_s = time.perf_counter() - began
+        named = [(str(k), job) for k, job in enumerate(jobs)]
+        ours_s, peer_s = interleave(
+            lambda: list(pool.run(prepare_job, iter(named))), lambda: list(processes.map(prepare_job, jobs)), 3
+        )
+        workers = pool.workers
+    where = f"loopback rig, photographs of 480 x 300 px, {workers} workers; starting the processes took {start_s:.1f} s"
+    peer = "processes, already started"
+    rate = strokes / ours_s
+    return [Result("validate.threads", rate, "strokes/s", peer, peer_s / ours_s, 3, seed, f"{where}; {machine()}")]
+
+
+def _measured(place: Path, out: Path) -> tuple[float, float]:
+    """(peak MB, seconds) of `brushloop validate` in a process of its own."""
+    program = (
+        "import resource, sys, brushloop\n"
+        f"sys.argv = ['brushloop', 'validate', {str(place)!r}, '--out', {str(out)!r}, '--no-held-out']\n"
+        "try:\n    brushloop.app()\nexcept SystemExit as end:\n    code = end.code or 0\n"
+        "sys.stderr.write(f'\\n{code} {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}')\n"
+    )
+    began = time.perf_counter()
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    seconds = time.perf_counter() - began
+    last = ran.stderr.split("\n")[-1].split()
+    if ran.returncode or len(last) != 2 or last[0] != "0":
+        raise BenchError(f"validate failed: {ran.stderr[-300:]}")
+    return int(last[1]) / 1024, seconds
+
+
+def cluster(under: Path, strokes: int, seed: int) -> list[Result]:
+    """Finding strokes by one Dask worker and by two, each with one thread; nothing where Dask is missing."""
+    if importlib.util.find_spec("distributed") is None:
+        return []
+    place = session(under, f"dask-{strokes}", strokes, seed)
+    jobs = [(str(k), PrepareJob(one, None, Field())) for k, one in enumerate(Recording(place).captures())]
+    taken: dict[int, float] = {}
+    for workers in (1, 2):
+        with _workers(under, workers) as address, Dask(address) as pool:
+            list(pool.run(prepare_job, iter(jobs[: 2 * workers])))  # imports, and what is compiled at the first call
+            began = time.perf_counter()
+            list(pool.run(prepare_job, iter(jobs)))
+            taken[workers] = time.perf_counter() - began
+    speed = taken[1] / taken[2]
+    where = f"loopback rig, {strokes} strokes, dask {version('distributed')}; {machine()}"
+    rate = strokes / taken[2]
+    return [Result("validate.dask", rate, "strokes/s", "one worker; two here", speed, 1, seed, where)]
+
+
+@contextmanager
+def _workers(under: Path, count: int) -> Iterator[str]:
+    """The address of a scheduler with so many workers of one thread."""
+    told = under / f"scheduler-{count}.json"
+    here = ("--host", "127.0.0.1", "--no-dashboard")
+    words = ("distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", str(told), *here)
+    started = [_quietly(under, *words)]
+    try:
+        deadline = time.monotonic() + START_S
+        while not told.is_file() or not told.read_text():
+            if time.monotonic() > deadline:
+                raise BenchError("the Dask scheduler did not start")
+            time.sleep(0.05)
+        address = str(json.loads(told.read_text())["address"])
+        worker = ("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny", *here)
+        started += [_quietly(under, *worker) for _ in range(count)]
+        distributed: Any = importlib.import_module("distributed")
+        with distributed.Client(address, set_as_default=False) as client:
+            client.wait_for_workers(count, timeout=START_S)
+        yield address
+    finally:
+        for process in reversed(started):
+            process.kill()
+            process.wait()
+
+
+def _quietly(under: Path, *words: str) -> subprocess.Popen[bytes]:
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", *words]
+    nowhere = subprocess.DEVNULL
+    return subprocess.Popen(command, cwd=under, env=environment, stdout=nowhere, stderr=nowhere)
+
+
+def session(under: Path, name: str, strokes: int, seed: int) -> Path:
+    """A session of so many presses; photographs repeat after the first thirty, which no cache here can notice."""
+    photos = under / f"{name}-photos"
+    photos.mkdir()
+    brush = Brush(BrushSpec(seed=1 + seed))
+    drawn = [
+        cv2.imencode(".png", photograph(brush, *CELLS[k % len(CELLS)], seed + k))[1].tobytes()
+        for k in range(min(PHOTOGRAPHS, strokes))
+    ]
+    lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
+    for k, data in zip(range(strokes), itertools.cycle(drawn), strict=False):
+        file = f"{k:06d}.png"
+        (photos / file).write_bytes(data)
+        height, tilt = CELLS[k % len(drawn) % len(CELLS)]
+        lines.append(f"{file},{height},{tilt},{PX_MM},{TOUCH[0]},{TOUCH[1]}")
+    (photos / "strokes.csv").write_text("\n".join(lines) + "\n")
+    out = under / name
+    import_photographs(photos, photos / "strokes.csv", out, ImportOptions(kind="press"), "bench", lambda: 1)
+    return out
+
+
+def pressed(cell: tuple[float, float], repeats: int, seed: int) -> list[Press]:
+    """Presses of one cell, found on their photographs."""
+    with tempfile.TemporaryDirectory() as folder:
+        photos = Path(folder) / "photos"
+        photos.mkdir()
+        brush = Brush(BrushSpec(seed=1 + seed))
+        lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
+        for k in range(repeats):
+            cv2.imwrite(str(photos / f"{k:03d}.png"), photograph(brush, *cell, seed + k))
+            lines.append(f"{k:03d}.png,{cell[0]},{cell[1]},{PX_MM},{TOUCH[0]},{TOUCH[1]}")
+        (photos / "strokes.csv").write_text("\n".join(lines) + "\n")
+        out = Path(folder) / "presses"
+        import_photographs(photos, photos / "strokes.csv", out, ImportOptions(kind="press"), "bench", lambda: 1)
+        return [prepare_job(PrepareJob(capture, None, Field())) for capture in Recording(out).captures()]
+
+
+def photograph(brush: Brush, height_mm: float, tilt_deg: float, seed: int) -> NDArray[np.uint8]:
+    """A press on white paper, its tip touching at TOUCH."""
+    mark = brush.press(height_mm, tilt_deg, ink_load=1.0, press_seed=seed)
+    page = np.full((300, 480), 235, np.uint8)
+    rows, columns = mark.density.shape
+    left, top = TOUCH[0] - round(mark.origin_px[0]), TOUCH[1] - round(mark.origin_px[1])
+    page[top : top + rows, left : left + columns] = 235 - np.rint(200 * np.clip(mark.density, 0, 1)).astype(np.uint8)
+    return page
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    began = time.perf_counter()
+    work()
+    return time.perf_counter() - began
+
+
+if __name__ == "__main__":
+    for line in run(n=int(sys.argv[1]) if len(sys.argv) > 1 else None):
+        sys.stdout.write(f"# {line.conditions}\n{line.to_line()}\n")

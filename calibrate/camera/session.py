@@ -1,0 +1,100 @@
+"""What a recording tells of its camera: the board, the lens, and the photographs of the board."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+from pydantic import BaseModel, ValidationError
+
+from calibrate.artefact import LensUsed, load_artefact
+from calibrate.camera.artefact import LensFile
+from calibrate.camera.lens import Gray
+from calibrate.errors import CalibrationError
+from calibrate.scale import BoardSpec
+from sessions import container
+from sessions.messages import decode_gray, decode_still
+from sessions.reader import Recording
+from sessions.schemas import StepEvent, Topic
+
+EFFECTIVE = "rig.effective.json"
+"""The configuration with what the environment changed on top of rig.toml."""
+NO_BOARD = "holds no view of the board (a `board` step)"
+
+
+class _Paper(BaseModel):
+    size_mm: tuple[float, float]
+
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def board_of(recording: Recording) -> BoardSpec:
+    """The board of a session's rig. Raises `CalibrationError` where the recording names none."""
+    try:
+        board = _rig(recording)["board"]
+    except KeyError:
+        raise CalibrationError(_where(recording), "holds no board") from None
+    return _parsed(recording, "board", BoardSpec, board)
+
+
+def sheet_of(recording: Recording) -> tuple[float, float] | None:
+    """Width and height in mm of the sheet that lies on the board; None where the rig's configuration tells none."""
+    paper = _rig(recording).get("paper")
+    size = cast("dict[str, Any]", paper).get("size_mm") if isinstance(paper, dict) else None
+    return None if size is None else _parsed(recording, "paper", _Paper, {"size_mm": size}).size_mm
+
+
+def lens_of_session(recording: Recording) -> LensUsed | None:
+    """The lens that the session was collected with; None where its rig named none. Raises `CalibrationError`."""
+    camera = _rig(recording).get("camera")
+    optics = cast("dict[str, Any]", camera).get("optics") if isinstance(camera, dict) else None
+    return None if optics is None else _parsed(recording, "camera.optics", LensUsed, optics)
+
+
+def read_lens(path: Path) -> LensUsed:
+    """A lens file of `camera intrinsics`. Raises `CalibrationError`."""
+    file = load_artefact(path, LensFile)
+    source = f"lens file {file.digest}"
+    return LensUsed(source=source, size_px=file.size_px, matrix=file.matrix, distortion=file.distortion)
+
+
+def known_lens(recording: Recording, given: Path | None) -> LensUsed | None:
+    """The lens file that was given, else the session's own. Raises `CalibrationError`."""
+    return read_lens(given) if given is not None else lens_of_session(recording)
+
+
+def board_stills(recording: Recording) -> Iterator[tuple[int, Gray]]:
+    """(t_ns, gray photograph) of every `board` step in order. Raises `SessionDamaged` for one that cannot be read."""
+    kind = ""
+    for _schema, channel, message in container.messages(recording.path, [str(Topic.STEP), str(Topic.STILL)]):
+        if channel.topic == Topic.STEP:
+            event = StepEvent.model_validate_json(message.data)
+            kind = event.kind if event.phase == "begin" else ""
+        elif kind == "board":
+            yield message.log_time, decode_gray(decode_still(message.data), str(recording.path))
+
+
+def _rig(recording: Recording) -> dict[str, Any]:
+    try:
+        rig: Any = json.loads(recording.attachment(EFFECTIVE))
+    except (ValueError, KeyError, RecursionError):
+        rig = None
+    if not isinstance(rig, dict):
+        raise CalibrationError(_where(recording), "holds no board")
+    return cast("dict[str, Any]", rig)
+
+
+def _parsed(recording: Recording, name: str, kind: type[M], values: object) -> M:
+    try:
+        return kind.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join([name, *map(str, first["loc"])])
+        raise CalibrationError(_where(recording), f"{field}: {first['msg']}") from None
+
+
+def _where(recording: Recording) -> str:
+    return f"{recording.path} {EFFECTIVE}"

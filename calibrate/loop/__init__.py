@@ -1,0 +1,1 @@
+"""Strokes pressed again from what their images told, beside the originals."""

@@ -1,0 +1,34 @@
+"""`brushloop loop compare`. Heavy imports wait until the command runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def compare(
+    original: Annotated[Path, typer.Argument(help="The session whose strokes were pressed again.")],
+    again: Annotated[Path, typer.Argument(help="The session of the replay protocol.")],
+    fit: Annotated[
+        Path | None, typer.Option(help="Brush fit that recovered depth and tilt; else CCD-BSM as published.")
+    ] = None,
+    mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = 0.3,
+    out: Annotated[Path, typer.Option(help="Folder for loop.html, loop.png, loop.csv, loop.json.")] = Path("loop"),
+) -> None:
+    """Compare re-pressed strokes with their originals, beside the brush's own repeatability."""
+    import sys
+
+    import rich
+    from rich.markup import escape
+
+    from calibrate.field import Field
+    from calibrate.loop.compare import compare_sessions
+    from calibrate.loop.report import PICTURE, summary, write_loop
+
+    closed = compare_sessions(original, again, fit, Field(mm_per_px=mm_per_px))
+    report = write_loop(closed, out, " ".join(["brushloop", *sys.argv[1:]]))
+    for line in summary(closed):
+        rich.print(escape(line))
+    rich.print(escape(f"Picture: {out / PICTURE}\nReport:  {report}"))

@@ -1,0 +1,123 @@
+"""Number of strokes against similarity: fits from a few presses, scored on all the others of their session."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calibrate.brushfit.fit import fit_presses
+from calibrate.field import KEYS, Alignment, Tone
+from calibrate.simulate import simulated_pixels
+from calibrate.validate.heldout import RefitJob, bezier_body, bezier_pixels, cropped, fitted_press, press_body
+from calibrate.validate.jobs import ABSENT, VERSION, ScoreJob, score_job
+from calibrate.validate.pixels import pack
+from calibrate.validate.pool import Scheduler
+from calibrate.validate.report import Step
+from calibrate.validate.run import CHUNK, Outcome
+from calibrate.validate.steps import Progress
+from calibrate.validation import brush_of
+from model.fitted_shape import fitted_model
+
+COUNTS = (1, 2, 3, 5, 9, 15, 30, 60)
+DRAWS = 2
+"""A fit from few presses depends on which they are; the average of two draws is shown."""
+MOST_SCORED = 200
+LEAST_LEFT = 5
+JUDGED = KEYS.index((Alignment.MM, Tone.BINARY))
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One fit: which rows it is made of, and which it is scored on."""
+
+    session: int
+    count: int
+    chosen: tuple[int, ...]
+    scored: tuple[int, ...]
+
+
+def similarity_by_strokes(outcome: Outcome, scheduler: Scheduler, progress: Progress) -> tuple[Step, ...]:
+    """The steps of every session; empty for one that has too few presses."""
+    jobs: dict[str, tuple[Trial, RefitJob]] = {}
+    for trial in _trials(outcome):
+        brush = brush_of(outcome.sessions[trial.session].header)
+        strokes = tuple((*outcome.rows[k].cell, outcome.press(k).pixels) for k in trial.chosen)
+        job = RefitJob(strokes, float(brush.radius_mm), float(brush.length_mm), None, outcome.options.view)
+        key = hashlib.sha256(f"fit {VERSION} {job.key}".encode()).hexdigest()
+        jobs[f"{key}:{len(jobs)}"] = (trial, job)
+    waiting = ((name, job) for name, (_, job) in jobs.items() if name.partition(":")[0] not in outcome.store)
+    for done, (name, found) in enumerate(scheduler.run(fit_job, waiting), 1):
+        outcome.store.put(name.partition(":")[0], found)
+        progress("fits from few strokes", done, len(jobs))
+    sums: dict[tuple[int, int, str], list[np.ndarray]] = {}
+    for name, (trial, _) in jobs.items():
+        made = outcome.store.get(name.partition(":")[0])
+        for model, scores in _scored(outcome, trial, made, scheduler):
+            sums.setdefault((trial.session, trial.count, model), []).append(scores)
+    steps: list[Step] = []
+    for (session, count, model), found in sorted(sums.items()):
+        scores = np.concatenate(found)
+        mean = 100.0 * scores.mean(axis=0)
+        ident = outcome.sessions[session].header.session_id
+        csim, ssim = (round(float(value), 6) for value in mean)
+        steps.append(Step(session_id=ident, strokes=count, model=model, csim=csim, ssim=ssim, n=len(scores)))
+    return tuple(steps)
+
+
+def fit_job(job: RefitJob) -> dict[str, Any]:
+    """As `refit_job`, but from the start: with few strokes the fit itself finds what it can tell."""
+    strokes, grid = cropped(job)
+    press = fit_presses(strokes, grid, job.radius_mm, job.length_mm).press
+    return {"fitted": press_body(press), "bezier": bezier_body(strokes, grid)}
+
+
+def _trials(outcome: Outcome) -> Iterator[Trial]:
+    for session in range(len(outcome.sessions)):
+        cells: dict[tuple[float, float], list[int]] = {}
+        for k, row in enumerate(outcome.rows):
+            if row.session == session and not row.press.cut:
+                cells.setdefault(row.cell, []).append(k)
+        for draw in range(DRAWS):
+            rng = np.random.default_rng([draw, session])
+            # Every cell once before any twice: that is how one would choose.
+            groups = [[int(k) for k in rng.permutation(cells[cell])] for cell in sorted(cells)]
+            groups = [groups[int(g)] for g in rng.permutation(len(groups))]
+            deepest = max(map(len, groups), default=0)
+            order = [group[depth] for depth in range(deepest) for group in groups if depth < len(group)]
+            for count in COUNTS:
+                left = order[count:]
+                if len(left) >= LEAST_LEFT:
+                    step = max(1, -(-len(left) // MOST_SCORED))
+                    yield Trial(session, count, tuple(order[:count]), tuple(sorted(left[::step])))
+
+
+def _scored(
+    outcome: Outcome, trial: Trial, made: dict[str, Any], scheduler: Scheduler
+) -> Iterator[tuple[str, np.ndarray]]:
+    """(model, (n, 2) CSIM and SSIM) in millimetres, binary."""
+    brush, view = brush_of(outcome.sessions[trial.session].header), outcome.options.view
+    press = fitted_press(made["fitted"], float(brush.radius_mm), float(brush.length_mm))
+    model = fitted_model(press)
+    cells: dict[tuple[float, float], list[int]] = {}
+    for k in trial.scored:
+        cells.setdefault(outcome.rows[k].cell, []).append(k)
+
+    def jobs() -> Iterator[tuple[str, ScoreJob]]:
+        for cell, group in cells.items():
+            bezier = ABSENT if made["bezier"] is None else pack(bezier_pixels(made["bezier"], *cell, view))
+            predictions = (pack(simulated_pixels(model, *cell, view)), bezier)
+            for start in range(0, len(group), CHUNK):
+                chunk = group[start : start + CHUNK]
+                presses = tuple(outcome.press(k).pixels for k in chunk)
+                nothing = tuple(() for _ in chunk)
+                yield str(chunk[0]), ScoreJob(presses, predictions, (), nothing, (ABSENT,) * len(chunk))
+
+    found = dict(scheduler.run(score_job, jobs()))
+    values = np.concatenate([found[name] for name in sorted(found, key=int)])[:, :, JUDGED]
+    yield "CCD-BSM", values[:, 0]
+    if made["bezier"] is not None:
+        yield "Bézier", values[:, 1]

@@ -1,0 +1,208 @@
+"""`brushloop validate SESSION...`, `brushloop validate diff A B` and `brushloop validate captures`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+if TYPE_CHECKING:
+    from calibrate.validate.diff import Difference
+    from calibrate.validate.steps import Progress
+
+SESSIONS = "sessions"
+MUCH = 10
+"""Lines that tell of progress where there is no terminal: one a tenth."""
+
+
+class SessionsOrCommand(TyperGroup):
+    """A group whose first argument may be a session: whatever is no command's name is one."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the command's name before a path or an option; `./diff` names a session of that name."""
+        if not args or (args[0] not in self.commands and args[0] != "--help"):
+            args = [SESSIONS, *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(
+    cls=SessionsOrCommand,
+    help="Compare every stroke model with every captured stroke (`brushloop validate SESSION...`).",
+)
+
+
+@app.command(SESSIONS)
+def validate(
+    session: Annotated[list[str], typer.Argument(help="Sessions: folders, .mcap files, or URLs with a checksum.")],
+    model: Annotated[list[str] | None, typer.Option(help="Only these models; all by default.")] = None,
+    generator: Annotated[list[Path] | None, typer.Option(help="A trained generator.safetensors.")] = None,
+    mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = 0.3,
+    calibration: Annotated[Path | None, typer.Option(help="Artefact; the session's newest by default.")] = None,
+    fit: Annotated[Path | None, typer.Option(help="Brush fit; the session's newest by default.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the report; <session>/validation by default.")] = None,
+    gate: Annotated[list[str] | None, typer.Option(help="As csim_avg>=0.90; exit code 5 where it is missed.")] = None,
+    ablations: Annotated[bool, typer.Option("--ablations", help="Lambdas, and similarity by number of fits.")] = False,
+    curves: Annotated[list[str] | None, typer.Option(help="NAME=FOLDER of a training, for figures 9 and 12.")] = None,
+    held_out: Annotated[bool, typer.Option(help="Fit to other cells, each cell left out in turn.")] = True,
+    tune: Annotated[int, typer.Option(min=0, help="Steps to tune each generator on other cells; 0: not.")] = 0,
+    parquet: Annotated[bool | None, typer.Option(help="scores.parquet; by default where pyarrow is there.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    scheduler: Annotated[str, typer.Option(help="An existing Dask cluster, as tcp://host:8786.")] = "",
+    workers: Annotated[int | None, typer.Option(min=1, max=1024, help="Threads; all cores by default.")] = None,
+) -> None:
+    """Compare every model with every captured stroke; the same command goes on where it was stopped."""
+    import sys
+
+    import rich
+    from rich.markup import escape
+
+    from calibrate.field import Field
+    from calibrate.terminal import summary as drag_summary
+    from calibrate.validate.main import Request, check
+    from calibrate.validate.main import validate as run
+    from calibrate.validate.terminal import summary
+
+    request = Request(
+        places=tuple(session),
+        command=" ".join(["brushloop", *sys.argv[1:]]),
+        models=tuple(model or ()),
+        view=Field(mm_per_px=mm_per_px),
+        calibration=calibration,
+        fit=fit,
+        generators=tuple(generator or ()),
+        curves=tuple(curves or ()),
+        gates=tuple(gate or ()),
+        ablations=ablations,
+        held_out=held_out,
+        tune_steps=tune,
+        parquet=parquet,
+        out=out,
+        scheduler=scheduler,
+        workers=workers,
+    )
+    with _shown() as progress:
+        made = run(request, progress)
+    if json and made.report is not None:
+        typer.echo(made.report.to_json(), nl=False)
+    else:
+        for drags in made.drags:
+            rich.print(*drag_summary(drags), sep="\n")
+        if made.report is not None:
+            rich.print(*summary(made.report), sep="\n")
+        for note in made.notes:
+            rich.print(escape(note))
+        rich.print(f"Report: {escape(str(made.folder / 'report.html'))}")
+    check(made, request)
+
+
+@app.command()
+def diff(
+    before: Annotated[Path, typer.Argument(help="A report.json, or a session that was validated.")],
+    after: Annotated[Path, typer.Argument(help="Another.")],
+    json: Annotated[bool, typer.Option("--json", help="Print every series as JSON.")] = False,
+) -> None:
+    """What got better or worse between two reports, sessions or versions of the software: a paired test."""
+    from calibrate.validate.diff import compare
+
+    found = compare(before, after)
+    if json:
+        from dataclasses import asdict
+        from json import dumps
+
+        changes = [asdict(change) | {"verdict": change.verdict} for change in found.changes]
+        said = {"paired_by": found.paired_by, "source": found.before.label, "changes": changes}
+        typer.echo(dumps(said, indent=1, ensure_ascii=False))
+        return
+    _print_difference(found)
+
+
+@app.command()
+def captures(
+    session: Annotated[list[str], typer.Argument(help="Sessions of presses.")],
+    generator: Annotated[Path, typer.Option(help="The generator.safetensors that is to be tuned.")],
+    out: Annotated[Path, typer.Option(help="The file for `brushloop train tune`.")] = Path("captures.safetensors"),
+    leave_out: Annotated[list[str] | None, typer.Option(help="A cell to keep for judging, H/alpha as 13/5.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Artefact; the session's newest by default.")] = None,
+) -> None:
+    """Write captured presses as `brushloop train tune` reads them."""
+    import rich
+    from rich.markup import escape
+
+    from calibrate.errors import CalibrationError
+    from calibrate.validate.captures_file import lay_captures, write_captures
+    from calibrate.validate.sources import open_session
+
+    cells: list[tuple[float, float]] = []
+    for text in leave_out or ():
+        try:
+            height, tilt = (float(part) for part in text.split("/"))
+        except ValueError:
+            raise CalibrationError(f"--leave-out {text}", "expected H/alpha, as 13/5") from None
+        cells.append((height, tilt))
+    opened = [open_session(place, out.parent / "work", calibration, None) for place in session]
+    laid = lay_captures(opened, generator)
+    count = write_captures(laid, out, cells)
+    for name, why in laid.left_out:
+        rich.print(f"left out: {escape(name)}: {escape(why)}")
+    if cells:
+        rich.print(f"left out, as asked: {len(laid.cells) - count} presses of {len(cells)} cells")
+    rich.print(f"{count} presses ({escape(laid.source)}): {escape(str(out))}")
+
+
+def _print_difference(found: Difference) -> None:
+    import rich
+    from rich.markup import escape
+    from rich.table import Table
+
+    from calibrate.validate.diff import sentences
+
+    rich.print(*(escape(sentence) for sentence in sentences(found)), sep="\n")
+    title = f"after minus before, points of percent ({found.before.label})"
+    out = Table("model", "images", "", "before", "after", "change", "95 %", "p", "", title=escape(title))
+    for change in found.changes:
+        name, alignment, tone, measure = change.series
+        span = change.test.interval
+        out.add_row(
+            escape(name),
+            f"{alignment}, {tone}",
+            measure.upper(),
+            f"{change.before:.2f}",
+            f"{change.after:.2f}",
+            f"{change.test.mean:+.3f}",
+            "" if span is None else f"{span[0]:+.2f} to {span[1]:+.2f}",
+            f"{change.p_holm:.3f}",
+            change.verdict,
+        )
+    rich.print(out)
+
+
+class _shown:  # noqa: N801 - used as a function
+    """Progress on stderr: a bar on a terminal, a line a tenth elsewhere."""
+
+    def __enter__(self) -> Progress:
+        from rich.console import Console
+        from rich.progress import Progress as Bar
+
+        self._console = Console(stderr=True)
+        self._bar = Bar(console=self._console, transient=True) if self._console.is_terminal else None
+        self._tasks: dict[str, Any] = {}
+        if self._bar is not None:
+            self._bar.start()
+        return self._show
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def _show(self, what: str, done: int, total: int) -> None:
+        if self._bar is not None:
+            if what not in self._tasks:
+                self._tasks[what] = self._bar.add_task(what, total=total)
+            self._bar.update(self._tasks[what], completed=done)
+            return
+        tenth = done * MUCH // max(total, 1)
+        if tenth > self._tasks.get(what, 0):
+            self._tasks[what] = tenth
+            typer.echo(f"{what}: {done} of {total}", err=True)

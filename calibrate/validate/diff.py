@@ -1,0 +1,145 @@
+"""Two reports compared: what got better or worse, with a paired test.
+
+Pairs are, in this order: the same stroke of the same recording (two versions of the software, or of the options); a
+stroke and the one that repeats it in name; the same cell (two sessions), by its average.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calibrate.errors import CalibrationError
+from calibrate.validate.report import Report, load_report
+from calibrate.validate.stats import Paired, holm, paired
+
+SIGNIFICANT = 0.05
+MEASURES = ("csim", "ssim")
+Series = tuple[str, str, str, str]
+"""Model, alignment, tone, measure."""
+Strokes = dict[tuple[str, ...], float]
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One series, `after` minus `before` in points (percent)."""
+
+    series: Series
+    before: float
+    after: float
+    test: Paired
+    p_holm: float
+    """Corrected for all the series that are compared."""
+
+    @property
+    def verdict(self) -> str:
+        """better, worse, or no difference that chance does not make."""
+        if self.p_holm > SIGNIFICANT:
+            return "no clear difference"
+        return "better" if self.test.mean > 0 else "worse"
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Two reports compared."""
+
+    before: Report
+    after: Report
+    paired_by: str
+    """`stroke` or `cell`."""
+    changes: list[Change]
+    only_before: list[str]
+    """Models that only one of the two has."""
+    only_after: list[str]
+
+
+def compare(before: Path, after: Path) -> Difference:
+    """Compare two reports, or two sessions that were validated. Raises `CalibrationError` where they cannot be."""
+    one, other = report_path(before), report_path(after)
+    a, b = load_report(one), load_report(other)
+    if a.source != b.source:
+        raise CalibrationError(str(other), f"is of {b.source}, {one} of {a.source}: they are not compared")
+    by_stroke = bool({s.recording_sha256 for s in a.sessions} & {s.recording_sha256 for s in b.sessions})
+    old, new = read_scores(one, a, by_stroke=by_stroke), read_scores(other, b, by_stroke=by_stroke)
+    tests: list[tuple[Series, Paired, float, float]] = []
+    for series in old:
+        if series not in new:
+            continue
+        both = sorted(old[series].keys() & new[series].keys())
+        values = [np.array([100.0 * side[series][key] for key in both]) for side in (old, new)]
+        test = paired(*values)
+        if test is not None:
+            tests.append((series, test, float(values[0].mean()), float(values[1].mean())))
+    if not tests:
+        raise CalibrationError(str(other), f"has no stroke, cell or model in common with {one}")
+    corrected = holm([test.p for _, test, _, _ in tests])
+    changes = [
+        Change(series, mean, then, test, p) for (series, test, mean, then), p in zip(tests, corrected, strict=True)
+    ]
+    models = [{series[0] for series in side} for side in (old, new)]
+    only = (sorted(models[0] - models[1]), sorted(models[1] - models[0]))
+    return Difference(a, b, "stroke" if by_stroke else "cell", changes, *only)
+
+
+def report_path(given: Path) -> Path:
+    """A report.json, by itself or in a session's folder. Raises `CalibrationError` where there is none."""
+    places = [
+        given,
+        given / "report.json",
+        given / "validation" / "report.json",
+        given.parent / "validation/report.json",
+    ]
+    for place in places:
+        if place.is_file() and place.suffix == ".json":
+            return place
+    raise CalibrationError(str(given), f"has no report: run `brushloop validate {given}` first, or give a report.json")
+
+
+def read_scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, Strokes]:
+    """Series -> score by (recording, stroke), or by cell on average. Raises `CalibrationError` for an edited table."""
+    table = path.with_name("scores.csv")
+    try:
+        with table.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise CalibrationError(str(table), error.strerror or str(error)) from None
+    if digest != report.scores_sha256:
+        raise CalibrationError(str(table), f"is not the table of {path.name}: its SHA-256 differs")
+    recordings = {s.session_id: s.recording_sha256 for s in report.sessions}
+    sums: dict[Series, dict[tuple[str, ...], tuple[float, int]]] = {}
+    with table.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            key = (
+                (recordings[row["session_id"]], row["stroke_id"]) if by_stroke else (row["height_mm"], row["tilt_deg"])
+            )
+            for measure in MEASURES:
+                series = sums.setdefault((row["model"], row["alignment"], row["tone"], measure), {})
+                total, count = series.get(key, (0.0, 0))
+                series[key] = total + float(row[measure]), count + 1
+    return {name: {key: total / count for key, (total, count) in series.items()} for name, series in sums.items()}
+
+
+def sentences(found: Difference) -> Iterator[str]:
+    """What the comparison is of, in words."""
+    versions = [side.software.get("brushloop", "?") for side in (found.before, found.after)]
+    yield f"Before: {_named(found.before)}, brushloop {versions[0]}. After: {_named(found.after)}, {versions[1]}."
+    what = "the same stroke" if found.paired_by == "stroke" else "the average of the same (H, α)"
+    yield (
+        f"Paired by {what}, n = {found.changes[0].test.n}; p by flipping signs, corrected by Holm for "
+        f"{len(found.changes)} series ({found.before.label})."
+    )
+    if found.paired_by == "cell":
+        yield "Two sessions differ in more than what was meant to change: brush, ink, paper, zero touch."
+    if found.only_before:
+        yield f"Only before: {', '.join(found.only_before)}."
+    if found.only_after:
+        yield f"Only after: {', '.join(found.only_after)}."
+
+
+def _named(report: Report) -> str:
+    return ", ".join(session.session_id for session in report.sessions[:4])

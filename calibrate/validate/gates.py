@@ -1,0 +1,96 @@
+"""Gates: what a score must reach, for scripts. `csim_avg>=0.90`, or with all of it told:
+`ccd-bsm-heldout:mm:binary:csim_avg>=0.93`."""
+
+from __future__ import annotations
+
+import operator
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+from calibrate.errors import CalibrationError
+from calibrate.field import Alignment, Tone
+from calibrate.validate.report import Report
+
+OPERATORS: dict[str, Callable[[float, float], bool]] = {
+    ">=": operator.ge,
+    "<=": operator.le,
+    ">": operator.gt,
+    "<": operator.lt,
+}
+STATISTICS = ("avg", "median", "min", "max")
+FORM = re.compile(
+    r"^(?P<where>(?:[^:<>=]+:)*)(?P<measure>csim|ssim)_(?P<statistic>\w+)\s*(?P<op>>=|<=|>|<)\s*(?P<limit>\S+)$"
+)
+
+
+class GateMissed(Exception):
+    """A score is not what a gate asks for; the report is written all the same."""
+
+    exit_code: ClassVar[int] = 5
+
+    def __init__(self, missed: list[str]) -> None:
+        self.missed = missed
+        super().__init__("gate missed: " + "; ".join(missed))
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """One condition. Without a model it is about the report's calibrated one, else about the first."""
+
+    text: str
+    model: str
+    alignment: Alignment
+    tone: Tone
+    measure: str
+    statistic: str
+    op: str
+    limit: float
+
+
+def parse_gate(text: str) -> Gate:
+    """Raises `CalibrationError` for what is no gate."""
+    found = FORM.match(text.strip())
+    if found is None:
+        raise _bad(text, "expected [MODEL:][ALIGNMENT:][TONE:]csim_avg>=0.90")
+    model, alignment, tone = "", Alignment.SIZE_NORMALISED, Tone.BINARY
+    for part in found["where"].split(":")[:-1]:
+        if part in list(Alignment):
+            alignment = Alignment(part)
+        elif part in list(Tone):
+            tone = Tone(part)
+        elif not model:
+            model = part
+        else:
+            raise _bad(text, f"names two models, {model!r} and {part!r}")
+    if found["statistic"] not in STATISTICS:
+        raise _bad(text, f"{found['statistic']!r} is not one of {', '.join(STATISTICS)}")
+    try:
+        limit = float(found["limit"])
+    except ValueError:
+        raise _bad(text, f"{found['limit']!r} is no number") from None
+    if not 0.0 <= limit <= 1.0:
+        raise _bad(text, f"{limit:g} is outside 0 to 1")
+    return Gate(text.strip(), model, alignment, tone, found["measure"], found["statistic"], found["op"], limit)
+
+
+def check_gates(report: Report, gates: list[Gate]) -> None:
+    """Raises `GateMissed` with every gate that is missed, and `CalibrationError` for a model that has no score."""
+    missed: list[str] = []
+    for gate in gates:
+        model = gate.model or report.shown
+        stat = report.stat(model, gate.alignment, gate.tone, gate.measure)
+        if stat is None:
+            known = ", ".join(dict.fromkeys(one.model for one in report.stats))
+            raise _bad(gate.text, f"{model!r} has no score; scored: {known}")
+        value = 0.01 * float(getattr(stat, gate.statistic))
+        if not OPERATORS[gate.op](value, gate.limit):
+            which = f"{model}, {gate.alignment}, {gate.tone}"
+            missed.append(f"{gate.text}: {gate.measure}_{gate.statistic} of {which} is {value:.4f} ({report.label})")
+    if missed:
+        raise GateMissed(missed)
+
+
+def _bad(text: str, what: str) -> CalibrationError:
+    return CalibrationError(f"--gate {text}", what)

@@ -1,0 +1,130 @@
+"""Fits that have not seen what they predict: each cell left out in turn, a fitted CCD-BSM and a Bezier refitted.
+
+A job carries its strokes and returns numbers, so that it runs anywhere and is kept as finished work.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calibrate.brushfit.artefact import BrushFit
+from calibrate.brushfit.bezier import TIP_SHARE, RefittedBezier, refit_bezier
+from calibrate.brushfit.captures import MARGIN_MM, grid_of
+from calibrate.brushfit.fit import Fit, Grid, Pressed, refit
+from calibrate.field import SIZE_PX, Field
+from calibrate.simulate import shape_pixels
+from calibrate.validate.jobs import VERSION
+from calibrate.validate.pixels import Pixels, unpack
+from model.fitted import MODES, NAMES, TERMS, FittedPress
+
+Cell = tuple[float, float]
+MOST_FOLDS = 15
+"""The paper's grid leaves out one cell at a time; with more cells, as many as make so many folds."""
+PER_CELL = 3
+"""Presses of each other cell that a fit is made of: more did not change it."""
+MOST_STROKES = 60
+
+
+@dataclass(frozen=True, slots=True)
+class RefitJob:
+    """Fit the brush and a Bezier to these presses."""
+
+    strokes: tuple[tuple[float, float, bytes], ...]
+    """H, alpha, `Press.pixels`, of which the coverage is the last image."""
+    radius_mm: float
+    length_mm: float
+    start: tuple[tuple[float, ...], tuple[str, ...]] | None
+    """Values and the parameters that the strokes tell, from the session's fit; None fits no CCD-BSM."""
+    view: Field
+
+    @property
+    def key(self) -> str:
+        """A hash of all that the result follows from."""
+        digest = hashlib.sha256(
+            f"refit {VERSION} {self.radius_mm} {self.length_mm} {self.start} {self.view} {len(self.strokes)}".encode()
+        )
+        for height, tilt, pixels in self.strokes:
+            digest.update(f"{height} {tilt} ".encode() + hashlib.sha256(pixels).digest())
+        return digest.hexdigest()
+
+
+def start_of(fit: BrushFit) -> tuple[tuple[float, ...], tuple[str, ...]]:
+    """Where a refit begins, and what it frees: what the whole session told apart."""
+    values = tuple(fit.parameters[name].value for name in NAMES)
+    return values, tuple(name for name in NAMES if fit.parameters[name].low is not None)
+
+
+def folds(cells: Sequence[Cell], most: int = MOST_FOLDS) -> list[list[Cell]]:
+    """Cells that are left out together; none where there is one cell only."""
+    ordered = sorted(set(cells))
+    count = min(len(ordered), most)
+    return [ordered[k::count] for k in range(count)] if len(ordered) > 1 else []
+
+
+def refit_job(job: RefitJob) -> dict[str, Any]:
+    """`fitted` (values, edges) and `bezier` (coefficients), each None where the strokes do not tell it."""
+    strokes, grid = cropped(job)
+    out: dict[str, Any] = {"fitted": None}
+    if job.start is not None:
+        values, free = job.start
+        empty = np.zeros((0, len(free)))
+        whole = Fit(FittedPress(job.radius_mm, job.length_mm, np.array(values)), free, (), empty, empty, len(strokes))
+        press = refit(whole, strokes, grid).press
+        out["fitted"] = press_body(press)
+    return out | {"bezier": bezier_body(strokes, grid)}
+
+
+def press_body(press: FittedPress) -> dict[str, Any]:
+    """A fitted brush as plain data."""
+    return {"values": press.values.tolist(), "edges": press.edges.ravel().tolist()}
+
+
+def bezier_body(strokes: Sequence[Pressed], grid: Grid) -> list[float] | None:
+    """A refitted Bezier as plain data; None where the cells span no plane."""
+    try:
+        coefficients = refit_bezier(strokes, grid).plane.coefficients
+    except ValueError:
+        return None
+    return [float(value) for value in coefficients.ravel()]
+
+
+def cropped(job: RefitJob) -> tuple[list[Pressed], Grid]:
+    """The strokes and their grid, cut to the rows that ink reaches and 2 mm more, as `brushloop fit` has them."""
+    inks = [unpack(pixels)[-1].astype(np.float64) / 255.0 for _, _, pixels in job.strokes]
+    inked = np.flatnonzero(np.any([ink.any(axis=1) for ink in inks], axis=0))
+    margin = round(MARGIN_MM / job.view.mm_per_px)
+    rows = slice(max(0, int(inked[0]) - margin), min(SIZE_PX, int(inked[-1]) + 1 + margin))
+    grid = grid_of(job.view)
+    pressed = [Pressed(h, a, ink[rows]) for (h, a, _), ink in zip(job.strokes, inks, strict=True)]
+    return pressed, Grid(grid.x_mm, grid.y_mm[rows])
+
+
+def fitted_press(made: dict[str, Any], radius_mm: float, length_mm: float) -> FittedPress:
+    """The brush of a finished job."""
+    edges = np.array(made["edges"]).reshape(2, MODES, TERMS)
+    return FittedPress(radius_mm, length_mm, np.array(made["values"]), edges)
+
+
+def bezier_pixels(coefficients: Sequence[float], height_mm: float, tilt_deg: float, view: Field) -> Pixels:
+    """(len(KEYS), 128, 128) of a refitted Bezier."""
+    import torch
+
+    from model.regression import Plane
+    from model.strokes.bezier import bezier
+
+    plane = Plane(("left_mm", "right_mm", "belly_mm", "shoulder"), torch.tensor(coefficients).double().reshape(4, 3))
+    left, right, belly, shoulder = (float(v) for v in RefittedBezier(plane).plane.at(height_mm, tilt_deg).values())
+    length = max(right - left, 0.2)
+    values = {
+        "tip_mm": TIP_SHARE * length,
+        "base_mm": (1 - TIP_SHARE) * length,
+        "belly_mm": max(belly, 0.1),
+        "shoulder": min(max(shoulder, 0.0), 1.0),
+    }
+    shape = bezier({name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()})
+    return shape_pixels(shape, left + TIP_SHARE * length, view)

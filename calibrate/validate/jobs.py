@@ -1,0 +1,146 @@
+"""What workers do: pure functions of picklable jobs, here or on another machine. No torch, and no files."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.artefact import Calibration
+from calibrate.errors import CaptureRefused
+from calibrate.field import BEST_SHIFT_PX, KEYS, Alignment, Field
+from calibrate.measure import Measured
+from calibrate.preprocess import Params
+from calibrate.presses import prepare_press
+from calibrate.validate.pixels import pack, press_images, unpack
+from sessions.errors import SessionDamaged
+from sessions.reader import Capture
+
+VERSION = "1"
+"""Of what a job makes of the same input: raise it whenever that changes, and finished work is done again."""
+ABSENT = b""
+"""Stands for the images of a model that does not predict this press."""
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class PrepareJob:
+    """Find the stroke on its photograph and lay it on the pixels that are compared."""
+
+    capture: Capture
+    calibration: Calibration | None
+    view: Field
+
+
+@dataclass(frozen=True, slots=True)
+class Press:
+    """A captured press on its way into the report; `pixels` is empty where it was refused."""
+
+    stroke_id: str
+    height_mm: float
+    tilt_deg: float
+    again_of: str
+    pixels: bytes
+    """`pack` of (len(KEYS) + 1, 128, 128): an image for each key, then the coverage on the millimetre field."""
+    measured: Measured | None
+    cut: bool
+    flags: tuple[str, ...]
+    refused: str
+
+    def to_body(self) -> dict[str, Any]:
+        """As plain data."""
+        return asdict(self)
+
+
+def press_of(body: dict[str, Any]) -> Press:
+    """A press from plain data."""
+    measured = body["measured"]
+    rest: dict[str, Any] = {"measured": Measured(**measured) if measured else None, "flags": tuple(body["flags"])}
+    return Press(**(body | rest))
+
+
+def prepare_job(job: PrepareJob) -> Press:
+    """Never raises for a capture that cannot be used: the reason travels with it."""
+    stroke = job.capture.stroke
+    height, tilt = stroke.height_mm, stroke.tilt_deg
+
+    def refused(why: str) -> Press:
+        depth, lean = (0.0 if value is None else value for value in (height, tilt))
+        return Press(stroke.stroke_id, depth, lean, stroke.again_of or "", b"", None, False, (), why)
+
+    if height is None or tilt is None:
+        return refused("tells no depth or tilt")
+    params = Params(**job.calibration.preprocess) if job.calibration else Params()
+    try:
+        found = press_images(stroke.stroke_id, prepare_press(job.capture, job.calibration, params, job.view))
+    except (CaptureRefused, SessionDamaged) as error:
+        return refused(error.what)
+    pixels = pack(np.concatenate([found.images, found.coverage[None]]))
+    again = stroke.again_of or ""
+    return Press(stroke.stroke_id, height, tilt, again, pixels, found.measured, found.cut, found.flags, "")
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreJob:
+    """Compare presses of one cell with every prediction, and with other presses."""
+
+    presses: tuple[bytes, ...]
+    """`Press.pixels` of those that are scored."""
+    predictions: tuple[bytes, ...]
+    """One a model, `pack` of (len(KEYS), 128, 128), or ABSENT."""
+    others: tuple[bytes, ...]
+    """Presses of the same cell that foretell: `Press.pixels`."""
+    foretell: tuple[tuple[int, ...], ...]
+    """For each press, which of `others` do; empty where there is none."""
+    originals: tuple[bytes, ...]
+    """For each press, the one that it repeats, or ABSENT."""
+
+    @property
+    def key(self) -> str:
+        """A hash of all that the scores follow from."""
+        digest = hashlib.sha256(f"score {VERSION} {self.foretell}".encode())
+        for group in (self.presses, self.predictions, self.others, self.originals):
+            for item in group:
+                digest.update(hashlib.sha256(item).digest())
+            digest.update(b"|")
+        return digest.hexdigest()
+
+
+def score_job(job: ScoreJob) -> Values:
+    """(presses, models + 2, KEYS, 2): CSIM and SSIM of each model, another press (averaged), and the original.
+
+    NaN where there is nothing to compare with.
+    """
+    out = np.full((len(job.presses), len(job.predictions) + 2, len(KEYS), 2), np.nan)
+    present = [m for m, packed in enumerate(job.predictions) if packed != ABSENT]
+    predicted = [unpack(job.predictions[m]) for m in present]
+    others = [unpack(packed) for packed in job.others]
+    for n, packed in enumerate(job.presses):
+        captured = unpack(packed)
+        if present:
+            out[n, present] = scores(captured, predicted)
+        if job.foretell[n]:
+            out[n, -2] = scores(captured, [others[k] for k in job.foretell[n]]).mean(axis=0)
+        if job.originals[n] != ABSENT:
+            out[n, -1] = scores(captured, [unpack(job.originals[n])])[0]
+    return out
+
+
+def scores(captured: NDArray[np.uint8], predicted: Sequence[NDArray[np.uint8]]) -> Values:
+    """(M, KEYS, 2) CSIM and SSIM of one press, (at least KEYS, 128, 128), against M predictions alike.
+
+    In the size-normalised alignment each prediction first takes its best shift. NaN where an image is blank.
+    """
+    from calibrate.validate.kernel import compare  # numba takes a fifth of a second to import
+
+    out = np.empty((len(predicted), len(KEYS), 2))
+    for k, (alignment, _tone) in enumerate(KEYS):
+        found = np.empty((len(predicted), 2))
+        reach = BEST_SHIFT_PX if alignment is Alignment.SIZE_NORMALISED else 0
+        compare(captured[k], np.stack([image[k] for image in predicted]), reach, found)
+        out[:, k] = found
+    return out

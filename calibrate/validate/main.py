@@ -1,0 +1,199 @@
+"""`brushloop validate` from places to files."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Generator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from calibrate.drags import validate_drags
+from calibrate.errors import CalibrationError
+from calibrate.field import Field
+from calibrate.files import write_whole
+from calibrate.preprocess import Params
+from calibrate.validate.ablation import similarity_by_strokes
+from calibrate.validate.contenders import generator_file
+from calibrate.validate.figures import read_curve
+from calibrate.validate.gates import check_gates, parse_gate
+from calibrate.validate.outputs import write_csv, write_parquet
+from calibrate.validate.page import page_of
+from calibrate.validate.pool import Dask, Threads
+from calibrate.validate.report import Report, Stat
+from calibrate.validate.run import Options, Outcome, validate_presses
+from calibrate.validate.sources import URL, Opened, one_source, open_session
+from calibrate.validate.steps import Progress
+from calibrate.validate.summary import report_of
+from calibrate.write import DragValidation, write_drags
+
+FOLDER = "validation"
+WORK = "work"
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What was asked for on the command line."""
+
+    places: tuple[str, ...]
+    command: str
+    models: tuple[str, ...] = ()
+    view: Field = field(default_factory=Field)
+    calibration: Path | None = None
+    fit: Path | None = None
+    generators: tuple[Path, ...] = ()
+    curves: tuple[str, ...] = ()
+    gates: tuple[str, ...] = ()
+    ablations: bool = False
+    held_out: bool = True
+    tune_steps: int = 0
+    parquet: bool | None = None
+    """None writes it where pyarrow is there."""
+    out: Path | None = None
+    scheduler: str = ""
+    workers: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """What was written: a report of presses, or one of each session of drags."""
+
+    folder: Path
+    report: Report | None = None
+    drags: tuple[DragValidation, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def validate(request: Request, progress: Progress) -> Made:
+    """Validate and write every file of the report; gates are checked by `check`.
+
+    Raises `CalibrationError`, `ClusterError`, and what reading a recording does; whatever is finished is kept in the
+    folder's `work`, so that the same command goes on.
+    """
+    for text in request.gates:
+        parse_gate(text)
+    if request.tune_steps and not request.generators:
+        raise CalibrationError("--tune", "needs a --generator to tune")
+    curves = [read_curve(text) for text in request.curves]
+    folder = _folder(request)
+    made_before = folder.exists()
+    try:
+        sessions = [open_session(p, folder / WORK, request.calibration, request.fit) for p in request.places]
+        one_source(sessions)
+    except BaseException:
+        if not made_before and folder.exists() and not any(folder.iterdir()):
+            folder.rmdir()
+        raise
+    kinds = {kind for session in sessions for kind in session.kinds}
+    if len(kinds) > 1:
+        raise CalibrationError(str(sessions[-1].recording.path), "mixes presses and drags: validate them apart")
+    if kinds == {"drag"}:
+        return _drags(request, sessions, folder)
+    options = Options(
+        request.models,
+        request.view,
+        tuple(generator_file(path) for path in request.generators),
+        request.ablations,
+        request.held_out,
+        request.tune_steps,
+    )
+    (folder / WORK).mkdir(parents=True, exist_ok=True)
+    with _alone(folder), _scheduler(request) as scheduler:
+        outcome = validate_presses(sessions, options, scheduler, folder / WORK, progress)
+        with outcome.store:
+            steps = similarity_by_strokes(outcome, scheduler, progress) if request.ablations else ()
+            report, notes = _write(outcome, folder, request, steps, curves)
+            return Made(folder, report, notes=notes)
+
+
+def check(made: Made, request: Request) -> None:
+    """Raises `GateMissed` where a gate is."""
+    if request.gates and made.report is None:
+        raise CalibrationError("--gate", "is about presses; these strokes travel")
+    if made.report is not None:
+        check_gates(made.report, [parse_gate(text) for text in request.gates])
+
+
+def _write(
+    outcome: Outcome, folder: Path, request: Request, steps: tuple[Any, ...], curves: Sequence[Any]
+) -> tuple[Report, tuple[str, ...]]:
+    digest = write_csv(outcome, folder / "scores.csv")
+    notes: list[str] = []
+    if request.parquet is not False:
+        try:
+            write_parquet(outcome, folder / "scores.parquet")
+        except CalibrationError as error:
+            if request.parquet:
+                raise
+            notes.append(f"no scores.parquet: {error.what}")
+    report = report_of(outcome, request.command, digest, steps)
+    write_whole(folder / "summary.csv", _summary_csv(report))
+    rows = [(r.session_id, r.stroke_id, r.why) for r in report.refused]
+    write_whole(folder / "failures.csv", _csv(("session_id", "stroke_id", "why"), rows))
+    write_whole(folder / "report.html", page_of(outcome, report, curves))
+    write_whole(folder / "report.json", report.to_json())
+    return report, tuple(notes)
+
+
+def _drags(request: Request, sessions: list[Opened], folder: Path) -> Made:
+    made: list[DragValidation] = []
+    for one in sessions:
+        params = Params(**one.calibration.preprocess) if one.calibration is not None else Params()
+        results = validate_drags(one.recording.captures(), params)
+        validation = DragValidation(one.header, one.recording.path, one.sha256, results)
+        target = folder / one.header.session_id if len(sessions) > 1 else folder
+        write_drags(validation, target, request.command)
+        made.append(validation)
+    return Made(folder, drags=tuple(made))
+
+
+def _folder(request: Request) -> Path:
+    if request.out is not None:
+        return request.out
+    if len(request.places) == 1 and not URL.match(request.places[0]):
+        path = Path(request.places[0])
+        return (path if path.is_dir() else path.parent) / FOLDER
+    return Path(FOLDER)
+
+
+@contextmanager
+def _alone(folder: Path) -> Generator[None]:
+    lock = FileLock(folder / WORK / "lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise CalibrationError(str(folder), "another validation is writing there") from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _scheduler(request: Request) -> AbstractContextManager[Threads] | AbstractContextManager[Dask]:
+    return Dask(request.scheduler) if request.scheduler else Threads(request.workers)
+
+
+def _summary_csv(report: Report) -> str:
+    head = ("model", "alignment", "tone", "measure", "height_mm", "tilt_deg", "n", "max", "min", "avg")
+    ends = ("avg_low", "avg_high", "median", "median_low", "median_high", "source")
+    return _csv((*head, *ends), [(*_stat_row(stat), report.label) for stat in report.stats])
+
+
+def _stat_row(stat: Stat) -> tuple[object, ...]:
+    cell = stat.cell if stat.cell is not None else ("", "")
+    low, high = (stat.avg_interval.low, stat.avg_interval.high) if stat.avg_interval is not None else ("", "")
+    middle = (stat.median_interval.low, stat.median_interval.high) if stat.median_interval is not None else ("", "")
+    known = (stat.model, stat.alignment, stat.tone, stat.measure, *cell, stat.n, stat.max, stat.min, stat.avg)
+    return (*known, low, high, stat.median, *middle)
+
+
+def _csv(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows(rows)
+    return out.getvalue()

@@ -1,0 +1,207 @@
+"""The report as data: everything that terminal, JSON, tables, gates and comparisons say comes from here."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from importlib.metadata import version
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from calibrate.errors import CalibrationError
+from calibrate.field import Alignment, Tone
+from calibrate.files import read_bounded
+from sessions.schemas import Source
+
+FORMAT = "brushloop-validation-1"
+MAX_BYTES = 256 * 1024 * 1024
+PACKAGES = ("numpy", "opencv-python-headless", "scikit-image", "numba", "torch")
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Interval(_Frozen):
+    """95 %, by bootstrap over the presses of each cell, or over cells where they have few."""
+
+    low: float
+    high: float
+
+
+class Stat(_Frozen):
+    """One model's scores in one alignment and tone, in percent; `cell` is (H, alpha), None for all of them."""
+
+    model: str
+    alignment: Alignment
+    tone: Tone
+    measure: str
+    """`csim` or `ssim`."""
+    cell: tuple[float, float] | None
+    n: int
+    max: float
+    min: float
+    avg: float
+    avg_interval: Interval | None
+    median: float
+    median_interval: Interval | None
+
+
+class Rival(_Frozen):
+    """What a row of the tables is, and what it knew of the strokes."""
+
+    name: str
+    label: str
+    definition: str
+    basis: str
+    sha256: str
+    """Of a generator's file; empty for others."""
+
+
+class Session(_Frozen):
+    """A recording, as it says of itself, and the artefacts that were used with it."""
+
+    session_id: str
+    source: Source
+    recording: str
+    recording_sha256: str
+    recorded_with: str
+    robot: str
+    camera: str
+    brush: str
+    ink: str
+    paper: str
+    protocol: str
+    origin: str
+    licence: str
+    strokes: int
+    compared: int
+    cut: tuple[str, ...]
+    calibration: str
+    """Digest; empty for an import, which brings its own scale."""
+    mm_per_px: float | None
+    mm_per_px_interval: Interval | None
+    board_rms_px: float | None
+    fit: str
+    length_ratio: float | None
+    width_ratio: float | None
+    """Measured over CCD-BSM as published, on average over whole strokes."""
+
+
+class Refused(_Frozen):
+    """A stroke that was not compared, or not by one model, and why."""
+
+    session_id: str
+    stroke_id: str
+    why: str
+
+
+class Extreme(_Frozen):
+    """One of the best or worst strokes of a model."""
+
+    session_id: str
+    stroke_id: str
+    height_mm: float
+    tilt_deg: float
+    model: str
+    csim: float
+    ssim: float
+
+
+class Step(_Frozen):
+    """What a fit from so many presses scores on all other presses of the session."""
+
+    session_id: str
+    strokes: int
+    model: str
+    csim: float
+    ssim: float
+    n: int
+
+
+class Report(_Frozen):
+    """Everything that was found."""
+
+    format: str = FORMAT
+    source: Source
+    """What kind of ink, from the recordings' own headers; all tables and figures carry it."""
+    software: dict[str, str]
+    command: str
+    mm_per_px: float
+    ssim_settings: str
+    sessions: tuple[Session, ...]
+    rivals: tuple[Rival, ...]
+    shown: str
+    """The model of the pictures: the best calibrated one that has not seen what it predicts, if there is one."""
+    stats: tuple[Stat, ...]
+    cells_told: bool
+    """False where there are too many different (H, alpha) for a table of each."""
+    best: tuple[Extreme, ...]
+    worst: tuple[Extreme, ...]
+    refused: tuple[Refused, ...]
+    by_strokes: tuple[Step, ...]
+    """Similarity against number of strokes; empty without --ablations."""
+    scores_sha256: str
+    """Of scores.csv beside it."""
+    digest: str = ""
+    """SHA-256 of everything above: a report that was edited is told from one that was not."""
+
+    def stat(
+        self,
+        model: str,
+        alignment: Alignment,
+        tone: Tone,
+        measure: str,
+        cell: tuple[float, float] | None = None,
+    ) -> Stat | None:
+        """The scores of one model, or None where it has none."""
+        for one in self.stats:
+            if (one.model, one.alignment, one.tone, one.measure, one.cell) == (model, alignment, tone, measure, cell):
+                return one
+        return None
+
+    @property
+    def label(self) -> str:
+        """What stands on every table and figure."""
+        return str(self.source)
+
+    def sealed(self) -> Report:
+        """The same with its digest."""
+        return self.model_copy(update={"digest": self._hash()})
+
+    def to_json(self) -> str:
+        """As it is written to disk."""
+        return json.dumps(self.model_dump(mode="json"), indent=1, ensure_ascii=False) + "\n"
+
+    def _hash(self) -> str:
+        bare = self.model_copy(update={"digest": ""}).model_dump(mode="json")
+        return hashlib.sha256(json.dumps(bare, sort_keys=True, ensure_ascii=False).encode()).hexdigest()
+
+    @property
+    def intact(self) -> bool:
+        """Whether the digest is that of the contents."""
+        return self.digest == self._hash()
+
+
+def load_report(path: Path) -> Report:
+    """A report.json. Raises `CalibrationError` where it is none, or was edited."""
+    data = read_bounded(path, MAX_BYTES)
+    try:
+        report = Report.model_validate_json(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise CalibrationError(str(path), f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    if report.format != FORMAT:
+        raise CalibrationError(str(path), f"format is {report.format[:40]!r}, expected {FORMAT!r}")
+    if not report.intact:
+        raise CalibrationError(str(path), "was edited: its digest is not that of its contents")
+    return report
+
+
+def software() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    return {"brushloop": version("brushloop"), "python": platform.python_version()} | {
+        name: version(name) for name in PACKAGES
+    }

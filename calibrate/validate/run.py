@@ -1,0 +1,266 @@
+"""The run: prepare every capture, fit to other cells, score everything. Finished work is never done again.
+
+Captures stream from the recording through the workers into the store; what stays in memory is the scores, a few hundred
+bytes a stroke. Each result follows only from its inputs, so neither the order nor the place of work changes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.errors import CalibrationError
+from calibrate.field import KEYS, Field
+from calibrate.validate import contenders as who
+from calibrate.validate.contenders import Contender, Generator
+from calibrate.validate.heldout import Cell
+from calibrate.validate.jobs import (
+    ABSENT,
+    Press,
+    ScoreJob,
+    press_of,
+    score_job,
+)
+from calibrate.validate.pixels import pack
+from calibrate.validate.pool import Scheduler
+from calibrate.validate.sources import Opened
+from calibrate.validate.steps import Progress, Row, pixels_of, prepared_rows, refits_by_cell
+from calibrate.validate.store import Store
+from calibrate.validate.tuned import FOLDS, tuned_by_cell
+from calibrate.validation import brush_of
+from model.ccdbsm import DomainError
+
+CEILING = "another press"
+"""A capture foretold by other captures of its cell, averaged: how well one press foretells another."""
+REPEATED = "robot writing"
+"""A press that repeats another session's stroke, against that stroke: the third row of the paper's Table 1."""
+MOST_OTHERS = 9
+"""Presses that foretell one: all others of a cell with ten, as the paper has; the next nine where there are more."""
+CHUNK = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What is compared, and how."""
+
+    models: tuple[str, ...] = ()
+    view: Field = field(default_factory=Field)
+    generators: tuple[Generator, ...] = ()
+    ablations: bool = False
+    held_out: bool = True
+    tune_steps: int = 0
+    """Steps of the tuning of each generator on other cells; 0: none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Every score of a run."""
+
+    sessions: list[Opened]
+    options: Options
+    contenders: list[list[Contender]]
+    """Of each session."""
+    names: list[str]
+    """Columns: every contender of any session, then the presses themselves."""
+    rows: list[Row]
+    """Strokes that are compared, by session and order of capture."""
+    values: NDArray[np.float64]
+    """(rows, names, KEYS, 2): CSIM and SSIM from 0 to 1; NaN where there is nothing to compare with."""
+    refused: list[tuple[str, str, str]]
+    """(session, stroke, why): what could not be used, wholly or by one model. Nothing is dropped in silence."""
+    store: Store
+
+    def press(self, row: int) -> Press:
+        """A stroke with its pixels."""
+        return press_of(self.store.get(self.rows[row].key))
+
+
+def validate_presses(
+    sessions: list[Opened], options: Options, scheduler: Scheduler, work: Path, progress: Progress
+) -> Outcome:
+    """Compare every contender with every press. The caller closes `Outcome.store`.
+
+    Raises `CalibrationError` for a model that is not known, or where a name of a session stands for two.
+    """
+    idents = [session.header.session_id for session in sessions]
+    for k, ident in enumerate(idents):
+        if ident in idents[:k]:
+            raise CalibrationError(str(sessions[k].recording.path), f"{ident} is given twice")
+    store = Store(work / "work.bin")
+    try:
+        return _validate(sessions, options, scheduler, store, work, progress)
+    except BaseException:
+        store.close()
+        raise
+
+
+def _validate(
+    sessions: list[Opened], options: Options, scheduler: Scheduler, store: Store, work: Path, progress: Progress
+) -> Outcome:
+    # All that can be refused is refused before hours of work.
+    known = [_known(session, options) for session in sessions]
+    every = list(dict.fromkeys(one.name for made in known for one in made))
+    held = (who.FITTED_HELD_OUT, who.BEZIER_REFITTED, who.GENERATOR_HELD_OUT)
+    for name in options.models:
+        if name not in (*every, *held):
+            raise CalibrationError("--model", f"{name!r} is not one of: {', '.join((*every, *held))}")
+    rows: list[Row] = []
+    refused: list[tuple[str, str, str]] = []
+    for number, session in enumerate(sessions):
+        for row in prepared_rows(number, session, options.view, scheduler, store, progress):
+            if row.press.refused:
+                refused.append((session.header.session_id, row.press.stroke_id, row.press.refused))
+            else:
+                rows.append(row)
+    contenders: list[list[Contender]] = []
+    for number, session in enumerate(sessions):
+        mine = [row for row in rows if row.session == number]
+        made = [*known[number], *_held_out(session, mine, options, scheduler, store, work, progress)]
+        contenders.append([one for one in _ordered(made) if not options.models or one.name in options.models])
+    for name in options.models:
+        if not any(one.name == name for made in contenders for one in made):
+            raise CalibrationError(
+                "--model", f"{name} needs a fit, or --tune: see `brushloop validate sessions --help`"
+            )
+    names = [*_ordered_names(contenders), CEILING, REPEATED]
+    values = np.full((len(rows), len(names), len(KEYS), 2), np.nan)
+    jobs: dict[str, tuple[list[int], list[int]]] = {}
+    total = len(rows)
+    done = 0
+
+    def waiting() -> Iterator[tuple[str, ScoreJob]]:
+        nonlocal done
+        for chunk, job in _score_jobs(sessions, contenders, rows, store, refused):
+            columns = [names.index(one.name) for one in contenders[rows[chunk[0]].session]] + [-2, -1]
+            key = job.key
+            if key in store:
+                _put(values, chunk, columns, store.get(key))
+                done += len(chunk)
+                progress("compared", done, total)
+                continue
+            name = f"{key}:{chunk[0]}"
+            jobs[name] = (chunk, columns)
+            yield name, job
+
+    for name, found in scheduler.run(score_job, waiting()):
+        chunk, columns = jobs.pop(name)
+        body = {"shape": list(found.shape), "values": found.tobytes()}
+        store.put(name.partition(":")[0], body)
+        _put(values, chunk, columns, body)
+        done += len(chunk)
+        progress("compared", done, total)
+    return Outcome(sessions, options, contenders, names, rows, values, refused, store)
+
+
+def _known(session: Opened, options: Options) -> list[Contender]:
+    made = who.closed_forms(session, options.view, ablations=options.ablations)
+    return _ordered([*who.generators(session, options.generators, options.view), *made])
+
+
+def _held_out(
+    session: Opened,
+    rows: list[Row],
+    options: Options,
+    scheduler: Scheduler,
+    store: Store,
+    work: Path,
+    progress: Progress,
+) -> Iterator[Contender]:
+    """Whatever is fitted to the session without the cells that it then predicts."""
+    wanted = options.models or (who.FITTED_HELD_OUT, who.BEZIER_REFITTED, who.GENERATOR_HELD_OUT)
+    brush, view = brush_of(session.header), options.view
+    if options.held_out and (who.FITTED_HELD_OUT in wanted or who.BEZIER_REFITTED in wanted):
+        fits = refits_by_cell(session, rows, view, scheduler, store, progress)
+        if fits:
+            yield from who.held_out(fits, brush, view, fitted=session.fit is not None)
+    if options.tune_steps and who.GENERATOR_HELD_OUT in wanted:
+        fits = refits_by_cell(session, rows, view, scheduler, store, progress, FOLDS)
+        for number, generator in enumerate(options.generators):
+            files = tuned_by_cell(session, fits, generator, options.tune_steps, work, progress)
+            if files:
+                yield who.tuned(files, brush, view, number)
+
+
+def _score_jobs(
+    sessions: list[Opened],
+    contenders: list[list[Contender]],
+    rows: list[Row],
+    store: Store,
+    refused: list[tuple[str, str, str]],
+) -> Iterator[tuple[list[int], ScoreJob]]:
+    """(rows, job), cell by cell."""
+    cells: dict[tuple[int, Cell], list[int]] = {}
+    for k, row in enumerate(rows):
+        cells.setdefault((row.session, row.cell), []).append(k)
+    originals = _originals(rows)
+    for (session, cell), group in sorted(cells.items()):
+        predictions: list[bytes] = []
+        for one in contenders[session]:
+            try:
+                predictions.append(pack(one.predict(*cell)))
+            except DomainError as error:
+                predictions.append(ABSENT)
+                told = f"{one.name} does not predict it: {error}"
+                refused.extend((sessions[session].header.session_id, rows[k].press.stroke_id, told) for k in group)
+        for start in range(0, len(group), CHUNK):
+            chunk = group[start : start + CHUNK]
+            reach = min(MOST_OTHERS, len(group) - 1)
+            theirs = [
+                [group[(start + n + step) % len(group)] for step in range(1, reach + 1)] for n in range(len(chunk))
+            ]
+            others = sorted({k for mine in theirs for k in mine})
+            job = ScoreJob(
+                tuple(pixels_of(store, rows[k].key) for k in chunk),
+                tuple(predictions),
+                tuple(pixels_of(store, rows[k].key) for k in others),
+                tuple(tuple(others.index(k) for k in mine) for mine in theirs),
+                tuple(pixels_of(store, rows[originals[k]].key) if k in originals else ABSENT for k in chunk),
+            )
+            yield chunk, job
+
+
+def _originals(rows: list[Row]) -> dict[int, int]:
+    """Row -> the row of another session that it repeats, where that session is given too."""
+    by_name: dict[str, list[int]] = {}
+    for k, row in enumerate(rows):
+        by_name.setdefault(row.press.stroke_id, []).append(k)
+    found: dict[int, int] = {}
+    for k, row in enumerate(rows):
+        of = [n for n in by_name.get(row.press.again_of, []) if rows[n].session != row.session]
+        if len(of) == 1:
+            found[k] = of[0]
+    return found
+
+
+def _put(values: NDArray[np.float64], chunk: list[int], columns: list[int], body: dict[str, Any]) -> None:
+    found = np.frombuffer(body["values"]).reshape(body["shape"])
+    values[np.ix_(chunk, [c % values.shape[1] for c in columns])] = found
+
+
+def _ordered_names(contenders: list[list[Contender]]) -> list[str]:
+    return list(dict.fromkeys(one.name for one in _ordered([one for made in contenders for one in made])))
+
+
+def _ordered(made: list[Contender]) -> list[Contender]:
+    """As the paper's tables go, calibrated beside uncalibrated; whatever is new comes after."""
+    first = [
+        "ccd-bsmg",
+        who.GENERATOR_HELD_OUT,
+        "ccd-bsm",
+        who.FITTED,
+        who.FITTED_HELD_OUT,
+        "bezier",
+        who.BEZIER_REFITTED,
+    ]
+    first += ["ellipse", "line", "circle"]
+
+    def place(one: Contender) -> tuple[int, int]:
+        stem = one.name if one.name in first else "ccd-bsmg" if one.name.startswith("ccd-bsmg-") else ""
+        return (first.index(stem), 0) if stem else (len(first), 0)
+
+    return sorted(made, key=place)

@@ -1,0 +1,168 @@
+"""Where sessions come from: folders and files here, or any URL that fsspec opens, which then tells its checksum.
+
+A remote recording is copied beside the finished work once, bounded in size, and believed only if its SHA-256 is the
+one given: as `#sha256=...` behind the URL, or in a file `<recording>.mcap.sha256` beside it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import re
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from calibrate.artefact import Calibration, load_artefact, newest
+from calibrate.brushfit.artefact import FOLDER as FITS
+from calibrate.brushfit.artefact import BrushFit
+from calibrate.errors import CalibrationError
+from calibrate.validation import calibration_of
+from sessions.errors import SessionDamaged
+from sessions.journal import JOURNAL_NAME, replay
+from sessions.reader import Recording
+from sessions.schemas import Header, Source
+from sessions.writer import file_sha256
+
+PIECE = 1024 * 1024
+MAX_DOWNLOAD_BYTES = 64 * 1024**3
+MAX_ARTEFACTS = 64
+MAX_ARTEFACT_BYTES = 4 * 1024 * 1024
+URL = re.compile(r"^[a-z][a-z0-9+.-]+://", re.IGNORECASE)
+SHA256 = re.compile(r"\b[0-9a-f]{64}\b")
+
+
+@dataclass(frozen=True, slots=True)
+class Opened:
+    """One session, checked, with what belongs to it."""
+
+    recording: Recording
+    sha256: str
+    calibration: Calibration | None
+    fit: BrushFit | None
+    kinds: frozenset[str]
+    count: int
+
+    @property
+    def header(self) -> Header:
+        """Who made it, on what."""
+        return self.recording.header
+
+
+def open_session(place: str, work: Path, calibration: Path | None, fit: Path | None) -> Opened:
+    """A session by path or URL. Raises `CalibrationError`, `InputError` or `SessionDamaged`, each naming it."""
+    path = fetched(place, work / "remote") if URL.match(place) else Path(place)
+    recording = Recording(path)
+    digest = recording.sha256
+    _check_journal(recording, digest)
+    strokes = list(recording.stroke_records())
+    if not strokes:
+        raise CalibrationError(str(recording.path), "holds no strokes")
+    kinds = frozenset(stroke.kind for stroke in strokes)
+    if len(kinds) > 1:
+        raise CalibrationError(str(recording.path), "mixes presses and drags; validate them as two sessions")
+    found = fit or newest(recording.path.parent, FITS)
+    return Opened(
+        recording,
+        digest,
+        calibration_of(recording, strokes[0], digest, calibration),
+        load_artefact(found, BrushFit) if found is not None else None,
+        kinds,
+        len(strokes),
+    )
+
+
+def one_source(sessions: list[Opened]) -> Source:
+    """The kind of ink of all of them, as the recordings say. Raises `CalibrationError` where they differ."""
+    first = sessions[0]
+    for other in sessions[1:]:
+        if other.header.source != first.header.source:
+            told = f"is {other.header.source}, {first.recording.path.name} is {first.header.source}"
+            raise CalibrationError(str(other.recording.path), f"{told}: validate them apart")
+    return first.header.source
+
+
+def _check_journal(recording: Recording, digest: str) -> None:
+    """The file must be the one that the session's journal closed with; imports and exports have no journal."""
+    journal = recording.path.parent / JOURNAL_NAME
+    if not journal.is_file():
+        return
+    closed = replay(journal).closed
+    if closed is not None and closed.get("sha256", digest) != digest:
+        raise SessionDamaged(recording.path, "is not the file that the session was closed with: its SHA-256 differs")
+
+
+def fetched(url: str, folder: Path) -> Path:
+    """A local copy of a remote recording, with its calibration and fit beside it. Raises `CalibrationError`."""
+    address, _, fragment = url.partition("#")
+    try:
+        untyped: Any = importlib.import_module("fsspec")  # without type stubs
+    except ImportError:
+        raise CalibrationError(address, "a URL needs fsspec: pip install 'brushloop[remote]'") from None
+    try:
+        system, where = untyped.core.url_to_fs(address)
+    except (ImportError, ValueError) as error:
+        raise CalibrationError(address, f"cannot be opened: {_line(error)}") from None
+    try:
+        if not where.endswith(".mcap"):
+            where = f"{where.rstrip('/')}/{PurePosixPath(where).name}.mcap"
+        expected = _expected(system, where, address, fragment)
+        target = folder / expected / PurePosixPath(where).name
+        if not (target.is_file() and file_sha256(target) == expected):
+            _copy(system, where, target, expected, address)
+        _copy_artefacts(system, where, target.parent)
+    except (OSError, ValueError, NotImplementedError) as error:
+        raise CalibrationError(address, f"cannot be read: {_line(error)}") from None
+    return target
+
+
+def _expected(system: Any, where: str, address: str, fragment: str) -> str:
+    told = fragment
+    if not told and system.exists(f"{where}.sha256"):
+        with system.open(f"{where}.sha256", "rb") as file:
+            told = file.read(4096).decode("utf-8", "replace")
+    found = SHA256.search(told)
+    if found is None:
+        what = "tells no checksum: add #sha256=... to the URL, or put it into a file beside, <recording>.mcap.sha256"
+        raise CalibrationError(address, what)
+    return found[0]
+
+
+def _copy(system: Any, where: str, target: Path, expected: str, address: str) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part = target.with_name(target.name + ".part")
+    digest, size = hashlib.sha256(), 0
+    try:
+        with system.open(where, "rb") as source, part.open("wb") as out:
+            while piece := source.read(PIECE):
+                size += len(piece)
+                if size > MAX_DOWNLOAD_BYTES:
+                    raise CalibrationError(address, f"is larger than {MAX_DOWNLOAD_BYTES} bytes")
+                digest.update(piece)
+                out.write(piece)
+        if digest.hexdigest() != expected:
+            raise CalibrationError(address, f"has SHA-256 {digest.hexdigest()}, {expected} was expected")
+        part.replace(target)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _copy_artefacts(system: Any, where: str, folder: Path) -> None:
+    """Calibrations and fits: each is named after its own hash, which is checked when it is read.
+
+    Whoever cannot list folders, as a plain web server, gives them by --calibration and --fit.
+    """
+    for kind in ("calibration", FITS):
+        try:
+            names = sorted(system.glob(f"{where.rsplit('/', 1)[0]}/{kind}/*.json"))[:MAX_ARTEFACTS]
+        except (OSError, NotImplementedError):
+            continue
+        for name in names:
+            with system.open(name, "rb") as file:
+                data = file.read(MAX_ARTEFACT_BYTES)
+            (folder / kind).mkdir(exist_ok=True)
+            (folder / kind / PurePosixPath(name).name).write_bytes(data)
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,47 @@
+"""What `brushloop validate` prints of presses: the short of the report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from rich.markup import escape
+from rich.table import Table
+
+from calibrate.field import Alignment, Tone
+from calibrate.validate import tables, words
+from calibrate.validate.report import Report
+from calibrate.wording import source_note
+
+MOST_REFUSED = 20
+SHORT = {"fitted, held-out cells": ", held out", "fitted, in sample": ", in sample"}
+
+
+def summary(report: Report) -> Iterator[Table | str]:
+    """Renderables for the terminal."""
+    names = ", ".join(session.session_id for session in report.sessions[:4])
+    yield escape(f"{names}: {source_note(report.source)}")
+    yield escape(words.measured(report))
+    for alignment in (Alignment.SIZE_NORMALISED, Alignment.MM):
+        yield _scores(report, alignment)
+    yield from (escape(sentence) for sentence in words.findings(report))
+    for point in words.trust(report):
+        yield escape(f"{'•' if point.good is None else '✓' if point.good else '✗'} {point.text}")
+    for one in report.refused[:MOST_REFUSED]:
+        yield escape(f"not used: {one.session_id} {one.stroke_id}: {one.why}")
+    if len(report.refused) > MOST_REFUSED:
+        yield f"and {len(report.refused) - MOST_REFUSED} more, in the report"
+
+
+def _scores(report: Report, alignment: Alignment) -> Table:
+    # The paper's numbers stand beside the table that was made as its own was, as far as it tells.
+    beside = alignment is Alignment.SIZE_NORMALISED
+    columns = ["model", "n", "CSIM max", "min", "avg", "SSIM max", "min", "avg", *(["paper's avg"] if beside else [])]
+    title = f"{alignment}, binary, ink = 1, percent ({report.label})"
+    out = Table(*columns, title=escape(title))
+    for row in tables.table_2(report, alignment, Tone.BINARY):
+        if row.ours is None:
+            continue
+        told = f"{row.paper[2]:.2f} / {row.paper[5]:.2f}" if row.paper is not None else ""
+        cells = [escape(row.label + SHORT.get(row.basis, "")), str(row.n), *(f"{v:.2f}" for v in row.ours)]
+        out.add_row(*cells, *([told] if beside else []))
+    return out

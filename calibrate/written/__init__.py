@@ -1,0 +1,1 @@
+"""Characters that the arm has written, beside what they should look like."""

@@ -1,0 +1,1 @@
+"""The loop closed: recover presses from their images, press them again, compare."""

@@ -1,0 +1,114 @@
+"""The end of a session: is the recording sound, and what comes next."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from textual import work
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import VerticalScroll
+from textual.content import Content
+from textual.screen import ModalScreen
+
+from collect.desk import run_command, verified
+from collect.tui.line import Line
+from collect.tui.text import plain
+from sessions.errors import SessionError
+
+if TYPE_CHECKING:
+    from sessions.verify import Verdict
+
+TAIL = 12
+
+
+class FinishScreen(ModalScreen[None]):
+    """Verifies at once; calibrate and report on a key, each in a process of its own."""
+
+    DEFAULT_CSS = """
+    FinishScreen { align: center middle; }
+    FinishScreen VerticalScroll {
+        width: 90%; max-width: 100; height: auto; max-height: 95%; padding: 0 2;
+        border: heavy $accent; background: $surface;
+    }
+    FinishScreen Line { margin-bottom: 1; }
+    """
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("c", "command('calibrate')", "Calibrate"),
+        Binding("w", "command('validate')", "Report"),
+        Binding("escape,q", "close", "Back"),
+    ]
+
+    def __init__(self, folder: Path, *, is_open: bool) -> None:
+        super().__init__()
+        self._folder = folder
+        self._open = is_open
+        self._verdict, self._next, self._said = Line("verdict"), Line("next"), Line("said")
+        self._busy = False
+
+    def compose(self) -> ComposeResult:
+        """Verdict, what comes next, what a command said."""
+        with VerticalScroll() as page:
+            page.border_title = "Finish"
+            yield self._verdict
+            yield self._next
+            yield self._said
+
+    def on_mount(self) -> None:
+        """Read every file again."""
+        self._verdict.show("Reading every file again ...")
+        self._next.show(self._next_content())
+        self._verify()
+
+    def action_close(self) -> None:
+        """Back to the captures."""
+        self.dismiss(None)
+
+    @work(exclusive=True, group="verify")
+    async def _verify(self) -> None:
+        try:
+            self._verdict.show(verdict_content(await asyncio.to_thread(verified, self._folder)))
+        except SessionError as error:
+            self._verdict.show(Content.styled(plain(str(error)), "$text-error"))
+
+    @work(exclusive=True, group="command")
+    async def action_command(self, name: str) -> None:
+        """Run a command of brushloop on the session."""
+        if self._open or self._busy:
+            return
+        self._busy = True
+        self._said.show(f"$ brushloop {name} {self._folder}\n... may take a minute")
+        try:
+            code, said = await asyncio.to_thread(run_command, name, self._folder)
+        finally:
+            self._busy = False
+        tail = "\n".join(plain(said).splitlines()[-TAIL:])
+        sign = "✓ done" if code == 0 else f"! exit code {code}"
+        self._said.show(f"$ brushloop {name} {self._folder}\n{sign}\n{tail}")
+
+    def _next_content(self) -> Content:
+        if self._open:
+            return Content(
+                "The session is open. The same `brushloop collect` finishes it, merges it, and reads it back;\n"
+                f"`brushloop sessions close {self._folder}` ends it as it is.\nescape  back"
+            )
+        return Content.assemble(
+            ("c", "bold $text-accent"),
+            f"  brushloop calibrate {self._folder}\n",
+            ("w", "bold $text-accent"),
+            f"  brushloop validate {self._folder}      (the report)\n",
+            ("escape", "bold $text-accent"),
+            "  back",
+        )
+
+
+def verdict_content(verdict: Verdict) -> Content:
+    """Sound, or what is damaged."""
+    read = f"{verdict.files} files, {verdict.strokes} strokes, {verdict.messages} messages read"
+    if verdict.sound:
+        return Content.assemble(("✓ sound", "bold $text-success"), f"  {verdict.session} ({verdict.state}): {read}")
+    lines = [Content.styled(f"! damaged  {verdict.session}: try `brushloop sessions repair`", "bold $text-error")]
+    lines += [Content(f"{finding.file}: {plain(finding.what)}") for finding in verdict.findings]
+    return Content("\n").join(lines)

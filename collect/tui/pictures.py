@@ -1,0 +1,147 @@
+"""Gray pictures in a terminal: half-cells that work anywhere, or textual-image's kitty and sixel where it is installed.
+
+A half-cell is `▀` with its own two grays: over SSH and tmux as good as any other text.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Literal
+
+from rich.segment import Segment
+from rich.style import Style
+from textual.app import ComposeResult
+from textual.containers import Container
+from textual.geometry import Size
+from textual.strip import Strip
+from textual.widget import Widget
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+HALF = "▀"
+LEVELS = 32
+"""Grays that are told apart: fewer styles, longer runs, less to send over a slow line."""
+Kind = Literal["auto", "cells", "off"]
+
+
+class CellPicture(Widget):
+    """A picture in half-cells, as large as its place allows, its shape kept."""
+
+    DEFAULT_CSS = """
+    CellPicture { width: 1fr; height: 1fr; }
+    """
+
+    def __init__(self, id: str | None = None) -> None:  # noqa: A002 - textual's name
+        super().__init__(id=id)
+        self._image: NDArray[np.uint8] | None = None
+        self._strips: list[Strip] = []
+        self._made_for: Size | None = None
+
+    def show(self, image: NDArray[np.uint8] | None) -> None:
+        """Draw another picture; the same object is not drawn twice."""
+        if image is not self._image:
+            self._image, self._made_for = image, None
+            self.refresh()
+
+    def render_line(self, y: int) -> Strip:
+        """One line of half-cells."""
+        if self._made_for != self.size:
+            self._strips, self._made_for = _strips(self._image, self.size), self.size
+        width, ground = self.size.width, self.rich_style
+        if y >= len(self._strips):
+            return Strip.blank(width, ground)
+        return self._strips[y].extend_cell_length(width, ground)
+
+
+class ImagePicture(Container):
+    """The same over textual-image, in pixels where the terminal has them."""
+
+    DEFAULT_CSS = """
+    ImagePicture { width: 1fr; height: 1fr; }
+    ImagePicture > * { width: auto; height: 100%; }
+    """
+
+    def __init__(self, widget: type[Any], id: str | None = None) -> None:  # noqa: A002 - textual's name
+        super().__init__(id=id)
+        self._inner: Any = widget()
+        self._image: NDArray[np.uint8] | None = None
+
+    def compose(self) -> ComposeResult:
+        """textual-image's own widget."""
+        yield self._inner
+
+    def show(self, image: NDArray[np.uint8] | None) -> None:
+        """Draw another picture."""
+        if image is self._image:
+            return
+        self._image = image
+        if image is None:
+            self._inner.image = None
+            return
+        from PIL import Image
+
+        self._inner.image = Image.fromarray(image)
+
+
+class Pictures:
+    """Makes picture widgets of the kind that this terminal shows best. Made before the app takes the terminal."""
+
+    def __init__(self, kind: Kind = "cells") -> None:
+        self.kind: Kind = kind
+        self._widget = _image_widget() if kind == "auto" else None
+
+    def make(self, id: str) -> CellPicture | ImagePicture:  # noqa: A002 - textual's name
+        """A new widget."""
+        return CellPicture(id) if self._widget is None else ImagePicture(self._widget, id)
+
+
+def binary_picture(binary: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Ink black on white."""
+    import numpy as np
+
+    return np.where(binary, 0, 255).astype(np.uint8)
+
+
+def _image_widget() -> type[Any] | None:
+    """textual-image's widget where it is installed and the terminal has pixels; asks the terminal, so call it early."""
+    try:
+        from textual_image.renderable import Image as Chosen
+        from textual_image.renderable import SixelImage, TGPImage
+        from textual_image.widget import Image
+    except (ImportError, OSError, ValueError):
+        # The extra is missing, or the terminal answered its question in a way that it does not understand.
+        return None
+    return Image if Chosen in (SixelImage, TGPImage) else None
+
+
+def _strips(image: NDArray[np.uint8] | None, size: Size) -> list[Strip]:
+    if image is None or not image.size or size.width < 1 or size.height < 1:
+        return []
+    import cv2
+    import numpy as np
+
+    height, width = image.shape
+    # A cell is about twice as high as wide: a half-cell is a square.
+    scale = min(size.width / width, 2 * size.height / height)
+    columns, lines = max(1, int(width * scale)), max(1, int(height * scale / 2))
+    small = np.asarray(cv2.resize(image, (columns, 2 * lines), interpolation=cv2.INTER_AREA), np.int64)
+    levels = (small * (LEVELS - 1) + 127) // 255
+    return [_strip(levels[2 * y], levels[2 * y + 1]) for y in range(lines)]
+
+
+def _strip(top: NDArray[np.int64], bottom: NDArray[np.int64]) -> Strip:
+    import numpy as np
+
+    pair = top * LEVELS + bottom
+    starts = np.flatnonzero(np.concatenate(([True], pair[1:] != pair[:-1])))
+    ends = np.append(starts[1:], len(pair))
+    segments = [Segment(HALF * int(b - a), _style(int(pair[a]))) for a, b in zip(starts, ends, strict=True)]
+    return Strip(segments, len(pair))
+
+
+@lru_cache(maxsize=LEVELS * LEVELS)
+def _style(pair: int) -> Style:
+    top, bottom = (round(level * 255 / (LEVELS - 1)) for level in divmod(pair, LEVELS))
+    return Style.parse(f"rgb({top},{top},{top}) on rgb({bottom},{bottom},{bottom})")

@@ -1,0 +1,56 @@
+"""The run screen: the view, and its keys."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.screen import Screen
+
+from collect.snapshot import Snapshot
+from collect.states import FINAL, State
+from collect.tui.keys import RUN_KEYS, KeyBar
+from collect.tui.pictures import Pictures
+from collect.tui.view import RunView
+
+CAN_PAUSE = frozenset({State.IDLE, State.RECOVERING, State.RUNNING})
+CAN_RESUME = frozenset({State.PAUSING, State.PAUSED})
+OVER_KEYS = (("q", "leave"), ("v", "review"), ("?", "help"), ("tab", "pane"), ("ctrl-p", "commands"))
+
+
+class RunScreen(Screen[None]):
+    """One run, from its first retreat to its end."""
+
+    AUTO_FOCUS = "#log-pane"
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("tab", "next_pane", "Next pane")]
+
+    def __init__(self, pictures: Pictures) -> None:
+        super().__init__()
+        self._view = RunView(pictures)
+        self._keys = KeyBar(RUN_KEYS)
+
+    def compose(self) -> ComposeResult:
+        """The view and the keys."""
+        yield self._view
+        yield self._keys
+
+    def action_next_pane(self) -> None:
+        """On a narrow screen, the next pane."""
+        self._view.next_pane()
+
+    def stop_sent(self) -> None:
+        """Show at once that the stop key was heard."""
+        self._view.stop_sent()
+
+    def show(self, now: Snapshot) -> None:
+        """Draw what differs."""
+        self._view.show(now)
+        if now.state in FINAL:
+            self._keys.show(OVER_KEYS)
+        elif now.state in CAN_RESUME:
+            self._keys.show(tuple(("space", "resume") if key == "space" else (key, what) for key, what in RUN_KEYS))
+        elif now.state in CAN_PAUSE:
+            self._keys.show(RUN_KEYS)
+        else:
+            self._keys.show(tuple(key for key in RUN_KEYS if key[0] != "space"))

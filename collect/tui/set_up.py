@@ -1,0 +1,163 @@
+"""The set-up wizard: what each step measured, whether it is good enough, and the engine's question about it."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from textual import events
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Horizontal, Vertical, VerticalScroll
+from textual.content import Content
+from textual.screen import Screen
+
+from collect.asking import Prompt
+from collect.set_up_steps import Fact, SetUpStep, Standing
+from collect.snapshot import EngineView, Snapshot
+from collect.steps import StepKind
+from collect.tui.ask import choices_content
+from collect.tui.facts import target_text
+from collect.tui.keys import STOP_KEY, KeyBar
+from collect.tui.line import Line
+from collect.tui.pictures import Pictures
+from collect.tui.text import SOFTWARE_STOP, one_line, plain, tip_text
+from collect.tui.trace import force_bar, spark
+from collect.tui.view import NARROW_COLUMNS
+
+SIGNS = {
+    Standing.TO_COME: ("·", "dim"),
+    Standing.NOW: ("▶", "bold reverse"),
+    Standing.GOOD: ("✓", "bold $text-success"),
+    Standing.DOUBTFUL: ("!", "bold $text-warning"),
+}
+SHARP_PX = 2.0
+"""Of the full frame: what a lens in focus easily reaches; a hint while turning it, the measured blur decides."""
+FORCE_SCALE_N = 0.1
+"""Full bar: a soft brush pushes with a few tens of mN."""
+BAR = 30
+KEYS = (STOP_KEY, ("space", "pause"), ("q", "leave"), ("?", "help"), ("ctrl-p", "commands"))
+
+
+class SetUpScreen(Screen[None]):
+    """One screen for all steps: the list, what was found, the live figures, the question."""
+
+    DEFAULT_CSS = """
+    SetUpScreen #set-up-title { height: 1; padding: 0 1; background: $panel; text-style: bold; text-wrap: nowrap; }
+    SetUpScreen #set-up-body { height: 1fr; }
+    SetUpScreen #steps { width: 26; padding: 0 1; border-right: solid $foreground 40%; height: 100%; }
+    SetUpScreen #found { width: 1fr; height: 1fr; padding: 0 1; }
+    SetUpScreen #set-up-camera { width: 34%; height: 100%; padding: 0 1; }
+    SetUpScreen.-narrow #set-up-camera { display: none; }
+    SetUpScreen.-picture #set-up-camera { display: block; width: 100%; }
+    SetUpScreen.-narrow.-picture #steps, SetUpScreen.-narrow.-picture #found-pane { display: none; }
+    SetUpScreen #live { height: 5; padding: 0 1; border-top: solid $foreground 40%; text-wrap: nowrap; }
+    SetUpScreen #question-box { height: auto; max-height: 11; padding: 0 1; border: heavy $warning; display: none; }
+    SetUpScreen.-asking #question-box { display: block; }
+    SetUpScreen #set-up-note { height: 1; padding: 0 1; background: $panel; }
+    """
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("tab", "picture", "Camera")]
+
+    def __init__(self, engine: EngineView, pictures: Pictures) -> None:
+        super().__init__()
+        self._engine = engine
+        self._prompt: Prompt | None = None
+        self._title, self._steps, self._found = Line("set-up-title"), Line("steps"), Line("found-text")
+        self._live, self._question, self._note = Line("live"), Line("question-text"), Line("set-up-note")
+        self._camera = pictures.make("set-up-camera")
+        self._with_camera = pictures.kind != "off"
+
+    def compose(self) -> ComposeResult:
+        """List, findings, live figures, question."""
+        yield self._title
+        with Horizontal(id="set-up-body"):
+            yield self._steps
+            with Vertical(id="found-pane"), VerticalScroll(id="found"):
+                yield self._found
+            if self._with_camera:
+                yield self._camera
+        yield self._live
+        with VerticalScroll(id="question-box") as box:
+            box.can_focus = False
+            yield self._question
+        yield self._note
+        yield KeyBar((*KEYS, ("tab", "camera")))
+
+    def on_resize(self, event: events.Resize) -> None:
+        """The camera beside the findings where there is room."""
+        self.set_class(event.size.width < NARROW_COLUMNS, "-narrow")
+
+    def action_picture(self) -> None:
+        """On a narrow screen, the camera instead of the findings."""
+        self.toggle_class("-picture")
+
+    def stop_sent(self) -> None:
+        """Show at once that the stop key was heard."""
+        self._note.show(Content.styled(" STOP SENT ", "bold reverse"))
+
+    def show(self, now: Snapshot) -> None:
+        """Draw what differs."""
+        session = one_line(now.session_id) or "no session yet"
+        self._title.show(f"Set-up   {session}   {now.state}: {one_line(now.step)}")
+        self._steps.show(steps_content(now.set_up))
+        self._found.show(found_content(now.set_up))
+        self._live.show(live_content(now))
+        if now.picture is not None and self._camera.display:
+            self._camera.show(now.picture.image)
+        self._prompt = now.prompt
+        self.set_class(now.prompt is not None, "-asking")
+        if now.prompt is not None:
+            question = Content.styled(plain(now.prompt.question), "bold")
+            self._question.show(Content("\n").join((question, choices_content(now.prompt))))
+        self._note.show(SOFTWARE_STOP)
+
+    def on_key(self, event: events.Key) -> None:
+        """An answer's key answers."""
+        prompt = self._prompt
+        if prompt is not None and any(choice.key == event.character for choice in prompt.choices):
+            event.stop()
+            self._engine.answer(prompt.number, str(event.character))
+
+
+def steps_content(steps: tuple[SetUpStep, ...]) -> Content:
+    """`✓ Camera, board, scale`, one a line."""
+    lines = [
+        Content.assemble(SIGNS[step.standing], f" {step.title}\n", (f"  {step.standing}", "dim")) for step in steps
+    ]
+    return Content("\n").join(lines)
+
+
+def found_content(steps: tuple[SetUpStep, ...]) -> Content:
+    """What was measured, newest step first: the operator is asked about that."""
+    parts: list[Content] = []
+    for step in reversed(steps):
+        if step.facts:
+            parts.append(Content.styled(step.title, "bold underline"))
+            parts += [_fact(fact) for fact in step.facts]
+            parts.append(Content(""))
+    return Content("\n").join(parts) if parts else Content.styled("nothing measured yet", "dim")
+
+
+def live_content(now: Snapshot) -> Content:
+    """Tip, target, force bar, focus: as they are at this moment."""
+    blur = "no picture yet"
+    if now.picture is not None:
+        blur_px = now.picture.blur_px
+        if blur_px is None:
+            blur = "no edge in view to tell by"
+        else:
+            blur = f"blur {blur_px:.1f} px  {'✓ sharp' if blur_px < SHARP_PX else '! turn the lens'}"
+    force = f"{force_bar(now.force_n, FORCE_SCALE_N, BAR)} {spark(now.trace_n, 20)}"
+    if now.force_n is not None and not _zeroed(now.set_up):
+        force = f"{now.force_n:.3f} N, weight of the holder included: set to zero with zero touch"
+    rows = (("Tip", tip_text(now.tip_mm)), ("Target", target_text(now)), ("Force", force), ("Focus", blur))
+    return Content("\n").join(Content.assemble((name.ljust(8), "dim"), text) for name, text in rows)
+
+
+def _zeroed(steps: tuple[SetUpStep, ...]) -> bool:
+    return any(step.kind is StepKind.ZERO_TOUCH and step.standing is not Standing.TO_COME for step in steps)
+
+
+def _fact(fact: Fact) -> Content:
+    sign, style = {True: ("✓", "$text-success"), False: ("!", "bold $text-warning"), None: (" ", "")}[fact.good]
+    limit = f"  ({fact.limit})" if fact.limit else ""
+    return Content.assemble((sign, style), f" {fact.name.ljust(20)} {fact.value}", (limit, "dim"))

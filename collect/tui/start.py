@@ -1,0 +1,233 @@
+"""The start screen: recent sessions and how each stands, the files to work with, and the rig's health."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import TYPE_CHECKING, ClassVar
+
+from textual import work
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Horizontal, Vertical, VerticalScroll
+from textual.content import Content
+from textual.screen import Screen
+from textual.widgets import Input, OptionList
+from textual.widgets.option_list import Option
+
+from collect.desk import Desk
+from collect.errors import ConfigError
+from collect.tui.confirm import Confirm
+from collect.tui.host import host
+from collect.tui.keys import KeyBar
+from collect.tui.line import Line
+from collect.tui.text import one_line, plain
+from sessions.errors import SessionError
+
+if TYPE_CHECKING:
+    from collect.doctor import Finding
+    from sessions.show import Details
+    from sessions.summary import Summary
+
+KEYS = (
+    ("enter", "resume or look"),
+    ("n", "new session"),
+    ("d", "rig health"),
+    ("e", "files"),
+    ("?", "help"),
+    ("q", "leave"),
+    ("ctrl-p", "commands"),
+)
+WELCOME = (
+    "No session yet.\n\nn starts one: the set-up looks through the camera, finds the paper, and asks "
+    "you about each measurement; then the strokes follow.\n\nd asks every device of the rig whether it is well. "
+    "Nothing moves from this screen."
+)
+FRESH = "A new session: is a blank sheet in as its sheet 1?"
+Begin = Callable[[str | None], None]
+"""Goes on with a session of that name; None is a new one."""
+
+
+class StartScreen(Screen[None]):
+    """Where a day begins."""
+
+    AUTO_FOCUS = "#sessions"
+    DEFAULT_CSS = """
+    StartScreen #start-title { height: 1; padding: 0 1; background: $panel; text-style: bold; }
+    StartScreen #start-body { height: 1fr; }
+    StartScreen #sessions { width: 42%; height: 100%; border: none; padding: 0; }
+    StartScreen #standing { width: 1fr; height: 100%; padding: 0 1; border-left: solid $foreground 40%; }
+    StartScreen #files { height: 1; }
+    StartScreen #files Line { width: auto; padding: 0 1; }
+    StartScreen #files Input { width: 1fr; height: 1; border: none; padding: 0; }
+    StartScreen #health { height: auto; max-height: 8; padding: 0 1; border-top: solid $foreground 40%; }
+    StartScreen #trouble { height: auto; max-height: 6; padding: 0 1; color: $text-error; text-style: bold; }
+    """
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("n", "new", "New session"),
+        Binding("d", "health", "Rig health"),
+        Binding("e", "files", "Files"),
+        Binding("escape", "list", "Sessions", show=False),
+    ]
+
+    def __init__(self, desk: Desk, begin: Begin, look: Callable[[str], None]) -> None:
+        super().__init__()
+        self._desk = desk
+        self._begin = begin
+        self._look = look
+        self._rows: list[Summary] = []
+        self._title, self._standing = Line("start-title"), Line("standing-text")
+        self._health, self._trouble = Line("health-text"), Line("trouble")
+        self._options = OptionList(id="sessions", markup=False)
+        paths = desk.paths
+        self._config = Input(str(paths.config), id="config", compact=True, select_on_focus=False)
+        self._protocol = Input(str(paths.protocol), id="protocol", compact=True, select_on_focus=False)
+
+    def compose(self) -> ComposeResult:
+        """Sessions and standing, files, health, keys."""
+        yield self._title
+        with Horizontal(id="start-body"):
+            yield self._options
+            with VerticalScroll(id="standing"):
+                yield self._standing
+        with Vertical(id="health"):
+            yield self._health
+        with Horizontal(id="files"):
+            yield Line("rig-label")
+            yield self._config
+            yield Line("protocol-label")
+            yield self._protocol
+        yield self._trouble
+        yield KeyBar(KEYS)
+
+    def on_mount(self) -> None:
+        """Look what there is."""
+        self.query_one("#rig-label", Line).show("rig")
+        self.query_one("#protocol-label", Line).show("protocol")
+        self._health.show(Content.styled("Rig health: d asks every device; powers nothing, moves nothing", "dim"))
+        self.reread()
+
+    def on_screen_resume(self) -> None:
+        """After a run the list has changed."""
+        self.reread()
+
+    def reread(self) -> None:
+        """List the sessions again."""
+        self._title.show(f"brushloop   sessions in {one_line(str(self._desk.paths.root))}")
+        try:
+            self._rows = self._desk.recent()
+        except (SessionError, OSError) as error:
+            self.trouble(str(error))
+            return
+        self._options.clear_options()
+        self._options.add_options(Option(_row_content(row), id=row.session_id) for row in self._rows)
+        if self._rows:
+            self._options.highlighted = 0
+        else:
+            self._standing.show(WELCOME)
+
+    def trouble(self, words: str) -> None:
+        """One clear line, or none."""
+        self._trouble.show(plain(words))
+
+    def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
+        """How the session under the cursor stands."""
+        self._show_standing(str(event.option.id))
+
+    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+        """Resume an open session, look through a closed one."""
+        row = next(row for row in self._rows if row.session_id == event.option.id)
+        self.trouble("")
+        if row.state == "open":
+            self._choose()
+            self._begin(row.session_id)
+        else:
+            self._look(row.session_id)
+
+    def on_input_submitted(self, _event: Input.Submitted) -> None:
+        """Back to the list with the files that were typed."""
+        self._choose()
+        self.action_list()
+
+    def action_list(self) -> None:
+        """Focus on the sessions."""
+        self._options.focus()
+
+    def action_files(self) -> None:
+        """Type other files."""
+        self._config.focus()
+
+    @work(exclusive=True, group="new")
+    async def action_new(self) -> None:
+        """Ask for a blank sheet, then begin."""
+        self._choose()
+        self.trouble("reading the files ...")
+        try:
+            words = f"{FRESH}\n\n{await asyncio.to_thread(self._desk.planned)}"
+        except (ConfigError, OSError) as error:
+            self.trouble(str(error))
+            return
+        self.trouble("")
+
+        def answered(yes: bool | None) -> None:
+            if yes:
+                self._begin(None)
+
+        host(self).push_screen(Confirm(words, "y  it is in: begin      n  back"), answered)
+
+    @work(exclusive=True, group="health")
+    async def action_health(self) -> None:
+        """Ask every device, off the screen's loop."""
+        self._choose()
+        self._health.show("Rig health: asking every device ...")
+        try:
+            findings = await asyncio.to_thread(self._desk.health)
+        except (ConfigError, OSError) as error:
+            self._health.show(Content.styled(f"Rig health: {plain(str(error))}", "$text-error"))
+            return
+        self._health.show(health_content(findings))
+
+    def _choose(self) -> None:
+        self._desk.choose(self._config.value, self._protocol.value)
+
+    def _show_standing(self, session_id: str) -> None:
+        try:
+            self._standing.show(standing_content(self._desk.standing(session_id)))
+        except SessionError as error:
+            self._standing.show(Content.styled(plain(str(error)), "$text-error"))
+
+
+def _row_content(row: Summary) -> Content:
+    sign, style = {"open": ("▶", "bold $text-warning"), "damaged": ("!", "bold $text-error")}.get(row.state, ("✓", ""))
+    return Content.assemble((sign, style), f" {one_line(row.session_id)} {row.state}")
+
+
+def standing_content(told: Details) -> Content:
+    """What is finished, what is void, what comes next."""
+    planned = "" if told.planned is None else f" of {told.planned}"
+    parts = [
+        Content.assemble((told.session_id, "bold"), f"  {told.state}\n{told.source}"),
+        Content.assemble(("Finished  ", "dim"), (f"{told.strokes}{planned} strokes", "bold")),
+    ]
+    if told.void:
+        parts.append(Content.assemble(("Void      ", "dim"), (f"{len(told.void)} cut short", "bold $text-warning")))
+        parts += [Content(f"  × {plain(line)}") for line in told.void[-5:]]
+    if told.state == "open":
+        following = told.next or ("the next stroke" if told.strokes else "set-up")
+        parts.append(Content.assemble(("Next      ", "dim"), (plain(following), "bold")))
+        parts.append(Content("The arm first lifts and parks; then it goes on there. No stroke is made twice."))
+    parts.append(Content.assemble(("Sheets    ", "dim"), f"{len(told.sheets)}"))
+    if told.repairs:
+        parts.append(Content.styled(f"{len(told.repairs)} repairs", "$text-warning"))
+    return Content("\n").join(parts)
+
+
+def health_content(findings: list[Finding]) -> Content:
+    """One line a device, the verdict as a sign and in words."""
+    lines: list[Content] = []
+    for finding in findings:
+        sign = ("✓ well   ", "$text-success") if finding.well else ("! trouble", "bold $text-error")
+        latency = "" if finding.latency_ms is None else f"  {finding.latency_ms:.0f} ms"
+        what = finding.notes if finding.well else f"{finding.problem}. {finding.remedy}"
+        lines.append(Content.assemble(sign, f" {finding.device:<7}{latency}  {one_line(what)}"))
+    return Content("\n").join(lines)

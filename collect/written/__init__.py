@@ -1,0 +1,1 @@
+"""Characters written by the arm, from the plan to the report."""

@@ -1,0 +1,134 @@
+"""From photographs of dragged strokes to a drag model on disk; loopback brush."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from brushloop import app
+from calibrate.artefact import load_artefact, newest
+from calibrate.brushfit.drag_captures import commanded_path, figures_of, read_drags
+from calibrate.brushfit.drag_run import FOLDER, LAGGING, STAMPS, DragArtefact
+from calibrate.brushfit.drags import chance, fit_drags
+from calibrate.errors import CalibrationError
+from drivers.sim.brush import Brush, BrushSpec, Waypoint
+from model.drag import DragModel
+from sessions.importer import ImportOptions, import_photographs
+from sessions.schemas import Header, Source
+
+STROKES = [
+    (30.0, 0.0, 4.0),
+    (30.0, 12.0, 7.0),
+    (25.0, -12.0, 5.0),
+    (35.0, 8.0, 8.0),
+    (28.0, -8.0, 3.0),
+    (32.0, 15.0, 6.0),
+]
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photos")
+    lines = ["file,length_mm,bend_mm,depth_mm,px_per_mm,start_x_px,start_y_px"]
+    brush = Brush(BrushSpec())
+    for k, (length, bend, depth) in enumerate(STROKES):
+        path = commanded_path(length, bend, depth, depth)
+        mark = brush.drag([Waypoint(*row[:3]) for row in path.tolist()], 0.0, 0.0, ink_load=1.0, press_seed=k)
+        page = np.full((700, 900), 235, np.uint8)
+        rows, columns = mark.density.shape
+        left, top = 300 - round(mark.origin_px[0]), 350 - round(mark.origin_px[1])
+        page[top : top + rows, left : left + columns] -= np.rint(200 * np.clip(mark.density, 0, 1)).astype(np.uint8)
+        cv2.imwrite(str(folder / f"{k}.png"), page)
+        lines.append(f"{k}.png,{length},{bend},{depth},10.0,300,350")
+    table = folder / "strokes.csv"
+    table.write_text("\n".join(lines) + "\n")
+    out = tmp_path_factory.mktemp("sessions") / "drags"
+    import_photographs(folder, table, out, ImportOptions(kind="drag"), "test", lambda: 1)
+    return out
+
+
+def test_dragged_strokes_are_fitted_and_written(session: Path) -> None:
+    ran = CliRunner().invoke(app, ["fit", str(session), "--drags", "--mm-per-px", "1.0"])
+    assert ran.exit_code == 0, ran.output
+    for words in ("bristle lag", "circle stamps", "leash_mm", "condition"):
+        assert words in ran.output
+    path = newest(session, FOLDER)
+    assert path is not None
+    fit = load_artefact(path, DragArtefact)
+    assert (fit.images, fit.strokes) == (6, 6)
+    assert fit.held_out[LAGGING].csim_percent > fit.held_out[STAMPS].csim_percent + 2.0
+    assert fit.model().leash_mm + 6.0 * fit.model().leash_per_mm > 1.0
+    assert all(value.low is not None and value.high is not None for value in fit.parameters.values())
+
+
+def test_equal_inputs_give_an_equal_file_and_an_edited_one_is_refused(session: Path, tmp_path: Path) -> None:
+    for _ in range(2):
+        assert CliRunner().invoke(app, ["fit", str(session), "--drags", "--mm-per-px", "1.0"]).exit_code == 0
+    [path] = (session / FOLDER).glob("*.json")
+    edited = tmp_path / path.name
+    edited.write_text(path.read_text().replace('"leash_mm"', '"leash_m"'))
+    with pytest.raises(CalibrationError, match="leash_mm"):
+        load_artefact(edited, DragArtefact)
+
+
+def test_presses_are_refused_with_one_line(session: Path) -> None:
+    ran = CliRunner().invoke(app, ["fit", str(session)])
+    assert ran.exit_code != 0
+    assert "strokes that travel" in str(ran.exception)
+    ran = CliRunner().invoke(app, ["fit", str(session), "--drags", "--correction"])
+    assert ran.exit_code == 2
+
+
+def test_the_ink_lies_where_the_command_put_it(session: Path) -> None:
+    drawn = read_drags(session, 1.0)
+    assert drawn.ink.shape == (6, len(drawn.y_mm), len(drawn.x_mm))
+    straight = drawn.ink[drawn.stroke_ids.index("0")] > 0.5
+    x, y = drawn.x_mm[straight.any(axis=0)], drawn.y_mm[straight.any(axis=1)]
+    assert -12.0 < x.min() < 2.0
+    assert 20.0 < x.max() < 36.0
+    assert abs(float(y.mean())) < 2.0
+
+
+def test_a_drawn_figure_has_the_strokes_of_its_protocol() -> None:
+    points = [[1.0, 2.0, 3.0, 4.0, 90.0], [5.0, 6.0, 7.0, 8.0, 90.0]]
+    told = {"kind": "write", "figures": [{"name": "yong", "strokes": [{"points": points}, {"points": points}]}]}
+    found = figures_of(_header(json.dumps(told)))
+    assert [path.tolist() for path in found["yong"]] == [[[1.0, 2.0, 3.0, 90.0], [5.0, 6.0, 7.0, 90.0]]] * 2
+    with pytest.raises(CalibrationError, match="tells no trajectories"):
+        figures_of(_header('{"kind": "grid"}'))
+
+
+def test_figures_of_several_strokes_are_fitted_as_a_whole() -> None:
+    truth = DragModel(half_mm=1.0, half_per_mm=0.4, leash_mm=3.0, leash_per_mm=0.4, drift_x_mm=0.5, settle_mm=2.0)
+    x_mm, y_mm = np.arange(0.0, 60.0, 1.0), np.arange(59.0, -1.0, -1.0)
+    rng = np.random.default_rng(4)
+    paths = []
+    for _ in range(8):
+        for heading in (0.0, -90.0):  # a cross: one stroke to the right, one down, the brush turned with it
+            way = (
+                np.linspace(0.0, 1.0, 12)[:, None]
+                * rng.uniform(22.0, 30.0)
+                * np.array([np.cos(np.radians(heading)), np.sin(np.radians(heading))])
+            )
+            start = np.array([15.0, 30.0]) if heading == 0.0 else np.array([30.0, 46.0])
+            deep = np.full(12, rng.uniform(3.0, 8.0))
+            paths.append(np.column_stack([start + way, deep, np.full(12, heading)]))
+    groups = np.arange(0, 17, 2)
+    ink = np.array(
+        [np.maximum(*(chance(truth.distance(p, x_mm, y_mm)) for p in paths[g : g + 2])) for g in groups[:-1]]
+    )
+    fit = fit_drags(paths, ink, x_mm, y_mm, groups=groups)
+    for depth in (3.0, 8.0):
+        assert fit.model.leash_mm + depth * fit.model.leash_per_mm == pytest.approx(3.0 + 0.4 * depth, rel=0.2)
+    assert np.abs(chance(fit.distance(paths, x_mm, y_mm, groups=groups)) - ink).mean() < 0.01
+    with pytest.raises(ValueError, match="not alike"):
+        fit_drags(paths, ink, x_mm, y_mm)
+
+
+def _header(protocol: str) -> Header:
+    return Header(session_id="s", source=Source.LOOPBACK, software="test", protocol=protocol)

@@ -1,0 +1,293 @@
+"""`camera check|drift|register|intrinsics`: what they say of a sound board, and how each bad photograph is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from brushloop import app
+from calibrate.camera.artefact import LensFile
+from calibrate.camera.lens import Gray
+from calibrate.errors import CalibrationError
+from calibrate.scale import BoardSpec, apply, charuco_board
+
+if TYPE_CHECKING:
+    from conftest import Photographed
+
+SPEC = BoardSpec(squares=(9, 7), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_100", origin_mm=(0.0, 0.0))
+BOARD = ("--charuco", "9x7", "--square-mm", "20", "--dictionary", "DICT_5X5_100")
+PX_PER_MM = 8.0
+EDGE_PX = 60
+SLANT = np.array([[0.62, 0.02, 30.0], [-0.01, 0.62, 40.0], [1e-5, 2e-5, 1.0]])
+
+
+def board(shift_px: float = 0.0, seed: int = 0) -> Gray:
+    """The board at about 5 px/mm, seen at a slant."""
+    picture = charuco_board(SPEC, "test").generateImage((9 * 160, 7 * 160))
+    picture = cv2.copyMakeBorder(picture, *[EDGE_PX] * 4, cv2.BORDER_CONSTANT, value=240)
+    slant = SLANT + np.array([[0, 0, shift_px], [0, 0, 0], [0, 0, 0]])
+    image = cv2.warpPerspective(picture, slant, (1024, 800), flags=cv2.INTER_AREA, borderValue=120)
+    noisy = cv2.GaussianBlur(image, (0, 0), 0.9) + np.random.default_rng(seed).normal(0, 1.5, image.shape)
+    return np.clip(noisy, 0, 235).astype(np.uint8)
+
+
+def pixels(paper_mm: np.ndarray) -> np.ndarray:
+    """Where points of the paper lie in that photograph; the board's y counts down from 140 mm."""
+    drawn = np.column_stack([paper_mm[:, 0], 140.0 - paper_mm[:, 1]]) * PX_PER_MM + EDGE_PX - 0.5
+    return apply(SLANT, drawn)
+
+
+def half_hidden(share: float) -> Gray:
+    image = board()
+    image[:, round(share * 1024) :] = 200
+    return image
+
+
+BLANK = np.full((800, 1024), 220, np.uint8)
+MIRRORED = np.ascontiguousarray(board()[:, ::-1])
+TWO = np.hstack([board(), board()])
+SATURATED = np.where(board() > 110, 255, board()).astype(np.uint8)
+
+
+def saved(path: Path, image: Gray) -> Path:
+    cv2.imwrite(str(path), image)
+    return path
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["camera", *map(str, arguments)])
+
+
+def refused(ran: Result, told: str) -> None:
+    assert isinstance(ran.exception, CalibrationError), ran.output
+    assert ran.exception.exit_code == 2
+    assert told in str(ran.exception)
+    assert "\n" not in str(ran.exception)
+
+
+def a_lens(folder: Path, size_px: tuple[int, int] = (1024, 800), k1: float = 0.0) -> Path:
+    width, height = size_px
+    return LensFile(
+        software="test",
+        photographs={},
+        board="a board",
+        size_px=size_px,
+        matrix=(1024.0, 1024.0, (width - 1) / 2, (height - 1) / 2),
+        distortion=(k1, 0.0, 0.0, 0.0, 0.0),
+        focal_se_px=(1.0, 1.0),
+        rms_px=0.2,
+        rms_limit_px=0.5,
+        residuals_px={},
+        dropped={},
+        unusable={},
+        guidance=(),
+        warnings=(),
+    ).save(folder)
+
+
+# What no command can measure by: the photograph, the options for the board, and the words.
+USELESS = [
+    pytest.param(BLANK, BOARD, "is blank", id="blank page"),
+    pytest.param(half_hidden(0.18), BOARD, "of 48 board corners found", id="board hidden"),
+    pytest.param(board(), ("--charuco", "5x4", *BOARD[2:]), "it is another board", id="a smaller board is expected"),
+    pytest.param(board(), ("--charuco", "8x8", *BOARD[2:]), "do not lie as this board", id="a wrong size is expected"),
+    pytest.param(MIRRORED, BOARD, "is mirrored", id="mirrored"),
+    pytest.param(TWO, BOARD, "two boards", id="two boards"),
+]
+
+
+@pytest.mark.parametrize(("image", "options", "told"), USELESS)
+def test_check_refuses_a_photograph_that_tells_nothing(
+    tmp_path: Path, image: Gray, options: Sequence[str], told: str
+) -> None:
+    refused(run("check", saved(tmp_path / "p.png", image), *options), told)
+
+
+@pytest.mark.parametrize(
+    ("image", "told"),
+    [
+        pytest.param(half_hidden(0.5), "the board is partly hidden", id="board half hidden"),
+        pytest.param(SATURATED, "% of the pixels are saturated", id="saturated"),
+    ],
+)
+def test_check_flags_what_can_be_used_with_care(tmp_path: Path, image: Gray, told: str) -> None:
+    ran = run("check", saved(tmp_path / "p.png", image), *BOARD)
+    assert ran.exit_code == 5
+    assert any(line.startswith("warning: ") and told in line for line in ran.output.splitlines()), ran.output
+    assert ran.output.startswith("pix2len 0.")
+
+
+def test_check_passes_a_sound_board_and_says_nothing_else(tmp_path: Path) -> None:
+    ran = run("check", saved(tmp_path / "p.png", board()), *BOARD)
+    assert ran.exit_code == 0, ran.output
+    [line] = ran.output.splitlines()
+    assert line.startswith("pix2len 0.2")
+
+
+def test_check_names_the_remedy_for_a_lens_that_bends(tmp_path: Path) -> None:
+    size = (1024, 800)
+    columns, rows = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    matrix = np.array([[1024.0, 0, 511.5], [0, 1024.0, 399.5], [0, 0, 1]])
+    places = cv2.undistortPoints(
+        np.stack([columns, rows], -1).reshape(-1, 1, 2).astype(np.float64), matrix, np.array([-0.1, 0, 0, 0]), P=matrix
+    )
+    bent = cv2.remap(board(), places.reshape(size[1], size[0], 2).astype(np.float32), np.empty(0), cv2.INTER_LINEAR)
+    path = saved(tmp_path / "bent.png", np.asarray(bent, np.uint8))
+    ran = run("check", path, *BOARD)
+    assert ran.exit_code == 5
+    assert "warning: the board is bent by" in ran.output
+    assert "brushloop camera intrinsics" in ran.output
+    assert run("check", path, *BOARD, "--lens", a_lens(tmp_path, k1=-0.1)).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("data", "told"),
+    [(b"", "no whole PNG or JPEG"), (b"\x89PNG\r\n\x1a\nabc", "no whole PNG or JPEG"), (None, "No such file")],
+    ids=["empty", "torn", "missing"],
+)
+def test_what_is_no_photograph_is_refused(tmp_path: Path, data: bytes | None, told: str) -> None:
+    path = tmp_path / "p.png"
+    if data is not None:
+        path.write_bytes(data)
+    refused(run("check", path, *BOARD), told)
+    refused(run("intrinsics", path, *BOARD, "--out", tmp_path / "out"), told)
+    refused(run("register", points(tmp_path), "--photograph", path, *BOARD, "--out", tmp_path / "out"), told)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_or_a_lens_of_another_camera_is_refused(tmp_path: Path) -> None:
+    refused(run("check", tmp_path, *BOARD), "is no file")
+    photograph = saved(tmp_path / "p.png", board())
+    other = a_lens(tmp_path, (640, 480))
+    refused(
+        run("check", photograph, *BOARD, "--lens", other), "is 1024 x 800 px, the lens was calibrated at 640 x 480 px"
+    )
+    other.write_text(other.read_text().replace("a board", "another"))
+    refused(run("check", photograph, *BOARD, "--lens", other), "was edited")
+
+
+def points(folder: Path, change: str = "") -> Path:
+    """Five marks that a robot touched, turned by 10 degrees; `change` spoils the table."""
+    paper = np.array([[20.0, 20.0], [150.0, 25.0], [140.0, 120.0], [30.0, 110.0], [90.0, 60.0]])
+    turn = math.radians(10.0)
+    rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    robot = (paper - np.array([300.0, -50.0])) @ rotation
+    lines = ["name,robot_x_mm,robot_y_mm,image_x_px,image_y_px"]
+    for k, (r, i) in enumerate(zip(robot, pixels(paper), strict=True)):
+        lines.append(f"p{k},{r[0]:.4f},{r[1]:.4f},{i[0]:.4f},{i[1]:.4f}")
+    match change:
+        case "few":
+            lines = lines[:3]
+        case "mixed":
+            cells = [line.split(",") for line in lines]
+            order = [0, 4, 1, 5, 2, 3]
+            lines = [",".join([*a[:3], *cells[k][3:]]) for a, k in zip(cells, order, strict=True)]
+        case "word":
+            lines[2] = lines[2].replace(lines[2].split(",")[3], "left")
+        case "column":
+            lines[0] = lines[0].replace("image_x_px", "image_x")
+        case _:
+            pass
+    table = folder / "points.csv"
+    table.write_text("\n".join(lines) + "\n")
+    return table
+
+
+def test_register_finds_the_turn_and_names_all_that_it_was_made_of(tmp_path: Path) -> None:
+    photograph, lens = saved(tmp_path / "p.png", board()), a_lens(tmp_path)
+    ran = run("register", points(tmp_path), "--photograph", photograph, *BOARD, "--lens", lens, "--out", tmp_path / "o")
+    assert ran.exit_code == 0, ran.output
+    [path] = (tmp_path / "o").iterdir()
+    made = json.loads(path.read_text())
+    assert made["turn_deg"] == pytest.approx(10.0, abs=0.01)
+    assert made["rms_mm"] < 0.05
+    assert made["source"].count("sha256 ") == 2
+    assert f"lens file {lens.stem}" in made["source"]
+
+
+@pytest.mark.parametrize(("image", "options", "told"), USELESS)
+def test_register_writes_nothing_by_a_photograph_that_tells_nothing(
+    tmp_path: Path, image: Gray, options: Sequence[str], told: str
+) -> None:
+    photograph, out = saved(tmp_path / "p.png", image), tmp_path / "out"
+    refused(run("register", points(tmp_path), "--photograph", photograph, *options, "--out", out), told)
+    assert not out.exists()
+
+
+def test_register_flags_what_can_be_used_with_care(tmp_path: Path) -> None:
+    for image, told in ((half_hidden(0.5), "partly hidden"), (SATURATED, "are saturated")):
+        photograph = saved(tmp_path / "p.png", image)
+        ran = run("register", points(tmp_path), "--photograph", photograph, *BOARD, "--out", tmp_path / "out")
+        assert ran.exit_code == 0, ran.output
+        assert any(line.startswith("warning: ") and told in line for line in ran.output.splitlines()), ran.output
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("few", "2 points: at least 3 are needed"),
+        ("mixed", "are their names mixed up?"),
+        ("word", "line 3, column `image_x_px`: 'left' is not a finite number"),
+        ("column", "missing: image_x_px"),
+    ],
+)
+def test_register_writes_nothing_by_a_bad_table(tmp_path: Path, change: str, told: str) -> None:
+    out = tmp_path / "out"
+    photograph = saved(tmp_path / "p.png", board())
+    refused(run("register", points(tmp_path, change), "--photograph", photograph, *BOARD, "--out", out), told)
+    assert not out.exists()
+
+
+def test_drift_tells_a_camera_that_stays_and_one_that_was_touched(photographed: Photographed, tmp_path: Path) -> None:
+    still = photographed(tmp_path / "still", SPEC, [board(seed=k) for k in range(3)])
+    ran = run("drift", still)
+    assert ran.exit_code == 0, ran.output
+    assert [line.split(" s:")[0].strip() for line in ran.output.splitlines()[:3]] == ["0", "60", "120"]
+    assert "trend " in ran.output
+    touched = photographed(tmp_path / "touched", SPEC, [board(), board(4.0, seed=1), half_hidden(0.5), BLANK])
+    ran = run("drift", touched)
+    assert ran.exit_code == 5
+    warnings = [line for line in ran.output.splitlines() if line.startswith("warning: ")]
+    assert "is blank" in warnings[0]
+    assert "the board is partly hidden" in warnings[1]
+    assert "the board moved by 3.9 px" in warnings[2]
+    assert len(warnings) == 3, "half a board tells the same scale as a whole one"
+
+
+@pytest.mark.parametrize(
+    ("image", "told"),
+    [(BLANK, "is blank"), (MIRRORED, "is mirrored"), (TWO, "two boards"), (half_hidden(0.18), "corners found")],
+    ids=["blank", "mirrored", "two", "hidden"],
+)
+def test_drift_refuses_a_session_in_which_no_board_is_seen(
+    photographed: Photographed, tmp_path: Path, image: Gray, told: str
+) -> None:
+    session = photographed(tmp_path / "s", SPEC, [image, image])
+    before = sorted(tmp_path.rglob("*"))
+    ran = run("drift", session)
+    refused(ran, told)
+    assert "is not seen in any of 2 photographs" in str(ran.exception)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_drift_refuses_what_is_no_session_with_boards(photographed: Photographed, tmp_path: Path) -> None:
+    assert "no such session" in str(run("drift", tmp_path / "nosuch").exception)
+    refused(run("drift", photographed(tmp_path / "none", SPEC, [])), "holds no view of the board")
+
+
+def test_intrinsics_names_every_useless_photograph_and_writes_nothing(tmp_path: Path) -> None:
+    images = {"blank": BLANK, "mirrored": MIRRORED, "two": TWO, "sound": board()}
+    paths = [saved(tmp_path / f"{name}.png", image) for name, image in images.items()]
+    ran = run("intrinsics", *paths, *BOARD, "--out", tmp_path / "out")
+    refused(ran, "1 usable views of the board, at least 4 needed")
+    for told in ("blank.png is blank", "mirrored.png is mirrored", "two.png shows two boards"):
+        assert told in str(ran.exception)
+    assert not (tmp_path / "out").exists()

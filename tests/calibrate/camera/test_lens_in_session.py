@@ -1,0 +1,201 @@
+"""A camera that distorts: the session's lens, or a given one, is undone first; without one the remedy is told.
+
+Loopback rig, its barrel camera (k1 = -0.15).
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from bench.preprocess_rigs import CAMERAS, Shot, lens_views, sheet, true_mask, true_scale
+from brushloop import app
+from calibrate.artefact import Calibration, LensUsed, load_artefact, newest
+from calibrate.calibration import FITTED, calibrate_session
+from calibrate.camera.artefact import LensFile, lens_file
+from calibrate.camera.boards import see
+from calibrate.camera.intrinsics import fit_lens
+from calibrate.camera.session import read_lens
+from calibrate.errors import CalibrationError, CaptureRefused
+from calibrate.field import Field
+from calibrate.prepare.params import PX_PER_MM, Params
+from calibrate.presses import prepare_press
+from calibrate.scale import see_board
+from sessions.reader import Recording
+from sessions.schemas import Stroke
+
+if TYPE_CHECKING:
+    from conftest import Photographed
+
+BARREL = 3
+WORST_SCALE = 2e-4
+WORST_ANCHOR_MM = 0.1
+
+
+def kept_lens(folder: Path, k1: float, size_px: tuple[int, int] = (2048, 1536)) -> Path:
+    """A lens file as `camera intrinsics` would write it for a rig's camera, a little off in focus and centre."""
+    width, height = size_px
+    return LensFile(
+        software="brushloop test",
+        photographs={"0.png": "ab" * 32},
+        board="a board",
+        size_px=size_px,
+        matrix=(width + 1.0, width + 1.0, (width - 1) / 2 + 0.5, (height - 1) / 2 - 0.5),
+        distortion=(k1 + 0.002, 0.0, 0.0, 0.0, 0.0),
+        focal_se_px=(1.0, 1.0),
+        rms_px=0.1,
+        rms_limit_px=0.5,
+        residuals_px={"0.png": 0.1},
+        dropped={},
+        unusable={},
+        guidance=(),
+        warnings=(),
+    ).save(folder)
+
+
+@pytest.fixture(scope="module")
+def shot() -> Shot:
+    return sheet(BARREL, 2)
+
+
+@pytest.fixture(scope="module")
+def lens(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return kept_lens(tmp_path_factory.mktemp("lens"), CAMERAS[BARREL].k1)
+
+
+def collected(photographed: Photographed, folder: Path, shot: Shot, optics: LensUsed | None = None) -> Path:
+    strokes = [
+        Stroke(
+            stroke_id=f"s{k}",
+            kind="press",
+            still=0,
+            height_mm=13.0,
+            tilt_deg=5.0,
+            anchor_mm=anchor,
+            cell_mm=(anchor[0] - 30.0, anchor[1] - 12.0, 40.0, 24.0),
+        )
+        for k, anchor in enumerate(shot.anchors_mm)
+    ]
+    return photographed(folder, shot.board, [shot.image], [(one, shot.image) for one in strokes], optics=optics)
+
+
+def holds(made: Calibration, shot: Shot) -> None:
+    """The issue's figures: scale within 2e-4 and inside its interval, anchors within 0.1 mm."""
+    assert made.middle_px is not None
+    truth = true_scale(shot, made.middle_px)
+    assert made.mm_per_px == pytest.approx(truth, rel=WORST_SCALE)
+    assert made.mm_per_px_low <= truth <= made.mm_per_px_high
+    anchors = np.array(shot.anchors_mm)
+    off_px = np.linalg.norm(made.to_image(anchors) - shot.optics.image_of(anchors), axis=1)
+    assert off_px.max() * truth <= WORST_ANCHOR_MM
+
+
+def test_without_its_lens_a_bent_session_is_refused_with_the_remedy(
+    photographed: Photographed, tmp_path: Path, shot: Shot
+) -> None:
+    session = collected(photographed, tmp_path / "bent", shot)
+    with pytest.raises(CalibrationError, match=r"bent by .* px: .*`brushloop camera intrinsics`.*--lens") as refused:
+        calibrate_session(session)
+    assert refused.value.exit_code == 2
+    assert "camera.lens_file in rig.toml" in str(refused.value)
+    assert not (session / "calibration").exists()
+
+
+def test_a_lens_file_makes_scale_anchors_and_masks_right(
+    photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path
+) -> None:
+    session = collected(photographed, tmp_path / "bent", shot)
+    ran = CliRunner().invoke(app, ["calibrate", str(session), "--lens", str(lens)])
+    assert ran.exit_code == 0, ran.output
+    assert f"lens: lens file {lens.stem}" in ran.output
+    path = newest(session)
+    assert path is not None
+    made = load_artefact(path, Calibration)
+    holds(made, shot)
+    assert made.lens is not None
+    assert made.lens.source == f"lens file {lens.stem}"
+    assert made.lens.distortion[0] == pytest.approx(CAMERAS[BARREL].k1, abs=0.005)
+    assert made.board == shot.board
+    assert len(made.still_sha256) == len(made.recording_sha256) == 64
+
+    for capture in Recording(session).captures():
+        assert capture.stroke.anchor_mm is not None
+        mask = prepare_press(capture, made, Params(), Field()).mask
+        truth = true_mask(shot, Field().window_mm(capture.stroke.anchor_mm), PX_PER_MM)
+        # The cell of the model's field may end in the middle of the stroke's neighbour; here there is none.
+        assert (mask & truth).sum() / (mask | truth).sum() >= 0.95
+    small = made.model_copy(update={"lens": made.lens.model_copy(update={"size_px": (1024, 768)})})
+    with pytest.raises(CaptureRefused, match="is 2048 x 1536 px, the calibration is for 1024 x 768 px"):
+        prepare_press(capture, small, Params(), Field())
+
+
+def test_a_session_that_was_collected_with_a_lens_needs_no_other(
+    photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path
+) -> None:
+    session = collected(photographed, tmp_path / "own", shot, read_lens(lens))
+    holds(load_artefact(calibrate_session(session), Calibration), shot)
+    wrong = kept_lens(tmp_path / "wrong", 0.08)
+    with pytest.raises(CalibrationError, match=r"bent by .* of another camera, or of another focus"):
+        calibrate_session(session, wrong)
+    small = kept_lens(tmp_path / "small", -0.15, (1024, 768))
+    with pytest.raises(CalibrationError, match=r"is 2048 x 1536 px, the lens was calibrated at 1024 x 768 px"):
+        calibrate_session(session, small)
+    with pytest.raises(CalibrationError, match="No such file"):
+        calibrate_session(session, tmp_path / "nosuch.json")
+
+
+def test_a_straight_camera_needs_no_lens(photographed: Photographed, tmp_path: Path) -> None:
+    straight = sheet(0, 1)
+    made = load_artefact(calibrate_session(collected(photographed, tmp_path / "straight", straight)), Calibration)
+    assert made.lens is not None
+    assert made.lens.source == FITTED
+    holds(made, straight)
+
+
+def test_the_quick_look_at_a_board_knows_a_lens_too(tmp_path: Path, shot: Shot, lens: Path) -> None:
+    with pytest.raises(CalibrationError, match="the lens bends straight lines: calibrate it with `brushloop camera"):
+        see_board(shot.image, shot.board)
+    wrong = read_lens(kept_lens(tmp_path, 0.08)).lens()
+    with pytest.raises(CalibrationError, match="of another camera, or of another focus"):
+        see_board(shot.image, shot.board, lens=wrong)
+    known = read_lens(lens).lens()
+    plane = see_board(shot.image, shot.board, lens=known)
+    again = see_board(known.straighten(shot.image), shot.board)
+    assert plane.rms_px < 0.3
+    assert again.mm_per_px == pytest.approx(plane.mm_per_px, rel=2e-4)
+    with pytest.raises(CalibrationError, match="the lens was calibrated at 2048 x 1536 px"):
+        see_board(np.ascontiguousarray(shot.image[:, :-8]), shot.board, lens=known)
+
+
+def test_every_stage_is_shown_with_the_lens(photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path) -> None:
+    session, out = collected(photographed, tmp_path / "bent", shot), tmp_path / "stages.png"
+    command = ["calibrate", "preprocess", str(session), "--out", str(out)]
+    refused = CliRunner().invoke(app, command)
+    assert "brushloop camera intrinsics" in str(refused.exception)
+    assert not out.exists()
+    shown = CliRunner().invoke(app, [*command, "--lens", str(lens)])
+    assert shown.exit_code == 0, shown.output
+    told = dict(line.split() for line in shown.output.splitlines() if line.startswith("undistort."))
+    assert float(told["undistort.k1"]) == pytest.approx(CAMERAS[BARREL].k1, abs=0.005)
+    # What is shown is what is measured: the same plane, the same paper cell.
+    made = load_artefact(calibrate_session(session, lens), Calibration)
+    shown_first = next(Recording(session).captures())
+    prepared = prepare_press(shown_first, made, Params(), Field())
+    numbers = json.loads(out.with_suffix(".json").read_text())["fitted"]
+    assert numbers["threshold.reflectance"] == prepared.threshold
+    assert numbers["binarise.area_mm2"] == prepared.mask.sum() / PX_PER_MM**2
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("rig", [1, 2, 3, 4])
+def test_a_lens_from_slanted_boards_carries_a_session(photographed: Photographed, tmp_path: Path, rig: int) -> None:
+    views = [see(image, sheet(rig, 1).board, f"{k}") for k, image in enumerate(lens_views(rig, 12))]
+    lens = lens_file(fit_lens(views), "a board", {}, {}, 0.5, "test").save(tmp_path)
+    seen = sheet(rig, 15)
+    holds(load_artefact(calibrate_session(collected(photographed, tmp_path / "s", seen), lens), Calibration), seen)

@@ -1,0 +1,89 @@
+"""Sessions of a few photographs, collected as the engine collects them but without a rig."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calibrate.artefact import LensUsed
+from calibrate.scale import BoardSpec
+from sessions.messages import encode_png, image_message
+from sessions.schemas import Header, Source, StepEvent, Stroke, Topic
+from sessions.store import SessionStore
+from sessions.writer import Outgoing
+
+T0_NS = 1_700_000_000_000_000_000
+MINUTE_NS = 60_000_000_000
+Gray = NDArray[np.uint8]
+
+
+class Photographed(Protocol):
+    def __call__(
+        self,
+        folder: Path,
+        spec: BoardSpec,
+        boards: Sequence[Gray],
+        presses: Sequence[tuple[Stroke, Gray]] = (),
+        *,
+        optics: LensUsed | None = None,
+        sheet_mm: tuple[float, float] | None = None,
+    ) -> Path: ...
+
+
+@pytest.fixture(scope="session")
+def photographed() -> Photographed:
+    """A closed session: the board seen at intervals of a minute, then these strokes."""
+    return _photographed
+
+
+def _photographed(
+    folder: Path,
+    spec: BoardSpec,
+    boards: Sequence[Gray],
+    presses: Sequence[tuple[Stroke, Gray]] = (),
+    *,
+    optics: LensUsed | None = None,
+    sheet_mm: tuple[float, float] | None = None,
+) -> Path:
+    rig: dict[str, Any] = {
+        "board": spec.model_dump(),
+        "camera": {"optics": None if optics is None else optics.model_dump()},
+    }
+    if sheet_mm is not None:
+        rig["paper"] = {"size_mm": sheet_mm}
+    snapshots = {"rig.toml": "", "protocol.toml": "", "rig.effective.json": json.dumps(rig)}
+    header = Header(session_id=folder.name, source=Source.LOOPBACK, software="brushloop test")
+    store = SessionStore.create(folder, header, snapshots, functools.partial(next, itertools.count(T0_NS, 1_000_000)))
+    for number, image in enumerate(boards):
+        _take(store, "board", number, [_still(T0_NS + number * MINUTE_NS, number, image)])
+    for number, (stroke, image) in enumerate(presses, start=len(boards)):
+        t_ns = T0_NS + number * MINUTE_NS
+        marked = Outgoing(Topic.STROKE, t_ns, t_ns, number, stroke.model_copy(update={"still": number}))
+        _take(store, "capture", number, [_still(t_ns, number, image), marked])
+    store.close()
+    store.release()
+    return folder
+
+
+def _take(store: SessionStore, kind: str, number: int, messages: list[Outgoing]) -> None:
+    attempt = store.begin(f"{kind} {number}", kind, cell=None, notes={"params": {}})
+    event: dict[str, Any] = {"key": "k", "kind": kind, "index": number, "attempt": 1, "params": {}}
+    begin, end = (
+        Outgoing(Topic.STEP, message.log_ns, message.log_ns, number, StepEvent(**event, phase=phase))
+        for message, phase in ((messages[0], "begin"), (messages[-1], "end"))
+    )
+    for message in (begin, *messages, end):
+        attempt.writer.write(message)
+    store.done(attempt, {})
+
+
+def _still(t_ns: int, number: int, image: Gray) -> Outgoing:
+    return Outgoing(Topic.STILL, t_ns, t_ns, number, image_message(t_ns, encode_png(image)))

@@ -1,0 +1,144 @@
+"""Pairs by name, scored against the brush's own repeatability; captures drawn by the model itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+
+from calibrate.artefact import Calibration
+from calibrate.field import Alignment, Field, Tone
+from calibrate.loop.pairs import Paired, Side, pair_up
+from calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, bootstrap, score_pairs, statistics, verdicts
+from model.ccdbsm import Brush
+from model.coverage import coverage
+from model.registry import stroke_model
+from sessions.messages import encode_png
+from sessions.reader import Capture
+from sessions.schemas import Stroke
+
+MODEL = stroke_model("ccd-bsm", Brush())
+ANCHOR, CELL = (60.0, 40.0), (30.0, 28.0, 40.0, 24.0)
+CALIBRATION = Calibration(
+    session_id="test",
+    source="loopback rig",
+    recording_sha256="",
+    software="",
+    image_to_paper=(0.1, 0.0, 0.05, 0.0, -0.1, 79.95, 0.0, 0.0, 1.0),
+    mm_per_px=0.1,
+    mm_per_px_low=0.1,
+    mm_per_px_high=0.1,
+    rms_px=0.0,
+    corners=24,
+    corners_dropped=0,
+    preprocess={},
+)
+STRICT = (Alignment.MM, Tone.BINARY)
+
+
+def photograph(height_mm: float, tilt_deg: float) -> np.ndarray:
+    """100 x 80 mm at 10 px/mm, straight from above, with the model's mark at the anchor."""
+    axis_x = ANCHOR[0] + height_mm * math.tan(math.radians(tilt_deg))
+    mark = coverage(MODEL.profile(height_mm, tilt_deg), (axis_x, 80.0 - ANCHOR[1]), size_px=1000, px_mm=0.1)
+    return np.rint(230.0 * (1.0 - 0.92 * mark[0].numpy()[:800])).astype(np.uint8)
+
+
+def capture(name: str, shown: tuple[float, float], asked: tuple[float, float], of: str | None = None) -> Capture:
+    stroke = Stroke(
+        stroke_id=name,
+        kind="press",
+        still=0,
+        height_mm=asked[0],
+        tilt_deg=asked[1],
+        cell_mm=CELL,
+        anchor_mm=ANCHOR,
+        again_of=of,
+    )
+    return Capture(stroke, encode_png(photograph(*shown)), f"test {name}")
+
+
+def paired(originals: Iterable[Capture], again: Iterable[Capture]) -> Paired:
+    return pair_up(Side(iter(originals), CALIBRATION), Side(iter(again), CALIBRATION), MODEL, Field())
+
+
+ORIGINALS = [
+    capture("a-r01", (14.6, 5.0), (15.0, 5.0)),
+    capture("a-r02", (15.4, 5.0), (15.0, 5.0)),
+    capture("b-r01", (19.0, 0.0), (19.0, 0.0)),
+]
+
+
+def test_a_press_made_again_as_it_was_beats_the_other_press_of_its_cell() -> None:
+    again = [
+        capture("a-r01~1", (14.6, 5.0), (14.6, 5.0), "a-r01"),
+        capture("a-r02~1", (15.4, 5.0), (15.4, 5.0), "a-r02"),
+    ]
+    made = paired(ORIGINALS, again)
+    assert [(pair.original.stroke_id, pair.again.stroke_id) for pair in made.pairs] == [
+        ("a-r01", "a-r01~1"),
+        ("a-r02", "a-r02~1"),
+    ]
+    assert made.refused == [("b-r01", "was not pressed again")]
+    scores = score_pairs(made)
+    same = statistics(scores, AGAIN, *STRICT, "csim")
+    other = statistics(scores, ANOTHER, *STRICT, "csim")
+    simulated = statistics(scores, SIMULATED, *STRICT, "csim")
+    assert same is not None
+    assert other is not None
+    assert simulated is not None
+    assert same.min == pytest.approx(100.0)
+    assert other.max < 98.0
+    assert simulated.avg > 99.0
+    found = verdicts(scores)
+    assert len(found) == 8
+    assert all(verdict.holds and verdict.n == 2 for verdict in found)
+    # One cell only: nothing says how sure that is.
+    assert found[0].low is None
+    assert not found[0].certain
+
+
+def test_a_press_made_again_too_deep_fails_and_says_so() -> None:
+    again = [capture("a-r01~1", (18.0, 5.0), (18.0, 5.0), "a-r01")]
+    [strict] = [
+        v
+        for v in verdicts(score_pairs(paired(ORIGINALS, again)))
+        if (v.alignment, v.tone, v.measure) == (*STRICT, "csim")
+    ]
+    assert strict.difference < -2.0
+    assert not strict.holds
+
+
+def test_what_repeats_nothing_is_named() -> None:
+    again = [
+        capture("x~1", (15.0, 5.0), (15.0, 5.0), "x"),
+        capture("y", (15.0, 5.0), (15.0, 5.0)),
+        capture("a-r01~1", (15.0, 5.0), (15.0, 5.0), "a-r01"),
+    ]
+    made = paired([*ORIGINALS, ORIGINALS[0]], again)
+    assert len(made.pairs) == 1
+    assert dict(made.refused) == {
+        "a-r01": "its name stands for two strokes: the first is used",
+        "x~1": "repeats x, which is not there or cannot be used",
+        "y": "repeats no stroke",
+        "a-r02": "was not pressed again",
+        "b-r01": "was not pressed again",
+    }
+
+
+def test_an_original_alone_in_its_cell_has_no_repeatability() -> None:
+    again = [capture("b-r01~1", (19.0, 0.0), (19.0, 0.0), "b-r01")]
+    scores: list[PairScore] = score_pairs(paired(ORIGINALS, again))
+    assert statistics(scores, ANOTHER, *STRICT, "ssim") is None
+    assert verdicts(scores) == []
+
+
+def test_the_interval_draws_whole_groups() -> None:
+    # Three cells, each of which agrees with itself: ten presses a cell tell no more than three numbers do.
+    low, high = bootstrap([[0.0] * 10, [1.0] * 10, [2.0] * 10])
+    assert low is not None
+    assert high is not None
+    assert low < 0.4
+    assert high > 1.6
+    assert bootstrap([[0.0], [1.0]]) == (None, None)

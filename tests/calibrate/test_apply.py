@@ -1,0 +1,185 @@
+"""`calibrate show`, `diff` and `apply`: artefacts in words, and another session's calibration only by force."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from bench.preprocess_rigs import board_of
+from brushloop import app
+from calibrate.artefact import HASH_CHARS, Calibration, load_artefact, newest
+from calibrate.calibration import calibrate_session
+from calibrate.errors import CalibrationError
+from calibrate.validation import calibration_of
+from drivers.geometry import brush_pose
+from drivers.sim.config import SimConfig, Table, View
+from drivers.sim.scene import Scene
+from drivers.sim.world import World
+from sessions.reader import Recording
+from sessions.schemas import Stroke
+
+if TYPE_CHECKING:
+    from conftest import Photographed
+
+VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125)
+ANCHOR = (100.0, 80.0)
+
+
+def sheet(view: View) -> np.ndarray:
+    config = SimConfig(view=view)
+    return Scene(World(config)).render(0, brush_pose(*config.home_mm))
+
+
+@pytest.fixture(scope="module")
+def sessions(tmp_path_factory: pytest.TempPathFactory, photographed: Photographed) -> tuple[Path, Path]:
+    """Two sessions with a stroke each; in the second the camera stands 5 mm further and nearer by half a percent."""
+    root, stroke = tmp_path_factory.mktemp("sessions"), Stroke(stroke_id="s", kind="press", still=0, anchor_mm=ANCHOR)
+    moved = dataclasses.replace(VIEW, centre_mm=(127.0, 86.0), px_per_mm=3.14)
+    one, other = (
+        photographed(root / name, board_of(Table()), [image], [(stroke, image)])
+        for name, image in (("one", sheet(VIEW)), ("other", sheet(moved)))
+    )
+    calibrate_session(one)
+    return one, other
+
+
+@pytest.fixture
+def pair(sessions: tuple[Path, Path], tmp_path: Path) -> tuple[Path, Path, Path]:
+    """Copies of both sessions, and the calibration of the first."""
+    one, other = (Path(shutil.copytree(folder, tmp_path / folder.name)) for folder in sessions)
+    made = newest(one)
+    assert made is not None
+    return one, other, made
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["calibrate", *map(str, arguments)])
+
+
+def used(session: Path) -> Calibration:
+    recording = Recording(session)
+    found = calibration_of(recording, next(recording.stroke_records()), recording.sha256, None)
+    assert found is not None
+    return found
+
+
+def test_show_tells_every_value_of_an_artefact_or_of_a_sessions_newest(pair: tuple[Path, Path, Path]) -> None:
+    one, other, made = pair
+    for what in (made, one):
+        told = run("show", what)
+        assert told.exit_code == 0
+        assert told.output.splitlines()[0] == str(made)
+        for line in ('source = "loopback rig"', 'lens.source = "k1 fitted on the board"', "board.square_mm = 12.0"):
+            assert line in told.output
+    assert "is not calibrated" in str(run("show", other).exception)
+
+
+def test_diff_says_what_changed_and_what_it_means_on_the_paper(pair: tuple[Path, Path, Path]) -> None:
+    one, other, made = pair
+    assert run("diff", one, made).output == "they are equal\n"
+    calibrate_session(other)
+    told = run("diff", one, other).output
+    assert 'session_id: "one" -> "other"' in told
+    assert "preprocess" not in told
+    assert "pix2len differs by -0.4" in told
+    assert "their intervals lie apart" in told
+    words = next(line for line in told.splitlines() if line.startswith("the same pixel lies"))
+    assert float(words.split()[4]) == pytest.approx(5.0, abs=0.5)
+
+
+def test_another_sessions_calibration_is_refused_unless_forced_and_then_labelled(
+    pair: tuple[Path, Path, Path],
+) -> None:
+    _, other, made = pair
+    refused = run("apply", made, other)
+    assert isinstance(refused.exception, CalibrationError)
+    assert refused.exception.exit_code == 2
+    assert "belongs to another recording (one)" in str(refused.exception)
+    assert not (other / "calibration").exists()
+
+    shutil.copytree(made.parent, other / "calibration")
+    with pytest.raises(CalibrationError, match=r"belongs to another recording \(one\): .*apply --force"):
+        used(other)
+
+    forced = run("apply", made, other, "--force")
+    assert forced.exit_code == 0, forced.output
+    assert f"warning: foreign calibration: {made.stem} of one (loopback rig), its board lies" in forced.output
+    applied = used(other)
+    assert applied.label in forced.output
+    assert applied.foreign is not None
+    assert applied.foreign.board_off_mm == pytest.approx(5.0, abs=0.5)
+    assert applied.session_id == "other"
+    assert applied.named.startswith(applied.digest + ", foreign calibration")
+    assert run("show", other).output.splitlines()[1].startswith("foreign calibration")
+
+    calibrate_session(other)
+    run("apply", made, other, "--force")
+    assert used(other) == applied, "what was applied last is used"
+
+
+def test_a_sessions_own_calibration_is_put_back_without_a_label(pair: tuple[Path, Path, Path]) -> None:
+    one, _, made = pair
+    later = load_artefact(made, Calibration).model_copy(update={"rms_px": 0.5}).save(one / "calibration")
+    later.touch()
+    assert used(one).rms_px == 0.5
+    assert run("apply", made, one).output == f"{made}\n"
+    assert used(one).digest == made.stem
+    assert used(one).label == ""
+
+
+def test_a_camera_of_another_size_cannot_be_forced(
+    pair: tuple[Path, Path, Path], tmp_path: Path, photographed: Photographed
+) -> None:
+    small = sheet(dataclasses.replace(VIEW, width_px=1000, height_px=750))
+    session = photographed(tmp_path / "small", board_of(Table()), [small])
+    told = run("apply", pair[2], session, "--force")
+    assert "is 1000 x 750 px, the lens was calibrated at 1024 x 768 px" in str(told.exception)
+    assert not (session / "calibration").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("no json", "is no artefact: not JSON"),
+        ("[" * 100_000, "is no artefact: not JSON"),
+        ("[]", "is no artefact of this software"),
+        ('{"kind": "song"}', "is no artefact of this software"),
+        ('{"image_to_paper": 1}', "session_id: Field required"),
+    ],
+    ids=["words", "deep", "list", "another", "half"],
+)
+def test_what_is_no_artefact_is_refused_in_one_line(tmp_path: Path, text: str, told: str) -> None:
+    path = tmp_path / "x.json"
+    path.write_text(text)
+    for ran in (run("show", path), run("diff", path, path)):
+        assert isinstance(ran.exception, CalibrationError)
+        assert told in str(ran.exception)
+        assert "\n" not in str(ran.exception)
+
+
+def test_files_of_version_1_are_read_and_later_ones_are_not(pair: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    values = json.loads(pair[2].read_text())
+    for name in ("lens", "middle_px", "board", "still_sha256", "flags", "foreign"):
+        del values[name]
+    old = Calibration.model_validate(values | {"schema_version": 1})
+    text = json.dumps(values | {"schema_version": 1}, indent=2) + "\n"
+    assert load_artefact(_named(tmp_path, text), Calibration) == old
+    assert old.lens is None
+    later = _named(tmp_path, json.dumps(values | {"schema_version": 3, "tilt": 1}))
+    with pytest.raises(CalibrationError, match=r"schema_version: 3 is not one that is read here \(1, 2\)"):
+        load_artefact(later, Calibration)
+
+
+def _named(folder: Path, text: str) -> Path:
+    import hashlib
+
+    path = folder / f"{hashlib.sha256(text.encode()).hexdigest()[:HASH_CHARS]}.json"
+    path.write_text(text)
+    return path

@@ -1,0 +1,91 @@
+"""`brushloop calibrate SESSION`: each bad view of the board is a stated error or a stated flag, and nothing is left."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from bench.preprocess_rigs import board_of
+from brushloop import app
+from calibrate.artefact import Calibration, load_artefact, newest
+from calibrate.errors import CalibrationError
+from calibrate.scale import BoardSpec
+from drivers.geometry import brush_pose
+from drivers.sim.config import SimConfig, Table, View
+from drivers.sim.scene import Scene
+from drivers.sim.world import World
+
+if TYPE_CHECKING:
+    from conftest import Photographed
+
+SPEC = board_of(Table())
+SHEET_MM = Table().sheet_mm
+
+
+@pytest.fixture(scope="module")
+def board() -> np.ndarray:
+    config = SimConfig(view=View(width_px=1024, height_px=768, px_per_mm=3.125))
+    return Scene(World(config)).render(0, brush_pose(*config.home_mm))
+
+
+def half(image: np.ndarray, share: float) -> np.ndarray:
+    hidden = image.copy()
+    hidden[:, : round(share * image.shape[1])] = 70
+    return hidden
+
+
+@pytest.mark.parametrize(
+    ("spoil", "spec", "told"),
+    [
+        (lambda image: np.full_like(image, 200), SPEC, "is blank"),
+        (lambda image: image[:, ::-1], SPEC, "is mirrored"),
+        (lambda image: np.hstack([image, image]), SPEC, "two boards"),
+        (lambda image: half(image, 0.97), SPEC, "board corners found, at least 8 are needed"),
+        (lambda image: image, SPEC.model_copy(update={"squares": (9, 7)}), "it is another board"),
+        (lambda image: image, SPEC.model_copy(update={"squares": (25, 21)}), "do not lie as this board has them"),
+    ],
+    ids=["blank", "mirrored", "two boards", "hidden", "a smaller board", "a wrong board"],
+)
+def test_a_session_without_a_usable_board_is_refused(
+    photographed: Photographed, tmp_path: Path, board: np.ndarray, spoil: object, spec: BoardSpec, told: str
+) -> None:
+    assert callable(spoil)
+    session = photographed(tmp_path / "s", spec, [np.ascontiguousarray(spoil(board))])
+    ran = CliRunner().invoke(app, ["calibrate", str(session)])
+    assert isinstance(ran.exception, CalibrationError), ran.output
+    assert ran.exception.exit_code == 2
+    assert told in str(ran.exception)
+    assert not (session / "calibration").exists()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda image: half(image, 0.6), "the board is partly hidden"),
+        (lambda image: np.where(image > 110, 255, image), "of the pixels are saturated"),
+    ],
+    ids=["half hidden", "saturated"],
+)
+def test_what_can_be_used_with_care_is_flagged_in_the_artefact(
+    photographed: Photographed, tmp_path: Path, board: np.ndarray, spoil: object, told: str
+) -> None:
+    assert callable(spoil)
+    session = photographed(tmp_path / "s", SPEC, [np.asarray(spoil(board), np.uint8)], sheet_mm=SHEET_MM)
+    ran = CliRunner().invoke(app, ["calibrate", str(session)])
+    assert ran.exit_code == 0, ran.output
+    assert told in " ".join(ran.output.split())
+    path = newest(session)
+    assert path is not None
+    assert any(told in flag for flag in load_artefact(path, Calibration).flags)
+
+
+def test_a_sound_board_has_no_flags(photographed: Photographed, tmp_path: Path, board: np.ndarray) -> None:
+    session = photographed(tmp_path / "s", SPEC, [board], sheet_mm=SHEET_MM)
+    ran = CliRunner().invoke(app, ["calibrate", str(session)])
+    assert ran.exit_code == 0, ran.output
+    assert "warning" not in ran.output, "the sheet itself hides most of the board"
+    assert "lens: k1 fitted on the board" in ran.output

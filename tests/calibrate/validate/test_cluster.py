@@ -1,0 +1,150 @@
+"""The same work on a Dask cluster of two workers: equal results, one worker lost on the way, clear refusals.
+
+Scheduler and workers are processes of their own, as on a real cluster; so is the command.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from calibrate.validate.pool import ClusterError, Dask
+
+pytest.importorskip("distributed")
+pytestmark = pytest.mark.timeout(180)
+DEADLINE_S = 60.0
+FILES = ("scores.csv", "summary.csv", "failures.csv")
+
+
+@dataclass(frozen=True)
+class Cluster:
+    address: str
+    workers: list[subprocess.Popen[bytes]]
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    told = tmp_path / "scheduler.json"
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(*words: str) -> subprocess.Popen[bytes]:
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        started.append(subprocess.Popen([sys.executable, "-m", *words], cwd=tmp_path, **quiet))
+        return started[-1]
+
+    try:
+        here = ("--host", "127.0.0.1", "--no-dashboard")
+        start("distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", str(told), *here)
+        deadline = time.monotonic() + DEADLINE_S
+        while not told.is_file() or not told.read_text():
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        address = json.loads(told.read_text())["address"]
+        words = ("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny", *here)
+        yield Cluster(address, [start(*words), start(*words)])
+    finally:
+        for process in reversed(started):
+            process.kill()
+            process.wait()
+
+
+def validate(session: Path, out: Path, *more: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "brushloop", "validate", str(session), "--out", str(out), "--no-held-out", *more]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, **quiet)
+
+
+def test_jobs_come_back_whole_and_alike_though_a_worker_dies(cluster: Cluster, session: Path) -> None:
+    program = f"""
+import os, signal
+from pathlib import Path
+from calibrate.field import Field
+from calibrate.validate.jobs import PrepareJob, prepare_job
+from calibrate.validate.pool import Dask, Threads
+from sessions.reader import Recording
+captures = list(Recording(Path({str(session)!r})).captures()) * 3
+jobs = [(str(k), PrepareJob(one, None, Field())) for k, one in enumerate(captures)]
+there = {{}}
+with Dask({cluster.address!r}) as pool:
+    for name, press in pool.run(prepare_job, iter(jobs)):
+        there[name] = press
+        if len(there) == 5:
+            os.kill({cluster.workers[0].pid}, signal.SIGKILL)
+with Threads(1) as pool:
+    here = dict(pool.run(prepare_job, iter(jobs)))
+print(len(there), there == here)
+"""
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=120)
+    assert ran.stdout == "33 True\n", ran.stderr
+    assert cluster.workers[0].wait(10.0) != 0
+
+
+@pytest.mark.soak
+def test_two_workers_give_the_numbers_of_this_machine_also_when_one_is_lost(
+    cluster: Cluster, make_session: object, tmp_path: Path
+) -> None:
+    session = make_session(tmp_path, "many", repeats=5)  # pyright: ignore[reportCallIssue]
+    here = validate(session, tmp_path / "here")
+    _, told = here.communicate()
+    assert here.returncode == 0, told
+
+    there = validate(session, tmp_path / "there", "--scheduler", cluster.address)
+    assert there.stderr is not None
+    lines: list[str] = []
+    for line in there.stderr:
+        lines.append(line)
+        if len([one for one in lines if "found: " in one]) == 3 and cluster.workers[0].poll() is None:
+            cluster.workers[0].kill()
+            cluster.workers[0].wait()
+    there.stderr.close()
+    assert there.wait() == 0, lines
+    assert cluster.workers[0].returncode is not None
+    assert any("found: 26 of 26" in line for line in lines)
+    assert any("compared: 25 of 25" in line for line in lines)
+    for name in FILES:
+        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes()
+
+
+def test_no_scheduler_there_is_one_clear_line(session: Path, tmp_path: Path) -> None:
+    environment = os.environ | {"DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "1s"}
+    program = (
+        "import sys, brushloop, calibrate.validate.pool as pool; pool.CONNECT_S = 1.0; "
+        f"sys.argv = ['brushloop', 'validate', {str(session)!r}, '--out', {str(tmp_path / 'out')!r}, "
+        "'--scheduler', 'tcp://127.0.0.1:9']; brushloop.main()"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False, env=environment, timeout=60
+    )
+    assert ran.returncode == 2, ran.stderr
+    assert ran.stderr.count("\n") == 1, ran.stderr
+    assert "tcp://127.0.0.1:9: no Dask scheduler there" in ran.stderr
+
+
+def test_a_worker_with_other_software_is_refused(cluster: Cluster) -> None:
+    program = (
+        "import calibrate.validate.jobs as jobs; jobs.VERSION = 'of tomorrow'\n"
+        "from calibrate.validate.pool import ClusterError, Dask\n"
+        f"try:\n    Dask({cluster.address!r})\nexcept ClusterError as error:\n    print(error)\n"
+    )
+    deadline = time.monotonic() + DEADLINE_S
+    said = "has no worker"
+    while "has no worker" in said:
+        assert time.monotonic() < deadline
+        ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+        said = ran.stdout
+    assert "has brushloop" in said
+    assert "(work of tomorrow) is needed there" in said
+
+
+def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ClusterError, match=r"brushloop\[cluster\]"):
+        Dask("tcp://127.0.0.1:9")

@@ -1,0 +1,70 @@
+"""Two reports compared: equal ones differ in nothing, a better fit is found to be better."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from brushloop import app
+from calibrate.errors import CalibrationError
+from calibrate.validate.diff import compare
+
+MODELS = ("--model", "line", "--model", "ellipse", "--no-held-out")
+
+
+def invoke(*arguments: str | Path) -> str:
+    ran = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert ran.exit_code == 0, (ran.output, ran.exception)
+    return ran.output
+
+
+@pytest.fixture(scope="module")
+def before(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("before")
+    invoke("validate", session, "--out", out, *MODELS)
+    return out
+
+
+def test_a_report_does_not_differ_from_itself(before: Path) -> None:
+    found = compare(before, before / "report.json")
+    assert found.paired_by == "stroke"
+    assert len(found.changes) == 3 * 4 * 2
+    assert {change.verdict for change in found.changes} == {"no clear difference"}
+    assert all(change.test.mean == 0.0 and change.test.n == 10 for change in found.changes)
+
+
+def test_another_scale_of_the_field_is_told_stroke_by_stroke(session: Path, before: Path, tmp_path: Path) -> None:
+    invoke("validate", session, "--out", tmp_path, *MODELS, "--mm-per-px", "0.5")
+    found = {change.series: change for change in compare(before, tmp_path).changes}
+    # A coarser field: more blank paper in every window of SSIM.
+    assert found[("line", "mm", "binary", "ssim")].verdict == "better"
+    assert found[("line", "mm", "binary", "ssim")].test.n == 10
+    assert found[("line", "size-normalised", "binary", "ssim")].verdict == "no clear difference"
+    said = json.loads(invoke("validate", "diff", before, tmp_path, "--json"))
+    assert said["paired_by"] == "stroke"
+    assert said["source"] == "imported photographs"
+    table = invoke("validate", "diff", before, tmp_path)
+    assert "better" in table
+    assert "the same stroke" in table
+
+
+def test_two_sessions_are_compared_cell_by_cell(make_session: object, before: Path, tmp_path: Path) -> None:
+    other = make_session(tmp_path, "other", seed=500, blank=False)  # pyright: ignore[reportCallIssue]
+    invoke("validate", other, *MODELS)
+    found = compare(before, other)  # the session's own folder
+    assert found.paired_by == "cell"
+    assert all(change.test.n == 5 for change in found.changes)
+    assert {change.verdict for change in found.changes} == {"no clear difference"}
+
+
+def test_what_has_no_report_or_an_edited_table_is_refused(session: Path, before: Path, tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match="has no report: run `brushloop validate"):
+        compare(before, tmp_path)
+    for name in ("report.json", "scores.csv"):
+        (tmp_path / name).write_bytes((before / name).read_bytes())
+    (tmp_path / "scores.csv").write_text((tmp_path / "scores.csv").read_text().replace("0.9", "0.8"))
+    with pytest.raises(CalibrationError, match="its SHA-256 differs"):
+        compare(before, tmp_path)

@@ -1,0 +1,150 @@
+"""A trained generator among the models, and captured presses as `brushloop train tune` reads them, end to end."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from brushloop import app
+from calibrate.field import Alignment, Tone
+from calibrate.validate.report import load_report
+from model.ccdbsm import Brush
+from model.train.captures import load_captures
+from model.train.checkpoint import load_weights
+from model.train.errors import TrainError
+from model.train.load import load_generator
+
+# One word a line, as the file's owner would write it.
+TRAINING = """
+steps = 250
+training_images = 400
+validation_images = 16
+batch = 32
+validate_every = 125
+checkpoint_every = 125
+picture_every = 250
+learning_rate = 0.01
+[target]
+ranges = { height_mm = [11, 20], tilt_deg = [0, 10] }
+px_mm = 1.0
+size_px = 32
+placement = "PLACEMENT"
+[layers]
+width = 32
+channels = 4
+side = 8
+"""
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> object:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def invoke(*arguments: str | Path) -> str:
+    ran = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert ran.exit_code == 0, (ran.output, ran.exception)
+    return " ".join(ran.output.split())
+
+
+@pytest.fixture(scope="module")
+def generator(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("generator")
+    (folder / "train.toml").write_text(TRAINING.replace("PLACEMENT", "centred"))
+    invoke("train", "--config", folder / "train.toml", "--out", folder / "made")
+    return folder / "made" / "generator.safetensors"
+
+
+def test_a_generator_is_scored_beside_what_it_was_trained_on(session: Path, generator: Path, tmp_path: Path) -> None:
+    training = generator.parent
+    given = ("--generator", generator, "--curves", f"CCD-BSMG={training}", "--no-held-out")
+    said = invoke("validate", session, "--out", tmp_path, *given)
+    assert "CCD-BSMG as published" in said
+    report = load_report(tmp_path / "report.json")
+    mine, exact = (
+        report.stat(name, Alignment.SIZE_NORMALISED, Tone.BINARY, "csim") for name in ("ccd-bsmg", "ccd-bsm")
+    )
+    assert mine is not None
+    assert exact is not None
+    assert mine.n == exact.n == 10
+    assert mine.avg == pytest.approx(exact.avg, abs=6.0)
+    [rival] = [one for one in report.rivals if one.name == "ccd-bsmg"]
+    assert rival.basis == "trained on exact images"
+    assert len(rival.sha256) == 64
+
+
+def test_a_tuned_generator_is_judged_on_cells_that_it_has_not_seen(
+    session: Path, generator: Path, tmp_path: Path
+) -> None:
+    given = ("--generator", generator, "--tune", "80", "--model", "ccd-bsmg", "--model", "ccd-bsmg-heldout")
+    assert "Tuned to this brush, CCD-BSMG reaches" in invoke("validate", session, "--out", tmp_path, *given)
+    report = load_report(tmp_path / "report.json")
+    [rival] = [one for one in report.rivals if one.name == "ccd-bsmg-heldout"]
+    assert rival.basis == "fitted, held-out cells"
+    plain, tuned = (
+        report.stat(name, Alignment.SIZE_NORMALISED, Tone.GRAY, "csim") for name in ("ccd-bsmg", "ccd-bsmg-heldout")
+    )
+    assert plain is not None
+    assert tuned is not None
+    assert tuned.avg > plain.avg + 3.0
+    folds = {path.parent.name for path in (tmp_path / "work" / "tuned").rglob("generator.safetensors")}
+    assert len(folds) == 5
+    config, _, _ = load_weights(tmp_path / "work" / "tuned" / min(folds) / "generator.safetensors")
+    kept, _ = load_captures(tmp_path / "work" / "tuned" / min(folds) / "captures.safetensors", config)
+    assert len(kept.inputs) == 8  # two presses of one of five cells are left out
+
+
+@pytest.mark.parametrize("placement", ["centred", "zero-touch"])
+def test_captures_go_through_the_file_into_a_tuning(
+    session: Path, generator: Path, tmp_path: Path, placement: str
+) -> None:
+    if placement == "zero-touch":
+        (tmp_path / "train.toml").write_text(
+            TRAINING.replace("PLACEMENT", placement)
+            .replace("steps = 250", "steps = 60")
+            .replace("px_mm = 1.0", "px_mm = 1.4")
+        )
+        invoke("train", "--config", tmp_path / "train.toml", "--out", tmp_path / "made")
+        generator = tmp_path / "made" / "generator.safetensors"
+    captures = tmp_path / "captures.safetensors"
+    said = invoke("validate", "captures", session, "--generator", generator, "--out", captures, "--leave-out", "15/5")
+    assert "left out: blank" in said
+    assert "left out, as asked: 2 presses of 1 cells" in said
+    assert "8 presses (imported photographs)" in said
+
+    config, _, _ = load_weights(generator)
+    kept, source = load_captures(captures, config)
+    assert source == "imported photographs"
+    assert kept.images.shape == (8, 32, 32)
+    assert kept.inputs.tolist()[:2] == [[11.0, 0.0], [11.0, 10.0]]
+    # The ink of a deeper press is more; none is cut off, and it lies where the generator puts it.
+    area = kept.images.sum(dim=(1, 2))
+    assert area[2] > 1.5 * area[0]
+    assert kept.images[:, 0].max() == kept.images[:, -1].max() == 0.0
+    middle = (kept.images.sum(dim=1) * torch.arange(32)).sum(dim=1) / area
+    assert (middle - (16 if placement == "centred" else 18)).abs().max() < 4.0
+
+    tuned = tmp_path / "tuned"
+    invoke("train", "tune", generator, captures, "--out", tuned, "--steps", "100", "--held-out", "0.25")
+    made = load_generator(tuned / "generator.safetensors")
+    assert made.fitted
+    inputs, truth = kept.inputs, kept.images
+    with torch.no_grad():
+        before, after = (
+            float(((load_generator(path).network(inputs) - truth) ** 2).mean())
+            for path in (generator, tuned / "generator.safetensors")
+        )
+    assert after < 0.8 * before
+
+
+def test_a_generator_for_another_brush_is_refused(generator: Path) -> None:
+    with pytest.raises(TrainError, match="was trained for a brush with radius_mm = 6, not 5"):
+        load_generator(generator, Brush(radius_mm=5.0, length_mm=48.0))
+    assert json.dumps(load_generator(generator, Brush()).target.fixed)

@@ -1,0 +1,58 @@
+"""A press that repeats a stroke of another given session stands against that stroke: the third row of Table 1."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.validate import scoring
+from calibrate.field import Field
+from calibrate.validate import run as running
+from calibrate.validate import steps
+from calibrate.validate.jobs import PrepareJob, Press, prepare_job
+from calibrate.validate.pool import Threads
+from calibrate.validate.run import CEILING, REPEATED, Options, validate_presses
+from calibrate.validate.sources import open_session
+from sessions.reader import Recording
+
+
+def test_the_repetition_is_scored_against_its_original_only(
+    session: Path, make_session: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    again = make_session(tmp_path, "again", repeats=1, blank=False, seed=90)  # pyright: ignore[reportCallIssue]
+
+    def repeating(job: PrepareJob) -> Press:
+        """As a replay protocol records it: each stroke of the second session repeats one of the first."""
+        if "again" in job.capture.where:
+            stroke = job.capture.stroke.model_copy(
+                update={"again_of": job.capture.stroke.stroke_id, "stroke_id": f"again-{job.capture.stroke.stroke_id}"}
+            )
+            job = PrepareJob(type(job.capture)(stroke, job.capture.still_png, job.capture.where), None, job.view)
+        return prepare_job(job)
+
+    monkeypatch.setattr(steps, "prepare_job", repeating)
+    sessions = [open_session(str(place), tmp_path, None, None) for place in (session, again)]
+    with Threads(1) as pool:
+        outcome = validate_presses(sessions, Options(held_out=False), pool, tmp_path, lambda *_: None)
+    with outcome.store:
+        found = outcome.values[:, outcome.names.index(REPEATED), :, 0]
+        repeats = [row.session == 1 for row in outcome.rows]
+        assert np.array_equal(np.isfinite(found).all(axis=1), repeats)
+        assert sum(repeats) == 5
+        # Two presses of one command by one brush: about as alike as the originals among themselves.
+        ceiling = outcome.values[:10, outcome.names.index(CEILING), :, 0]
+        assert np.nanmean(found) == pytest.approx(np.nanmean(ceiling), abs=0.05)
+    assert running.MOST_OTHERS == 9
+
+
+def test_the_bench_holds_its_scores_to_scikit_image() -> None:
+    [result] = scoring(3, repeats=3, rounds=1)
+    assert result.ratio > 1.0
+    assert "worst difference" in result.conditions
+
+
+def test_a_capture_keeps_its_place(session: Path) -> None:
+    capture = next(Recording(session).captures())
+    assert prepare_job(PrepareJob(capture, None, Field())).stroke_id == "000"

@@ -1,0 +1,191 @@
+"""`brushloop validate` from a session to its files: what is in them, what they say, and what cannot be edited away."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pyarrow.parquet
+import pytest
+from typer.testing import CliRunner
+
+from brushloop import app
+from calibrate.errors import CalibrationError
+from calibrate.field import Alignment, Tone
+from calibrate.validate.gates import GateMissed, parse_gate
+from calibrate.validate.report import Report, load_report
+
+MODELS = ("ccd-bsm", "bezier", "bezier-refitted", "ellipse", "line", "circle", "qbc", "another press")
+
+
+def run(*arguments: str | Path) -> str:
+    ran = CliRunner().invoke(app, ["validate", *map(str, arguments)])
+    assert ran.exit_code == 0, ran.output
+    return " ".join(ran.output.split())
+
+
+@pytest.fixture(scope="module")
+def folder(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("report")
+    said = run(session, "--out", out)
+    assert "10 brush presses at 5 combinations" in said
+    assert "1 more could not be used" in said
+    assert "imported photographs" in said
+    return out
+
+
+@pytest.fixture(scope="module")
+def report(folder: Path) -> Report:
+    return load_report(folder / "report.json")
+
+
+def test_every_model_is_scored_in_both_alignments_and_tones(report: Report) -> None:
+    for model in MODELS:
+        for alignment in Alignment:
+            for tone in Tone:
+                for measure in ("csim", "ssim"):
+                    stat = report.stat(model, alignment, tone, measure)
+                    assert stat is not None
+                    assert stat.n == 10
+                    assert 0.0 < stat.min <= stat.median <= stat.max <= 100.0
+                    assert stat.avg_interval is not None
+                    assert stat.avg_interval.low <= stat.avg <= stat.avg_interval.high
+    cell = report.stat("ccd-bsm", Alignment.MM, Tone.BINARY, "csim", (15.0, 5.0))
+    assert cell is not None
+    assert cell.n == 2
+
+
+def test_a_refitted_bezier_has_not_seen_what_it_predicts_and_beats_the_published_one(report: Report) -> None:
+    refitted, published = (
+        report.stat(name, Alignment.MM, Tone.BINARY, "csim") for name in ("bezier-refitted", "bezier")
+    )
+    assert refitted is not None
+    assert published is not None
+    assert refitted.avg > published.avg + 5.0
+    [rival] = [one for one in report.rivals if one.name == "bezier-refitted"]
+    assert rival.basis == "fitted, held-out cells"
+
+
+def test_the_blank_capture_is_named_with_the_reason(report: Report, folder: Path) -> None:
+    [refused] = report.refused
+    assert refused.stroke_id == "blank"
+    assert "is blank" in refused.why
+    page = (folder / "report.html").read_text()
+    assert "blank: is blank" in page
+    with (folder / "failures.csv").open() as file:
+        assert [row["stroke_id"] for row in csv.DictReader(file)] == ["blank"]
+
+
+def test_tables_stand_beside_the_papers_numbers_and_carry_their_source(folder: Path) -> None:
+    page = (folder / "report.html").read_text()
+    for number in ("91.84", "87.71", "67.03", "72.77", "98.21", "94.58"):
+        assert number in page
+    captions = re.findall(r"<caption>(.*?)</caption>", page, re.DOTALL)
+    assert len(captions) >= 8
+    assert all("imported photographs" in caption for caption in captions)
+    for text in ("Table 1", "Table 2", "Table 3", "In short", "Can it be trusted?"):
+        assert text in page
+
+
+def test_the_page_is_one_file_that_fetches_nothing_and_escapes_what_others_wrote(folder: Path) -> None:
+    page = (folder / "report.html").read_text()
+    sources = re.findall(r'(?:src|href)="([^"]*)"', page)
+    assert sources
+    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert "<script" not in page
+    assert "&lt;script&gt;" in page
+    assert not re.search(r"url\(|@import|<link|<iframe", page)
+
+
+def test_csv_and_parquet_hold_the_same_scores(folder: Path) -> None:
+    with (folder / "scores.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    table = pyarrow.parquet.read_table(folder / "scores.parquet").to_pylist()
+    assert len(rows) == len(table) > 10 * 4 * 7
+    for text, binary in zip(rows, table, strict=True):
+        assert float(text["csim"]) == pytest.approx(binary["csim"], abs=1e-7)
+        assert {k: text[k] for k in ("stroke_id", "model", "source")} == {
+            k: binary[k] for k in ("stroke_id", "model", "source")
+        }
+
+
+def test_averages_of_the_report_are_those_of_the_scores(folder: Path, report: Report) -> None:
+    with (folder / "scores.csv").open() as file:
+        mine = [
+            float(row["ssim"])
+            for row in csv.DictReader(file)
+            if (row["model"], row["alignment"], row["tone"]) == ("ellipse", "mm", "gray")
+        ]
+    stat = report.stat("ellipse", Alignment.MM, Tone.GRAY, "ssim")
+    assert stat is not None
+    assert stat.avg == pytest.approx(100 * sum(mine) / len(mine), abs=1e-5)
+
+
+def test_json_is_printed_whole(session: Path, folder: Path) -> None:
+    ran = CliRunner().invoke(app, ["validate", str(session), "--out", str(folder), "--json"])
+    said = json.loads(ran.stdout)
+    assert said["source"] == "imported photographs"
+    assert Report.model_validate(said).intact
+
+
+def test_an_edited_report_is_not_read(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "copy")
+    path = tmp_path / "copy" / "report.json"
+    path.write_text(path.read_text().replace("imported photographs", "real capture"))
+    with pytest.raises(CalibrationError, match="was edited"):
+        load_report(path)
+
+
+def test_a_gate_that_holds_passes_and_one_that_is_missed_exits_5(session: Path, folder: Path) -> None:
+    run(session, "--out", folder, "--gate", "csim_avg>=0.10", "--gate", "circle:mm:gray:ssim_max<0.999")
+    # Typer's runner keeps the exception; the front door gives it its exit code.
+    arguments = ["validate", str(session), "--out", str(folder), "--gate", "circle:mm:csim_avg>=0.99"]
+    ran = CliRunner().invoke(app, arguments)
+    assert isinstance(ran.exception, GateMissed)
+    assert ran.exception.exit_code == 5
+    assert "csim_avg of circle, mm, binary is 0." in str(ran.exception)
+    assert "imported photographs" in str(ran.exception)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("csim>=0.9", "expected"),
+        ("csim_mean>=0.9", "'mean' is not one of"),
+        ("csim_avg>=90", "90 is outside 0 to 1"),
+        ("csim_avg>=x", "no number"),
+        ("a:b:csim_avg>=0.9", "names two models"),
+    ],
+)
+def test_what_is_no_gate_is_refused_before_any_work(text: str, words: str) -> None:
+    with pytest.raises(CalibrationError, match=words):
+        parse_gate(text)
+
+
+def test_only_the_models_asked_for_and_an_unknown_one_is_refused(session: Path, tmp_path: Path) -> None:
+    run(session, "--out", tmp_path, "--model", "line", "--model", "circle")
+    report = load_report(tmp_path / "report.json")
+    assert {stat.model for stat in report.stats} == {"line", "circle", "another press"}
+    ran = CliRunner().invoke(app, ["validate", str(session), "--out", str(tmp_path), "--model", "square"])
+    assert isinstance(ran.exception, CalibrationError)
+    assert "'square' is not one of: ccd-bsm" in str(ran.exception)
+
+
+def test_ablations_show_lambda_and_the_number_of_strokes(session: Path, tmp_path: Path) -> None:
+    curve = tmp_path / "training"
+    curve.mkdir()
+    (curve / "validation.csv").write_text("step,mse,iou,csim\n10,0.1,0.5,0.6\n20,0.01,0.9,0.95\n")
+    given = ("--model", "ccd-bsm", "--model", "ccd-bsm-lambda-1", "--model", "ccd-bsm-lambda-pi/2")
+    run(session, "--out", tmp_path / "out", *given, "--ablations", "--curves", f"QBC={curve}")
+    report = load_report(tmp_path / "out" / "report.json")
+    assert report.stat("ccd-bsm-lambda-1", Alignment.MM, Tone.BINARY, "csim") is not None
+    by_count = {step.strokes: step.csim for step in report.by_strokes if step.model == "CCD-BSM"}
+    assert sorted(by_count) == [1, 2, 3, 5]
+    assert by_count[5] > by_count[1]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "λ = π/2" in page
+    assert "similarity against the number of fitted presses" in page
+    assert "validation losses" in page

@@ -1,0 +1,93 @@
+"""Killed in the middle and run again: finished work is not done again, and the result is that of an unbroken run."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from calibrate.validate.store import Store
+
+FILES = ("report.json", "report.html", "scores.csv", "summary.csv", "failures.csv", "scores.parquet")
+DEADLINE_S = 60.0
+
+
+def command(session: str) -> list[str]:
+    return [sys.executable, "-m", "brushloop", "validate", session, "--out", "out", "--workers", "1"]
+
+
+def records(work: Path) -> set[str]:
+    with Store(work) as store:
+        return set(store.keys())
+
+
+@pytest.mark.timeout(240)
+def test_after_kill_9_the_same_command_gives_the_same_bytes_and_repeats_nothing(session: Path, tmp_path: Path) -> None:
+    for name in ("whole", "killed"):
+        shutil.copytree(session, tmp_path / name / "presses")
+    ran = subprocess.run(command("presses"), cwd=tmp_path / "whole", capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+
+    work = tmp_path / "killed" / "out" / "work" / "work.bin"
+    first = subprocess.Popen(
+        command("presses"), cwd=tmp_path / "killed", stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    deadline = time.monotonic() + DEADLINE_S
+    while not (work.is_file() and work.stat().st_size > 10_000):
+        assert time.monotonic() < deadline
+        assert first.poll() is None
+        time.sleep(0.002)
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    assert not (work.parent.parent / "report.json").exists()
+    shutil.copy(work, tmp_path / "before.bin")
+    before = records(tmp_path / "before.bin")
+    assert before
+
+    ran = subprocess.run(command("presses"), cwd=tmp_path / "killed", capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    for name in FILES:
+        whole, resumed = (tmp_path / which / "out" / name for which in ("whole", "killed"))
+        assert whole.read_bytes() == resumed.read_bytes(), name
+    # What was finished stands where it stood: nothing was written twice.
+    data, kept = work.read_bytes(), (tmp_path / "before.bin").read_bytes()
+    assert data.startswith(kept)
+    assert records(work) == records(tmp_path / "whole" / "out" / "work" / "work.bin") >= before
+    assert len(data) == (tmp_path / "whole" / "out" / "work" / "work.bin").stat().st_size
+
+
+def test_a_second_run_does_no_work_again(session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from typer.testing import CliRunner
+
+    from brushloop import app
+    from calibrate.validate import run, steps
+
+    arguments = ["validate", str(session), "--out", str(tmp_path)]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    first = (tmp_path / "scores.csv").read_bytes()
+
+    def never(_job: object) -> None:
+        raise AssertionError("finished work was done again")
+
+    for name in ("prepare_job", "refit_job", "score_job"):
+        monkeypatch.setattr(run if name == "score_job" else steps, name, never)
+    ran = CliRunner().invoke(app, arguments)
+    assert ran.exit_code == 0, ran.exception
+    assert (tmp_path / "scores.csv").read_bytes() == first
+
+
+def test_two_at_a_time_in_one_folder_are_refused(session: Path, tmp_path: Path) -> None:
+    from filelock import FileLock
+    from typer.testing import CliRunner
+
+    from brushloop import app
+
+    (tmp_path / "work").mkdir()
+    with FileLock(tmp_path / "work" / "lock"):
+        ran = CliRunner().invoke(app, ["validate", str(session), "--out", str(tmp_path)])
+    assert "another validation is writing there" in str(ran.exception)

@@ -1,0 +1,128 @@
+"""Sessions from URLs: believed by their checksum only. `memory:` stands for s3 and gs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+import fsspec
+import pytest
+
+from calibrate.errors import CalibrationError
+from calibrate.validate import sources
+from calibrate.validate.sources import open_session
+from sessions.errors import SessionDamaged
+
+
+@pytest.fixture
+def remote(session: Path) -> str:
+    data = (session / "presses.mcap").read_bytes()
+    memory = fsspec.filesystem("memory")
+    memory.store.clear()
+    memory.pipe("/lab/presses/presses.mcap", data)
+    return "memory://lab/presses"
+
+
+def digest(session: Path) -> str:
+    return hashlib.sha256((session / "presses.mcap").read_bytes()).hexdigest()
+
+
+def test_a_url_with_its_checksum_opens_like_a_folder(session: Path, remote: str, tmp_path: Path) -> None:
+    for url in (f"{remote}#sha256={digest(session)}", f"{remote}/presses.mcap#sha256={digest(session)}"):
+        opened = open_session(url, tmp_path, None, None)
+        assert opened.sha256 == digest(session)
+        assert opened.count == 11
+        assert opened.kinds == {"press"}
+
+
+def test_the_checksum_may_lie_beside(session: Path, remote: str, tmp_path: Path) -> None:
+    text = f"{digest(session)}  presses.mcap\n"
+    fsspec.filesystem("memory").pipe("/lab/presses/presses.mcap.sha256", text.encode())
+    assert open_session(remote, tmp_path, None, None).sha256 == digest(session)
+
+
+def test_it_is_fetched_once(session: Path, remote: str, tmp_path: Path) -> None:
+    url = f"{remote}#sha256={digest(session)}"
+    open_session(url, tmp_path, None, None)
+    fsspec.filesystem("memory").store["/lab/presses/presses.mcap"].seek(0)
+    fsspec.filesystem("memory").pipe("/lab/presses/presses.mcap", b"changed since")
+    assert open_session(url, tmp_path, None, None).count == 11
+
+
+def test_calibrations_and_fits_beside_come_along(session: Path, remote: str, tmp_path: Path) -> None:
+    fsspec.filesystem("memory").pipe("/lab/presses/calibration/0123.json", b"{}")
+    open_session(f"{remote}#sha256={digest(session)}", tmp_path, None, None)
+    assert [path.name for path in tmp_path.rglob("calibration/*.json")] == ["0123.json"]
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("memory://lab/presses", "tells no checksum"),
+        ("memory://lab/presses#sha256=" + "0" * 64, "0000 was expected"),
+        ("memory://lab/nothing#sha256=" + "0" * 64, "cannot be read"),
+        ("nosuch://lab/presses#sha256=" + "0" * 64, "cannot be opened"),
+    ],
+)
+def test_what_cannot_be_believed_is_refused_and_leaves_nothing(
+    remote: str, tmp_path: Path, url: str, words: str
+) -> None:
+    with pytest.raises(CalibrationError, match=words):
+        open_session(url, tmp_path, None, None)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_a_recording_larger_than_allowed_is_refused(
+    session: Path, remote: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sources, "MAX_DOWNLOAD_BYTES", 1000)
+    with pytest.raises(CalibrationError, match="larger than 1000 bytes"):
+        open_session(f"{remote}#sha256={digest(session)}", tmp_path, None, None)
+
+
+def test_a_file_url_is_a_url_too(session: Path, tmp_path: Path) -> None:
+    url = f"file://{session / 'presses.mcap'}#sha256={digest(session)}"
+    assert open_session(url, tmp_path, None, None).count == 11
+
+
+@pytest.fixture
+def web(session: Path) -> Iterator[str]:
+    pytest.importorskip("aiohttp", reason="needs the extra [remote]")
+
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None: ...
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(session.parent))) as server:
+        thread = Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_address[1]}/{session.name}"
+        server.shutdown()
+        thread.join()
+
+
+def test_a_web_server_is_a_place_like_any_other(web: str, session: Path, tmp_path: Path) -> None:
+    assert open_session(f"{web}/presses.mcap#sha256={digest(session)}", tmp_path, None, None).count == 11
+    with pytest.raises(CalibrationError, match="tells no checksum"):
+        open_session(f"{web}/presses.mcap", tmp_path, None, None)
+    with pytest.raises(CalibrationError, match="cannot be read"):
+        open_session(f"{web}/nothing.mcap#sha256={digest(session)}", tmp_path, None, None)
+
+
+def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "presses"
+    folder.mkdir()
+    (folder / "presses.mcap").write_bytes((session / "presses.mcap").read_bytes())
+    lines = [{"t_ns": 1, "event": "open", "header": {}}, {"t_ns": 2, "event": "closed", "sha256": "0" * 64}]
+    from sessions.lines import encode_line
+
+    with (folder / "journal.jsonl").open("wb") as file:
+        for line in lines:
+            file.write(encode_line(line.pop("t_ns"), line))
+    assert json.loads((folder / "journal.jsonl").read_bytes().splitlines()[0])["event"] == "open"
+    with pytest.raises(SessionDamaged, match="SHA-256 differs"):
+        open_session(str(folder), tmp_path / "work", None, None)

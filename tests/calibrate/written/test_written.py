@@ -1,0 +1,175 @@
+"""Written characters against simulation and reference: all of a cell's ink, both polarities, Table 3 as data."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calibrate.artefact import Calibration
+from calibrate.errors import CalibrationError, CaptureRefused
+from calibrate.field import Alignment, Tone
+from calibrate.written.images import KEYS, Polarity, captured, drawn, laid, read_reference, similarity
+from calibrate.written.record import PlannedBy, PlanRecord, figure_record, load_plan, points_digest
+from calibrate.written.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED, Character, score_character
+from calibrate.written.table import read_table_3, table_3
+from sessions.messages import encode_png
+from sessions.reader import Capture
+from sessions.schemas import Stroke
+
+CELL = (20.0, 10.0, 60.0, 60.0)
+CALIBRATION = Calibration(
+    session_id="test",
+    source="loopback rig",
+    recording_sha256="",
+    software="",
+    image_to_paper=(0.1, 0.0, 0.05, 0.0, -0.1, 79.95, 0.0, 0.0, 1.0),
+    mm_per_px=0.1,
+    mm_per_px_low=0.1,
+    mm_per_px_high=0.1,
+    rms_px=0.0,
+    corners=24,
+    corners_dropped=0,
+    preprocess={},
+)
+BY = PlannedBy(
+    model="ccd-bsm",
+    radius_mm=6.0,
+    length_mm=48.0,
+    lam=None,
+    height_range_mm=(0.5, 20.0),
+    tilt_range_deg=(0.0, 10.0),
+    turn_deg_mm=12.0,
+    speed_mm_s=15.0,
+)
+STRICT = (Alignment.MM, Tone.BINARY, Polarity.INK)
+
+
+def cross(dx: int = 0, width: int = 8) -> np.ndarray:
+    """(128, 128) ink: two bars, moved to the right."""
+    image = np.zeros((128, 128), np.float32)
+    image[60 : 60 + width, 30 + dx : 100 + dx] = 1.0
+    image[30:100, 62 + dx : 62 + dx + width] = 1.0
+    return image
+
+
+def page(*rectangles: tuple[int, int, int, int]) -> np.ndarray:
+    """A 100 x 80 mm page at 10 px/mm with (left, top, right, bottom) px of ink."""
+    image = np.full((800, 1000), 225, np.uint8)
+    for left, top, right, bottom in rectangles:
+        image[top:bottom, left:right] = 25
+    return image
+
+
+def capture(image: np.ndarray, cell: tuple[float, float, float, float] | None = CELL) -> Capture:
+    stroke = Stroke(stroke_id="x-r01", kind="drag", still=0, cell_mm=cell)
+    return Capture(stroke, encode_png(image), "test x-r01")
+
+
+def test_every_stroke_of_a_character_counts_however_far_apart_and_the_neighbour_does_not() -> None:
+    # The cell is x 200..800, y 100..700 px from the page's upper left corner; a dot of 2 mm lies 40 mm from the bar.
+    image = page((250, 600, 750, 640), (300, 180, 320, 200), (850, 300, 950, 500))
+    ink, cut = captured(capture(image), CALIBRATION)
+    assert not cut
+    area_mm2 = float(ink[Tone.BINARY].sum()) * (60 / 128) ** 2
+    assert area_mm2 == pytest.approx(50 * 4 + 2 * 2, rel=0.03)
+    rows = np.flatnonzero((ink[Tone.BINARY] > 0.5).any(axis=1))
+    # Row 0 is the far edge: the dot, 8 mm below it, comes first.
+    assert rows[0] == pytest.approx(8 / 60 * 128, abs=1.5)
+    assert rows[-1] == pytest.approx(54 / 60 * 128, abs=1.5)
+
+
+def test_ink_on_the_edge_of_the_cell_is_told_and_other_cells_are_refused() -> None:
+    _, cut = captured(capture(page((150, 300, 500, 340))), CALIBRATION)
+    assert cut
+    with pytest.raises(CaptureRefused, match="a square is needed"):
+        captured(capture(page((250, 300, 500, 340)), (20.0, 10.0, 60.0, 40.0)), CALIBRATION)
+    with pytest.raises(CaptureRefused, match="is blank"):
+        captured(capture(page()), CALIBRATION)
+
+
+def test_size_normalised_forgives_place_and_size_and_mm_does_not() -> None:
+    small = cv2.resize(cross(), (64, 64), interpolation=cv2.INTER_AREA)
+    moved = np.zeros((128, 128), np.float32)
+    moved[5:69, 50:114] = small
+    for tone in Tone:
+        near = similarity(drawn(cross()), drawn(moved), (Alignment.SIZE_NORMALISED, tone, Polarity.INK))
+        far = similarity(drawn(cross()), drawn(moved), (Alignment.MM, tone, Polarity.INK))
+        assert near[0] > 0.93
+        assert far[0] < 0.5
+    whole = laid(cross(), Alignment.SIZE_NORMALISED) > 0.5
+    assert np.ptp(np.flatnonzero(whole.any(axis=1))) + 1 == pytest.approx(100, abs=2)
+
+
+def test_a_blank_page_scores_high_where_paper_is_one_and_cannot_be_scored_where_ink_is() -> None:
+    dot = np.zeros((128, 128), np.float32)
+    dot[0:2, 0:2] = 1.0
+    assert similarity(drawn(cross()), drawn(dot), (Alignment.MM, Tone.BINARY, Polarity.PAPER))[0] > 0.9
+    assert similarity(drawn(cross()), drawn(dot), STRICT)[0] == 0.0
+    with pytest.raises(ValueError, match="blank"):
+        similarity(drawn(cross()), drawn(np.zeros((128, 128), np.float32)), STRICT)
+
+
+def character() -> Character:
+    writings = {f"x-r{k:02d}": drawn(cross(dx)) for k, dx in enumerate((0, 1, 2), 1)}
+    return Character("x", "font of the test", drawn(cross()), drawn(cross(width=10)), writings)
+
+
+def test_table_3_has_a_row_for_each_comparison_and_survives_the_disk(tmp_path: Path) -> None:
+    scores = list(score_character(character()))
+    rows = table_3(scores, source="loopback rig", session_id="s", model="CCD-BSM", references={"x": "font of the test"})
+    assert len(rows) == len(KEYS) * 4
+    strict = {row.pair: row for row in rows if (row.alignment, row.tone, row.polarity) == STRICT}
+    assert [strict[pair].n for pair in (SIMULATED, REFERENCE, PLANNED, ANOTHER)] == [3, 3, 1, 3]
+    assert strict[REFERENCE].csim[0] == pytest.approx(100.0)
+    assert strict[REFERENCE].csim[0] > strict[REFERENCE].csim[2] > strict[REFERENCE].csim[1]
+    assert strict[REFERENCE].paper_row == "robot writing"
+    assert strict[REFERENCE].reference == "font of the test"
+    # The middle one is nearest to the two others.
+    another = {s.stroke_id: s.csim for s in scores if s.pair == ANOTHER and (s.alignment, s.tone, s.polarity) == STRICT}
+    assert max(another, key=lambda name: another[name]) == "x-r02"
+
+    path = tmp_path / "written.json"
+    path.write_text('{"table_3": [' + ",".join(row.model_dump_json() for row in rows) + "]}")
+    assert read_table_3(tmp_path) == rows
+    path.write_text("{}")
+    with pytest.raises(CalibrationError, match="holds no Table 3"):
+        read_table_3(path)
+
+
+def test_a_writing_alone_has_no_other() -> None:
+    one = character()
+    alone = dataclasses.replace(one, captured=dict(list(one.captured.items())[:1]))
+    assert ANOTHER not in {score.pair for score in score_character(alone)}
+
+
+def test_a_plan_keeps_its_images_and_knows_its_points(tmp_path: Path) -> None:
+    strokes = [np.array([[1.0, 2.0, 3.0, 4.0, -0.0001], [5.5, 6.25, 7.125, 8.0, 9.0]])]
+    figure = figure_record("x", "font", strokes, strokes, wanted=cross(), simulated=cross(width=10))
+    plan = PlanRecord(model="CCD-BSM", planned_by=BY, cell_mm=60.0, software="test", figures=(figure,))
+    (tmp_path / "plan.json").write_text(plan.model_dump_json())
+    loaded = load_plan(tmp_path)
+    assert loaded == plan
+    np.testing.assert_array_equal(loaded.figures[0].wanted(), cross())
+    # What the protocol holds has three decimals.
+    assert figure.points_sha256 == points_digest([[[1, 2, 3, 4, 0.0], [5.5, 6.25, 7.125, 8, 9]]])
+    assert figure.points_sha256 != points_digest([[[1, 2, 3, 4, 0.0], [5.5, 6.25, 7.126, 8, 9]]])
+    (tmp_path / "plan.json").write_text(plan.model_dump_json().replace(figure.wanted_png, "AAAA"))
+    with pytest.raises(CalibrationError, match="x: wanted_png is no picture"):
+        load_plan(tmp_path).figures[0].wanted()
+
+
+def test_a_picture_of_ones_own_is_padded_to_a_square_and_must_be_dark_on_light(tmp_path: Path) -> None:
+    image = np.full((100, 200), 255, np.uint8)
+    image[40:60, 20:180] = 0
+    cv2.imwrite(str(tmp_path / "mine.png"), image)
+    ink = read_reference(tmp_path / "mine.png")
+    assert ink.shape == (128, 128)
+    assert ink.sum() * (200 / 128) ** 2 == pytest.approx(20 * 160, rel=0.01)
+    assert ink[64, 64] == pytest.approx(1.0)
+    cv2.imwrite(str(tmp_path / "negative.png"), 255 - image)
+    with pytest.raises(CalibrationError, match=r"negative\.png: is mostly dark"):
+        read_reference(tmp_path / "negative.png")

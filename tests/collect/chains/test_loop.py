@@ -1,0 +1,102 @@
+"""`brushloop loop` on the loopback rig: presses recovered, pressed again and compared, also after kill -9."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from calibrate.loop.table import read_table_1
+from sessions.journal import JOURNAL_NAME
+from sessions.reader import Recording
+
+if TYPE_CHECKING:
+    from tests.collect.chains.conftest import Bench
+
+GRID = 'kind = "grid"\nheights_mm = [11.0, 15.0, 20.0]\ntilts_deg = [0.0, 8.0]\nrepeats = 1\n'
+"""Six presses: as few as tell depth and tilt to the fit."""
+
+
+def words(bench: Bench, session: Path, *more: str) -> list[str]:
+    return ["loop", str(session), "--config", str(bench.rig), "--no-tui", *more]
+
+
+def replay_journal(bench: Bench) -> bytes:
+    found = list(bench.sessions.glob(f"*replay*/{JOURNAL_NAME}"))
+    return found[0].read_bytes() if found else b""
+
+
+@pytest.mark.timeout(600)
+def test_the_loop_is_closed_and_goes_on_after_kill_nine(bench: Bench) -> None:
+    session = bench.collect(GRID)
+    refused = bench.run(*words(bench, session))
+    assert refused.returncode == 2
+    assert "would press on whatever sheet is in" in refused.stderr
+    protocol = session / "loop" / "protocol-replay.toml"
+    recovered_at = protocol.stat().st_mtime_ns
+
+    bench.fresh_sheet()
+    again = words(bench, session, "--sheet", "1")
+    first = subprocess.Popen(
+        [sys.executable, "-m", "brushloop", *again],
+        start_new_session=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    deadline = time.monotonic() + 100
+    while replay_journal(bench).count(b'"event":"done","key"') < 6:
+        assert first.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    os.killpg(first.pid, signal.SIGKILL)
+    first.wait()
+
+    ran = bench.run(*again)
+    assert ran.returncode == 0, ran.stderr
+    assert protocol.stat().st_mtime_ns == recovered_at
+    [replay] = [folder for folder in bench.sessions.iterdir() if "replay" in folder.name]
+    originals = sorted(stroke.stroke_id for stroke in Recording(session).stroke_records())
+    repeated = [stroke.again_of for stroke in Recording(replay).stroke_records()]
+    assert sorted(map(str, repeated)) == originals
+
+    told: dict[str, Any] = json.loads((session / "loop" / "loop.json").read_text(encoding="utf-8"))
+    assert told["source"] == "loopback rig"
+    assert told["pairs"] == 6
+    assert told["refused"] == []
+    assert told["in_sample"]
+    rows = read_table_1(session / "loop")
+    assert {row.what for row in rows} == {"re-pressed", "recovered, simulated"}
+    assert all(row.n == 6 and row.source == "loopback rig" for row in rows)
+    # No cell was pressed twice: the brush's repeatability is not known, and nothing is claimed.
+    assert told["verdicts"] == []
+    with (session / "loop" / "loop.csv").open(encoding="utf-8") as file:
+        single = [row for row in csv.DictReader(file) if row["what"] == "re-pressed" and row["tone"] == "binary"]
+    assert len(single) == 12
+    assert all(float(row["csim"]) > 0.88 for row in single)
+    page = (session / "loop" / "loop.html").read_text(encoding="utf-8")
+    assert '<span class="source">loopback rig</span>' in page
+    assert 'src="http' not in page
+    assert (session / "loop" / "loop.png").stat().st_size > 10_000
+
+    # Done is done: nothing is pressed again, and another loop does not go on in this one's folder.
+    ran = bench.run(*again)
+    assert ran.returncode == 0, ran.stderr
+    assert "brushloop collect" not in ran.stdout
+    other = bench.run(*again, "--repeats", "2")
+    assert other.returncode == 2
+    assert "repeats: this loop was begun with 1, not 2: use another --out" in other.stderr
+
+    # Another brush makes other marks: said before anything moves.
+    name = Recording(session).header.brush
+    bench.rig.write_text(bench.rig.read_text(encoding="utf-8").replace(name, "goat hair"), encoding="utf-8")
+    strange = bench.run(*again)
+    assert strange.returncode == 2
+    assert f"brush.name: 'goat hair': the original was pressed with {name!r}" in strange.stderr

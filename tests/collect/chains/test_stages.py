@@ -1,0 +1,58 @@
+"""What a chain of commands keeps, and what it refuses before anything moves; no rig."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from collect.commands import CommandFailed, run_command
+from collect.errors import ConfigError
+from collect.loop.run import check_recovered
+from collect.loop.settings import FILE, Settings, begun_with, keep
+
+SETTINGS = Settings(
+    original="grid-01",
+    original_sha256="ab",
+    fit="cd",
+    height_range_mm=(2.0, 22.0),
+    tilt_range_deg=(0.0, 15.0),
+    repeats=1,
+    seed=1,
+)
+
+
+def test_a_loop_goes_on_with_what_it_was_begun_with_and_nothing_else(tmp_path: Path) -> None:
+    folder = tmp_path / "loop"
+    assert begun_with(folder) is None
+    keep(SETTINGS, folder)
+    keep(SETTINGS, folder)
+    assert begun_with(folder) == SETTINGS
+    for name, value in (("fit", "ef"), ("original_sha256", "xy"), ("height_range_mm", (2.0, 20.0))):
+        with pytest.raises(ConfigError, match=f"{name}: this loop was begun with"):
+            keep(SETTINGS.model_copy(update={name: value}), folder)
+    (folder / FILE).write_text("{}")
+    with pytest.raises(ConfigError, match="does not hold the settings of a loop"):
+        keep(SETTINGS, folder)
+
+
+def test_a_fit_that_does_not_describe_the_brush_is_not_pressed(tmp_path: Path) -> None:
+    path = tmp_path / "recovered.csv"
+    path.write_text("stroke_id,flags\na,\nb,at_bound\nc,\nd,at_bound\n")
+    check_recovered(path)
+    path.write_text("stroke_id,flags\na,\nb,at_bound\nc,alpha_unknown at_bound\n")
+    with pytest.raises(ConfigError, match="2 of 3 presses were recovered at a bound") as caught:
+        check_recovered(path)
+    assert caught.value.exit_code == 2
+
+
+def test_a_command_that_fails_ends_the_chain_with_its_exit_code(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    said: list[str] = []
+    with pytest.raises(CommandFailed) as caught:
+        run_command(said.append, "sessions", "list", tmp_path / "nowhere")
+    assert caught.value.exit_code == 2
+    assert said == [f"$ brushloop sessions list {tmp_path / 'nowhere'}"]
+    assert "is not a folder" in capfd.readouterr().err
+    assert run_command(said.append, "sessions", "list", tmp_path / "nowhere", accepts=(0, 2)) == 2

@@ -1,0 +1,70 @@
+"""`brushloop write` on the loopback rig: a cross of two strokes, planned, written twice, captured, compared."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from calibrate.written.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED
+from calibrate.written.table import Table3Row, read_table_3
+from sessions.reader import Recording
+
+if TYPE_CHECKING:
+    from tests.collect.chains.conftest import Bench
+
+CROSS = {"strokes": [[[12, 24, 5], [36, 24, 5]], [[24, 37, 5], [24, 11, 5]]]}
+
+
+def write(bench: Bench, what: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    words = ["write", what, "--config", bench.rig, "--out", bench.folder / "written", "--sessions", bench.sessions]
+    return bench.run(*words, "--no-tui", "--cell-mm", "48", *more)
+
+
+def strict(rows: list[Table3Row], pair: str, alignment: str = "mm") -> Table3Row:
+    [row] = [r for r in rows if (r.pair, r.alignment, r.tone, r.polarity) == (pair, alignment, "binary", "ink = 1")]
+    return row
+
+
+@pytest.mark.timeout(600)
+def test_a_character_is_written_twice_and_compared(bench: Bench) -> None:
+    what = bench.folder / "cross.json"
+    what.write_text(json.dumps(CROSS), encoding="utf-8")
+    ran = write(bench, what, "--count", "2")
+    assert ran.returncode == 0, ran.stderr
+    [session] = bench.sessions.iterdir()
+    assert [stroke.stroke_id for stroke in Recording(session).stroke_records()] == ["cross-r01", "cross-r02"]
+
+    rows = read_table_3(bench.folder / "written")
+    assert {row.source for row in rows} == {"loopback rig"}
+    assert strict(rows, REFERENCE).n == 2
+    assert strict(rows, REFERENCE).reference == "cross.json"
+    assert strict(rows, PLANNED).csim[2] > 95.0
+    # The brush writes nearly the same twice; that it does not write what the uncalibrated model thinks is a finding.
+    assert strict(rows, ANOTHER).csim[2] > 93.0
+    assert 55.0 < strict(rows, SIMULATED, "size-normalised").csim[2] < 99.9
+    page = (bench.folder / "written" / "written.html").read_text(encoding="utf-8")
+    assert '<span class="source">loopback rig</span>' in page
+    assert "cross.json" in page
+    assert 'src="http' not in page
+    assert (bench.folder / "written" / "figure-13.png").stat().st_size > 10_000
+
+    # Done is done, and what was planned stays: another count is another plan.
+    again = write(bench, what, "--count", "2")
+    assert again.returncode == 0, again.stderr
+    assert "brushloop collect" not in again.stdout
+    other = write(bench, what, "--count", "3")
+    assert other.returncode == 2
+    assert "repeats: plans 2 writings, not 3: use another --out" in other.stderr
+    told: dict[str, Any] = json.loads((bench.folder / "written" / "written.json").read_text(encoding="utf-8"))
+    assert told["refused"] == []
+
+    # A session is compared with the plan that it was drawn from, and with no other.
+    plan = bench.folder / "plan"
+    bench.run("write", "plan", "--out", str(plan), "--steps", "1", "--cell-mm", "48", str(what))
+    strange = bench.run("write", "compare", str(session), "--plan", str(plan))
+    assert strange.returncode == 2
+    assert "'cross' was not drawn from this plan" in strange.stderr

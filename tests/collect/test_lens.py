@@ -1,0 +1,112 @@
+"""A camera that distorts, collected with its lens file: the lens is recorded, captures judged, the rig checked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+
+from calibrate.artefact import Calibration, load_artefact
+from calibrate.calibration import calibrate_session
+from calibrate.camera.artefact import LensFile
+from collect.config import load_rig
+from collect.errors import ConfigError, StepError
+from collect.states import State
+from sessions import container
+from sessions.journal import read_lines, replay
+from sessions.reader import Recording
+from sessions.schemas import Topic
+
+if TYPE_CHECKING:
+    from conftest import Lab
+
+K1 = -0.08
+
+
+def lens_file(folder: Path, k1: float = K1) -> Path:
+    return LensFile(
+        software="brushloop test",
+        photographs={},
+        board="a board",
+        size_px=(2048, 1536),
+        matrix=(2048.0, 2048.0, 1023.5, 767.5),
+        distortion=(k1, 0.0, 0.0, 0.0, 0.0),
+        focal_se_px=(1.0, 1.0),
+        rms_px=0.1,
+        rms_limit_px=0.5,
+        residuals_px={},
+        dropped={},
+        unusable={},
+        guidance=(),
+        warnings=(),
+    ).save(folder)
+
+
+def named(lab: Lab, path: Path, also: str = "") -> Path:
+    """Name the lens file in rig.toml, as an operator does."""
+    rig = lab.folder / "rig.toml"
+    text = rig.read_text().replace("[camera]", f'[camera]\nlens_file = "{path.relative_to(lab.folder)}"', 1)
+    rig.write_text(text + also)
+    return rig
+
+
+def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> None:
+    lens = lens_file(bent_lab.folder / "camera")
+    named(bent_lab, lens, "\n[self_check]\nenabled = true\n")
+    engine = bent_lab.engine()
+    engine.start()
+    engine.join()
+    assert engine.snapshot().state is State.DONE, engine.snapshot().messages
+
+    [folder] = bent_lab.sessions.iterdir()
+    [(schema, _, message)] = container.messages(Recording(folder).path, [str(Topic.CALIBRATION)])
+    told = CameraCalibration.FromString(message.data)
+    assert schema is not None
+    assert (schema.name, told.width, told.height) == ("foxglove.CameraCalibration", 2048, 1536)
+    assert (list(told.D), told.K[0]) == ([K1, 0.0, 0.0, 0.0, 0.0], 2048.0)
+
+    made = load_artefact(calibrate_session(folder), Calibration)
+    assert made.lens is not None
+    assert made.lens.source == f"lens file {lens.stem}"
+
+    # The self-check spent three cells far apart, and the press lies on a fourth.
+    lines = read_lines(folder / "journal.jsonl")
+    [check] = [line for line in lines if line["event"] == "done" and line["kind"] == "self_check"]
+    assert check["result"]["cells"] == [0, 5, 36]
+    assert max(abs(scale - 1.0) for scale in check["result"]["scale"]) < 0.005
+    state = replay(folder / "journal.jsonl")
+    assert {(0, 0), (0, 5), (0, 36), (0, 1)} <= state.used_cells
+    assert len(state.used_cells) == 4 + 3 * state.voids
+
+
+def test_without_the_lens_file_the_run_ends_before_ink_and_names_the_remedy(bent_lab: Lab) -> None:
+    engine = bent_lab.engine()
+    engine.start()
+    with pytest.raises(StepError, match=r"the lens bends straight lines: .*camera\.lens_file"):
+        engine.join()
+    [folder] = bent_lab.sessions.iterdir()
+    assert replay(folder / "journal.jsonl").used_cells == set()
+
+
+def test_what_is_no_lens_file_is_refused_in_one_line(bent_lab: Lab) -> None:
+    lens = lens_file(bent_lab.folder)
+    rig = named(bent_lab, lens)
+    optics = load_rig(rig).camera.optics
+    assert optics is not None
+    assert optics.distortion[0] == K1
+    lens.write_text(lens.read_text().replace("a board", "another"))
+    with pytest.raises(ConfigError, match=r"rig.toml: camera.lens_file: .*was edited"):
+        load_rig(rig)
+    lens.unlink()
+    with pytest.raises(ConfigError, match=r"rig.toml: camera.lens_file: .*No such file"):
+        load_rig(rig)
+
+
+def test_a_changed_lens_file_is_a_changed_configuration(bent_lab: Lab) -> None:
+    rig = named(bent_lab, lens_file(bent_lab.folder))
+    before = load_rig(rig).model_dump_json()
+    other = lens_file(bent_lab.folder, -0.07)
+    rig.write_text(rig.read_text().replace(lens_file(bent_lab.folder).name, other.name))
+    assert load_rig(rig).model_dump_json() != before

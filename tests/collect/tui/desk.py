@@ -1,0 +1,99 @@
+"""A desk and a session without a disk, for screens that show them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from collect.desk import Desk, Paths
+from collect.doctor import Finding
+from collect.reviewing import Looked, Review, Seen
+from collect.tui.pictures import Pictures
+from collect.tui.review import ReviewScreen
+from sessions.remarks import Remark
+from sessions.show import Details, Sheet
+from sessions.summary import Summary
+from tests.collect.tui.fake import blot
+
+FINDINGS = [
+    Finding(
+        "camera",
+        "http://127.0.0.1:1/",
+        True,
+        "loopback",
+        latency_ms=131.2,
+        notes="board: 184 corners, residual 0.11 px",
+    ),
+    Finding("force", "can0", True, "SRI M8123", latency_ms=1.1, notes="1000 rounds/s, 0.412 N before bias, simulated"),
+    Finding(
+        "robot",
+        "127.0.0.1:30004",
+        True,
+        "AUBO-i5",
+        latency_ms=2.0,
+        problem="safety mode is ProtectiveStop",
+        remedy="Look at the pendant; nothing is cleared from here.",
+    ),
+]
+
+
+class FakeDesk(Desk):
+    """Two sessions, one cut in its middle, and a rig with trouble."""
+
+    def __init__(self, rows: tuple[Summary, ...] | None = None) -> None:
+        super().__init__(Paths())
+        self._rows = rows
+        self.asked: list[Any] = []
+
+    def recent(self) -> list[Summary]:
+        if self._rows is not None:
+            return list(self._rows)
+        return [
+            Summary("2026-11-21-grid-02", "open", "", 13, ""),
+            Summary("2026-11-21-grid-01", "closed", "loopback rig", 150, "2026-11-21-grid-01.mcap"),
+        ]
+
+    def standing(self, session_id: str) -> Details:
+        told = Details(
+            session_id, "open", "loopback rig", {}, "brushloop 0.1", 1, {"capture": 13}, strokes=13, planned=30
+        )
+        told.void = ["press H15-a5-r01, attempt 1: the process ended during it"]
+        told.next, told.sheets = "press H15-a5-r01", [Sheet(1, [1, 2])]
+        return told
+
+    def health(self) -> list[Finding]:
+        return FINDINGS
+
+    def planned(self) -> str:
+        return "30 strokes on 1 sheet, about 21 min"
+
+
+class FakeReview(Review):
+    """Three captures of one cell, one of them marked bad."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / "2026-11-21-grid-01"
+        self.folder.mkdir(exist_ok=True)
+        self.read()
+
+    def read(self) -> None:
+        self.open = False
+        bad = Remark(7, "H13-a0-r02", True, "smudged, 墨 ran", 1)
+        self.captures = (
+            Seen("H13-a0-r01", 13.0, 0.0, 4, True, "", "0004-capture-a.mcap", None),
+            Seen("H13-a0-r02", 13.0, 0.0, 7, True, "", "0007-capture-b.mcap", bad),
+            Seen("H13-a0-r03", 13.0, 0.0, 10, False, "split", "0010-capture-c.mcap", None),
+        )
+
+    def look(self, seen: Seen) -> Looked:
+        binary = blot()
+        return Looked(np.where(binary, 40, 210).astype(np.uint8), binary, 1_795_273_966_402_000_000)
+
+    def repeatability(self, height_mm: float, tilt_deg: float) -> tuple[float, int] | None:
+        return 0.914, 9
+
+
+def a_review(folder: Path) -> ReviewScreen:
+    return ReviewScreen(FakeReview(folder), Pictures(), now_ns=lambda: 5)

@@ -1,0 +1,200 @@
+"""What the app asks of an engine besides pause and stop, on the loopback rig: wishes, park, guided set-up."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import pytest
+
+from collect.engine import Engine
+from collect.errors import CollectAborted, NeedsOperator, Parked
+from collect.opening import Opening, find_resumable, open_store
+from collect.snapshot import Snapshot
+from collect.states import State
+from collect.tally import Mark
+from collect.wishes import Wish, Wishes
+from drivers.clock import HostClock
+from sessions.journal import read_lines
+from sessions.reader import Recording
+from tests.collect.conftest import Lab
+
+
+def engine_of(lab: Lab, *, guided: bool = False, preview: bool = False) -> Engine:
+    opening, clock = Opening.load(lab.sessions, lab.folder / "rig.toml", lab.folder / "protocol.toml"), HostClock()
+    resume = find_resumable(opening)
+    return Engine(
+        opening.rig,
+        opening.protocol,
+        lambda rig: open_store(opening, resume, rig, clock),
+        clock,
+        watched=True,
+        guided=guided,
+        preview=preview,
+    )
+
+
+def until(engine: Engine, condition: Callable[[Snapshot], bool], timeout_s: float = 60.0) -> Snapshot:
+    deadline = time.monotonic() + timeout_s
+    while not condition(now := engine.snapshot()):
+        assert time.monotonic() < deadline, now
+        assert not engine.finished, now
+        time.sleep(0.005)
+    return now
+
+
+def answer(engine: Engine, words: str, key: str) -> None:
+    now = until(engine, lambda n: n.prompt is not None and words in n.prompt.question)
+    assert now.prompt is not None
+    number = now.prompt.number
+    assert engine.answer(number, key)
+    deadline = time.monotonic() + 10.0
+    while (prompt := engine.snapshot().prompt) is not None and prompt.number == number:
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def lines(lab: Lab, event: str) -> list[dict[str, object]]:
+    [folder] = lab.sessions.iterdir()
+    return [line for line in read_lines(folder / "journal.jsonl") if line["event"] == event]
+
+
+def test_a_wish_asked_twice_is_taken_back_and_retake_and_skip_exclude_each_other() -> None:
+    wishes = Wishes()
+    assert wishes.toggle(Wish.RETAKE)
+    assert wishes.toggle(Wish.SKIP)
+    assert wishes.open == (Wish.SKIP,)
+    assert not wishes.toggle(Wish.SKIP)
+    assert not wishes.take(Wish.SKIP)
+    assert wishes.toggle(Wish.JOG)
+    assert wishes.take(Wish.JOG)
+    assert wishes.open == ()
+
+
+def test_a_stroke_is_pressed_again_on_a_new_cell_because_the_operator_asked(lab: Lab) -> None:
+    lab.write_protocol("[11.0]", "[0.0]")
+    engine = engine_of(lab)
+    engine.wish(Wish.RETAKE)
+    engine.wish(Wish.NEW_SHEET)
+    engine.wish(Wish.NEW_SHEET)
+    engine.start()
+    engine.join()
+    now = engine.snapshot()
+    assert (now.state, now.strokes_done, now.given_up, now.wishes) == (State.DONE, 1, 0, ())
+    assert now.sheet is not None
+    assert [mark for mark in now.sheet.marks if mark] == [Mark.BAD, Mark.KEPT]
+    assert now.grid[0].bad == 1
+    [folder] = lab.sessions.iterdir()
+    assert len(list(Recording(folder).captures())) == 1
+
+
+def test_a_stroke_is_left_out_before_it_is_pressed_and_stays_left_out_after_a_resume(lab: Lab) -> None:
+    lab.write_protocol("[11.0, 15.0]", "[0.0]")
+    first = engine_of(lab)
+    first.wish(Wish.SKIP)
+    first.start()
+    until(first, lambda now: now.given_up == 1)
+    first.park()
+    with pytest.raises(Parked):
+        first.join()
+    assert first.snapshot().strokes_done + first.snapshot().given_up < 3
+    again = engine_of(lab)
+    again.start()
+    again.join()
+    now = again.snapshot()
+    assert (now.state, now.strokes_done, now.given_up) == (State.DONE, 1, 1)
+    assert len(lab.rig.world.presses) == 1
+    assert sum(cell.left_out for cell in now.grid) == 1
+
+
+def test_a_new_sheet_is_asked_for_and_the_next_stroke_lies_on_it(lab: Lab) -> None:
+    lab.write_protocol("[11.0]", "[0.0]")
+    engine = engine_of(lab)
+    engine.wish(Wish.NEW_SHEET)
+    engine.start()
+    answer(engine, "Put a new sheet in for sheet 1", "g")
+    engine.join()
+    now = engine.snapshot()
+    assert now.sheet is not None
+    assert now.sheet.number == 2
+    assert now.sheet.marks[0] is Mark.KEPT
+
+
+def test_the_paper_is_found_again_by_jog_between_two_strokes(lab: Lab) -> None:
+    lab.write_protocol("[11.0]", "[0.0]")
+    engine = engine_of(lab)
+    engine.wish(Wish.JOG)
+    engine.start()
+    for _ in range(3):  # touches at one point, which must agree
+        answer(engine, "+2.00 mm", "1")
+        answer(engine, "+1.00 mm", "t")
+    engine.join()
+    assert engine.snapshot().strokes_done == 1
+    methods = [line["result"]["method"] for line in lines(lab, "done") if line["kind"] == "zero_touch"]  # type: ignore[index]
+    assert methods == ["taught", "jog"]
+
+
+def test_park_ends_the_run_after_the_step_with_the_arm_at_its_place(lab: Lab) -> None:
+    lab.write_protocol("[11.0]", "[0.0, 10.0]")
+    engine = engine_of(lab)
+    engine.start()
+    until(engine, lambda now: now.strokes_done == 1)
+    engine.park()
+    with pytest.raises(Parked):
+        engine.join()
+    now = engine.snapshot()
+    assert (now.state, now.voids) == (State.STOPPED, 0)
+    assert now.parked
+    again = engine_of(lab)
+    again.start()
+    again.join()
+    assert again.snapshot().strokes_done == 2
+    assert len({c.stroke.stroke_id for c in Recording(next(lab.sessions.iterdir())).captures()}) == 2
+
+
+def test_park_while_paused_parks_too(lab: Lab) -> None:
+    engine = engine_of(lab)
+    engine.pause()
+    engine.start()
+    until(engine, lambda now: now.state is State.PAUSED)
+    engine.park()
+    with pytest.raises(Parked):
+        engine.join()
+    assert engine.snapshot().parked
+
+
+def test_park_while_a_question_waits_asks_nobody_any_more(lab: Lab) -> None:
+    engine = engine_of(lab, guided=True)
+    engine.start()
+    until(engine, lambda now: now.prompt is not None)
+    engine.park()
+    with pytest.raises((NeedsOperator, CollectAborted)):
+        engine.join()
+    assert engine.snapshot().prompt is None
+    assert engine.snapshot().parked
+
+
+def test_a_guided_set_up_measures_again_when_it_is_asked_to_and_shows_the_camera(lab: Lab) -> None:
+    lab.write_protocol("[11.0]", "[0.0]")
+    engine = engine_of(lab, guided=True, preview=True)
+    engine.start()
+    answer(engine, "Camera, board, scale", "a")
+    now = until(engine, lambda now: now.prompt is not None and now.prompt.number == 2)
+    board = now.set_up[0]
+    assert [fact.name for fact in board.facts][:3] == ["corners seen", "scale (pix2len)", "residual of corners"]
+    assert all(fact.good is not False for fact in board.facts)
+    picture = until(engine, lambda now: now.picture is not None).picture
+    assert picture is not None
+    assert picture.image.shape == (240, 320)
+    answer(engine, "Camera, board, scale", "g")
+    answer(engine, "Zero touch and plane", "g")
+    until(engine, lambda now: not now.set_up)
+    engine.join()
+    now = engine.snapshot()
+    assert (now.state, now.strokes_done) == (State.DONE, 1)
+    assert sum(line["kind"] == "board" for line in lines(lab, "done")) == 2
+    assert now.last is not None
+    assert now.last.binary is not None
+    assert now.last.binary.shape == (128, 128)
+    assert now.target_mm is not None
+    assert now.trace_n

@@ -1,0 +1,209 @@
+"""The screens around a run: start, review, finish, pictures."""
+
+from __future__ import annotations
+
+import builtins
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from textual.app import App
+from textual.geometry import Size
+from textual.pilot import Pilot
+
+from collect.errors import ConfigError
+from collect.tui.app import OperatorApp
+from collect.tui.confirm import Confirm
+from collect.tui.finish import FinishScreen, verdict_content
+from collect.tui.pictures import HALF, CellPicture, ImagePicture, Pictures, _strips
+from collect.tui.start import StartScreen
+from collect.tui.trace import force_bar, plot, spark
+from sessions.remarks import remarks_of
+from sessions.verify import Finding, Verdict
+from tests.collect.tui.desk import FakeDesk, a_review
+from tests.collect.tui.fake import FakeEngine, picture
+from tests.collect.tui.test_app import look, shown
+
+
+class Beginning(FakeDesk):
+    """Notes which session is gone on with."""
+
+    def engine(self, session_id: str | None, **options: Any) -> Any:
+        self.asked.append((session_id, options["guided"]))
+        if session_id is None:
+            raise ConfigError("rig.toml", "robot", "another brushloop is driving the arm")
+        return FakeEngine(picture())
+
+
+async def ready(app: OperatorApp, pilot: Pilot[None]) -> str:
+    await pilot.pause()
+    await app.workers.wait_for_complete()
+    await pilot.pause()
+    return shown(app)
+
+
+async def test_the_start_screen_tells_what_is_finished_void_and_next() -> None:
+    app = OperatorApp(desk=FakeDesk())
+    async with app.run_test(size=(80, 24)) as pilot:
+        text = await ready(app, pilot)
+        for part in ("▶ 2026-11-21-grid-02 open", "13 of 30 strokes", "1 cut short", "the process", "press H15-a5-r01"):
+            assert part in text
+        await pilot.press("d")
+        text = await ready(app, pilot)
+        for part in ("✓ well    camera", "! trouble robot", "ProtectiveStop"):
+            assert part in text
+
+
+async def test_the_first_day_says_what_to_do() -> None:
+    app = OperatorApp(desk=FakeDesk(rows=()))
+    async with app.run_test(size=(80, 24)) as pilot:
+        text = await ready(app, pilot)
+        assert "No session yet" in text
+        assert "q leave" in text
+        await pilot.press("s", "q")
+    assert app.return_code == 0
+
+
+async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_first() -> None:
+    desk = Beginning()
+    app = OperatorApp(desk=desk)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await ready(app, pilot)
+        await pilot.press("n")
+        await ready(app, pilot)
+        assert isinstance(app.screen, Confirm)
+        await pilot.press("n")
+        assert desk.asked == []
+        await pilot.press("n")
+        await ready(app, pilot)
+        await pilot.press("y")
+        text = await ready(app, pilot)
+        assert desk.asked == [(None, True)]
+        assert "rig.toml: robot: another brushloop is driving the arm" in text
+        await pilot.press("enter")
+        await ready(app, pilot)
+        assert desk.asked[1:] == [("2026-11-21-grid-02", True)]
+        assert app.engine is not None
+        assert app.engine.calls == ["start"]  # type: ignore[attr-defined]
+        await look(app, pilot)
+        await pilot.press("s")
+        assert "stop" in app.engine.calls  # type: ignore[attr-defined]
+
+
+async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
+    desk = FakeDesk()
+    app = OperatorApp(desk=desk)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await ready(app, pilot)
+        await pilot.press("e", "ctrl+u", *"s2.toml", "enter")
+        await ready(app, pilot)
+        assert str(desk.paths.config) == "s2.toml"
+        assert isinstance(app.screen, StartScreen)
+
+
+async def test_marks_and_notes_are_kept_beside_the_recording(tmp_path: Path) -> None:
+    app = OperatorApp(desk=FakeDesk())
+    async with app.run_test(size=(120, 40)) as pilot:
+        await ready(app, pilot)
+        review = a_review(tmp_path)
+        app.push_screen(review)
+        text = await ready(app, pilot)
+        for part in (
+            "1 of 3 count",
+            "mean CSIM 0.914 of every pair of 9 presses",
+            "still 4  at 1795273966.402 s",
+            HALF,
+        ):
+            assert part in text
+        await pilot.press("b")
+        await ready(app, pilot)
+        await pilot.press("o", *"so so", "enter")
+        await ready(app, pilot)
+        remark = remarks_of(tmp_path / "2026-11-21-grid-01")[4]
+        assert (remark.stroke_id, remark.note) == ("H13-a0-r01", "so so")
+        await pilot.press("down")
+        text = await ready(app, pilot)
+        assert "marked bad" in text
+        assert "墨 ran" in text
+        await pilot.press("escape")
+        assert isinstance(app.screen, StartScreen)
+
+
+async def test_no_note_is_typed_while_the_arm_is_at_work(tmp_path: Path) -> None:
+    engine = FakeEngine(picture())
+    app = OperatorApp(engine)
+    async with app.run_test(size=(120, 40)) as pilot:
+        await look(app, pilot)
+        review = a_review(tmp_path)
+        review._at_work = lambda: app.at_work
+        app.push_screen(review)
+        await ready(app, pilot)
+        await pilot.press("o", "s")
+        assert engine.calls == ["stop"]
+        assert not review.has_class("-noting")
+
+
+async def test_finishing_verifies_and_runs_what_comes_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: list[tuple[str, Path]] = []
+
+    def command(name: str, folder: Path) -> tuple[int, str]:
+        ran.append((name, folder))
+        return 0, "\n".join(f"line {n}" for n in range(30))
+
+    monkeypatch.setattr("collect.tui.finish.run_command", command)
+    monkeypatch.setattr("collect.tui.finish.verified", lambda _folder: Verdict("s", "closed", files=3, strokes=2))
+    app = OperatorApp(desk=FakeDesk())
+    async with app.run_test(size=(120, 40)) as pilot:
+        await ready(app, pilot)
+        app.push_screen(FinishScreen(tmp_path, is_open=False))
+        text = await ready(app, pilot)
+        assert "✓ sound" in text
+        await pilot.press("c")
+        text = await ready(app, pilot)
+        assert ran == [("calibrate", tmp_path)]
+        assert "line 29" in text
+    assert "! damaged" in verdict_content(Verdict("s", "closed", findings=[Finding("a.mcap", "is cut")])).plain
+
+
+def test_pictures_work_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    imports = builtins.__import__
+
+    def missing(name: str, *rest: Any) -> Any:
+        if name.startswith("textual_image"):
+            raise ImportError(name)
+        return imports(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", missing)
+    assert isinstance(Pictures("auto").make("x"), CellPicture)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:textual_image")
+async def test_pictures_by_the_extra_are_shown_and_changed() -> None:
+    widget = pytest.importorskip("textual_image.widget").HalfcellImage
+    app: App[None] = App()
+    async with app.run_test(size=(80, 24)) as pilot:
+        shows = ImagePicture(widget, "x")
+        await app.screen.mount(shows)
+        for image in (np.zeros((20, 40), np.uint8), np.full((20, 40), 255, np.uint8), None):
+            shows.show(image)
+            await pilot.pause()
+        assert app.is_running
+
+
+def test_a_picture_fits_its_place_and_keeps_its_shape() -> None:
+    image = np.tile(np.arange(64, dtype=np.uint8) * 4, (32, 1))
+    strips = _strips(image, Size(40, 30))
+    assert (len(strips), strips[0].cell_length) == (10, 40)
+    assert {segment.text[0] for strip in strips for segment in strip} == {HALF}
+    assert _strips(None, Size(40, 30)) == []
+    assert _strips(image, Size(0, 0)) == []
+
+
+def test_a_force_is_drawn_to_scale_and_noise_does_not_fill_its_place() -> None:
+    assert spark([0.0, 0.5, 1.0], 4) == "  ▄█"
+    assert spark([0.001, 0.0], 2) == "▁ "
+    assert plot([0.0, 1.0], 2, 2).plain == " █\n █"
+    assert force_bar(0.05, 0.1, 10) == "█████░░░░░   0.050 N"
+    assert force_bar(9.0, 0.1, 4) == "████   9.000 N"
+    assert force_bar(None, 0.1, 4) == "no force sensor"
