@@ -18,7 +18,10 @@ def prepare_press(capture: Capture, calibration: Calibration | None, params: Par
 
     Raises `CaptureRefused` for a capture that cannot be used, `SessionDamaged` for a picture that cannot be read.
     """
-    stroke, image = capture.stroke, capture.image()
+    stroke = capture.stroke
+    if capture.bad:
+        raise CaptureRefused(stroke.stroke_id, capture.bad)
+    image = capture.image()
     left, top = (v * PX_PER_MM for v in view.anchor_mm)
     if stroke.anchor_mm is not None and calibration is not None:
         window = view.window_mm(stroke.anchor_mm)

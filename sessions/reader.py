@@ -16,6 +16,7 @@ from sessions import container
 from sessions.errors import InputError, SessionDamaged, in_one_line
 from sessions.journal import JOURNAL_NAME, is_open, replay
 from sessions.messages import decode_gray, decode_still
+from sessions.remarks import remarks_of
 from sessions.schemas import Event, Header, StepEvent, Stroke, Topic
 from sessions.writer import HEADER_METADATA, file_sha256, header_crc
 
@@ -35,6 +36,8 @@ class Capture:
     stroke: Stroke
     still_png: bytes
     where: str
+    bad: str = ""
+    """Why it does not count, in a person's words; empty where nobody marked it."""
 
     def image(self) -> NDArray[np.uint8]:
         """(h, w) uint8 gray. Raises `SessionDamaged` naming the stroke."""
@@ -71,6 +74,7 @@ class Recording:
 
     def captures(self) -> Iterator[Capture]:
         """Every stroke in order of capture. Raises `SessionDamaged`."""
+        bad = self.marked_bad()
         stills: OrderedDict[int, bytes] = OrderedDict()
         for topic, sequence, data in self._messages([Topic.STILL, Topic.STROKE]):
             if topic == Topic.STILL:
@@ -81,7 +85,13 @@ class Recording:
             stroke = _event(self.path, Stroke, data)
             if stroke.still not in stills:
                 raise SessionDamaged(self.path, f"stroke {stroke.stroke_id} names still {stroke.still}, not there")
-            yield Capture(stroke, stills[stroke.still], f"{self.path} stroke {stroke.stroke_id}")
+            where = f"{self.path} stroke {stroke.stroke_id}"
+            yield Capture(stroke, stills[stroke.still], where, bad.get(stroke.still, ""))
+
+    def marked_bad(self) -> dict[int, str]:
+        """Why a person marked a capture bad, by still. Raises `SessionDamaged`."""
+        latest = remarks_of(self.path.parent).values()
+        return {one.still: f"was marked bad{f': {one.note}' if one.note else ''}" for one in latest if one.bad}
 
     def stills_of(self, kind: str) -> Iterator[bytes]:
         """The stills taken in steps of this kind (`board`), encoded."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from sessions.errors import InputError, SessionError
 from sessions.journal import JOURNAL_NAME, is_open, replay
 from sessions.reader import Recording
-from sessions.schemas import Source
+from sessions.schemas import Source, Topic
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +39,8 @@ def summaries(root: Path) -> Iterator[Summary]:
 def _summary(folder: Path) -> Summary | None:
     collected = (folder / JOURNAL_NAME).is_file()
     if collected and is_open(state := replay(folder / JOURNAL_NAME)):
-        captures = {line["key"] for line in state.segments if line["kind"] == "capture"}
-        return Summary(folder.name, "open", "", len(captures), "")
+        strokes = sum(line["counts"].get(Topic.STROKE, 0) for line in state.segments)
+        return Summary(folder.name, "open", "", strokes, "")
     merged = folder / f"{folder.name}.mcap"
     if not merged.is_file():
         return None

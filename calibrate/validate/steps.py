@@ -39,7 +39,8 @@ def prepared_rows(
 ) -> Iterator[Row]:
     """Every stroke of a session, in order of capture; what is not in the store yet is prepared first."""
     calibration = session.calibration.digest if session.calibration is not None else ""
-    base = hashlib.sha256(f"prepare {VERSION} {session.sha256} {calibration} {view}".encode()).hexdigest()
+    bad = sorted(session.recording.marked_bad().items())
+    base = hashlib.sha256(f"prepare {VERSION} {session.sha256} {calibration} {view} {bad}".encode()).hexdigest()
     keys = [f"{base}:{k}" for k in range(session.count)]
     what = f"{session.header.session_id}: found"
     missing = [key for key in keys if key not in store]

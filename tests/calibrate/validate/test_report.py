@@ -17,6 +17,8 @@ from calibrate.errors import CalibrationError
 from calibrate.field import Alignment, Tone
 from calibrate.validate.gates import GateMissed, parse_gate
 from calibrate.validate.report import Report, load_report
+from sessions.reader import Recording
+from sessions.remarks import Remark, add_remark
 
 MODELS = ("ccd-bsm", "bezier", "bezier-refitted", "ellipse", "line", "circle", "qbc", "another press")
 
@@ -172,6 +174,22 @@ def test_only_the_models_asked_for_and_an_unknown_one_is_refused(session: Path, 
     ran = CliRunner().invoke(app, ["validate", str(session), "--out", str(tmp_path), "--model", "square"])
     assert isinstance(ran.exception, CalibrationError)
     assert "'square' is not one of: ccd-bsm" in str(ran.exception)
+
+
+def test_a_capture_that_a_person_marked_bad_is_left_out_by_name(session: Path, tmp_path: Path) -> None:
+    marked = tmp_path / session.name
+    shutil.copytree(session, marked)
+    still = next(stroke.still for stroke in Recording(marked).stroke_records() if stroke.stroke_id == "003")
+    run(marked, "--out", tmp_path / "before", "--model", "line", "--no-held-out")
+    add_remark(marked, Remark(still, "003", bad=True, note="<b>hair</b> in it"))
+    for out in ("before", "after"):  # also where the work of before is still there
+        run(marked, "--out", tmp_path / out, "--model", "line", "--no-held-out")
+        told = {one.stroke_id: one.why for one in load_report(tmp_path / out / "report.json").refused}
+        assert told["003"] == "was marked bad: <b>hair</b> in it"
+        assert "&lt;b&gt;hair" in (tmp_path / out / "report.html").read_text()
+    add_remark(marked, Remark(still, "003"))
+    run(marked, "--out", tmp_path / "after", "--model", "line", "--no-held-out")
+    assert "003" not in {one.stroke_id for one in load_report(tmp_path / "after" / "report.json").refused}
 
 
 def test_ablations_show_lambda_and_the_number_of_strokes(session: Path, tmp_path: Path) -> None:
