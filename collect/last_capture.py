@@ -5,20 +5,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from calibrate.errors import CaptureRefused
-from calibrate.field import Field, Tone, captured_mm
+from calibrate.field import SIZE_PX, Field, Tone, captured_mm
 from calibrate.preprocess import Params, prepare, rectify
+from calibrate.similarity import csim
 from collect.quality.verdict import Verdict
 from collect.sheet import Cell
+from model.fitted import FittedPress
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from calibrate.preprocess import Gray
     from calibrate.scale import PlaneFit
 
 PX_PER_MM = 20.0
+FINE = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +40,30 @@ class LastCapture:
     """(h, w) gray of the field around the zero-touch point, seen from above."""
     binary: NDArray[np.bool_] | None = None
     """(128, 128) true where ink: the image that a validation compares, in the millimetre alignment."""
+    model: NDArray[np.bool_] | None = None
+    """(128, 128) of CCD-BSM as published, for the same H and alpha; None for a figure, or beyond what it can draw."""
+
+    @property
+    def likeness(self) -> float | None:
+        """CSIM of `binary` and `model`, 0 to 1."""
+        if self.binary is None or self.model is None or not (self.binary.any() and self.model.any()):
+            return None
+        return csim(self.binary.astype(float), self.model.astype(float))
+
+
+def published_mark(
+    height_mm: float, tilt_deg: float, *, radius_mm: float, length_mm: float
+) -> NDArray[np.bool_] | None:
+    """CCD-BSM as published, (128, 128) on the default field; None where it draws no mark. A few milliseconds."""
+    press, field = FittedPress(radius_mm, length_mm), Field()
+    left, top = field.anchor_mm
+    centres = (np.arange(FINE * SIZE_PX) + 0.5) * (field.mm_per_px / FINE)
+    try:
+        half_mm = press.half_width(height_mm, tilt_deg, np.asarray(centres - left, np.float64))
+    except ValueError:
+        return None
+    fine = np.abs(top - centres)[:, None] <= half_mm[None]
+    return np.asarray(fine.reshape(SIZE_PX, FINE, SIZE_PX, FINE).mean(axis=(1, 3)) > 0.5)
 
 
 def pictures_of(image: Gray, plane: PlaneFit, cell: Cell) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:

@@ -1,4 +1,4 @@
-"""The newest capture: its photograph, the binarised image that is compared, and how it was judged."""
+"""The newest capture: its photograph, the binarised image that is compared, the model's, and how it was judged."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from collect.last_capture import LastCapture
 
-NO_MODEL = "CCD-BSM for this (H, α): scored by `brushloop validate`, which a rig PC need not have"
 
 
 class CapturePane(Vertical):
@@ -28,14 +27,14 @@ class CapturePane(Vertical):
     CapturePane { height: 1fr; }
     CapturePane #capture-words { height: auto; max-height: 50%; }
     CapturePane #capture-pictures { height: 1fr; min-height: 4; }
-    CapturePane #photo { margin-right: 1; }
+    CapturePane #photo, CapturePane #binary { margin-right: 1; }
     """
 
     def __init__(self, pictures: Pictures) -> None:
         super().__init__(id="capture-pane", classes="pane")
-        self.border_title = "Last capture: photograph, and binarised 128 x 128"
+        self.border_title = "Last capture: photograph, binarised, CCD-BSM"
         self._words = Line("capture-words")
-        self._photo, self._binary = pictures.make("photo"), pictures.make("binary")
+        self._photo, self._binary, self._model = (pictures.make(name) for name in ("photo", "binary", "model"))
         self._shown: LastCapture | None = None
         self._flat: NDArray[np.uint8] | None = None
 
@@ -45,6 +44,7 @@ class CapturePane(Vertical):
         with Horizontal(id="capture-pictures"):
             yield self._photo
             yield self._binary
+            yield self._model
 
     def show(self, last: LastCapture | None) -> None:
         """Draw it, if it is another one."""
@@ -57,6 +57,7 @@ class CapturePane(Vertical):
         self._words.show(capture_words(last))
         self._photo.show(last.photo)
         self._binary.show(None if last.binary is None else binary_picture(last.binary))
+        self._model.show(None if last.model is None else binary_picture(last.model))
 
 
 def capture_words(last: LastCapture) -> Content:
@@ -70,7 +71,9 @@ def capture_words(last: LastCapture) -> Content:
         if last.verdict.reason:
             lines.append(Content.styled(last.verdict.reason, "$text-warning"))
         lines.append(Content("  ").join(_check(check) for check in last.verdict.checks))
-    lines.append(Content.styled(NO_MODEL, "dim"))
+    if last.model is not None:
+        like = "" if last.likeness is None else f": CSIM {100.0 * last.likeness:.1f} % in mm"
+        lines.append(Content.styled(f"CCD-BSM as published for this H and α, right{like}", "dim"))
     return Content("\n").join(lines)
 
 

@@ -6,7 +6,7 @@ import contextlib
 
 from collect.asking import Choice, Prompt
 from collect.errors import BadPicture, NeedsOperator, StepError
-from collect.last_capture import LastCapture, pictures_of
+from collect.last_capture import LastCapture, pictures_of, published_mark
 from collect.quality.check import check_capture
 from collect.quality.verdict import Family, Verdict
 from collect.sheet import Cell
@@ -114,7 +114,10 @@ def _show(job: Job, verdict: Verdict | None, image: Gray, cell: Cell, kept: bool
         photo, binary = pictures_of(image, image_plane(job.bench, image), cell)
     stroke_id, still = str(job.step.params["stroke_id"]), job.attempt.serial
     height_mm, tilt_deg = job.number("height_mm"), job.number("tilt_deg")
-    job.bench.progress.show(LastCapture(stroke_id, height_mm, tilt_deg, still, kept, verdict, photo, binary))
+    brush = job.bench.rig.config.brush
+    sizes = {"radius_mm": brush.radius_mm, "length_mm": brush.length_mm}
+    model = None if job.step.params.get("drawn") else published_mark(height_mm, tilt_deg, **sizes)
+    job.bench.progress.show(LastCapture(stroke_id, height_mm, tilt_deg, still, kept, verdict, photo, binary, model))
 
 
 def _cut_out(bench: Bench, image: Gray, cell: Cell) -> Gray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from collect.asking import Choice, Prompt
 from collect.errors import CollectAborted
-from collect.last_capture import LastCapture
+from collect.last_capture import LastCapture, published_mark
 from collect.quality.verdict import Check, Failure, Verdict
 from collect.set_up_steps import Fact, SetUpStep, Standing
 from collect.snapshot import CellCount, Snapshot
@@ -72,7 +72,8 @@ def checks(*, split: bool = False) -> Verdict:
 def capture(*, kept: bool = True) -> LastCapture:
     binary = blot()
     photo = np.where(binary, 45, 205).astype(np.uint8).repeat(4, axis=0).repeat(4, axis=1)
-    return LastCapture("H15-a5-r01", 15.0, 5.0, 41, kept, checks(split=not kept), photo, binary)
+    model = published_mark(15.0, 5.0, radius_mm=6.0, length_mm=48.0)
+    return LastCapture("H15-a5-r01", 15.0, 5.0, 41, kept, checks(split=not kept), photo, binary, model)
 
 
 def camera_picture() -> Picture:

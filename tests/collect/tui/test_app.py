@@ -301,7 +301,7 @@ async def test_tab_turns_to_the_capture_and_the_camera_where_there_is_no_room_fo
         await pilot.press("tab")
         text = await look(app, pilot)
         assert "H15-a5-r01" in text
-        assert "scored by `brushloop validate`" in text
+        assert "CCD-BSM as published for this H and α, right: CSIM" in text
         assert "▀" in text
         await pilot.press("tab")
         assert "Camera" in await look(app, pilot)

@@ -1,0 +1,41 @@
+"""What a screen shows of a capture, without torch: the model's mark is the one that validation draws."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calibrate.field import Alignment, Field, Tone
+from calibrate.simulate import simulated
+from collect.last_capture import LastCapture, published_mark
+from model.registry import stroke_model
+
+BRUSH = {"radius_mm": 6.0, "length_mm": 48.0}
+
+
+@pytest.mark.parametrize("height_mm", [11.0, 15.0, 20.0])
+@pytest.mark.parametrize("tilt_deg", [0.0, 5.0, 10.0])
+def test_the_mark_is_the_one_of_the_closed_form(height_mm: float, tilt_deg: float) -> None:
+    mark = published_mark(height_mm, tilt_deg, **BRUSH)
+    model = stroke_model("ccd-bsm", type("Brush", (), BRUSH)())
+    exact = simulated(model, height_mm, tilt_deg, Alignment.MM, Tone.BINARY, Field()) > 0.5
+    assert mark is not None
+    assert exact.sum() > 100
+    assert np.logical_xor(mark, exact).sum() <= 0.01 * exact.sum()
+
+
+def test_beyond_the_domain_there_is_none() -> None:
+    assert published_mark(0.0, 0.0, **BRUSH) is None
+    assert published_mark(11.0, 85.0, **BRUSH) is None
+
+
+def test_likeness_is_a_cosine_and_needs_ink_on_both() -> None:
+    mark = published_mark(11.0, 0.0, **BRUSH)
+
+    def capture(binary: np.ndarray | None) -> LastCapture:
+        return LastCapture("H11-a0-r00", 11.0, 0.0, 1, True, None, None, binary, mark)
+
+    assert capture(mark).likeness == pytest.approx(1.0)
+    assert capture(np.roll(mark, 60, axis=0)).likeness == pytest.approx(0.0)
+    assert capture(None).likeness is None
+    assert capture(np.zeros_like(mark)).likeness is None
