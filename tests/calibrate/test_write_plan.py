@@ -107,6 +107,7 @@ def test_a_hand_is_planned_with_the_widths_it_asks_for(tmp_path: Path) -> None:
     assert MODEL.profile(float(middle[2]), float(middle[3])).width_mm[0] == pytest.approx(3.0, abs=0.5)
 
 
+@pytest.mark.soak  # half a minute of drawing again and again
 def test_with_a_drag_fit_the_plan_makes_up_for_the_lag(tmp_path: Path) -> None:
     values = {name: FittedValue(value=v, low=None, high=None) for name, v in zip(DragModel.names(), LAG, strict=True)}
     fit = DragArtefact(

@@ -66,10 +66,10 @@ class Toll:
         )
 
 
-def test_a_session_that_is_killed_ten_times_ends_whole(lab: Lab) -> None:
+def test_a_session_that_is_killed_six_times_ends_whole(lab: Lab) -> None:
     toll = Toll(seed=1)
-    while toll.kills.total() < 10:
-        session(lab, toll, kills=10 - toll.kills.total())
+    while toll.kills.total() < 6:
+        session(lab, toll, kills=6 - toll.kills.total())
     sys.stdout.write(f"{toll}\n")
 
 

@@ -173,6 +173,7 @@ def test_a_session_stops_when_enough_is_known_and_says_what_it_saved(lab: Lab) -
     assert all(c["strokes"] == k for k, c in enumerate(made))
 
 
+@pytest.mark.soak
 def test_killed_again_and_again_it_presses_each_choice_once(lab: Lab) -> None:
     """kill -9 in mid press, after a capture, and while choosing: what was chosen stays chosen."""
     adaptive_lab(lab, 0.01)

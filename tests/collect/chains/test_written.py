@@ -29,6 +29,7 @@ def strict(rows: list[Table3Row], pair: str, alignment: str = "mm") -> Table3Row
     return row
 
 
+@pytest.mark.soak
 @pytest.mark.timeout(600)
 def test_a_character_is_written_twice_and_compared(bench: Bench) -> None:
     what = bench.folder / "cross.json"
