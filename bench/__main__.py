@@ -21,6 +21,7 @@ from bench import (
     recorder,
     rpc,
     startup,
+    tables,
     tui,
     validate,
 )
@@ -43,8 +44,9 @@ def benches() -> dict[str, Bench]:
         "recorder": recorder.run,
         "rpc": rpc.run,
         "startup": startup.run,
-        "validate": validate.run,
+        "tables": tables.run,
         "tui": tui.run,
+        "validate": validate.run,
     }
 
 

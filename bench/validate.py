@@ -248,14 +248,16 @@ def _quietly(under: Path, *words: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, cwd=under, env=environment, stdout=nowhere, stderr=nowhere)
 
 
-def session(under: Path, name: str, strokes: int, seed: int) -> Path:
-    """A session of so many presses; photographs repeat after the first thirty, which no cache here can notice."""
+def session(
+    under: Path, name: str, strokes: int, seed: int, spec: BrushSpec | None = None, distinct: int = PHOTOGRAPHS
+) -> Path:
+    """A session of so many presses; photographs repeat after the first `distinct`, which no cache here can notice."""
     photos = under / f"{name}-photos"
     photos.mkdir()
-    brush = Brush(BrushSpec(seed=1 + seed))
+    brush = Brush(spec or BrushSpec(seed=1 + seed))
     drawn = [
         cv2.imencode(".png", photograph(brush, *CELLS[k % len(CELLS)], seed + k))[1].tobytes()
-        for k in range(min(PHOTOGRAPHS, strokes))
+        for k in range(min(distinct, strokes))
     ]
     lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
     for k, data in zip(range(strokes), itertools.cycle(drawn), strict=False):

@@ -34,6 +34,7 @@ def replay_journal(bench: Bench) -> bytes:
     return found[0].read_bytes() if found else b""
 
 
+@pytest.mark.soak
 @pytest.mark.timeout(600)
 def test_the_loop_is_closed_and_goes_on_after_kill_nine(bench: Bench) -> None:
     session = bench.collect(GRID)
