@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from collect.last_capture import LastCapture
 
 
-
 class CapturePane(Vertical):
     """One `LastCapture`."""
 
