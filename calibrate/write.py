@@ -12,6 +12,7 @@ from pathlib import Path
 from calibrate import pictures
 from calibrate.drags import DragResults
 from calibrate.files import write_whole
+from calibrate.pages import render
 from calibrate.wording import DRAG_LIMITS, fit_sentences, source_note
 from sessions.schemas import Header
 
@@ -30,19 +31,10 @@ class DragValidation:
 
 def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
     """Write `report.html` and `measured.csv` into `folder`; returns the report's path. Raises OSError."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    # Names, licences and origins come from files of others: everything is escaped.
-    environment = Environment(
-        loader=PackageLoader("calibrate"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     results = validation.results
     step = max(1, -(-len(results.strokes) // MAX_THUMBNAILS))
-    page = environment.get_template("drags.html.j2").render(
+    page = render(
+        "drags.html.j2",
         header=validation.header,
         note=source_note(validation.header.source),
         refused=results.refused,

@@ -12,6 +12,7 @@ import sys
 import time
 from pathlib import Path
 
+from collect.commands import run_command
 from collect.config import RigConfig, load_rig
 from collect.errors import CollectAborted
 from sessions.store import open_sessions
@@ -35,14 +36,16 @@ def run_demo(out: Path, repeats: int, rate: float, seed: int) -> None:
     rig = _serving(rig_toml, rate, seed, fresh=finished)
     try:
         sheet = ("--sheet", "1") if finished else ()
-        _run("collect", "--config", rig_toml, "--protocol", protocol_toml, "--out", sessions, "--no-tui", *sheet)
+        run_command(
+            _say, "collect", "--config", rig_toml, "--protocol", protocol_toml, "--out", sessions, "--no-tui", *sheet
+        )
     finally:
         if rig is not None and rig.poll() is not None:
             sys.stderr.write(f"the loopback rig ended with {rig.returncode}; see {out / 'rig.log'}\n")
     session = max(sessions.iterdir(), key=lambda path: path.stat().st_mtime_ns)
-    _run("calibrate", session)
-    _run("fit", session)
-    _run("validate", session)
+    run_command(_say, "calibrate", session)
+    run_command(_say, "fit", session)
+    run_command(_say, "validate", session)
     if rig is not None:
         rig.terminate()
         rig.wait()
@@ -79,20 +82,9 @@ def _serving(rig_toml: Path, rate: float, seed: int, *, fresh: bool) -> subproce
     return process
 
 
-def _run(*arguments: str | Path) -> None:
-    words = [str(argument) for argument in arguments]
-    sys.stdout.write(f"$ brushloop {' '.join(words)}\n")
+def _say(line: str) -> None:
+    sys.stdout.write(line + "\n")
     sys.stdout.flush()
-    process = subprocess.Popen([sys.executable, "-m", "brushloop", *words])
-    while True:
-        try:
-            code = process.wait()
-            break
-        except KeyboardInterrupt:
-            continue  # the command got it too, stops the arm and says so
-    if code != 0:
-        # The command has said why; the demo ends with its exit code.
-        sys.exit(code)
 
 
 def _free_port() -> int:

@@ -9,7 +9,6 @@ import io
 import json
 import platform
 from collections.abc import Iterator
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from calibrate.loop.picture import draw
 from calibrate.loop.scores import AGAIN, GOAL_POINTS, PairScore
 from calibrate.loop.table import FILE as NUMBERS
 from calibrate.loop.table import PAPER_ROBOT, Table1Row
+from calibrate.pages import render
 from calibrate.pictures import difference, ink
 from calibrate.similarity import SSIM_SETTINGS
 from calibrate.wording import source_note
@@ -33,13 +33,10 @@ MAX_PAIRS_SHOWN = 150
 
 def write_loop(closed: Closed, folder: Path, command: str) -> Path:
     """Write the report's files into `folder`; returns the page's path. Raises OSError."""
-    from jinja2 import Environment, StrictUndefined
-
     folder.mkdir(parents=True, exist_ok=True)
     draw(closed, folder / PICTURE)
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string((files("calibrate") / "templates" / "loop.html.j2").read_text("utf-8"))
-    page = template.render(
+    page = render(
+        "loop.html.j2",
         header=closed.original.header,
         again=closed.again.header,
         source=closed.again.header.source,

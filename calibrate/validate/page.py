@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from calibrate.field import Alignment, Tone
+from calibrate.pages import render
 from calibrate.validate import contenders as who
 from calibrate.validate import figures, tables, words
 from calibrate.validate.figures import Curve
@@ -21,19 +22,10 @@ MOST_REFUSED = 200
 
 def page_of(outcome: Outcome, report: Report, curves: Sequence[Curve], table_three: str = "") -> str:
     """The whole page. `table_three` is one sentence about characters, where they were written."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    # Names, licences and origins come from files of others: everything is escaped.
-    environment = Environment(
-        loader=PackageLoader("calibrate"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     shown = tables.rival(report, report.shown)
     normal, strict = (Alignment.SIZE_NORMALISED, Tone.BINARY), (Alignment.MM, Tone.BINARY)
-    return environment.get_template("presses.html.j2").render(
+    return render(
+        "presses.html.j2",
         report=report,
         name=", ".join(session.session_id for session in report.sessions[:4])
         + (f" and {len(report.sessions) - 4} more" if len(report.sessions) > 4 else ""),

@@ -8,12 +8,12 @@ import io
 import json
 import platform
 from collections.abc import Iterator
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from calibrate.field import Alignment, Tone
 from calibrate.files import write_whole
+from calibrate.pages import render
 from calibrate.pictures import difference, ink
 from calibrate.similarity import SSIM_SETTINGS
 from calibrate.wording import source_note
@@ -29,13 +29,10 @@ PICTURE, PAGE, TABLE = "figure-13.png", "written.html", "written.csv"
 
 def write_written(written: Written, folder: Path, command: str) -> Path:
     """Write the report's files into `folder`; returns the page's path. Raises OSError."""
-    from jinja2 import Environment, StrictUndefined
-
     folder.mkdir(parents=True, exist_ok=True)
     draw(written, folder / PICTURE)
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string((files("calibrate") / "templates" / "written.html.j2").read_text("utf-8"))
-    page = template.render(
+    page = render(
+        "written.html.j2",
         header=written.header,
         note=source_note(written.header.source),
         names=" ".join(one.name for one in written.characters),
