@@ -39,7 +39,10 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     out: list[Result] = []
     with tempfile.TemporaryDirectory() as folder:
         under = Path(folder)
-        _brushloop("train", "--out", str(under / "generator"), "--steps", str(TRAIN_STEPS), "--seed", str(seed))
+        _brushloop(
+            *("train", "--target", "anchored", "--out", str(under / "generator")),
+            *("--steps", str(TRAIN_STEPS), "--seed", str(seed)),
+        )
         for number, spec in enumerate(brushes, 1):
             count = REPEATS * len(CELLS)
             place = session(under, f"brush-{number}", count, seed, spec, count)
