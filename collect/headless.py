@@ -6,8 +6,8 @@ import contextlib
 import signal
 import threading
 import time
-from collections.abc import Generator
-from contextlib import contextmanager
+from collections.abc import Callable, Generator
+from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
 from typing import Protocol
 
@@ -102,12 +102,12 @@ def eta_text(now: Snapshot) -> str:
 
 
 @contextmanager
-def stopping_signals(engine: Stoppable) -> Generator[None]:
-    """SIGINT, SIGTERM and SIGHUP stop the arm at once; the run then ends by itself."""
+def stop_signals(heed: Callable[[int], None]) -> Generator[None]:
+    """Call `heed` with the number of each SIGINT, SIGTERM and SIGHUP, in a thread of its own."""
 
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
+    def on_signal(number: int, _frame: FrameType | None) -> None:
         # Not from the handler itself: it may have interrupted a holder of the engine's lock.
-        threading.Thread(target=engine.stop, name="stop key").start()
+        threading.Thread(target=heed, args=(number,), name="stop key").start()
 
     before = {number: signal.signal(number, on_signal) for number in STOP_SIGNALS}
     try:
@@ -115,3 +115,8 @@ def stopping_signals(engine: Stoppable) -> Generator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def stopping_signals(engine: Stoppable) -> AbstractContextManager[None]:
+    """SIGINT, SIGTERM and SIGHUP stop the arm at once; the run then ends by itself."""
+    return stop_signals(lambda _number: engine.stop())

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.brushfit.fit import Grid, Pressed
+from model.profile import Shape
 from model.raster.compiled import coverage_numpy
 from model.regression import Plane, fit_plane
 from model.strokes.bezier import bezier
@@ -22,8 +23,8 @@ class RefittedBezier:
 
     plane: Plane
 
-    def image(self, height_mm: float, tilt_deg: float, grid: Grid) -> np.ndarray:
-        """Coverage (len(y_mm), len(x_mm)) on the grid."""
+    def mark(self, height_mm: float, tilt_deg: float) -> tuple[Shape, float]:
+        """The stroke, and where its origin lies from the point of touch, mm."""
         import torch
 
         left, right, belly, shoulder = (float(v) for v in self.plane.at(height_mm, tilt_deg).values())
@@ -35,8 +36,13 @@ class RefittedBezier:
             "shoulder": min(max(shoulder, 0.0), 1.0),
         }
         shape = bezier({name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()})
+        return shape, left + TIP_SHARE * length
+
+    def image(self, height_mm: float, tilt_deg: float, grid: Grid) -> np.ndarray:
+        """Coverage (len(y_mm), len(x_mm)) on the grid."""
+        shape, origin_mm = self.mark(height_mm, tilt_deg)
         corner = (grid.x_mm[0] - 0.5 * grid.px_mm, grid.y_mm[0] + 0.5 * grid.px_mm)
-        origin = (left + TIP_SHARE * length - corner[0], corner[1])
+        origin = (origin_mm - corner[0], corner[1])
         side = max(len(grid.x_mm), len(grid.y_mm))
         image = coverage_numpy(shape, origin, size_px=side, px_mm=grid.px_mm, threads=1)[0]
         return image[: len(grid.y_mm), : len(grid.x_mm)]

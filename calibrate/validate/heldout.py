@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from calibrate.brushfit.artefact import BrushFit
-from calibrate.brushfit.bezier import TIP_SHARE, RefittedBezier, refit_bezier
+from calibrate.brushfit.bezier import RefittedBezier, refit_bezier
 from calibrate.brushfit.captures import MARGIN_MM, grid_of
 from calibrate.brushfit.fit import Fit, Grid, Pressed, refit
 from calibrate.field import SIZE_PX, Field
@@ -115,16 +115,6 @@ def bezier_pixels(coefficients: Sequence[float], height_mm: float, tilt_deg: flo
     import torch
 
     from model.regression import Plane
-    from model.strokes.bezier import bezier
 
     plane = Plane(("left_mm", "right_mm", "belly_mm", "shoulder"), torch.tensor(coefficients).double().reshape(4, 3))
-    left, right, belly, shoulder = (float(v) for v in RefittedBezier(plane).plane.at(height_mm, tilt_deg).values())
-    length = max(right - left, 0.2)
-    values = {
-        "tip_mm": TIP_SHARE * length,
-        "base_mm": (1 - TIP_SHARE) * length,
-        "belly_mm": max(belly, 0.1),
-        "shoulder": min(max(shoulder, 0.0), 1.0),
-    }
-    shape = bezier({name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()})
-    return shape_pixels(shape, left + TIP_SHARE * length, view)
+    return shape_pixels(*RefittedBezier(plane).mark(height_mm, tilt_deg), view)

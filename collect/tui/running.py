@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import signal
-import threading
-from collections.abc import Generator
-from contextlib import contextmanager
-from types import FrameType
+from contextlib import AbstractContextManager
 
 from collect.desk import Desk, Paths
 from collect.errors import CollectAborted
-from collect.headless import STOP_SIGNALS, RunnableEngine
+from collect.headless import RunnableEngine, stop_signals
 from collect.tui.app import OperatorApp
 from collect.tui.pictures import Kind, Pictures
 
@@ -58,23 +55,13 @@ def _run(app: OperatorApp) -> None:
         raise ScreenCrashed("the screen crashed; the arm was stopped")
 
 
-@contextmanager
-def _signals(app: OperatorApp) -> Generator[None]:
+def _signals(app: OperatorApp) -> AbstractContextManager[None]:
     """SIGINT and SIGTERM stop the arm at once. SIGHUP, a terminal that is lost, finishes the step and parks the arm:
     nobody is there to lift a brush that was stopped on the paper. Each ends the screen."""
-
-    def on_signal(number: int, _frame: FrameType | None) -> None:
-        # Not from the handler itself: it may have interrupted a holder of the engine's lock.
-        threading.Thread(target=heed, args=(number,), name="stop key").start()
 
     def heed(number: int) -> None:
         if app.engine is not None:
             (app.engine.park if number == signal.SIGHUP else app.engine.stop)()
         app.leave()
 
-    before = {number: signal.signal(number, on_signal) for number in STOP_SIGNALS}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    return stop_signals(heed)

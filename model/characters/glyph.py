@@ -58,12 +58,7 @@ class Glyph:
 
 def parse_glyph(text: str, name: str) -> Glyph:
     """A character out of `{"strokes": [path, ...], "medians": [[[x, y], ...], ...]}`; raises GlyphError."""
-    if len(text) > MAX_CHARS:
-        raise GlyphError("", f"is longer than {MAX_CHARS} characters")
-    try:
-        data: Any = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise GlyphError("", f"is not JSON: {str(error).splitlines()[0][:100]}") from None
+    data = json_of(text, MAX_CHARS)
     if not isinstance(data, dict):
         raise GlyphError("", "is no JSON object")
     table = cast("dict[str, Any]", data)
@@ -76,6 +71,16 @@ def parse_glyph(text: str, name: str) -> Glyph:
             raise GlyphError(f"strokes.{k}", "is no text")
         strokes.append(GlyphStroke(parse_path(path, f"strokes.{k}"), _median(median, f"medians.{k}")))
     return Glyph(name, tuple(strokes))
+
+
+def json_of(text: str, most_chars: int) -> Any:
+    """What a JSON text of at most so many characters holds; raises GlyphError."""
+    if len(text) > most_chars:
+        raise GlyphError("", f"is longer than {most_chars} characters")
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise GlyphError("", f"is not JSON: {str(error).splitlines()[0][:100]}") from None
 
 
 def parse_path(path: str, field: str) -> Floats:

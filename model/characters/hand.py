@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 from typing import Any, cast
 
 import numpy as np
 
-from model.characters.glyph import GlyphError
+from model.characters.glyph import GlyphError, json_of
 from model.characters.plan import Cell, Path, resampled
 
 MAX_CHARS = 4 * 1024 * 1024
@@ -59,12 +58,7 @@ def parse_csv(text: str, cell: Cell, step_mm: float) -> list[Path]:
 
 def parse_json(text: str, cell: Cell, step_mm: float) -> list[Path]:
     """The paths of a JSON trajectory; raises GlyphError that names stroke and point."""
-    if len(text) > MAX_CHARS:
-        raise GlyphError("", f"is longer than {MAX_CHARS} characters")
-    try:
-        data: Any = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise GlyphError("", f"is not JSON: {str(error).splitlines()[0][:100]}") from None
+    data = json_of(text, MAX_CHARS)
     given = cast("dict[str, Any]", data).get("strokes") if isinstance(data, dict) else None
     if not isinstance(given, list):
         raise GlyphError("strokes", "expected a list of strokes")

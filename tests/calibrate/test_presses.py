@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.artefact import Calibration
 from calibrate.field import KEYS, Alignment, Field, Tone, best_shift
 from calibrate.simulate import simulated, simulated_pixels
 from calibrate.validate.jobs import ABSENT, PrepareJob, Press, ScoreJob, prepare_job, score_job
@@ -20,6 +19,7 @@ from model.registry import stroke_models
 from sessions.messages import encode_png
 from sessions.reader import Capture
 from sessions.schemas import Stroke
+from tests.calibrate.given import CALIBRATION
 
 MODELS = stroke_models(Brush())
 ANCHOR = (60.0, 40.0)
@@ -45,23 +45,6 @@ def capture(stroke_id: str, image: np.ndarray, height_mm: float, tilt_deg: float
         anchor_mm=ANCHOR,
     )
     return Capture(stroke, encode_png(image), f"test {stroke_id}")
-
-
-CALIBRATION = Calibration(
-    session_id="test",
-    source="loopback rig",
-    recording_sha256="",
-    software="",
-    # Pixel centres on integers: pixel (0, 0) is the middle of the first 0.1 mm.
-    image_to_paper=(0.1, 0.0, 0.05, 0.0, -0.1, 79.95, 0.0, 0.0, 1.0),
-    mm_per_px=0.1,
-    mm_per_px_low=0.1,
-    mm_per_px_high=0.1,
-    rms_px=0.0,
-    corners=24,
-    corners_dropped=0,
-    preprocess={},
-)
 
 
 @dataclass(frozen=True)

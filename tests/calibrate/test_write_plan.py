@@ -18,27 +18,18 @@ from calibrate.brushfit.drag_run import DragArtefact
 from calibrate.errors import CalibrationError
 from calibrate.write_plan import Settings, plan, wanted_of
 from calibrate.write_plan_files import PICTURE, PROTOCOL, write_plan
-from calibrate.written.record import PlannedBy, load_plan
+from calibrate.written.record import load_plan
 from collect.protocols.config import WriteConfig
 from collect.protocols.loading import load_protocol
 from model.ccdbsm import Brush
 from model.characters.brush import Reach
 from model.drag import DragModel
 from model.registry import stroke_model
+from tests.calibrate.given import BY
 
 MODEL = stroke_model("ccd-bsm", Brush())
 QUICK = Settings(steps=4)
 LAG = DragModel(half_mm=0.4, half_per_mm=0.4, leash_mm=2.5, leash_per_mm=0.3, settle_mm=2.0).vector().tolist()
-BY = PlannedBy(
-    model="ccd-bsm",
-    radius_mm=6.0,
-    length_mm=48.0,
-    lam=None,
-    height_range_mm=(0.5, 20.0),
-    tilt_range_deg=(0.0, 10.0),
-    turn_deg_mm=12.0,
-    speed_mm_s=15.0,
-)
 BAR = {"strokes": ["M 100 400 L 900 400 L 900 480 L 100 480 Z"], "medians": [[[110, 440], [890, 440]]]}
 
 

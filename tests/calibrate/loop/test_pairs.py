@@ -8,7 +8,6 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from calibrate.artefact import Calibration
 from calibrate.field import Alignment, Field, Tone
 from calibrate.loop.pairs import Paired, Side, pair_up
 from calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, bootstrap, score_pairs, statistics, verdicts
@@ -18,23 +17,10 @@ from model.registry import stroke_model
 from sessions.messages import encode_png
 from sessions.reader import Capture
 from sessions.schemas import Stroke
+from tests.calibrate.given import CALIBRATION
 
 MODEL = stroke_model("ccd-bsm", Brush())
 ANCHOR, CELL = (60.0, 40.0), (30.0, 28.0, 40.0, 24.0)
-CALIBRATION = Calibration(
-    session_id="test",
-    source="loopback rig",
-    recording_sha256="",
-    software="",
-    image_to_paper=(0.1, 0.0, 0.05, 0.0, -0.1, 79.95, 0.0, 0.0, 1.0),
-    mm_per_px=0.1,
-    mm_per_px_low=0.1,
-    mm_per_px_high=0.1,
-    rms_px=0.0,
-    corners=24,
-    corners_dropped=0,
-    preprocess={},
-)
 STRICT = (Alignment.MM, Tone.BINARY)
 
 

@@ -13,22 +13,13 @@ from calibrate.field import Tone
 from calibrate.written.compare import Written
 from calibrate.written.images import drawn
 from calibrate.written.learn import MOST_MM, learned, model_of, reach_of, smoothed
-from calibrate.written.record import PlannedBy, PlanRecord, arrays, figure_record
+from calibrate.written.record import PlanRecord, arrays, figure_record
 from calibrate.written.scores import Character
 from model.characters.ink import written as ink_of
 from sessions.schemas import Header, Source
+from tests.calibrate.given import BY
 
 SIDE_MM = 48.0
-BY = PlannedBy(
-    model="ccd-bsm",
-    radius_mm=6.0,
-    length_mm=48.0,
-    lam=None,
-    height_range_mm=(0.5, 20.0),
-    tilt_range_deg=(0.0, 10.0),
-    turn_deg_mm=12.0,
-    speed_mm_s=15.0,
-)
 STROKE = np.column_stack(
     (np.linspace(12.0, 36.0, 13), np.full(13, 24.0), np.full(13, 5.0), np.full(13, 5.0), np.zeros(13))
 )

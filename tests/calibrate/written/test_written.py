@@ -9,42 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.artefact import Calibration
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.field import Alignment, Tone
 from calibrate.written.images import KEYS, Polarity, captured, drawn, laid, read_reference, similarity
-from calibrate.written.record import PlannedBy, PlanRecord, figure_record, load_plan, points_digest
+from calibrate.written.record import PlanRecord, figure_record, load_plan, points_digest
 from calibrate.written.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED, Character, score_character
 from calibrate.written.table import read_table_3, table_3
 from sessions.messages import encode_png
 from sessions.reader import Capture
 from sessions.schemas import Stroke
+from tests.calibrate.given import BY, CALIBRATION
 
 CELL = (20.0, 10.0, 60.0, 60.0)
-CALIBRATION = Calibration(
-    session_id="test",
-    source="loopback rig",
-    recording_sha256="",
-    software="",
-    image_to_paper=(0.1, 0.0, 0.05, 0.0, -0.1, 79.95, 0.0, 0.0, 1.0),
-    mm_per_px=0.1,
-    mm_per_px_low=0.1,
-    mm_per_px_high=0.1,
-    rms_px=0.0,
-    corners=24,
-    corners_dropped=0,
-    preprocess={},
-)
-BY = PlannedBy(
-    model="ccd-bsm",
-    radius_mm=6.0,
-    length_mm=48.0,
-    lam=None,
-    height_range_mm=(0.5, 20.0),
-    tilt_range_deg=(0.0, 10.0),
-    turn_deg_mm=12.0,
-    speed_mm_s=15.0,
-)
 STRICT = (Alignment.MM, Tone.BINARY, Polarity.INK)
 
 
