@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
     from collect.last_capture import LastCapture
 
+A_LINE, CHECK_WIDTH = 3, 16
+"""Checks in a line: as many as the pane of 120 columns has room for."""
+
 
 class CapturePane(Vertical):
     """One `LastCapture`."""
@@ -69,7 +72,8 @@ def capture_words(last: LastCapture) -> Content:
     else:
         if last.verdict.reason:
             lines.append(Content.styled(last.verdict.reason, "$text-warning"))
-        lines.append(Content("  ").join(_check(check) for check in last.verdict.checks))
+        checks = [_check(check) for check in last.verdict.checks]
+        lines += [Content("  ").join(checks[k : k + A_LINE]) for k in range(0, len(checks), A_LINE)]
     if last.model is not None:
         like = "" if last.likeness is None else f": CSIM {100.0 * last.likeness:.1f} % in mm"
         lines.append(Content.styled(f"CCD-BSM as published for this H and α, right{like}", "dim"))
@@ -78,4 +82,6 @@ def capture_words(last: LastCapture) -> Content:
 
 def _check(check: Check) -> Content:
     sign, style = ("✓", "") if check.passed else ("!", "bold $text-warning")
-    return Content.styled(f"{sign}\N{NO-BREAK SPACE}{check.name}\N{NO-BREAK SPACE}{check.score:.2f}", style)
+    score = f"{check.score:.2f}" if abs(check.score) < 10.0 else f"{check.score:.0f}"
+    # In columns: a line that is broken anywhere would part the sign from its check.
+    return Content.styled(f"{sign} {check.name} {score}".ljust(CHECK_WIDTH), style)

@@ -1,11 +1,12 @@
-"""Gray pictures in a terminal: half-cells that work anywhere, or textual-image's kitty and sixel where it is installed.
+"""Gray pictures in a terminal: half-cells that work anywhere, or pixels where textual-image finds that it has them.
 
 A half-cell is `▀` with its own two grays: over SSH and tmux as good as any other text.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Literal
 
 from rich.segment import Segment
@@ -15,6 +16,8 @@ from textual.containers import Container
 from textual.geometry import Size
 from textual.strip import Strip
 from textual.widget import Widget
+
+from collect.tui.sixel import SixelPicture
 
 if TYPE_CHECKING:
     import numpy as np
@@ -56,7 +59,7 @@ class CellPicture(Widget):
 
 
 class ImagePicture(Container):
-    """The same over textual-image, in pixels where the terminal has them."""
+    """The same over textual-image, in pixels by kitty's protocol."""
 
     DEFAULT_CSS = """
     ImagePicture { width: 1fr; height: 1fr; }
@@ -90,11 +93,11 @@ class Pictures:
 
     def __init__(self, kind: Kind = "cells") -> None:
         self.kind: Kind = kind
-        self._widget = _image_widget() if kind == "auto" else None
+        self._make = _pixels() if kind == "auto" else CellPicture
 
-    def make(self, id: str) -> CellPicture | ImagePicture:  # noqa: A002 - textual's name
+    def make(self, id: str) -> CellPicture | SixelPicture | ImagePicture:  # noqa: A002 - textual's name
         """A new widget."""
-        return CellPicture(id) if self._widget is None else ImagePicture(self._widget, id)
+        return self._make(id)
 
 
 def binary_picture(binary: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -104,16 +107,17 @@ def binary_picture(binary: NDArray[np.bool_]) -> NDArray[np.uint8]:
     return np.where(binary, 0, 255).astype(np.uint8)
 
 
-def _image_widget() -> type[Any] | None:
-    """textual-image's widget where it is installed and the terminal has pixels; asks the terminal, so call it early."""
+def _pixels() -> Callable[[str], CellPicture | SixelPicture | ImagePicture]:
+    """What this terminal shows best; asks it, so call it early. Half-cells where textual-image is not installed."""
     try:
-        from textual_image.renderable import Image as Chosen
-        from textual_image.renderable import SixelImage, TGPImage
-        from textual_image.widget import Image
+        from textual_image.renderable import Image, SixelImage, TGPImage
+        from textual_image.widget import TGPImage as Widget
     except (ImportError, OSError, ValueError):
         # The extra is missing, or the terminal answered its question in a way that it does not understand.
-        return None
-    return Image if Chosen in (SixelImage, TGPImage) else None
+        return CellPicture
+    if Image is SixelImage:
+        return SixelPicture
+    return partial(ImagePicture, Widget) if Image is TGPImage else CellPicture
 
 
 def _strips(image: NDArray[np.uint8] | None, size: Size) -> list[Strip]:
