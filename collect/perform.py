@@ -13,7 +13,7 @@ from collect.inking import Inking
 from collect.live import LiveView
 from collect.procedures import Procedures
 from collect.progress import Progress
-from collect.protocols.config import ProtocolConfig
+from collect.protocols.config import ProtocolConfig, WriteConfig
 from collect.protocols.plans import cell_mm
 from collect.recorder import Recorder
 from collect.rig import Rig
@@ -22,7 +22,7 @@ from collect.steps import MARKING, Result, Step, StepKind
 from collect.telemetry import Telemetry
 from collect.touch.selfcheck import partners
 from collect.wishes import Wish, Wishes
-from collect.work import capturing, choosing, dipping, looking, marking, touching
+from collect.work import capturing, choosing, dipping, looking, marking, reviewed, touching
 from collect.work.context import Bench, Job
 from collect.work.waiting import uninterrupted
 from drivers.errors import DeviceError
@@ -75,6 +75,17 @@ class Performer:
         self._bench.store.fresh_sheet()
         self._bench.known.sound_frame = None
         self._bench.progress.sheet_in(self._bench.store.state.sheet)
+
+    @property
+    def write(self) -> WriteConfig | None:
+        """How figures are drawn, where the protocol draws some."""
+        protocol = self._bench.protocol
+        return protocol if isinstance(protocol, WriteConfig) else None
+
+    @property
+    def marked_bad(self) -> bool:
+        """Whether a person has marked a capture bad that was not made again yet."""
+        return bool(reviewed.marked_bad(self._bench))
 
     async def perform(self, step: Step) -> Result:
         """Do the step once. If it is cut, the attempt is voided and its cell stays used. Raises `SheetFull` first."""
@@ -148,6 +159,8 @@ class Performer:
                 return await capturing.capture(job)
             case StepKind.CHOOSE:
                 return await choosing.choose(job)
+            case StepKind.REVIEW:
+                return await reviewed.review(job)
 
 
 def _in_words(step: Step) -> str:

@@ -9,7 +9,8 @@ from dataclasses import replace
 from collect.asking import Prompt
 from collect.last_capture import LastCapture
 from collect.protocols.adaptive import with_choice
-from collect.protocols.planned import Layout
+from collect.protocols.again import AGAIN, with_review
+from collect.protocols.planned import Layout, Planned
 from collect.protocols.plans import ProtocolConfig, planned
 from collect.sheet import Sheet
 from collect.snapshot import CellCount, Snapshot
@@ -31,6 +32,7 @@ class Progress:
         self._lock = threading.Lock()
         self._plan = planned(protocol, layout)
         self._by_index = {p.index: p for p in self._plan}
+        self._free_index = 1 + max(self._by_index, default=0)
         self._planned = Counter((p.height_mm, p.tilt_deg) for p in self._plan)
         self._done: Counter[tuple[float, float]] = Counter()
         self._at_start = 0
@@ -74,6 +76,8 @@ class Progress:
                     self._given_up += 1
                 elif line["kind"] == StepKind.CHOOSE:
                     self._chosen(line["result"])
+                elif line["kind"] == StepKind.REVIEW:
+                    self._reviewed(line["result"])
                 elif line["kind"] == StepKind.BOARD:
                     self.found[StepKind.BOARD] = line["result"]
             self._at_start = self._done.total()
@@ -105,6 +109,8 @@ class Progress:
         with self._lock:
             if step.kind is StepKind.CHOOSE:
                 self._chosen(result)
+            elif step.kind is StepKind.REVIEW:
+                self._reviewed(result)
             self.set_up = None
             if step.kind in (StepKind.BOARD, StepKind.ZERO_TOUCH, StepKind.SELF_CHECK):
                 self.found[step.kind] = result
@@ -120,9 +126,28 @@ class Progress:
 
     def _chosen(self, result: Result) -> None:
         """Take a choice of an adaptive protocol into the plan, which is the worst case until then."""
-        self._plan = with_choice(self._plan, result)
-        self._by_index = {p.index: p for p in self._plan}
-        self._planned = Counter((p.height_mm, p.tilt_deg) for p in self._plan)
+        self._planned_now(with_choice(self._plan, result))
+
+    def _reviewed(self, result: Result) -> None:
+        """What was marked bad does not count any more; it is made again."""
+        names = {str(name) for name, _ in result["again"]}
+        self._done -= Counter((p.height_mm, p.tilt_deg) for p in self._plan if p.stroke_id in names)
+        self._planned_now(with_review(self._plan, result))
+
+    def _planned_now(self, plan: list[Planned]) -> None:
+        self._plan = plan
+        self._by_index = {p.index: p for p in plan}
+        self._planned = Counter((p.height_mm, p.tilt_deg) for p in plan)
+
+    @property
+    def first_free_index(self) -> int:
+        """An index that no step of the protocol has: those of strokes that are made again begin there."""
+        return self._free_index
+
+    def made_again(self, stroke_id: str) -> Planned:
+        """The stroke that is made again in the place of that one."""
+        with self._lock:
+            return next(p for p in self._plan if p.stroke_id == f"{stroke_id}{AGAIN}")
 
     def skipped(self, step: Step) -> Result:
         """What a dip tells whose stroke is left out."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Protocol as Interface
@@ -12,6 +13,7 @@ from collect.errors import ForceTooHigh, Parked, StepError, told
 from collect.perform import Performer
 from collect.policy import Action, decide
 from collect.progress import Progress
+from collect.protocols.strokes import takes
 from collect.questions import GO_ON, STOP, question
 from collect.rig import Rig
 from collect.set_up_steps import SET_UP
@@ -64,10 +66,19 @@ class Run:
     """A person looks at what each set-up step measured before it counts."""
 
     async def protocol(self, protocol: Protocol) -> None:
-        """Power on, retreat, then every step that the journal does not hold yet."""
+        """Power on, retreat, then every step that the journal does not hold yet, then what was marked bad again."""
         self.progress.doing("power on")
         await self._willing(self.rig.robot.enable)
         await self._willing(self._recover)
+        await self._walk(protocol)
+        for number in itertools.count():
+            step = Step(StepKind.REVIEW, number)
+            if step.key not in self.store.state.done and not self.performer.marked_bad:
+                break
+            for stroke_id, _ in (await self._result(step))["again"]:
+                await self._walk(takes(self.progress.made_again(str(stroke_id)), write=self.performer.write))
+
+    async def _walk(self, protocol: Protocol) -> None:
         step = next(protocol)
         with contextlib.suppress(StopIteration):
             while True:

@@ -29,6 +29,8 @@ class StepKind(StrEnum):
     CAPTURE = "capture"
     CHOOSE = "choose"
     """Fit the brush to what is captured, and choose the next press or to stop; nothing moves."""
+    REVIEW = "review"
+    """Read which captures a person has marked bad since the strokes were made; nothing moves."""
     SELF_CHECK = "self_check"
     """An uneven triangle of marks that a mirrored, turned or stretched rig does not reproduce."""
 

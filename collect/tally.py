@@ -49,6 +49,7 @@ class Tally:
         self._lock = threading.Lock()
         self._marks: dict[Place, Mark] = {}
         self._stroke_at: dict[str, Place] = {}
+        self._cell_of: dict[str, tuple[float, float]] = {}
         self._shape = (0, 0)
         self.bad: dict[tuple[float, float], int] = {}
         """Captures by (H, alpha) that were made and did not count."""
@@ -89,6 +90,8 @@ class Tally:
                         self._marks[(int(result["sheet"]), int(cell))] = Mark.CHECK
                 case StepKind.CAPTURE:
                     self._captured(result)
+                case StepKind.REVIEW:
+                    self._reviewed(result)
                 case _:
                     pass
             if result.get("skipped"):
@@ -103,6 +106,7 @@ class Tally:
 
     def _captured(self, result: Result) -> None:
         kept = bool(result.get("kept", True))
+        self._cell_of[str(result["stroke_id"])] = (float(result["height_mm"]), float(result["tilt_deg"]))
         place = self._stroke_at.get(str(result["stroke_id"]))
         if place is not None:
             self._marks[place] = Mark.KEPT if kept else Mark.BAD
@@ -113,6 +117,14 @@ class Tally:
             self.over.add(str(result["stroke_id"]))
         elif not result.get("retake"):
             self._leave_out(result)
+
+    def _reviewed(self, result: Result) -> None:
+        """What was marked bad stays over: another stroke is made in its place."""
+        for name, _index in result["again"]:
+            stroke_id = str(name)
+            self._marks[self._stroke_at[stroke_id]] = Mark.BAD
+            cell = self._cell_of[stroke_id]
+            self.bad[cell] = self.bad.get(cell, 0) + 1
 
     def _leave_out(self, result: Result) -> None:
         cell = (float(result["height_mm"]), float(result["tilt_deg"]))

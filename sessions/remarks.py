@@ -38,6 +38,13 @@ def add_remark(folder: Path, remark: Remark) -> None:
         journal.close()
 
 
+def mark_bad_or_good(folder: Path, still: int, stroke_id: str, t_ns: int) -> bool:
+    """Say the other of bad and good about a capture, its note kept; True for bad now. Raises `SessionError`."""
+    known = remarks_of(folder).get(still, Remark(still, stroke_id))
+    add_remark(folder, Remark(still, stroke_id, not known.bad, known.note, t_ns))
+    return not known.bad
+
+
 def remarks_of(folder: Path) -> dict[int, Remark]:
     """The latest remark by still; empty where nobody said anything. Raises `SessionDamaged`."""
     path = folder / REMARKS_NAME

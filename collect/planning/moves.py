@@ -58,7 +58,7 @@ def moves_of(
             wash = config.ink.wash
             washed = [] if wash is None or step.index % wash.every_dips else wash_moves(config, wash)
             return StepMoves([*washed, *dip_moves(config)], dips=1)
-        case StepKind.CHOOSE:
+        case StepKind.CHOOSE | StepKind.REVIEW:
             return StepMoves()
         case StepKind.BOARD | StepKind.CAPTURE:
             return StepMoves([*park_moves(config)], captures=1)

@@ -30,6 +30,7 @@ from collect.tui.terminal import TerminalDriver
 from collect.tui.text import plain
 from collect.wishes import Wish
 from sessions.errors import SessionError
+from sessions.remarks import mark_bad_or_good
 
 STOP_KEYS = frozenset({"s", "ctrl+c"})
 COMMANDS = (
@@ -39,6 +40,7 @@ COMMANDS = (
     ("Skip", "Leave the stroke in hand out", "wish('SKIP')"),
     ("New sheet", "Put a new sheet in before the next stroke", "wish('NEW_SHEET')"),
     ("Jog", "Find the paper again by jog before the next stroke", "wish('JOG')"),
+    ("Last capture bad", "It does not count, and is pressed again at the end", "mark_last"),
     ("Review", "Look through the captures", "review"),
     ("Leave", "Finish the step, park, leave", "quit"),
 )
@@ -57,6 +59,7 @@ class OperatorApp(App[None]):
         Binding("k", "wish('SKIP')", "Skip"),
         Binding("n", "wish('NEW_SHEET')", "New sheet"),
         Binding("j", "wish('JOG')", "Jog"),
+        Binding("b", "mark_last", "Last capture bad"),
         Binding("v", "review", "Review"),
         Binding("question_mark", "help", "Help"),
         Binding("q", "quit", "Leave"),
@@ -117,7 +120,7 @@ class OperatorApp(App[None]):
             return self.at_work
         if action == "pause":
             return self._now is not None and self._now.state in CAN_PAUSE | CAN_RESUME
-        if action == "wish":
+        if action in ("wish", "mark_last"):
             return self.at_work
         return super().check_action(action, parameters)
 
@@ -152,6 +155,19 @@ class OperatorApp(App[None]):
         if self.engine is not None:
             self.engine.wish(Wish[name])
             self._look()
+
+    def action_mark_last(self) -> None:
+        """The newest capture is bad, or good after all; at once on disk."""
+        last = None if self._now is None else self._now.last
+        if self._now is None or last is None or not last.kept or self.screen is not self._main:
+            return
+        try:
+            bad = mark_bad_or_good(Path(self._now.folder), last.still, last.stroke_id, time.time_ns())
+        except SessionError as error:
+            self.notify(plain(str(error)), severity="error")
+            return
+        told = "marked bad: pressed again once the plan is through" if bad else "good after all"
+        self.notify(f"{last.stroke_id}: {told}")
 
     def action_help(self) -> None:
         """Every key."""

@@ -18,14 +18,14 @@ s, ctrl-c   STOP the arm now, on every screen and over every question
 space       pause before the next step, and go on
 q           leave: finishes the step, parks the arm, then leaves
 r           press the stroke in hand again, once it is photographed
+b           the last capture is bad: pressed again once the plan is through
 k           leave the stroke in hand out
 n           put a new sheet in, before the next stroke
 j           find the paper again by jog, before the next stroke
-            (r, k, n, j: the same key again takes it back)
+            (r, b, k, n, j: the same key again takes it back)
 v           look through the captures: mark, note, how alike they are
 tab         on a narrow screen: overview, last capture, camera
-ctrl-p      all commands by name, light and dark among them
-?           this page; escape closes it
+ctrl-p, ?   all commands by name, light and dark among them; this page
 
 Grid     ✓ complete   ▶ now   › next   ! had bad takes   × left out
 Sheet    · blank   ● counts   ! does not count   × burnt   △ self-check

@@ -118,7 +118,10 @@ class ReviewScreen(Screen[None]):
         """Bad, or good after all."""
         if self._seen is not None:
             note = self._seen.remark.note if self._seen.remark is not None else ""
-            self._say(bad=counts(self._seen), note=note)
+            bad = counts(self._seen)
+            self._say(bad=bad, note=note)
+            if bad and self._review.open:
+                self.notify(f"{self._seen.stroke_id}: pressed again once the plan is through")
 
     def action_note(self) -> None:
         """Type a note."""

@@ -17,6 +17,7 @@ from collect.wishes import Wish, Wishes
 from drivers.clock import HostClock
 from sessions.journal import read_lines
 from sessions.reader import Recording
+from sessions.remarks import mark_bad_or_good
 from tests.collect.conftest import Lab
 
 
@@ -105,6 +106,44 @@ def test_a_stroke_is_left_out_before_it_is_pressed_and_stays_left_out_after_a_re
     assert (now.state, now.strokes_done, now.given_up) == (State.DONE, 1, 1)
     assert len(lab.rig.world.presses) == 1
     assert sum(cell.left_out for cell in now.grid) == 1
+
+
+def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(lab: Lab) -> None:
+    lab.write_protocol("[11.0, 15.0]", "[0.0]")
+    first = engine_of(lab)
+    first.start()
+    last = until(first, lambda now: now.strokes_done == 1 and now.last is not None).last
+    assert last is not None
+    [folder] = lab.sessions.iterdir()
+    assert mark_bad_or_good(folder, last.still, last.stroke_id, 1)
+    until(first, lambda now: now.stroke == f"{last.stroke_id}-again")
+    first.park()
+    with pytest.raises(Parked):
+        first.join()
+    again = engine_of(lab)
+    again.start()
+    again.join()
+
+    now = again.snapshot()
+    assert (now.state, now.strokes_done, now.strokes_planned) == (State.DONE, 2, 2)
+    assert sum(cell.bad for cell in now.grid) == 1
+    assert len(lab.rig.world.presses) == 3 + now.voids
+    captures = {capture.stroke.stroke_id: capture.bad for capture in Recording(folder).captures()}
+    assert len(captures) == 3
+    assert {name for name, bad in captures.items() if bad} == {last.stroke_id}
+    assert f"{last.stroke_id}-again" in captures
+
+
+def test_what_is_good_after_all_is_not_pressed_again(lab: Lab) -> None:
+    lab.write_protocol("[11.0, 15.0]", "[0.0]")
+    engine = engine_of(lab)
+    engine.start()
+    last = until(engine, lambda now: now.strokes_done == 1 and now.last is not None).last
+    assert last is not None
+    [folder] = lab.sessions.iterdir()
+    assert [mark_bad_or_good(folder, last.still, last.stroke_id, n) for n in range(2)] == [True, False]
+    engine.join()
+    assert len(list(Recording(folder).captures())) == 2
 
 
 def test_a_new_sheet_is_asked_for_and_the_next_stroke_lies_on_it(lab: Lab) -> None:
