@@ -11,6 +11,8 @@ Out = Annotated[Path | None, typer.Option(help="New session folder; sessions/<fo
 Licence = Annotated[str, typer.Option(help="Licence of the photographs, kept in the recording.")]
 Origin = Annotated[str, typer.Option(help="Where they come from, kept in the recording.")]
 Brush = Annotated[str, typer.Option(help="What is known of the brush.")]
+Radius = Annotated[float | None, typer.Option(min=0.5, max=50.0, help="R of the brush; 6 where it is not told.")]
+Length = Annotated[float | None, typer.Option(min=5.0, max=500.0, help="L of the brush; 48 where it is not told.")]
 
 
 def import_sequence(
@@ -55,6 +57,8 @@ def import_scans(
     licence: Licence = "",
     origin: Origin = "",
     brush: Brush = "",
+    brush_radius_mm: Radius = None,
+    brush_length_mm: Length = None,
 ) -> None:
     """Import flatbed scans; the scale is their dpi, and a sheet is cut into strokes where the table has boxes."""
     import time
@@ -63,7 +67,7 @@ def import_scans(
     from sessions.importer import ImportOptions
     from sessions.scan import import_scans as run
 
-    options = ImportOptions(kind, None, licence, origin, brush)
+    options = ImportOptions(kind, None, licence, origin, brush, brush_radius_mm, brush_length_mm)
     target = out or Path("sessions") / folder.resolve().name
     path = run(folder, csv, target, options, f"brushloop {version('brushloop')}", time.time_ns, dpi)
     typer.echo(f"Imported into {path}")

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from sessions.cli_import import Length, Radius
+
 
 def import_(
     folder: Annotated[Path, typer.Argument(help="Folder of photographs.")],
@@ -17,6 +19,8 @@ def import_(
     licence: Annotated[str, typer.Option(help="Licence of the photographs, kept in the recording.")] = "",
     origin: Annotated[str, typer.Option(help="Where they come from, kept in the recording.")] = "",
     brush: Annotated[str, typer.Option(help="What is known of the brush.")] = "",
+    brush_radius_mm: Radius = None,
+    brush_length_mm: Length = None,
 ) -> None:
     """Turn a folder of photographs with a parameter table into a session that every later command accepts."""
     import time
@@ -24,7 +28,7 @@ def import_(
 
     from sessions.importer import ImportOptions, import_photographs
 
-    options = ImportOptions(kind, px_per_mm, licence, origin, brush)
+    options = ImportOptions(kind, px_per_mm, licence, origin, brush, brush_radius_mm, brush_length_mm)
     target = out or Path("sessions") / folder.resolve().name
     path = import_photographs(folder, csv, target, options, f"brushloop {version('brushloop')}", time.time_ns)
     typer.echo(f"Imported into {path}")

@@ -35,6 +35,9 @@ class ImportOptions:
     licence: str = ""
     origin: str = ""
     brush: str = ""
+    brush_radius_mm: float | None = None
+    """R and L of the bundle, for the models of presses; None takes the nominal brush of the paper."""
+    brush_length_mm: float | None = None
 
 
 def import_photographs(
@@ -87,6 +90,8 @@ def store_rows(
         source=Source.IMPORT,
         software=software,
         brush=options.brush,
+        brush_radius_mm=options.brush_radius_mm,
+        brush_length_mm=options.brush_length_mm,
         protocol=protocol,
         licence=options.licence,
         origin=options.origin or f"{folder.resolve().name}, {table.name}",

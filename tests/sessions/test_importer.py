@@ -35,6 +35,13 @@ def test_presses_become_a_session_like_any_other(make, photos, out, run):
     assert [path.name for path in out.parent.iterdir()] == ["from-elsewhere"]
 
 
+def test_the_brush_is_as_large_as_it_was_told_to_be(make, photos, out, run):
+    make.photographs(photos, *ROWS)
+    run(ImportOptions(kind="press", brush_radius_mm=4.0, brush_length_mm=31.0))
+    header = Recording(out).header
+    assert (header.brush_radius_mm, header.brush_length_mm) == (4.0, 31.0)
+
+
 def test_the_origin_is_the_folder_and_its_table_unless_it_is_told(make, photos, out, run):
     make.photographs(photos, *ROWS)
     run(ImportOptions())
