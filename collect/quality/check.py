@@ -60,6 +60,27 @@ def check_capture(
     return Verdict(tuple(sorted(checks, key=lambda check: list(Failure).index(check.name))))
 
 
+def check_drawing(
+    image: Gray,
+    plane: PlaneFit,
+    cell: Cell,
+    *,
+    height_mm: float,
+    limits: QualityConfig,
+    previous: Gray | None = None,
+) -> Verdict:
+    """Judge a figure, drawn down to `height_mm`, from the (h, w) photograph taken after it: exposure, blur, and whether
+    there is ink in its cell that `previous` does not show. Its shape is not judged: no two figures have one in common.
+    """
+    frame = check_frame(image, plane, limits)
+    if not frame.passed:
+        return frame
+    inked = take(image, plane.image_to_paper, cell.rect_mm, Params()).inked(limits.ink_gate)
+    if previous is not None:
+        inked = inked & ~take(previous, plane.image_to_paper, cell.rect_mm, Params()).inked(limits.ink_gate)
+    return Verdict((*frame.checks, ink_checks.blank(mm2(inked), height_mm, limits)))
+
+
 def cell_is_blank(
     image: Gray,
     plane: PlaneFit,
@@ -87,7 +108,7 @@ def _judge_ink(
     limits: QualityConfig,
 ) -> list[Check]:
     neighbour = ink_checks.neighbour(ink, limits)
-    blank = ink_checks.blank(ink, height_mm, limits)
+    blank = ink_checks.blank(ink.own_mm2, height_mm, limits)
     if not blank.passed:
         far_mm = None
         if previous is not None:

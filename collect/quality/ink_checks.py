@@ -36,11 +36,11 @@ def neighbour(ink: Ink, limits: QualityConfig) -> Check:
     return _most(Failure.NEIGHBOUR, area_mm2, "mm^2", limits.foreign_mm2, reason)
 
 
-def blank(ink: Ink, height_mm: float, limits: QualityConfig) -> Check:
+def blank(own_mm2: float, height_mm: float, limits: QualityConfig) -> Check:
     """Some ink at all."""
     least_mm2 = limits.blank_mm2_per_mm * height_mm
-    reason = f"No stroke: {ink.own_mm2:.1f} mm^2 of ink. Dip again; if the well is full, teach the touch height anew."
-    return _least(Failure.BLANK, ink.own_mm2, "mm^2", least_mm2, reason)
+    reason = f"No stroke: {own_mm2:.1f} mm^2 of ink. Dip again; if the well is full, teach the touch height anew."
+    return _least(Failure.BLANK, own_mm2, "mm^2", least_mm2, reason)
 
 
 def far_off(away_mm: float, limits: QualityConfig) -> Check:

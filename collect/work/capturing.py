@@ -7,8 +7,8 @@ import contextlib
 from collect.asking import Choice, Prompt
 from collect.errors import BadPicture, NeedsOperator, StepError
 from collect.last_capture import LastCapture, pictures_of, published_mark
-from collect.quality.check import check_capture
-from collect.quality.verdict import Family, Verdict
+from collect.quality.check import check_capture, check_drawing
+from collect.quality.verdict import Failure, Family, Verdict
 from collect.sheet import Cell
 from collect.steps import Result
 from collect.wishes import Wish
@@ -32,7 +32,7 @@ async def capture(job: Job) -> Result:
         raise StepError(f"{stroke_id} lies on another sheet than the one that is in")
     cell = bench.sheet.cell(int(job.number("cell")))
     image = await photograph(job)
-    verdict = None if job.step.params.get("drawn") else await _judged(job, image, cell)
+    verdict = await _judged(job, image, cell)
     bench.known.sound_frame = image
     if bench.asker.watched:
         await uninterrupted(_show, job, verdict, image, cell, True)
@@ -66,7 +66,7 @@ async def _judged(job: Job, image: Gray, cell: Cell) -> Verdict | None:
     if not bench.rig.config.quality.enabled:
         return None
     with job.recorder.sections.timed("judge the capture"):
-        verdict = await uninterrupted(_judge, bench, image, cell, job.number("height_mm"))
+        verdict = await uninterrupted(_judge, job, image, cell)
     checks = tuple(
         Check(name=c.name, score=c.score, threshold=c.threshold, passed=c.passed, reason=c.reason)
         for c in verdict.checks
@@ -75,20 +75,30 @@ async def _judged(job: Job, image: Gray, cell: Cell) -> Verdict | None:
     job.recorder.quality(Quality(stroke_id=stroke_id, checks=checks), job.attempt.serial)
     if verdict.cause is not None:
         bench.progress.log(f"{stroke_id}: {verdict.reason}", warning=True)
-        if verdict.cause.name.family is Family.PICTURE:
+        # A camera that is late shows the cell as it was: look once more before a whole figure is drawn again.
+        late = verdict.cause.name is Failure.BLANK and _drawn(job) and job.attempt.attempt == 1
+        if verdict.cause.name.family is Family.PICTURE or late:
             raise BadPicture(verdict.cause.reason)
     return verdict
 
 
-def _judge(bench: Bench, image: Gray, cell: Cell, height_mm: float) -> Verdict:
-    config = bench.rig.config
+def _drawn(job: Job) -> bool:
+    return bool(job.step.params.get("drawn"))
+
+
+def _judge(job: Job, image: Gray, cell: Cell) -> Verdict:
+    bench, height_mm = job.bench, job.number("height_mm")
+    config, previous = bench.rig.config, bench.known.sound_frame
+    if _drawn(job):
+        plane = image_plane(bench, image)
+        return check_drawing(image, plane, cell, height_mm=height_mm, limits=config.quality, previous=previous)
     return check_capture(
         image,
         image_plane(bench, image),
         cell,
         height_mm=height_mm,
         limits=config.quality,
-        previous=bench.known.sound_frame,
+        previous=previous,
         sheet_mm=config.paper.size_mm,
     )
 
@@ -116,7 +126,7 @@ def _show(job: Job, verdict: Verdict | None, image: Gray, cell: Cell, kept: bool
     height_mm, tilt_deg = job.number("height_mm"), job.number("tilt_deg")
     brush = job.bench.rig.config.brush
     sizes = {"radius_mm": brush.radius_mm, "length_mm": brush.length_mm}
-    model = None if job.step.params.get("drawn") else published_mark(height_mm, tilt_deg, **sizes)
+    model = None if _drawn(job) else published_mark(height_mm, tilt_deg, **sizes)
     job.bench.progress.show(LastCapture(stroke_id, height_mm, tilt_deg, still, kept, verdict, photo, binary, model))
 
 
@@ -138,7 +148,7 @@ def _cut_out(bench: Bench, image: Gray, cell: Cell) -> Gray:
 def _stroke(job: Job, cell: Cell) -> Stroke:
     return Stroke(
         stroke_id=str(job.step.params["stroke_id"]),
-        kind="drag" if job.step.params.get("drawn") else "press",
+        kind="drag" if _drawn(job) else "press",
         still=job.attempt.serial,
         height_mm=job.number("height_mm"),
         tilt_deg=job.number("tilt_deg"),

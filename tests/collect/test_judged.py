@@ -6,10 +6,14 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
 from collect.errors import CollectAborted, NeedsOperator
+from collect.quality.check import check_drawing
+from collect.quality.verdict import Verdict
 from collect.states import State
+from collect.work import capturing
 from drivers.sim.flaws import Flaw
 from sessions.journal import replay
 from sessions.reader import Recording
@@ -17,6 +21,7 @@ from sessions.reader import Recording
 if TYPE_CHECKING:
     from conftest import Lab
 
+    from calibrate.preprocess import Gray
     from collect.engine import Engine
     from collect.snapshot import Snapshot
 
@@ -115,3 +120,34 @@ def test_saying_no_to_real_hardware_leaves_it_as_it_is(sharp_lab: Lab, monkeypat
     with pytest.raises(CollectAborted, match="nothing moved"):
         answered(engine, "x", over=lambda now: now.state in (State.STOPPED, State.FAILED))
     assert sharp_lab.rig.arcs.mode == "PowerOff"
+
+
+FIGURE = """kind = "write"
+cell_mm = [60.0, 60.0]
+[[figures]]
+name = "bar"
+[[figures.strokes]]
+points = [[15.0, 30.0, 5.0, 0.0, 0.0], [40.0, 30.0, 5.0, 0.0, 0.0]]
+"""
+
+
+@pytest.mark.parametrize(("blank", "drawings"), [(0, 1), (1, 1), (2, 2)])
+def test_a_figure_without_ink_is_looked_at_again_and_then_drawn_again(
+    sharp_lab: Lab, monkeypatch: pytest.MonkeyPatch, blank: int, drawings: int
+) -> None:
+    """`blank` photographs show the cell as it was before: a camera that is late."""
+    (sharp_lab.folder / "protocol.toml").write_text(FIGURE, encoding="utf-8")
+    left = [blank]
+
+    def late(image: Gray, *rest: object, **more: object) -> Verdict:
+        left[0] -= 1
+        return check_drawing(np.full_like(image, 200) if left[0] >= 0 else image, *rest, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(capturing, "check_drawing", late)
+    engine = sharp_lab.engine()
+    run(engine)
+    now = engine.snapshot()
+    assert (now.state, now.strokes_done, now.given_up) == (State.DONE, 1, 0)
+    assert used(sharp_lab) == drawings
+    [folder] = sharp_lab.sessions.iterdir()
+    assert [capture.stroke.stroke_id for capture in Recording(folder).captures()] == ["bar-r01"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from calibrate.scale import PlaneFit
-from collect.quality.check import cell_is_blank, check_capture, check_frame
+from collect.quality.check import cell_is_blank, check_capture, check_drawing, check_frame
 from collect.quality.config import QualityConfig
 from collect.quality.picture import blur_px, glare, paper_level
 from collect.quality.verdict import Failure, Family
@@ -42,9 +44,9 @@ def stroke(image: Gray, x_mm: float, y_mm: float, length_mm: float = 18.0, level
     return image
 
 
-@given(sigma=st.floats(0.8, 4.0), contrast=st.integers(40, 200))
+@given(sigma=st.floats(0.8, 4.0), contrast=st.integers(80, 200))
 @settings(max_examples=15, deadline=None)
-def test_blur_is_measured_whatever_the_contrast(sigma: float, contrast: int) -> None:
+def test_blur_is_measured_whatever_the_contrast_of_the_ink(sigma: float, contrast: int) -> None:
     sharp = np.full((400, 400), 220, np.uint8)
     sharp[:, 200:] -= np.uint8(contrast)
     sharp[:200, :100] -= np.uint8(contrast)
@@ -123,6 +125,20 @@ def test_a_mark_at_the_edge_of_the_frame_is_cut_and_nothing_else_is_said_of_it()
     assert verdict.cause is not None
     assert verdict.cause.name is Failure.CUT
     assert {check.name.family for check in verdict.checks} == {Family.PICTURE}
+
+
+def test_a_figure_is_sound_where_its_cell_has_new_ink_and_blank_where_it_has_none() -> None:
+    before = stroke(paper(seed=1), 50.0, 27.0)
+    drawn = stroke(stroke(paper(), 50.0, 27.0), 52.0, 22.0)
+    judge = partial(check_drawing, plane=plane(), cell=CELL, height_mm=5.0, limits=LIMITS)
+    assert judge(drawn, previous=before).passed
+    late = judge(stroke(paper(), 50.0, 27.0), previous=before)
+    assert late.cause is not None
+    assert late.cause.name is Failure.BLANK
+    assert judge(paper()).cause == judge(paper(), previous=paper(seed=1)).cause
+    dark = judge(np.asarray(drawn * 0.2, np.uint8))
+    assert dark.cause is not None
+    assert dark.cause.name is Failure.EXPOSURE
 
 
 def test_a_cell_that_is_not_wholly_seen_is_not_called_blank() -> None:
