@@ -31,8 +31,9 @@ types: $(STAMP)
 bench: $(STAMP)  ## every bench, one JSON object a line
 	$(BIN)/python -m bench --json
 
-soak: $(STAMP)  ## long kill and load loops
+soak: $(STAMP)  ## long kill and load loops, and property tests on new examples
 	$(BIN)/python -m pytest -m soak --timeout 3600
+	$(BIN)/python -m pytest --hypothesis-profile search
 
 clean:
 	rm -rf $(VENV) demo-run .pytest_cache .ruff_cache .hypothesis .import_linter_cache

@@ -8,6 +8,12 @@ import time
 from collections.abc import AsyncIterator, Iterator
 
 import pytest
+from hypothesis import settings
+
+# The same examples every time, so that a failure is that of the change; `make soak` looks for new ones.
+settings.register_profile("same", derandomize=True)
+settings.register_profile("search", derandomize=False)
+settings.load_profile("same")
 
 TOLERATED = ("asyncio_", "pytest_timeout", "ThreadPoolExecutor", "tqdm", "fsspecIO")
 """Pools that live as long as their loop or process; nothing of ours is called that."""
