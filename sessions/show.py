@@ -13,6 +13,7 @@ from sessions.errors import InputError
 from sessions.journal import JOURNAL_NAME, Replay, read_lines, replay
 from sessions.lines import Line
 from sessions.reader import Recording
+from sessions.remarks import remarks_of
 from sessions.schemas import Header, Stroke, Topic
 from sessions.store import counts_of, read_header
 
@@ -66,6 +67,8 @@ class Details:
     next: str = ""
     """The step that was being done when the last process ended; empty where none was."""
     strokes: int = 0
+    """That count: kept by the run, and not marked bad since."""
+    marked_bad: int = 0
     planned: int | None = None
     grid: list[GridCell] = field(default_factory=list[GridCell])
     sheets: list[Sheet] = field(default_factory=list[Sheet])
@@ -112,9 +115,12 @@ def _of_journal(folder: Path) -> Details:
     told.segments = [_segment(folder, line) for line in state.segments]
     used = {sheet for sheet, _cell in state.used_cells} | {state.sheet}
     told.sheets = [Sheet(n + 1, sorted(cell for sheet, cell in state.used_cells if sheet == n)) for n in sorted(used)]
-    presses = [_commanded(line, lines) for line in state.segments if Topic.STROKE in line["counts"]]
-    told.strokes = sum(line["counts"].get(Topic.STROKE, 0) for line in state.segments)
-    told.grid = _grid(presses, header)
+    with_stroke = [line for line in state.segments if Topic.STROKE in line["counts"]]
+    bad = {remark.still for remark in remarks_of(folder).values() if remark.bad}
+    counted = [line for line in with_stroke if line["result"].get("still") not in bad]
+    told.marked_bad = len(with_stroke) - len(counted)
+    told.strokes = sum(line["counts"].get(Topic.STROKE, 0) for line in counted)
+    told.grid = _grid([_commanded(line, lines) for line in counted], header)
     told.planned = sum(cell.planned or 0 for cell in told.grid) if _protocol(header) else None
     told.repairs = [f"{line['event']} {line['file']}: {line.get('why', '')}" for line in state.repairs]
     final = folder / f"{folder.name}.mcap"
@@ -173,11 +179,13 @@ def _commanded(line: Line, lines: list[Line]) -> Stroke:
 def _protocol(header: Header) -> dict[str, Any]:
     """The grid's protocol as it was recorded; empty where the recording was made by other means."""
     try:
-        protocol = json.loads(header.protocol)
-        known = isinstance(protocol, dict) and protocol.keys() >= {"heights_mm", "tilts_deg", "repeats"}
+        told: Any = json.loads(header.protocol)
     except ValueError:
         return {}
-    return protocol if known else {}  # pyright: ignore[reportUnknownVariableType]
+    protocol: dict[str, Any] = dict(told) if isinstance(told, dict) else {}  # pyright: ignore[reportUnknownArgumentType]
+    # An adaptive one presses what it needs, not the whole grid that it chooses from.
+    is_grid = protocol.get("kind", "grid") == "grid" and protocol.keys() >= {"heights_mm", "tilts_deg", "repeats"}
+    return protocol if is_grid else {}
 
 
 def _grid(strokes: list[Stroke], header: Header) -> list[GridCell]:

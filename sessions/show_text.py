@@ -30,7 +30,8 @@ def _facts(told: Details) -> Table:
     table = Table(show_header=False, box=None)
     table.add_row("session", f"[bold]{escape(told.session_id)}[/bold], {told.state}, {escape(told.source)}")
     of = f" of {told.planned} planned" if told.planned else ""
-    table.add_row("strokes", f"{told.strokes}{of}")
+    bad = f", and {told.marked_bad} marked bad" if told.marked_bad else ""
+    table.add_row("strokes", f"{told.strokes}{of}{bad}")
     steps = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in told.finished.items())
     if told.finished or told.void:
         table.add_row("steps", escape(f"finished: {steps or 'none'}; cut: {len(told.void)}"))

@@ -205,9 +205,10 @@ def _row_content(row: Summary) -> Content:
 def standing_content(told: Details) -> Content:
     """What is finished, what is void, what comes next."""
     planned = "" if told.planned is None else f" of {told.planned}"
+    bad = f", {told.marked_bad} marked bad" if told.marked_bad else ""
     parts = [
         Content.assemble((told.session_id, "bold"), f"  {told.state}\n{told.source}"),
-        Content.assemble(("Finished  ", "dim"), (f"{told.strokes}{planned} strokes", "bold")),
+        Content.assemble(("Finished  ", "dim"), (f"{told.strokes}{planned} strokes", "bold"), bad),
     ]
     if told.void:
         parts.append(Content.assemble(("Void      ", "dim"), (f"{len(told.void)} cut short", "bold $text-warning")))

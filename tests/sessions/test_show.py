@@ -7,6 +7,7 @@ from typer.testing import CliRunner
 
 from sessions.cli import app
 from sessions.errors import InputError
+from sessions.remarks import mark_bad_or_good
 from sessions.show import GridCell, Sheet, details
 from sessions.show_text import ranges
 from sessions.store import SessionStore
@@ -29,7 +30,7 @@ def press(make, store, stroke_id, height_mm, cell):
     attempt = store.begin(f"capture {stroke_id}", "capture", cell=None, notes={"params": params})
     attempt.writer.write(make.still(attempt.serial))
     attempt.writer.write(make.stroke(attempt.serial, stroke_id=stroke_id, height_mm=height_mm, tilt_deg=5.0))
-    store.done(attempt, {"stroke_id": stroke_id, "height_mm": height_mm, "tilt_deg": 5.0})
+    store.done(attempt, {"stroke_id": stroke_id, "height_mm": height_mm, "tilt_deg": 5.0, "still": attempt.serial})
 
 
 @pytest.fixture
@@ -56,6 +57,16 @@ def test_an_open_session_tells_what_is_done_cut_and_next(collected):
     assert told.sheets == [Sheet(1, [0, 1, 2]), Sheet(2, [0])]
     assert told.devices["robot"] == "aubo_i5"
     assert [segment.messages for segment in told.segments[:2]] == [{}, {"/camera/still": 1, "/stroke": 1}]
+
+
+def test_what_is_marked_bad_is_told_apart_from_what_counts(collected):
+    [first, _] = [line["result"]["still"] for line in collected.state.segments if line["kind"] == "capture"]
+    assert mark_bad_or_good(collected.folder, first, "H13-a5-r01", 1)
+    told = details(collected.folder)
+    assert (told.strokes, told.marked_bad) == (1, 1)
+    assert told.grid == [GridCell(13.0, 5.0, 0, 2), GridCell(15.0, 5.0, 1, 2)]
+    ran = CliRunner(env={"COLUMNS": "160"}).invoke(app, ["show", str(collected.folder)])
+    assert "1 of 4 planned, and 1 marked bad" in ran.output
 
 
 def test_a_closed_session_and_its_file_agree(collected):
