@@ -5,6 +5,7 @@ Imports wait for what is asked: the screen is up first.
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from sessions.verify import Verdict
 
 RECENT = 50
+COLUMNS = 68
+"""Of what commands say: as wide as the finish page is on a terminal of 80."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +102,9 @@ def verified(folder: Path) -> Verdict:
 
 
 def run_command(name: str, folder: Path) -> tuple[int, str]:
-    """`brushloop NAME FOLDER` in a process of its own: (exit code, what it said). May take minutes."""
-    ran = subprocess.run(
-        [sys.executable, "-m", "brushloop", name, str(folder)], capture_output=True, text=True, check=False
-    )
-    return ran.returncode, (ran.stdout + ran.stderr).strip()
+    """`brushloop NAME FOLDER` in a process of its own: (exit code, what it said; how far it got only where it failed).
+    May take minutes."""
+    command = [sys.executable, "-m", "brushloop", name, str(folder)]
+    fits = os.environ | {"COLUMNS": str(COLUMNS)}
+    ran = subprocess.run(command, capture_output=True, text=True, check=False, env=fits)
+    return ran.returncode, (ran.stdout if ran.returncode == 0 else ran.stdout + ran.stderr).strip()

@@ -17,7 +17,7 @@ from dataclasses import replace
 from collect.arming import arm
 from collect.asking import Asker
 from collect.config import RigConfig
-from collect.errors import CollectAborted, Parked, told
+from collect.errors import CollectAborted, Parked, rest_is_unknown, told
 from collect.live import LiveView, watching
 from collect.perform import Performer
 from collect.planning.walk import layout_of, sheet_of, steps_on
@@ -85,6 +85,7 @@ class Engine:
         self._stop_wanted = False
         self._pause_wanted = False
         self._stop_failure: DeviceError | None = None
+        self._rest_unknown = False
         self._closing = False
         self._thread = threading.Thread(target=self._run_thread, name="engine", daemon=True)
         self._outcome: concurrent.futures.Future[None] = concurrent.futures.Future()
@@ -119,6 +120,7 @@ class Engine:
             self._progress.snapshot(self._state, tip_mm, force_n, self._asker.prompt),
             target_mm=self._telemetry.target_mm,
             parked=self._parked(),
+            rest_unknown=self._rest_unknown,
             trace_n=self._telemetry.trace_n(),
             picture=self._telemetry.picture,
             wishes=self._wishes.open,
@@ -127,7 +129,7 @@ class Engine:
 
     def _parked(self) -> bool:
         tip_mm, motion = self._telemetry.tip_mm, self._rig_config.motion
-        return tip_mm is not None and math.dist(tip_mm, motion.park_mm) < PARKED_MM
+        return not self._rest_unknown and tip_mm is not None and math.dist(tip_mm, motion.park_mm) < PARKED_MM
 
     def _set_up(self) -> tuple[SetUpStep, ...]:
         if not self._guided or self._progress.strokes_begun:
@@ -214,6 +216,7 @@ class Engine:
             self._end(State.STOPPED, told(error))
             raise
         except Exception as error:
+            self._rest_unknown = rest_is_unknown(error)
             self._end(State.FAILED, told(error))
             raise
         finally:
@@ -227,6 +230,7 @@ class Engine:
             await self._stopper
         if self._stop_failure is not None and not isinstance(self._stop_failure, NotConnected):
             # Never told as stopped: the arm was not seen at rest.
+            self._rest_unknown = True
             self._end(State.FAILED, told(self._stop_failure))
             raise self._stop_failure
         self._end(State.STOPPED, "stopped by the operator")

@@ -16,6 +16,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar
 
+from drivers.errors import DeviceError, LimitExceeded, MotionRefused, NotConnected, RobotNotSafe
+
 
 class ConfigError(Exception):
     """A configuration cannot be used; nothing was powered and nothing moved."""
@@ -79,6 +81,12 @@ class CollectAborted(Exception):
 
 class Parked(CollectAborted):
     """Ended between two steps because that was asked for, with the arm lifted and parked."""
+
+
+def rest_is_unknown(error: BaseException | None) -> bool:
+    """Whether after this error nobody knows that the arm rests: it was lost, or did not answer the stop."""
+    known = RobotNotSafe | LimitExceeded | MotionRefused | NotConnected
+    return isinstance(error, DeviceError) and error.device == "robot" and not isinstance(error, known)
 
 
 def told(error: BaseException) -> str:

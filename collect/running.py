@@ -48,7 +48,7 @@ class Control(Interface):
         ...
 
 
-KEEP_SHEET = Choice("k", "keep the one that is in")
+KEEP_SHEET = Choice("o", "keep the old one in")
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +154,7 @@ class Run:
 
     async def _touch_again(self, step: Step) -> None:
         """Zero touch by jog between two strokes; where it fails, the plane stays as it was."""
-        touch = Step(StepKind.ZERO_TOUCH, step.index + 1, {"method": "jog"})
+        touch = Step(StepKind.ZERO_TOUCH, step.index + 1, {"method": "jog", "between_strokes": True})
         try:
             await self.performer.perform(touch)
         except StepError as error:
@@ -172,15 +172,20 @@ class Run:
 
     async def _ask(self, step: Step | None, error: StepError | DeviceError) -> None:
         """Let a person decide; raises `error` again where the answer is to stop."""
+        in_order = False
         if not isinstance(error, MotionError | RpcError | ForceTooHigh):
             with contextlib.suppress(StepError, DeviceError):
                 await self._recover()  # a person is about to reach under the arm
+                in_order = True
         self.control.move_to(State.ASKING)
         self.progress.doing("wait for an answer")
         asked = question(error, self.store.state.sheet)
         answer = await self.asker.ask(asked)
-        self.progress.log(f"{asked.question} -> {answer}")
+        meant = next(choice.label for choice in asked.choices if choice.key == answer)
+        self.progress.log(f"{asked.question} -> {meant}")
         if answer == STOP.key:
+            if in_order:
+                raise Parked(f"stopped at a question, parked: {told(error)}") from error
             raise error
         self.performer.answered(error)
         if isinstance(error, MotionError) and step is not None:

@@ -104,6 +104,10 @@ def _touch(result: Result, config: RigConfig) -> tuple[Fact, ...]:
         span_mm, limit_mm = float(point["span_mm"]), touch.repeatability_mm
         facts.append(Fact(where, f"{point['z_mm']:.3f} mm", "", None))
         facts.append(Fact("  its touches span", f"{span_mm:.3f} mm", f"at most {limit_mm:g}", span_mm <= limit_mm))
+    if method != "taught" and "moved_mm" in result:
+        moved_mm = float(result["moved_mm"])
+        near = abs(moved_mm) <= touch.moved_mm
+        facts.append(Fact("from the height before", f"{moved_mm:+.3f} mm", f"at most {touch.moved_mm:g}", near))
     residuals = [abs(float(r)) for r in result["residuals_mm"]]
     if len(residuals) > 3:
         worst_mm = max(residuals)

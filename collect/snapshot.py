@@ -75,6 +75,8 @@ class Snapshot:
     """Where the arm was last sent."""
     parked: bool = False
     """Whether the tip was last seen at the park position."""
+    rest_unknown: bool = False
+    """The run is over, and nobody knows that the arm rests."""
     trace_n: tuple[float, ...] = ()
     """Peaks of the force by tenth of a second, oldest first."""
     picture: Picture | None = None

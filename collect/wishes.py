@@ -14,6 +14,11 @@ class Wish(StrEnum):
     NEW_SHEET = "put a new sheet in"
     JOG = "find the paper again by jog"
 
+    @property
+    def short(self) -> str:
+        """Its key's name."""
+        return self.name.lower().replace("_", " ")
+
 
 class Wishes:
     """Asked for from any thread, granted by the engine's."""

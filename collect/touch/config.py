@@ -84,6 +84,8 @@ class TouchConfig(Config):
     """The approach begins so far above the expected height: more than its error."""
     travel_mm: Annotated[float, Field(gt=0.0, le=20.0)] = 2.0
     """The approach ends so far below it: nothing was touched."""
+    moved_mm: Positive = 0.5
+    """A height that is measured so far from the one before is doubtful: whoever sets up is told."""
     lean_deg: Annotated[float, Field(ge=0.0, le=3.0)] = 1.0
     """The sheet may lean so much: what is not known of a height far from the last touch widens the approach."""
     points_mm: Annotated[list[tuple[Finite, Finite]], Field(max_length=25)] = Field(

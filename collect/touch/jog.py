@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 
 from collect.asking import Asker, Choice, Prompt
 from collect.errors import StepError
@@ -11,29 +12,50 @@ from collect.touch.config import JogTouchConfig
 from collect.touch.reach import Reach
 from collect.touch.results import Touch
 
-NextJog = Callable[[float], Awaitable[float | None]]
-"""Told where the tip is above the expected height, in mm; the step to make, up being positive, or None: it touches."""
+
+@dataclass(frozen=True, slots=True)
+class Jogged:
+    """Where the tip is, for the operator."""
+
+    above_mm: float
+    """Above the expected height."""
+    lowest: bool
+    """At the end of the travel: nothing lower is allowed."""
+    number: int
+    """Of the touch, from 1."""
+    of: int
+    """Touches of this point and of all others."""
+
+
+NextJog = Callable[[Jogged], Awaitable[float | None]]
+"""The step to make, up being positive, or None: it touches."""
 ROUNDING_MM = 1e-6
 
 
 async def touch_by_jog(
-    arm: TouchArm, at_mm: tuple[float, float], reach: Reach, config: JogTouchConfig, next_jog: NextJog
+    arm: TouchArm,
+    at_mm: tuple[float, float],
+    reach: Reach,
+    config: JogTouchConfig,
+    next_jog: NextJog,
+    number: int = 1,
+    of: int = 1,
 ) -> Touch:
-    """One touch; the brush is left where the operator stopped.
+    """Touch `number` of `of`; the brush is left where the operator stopped.
 
     A step that would go below the travel limit, or above where the jog began, is shortened to it. Raises `StepError`
-    where the operator asks for more at the lower limit, and for a step of a size that the configuration does not have.
+    for a step of a size that the configuration does not have.
     """
     z_mm = reach.start_z_mm
-    rests_mm = await arm.to(*at_mm, z_mm)
-    while (step_mm := await next_jog(rests_mm - reach.expected_z_mm)) is not None:
+    while True:
+        rests_mm = await arm.to(*at_mm, z_mm)
+        lowest = z_mm <= reach.lowest_z_mm + ROUNDING_MM
+        step_mm = await next_jog(Jogged(rests_mm - reach.expected_z_mm, lowest, number, of))
+        if step_mm is None:
+            return Touch(*at_mm, rests_mm)
         if all(abs(abs(step_mm) - size) > ROUNDING_MM for size in config.steps_mm):
             raise StepError(f"a jog of {step_mm:g} mm is none of {', '.join(f'{s:g}' for s in config.steps_mm)} mm")
-        if step_mm < 0.0 and z_mm <= reach.lowest_z_mm + ROUNDING_MM:
-            raise StepError(f"nothing was touched down to {reach.lowest_z_mm:.2f} mm, the end of the travel")
         z_mm = min(max(z_mm + step_mm, reach.lowest_z_mm), reach.start_z_mm)
-        rests_mm = await arm.to(*at_mm, z_mm)
-    return Touch(*at_mm, rests_mm)
 
 
 def asked(asker: Asker, config: JogTouchConfig) -> NextJog:
@@ -43,11 +65,19 @@ def asked(asker: Asker, config: JogTouchConfig) -> NextJog:
     choices = (
         *(Choice(key, f"{'down' if step < 0 else 'up'} {abs(step):g} mm") for key, step in keys.items()),
         Choice("t", "the tip just touches"),
+        Choice("x", "give up: the height stays as it was"),
     )
 
-    async def next_jog(above_mm: float) -> float | None:
-        question = f"Jog until the tip just touches the paper. It is {above_mm:+.2f} mm from the expected height."
-        key = await asker.ask(Prompt(question, choices, "t"))
+    async def next_jog(at: Jogged) -> float | None:
+        question = (
+            f"Touch {at.number} of {at.of}. Jog until the tip just touches the paper. "
+            f"It is {at.above_mm:+.2f} mm from the expected height."
+        )
+        if at.lowest:
+            question += " This is the end of the travel: if nothing touches, give up, and mend touch_z_mm in rig.toml."
+        key = await asker.ask(Prompt(question, choices, "x"))
+        if key == "x":
+            raise StepError(f"the operator gave up at touch {at.number} of {at.of}")
         return keys.get(key)
 
     return next_jog

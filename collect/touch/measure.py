@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 from collect.errors import StepError
@@ -26,13 +27,20 @@ class TouchHands(Hands, Protocol):
 
 
 async def measure_plane(
-    rig: Rig, hands: TouchHands, config: TouchConfig, *, tap: ForceTap | None = None, next_jog: NextJog | None = None
+    rig: Rig,
+    hands: TouchHands,
+    config: TouchConfig,
+    *,
+    tap: ForceTap | None = None,
+    next_jog: NextJog | None = None,
+    tell: Callable[[str], None] = lambda _words: None,
 ) -> PlaneResult:
     """Touch as configured and fit the plane. The arm begins and ends at travel height.
 
     `tap` must be handed every sample of the force sensor; without one it listens to the sensor itself. `next_jog` is
-    the operator. The force must have been set to zero with nothing touching. Raises `StepError`, with the figures,
-    where nothing is touched, touches do not repeat, or the points do not lie in a plane; the brush is lifted then too.
+    the operator, `tell` says how far it is. The force must have been set to zero with nothing touching. Raises
+    `StepError`, with the figures, where nothing is touched, touches do not repeat, or the points do not lie in a plane;
+    the brush is lifted then too.
     """
     if config.method == "taught":
         return await _taught(rig, hands)
@@ -43,7 +51,7 @@ async def measure_plane(
             case "camera":
                 return through(await FirstInkTouch(rig, hands, arm, config).measure(points_mm), config)
             case "force":
-                return through(await _by_force(rig, arm, config, points_mm, tap), config)
+                return through(await _by_force(rig, arm, config, points_mm, tap, tell), config)
             case "jog":
                 if next_jog is None:
                     raise StepError("zero touch by jog needs an operator at a screen")
@@ -56,7 +64,12 @@ async def _taught(rig: Rig, hands: TouchHands) -> PlaneResult:
 
 
 async def _by_force(
-    rig: Rig, arm: TouchArm, config: TouchConfig, points_mm: list[tuple[float, float]], tap: ForceTap | None
+    rig: Rig,
+    arm: TouchArm,
+    config: TouchConfig,
+    points_mm: list[tuple[float, float]],
+    tap: ForceTap | None,
+    tell: Callable[[str], None],
 ) -> list[PointTouches]:
     if rig.force is None:
         raise StepError("zero touch by force needs a force sensor: [force] is missing")
@@ -70,7 +83,8 @@ async def _by_force(
             await arm.over(*point)
             await arm.near(*point, reach.start_z_mm)
             probe = RigProbe(arm, heard, rig.clock, point, config.force)
-            for _ in range(config.touches):
+            for number in range(config.touches):
+                tell(f"point {len(found) + 1} of {len(points_mm)}, touch {number + 1} of {config.touches}")
                 contact = await touch_by_force(probe, reach, config.force, near_z_mm)
                 near_z_mm = contact.z_mm
                 touches.append(Touch(*point, contact.z_mm, contact.sigma_mm))
@@ -91,7 +105,11 @@ async def _by_jog(
         reach = known.reach(*point)
         await arm.over(*point)
         await arm.near(*point, reach.start_z_mm)
-        touches = [await touch_by_jog(arm, point, reach, config.jog, next_jog) for _ in range(config.touches)]
+        touches = list[Touch]()
+        for _ in range(config.touches):
+            number = len(found) * config.touches + len(touches) + 1
+            of = len(points_mm) * config.touches
+            touches.append(await touch_by_jog(arm, point, reach, config.jog, next_jog, number, of))
         await arm.lift()
         found.append(at_one_point(touches, config))
         known.add(*found[-1].mean)

@@ -18,9 +18,9 @@ from collect.desk import Desk
 from collect.errors import ConfigError
 from collect.headless import REFRESH_S, RunnableEngine
 from collect.snapshot import Snapshot
-from collect.states import FINAL
+from collect.states import FINAL, State
 from collect.tui.ask import AskScreen
-from collect.tui.confirm import AT_WORK, AT_WORK_KEYS, NOT_PARKED, NOT_PARKED_KEYS, Confirm
+from collect.tui.confirm import AT_WORK, AT_WORK_KEYS, NOT_AT_REST, NOT_PARKED, NOT_PARKED_KEYS, Confirm
 from collect.tui.help import HelpScreen
 from collect.tui.pictures import Pictures
 from collect.tui.run import CAN_PAUSE, CAN_RESUME, RunScreen
@@ -32,6 +32,8 @@ from collect.wishes import Wish
 from sessions.errors import SessionError
 from sessions.remarks import mark_bad_or_good
 
+BOUNCE_S = 0.7
+"""After an answer, letters that ask a run for something are not heard: a key pressed twice would be a request."""
 STOP_KEYS = frozenset({"s", "ctrl+c"})
 COMMANDS = (
     ("Stop the arm now", "A software stop; the red button is the emergency stop", "stop"),
@@ -83,6 +85,7 @@ class OperatorApp(App[None]):
         self._main: RunScreen | SetUpScreen | None = None
         self._leave = threading.Event()
         self._leave_when_over = False
+        self._deaf_until_s = 0.0
 
     def on_mount(self) -> None:
         """Look now, then at 10 Hz."""
@@ -122,6 +125,8 @@ class OperatorApp(App[None]):
             return self._now is not None and self._now.state in CAN_PAUSE | CAN_RESUME
         if action in ("wish", "mark_last"):
             return self.at_work
+        if action == "review":
+            return self._now is not None and bool(self._now.folder)
         return super().check_action(action, parameters)
 
     def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
@@ -152,7 +157,7 @@ class OperatorApp(App[None]):
 
     def action_wish(self, name: str) -> None:
         """Ask the engine for something, or take it back."""
-        if self.engine is not None:
+        if self.engine is not None and self._now_s() >= self._deaf_until_s:
             self.engine.wish(Wish[name])
             self._look()
 
@@ -186,6 +191,10 @@ class OperatorApp(App[None]):
         now = self._now
         if now is None:
             self.exit()
+        elif now.state is State.STOPPING:
+            self.notify("The arm is being stopped. The red button, if it moves on.", severity="warning")
+        elif now.rest_unknown:
+            self.push_screen(Confirm(NOT_AT_REST, NOT_PARKED_KEYS), self._leave_answered)
         elif now.state not in FINAL:
             self.push_screen(Confirm(AT_WORK, AT_WORK_KEYS), self._park_answered)
         elif now.parked or now.target_mm is None:
@@ -209,6 +218,8 @@ class OperatorApp(App[None]):
             return
         while len(self.screen_stack) > 2:
             self.pop_screen()
+        if self._now is not None and self._now.rest_unknown and isinstance(self.screen, StartScreen):
+            self.screen.trouble("The arm was not seen at rest when the run ended. Use the emergency stop if it moves.")
         self._main = self._now = None
         self._leave_when_over = False
 
@@ -274,10 +285,13 @@ class OperatorApp(App[None]):
         self._ask(self._now)
         if self._now.state is not before.state:
             self.refresh_bindings()
+            if self._now.state in FINAL | {State.STOPPING} and isinstance(self.screen, Confirm):
+                self.pop_screen()  # what it asks about is over
         if self._leave_when_over and self._now.state in FINAL:
-            if isinstance(self.screen, Confirm):
-                self.pop_screen()
-            self._away()
+            if self._now.rest_unknown:
+                self._leave_when_over = False  # that has to be read first
+            else:
+                self._away()
 
     def _ask(self, now: Snapshot) -> None:
         prompt = None if isinstance(self._main, SetUpScreen) else now.prompt
@@ -288,5 +302,6 @@ class OperatorApp(App[None]):
             return
         if shown is not None and shown is self.screen:
             self.pop_screen()
+            self._deaf_until_s = self._now_s() + BOUNCE_S
         if prompt is not None and self.engine is not None and not isinstance(self.screen, Confirm | AskScreen):
             self.push_screen(AskScreen(prompt, self.engine, self._pictures, self._now_s))

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import ClassVar
 
 from textual import events
 from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
 from textual.containers import Vertical
 from textual.content import Content
 from textual.screen import ModalScreen
@@ -19,7 +21,8 @@ from collect.tui.line import Line
 from collect.tui.pictures import Pictures
 from collect.tui.text import plain
 
-STOP_LINE = "s  stop the arm now (software stop; the red button is the emergency stop)"
+LEAVE_LINE = "q  leave: park the arm, answer nothing"
+STOP_LINE = "s  stop the arm now: software stop; red button: emergency stop"
 
 
 class AskScreen(ModalScreen[None]):
@@ -35,6 +38,11 @@ class AskScreen(ModalScreen[None]):
     AskScreen #cause { height: 9; margin-bottom: 1; }
     AskScreen #left { color: $text-muted; }
     """
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("q", "app.quit", "Leave"),
+        Binding("question_mark", "app.help", "Help"),
+    ]
 
     def __init__(
         self, prompt: Prompt, engine: EngineView, pictures: Pictures, now_s: Callable[[], float] = time.monotonic
@@ -56,6 +64,7 @@ class AskScreen(ModalScreen[None]):
                 picture.show(self.prompt.image)
                 yield picture
             yield Static(choices_content(self.prompt), markup=False)
+            yield Static(LEAVE_LINE, markup=False)
             yield Static(STOP_LINE, markup=False)
             yield self._left
 

@@ -16,6 +16,10 @@ NOT_PARKED = (
     "The arm is not parked: it rests where it was stopped, perhaps with the brush down. "
     "The next run begins by lifting it. Leave it so?"
 )
+NOT_AT_REST = (
+    "The arm was not seen at rest: it may still be moving. Use the emergency stop, the red button. "
+    "Leave this screen all the same?"
+)
 NOT_PARKED_KEYS = "y  leave it so      n  stay"
 
 

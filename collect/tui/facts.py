@@ -63,6 +63,6 @@ def target_text(now: Snapshot) -> str:
 
 def _force(now: Snapshot, room: int) -> str:
     if now.force_n is None:
-        return "no force sensor, or silent"
+        return "not measured now" if now.state in FINAL else "no force sensor, or silent"
     told = f"{now.force_n:6.3f} N  "
     return told + spark(now.trace_n, max(0, min(room - len(told), 60)))

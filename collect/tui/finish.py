@@ -21,7 +21,7 @@ from sessions.errors import SessionError
 if TYPE_CHECKING:
     from sessions.verify import Verdict
 
-TAIL = 12
+MOST_LINES = 400
 
 
 class FinishScreen(ModalScreen[None]):
@@ -37,6 +37,7 @@ class FinishScreen(ModalScreen[None]):
     """
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("c", "command('calibrate')", "Calibrate"),
+        Binding("t", "command('fit')", "Fit the brush"),
         Binding("w", "command('validate')", "Report"),
         Binding("escape,q", "close", "Back"),
     ]
@@ -84,9 +85,11 @@ class FinishScreen(ModalScreen[None]):
             code, said = await asyncio.to_thread(run_command, name, self._folder)
         finally:
             self._busy = False
-        tail = "\n".join(plain(said).splitlines()[-TAIL:])
+        tail = "\n".join(plain(said).splitlines()[-MOST_LINES:])
         sign = "✓ done" if code == 0 else f"! exit code {code}"
-        self._said.show(f"$ brushloop {name} {self._folder}\n{sign}\n{tail}")
+        self._said.show(f"$ brushloop {name} {self._folder}\n{tail}\n{sign}")
+        # The end tells where the report lies; what was above can be scrolled to.
+        self.call_after_refresh(self.query_one(VerticalScroll).scroll_end, animate=False)
 
     def _next_content(self) -> Content:
         if self._open:
@@ -97,6 +100,8 @@ class FinishScreen(ModalScreen[None]):
         return Content.assemble(
             ("c", "bold $text-accent"),
             f"  brushloop calibrate {self._folder}\n",
+            ("t", "bold $text-accent"),
+            f"  brushloop fit {self._folder}\n",
             ("w", "bold $text-accent"),
             f"  brushloop validate {self._folder}      (the report)\n",
             ("escape", "bold $text-accent"),

@@ -18,12 +18,13 @@ RUN_KEYS: tuple[Key, ...] = (
     ("space", "pause"),
     ("q", "leave"),
     ("?", "help"),
+    ("tab", "pane"),
+    ("v", "review"),
     ("r", "retake"),
     ("k", "skip"),
     ("n", "new sheet"),
     ("j", "jog"),
-    ("v", "review"),
-    ("tab", "pane"),
+    ("b", "bad"),
     ("ctrl-p", "commands"),
 )
 

@@ -20,10 +20,10 @@ from textual.widgets.option_list import Option
 from collect.reviewing import Looked, Review, Seen, counts
 from collect.tui.finish import FinishScreen
 from collect.tui.host import host
-from collect.tui.keys import KeyBar
+from collect.tui.keys import STOP_KEY, KeyBar
 from collect.tui.line import Line
 from collect.tui.pictures import Pictures, binary_picture
-from collect.tui.text import one_line, plain
+from collect.tui.text import SOFTWARE_STOP, one_line, plain
 from sessions.errors import SessionError
 from sessions.remarks import Remark, add_remark
 
@@ -35,6 +35,8 @@ KEYS = (
     ("f", "finish"),
     ("?", "help"),
 )
+
+KEYS_S = 0.5
 
 
 class ReviewScreen(Screen[None]):
@@ -51,6 +53,8 @@ class ReviewScreen(Screen[None]):
     ReviewScreen #review-photo { margin-right: 1; }
     ReviewScreen #note-line { height: 1; border: none; padding: 0 1; display: none; }
     ReviewScreen.-noting #note-line { display: block; }
+    ReviewScreen #at-work { height: 1; padding: 0 1; display: none; background: $warning; color: $text; }
+    ReviewScreen.-at-work #at-work { display: block; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape", "back", "Back"),
@@ -80,11 +84,13 @@ class ReviewScreen(Screen[None]):
         self._title, self._words = Line("review-title"), Line("words")
         self._options = OptionList(id="captures", markup=False)
         self._photo, self._binary = pictures.make("review-photo"), pictures.make("review-binary")
+        self._keys, self._stop_note = KeyBar(KEYS), Line("at-work")
         self._note = Input(placeholder="note, enter keeps it, escape leaves it", id="note-line", compact=True)
 
     def compose(self) -> ComposeResult:
         """The list, the pictures, the keys."""
         yield self._title
+        yield self._stop_note
         with Horizontal(id="review-body"):
             yield self._options
             with Vertical(id="looked"):
@@ -93,11 +99,13 @@ class ReviewScreen(Screen[None]):
                     yield self._photo
                     yield self._binary
         yield self._note
-        yield KeyBar(KEYS)
+        yield self._keys
 
     def on_mount(self) -> None:
         """List the captures, by cell and then by name."""
         self._list(0)
+        self._show_keys()
+        self.set_interval(KEYS_S, self._show_keys)
 
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
         """Show the capture under the cursor."""
@@ -105,6 +113,13 @@ class ReviewScreen(Screen[None]):
         self._looked = None
         self._show_words()
         self._load(self._seen)
+
+    def _show_keys(self) -> None:
+        """While a run is on, how to stop it; notes and the finish wait."""
+        at_work = self._at_work()
+        self._keys.show((STOP_KEY, *(pair for pair in KEYS if pair[0] not in ("o", "f"))) if at_work else KEYS)
+        self._stop_note.show(f"The arm is at work. {SOFTWARE_STOP}" if at_work else "")
+        self.set_class(at_work, "-at-work")
 
     def action_back(self) -> None:
         """Leave the note, or the screen."""
@@ -116,7 +131,9 @@ class ReviewScreen(Screen[None]):
 
     def action_mark(self) -> None:
         """Bad, or good after all."""
-        if self._seen is not None:
+        if self._seen is not None and not self._seen.kept:
+            self.notify(f"{self._seen.stroke_id}: the run did not count it; there is nothing to mark.")
+        elif self._seen is not None:
             note = self._seen.remark.note if self._seen.remark is not None else ""
             bad = counts(self._seen)
             self._say(bad=bad, note=note)

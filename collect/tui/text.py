@@ -5,6 +5,8 @@ from __future__ import annotations
 FULL, EMPTY = "█", "░"
 SOFTWARE_STOP = "s is a software stop. The red button is the emergency stop."
 
+SHORT_STOP = "s: software stop; red button: emergency stop"
+
 
 def plain(text: str) -> str:
     """The text without characters that a terminal would act on; a device's reply may hold an escape sequence."""

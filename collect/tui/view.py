@@ -15,7 +15,7 @@ from collect.tui.grid import LEGEND, Grid
 from collect.tui.line import Line
 from collect.tui.pictures import Pictures
 from collect.tui.sheet import sheet_content, sheet_title
-from collect.tui.text import SOFTWARE_STOP, one_line, plain
+from collect.tui.text import SHORT_STOP, SOFTWARE_STOP, one_line, plain
 from collect.tui.trace import plot
 
 OVER = "Over: q leaves"
@@ -196,6 +196,9 @@ def note_content(now: Snapshot) -> Content:
     """What was asked for by key and waits, and what the stop key is."""
     if now.state in FINAL:
         return Content.assemble((f" {OVER} ", "bold reverse"), f"  {SOFTWARE_STOP}")
+    if now.state is State.STOPPING:
+        return Content.styled(" not seen at rest yet: the red button, if it moves on ", "bold reverse")
     if now.wishes:
-        return Content.assemble((f" asked: {'; '.join(now.wishes)} ", "bold reverse"), f"  {SOFTWARE_STOP}")
+        asked = ", ".join(wish.short for wish in now.wishes)
+        return Content.assemble((f" asked: {asked} ", "bold reverse"), f" {SHORT_STOP}")
     return Content(SOFTWARE_STOP)

@@ -18,7 +18,7 @@ from collect.work.looking import Gray, image_plane, photograph
 from collect.work.waiting import uninterrupted
 from sessions.schemas import Check, Quality, Stroke
 
-KEEP, AGAIN, SKIP = Choice("k", "keep it"), Choice("r", "press it again"), Choice("n", "go on without it")
+KEEP, AGAIN, SKIP = Choice("g", "good all the same: it counts"), Choice("r", "press it again"), Choice("k", "skip it")
 PICTURE_MARGIN_PX = 40
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
+from collect.asking import Choice, Prompt
 from collect.errors import ConfigError, StepError
 from collect.plane import PaperPlane
 from collect.planning.limits import check_poses
@@ -35,12 +36,31 @@ async def zero_touch(job: Job) -> Result:
         config = TouchConfig.model_validate(config.model_dump() | {"method": method})
     found = await _measured(job, config)
     await _check_plane(job, found.plane)
+    moved_mm = _moved_mm(found, bench.procedures.plane)
+    if found.method != "taught":
+        bench.progress.log(f"zero touch by {found.method}: the paper lies {moved_mm:+.2f} mm from where it was before")
+    if job.step.params.get("between_strokes"):
+        await _accepted(job, moved_mm)
     bench.procedures.plane = found.plane
     origin_mm, quaternion = found.plane.frame(rig.config.paper)
     job.recorder.frames([Transform("base", "paper", origin_mm, quaternion)])
     if (optics := rig.config.camera.optics) is not None:
         job.recorder.optics(optics)
-    return found.as_dict()
+    return {**found.as_dict(), "moved_mm": moved_mm}
+
+
+def _moved_mm(found: PlaneResult, before: PaperPlane) -> float:
+    """How far the paper was found above where it was thought to lie, at the touched point where that is most."""
+    away = [point.mean[2] - before.touch_z_mm(point.mean[0], point.mean[1]) for point in found.points]
+    return max(away, key=abs)
+
+
+async def _accepted(job: Job, moved_mm: float) -> None:
+    """A person looks before strokes are pressed from another height than those before. Raises `StepError`."""
+    words = f"The paper was found {moved_mm:+.2f} mm from where it was. Strokes from here on are pressed from there."
+    choices = (Choice("g", "good, go on from the new height"), Choice("k", "keep the height as it was"))
+    if await job.bench.asker.ask(Prompt(words, choices, "k")) != "g":
+        raise StepError("what was found was not taken.")
 
 
 async def touch(job: Job) -> Result:
@@ -97,7 +117,12 @@ async def _measured(job: Job, config: TouchConfig) -> PlaneResult:
     tap = ForceTap()
     with job.guard.also(tap.take):
         jog = asked(bench.asker, config.jog)
-        return await job.guard.guarded(measure_plane(bench.rig, _Hands(job), config, tap=tap, next_jog=jog))
+
+        def tell(words: str) -> None:
+            bench.progress.doing(f"zero touch by {config.method}: {words}")
+
+        measured = measure_plane(bench.rig, _Hands(job), config, tap=tap, next_jog=jog, tell=tell)
+        return await job.guard.guarded(measured)
 
 
 async def _check_plane(job: Job, plane: PaperPlane) -> None:

@@ -80,7 +80,7 @@ def test_a_stroke_that_fails_every_time_is_given_up_where_nobody_watches(sharp_l
 def test_an_operator_who_watches_may_keep_it(sharp_lab: Lab) -> None:
     sharp_lab.rig.world.flaws.update(dict.fromkeys(range(20), (Flaw.SPLIT, 1.0)))
     engine = sharp_lab.engine(watched=True)
-    [question] = answered(engine, "k", over=lambda now: now.state is State.DONE)
+    [question] = answered(engine, "g", over=lambda now: now.state is State.DONE)
     assert question.startswith("H13-a0-r01: ")
     assert (engine.snapshot().strokes_done, engine.snapshot().given_up) == (1, 0)
 

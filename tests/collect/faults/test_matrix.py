@@ -216,6 +216,8 @@ def test_a_fault_in_a_phase_ends_as_the_table_says(stage: Stage, name: str, phas
     assert type(ended) is (expected.error or type(None)), repr(ended)
     assert not isinstance(ended, DeviceError) or ended.device == expected.device
     assert ("may still be moving. Use the emergency stop" in now.error) is expected.alarm, now.error
+    assert now.rest_unknown or not expected.alarm
+    assert not (now.rest_unknown and now.parked)
     if isinstance(ended, RobotNotSafe):
         assert ended.remedy in now.error
         assert stage.rig.arcs.safety != SafetyMode.NORMAL, "nothing is ever cleared automatically"

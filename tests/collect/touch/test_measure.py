@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from collect.asking import Asker
 from collect.errors import NeedsOperator, StepError
 from collect.touch.config import TouchConfig
-from collect.touch.jog import asked
+from collect.touch.jog import Jogged, asked
 from collect.touch.measure import measure_plane
 from collect.touch.results import PlaneResult
 from drivers.samples import Pose
@@ -164,7 +164,7 @@ class Operator:
         self._bench = bench
         self.asked = 0
 
-    async def __call__(self, above_mm: float) -> float | None:
+    async def __call__(self, at: Jogged) -> float | None:
         self.asked += 1
         table, tip = self._bench.sim.table, self._bench.target
         gap_mm = table.above_mm(*self._bench.world.to_paper(tip.x_mm, tip.y_mm), tip.z_mm)
@@ -181,16 +181,32 @@ async def test_the_operator_jogs_until_it_touches(make_bench: MakeBench) -> None
     assert bench.lifted
 
 
-@pytest.mark.parametrize(("step_mm", "why"), [(-1.0, "nothing was touched down to 118.00"), (-5.0, "none of 0.02")])
-async def test_a_jog_ends_at_the_travel_limit(make_bench: MakeBench, step_mm: float, why: str) -> None:
+async def test_a_jog_ends_at_the_travel_limit_and_says_so(make_bench: MakeBench) -> None:
     bench = make_bench(paper_z_mm=110.0)
+    seen: list[Jogged] = []
 
-    async def down(above_mm: float) -> float | None:
-        assert above_mm >= -2.0
-        return step_mm
+    async def down(at: Jogged) -> float | None:
+        seen.append(at)
+        if len(seen) == 20:
+            raise StepError("given up")
+        return -1.0
 
-    with pytest.raises(StepError, match=why):
+    with pytest.raises(StepError, match="given up"):
         await measure_plane(bench.rig, bench.hands, TouchConfig(method="jog"), next_jog=down)
+    assert min(at.above_mm for at in seen) == pytest.approx(-2.0)
+    assert [at.lowest for at in seen] == [at.above_mm < -1.99 for at in seen]
+    assert {(at.number, at.of) for at in seen} == {(1, 3)}
+    assert bench.lifted
+
+
+async def test_a_jog_of_a_size_that_is_not_configured_is_refused(make_bench: MakeBench) -> None:
+    bench = make_bench()
+
+    async def far(_at: Jogged) -> float | None:
+        return -5.0
+
+    with pytest.raises(StepError, match=r"none of 0\.02"):
+        await measure_plane(bench.rig, bench.hands, TouchConfig(method="jog"), next_jog=far)
     assert bench.lifted
 
 

@@ -123,8 +123,8 @@ def full_picture(**changes: Any) -> Snapshot:
 
 SPLIT = Prompt(
     "H15-a5-r01: The tip is split by 0.42 mm. Comb the brush.",
-    (Choice("k", "keep it"), Choice("r", "press it again"), Choice("n", "go on without it")),
-    "n",
+    (Choice("g", "good all the same: it counts"), Choice("r", "press it again"), Choice("k", "skip it")),
+    "k",
     timeout_s=120.0,
     image=capture(kept=False).photo,
     number=3,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from dataclasses import replace
 
 import pytest
 from textual.pilot import Pilot
@@ -130,7 +131,9 @@ async def test_wishes_are_passed_on_and_shown_until_they_are_granted() -> None:
             assert "asked" not in await look(app, pilot)
             await pilot.press(key)
             assert engine.calls == [f"wish {wish}"]
-            assert f"asked: {engine.now.wishes[0]}" in await look(app, pilot)
+            text = await look(app, pilot)
+            assert f"asked: {engine.now.wishes[0].short}" in text
+            assert "red button: emergency stop" in text
 
 
 async def test_no_focus_keeps_a_key_for_itself() -> None:
@@ -171,17 +174,54 @@ async def test_y_parks_the_arm_and_leaves_only_then() -> None:
     assert app.return_code == 0
 
 
-async def test_the_run_is_watched_on_under_the_question() -> None:
+async def test_a_run_that_ends_takes_the_question_whether_to_leave_it_along() -> None:
     engine = FakeEngine(picture())
     app = OperatorApp(engine)
     async with app.run_test() as pilot:
         await look(app, pilot)
         await pilot.press("q")
         engine.now = FAILED
-        await look(app, pilot)
-        assert isinstance(app.screen, Confirm)
-        await pilot.press("n")
         assert "FAILED" in await look(app, pilot)
+        assert not isinstance(app.screen, Confirm)
+
+
+async def test_while_the_arm_is_being_stopped_q_asks_nothing_and_the_red_button_is_named() -> None:
+    engine = FakeEngine(picture(state=State.STOPPING))
+    app = OperatorApp(engine)
+    async with app.run_test(size=(80, 24)) as pilot:
+        assert "not seen at rest yet: the red button" in await look(app, pilot)
+        await pilot.press("q")
+        assert not isinstance(app.screen, Confirm)
+        assert engine.calls == []
+
+
+async def test_an_arm_that_was_not_seen_at_rest_is_never_said_to_rest() -> None:
+    engine = FakeEngine(replace(FAILED, rest_unknown=True, parked=False, target_mm=(0.0, 0.0, 0.0)))
+    app = OperatorApp(engine)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await look(app, pilot)
+        await pilot.press("q")
+        text = await look(app, pilot)
+        assert "may still be moving" in text
+        assert "it rests where" not in text
+        await pilot.press("y")
+        assert not app.is_running
+
+
+async def test_a_key_that_bounces_after_an_answer_asks_for_nothing() -> None:
+    now_s = [100.0]
+    engine = FakeEngine(picture(state=State.ASKING, prompt=SPLIT))
+    app = OperatorApp(engine, now_s=lambda: now_s[0])
+    async with app.run_test(size=(80, 24)) as pilot:
+        await look(app, pilot)
+        await pilot.press("k")
+        engine.now = picture()
+        await look(app, pilot)
+        await pilot.press("k")
+        assert [call for call in engine.calls if call.startswith("wish")] == []
+        now_s[0] += 1.0
+        await pilot.press("k")
+        assert engine.calls[-1] == "wish SKIP"
 
 
 @pytest.mark.parametrize("state", sorted(FINAL))

@@ -10,6 +10,7 @@ from collect.asking import Choice, Prompt
 from collect.states import State
 from collect.tui.app import OperatorApp
 from collect.tui.ask import AskScreen
+from collect.tui.confirm import Confirm
 from collect.tui.set_up import SetUpScreen
 from tests.collect.tui.fake import SET_UP, SPLIT, TOUCHED, FakeEngine, picture
 from tests.collect.tui.test_app import look
@@ -32,8 +33,20 @@ async def test_a_key_answers_the_question_that_is_shown(engine: FakeEngine) -> N
     async with app.run_test(size=(80, 24)) as pilot:
         assert "Waits until it is answered" in await look(app, pilot)
         assert isinstance(app.screen, AskScreen)
-        await pilot.press("q", "z", "g")
+        await pilot.press("z", "g")
         assert [call for call in engine.calls if call.startswith("answer")] == ["answer 7 g"]
+
+
+async def test_q_over_a_question_leaves_it_unanswered_and_parks(engine: FakeEngine) -> None:
+    app = OperatorApp(engine)
+    async with app.run_test(size=(80, 24)) as pilot:
+        assert "q  leave: park the arm" in await look(app, pilot)
+        await pilot.press("q")
+        assert isinstance(app.screen, Confirm)
+        await pilot.press("n")
+        assert isinstance(app.screen, AskScreen)
+        await pilot.press("q", "y")
+        assert engine.calls == ["park"]
 
 
 async def test_the_question_goes_when_it_is_over_and_the_next_one_comes(engine: FakeEngine) -> None:
@@ -53,7 +66,7 @@ async def test_a_bad_stroke_is_shown_with_its_picture_its_default_and_the_time_t
     app = OperatorApp(engine, now_s=lambda: now_s[0])
     async with app.run_test(size=(80, 24)) as pilot:
         text = await look(app, pilot)
-        for part in ("The tip is split", "▀", "n  go on without it   (if nobody answers)", "110 s left"):
+        for part in ("The tip is split", "▀", "k  skip it   (if nobody answers)", "110 s left"):
             assert part in text
         now_s[0] = 1100.0
         assert "20 s left" in await look(app, pilot)

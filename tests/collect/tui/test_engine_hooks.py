@@ -167,10 +167,33 @@ def test_the_paper_is_found_again_by_jog_between_two_strokes(lab: Lab) -> None:
     for _ in range(3):  # touches at one point, which must agree
         answer(engine, "+2.00 mm", "1")
         answer(engine, "+1.00 mm", "t")
+    answer(engine, "found +1.", "g")
     engine.join()
     assert engine.snapshot().strokes_done == 1
+    assert any("the paper lies +1." in line for line in engine.snapshot().messages)
     methods = [line["result"]["method"] for line in lines(lab, "done") if line["kind"] == "zero_touch"]  # type: ignore[index]
     assert methods == ["taught", "jog"]
+
+
+def test_a_height_that_is_not_taken_and_a_jog_that_is_given_up_leave_the_paper_where_it_was(lab: Lab) -> None:
+    lab.write_protocol("[11.0, 15.0]", "[0.0]")
+    engine = engine_of(lab)
+    engine.wish(Wish.JOG)
+    engine.start()
+    for number in range(1, 4):
+        answer(engine, f"Touch {number} of 3.", "t")
+    answer(engine, "found +2.", "k")
+    engine.wish(Wish.JOG)
+    answer(engine, "Touch 1 of 3.", "x")
+    engine.join()
+    now = engine.snapshot()
+    assert now.strokes_done == 2
+    methods = [line["result"]["method"] for line in lines(lab, "done") if line["kind"] == "zero_touch"]  # type: ignore[index]
+    assert methods == ["taught"]
+    assert [str(line["why"]) for line in lines(lab, "void") if "void" in line["event"]][-2:] == [
+        "what was found was not taken.",
+        "the operator gave up at touch 1 of 3",
+    ]
 
 
 def test_park_ends_the_run_after_the_step_with_the_arm_at_its_place(lab: Lab) -> None:

@@ -57,7 +57,7 @@ class Operator:
         asked = screen.prompt if isinstance(screen, AskScreen) else None
         if asked is None or SPLIT in asked.question:
             return
-        for words, key in (("keep it", "k"), ("try again", "g")):
+        for words, key in (("it counts", "g"), ("try again", "g")):
             if words in str(asked.choices):
                 await self.press(key)
                 await self.pilot.pause(0.2)

@@ -138,7 +138,10 @@ async def test_no_note_is_typed_while_the_arm_is_at_work(tmp_path: Path) -> None
         review = a_review(tmp_path)
         review._at_work = lambda: app.at_work
         app.push_screen(review)
-        await ready(app, pilot)
+        text = await ready(app, pilot)
+        for words in ("The arm is at work", "red button", "s STOP"):
+            assert words in text
+        assert "o note" not in text
         await pilot.press("o", "s")
         assert engine.calls == ["stop"]
         assert not review.has_class("-noting")
