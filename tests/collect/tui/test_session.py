@@ -89,7 +89,7 @@ retakes = 0
 
 [touch]
 method = "force"
-touches = 2
+touches = 1
 
 [touch.force]
 sigma_mm = 0.1
@@ -102,7 +102,7 @@ enabled = true
 @pytest.fixture
 def lab(tmp_path: Path) -> Iterator[Lab]:
     """A camera sharp enough to judge by, and a force sensor that may have to wait for the rest of this process."""
-    with serving(SimConfig(rate=20.0, view=View(fps=3.0))) as rig:
+    with serving(SimConfig(rate=20.0, view=View(fps=5.0))) as rig:
         text = rig.toml().replace("latency_ms = 250.0", "latency_ms = 1500.0")
         text = text.replace("stale_ms = 1000.0", "stale_ms = 2000.0\nbias_s = 0.25")
         (tmp_path / "rig.toml").write_text(text + MEASURED, encoding="utf-8")
