@@ -38,6 +38,8 @@ KEYS = (
     ("q", "leave"),
     ("ctrl-p", "commands"),
 )
+TYPING_KEYS = (("enter", "use these files"), ("tab", "the other file"), ("escape", "back, as they were"))
+UNASKED = Content.styled("Rig health: d asks every device; powers nothing, moves nothing", "dim")
 WELCOME = (
     "No session yet.\n\nn starts one: the set-up looks through the camera, finds the paper, and asks "
     "you about each measurement; then the strokes follow.\n\nd asks every device of the rig whether it is well. "
@@ -79,6 +81,7 @@ class StartScreen(Screen[None]):
         self._title, self._standing = Line("start-title"), Line("standing-text")
         self._health, self._trouble = Line("health-text"), Line("trouble")
         self._options = OptionList(id="sessions", markup=False)
+        self._keys = KeyBar(KEYS)
         paths = desk.paths
         self._config = Input(str(paths.config), id="config", compact=True, select_on_focus=False)
         self._protocol = Input(str(paths.protocol), id="protocol", compact=True, select_on_focus=False)
@@ -98,13 +101,13 @@ class StartScreen(Screen[None]):
             yield Line("protocol-label")
             yield self._protocol
         yield self._trouble
-        yield KeyBar(KEYS)
+        yield self._keys
 
     def on_mount(self) -> None:
         """Look what there is."""
         self.query_one("#rig-label", Line).show("rig")
         self.query_one("#protocol-label", Line).show("protocol")
-        self._health.show(Content.styled("Rig health: d asks every device; powers nothing, moves nothing", "dim"))
+        self._health.show(UNASKED)
         self.reread()
 
     def on_screen_resume(self) -> None:
@@ -145,17 +148,25 @@ class StartScreen(Screen[None]):
             self._look(row.session_id)
 
     def on_input_submitted(self, _event: Input.Submitted) -> None:
-        """Back to the list with the files that were typed."""
+        """Back to the list with the files that were typed; what was said of others is gone."""
         self._choose()
-        self.action_list()
+        self._health.show(UNASKED)
+        self.trouble("")
+        self._to_list()
 
     def action_list(self) -> None:
-        """Focus on the sessions."""
-        self._options.focus()
+        """Focus on the sessions; files that were being typed are as before."""
+        self._config.value, self._protocol.value = str(self._desk.paths.config), str(self._desk.paths.protocol)
+        self._to_list()
 
     def action_files(self) -> None:
         """Type other files."""
+        self._keys.show(TYPING_KEYS)
         self._config.focus()
+
+    def _to_list(self) -> None:
+        self._keys.show(KEYS)
+        self._options.focus()
 
     @work(exclusive=True, group="new")
     async def action_new(self) -> None:

@@ -106,10 +106,13 @@ def _judge(job: Job, image: Gray, cell: Cell) -> Verdict:
 async def _decide(job: Job, verdict: Verdict, image: Gray, cell: Cell) -> tuple[bool, bool]:
     """(kept, retake): again while takes are left, then a person decides; unwatched, the stroke is given up."""
     bench = job.bench
-    if int(job.step.params.get("take") or 1) <= bench.rig.config.quality.retakes:
+    take = int(job.step.params.get("take") or 1)
+    if take <= bench.rig.config.quality.retakes:
         return False, True
     stroke_id = str(job.step.params["stroke_id"])
-    prompt = Prompt(f"{stroke_id}: {verdict.reason}", (KEEP, AGAIN, SKIP), SKIP.key, image=_cut_out(bench, image, cell))
+    prompt = Prompt(
+        f"{stroke_id}, take {take}: {verdict.reason}", (KEEP, AGAIN, SKIP), SKIP.key, image=_cut_out(bench, image, cell)
+    )
     try:
         answer = await bench.asker.ask(prompt)
     except NeedsOperator:

@@ -81,7 +81,7 @@ def test_an_operator_who_watches_may_keep_it(sharp_lab: Lab) -> None:
     sharp_lab.rig.world.flaws.update(dict.fromkeys(range(20), (Flaw.SPLIT, 1.0)))
     engine = sharp_lab.engine(watched=True)
     [question] = answered(engine, "g", over=lambda now: now.state is State.DONE)
-    assert question.startswith("H13-a0-r01: ")
+    assert question.startswith("H13-a0-r01, take 3: ")
     assert (engine.snapshot().strokes_done, engine.snapshot().given_up) == (1, 0)
 
 

@@ -102,6 +102,22 @@ async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
         assert isinstance(app.screen, StartScreen)
 
 
+async def test_escape_leaves_the_files_as_they_were() -> None:
+    desk = FakeDesk()
+    app = OperatorApp(desk=desk)
+    async with app.run_test(size=(80, 24)) as pilot:
+        before = desk.paths
+        await ready(app, pilot)
+        await pilot.press("e", *"xx")
+        assert "escape back, as they were" in await ready(app, pilot)
+        await pilot.press("escape")
+        text = await ready(app, pilot)
+        assert str(before.config) in text
+        assert f"{before.config}xx" not in text
+        assert "q leave" in text
+        assert desk.paths == before
+
+
 async def test_marks_and_notes_are_kept_beside_the_recording(tmp_path: Path) -> None:
     app = OperatorApp(desk=FakeDesk())
     async with app.run_test(size=(120, 40)) as pilot:
