@@ -17,6 +17,7 @@ from dataclasses import replace
 from collect.arming import arm
 from collect.asking import Asker
 from collect.config import RigConfig
+from collect.control import RunControl
 from collect.errors import CollectAborted, Parked, rest_is_unknown, told
 from collect.live import LiveView, watching
 from collect.perform import Performer
@@ -29,7 +30,7 @@ from collect.running import Run
 from collect.set_up_steps import SetUpStep
 from collect.setting_up import board_first, listed
 from collect.snapshot import Snapshot
-from collect.states import FINAL, State, check_transition
+from collect.states import State
 from collect.telemetry import NotedRobot, Telemetry
 from collect.wishes import Wish, Wishes
 from collect.work.waiting import uninterrupted
@@ -74,19 +75,12 @@ class Engine:
         self._preview = preview
         self._telemetry = Telemetry()
         self._wishes = Wishes()
-        self._park_wanted = False
-        self._state = State.IDLE
-        self._lock = threading.Lock()
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._control = RunControl(self._progress.doing)
         self._task: asyncio.Task[None] | None = None
         self._stopper: asyncio.Task[None] | None = None
-        self._go_on = asyncio.Event()
         self._rig: Rig | None = None
-        self._stop_wanted = False
-        self._pause_wanted = False
         self._stop_failure: DeviceError | None = None
         self._rest_unknown = False
-        self._closing = False
         self._thread = threading.Thread(target=self._run_thread, name="engine", daemon=True)
         self._outcome: concurrent.futures.Future[None] = concurrent.futures.Future()
 
@@ -117,7 +111,7 @@ class Engine:
         if force_n is not None:
             self._telemetry.note_force(force_n, self._clock.now_ns())
         return replace(
-            self._progress.snapshot(self._state, tip_mm, force_n, self._asker.prompt),
+            self._progress.snapshot(self._control.state, tip_mm, force_n, self._asker.prompt),
             target_mm=self._telemetry.target_mm,
             parked=self._parked(),
             rest_unknown=self._rest_unknown,
@@ -142,11 +136,8 @@ class Engine:
 
     def park(self) -> None:
         """End the run after this step, the arm lifted and parked; nobody is asked any more. From any thread."""
-        with self._lock:
-            self._park_wanted = True
-            self._asker.abandon()
-            if self._loop is not None and self._state not in FINAL:
-                self._loop.call_soon_threadsafe(self._go_on.set)
+        self._control.park()
+        self._asker.abandon()
 
     def answer(self, number: int, key: str) -> bool:
         """Answer the prompt of that number; False where it is over. From any thread."""
@@ -154,35 +145,21 @@ class Engine:
 
     def pause(self) -> None:
         """Pause before the next step."""
-        with self._lock:
-            self._pause_wanted = True
-            if self._state == State.RUNNING:
-                self._set(State.PAUSING)
+        self._control.pause()
 
     def resume(self) -> None:
         """Go on after a pause, or forget one that has not begun."""
-        with self._lock:
-            self._pause_wanted = False
-            if self._state == State.PAUSING:
-                self._set(State.RUNNING)
-            if self._loop is not None and self._state not in FINAL:
-                self._loop.call_soon_threadsafe(self._go_on.set)
+        self._control.resume()
 
     def stop(self) -> None:
         """Stop the arm now and end the run; from any thread, in any state, any number of times."""
-        with self._lock:
-            self._stop_wanted = True
-            if self._loop is None or self._state in FINAL:
-                return
-            if self._state != State.STOPPING and not self._closing:
-                self._set(State.STOPPING)
-            self._loop.call_soon_threadsafe(self._stop_now)
+        self._control.stop(self._stop_now)
 
     def _stop_now(self) -> None:
         if self._stopper is None or self._stopper.done():
             self._stopper = asyncio.create_task(self._stop_arm(), name="stop")
         # Once all is collected the arm is parked; the merge ends by itself and loses nothing.
-        if self._task is not None and not self._closing and not self._task.cancelling():
+        if self._task is not None and not self._control.closing and not self._task.cancelling():
             self._task.cancel()
 
     async def _stop_arm(self) -> None:
@@ -203,11 +180,8 @@ class Engine:
             self._outcome.set_result(None)
 
     async def _main(self) -> None:
-        with self._lock:
-            self._loop = asyncio.get_running_loop()
-            self._task = asyncio.create_task(self._session(), name="session")
-            if self._stop_wanted:
-                self._task.cancel()
+        self._task = asyncio.create_task(self._session(), name="session")
+        self._control.entered(self._task)
         try:
             await self._task
         except asyncio.CancelledError:
@@ -222,8 +196,7 @@ class Engine:
         finally:
             if self._stopper is not None:
                 await self._stopper
-            with self._lock:
-                self._loop = None
+            self._control.left()
 
     async def _stopped(self) -> None:
         if self._stopper is not None:
@@ -250,17 +223,13 @@ class Engine:
                     previewing(self._telemetry, rig.camera, wanted=self._preview),
                 ):
                     await self._protocol(rig, store)
-                with self._lock:
-                    if self._state == State.STOPPING:
-                        raise asyncio.CancelledError
-                    self._closing = True
+                self._control.begin_closing()
                 self._progress.doing("merge and verify")
                 final = await uninterrupted(store.close)
                 self._progress.closed(f"closed: {final}")
             finally:
                 store.release()
-        with self._lock:
-            self._set(State.DONE)
+        self._control.end(State.DONE)
 
     async def _protocol(self, rig: Rig, store: SessionStore) -> None:
         performer = Performer(
@@ -273,46 +242,10 @@ class Engine:
             telemetry=self._telemetry,
             wishes=self._wishes,
         )
-        run = Run(rig, store, performer, self._progress, self._asker, self, self._wishes, self._guided)
+        run = Run(rig, store, performer, self._progress, self._asker, self._control, self._wishes, self._guided)
         steps = steps_on(self._rig_config, self._protocol_config)
         await run.protocol(board_first(steps) if self._guided else steps)
 
-    @property
-    def park_wanted(self) -> bool:
-        """Whether the run is to end before the next step."""
-        return self._park_wanted
-
-    async def pause_point(self) -> None:
-        """Between two steps: wait here while paused."""
-        with self._lock:
-            if self._state != State.PAUSING:
-                return
-            self._set(State.PAUSED)
-        self._progress.doing("paused")
-        while self._pause_wanted and not self._park_wanted:
-            self._go_on.clear()
-            await self._go_on.wait()
-        self.move_to(State.RUNNING)
-
-    def running(self) -> State:
-        """The state to go on in."""
-        return State.PAUSING if self._pause_wanted else State.RUNNING
-
-    def move_to(self, new: State) -> None:
-        """Change the state, unless the stop key was faster."""
-        with self._lock:
-            if self._state == State.STOPPING:
-                raise asyncio.CancelledError  # the stop key was faster than this step
-            if new is not self._state:  # one question after another
-                self._set(new)
-
-    def _set(self, new: State) -> None:
-        check_transition(self._state, new)
-        self._state = new
-
     def _end(self, state: State, why: str) -> None:
-        with self._lock:
-            if state is State.STOPPED and self._state is not State.STOPPING:
-                self._set(State.STOPPING)
-            self._set(state)
+        self._control.end(state)
         self._progress.ended(why)
