@@ -10,6 +10,7 @@ import sys
 
 from bench import (
     brushfit,
+    curves,
     generator,
     inversion,
     loop,
@@ -24,6 +25,7 @@ from bench import (
     tables,
     tui,
     validate,
+    written,
 )
 from bench.harness import Bench, BenchError, results_of
 
@@ -32,6 +34,7 @@ def benches() -> dict[str, Bench]:
     """Every benchmark by name; a new one is added here."""
     return {
         "brushfit": brushfit.run,
+        "curves": curves.run,
         "generator": generator.run,
         "generator-qbc": generator.run_qbc,
         "inversion": inversion.run,
@@ -47,6 +50,7 @@ def benches() -> dict[str, Bench]:
         "tables": tables.run,
         "tui": tui.run,
         "validate": validate.run,
+        "written": written.run,
     }
 
 

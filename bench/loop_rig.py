@@ -1,4 +1,4 @@
-"""`python -m bench.loop_rig FILE NUMBER RATE`: a loopback rig with a frozen brush, until its input ends.
+"""`python -m bench.loop_rig FILE NUMBER RATE [SEED]`: a loopback rig with a frozen brush, until its input ends.
 
 Each line on its input puts a fresh sheet in and is answered.
 """
@@ -15,9 +15,10 @@ from drivers.sim.config import SimConfig
 from drivers.sim.rig import LoopbackRig
 
 
-async def serve(path: Path, brush: int, rate: float) -> None:
-    """Write rig.toml, say so, and serve."""
-    config = SimConfig(seed=FROZEN[brush].seed, rate=rate, brush=FROZEN[brush])
+async def serve(path: Path, brush: int, rate: float, seed: int | None = None) -> None:
+    """Write rig.toml, say so, and serve. Without a seed of its own the rig takes its brush's."""
+    spec = FROZEN[brush]
+    config = SimConfig(seed=spec.seed if seed is None else seed, rate=rate, brush=spec)
     async with LoopbackRig(config) as rig:
         path.write_text(rig.toml(), encoding="utf-8")
         asked = await lines_of_input()
@@ -28,4 +29,4 @@ async def serve(path: Path, brush: int, rate: float) -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(serve(Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])))
+    asyncio.run(serve(Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]), *map(int, sys.argv[4:])))

@@ -72,7 +72,7 @@ def compare_sessions(original: Path, again: Path, fit: Path | None, view: Field)
     in_sample = fitted_to == one.sha256
     table = table_1(
         scores,
-        source=str(other.header.source),
+        source=other.header.source,
         original=one.header.session_id,
         again=other.header.session_id,
         model=model.label,

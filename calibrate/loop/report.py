@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import base64
 import csv
-import dataclasses
 import io
-import json
 import platform
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,7 +17,7 @@ from calibrate.loop.images import KEYS
 from calibrate.loop.picture import draw
 from calibrate.loop.scores import AGAIN, GOAL_POINTS, PairScore
 from calibrate.loop.table import FILE as NUMBERS
-from calibrate.loop.table import PAPER_ROBOT, Table1Row
+from calibrate.loop.table import PAPER_ROBOT, LoopRecord, Table1Row
 from calibrate.pages import render
 from calibrate.pictures import difference, ink
 from calibrate.similarity import SSIM_SETTINGS
@@ -57,7 +55,7 @@ def write_loop(closed: Closed, folder: Path, command: str) -> Path:
         provenance=list(_provenance(closed, command)),
     )
     write_whole(folder / TABLE, loop_csv(closed.scores, closed.again.header.source))
-    write_whole(folder / NUMBERS, json.dumps(as_json(closed, command), indent=2) + "\n")
+    write_whole(folder / NUMBERS, record_of(closed, command).to_json())
     write_whole(folder / PAGE, page)
     return folder / PAGE
 
@@ -105,24 +103,25 @@ def loop_csv(scores: list[PairScore], source: str) -> str:
     return out.getvalue()
 
 
-def as_json(closed: Closed, command: str) -> dict[str, Any]:
-    """Everything but the images and the single scores."""
-    return {
-        "source": str(closed.again.header.source),
-        "original": closed.original.header.session_id,
-        "original_sha256": closed.original.sha256,
-        "again": closed.again.header.session_id,
-        "again_sha256": closed.again.sha256,
-        "model": closed.model,
-        "in_sample": closed.in_sample,
-        "pairs": len(closed.paired.pairs),
-        "goal_points": GOAL_POINTS,
-        "table_1": [row.model_dump(mode="json") for row in closed.table],
-        "verdicts": [dataclasses.asdict(verdict) for verdict in closed.verdicts],
-        "refused": closed.paired.refused,
-        "software": closed.software,
-        "command": command,
-    }
+def record_of(closed: Closed, command: str) -> LoopRecord:
+    """Everything but the images and the single scores, with its digest."""
+    return LoopRecord(
+        source=closed.again.header.source,
+        original=closed.original.header.session_id,
+        original_sha256=closed.original.sha256,
+        again=closed.again.header.session_id,
+        again_sha256=closed.again.sha256,
+        model=closed.model,
+        in_sample=closed.in_sample,
+        mm_per_px=closed.field.mm_per_px,
+        pairs=len(closed.paired.pairs),
+        goal_points=GOAL_POINTS,
+        table_1=tuple(closed.table),
+        verdicts=tuple(closed.verdicts),
+        refused=tuple(closed.paired.refused),
+        software=closed.software,
+        command=command,
+    ).sealed()
 
 
 def _tables(rows: list[Table1Row]) -> list[dict[str, Any]]:

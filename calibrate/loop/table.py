@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, ClassVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from calibrate.errors import CalibrationError
 from calibrate.field import Alignment, Tone
-from calibrate.files import read_bounded
 from calibrate.loop.images import KEYS
-from calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, statistics
+from calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, Verdict, statistics
+from calibrate.sealed import Sealed, load_sealed
+from sessions.schemas import Source
 
 FILE = "loop.json"
+FORMAT = "brushloop-loop-1"
+MAX_BYTES = 8 * 1024 * 1024
 Summed = tuple[float, float, float]
 """Max, min, avg in percent."""
 PAPER_ROBOT: tuple[Summed, Summed] = ((98.21, 89.42, 93.31), (95.62, 85.85, 90.12))
@@ -27,7 +28,7 @@ class Table1Row(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    source: str
+    source: Source
     """`loopback rig` or `real capture`."""
     original: str
     again: str
@@ -52,7 +53,43 @@ class Table1Row(BaseModel):
         return (*self.csim, self.csim_median, *self.ssim, self.ssim_median)
 
 
-def table_1(scores: Sequence[PairScore], *, source: str, original: str, again: str, model: str) -> list[Table1Row]:
+class LoopRecord(Sealed):
+    """A closed loop as its `loop.json` holds it: everything but the images and the single scores."""
+
+    FORMAT: ClassVar[str] = FORMAT
+    MADE_BY: ClassVar[str] = "brushloop loop compare"
+
+    format: str = FORMAT
+    source: Source
+    """Of the session that pressed again."""
+    original: str
+    original_sha256: str
+    again: str
+    again_sha256: str
+    """Session ids, and of their recordings."""
+    model: str
+    in_sample: bool
+    """Whether that model was fitted to the original presses themselves."""
+    mm_per_px: float
+    """Scale of the millimetre field."""
+    pairs: int
+    goal_points: float
+    table_1: tuple[Table1Row, ...]
+    verdicts: tuple[Verdict, ...]
+    refused: tuple[tuple[str, str], ...]
+    """(stroke, why)."""
+    software: str
+    command: str
+
+    def row(self, what: str, alignment: Alignment, tone: Tone) -> Table1Row | None:
+        """One row of the table, or None where nothing was compared so."""
+        for one in self.table_1:
+            if (one.what, one.alignment, one.tone) == (what, alignment, tone):
+                return one
+        return None
+
+
+def table_1(scores: Sequence[PairScore], *, source: Source, original: str, again: str, model: str) -> list[Table1Row]:
     """The rows in the order of `KEYS`; the paper's stand beside the re-pressed ones."""
     rows: list[Table1Row] = []
     for alignment, tone in KEYS:
@@ -81,12 +118,11 @@ def table_1(scores: Sequence[PairScore], *, source: str, original: str, again: s
     return rows
 
 
+def read_loop(path: Path) -> LoopRecord:
+    """A `loop.json`, or the one in a loop's folder. Raises `CalibrationError` where it is none, or was edited."""
+    return load_sealed(path / FILE if path.is_dir() else path, LoopRecord, MAX_BYTES)
+
+
 def read_table_1(path: Path) -> list[Table1Row]:
-    """The rows of a `loop.json`, or of the one in a loop's folder. Raises `CalibrationError`."""
-    path = path / FILE if path.is_dir() else path
-    data = read_bounded(path)
-    try:
-        told: Any = json.loads(data)
-        return [Table1Row.model_validate(row) for row in told["table_1"]]
-    except (ValidationError, ValueError, KeyError, TypeError, RecursionError):
-        raise CalibrationError(str(path), "holds no Table 1: write it with `brushloop loop compare`") from None
+    """The rows of `read_loop`."""
+    return list(read_loop(path).table_1)

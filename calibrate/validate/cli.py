@@ -47,6 +47,13 @@ def validate(
     curves: Annotated[list[str] | None, typer.Option(help="NAME=FOLDER of a training, for figures 9 and 12.")] = None,
     held_out: Annotated[bool, typer.Option(help="Fit to other cells, each cell left out in turn.")] = True,
     tune: Annotated[int, typer.Option(min=0, help="Steps to tune each generator on other cells; 0: not.")] = 0,
+    loop: Annotated[
+        list[Path] | None, typer.Option(help="loop.json of re-pressed strokes; <session>/loop by default.")
+    ] = None,
+    written: Annotated[
+        list[Path] | None, typer.Option(help="written.json of characters; that beside the sessions by default.")
+    ] = None,
+    beside: Annotated[bool, typer.Option(help="Take up loop and characters that lie beside the session.")] = True,
     parquet: Annotated[bool | None, typer.Option(help="scores.parquet; by default where pyarrow is there.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
     scheduler: Annotated[str, typer.Option(help="An existing Dask cluster, as tcp://host:8786.")] = "",
@@ -60,6 +67,7 @@ def validate(
 
     from calibrate.field import Field
     from calibrate.terminal import summary as drag_summary
+    from calibrate.validate.beside import Given
     from calibrate.validate.main import Request, check
     from calibrate.validate.main import validate as run
     from calibrate.validate.terminal import summary
@@ -78,6 +86,7 @@ def validate(
         held_out=held_out,
         tune_steps=tune,
         parquet=parquet,
+        beside=Given(tuple(loop or ()), tuple(written or ()), beside),
         out=out,
         scheduler=scheduler,
         workers=workers,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,17 +88,21 @@ def compare(before: Path, after: Path) -> Difference:
 
 
 def report_path(given: Path) -> Path:
-    """A report.json, by itself or in a session's folder. Raises `CalibrationError` where there is none."""
-    places = [
-        given,
-        given / "report.json",
-        given / "validation" / "report.json",
-        given.parent / "validation/report.json",
-    ]
-    for place in places:
-        if place.is_file() and place.suffix == ".json":
+    """A report.json, by itself, in a report's or a session's folder, or beside a recording.
+
+    Raises `CalibrationError` where there is none, and tells the command that makes one.
+    """
+    if not given.exists():
+        raise CalibrationError(str(given), "is not there: give a report.json, or a session that was validated")
+    if given.is_file() and given.suffix == ".json":
+        return given
+    # Only a recording's own folder is looked into: beside a folder of a session may lie a report of many.
+    folder = given.parent if given.is_file() else given
+    for place in (folder / "report.json", folder / "validation" / "report.json"):
+        if place.is_file():
             return place
-    raise CalibrationError(str(given), f"has no report: run `brushloop validate {given}` first, or give a report.json")
+    told = f"was not validated: run `brushloop validate {shlex.quote(str(given))}` first, or give a report.json"
+    raise CalibrationError(str(given), told)
 
 
 def read_scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, Strokes]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Generator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
@@ -17,14 +15,15 @@ from calibrate.errors import CalibrationError
 from calibrate.field import Field
 from calibrate.files import write_whole
 from calibrate.preprocess import Params
+from calibrate.validate import beside as extra
 from calibrate.validate.ablation import similarity_by_strokes
 from calibrate.validate.contenders import generator_file
 from calibrate.validate.figures import read_curve
 from calibrate.validate.gates import check_gates, parse_gate
-from calibrate.validate.outputs import write_csv, write_parquet
+from calibrate.validate.outputs import csv_of, summary_csv, table_3_csv, write_csv, write_parquet
 from calibrate.validate.page import page_of
 from calibrate.validate.pool import Dask, Threads
-from calibrate.validate.report import Report, Stat
+from calibrate.validate.report import Report
 from calibrate.validate.run import Options, Outcome, validate_presses
 from calibrate.validate.sources import URL, Opened, one_source, open_session
 from calibrate.validate.steps import Progress
@@ -33,6 +32,7 @@ from calibrate.write import DragValidation, write_drags
 
 FOLDER = "validation"
 WORK = "work"
+TABLE_3 = "table3.csv"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +53,7 @@ class Request:
     tune_steps: int = 0
     parquet: bool | None = None
     """None writes it where pyarrow is there."""
+    beside: extra.Given = field(default_factory=extra.Given)
     out: Path | None = None
     scheduler: str = ""
     workers: int | None = None
@@ -84,14 +85,13 @@ def validate(request: Request, progress: Progress) -> Made:
     try:
         sessions = [open_session(p, folder / WORK, request.calibration, request.fit) for p in request.places]
         one_source(sessions)
+        kind = _kind(sessions, request)
+        beside = extra.take_up(sessions, request.beside) if kind == "press" else extra.Beside()
     except BaseException:
-        if not made_before and folder.exists() and not any(folder.iterdir()):
-            folder.rmdir()
+        if not made_before:
+            _drop_empty(folder)
         raise
-    kinds = {kind for session in sessions for kind in session.kinds}
-    if len(kinds) > 1:
-        raise CalibrationError(str(sessions[-1].recording.path), "mixes presses and drags: validate them apart")
-    if kinds == {"drag"}:
+    if kind == "drag":
         return _drags(request, sessions, folder)
     options = Options(
         request.models,
@@ -106,8 +106,8 @@ def validate(request: Request, progress: Progress) -> Made:
         outcome = validate_presses(sessions, options, scheduler, folder / WORK, progress)
         with outcome.store:
             steps = similarity_by_strokes(outcome, scheduler, progress) if request.ablations else ()
-            report, notes = _write(outcome, folder, request, steps, curves)
-            return Made(folder, report, notes=notes)
+            report, notes = _write(outcome, folder, request, steps, curves, beside)
+            return Made(folder, report, notes=(*beside.notes, *notes))
 
 
 def check(made: Made, request: Request) -> None:
@@ -118,8 +118,32 @@ def check(made: Made, request: Request) -> None:
         check_gates(made.report, [parse_gate(text) for text in request.gates])
 
 
+def _drop_empty(folder: Path) -> None:
+    """Remove folders that hold no file; what was fetched and can be believed stays."""
+    for path in sorted([folder, *folder.rglob("*")], reverse=True):
+        if path.is_dir() and not any(path.iterdir()):
+            path.rmdir()
+
+
+def _kind(sessions: list[Opened], request: Request) -> str:
+    """`press` or `drag`."""
+    kinds = {kind for session in sessions for kind in session.kinds}
+    if len(kinds) > 1:
+        raise CalibrationError(str(sessions[-1].recording.path), "mixes presses and drags: validate them apart")
+    [kind] = kinds
+    for option, paths in (("--loop", request.beside.loops), ("--written", request.beside.written)):
+        if paths and kind == "drag":
+            raise CalibrationError(option, "goes into a report of presses; these strokes travel")
+    return kind
+
+
 def _write(
-    outcome: Outcome, folder: Path, request: Request, steps: tuple[Any, ...], curves: Sequence[Any]
+    outcome: Outcome,
+    folder: Path,
+    request: Request,
+    steps: tuple[Any, ...],
+    curves: Sequence[Any],
+    beside: extra.Beside,
 ) -> tuple[Report, tuple[str, ...]]:
     digest = write_csv(outcome, folder / "scores.csv")
     notes: list[str] = []
@@ -130,11 +154,15 @@ def _write(
             if request.parquet:
                 raise
             notes.append(f"no scores.parquet: {error.what}")
-    report = report_of(outcome, request.command, digest, steps)
-    write_whole(folder / "summary.csv", _summary_csv(report))
+    report = report_of(outcome, request.command, digest, steps, beside)
+    write_whole(folder / "summary.csv", summary_csv(report))
+    if report.written:
+        write_whole(folder / TABLE_3, table_3_csv(report))
+    else:
+        (folder / TABLE_3).unlink(missing_ok=True)  # of an earlier run that had characters
     rows = [(r.session_id, r.stroke_id, r.why) for r in report.refused]
-    write_whole(folder / "failures.csv", _csv(("session_id", "stroke_id", "why"), rows))
-    write_whole(folder / "report.html", page_of(outcome, report, curves))
+    write_whole(folder / "failures.csv", csv_of(("session_id", "stroke_id", "why"), rows))
+    write_whole(folder / "report.html", page_of(outcome, report, curves, beside.figures))
     write_whole(folder / "report.json", report.to_json())
     return report, tuple(notes)
 
@@ -175,25 +203,3 @@ def _alone(folder: Path) -> Generator[None]:
 
 def _scheduler(request: Request) -> AbstractContextManager[Threads] | AbstractContextManager[Dask]:
     return Dask(request.scheduler) if request.scheduler else Threads(request.workers)
-
-
-def _summary_csv(report: Report) -> str:
-    head = ("model", "alignment", "tone", "measure", "height_mm", "tilt_deg", "n", "max", "min", "avg")
-    ends = ("avg_low", "avg_high", "median", "median_low", "median_high", "source")
-    return _csv((*head, *ends), [(*_stat_row(stat), report.label) for stat in report.stats])
-
-
-def _stat_row(stat: Stat) -> tuple[object, ...]:
-    cell = stat.cell if stat.cell is not None else ("", "")
-    low, high = (stat.avg_interval.low, stat.avg_interval.high) if stat.avg_interval is not None else ("", "")
-    middle = (stat.median_interval.low, stat.median_interval.high) if stat.median_interval is not None else ("", "")
-    known = (stat.model, stat.alignment, stat.tone, stat.measure, *cell, stat.n, stat.max, stat.min, stat.avg)
-    return (*known, low, high, stat.median, *middle)
-
-
-def _csv(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(head)
-    writer.writerows(rows)
-    return out.getvalue()

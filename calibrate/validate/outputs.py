@@ -1,4 +1,4 @@
-"""Every score on disk, as CSV and as Parquet, written as it is read: neither is ever whole in memory."""
+"""Every score on disk, as CSV and as Parquet, written as it is read: never whole in memory. And the report's tables."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import csv
 import hashlib
 import importlib
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,9 @@ import numpy as np
 
 from calibrate.errors import CalibrationError
 from calibrate.field import KEYS
-from calibrate.validate.run import Outcome
+from calibrate.loop.scores import AGAIN
+from calibrate.validate.report import Report, Stat
+from calibrate.validate.run import REPEATED, Outcome
 
 COLUMNS = ("session_id", "stroke_id", "height_mm", "tilt_deg", "model", "alignment", "tone", "csim", "ssim", "source")
 GROUP = 2000
@@ -94,6 +96,60 @@ def write_parquet(outcome: Outcome, path: Path) -> None:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def summary_csv(report: Report) -> str:
+    """Every statistic, per cell and overall; strokes that `brushloop loop` pressed again as “robot writing”."""
+    head = ("model", "alignment", "tone", "measure", "height_mm", "tilt_deg", "n", "max", "min", "avg")
+    ends = ("avg_low", "avg_high", "median", "median_low", "median_high", "source")
+    rows = [(*_stat_row(stat), report.label) for stat in report.stats]
+    return csv_of((*head, *ends), [*rows, *_loop_rows(report)])
+
+
+def _stat_row(stat: Stat) -> tuple[object, ...]:
+    cell = stat.cell if stat.cell is not None else ("", "")
+    low, high = (stat.avg_interval.low, stat.avg_interval.high) if stat.avg_interval is not None else ("", "")
+    middle = (stat.median_interval.low, stat.median_interval.high) if stat.median_interval is not None else ("", "")
+    known = (stat.model, stat.alignment, stat.tone, stat.measure, *cell, stat.n, stat.max, stat.min, stat.avg)
+    return (*known, low, high, stat.median, *middle)
+
+
+def _loop_rows(report: Report) -> Iterator[tuple[object, ...]]:
+    for loop in report.loops:
+        for row in loop.table_1:
+            if row.what != AGAIN:
+                continue
+            name = f"{REPEATED} ({loop.again})"
+            for measure, three, median in (("csim", row.csim, row.csim_median), ("ssim", row.ssim, row.ssim_median)):
+                known = (name, row.alignment, row.tone, measure, "", "", row.n, *three)
+                yield (*known, "", "", median, "", "", str(row.source))
+
+
+def table_3_csv(report: Report) -> str:
+    """Every row of Table 3, the paper's numbers in the rows that stand beside them."""
+    head = ["session_id", "character", "reference", "model", "compared", "alignment", "tone", "polarity", "n"]
+    head += [f"{of}_{what}" for of in ("csim", "ssim") for what in ("max", "min", "avg", "median")]
+    head += ["paper_row", *(f"paper_{of}_{what}" for of in ("csim", "ssim") for what in ("max", "min", "avg"))]
+    none = ("", "", "")
+    rows = [
+        (
+            *(row.session_id, row.character, row.reference, row.model, row.pair, row.alignment, row.tone, row.polarity),
+            *(row.n, *row.csim, row.csim_median, *row.ssim, row.ssim_median),
+            *(row.paper_row or "", *(row.paper_csim or none), *(row.paper_ssim or none), str(row.source)),
+        )
+        for record in report.written
+        for row in record.table_3
+    ]
+    return csv_of((*head, "source"), rows)
+
+
+def csv_of(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A small table as text."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows(rows)
+    return out.getvalue()
 
 
 def _groups(outcome: Outcome) -> Iterator[list[Cells]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from calibrate.field import Alignment, Tone
@@ -20,8 +20,8 @@ CELL_COLUMNS = ("ccd-bsmg", who.GENERATOR_HELD_OUT, "ccd-bsm", who.FITTED_HELD_O
 MOST_REFUSED = 200
 
 
-def page_of(outcome: Outcome, report: Report, curves: Sequence[Curve], table_three: str = "") -> str:
-    """The whole page. `table_three` is one sentence about characters, where they were written."""
+def page_of(outcome: Outcome, report: Report, curves: Sequence[Curve], figures_13: Sequence[str] = ()) -> str:
+    """The whole page. `figures_13` are the pictures of written characters, data URIs, empty where there is none."""
     shown = tables.rival(report, report.shown)
     normal, strict = (Alignment.SIZE_NORMALISED, Tone.BINARY), (Alignment.MM, Tone.BINARY)
     return render(
@@ -39,7 +39,8 @@ def page_of(outcome: Outcome, report: Report, curves: Sequence[Curve], table_thr
             "two": tables.table_2(report, *normal),
             "strict": tables.table_2(report, *strict),
         },
-        table_three=table_three,
+        table_three=tables.table_3(report),
+        figures_13=[(record.session, uri) for record, uri in zip(report.written, figures_13, strict=False) if uri],
         paper_three=list(TABLE_3.values()),
         plot=figures.distributions(outcome, report),
         full=[
@@ -55,7 +56,7 @@ def page_of(outcome: Outcome, report: Report, curves: Sequence[Curve], table_thr
         ablations=_ablations(outcome, report, curves),
         refused=report.refused[:MOST_REFUSED],
         more_refused=max(0, len(report.refused) - MOST_REFUSED),
-        provenance=[*(_of_session(one) for one in report.sessions), _of_run(report)],
+        provenance=[*(_of_session(one) for one in report.sessions), *_of_others(report), _of_run(report)],
     )
 
 
@@ -142,6 +143,30 @@ def _calibration(one: Session) -> str:
         f"{one.calibration}: pix2len {one.mm_per_px:.5f} mm/px (95 % {span.low:.5f} to {span.high:.5f}), "
         f"board residual {one.board_rms_px:.3f} px"
     )
+
+
+def _of_others(report: Report) -> Iterator[list[tuple[str, str]]]:
+    """The loops and the characters that were taken up, each with its own digest."""
+    for loop in report.loops:
+        yield [
+            ("pressed again", f"{loop.again}, recording sha256 {loop.again_sha256}"),
+            ("source", str(loop.source)),
+            ("of", f"{loop.original}, recovered by {loop.model}{' (in sample)' if loop.in_sample else ''}"),
+            ("strokes", f"{loop.pairs} pairs, {len(loop.refused)} strokes not compared"),
+            ("compared with", f"{loop.software}; {loop.command}"),
+            ("loop.json", f"digest {loop.digest}"),
+        ]
+    for record in report.written:
+        yield [
+            ("characters", f"{' '.join(record.characters)} in {record.session}"),
+            ("source", str(record.source)),
+            ("recording", f"sha256 {record.recording_sha256}"),
+            ("brush", record.brush or "not named"),
+            ("planned by", record.model),
+            ("strokes", f"{len(record.refused)} not compared"),
+            ("compared with", f"{record.software}; {record.command}"),
+            ("written.json", f"digest {record.digest}"),
+        ]
 
 
 def _of_run(report: Report) -> list[tuple[str, str]]:

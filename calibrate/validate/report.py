@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import platform
 from importlib.metadata import version
 from pathlib import Path
+from typing import ClassVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
-from calibrate.errors import CalibrationError
 from calibrate.field import Alignment, Tone
-from calibrate.files import read_bounded
+from calibrate.loop.table import LoopRecord
+from calibrate.sealed import Sealed, load_sealed
+from calibrate.written.table import WrittenRecord
 from sessions.schemas import Source
 
 FORMAT = "brushloop-validation-1"
@@ -121,8 +121,11 @@ class Step(_Frozen):
     n: int
 
 
-class Report(_Frozen):
+class Report(Sealed):
     """Everything that was found."""
+
+    FORMAT: ClassVar[str] = FORMAT
+    MADE_BY: ClassVar[str] = "brushloop validate"
 
     format: str = FORMAT
     source: Source
@@ -145,8 +148,10 @@ class Report(_Frozen):
     """Similarity against number of strokes; empty without --ablations."""
     scores_sha256: str
     """Of scores.csv beside it."""
-    digest: str = ""
-    """SHA-256 of everything above: a report that was edited is told from one that was not."""
+    loops: tuple[LoopRecord, ...] = ()
+    """Strokes of these sessions that were pressed again: Table 1's third row."""
+    written: tuple[WrittenRecord, ...] = ()
+    """Characters: Table 3. Both are sealed by themselves, as they were found."""
 
     def stat(
         self,
@@ -167,37 +172,10 @@ class Report(_Frozen):
         """What stands on every table and figure."""
         return str(self.source)
 
-    def sealed(self) -> Report:
-        """The same with its digest."""
-        return self.model_copy(update={"digest": self._hash()})
-
-    def to_json(self) -> str:
-        """As it is written to disk."""
-        return json.dumps(self.model_dump(mode="json"), indent=1, ensure_ascii=False) + "\n"
-
-    def _hash(self) -> str:
-        bare = self.model_copy(update={"digest": ""}).model_dump(mode="json")
-        return hashlib.sha256(json.dumps(bare, sort_keys=True, ensure_ascii=False).encode()).hexdigest()
-
-    @property
-    def intact(self) -> bool:
-        """Whether the digest is that of the contents."""
-        return self.digest == self._hash()
-
 
 def load_report(path: Path) -> Report:
     """A report.json. Raises `CalibrationError` where it is none, or was edited."""
-    data = read_bounded(path, MAX_BYTES)
-    try:
-        report = Report.model_validate_json(data)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise CalibrationError(str(path), f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
-    if report.format != FORMAT:
-        raise CalibrationError(str(path), f"format is {report.format[:40]!r}, expected {FORMAT!r}")
-    if not report.intact:
-        raise CalibrationError(str(path), "was edited: its digest is not that of its contents")
-    return report
+    return load_sealed(path, Report, MAX_BYTES)
 
 
 def software() -> dict[str, str]:

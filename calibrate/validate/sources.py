@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import re
+import sys
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -29,6 +30,16 @@ MAX_DOWNLOAD_BYTES = 64 * 1024**3
 MAX_ARTEFACTS = 64
 MAX_ARTEFACT_BYTES = 4 * 1024 * 1024
 URL = re.compile(r"^[a-z][a-z0-9+.-]+://", re.IGNORECASE)
+EXTRAS = {"http": "remote", "https": "remote", "s3": "s3", "s3a": "s3", "gs": "gs", "gcs": "gs"}
+"""Kind of URL -> the extra that opens it."""
+BACKEND_ERRORS = (
+    ("aiohttp", "ClientError"),
+    ("botocore.exceptions", "BotoCoreError"),
+    ("botocore.exceptions", "ClientError"),
+    ("gcsfs.retry", "HttpError"),
+    ("google.auth.exceptions", "GoogleAuthError"),
+)
+"""Module and name: none of them is an OSError, and none is imported unless its kind of URL is asked for."""
 SHA256 = re.compile(r"\b[0-9a-f]{64}\b")
 
 
@@ -101,8 +112,11 @@ def fetched(url: str, folder: Path) -> Path:
         raise CalibrationError(address, "a URL needs fsspec: pip install 'brushloop[remote]'") from None
     try:
         system, where = untyped.core.url_to_fs(address)
+        system.invalidate_cache()  # listings of before: fsspec keeps one system an address as long as the process lives
     except (ImportError, ValueError) as error:
-        raise CalibrationError(address, f"cannot be opened: {_line(error)}") from None
+        extra = EXTRAS.get(address.partition(":")[0].lower()) if isinstance(error, ImportError) else None
+        how = f": pip install 'brushloop[{extra}]'" if extra else ""
+        raise CalibrationError(address, f"cannot be opened: {_line(error)}{how}") from None
     try:
         if not where.endswith(".mcap"):
             where = f"{where.rstrip('/')}/{PurePosixPath(where).name}.mcap"
@@ -111,9 +125,15 @@ def fetched(url: str, folder: Path) -> Path:
         if not (target.is_file() and file_sha256(target) == expected):
             _copy(system, where, target, expected, address)
         _copy_artefacts(system, where, target.parent)
-    except (OSError, ValueError, NotImplementedError) as error:
+    except (OSError, ValueError, NotImplementedError, *_backend_errors()) as error:
         raise CalibrationError(address, f"cannot be read: {_line(error)}") from None
     return target
+
+
+def _backend_errors() -> tuple[type[Exception], ...]:
+    """The errors of their own that what fsspec loaded for this URL may raise, as for want of credentials."""
+    loaded = [(sys.modules[module], name) for module, name in BACKEND_ERRORS if module in sys.modules]
+    return tuple(getattr(module, name) for module, name in loaded if hasattr(module, name))
 
 
 def _expected(system: Any, where: str, address: str, fragment: str) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 from calibrate.field import KEYS, Alignment, Key, Tone
 from calibrate.similarity import SSIM_SETTINGS
 from calibrate.validate import contenders as who
+from calibrate.validate.beside import Beside
 from calibrate.validate.report import Extreme, Interval, Refused, Report, Rival, Session, Stat, Step, software
 from calibrate.validate.run import CEILING, REPEATED, Outcome
 from calibrate.validate.sources import Opened, one_source
@@ -30,7 +31,9 @@ PRESSES = {
 }
 
 
-def report_of(outcome: Outcome, command: str, scores_sha256: str, by_strokes: tuple[Step, ...]) -> Report:
+def report_of(
+    outcome: Outcome, command: str, scores_sha256: str, by_strokes: tuple[Step, ...], beside: Beside
+) -> Report:
     """Everything of a run as one frozen report."""
     cells = sorted({row.cell for row in outcome.rows})
     told = len(cells) <= MOST_CELLS
@@ -52,6 +55,8 @@ def report_of(outcome: Outcome, command: str, scores_sha256: str, by_strokes: tu
         refused=tuple(Refused(session_id=s, stroke_id=n, why=why) for s, n, why in outcome.refused),
         by_strokes=by_strokes,
         scores_sha256=scores_sha256,
+        loops=beside.loops,
+        written=beside.written,
     ).sealed()
 
 

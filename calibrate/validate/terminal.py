@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from calibrate.field import Alignment, Tone
 from calibrate.validate import tables, words
@@ -23,6 +24,8 @@ def summary(report: Report) -> Iterator[Table | str]:
     yield escape(words.measured(report))
     for alignment in (Alignment.SIZE_NORMALISED, Alignment.MM):
         yield _scores(report, alignment)
+    for one in tables.table_3(report):
+        yield from _character(report, one)
     yield from (escape(sentence) for sentence in words.findings(report))
     for point in words.trust(report):
         yield escape(f"{'•' if point.good is None else '✓' if point.good else '✗'} {point.text}")
@@ -38,10 +41,27 @@ def _scores(report: Report, alignment: Alignment) -> Table:
     columns = ["model", "n", "CSIM max", "min", "avg", "SSIM max", "min", "avg", *(["paper's avg"] if beside else [])]
     title = f"{alignment}, binary, ink = 1, percent ({report.label})"
     out = Table(*columns, title=escape(title))
-    for row in tables.table_2(report, alignment, Tone.BINARY):
+    others = tables.robot_writing(report, alignment, Tone.BINARY)
+    for row in (*tables.table_2(report, alignment, Tone.BINARY), *others):
         if row.ours is None:
             continue
         told = f"{row.paper[2]:.2f} / {row.paper[5]:.2f}" if row.paper is not None else ""
         cells = [escape(row.label + SHORT.get(row.basis, "")), str(row.n), *(f"{v:.2f}" for v in row.ours)]
         out.add_row(*cells, *([told] if beside else []))
     return out
+
+
+def _character(report: Report, one: tables.Written) -> Iterator[Table]:
+    """A table for each alignment and polarity."""
+    for alignment, rows in ((Alignment.SIZE_NORMALISED, one.paper_like), (Alignment.MM, one.strict)):
+        for polarity, group in itertools.groupby(rows, key=lambda row: row.basis.partition(";")[0]):
+            beside = alignment is Alignment.SIZE_NORMALISED
+            columns = ["n", "CSIM\nmax", "min", "avg", "SSIM\nmax", "min", "avg", *(["paper's avg"] if beside else [])]
+            title = f"Table 3: {one.character}, {alignment}, binary, {polarity}, percent ({report.label})"
+            out = Table(Column("", min_width=len("simulated")), *columns, title=escape(title))
+            for row in group:
+                assert row.ours is not None, "rows of Table 3 are rows of ours"
+                told = f"{row.paper[2]:.2f} / {row.paper[5]:.2f}" if row.paper is not None else ""
+                cells = [escape(row.label), str(row.n), *(f"{value:.2f}" for value in row.ours)]
+                out.add_row(*cells, *([told] if beside else []))
+            yield out

@@ -7,10 +7,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from calibrate.field import Alignment, Tone
+from calibrate.loop.scores import AGAIN, ANOTHER
+from calibrate.loop.table import LoopRecord
 from calibrate.validate import contenders as who
 from calibrate.validate.paper import ORDER
 from calibrate.validate.report import Report, Stat
 from calibrate.validate.run import CEILING
+from calibrate.written.images import Polarity
+from calibrate.written.scores import REFERENCE
 from sessions.schemas import Source
 
 CLOSE = 0.5
@@ -69,6 +73,8 @@ def findings(report: Report) -> Iterator[str]:
     if bezier is not None:
         beside = "" if held is None else f": {abs(held.avg - bezier.avg):.1f} points {_less(bezier.avg, held.avg)}"
         yield f"A Bézier stroke fitted to the same captures reaches {_told(bezier)}{beside}."
+    yield from _pressed_again(report)
+    yield from _characters(report)
     published = [(name, stat) for name in ("ccd-bsmg", "ccd-bsm") if (stat := _avg(report, name)) is not None]
     for name, stat in published:
         label = _label(report, name)
@@ -77,6 +83,29 @@ def findings(report: Report) -> Iterator[str]:
         yield from _sizes(report)
     if held is None and report.source != Source.IMPORT:
         yield "No model was calibrated to this brush: “brushloop fit” does that; then validate again."
+
+
+def _pressed_again(report: Report) -> Iterator[str]:
+    for loop in report.loops:
+        again, other = (loop.row(what, Alignment.MM, Tone.BINARY) for what in (AGAIN, ANOTHER))
+        if again is None:
+            continue
+        beside = "" if other is None else f", other presses of the same H and α {other.csim[2]:.1f} %"
+        yield (
+            f"Pressed again from what their photographs told ({loop.again}), {again.n} strokes are like their "
+            f"originals with a CSIM of {again.csim[2]:.1f} %{beside}."
+        )
+
+
+def _characters(report: Report) -> Iterator[str]:
+    for record in report.written:
+        for row in record.table_3:
+            key = (row.pair, row.alignment, row.tone, row.polarity)
+            if key == (REFERENCE, Alignment.MM, Tone.BINARY, Polarity.INK):
+                yield (
+                    f"{row.character}, written {row.n} times by the arm, is like its reference ({row.reference}) with "
+                    f"a CSIM of {row.csim[2]:.1f} %."
+                )
 
 
 def _sizes(report: Report) -> Iterator[str]:
@@ -164,9 +193,26 @@ def trust(report: Report) -> Iterator[Point]:
         yield Point(near, f"The calibrated model is {how} {NEAR_CEILING} points of the ceiling (mm, binary, CSIM).")
     if held is not None and bezier is not None and held.avg < bezier.avg:
         yield Point(False, "The refitted Bézier predicts unseen cells better than the calibrated CCD-BSM.")
+    for loop in report.loops:
+        yield from _verdict(loop)
     if any("in sample" in rival.basis for rival in report.rivals):
         words = "Rows “in sample” were fitted to the very strokes that they predict: read the held-out rows instead."
         yield Point(None, words)
+
+
+def _verdict(loop: LoopRecord) -> Iterator[Point]:
+    if not loop.verdicts:
+        yield Point(None, f"{loop.again}: no original cell was pressed twice, so nothing says how alike is alike.")
+        return
+    least = min(loop.verdicts, key=lambda verdict: verdict.difference)
+    failed = sum(not verdict.holds for verdict in loop.verdicts)
+    how = "at most" if not failed else f"in {failed} of {len(loop.verdicts)} comparisons more than"
+    sure = "" if all(verdict.certain for verdict in loop.verdicts) else ", not certain in all"
+    yield Point(
+        not failed,
+        f"Strokes pressed again ({loop.again}) are {how} {loop.goal_points:g} point less like their originals than "
+        f"other presses of the same cell (least: {least.difference:+.2f} points{sure}).",
+    )
 
 
 def _avg(report: Report, model: str) -> Stat | None:

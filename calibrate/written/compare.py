@@ -61,7 +61,7 @@ def compare_written(session: Path, plan: PlanRecord, references: dict[str, tuple
     header = recording.header
     table = table_3(
         scores,
-        source=str(header.source),
+        source=header.source,
         session_id=header.session_id,
         model=plan.model,
         references={one.name: one.reference_name for one in characters},

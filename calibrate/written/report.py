@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import base64
 import csv
+import hashlib
 import io
-import json
 import platform
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,15 +22,16 @@ from calibrate.written.images import Polarity
 from calibrate.written.picture import draw, ranked
 from calibrate.written.scores import PAIRS, WrittenScore
 from calibrate.written.table import FILE as NUMBERS
-from calibrate.written.table import Table3Row
+from calibrate.written.table import PICTURE, Table3Row, WrittenRecord
 
-PICTURE, PAGE, TABLE = "figure-13.png", "written.html", "written.csv"
+PAGE, TABLE = "written.html", "written.csv"
 
 
 def write_written(written: Written, folder: Path, command: str) -> Path:
     """Write the report's files into `folder`; returns the page's path. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     draw(written, folder / PICTURE)
+    picture = (folder / PICTURE).read_bytes()
     page = render(
         "written.html.j2",
         header=written.header,
@@ -44,11 +45,11 @@ def write_written(written: Written, folder: Path, command: str) -> Path:
         refused=written.refused,
         cut=[stroke_id for one in written.characters for stroke_id in one.cut],
         ssim_settings=SSIM_SETTINGS,
-        picture="data:image/png;base64," + base64.b64encode((folder / PICTURE).read_bytes()).decode(),
+        picture="data:image/png;base64," + base64.b64encode(picture).decode(),
         provenance=list(_provenance(written, command)),
     )
     write_whole(folder / TABLE, written_csv(written.scores, str(written.header.source)))
-    write_whole(folder / NUMBERS, json.dumps(as_json(written, command), indent=2, ensure_ascii=False) + "\n")
+    write_whole(folder / NUMBERS, record_of(written, command, picture).to_json())
     write_whole(folder / PAGE, page)
     return folder / PAGE
 
@@ -74,19 +75,21 @@ def written_csv(scores: list[WrittenScore], source: str) -> str:
     return out.getvalue()
 
 
-def as_json(written: Written, command: str) -> dict[str, Any]:
-    """Everything but the images and the single scores."""
-    return {
-        "source": str(written.header.source),
-        "session": written.header.session_id,
-        "recording_sha256": written.recording_sha256,
-        "model": written.plan.model,
-        "cell_mm": written.plan.cell_mm,
-        "table_3": [row.model_dump(mode="json") for row in written.table],
-        "refused": written.refused,
-        "software": written.software,
-        "command": command,
-    }
+def record_of(written: Written, command: str, picture: bytes) -> WrittenRecord:
+    """Everything but the images and the single scores, with its digest and that of Figure 13."""
+    return WrittenRecord(
+        source=written.header.source,
+        session=written.header.session_id,
+        recording_sha256=written.recording_sha256,
+        brush=written.header.brush,
+        model=written.plan.model,
+        cell_mm=written.plan.cell_mm,
+        table_3=tuple(written.table),
+        refused=tuple(written.refused),
+        figure_13_sha256=hashlib.sha256(picture).hexdigest(),
+        software=written.software,
+        command=command,
+    ).sealed()
 
 
 def _tables(table: list[Table3Row]) -> list[dict[str, Any]]:

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, ClassVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from calibrate.errors import CalibrationError
 from calibrate.field import Alignment, Tone
-from calibrate.files import read_bounded
+from calibrate.sealed import Sealed, load_sealed
 from calibrate.written.images import KEYS, Polarity
 from calibrate.written.scores import PAIRS, REFERENCE, SIMULATED, WrittenScore
+from sessions.schemas import Source
 
-FILE = "written.json"
+FILE, PICTURE = "written.json", "figure-13.png"
+FORMAT = "brushloop-written-1"
 MAX_BYTES = 8 * 1024 * 1024
 Summed = tuple[float, float, float]
 """Max, min, avg in percent."""
@@ -33,7 +33,7 @@ class Table3Row(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    source: str
+    source: Source
     """`loopback rig` or `real capture`."""
     session_id: str
     character: str
@@ -55,8 +55,36 @@ class Table3Row(BaseModel):
     paper_ssim: Summed | None = None
 
 
+class WrittenRecord(Sealed):
+    """Written characters as their `written.json` holds them: everything but the images and the single scores."""
+
+    FORMAT: ClassVar[str] = FORMAT
+    MADE_BY: ClassVar[str] = "brushloop write compare"
+
+    format: str = FORMAT
+    source: Source
+    session: str
+    recording_sha256: str
+    brush: str
+    """As the recording names it."""
+    model: str
+    cell_mm: float
+    table_3: tuple[Table3Row, ...]
+    refused: tuple[tuple[str, str], ...]
+    """(stroke, why)."""
+    figure_13_sha256: str
+    """Of the picture beside it."""
+    software: str
+    command: str
+
+    @property
+    def characters(self) -> tuple[str, ...]:
+        """What was written, in the table's order."""
+        return tuple(dict.fromkeys(row.character for row in self.table_3))
+
+
 def table_3(
-    scores: Iterable[WrittenScore], *, source: str, session_id: str, model: str, references: dict[str, str]
+    scores: Iterable[WrittenScore], *, source: Source, session_id: str, model: str, references: dict[str, str]
 ) -> list[Table3Row]:
     """The rows, by character, then in the order of `KEYS` and `PAIRS`; `references` name each character's reference."""
     grouped: dict[tuple[str, Alignment, Tone, Polarity, str], list[WrittenScore]] = {}
@@ -95,15 +123,14 @@ def table_3(
     return rows
 
 
+def read_written(path: Path) -> WrittenRecord:
+    """A `written.json`, or the one in a report's folder. Raises `CalibrationError` where it is none, or was edited."""
+    return load_sealed(path / FILE if path.is_dir() else path, WrittenRecord, MAX_BYTES)
+
+
 def read_table_3(path: Path) -> list[Table3Row]:
-    """The rows of a `written.json`, or of the one in a report's folder. Raises `CalibrationError`."""
-    path = path / FILE if path.is_dir() else path
-    data = read_bounded(path, MAX_BYTES)
-    try:
-        told: Any = json.loads(data)
-        return [Table3Row.model_validate(row) for row in told["table_3"]]
-    except (ValidationError, ValueError, KeyError, TypeError, RecursionError):
-        raise CalibrationError(str(path), "holds no Table 3: write it with `brushloop write compare`") from None
+    """The rows of `read_written`."""
+    return list(read_written(path).table_3)
 
 
 def _summed(values: list[float]) -> Summed:

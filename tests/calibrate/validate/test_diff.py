@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -60,8 +61,24 @@ def test_two_sessions_are_compared_cell_by_cell(make_session: object, before: Pa
     assert {change.verdict for change in found.changes} == {"no clear difference"}
 
 
+def test_a_session_that_was_never_validated_is_refused_with_the_command_that_does_it(
+    make_session: object, before: Path, tmp_path: Path
+) -> None:
+    never = make_session(tmp_path, "never", repeats=1, blank=False)  # pyright: ignore[reportCallIssue]
+    # A report of many sessions beside it is not this session's.
+    shutil.copytree(before, tmp_path / "validation")
+    for given in (never, never / "never.mcap"):
+        ran = CliRunner().invoke(app, ["validate", "diff", str(before), str(given)])
+        assert isinstance(ran.exception, CalibrationError)
+        assert ran.exception.exit_code == 2
+        told = f"{given}: was not validated: run `brushloop validate {given}` first, or give a report.json"
+        assert str(ran.exception) == told
+    with pytest.raises(CalibrationError, match=r"nowhere: is not there: give a report\.json"):
+        compare(tmp_path / "nowhere", before)
+
+
 def test_what_has_no_report_or_an_edited_table_is_refused(session: Path, before: Path, tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match="has no report: run `brushloop validate"):
+    with pytest.raises(CalibrationError, match="was not validated: run `brushloop validate"):
         compare(before, tmp_path)
     for name in ("report.json", "scores.csv"):
         (tmp_path / name).write_bytes((before / name).read_bytes())

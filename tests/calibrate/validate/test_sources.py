@@ -1,9 +1,11 @@
-"""Sessions from URLs: believed by their checksum only. `memory:` stands for s3 and gs."""
+"""Sessions from URLs: believed by their checksum only. `memory:` stands for whatever fsspec opens."""
 
 from __future__ import annotations
 
 import hashlib
+import importlib
 import json
+import sys
 from collections.abc import Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -75,6 +77,16 @@ def test_what_cannot_be_believed_is_refused_and_leaves_nothing(
     with pytest.raises(CalibrationError, match=words):
         open_session(url, tmp_path, None, None)
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize(("kind", "package"), [("s3", "s3fs"), ("gs", "gcsfs")])
+def test_a_url_whose_package_is_not_there_tells_the_extra(
+    kind: str, package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.delitem(importlib.import_module("fsspec.registry")._registry, kind, raising=False)  # found before
+    with pytest.raises(CalibrationError, match=rf"{kind}://lab/x: cannot be opened: .*brushloop\[{kind}\]"):
+        open_session(f"{kind}://lab/x#sha256=" + "0" * 64, tmp_path, None, None)
 
 
 def test_a_recording_larger_than_allowed_is_refused(

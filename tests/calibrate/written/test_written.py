@@ -17,8 +17,9 @@ from calibrate.written.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED, Cha
 from calibrate.written.table import read_table_3, table_3
 from sessions.messages import encode_png
 from sessions.reader import Capture
-from sessions.schemas import Stroke
+from sessions.schemas import Source, Stroke
 from tests.calibrate.given import BY, CALIBRATION
+from tests.calibrate.records import written_record
 
 CELL = (20.0, 10.0, 60.0, 60.0)
 STRICT = (Alignment.MM, Tone.BINARY, Polarity.INK)
@@ -96,7 +97,9 @@ def character() -> Character:
 
 def test_table_3_has_a_row_for_each_comparison_and_survives_the_disk(tmp_path: Path) -> None:
     scores = list(score_character(character()))
-    rows = table_3(scores, source="loopback rig", session_id="s", model="CCD-BSM", references={"x": "font of the test"})
+    rows = table_3(
+        scores, source=Source.LOOPBACK, session_id="s", model="CCD-BSM", references={"x": "font of the test"}
+    )
     assert len(rows) == len(KEYS) * 4
     strict = {row.pair: row for row in rows if (row.alignment, row.tone, row.polarity) == STRICT}
     assert [strict[pair].n for pair in (SIMULATED, REFERENCE, PLANNED, ANOTHER)] == [3, 3, 1, 3]
@@ -109,10 +112,13 @@ def test_table_3_has_a_row_for_each_comparison_and_survives_the_disk(tmp_path: P
     assert max(another, key=lambda name: another[name]) == "x-r02"
 
     path = tmp_path / "written.json"
-    path.write_text('{"table_3": [' + ",".join(row.model_dump_json() for row in rows) + "]}")
+    path.write_text(written_record(tuple(rows)).to_json())
     assert read_table_3(tmp_path) == rows
+    path.write_text(path.read_text().replace("loopback rig", "real capture"))
+    with pytest.raises(CalibrationError, match=r"written\.json: was edited"):
+        read_table_3(path)
     path.write_text("{}")
-    with pytest.raises(CalibrationError, match="holds no Table 3"):
+    with pytest.raises(CalibrationError, match="is no report with a digest: write it with `brushloop write compare`"):
         read_table_3(path)
 
 

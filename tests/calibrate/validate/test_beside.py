@@ -1,0 +1,328 @@
+"""One command per table: loops and characters that lie beside are taken up, and what cannot be believed is refused."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from brushloop import app
+from calibrate.errors import CalibrationError
+from calibrate.field import Alignment, Tone
+from calibrate.loop.table import LoopRecord
+from calibrate.validate import tables
+from calibrate.validate.report import load_report
+from calibrate.validate.run import REPEATED
+from sessions.importer import ImportOptions, import_photographs
+from sessions.reader import Recording
+from sessions.schemas import Source
+from tests.calibrate.records import loop_record, table_of, written_record
+
+FAST = ("--model", "line", "--no-held-out", "--no-parquet")
+HALF = '{"format": "brushloop-loop-1", "digest": "\\ud800"}'
+"""Half a surrogate: JSON, but no text that a page could hold."""
+NORMAL = (Alignment.SIZE_NORMALISED, Tone.BINARY)
+
+
+def invoke(*words: str | Path) -> str:
+    ran = CliRunner().invoke(app, ["validate", *map(str, words), *FAST])
+    assert ran.exit_code == 0, (ran.output, ran.exception)
+    return " ".join(ran.output.split())
+
+
+def refused(*words: str | Path) -> str:
+    """What the front door would print, and end with exit code 2."""
+    ran = CliRunner().invoke(app, ["validate", *map(str, words), *FAST])
+    assert isinstance(ran.exception, CalibrationError), ran.output
+    assert ran.exception.exit_code == 2
+    return " ".join([str(ran.exception), *getattr(ran.exception, "__notes__", [])])
+
+
+@pytest.fixture
+def lab(session: Path, tmp_path: Path) -> Path:
+    """A folder of sessions with one in it, of imported photographs."""
+    shutil.copytree(session, tmp_path / "sessions" / session.name)
+    return tmp_path
+
+
+@pytest.fixture
+def place(lab: Path, session: Path) -> Path:
+    return lab / "sessions" / session.name
+
+
+@pytest.fixture
+def a_loop(place: Path) -> Callable[..., LoopRecord]:
+    """The loop of that session, with changes that are sealed in."""
+    sha256 = Recording(place).sha256
+
+    def make(**changes: Any) -> LoopRecord:
+        told: dict[str, Any] = {"original": place.name, "original_sha256": sha256, "source": Source.IMPORT}
+        return loop_record(**(told | changes))
+
+    return make
+
+
+def put(folder: Path, text: str, name: str = "loop.json") -> Path:
+    folder.mkdir(exist_ok=True)
+    (folder / name).write_text(text)
+    return folder / name
+
+
+def picture(width: int = 40) -> bytes:
+    return cv2.imencode(".png", np.full((20, width), 200, np.uint8))[1].tobytes()
+
+
+def characters(folder: Path, figure: bytes | None = None, *, named: dict[str, str] | None = None, **told: Any) -> Path:
+    """A `written` folder of imported photographs: only tests have such characters."""
+    data = picture() if figure is None else figure
+    rows = tuple(table_of(source=Source.IMPORT, **(named or {})))
+    sealed = written_record(rows, **({"figure_13_sha256": hashlib.sha256(data).hexdigest()} | told))
+    path = put(folder, sealed.to_json(), "written.json")
+    if data:
+        (folder / "figure-13.png").write_bytes(data)
+    return path
+
+
+def test_a_loop_in_the_session_is_found_and_is_the_third_row_of_table_1(
+    place: Path, a_loop: Callable[..., LoopRecord]
+) -> None:
+    loop = a_loop()
+    put(place / "loop", loop.to_json())
+    said = invoke(place)
+    assert "robot writing" in said
+    assert "6 strokes are like their originals with a CSIM of 94.2 %, other presses of the same H and α 95.2 %" in said
+
+    folder = place / "validation"
+    report = load_report(folder / "report.json")
+    assert report.loops == (loop,)
+    assert report.loops[0].intact
+    [row] = [row for row in tables.table_1(report, *NORMAL) if row.label == "robot writing"]
+    assert row.n == 6
+    assert row.ours == pytest.approx((94.5, 94.0, 94.25, 84.5, 84.0, 84.25))
+    assert row.paper == (98.21, 89.42, 93.31, 95.62, 85.85, 90.12)
+    with (folder / "summary.csv").open() as file:
+        told = [r for r in csv.DictReader(file) if r["model"] == f"robot writing ({place.name}-replay)"]
+    assert len(told) == 2 * 2 * 2
+    assert {r["source"] for r in told} == {"imported photographs"}
+    page = (folder / "report.html").read_text()
+    assert f"{place.name} pressed again as {place.name}-replay" in page
+    assert loop.digest in page
+    assert "at most 1 point less like their originals" in " ".join(page.split())
+
+    assert "robot writing" not in invoke(place, "--no-beside")
+    assert load_report(folder / "report.json").loops == ()
+
+
+def test_several_loops_are_given_by_name_and_the_same_one_counts_once(
+    place: Path, tmp_path: Path, a_loop: Callable[..., LoopRecord]
+) -> None:
+    again = [row.model_copy(update={"again": "b"}) for row in a_loop().table_1]
+    first = put(tmp_path / "a", a_loop().to_json())
+    second = put(tmp_path / "b", a_loop(again="b", table_1=tuple(again)).to_json())
+    invoke(place, "--loop", first, "--loop", second.parent, "--loop", first.parent)
+    report = load_report(place / "validation" / "report.json")
+    assert [loop.again for loop in report.loops] == [f"{place.name}-replay", "b"]
+    assert [row.label for row in tables.robot_writing(report, *NORMAL)] == ["robot writing"] * 2
+
+
+def test_presses_that_this_run_scores_itself_are_not_told_twice(place: Path, a_loop: Callable[..., LoopRecord]) -> None:
+    put(place / "loop", a_loop().to_json())
+    invoke(place)
+    report = load_report(place / "validation" / "report.json")
+    line = [stat for stat in report.stats if stat.model == "line"]
+    scored = report.model_copy(
+        update={
+            "stats": (*report.stats, *(stat.model_copy(update={"model": REPEATED}) for stat in line)),
+            "sessions": (
+                *report.sessions,
+                report.sessions[0].model_copy(update={"recording_sha256": report.loops[0].again_sha256}),
+            ),
+        }
+    )
+    assert [row.n for row in tables.robot_writing(report, *NORMAL)] == [6]
+    assert [row.n for row in tables.robot_writing(scored, *NORMAL)] == [10]
+
+
+def test_without_a_loop_or_characters_the_page_tells_the_commands(place: Path) -> None:
+    invoke(place)
+    page = " ".join((place / "validation" / "report.html").read_text().split())
+    assert "“brushloop loop SESSION --config RIG” presses recovered strokes again" in page
+    assert "<code>brushloop write 字 --config RIG</code> writes characters" in page
+    assert not (place / "validation" / "table3.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "edit", "words"),
+    [
+        ({}, ("imported photographs", "real capture"), "was edited: its digest is not that of its contents"),
+        ({}, ('"n": 6', '"n": 5'), "was edited"),
+        ({}, ('"n": 6', '"n": -1'), "table_1.0.n: Input should be greater than or equal to 1"),
+        ({}, ('"digest"', '"digested"'), "is no report with a digest: write it with `brushloop loop compare`"),
+        ({}, ("brushloop-loop-1", "brushloop-loop-9"), "format is 'brushloop-loop-9', expected 'brushloop-loop-1'"),
+        ({"source": Source.LOOPBACK}, None, "is of loopback rig, presses.mcap of imported photographs"),
+        ({"source": Source.REAL}, None, "is of real capture, presses.mcap of imported photographs"),
+        ({"original": "other", "original_sha256": "3" * 64}, None, "repeats other, not presses"),
+        ({"original_sha256": "3" * 64}, None, "is of another recording of presses: its SHA-256 differs"),
+        ({"again": "other"}, None, "table_1: has rows of other sessions than its own"),
+    ],
+)
+def test_a_loop_that_is_edited_or_of_something_else_is_refused_by_name(
+    place: Path,
+    a_loop: Callable[..., LoopRecord],
+    changes: dict[str, Any],
+    edit: tuple[str, str] | None,
+    words: str,
+) -> None:
+    text = a_loop(**changes).to_json()
+    path = put(place / "loop", text if edit is None else text.replace(*edit))
+    said = refused(place)
+    assert said.startswith(f"{path}: {words}")
+    assert said.endswith("(found beside the session; --no-beside goes without)")
+    assert not (place / "validation").exists()
+    assert refused(place, "--loop", path) == said.partition(" (found")[0]
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '"x"', "[" * 100_000, '{"format": 1, "digest": {}}', HALF])
+def test_what_is_no_loop_at_all_is_refused(place: Path, text: str) -> None:
+    path = put(place / "loop", text)
+    assert refused(place).startswith(f"{path}: ")
+
+
+def test_a_file_too_large_is_not_read(place: Path, a_loop: Callable[..., LoopRecord]) -> None:
+    path = put(place / "loop", a_loop().to_json() + " " * 9_000_000)
+    assert "is larger than" in refused(place, "--loop", path)
+    assert "No such file" in refused(place, "--loop", place / "nowhere.json")
+
+
+def test_table_3_has_the_papers_rows_beside_and_figure_13(lab: Path, place: Path) -> None:
+    characters(lab / "elsewhere")
+    said = invoke(place, "--written", lab / "elsewhere")
+    assert "Table 3: 字" in said
+    assert "字, written 2 times by the arm, is like its reference (a font) with a CSIM of 85.0 %" in said
+    folder = place / "validation"
+    report = load_report(folder / "report.json")
+    [one] = tables.table_3(report)
+    assert [(row.label, row.basis.partition(";")[0]) for row in one.paper_like] == [
+        ("simulated", "ink = 1"),
+        ("robot writing", "ink = 1"),
+        ("another writing", "ink = 1"),
+        ("the plan", "ink = 1"),
+        ("simulated", "paper = 1"),
+        ("robot writing", "paper = 1"),
+    ]
+    papers = [None if row.paper is None else (row.paper[2], row.paper[5]) for row in one.paper_like]
+    assert papers == [(94.58, 75.91), (93.59, 74.60), None, None, (94.58, 75.91), (93.59, 74.60)]
+    assert "(beside the paper's CCD-BSMG)" in one.paper_like[0].basis
+    assert all(row.paper is None for row in one.strict)
+    with (folder / "table3.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(report.written[0].table_3)
+    assert float(rows[0]["csim_avg"]) == pytest.approx(85.0)
+    assert {row["source"] for row in rows} == {"imported photographs"}
+    page = (folder / "report.html").read_text()
+    assert page.count("Figure 13") >= 2
+    assert all(src.startswith("data:image/png;base64,") for src in re.findall(r'src="([^"]*)"', page))
+
+    invoke(place)
+    assert not (folder / "table3.csv").exists()
+
+
+def test_characters_of_this_lab_are_found_and_others_are_left_out_with_the_reason(lab: Path, place: Path) -> None:
+    said = invoke(place)
+    assert "Table 3" not in said
+    characters(lab / "written")
+    assert "its session write-01 does not lie beside" in invoke(place)
+    (lab / "sessions" / "write-01").mkdir()
+    for name in (str(lab), "../sessions", ".", ""):
+        characters(lab / "written", named={"session": name})
+        assert "does not lie beside" in invoke(place)
+    characters(lab / "written")
+    assert "Table 3: 字" in invoke(place)
+    characters(lab / "written", brush="goat hair")
+    assert "it was written with another brush, goat hair" in invoke(place)
+    assert "Table 3: 字" in invoke(place, "--written", lab / "written")
+
+    (lab / "written" / "written.json").write_text(written_record(tuple(table_of())).to_json())
+    assert "it is of loopback rig, not imported photographs" in invoke(place)
+    assert "is of loopback rig, presses.mcap of imported photographs" in refused(place, "--written", lab / "written")
+    # What lies in the session itself is meant for it.
+    (lab / "written").rename(place / "written")
+    assert "is of loopback rig" in refused(place)
+
+
+def test_an_edited_table_3_or_another_picture_is_refused(lab: Path, place: Path) -> None:
+    path = characters(lab / "w")
+    text = path.read_text()
+    path.write_text(text.replace('"字"', '"子"'))
+    assert refused(place, "--written", path) == f"{path}: was edited: its digest is not that of its contents"
+    path.write_text(text)
+    figure = lab / "w" / "figure-13.png"
+    for data, words in (
+        (picture(50), "is not the picture of written.json beside it: its SHA-256 differs"),
+        (b"<svg onload='alert(1)'/>", "is no PNG"),
+        (b"", "is no PNG"),
+        (picture()[:18] + b"\x7f" + picture()[19:], "at most 20000 a side are shown"),
+        (picture() + bytes(17_000_000), "is larger than"),
+    ):
+        figure.write_bytes(data)
+        said = refused(place, "--written", path)
+        assert said.startswith(f"{figure}: ")
+        assert words in said
+    figure.unlink()
+    assert f"{figure} is not there" in invoke(place, "--written", path)
+    # Rows of another source, sealed anew by somebody's script.
+    rows = (*table_of(source=Source.IMPORT), *table_of())
+    path.write_text(written_record(rows).to_json())
+    assert "is of loopback rig" in refused(place, "--written", path)
+
+
+def test_what_others_wrote_is_escaped(lab: Path, place: Path, a_loop: Callable[..., LoopRecord]) -> None:
+    bad = "<img src=x onerror=alert(1)>{{ 7 * 7 }}"
+    named = {"character": bad, "reference": bad, "model": bad, "session": bad}
+    characters(lab / "w", named=named, brush=bad, command=bad, software=bad)
+    loop = put(lab / "l", a_loop(command=bad, software=bad, model=bad).to_json())
+    said = invoke(place, "--written", lab / "w", "--loop", loop)
+    assert "onerror=alert(1)>" in said  # a terminal shows it as it is
+    page = (place / "validation" / "report.html").read_text()
+    assert "<img src=x" not in page
+    assert page.count("&lt;img src=x onerror=alert(1)&gt;{{ 7 * 7 }}") > 8
+
+
+def test_strokes_that_travel_have_no_such_tables(
+    place: Path, tmp_path: Path, a_loop: Callable[..., LoopRecord]
+) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (photos / "0.png").write_bytes(picture())
+    (photos / "strokes.csv").write_text("file,length_mm,depth_mm,px_per_mm\n0.png,2,1,8.0\n")
+    drags = tmp_path / "drags"
+    import_photographs(photos, photos / "strokes.csv", drags, ImportOptions(kind="drag"), "test", lambda: 1)
+    loop = put(tmp_path / "l", a_loop().to_json())
+    assert refused(drags, "--loop", loop) == "--loop: goes into a report of presses; these strokes travel"
+    assert refused(drags, "--written", loop) == "--written: goes into a report of presses; these strokes travel"
+    assert not (drags / "validation").exists()
+
+
+def test_a_report_of_before_there_were_such_fields_is_still_read_and_intact(place: Path) -> None:
+    invoke(place)
+    path = place / "validation" / "report.json"
+    told = json.loads(path.read_text())
+    del told["loops"], told["written"]
+    told["digest"] = ""
+    text = json.dumps(told, sort_keys=True, ensure_ascii=False)
+    told["digest"] = hashlib.sha256(text.encode()).hexdigest()
+    path.write_text(json.dumps(told))
+    assert load_report(path).loops == ()
+    path.write_text(json.dumps(told | {"command": "brushloop"}))
+    with pytest.raises(CalibrationError, match="was edited"):
+        load_report(path)
