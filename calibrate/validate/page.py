@@ -130,9 +130,21 @@ def _of_session(one: Session) -> list[tuple[str, str]]:
         ("licence", one.licence),
         ("calibration", _calibration(one)),
         ("brush fit", one.fit),
-        ("strokes", f"{one.strokes} captured, {one.compared} compared"),
+        ("strokes", _strokes(one)),
+        ("zero touch", "" if one.collected is None else ", ".join(one.collected.touches)),
     ]
     return [(name, text) for name, text in rows if text]
+
+
+def _strokes(one: Session) -> str:
+    told = one.collected
+    if told is None:
+        return f"{one.strokes} captured, {one.compared} compared"
+    planned = "" if told.planned is None else f"{told.planned} planned, "
+    return (
+        f"{planned}{told.photographed} photographed, {len(told.pressed_again)} of them pressed again, "
+        f"{len(told.left_out)} left out, {one.strokes} counted, {one.compared} compared"
+    )
 
 
 def _calibration(one: Session) -> str:

@@ -60,6 +60,21 @@ class Rival(_Frozen):
     """Of a generator's file; empty for others."""
 
 
+class Collected(_Frozen):
+    """What the session's journal tells of how its strokes came about."""
+
+    planned: int | None
+    """None where the protocol is no grid."""
+    photographed: int
+    pressed_again: tuple[str, ...]
+    """Stroke of each take that did not count and was made again."""
+    left_out: tuple[str, ...]
+    touches: tuple[str, ...]
+    """Method and height of every zero touch."""
+    moved_mm: float
+    """Highest less lowest paper."""
+
+
 class Session(_Frozen):
     """A recording, as it says of itself, and the artefacts that were used with it."""
 
@@ -88,6 +103,8 @@ class Session(_Frozen):
     length_ratio: float | None
     width_ratio: float | None
     """Measured over CCD-BSM as published, on average over whole strokes."""
+    collected: Collected | None = None
+    """None where there is no journal: imports, and files that were sent alone."""
 
 
 class Refused(_Frozen):

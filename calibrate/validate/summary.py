@@ -8,13 +8,26 @@ from calibrate.field import KEYS, Alignment, Key, Tone
 from calibrate.similarity import SSIM_SETTINGS
 from calibrate.validate import contenders as who
 from calibrate.validate.beside import Beside
-from calibrate.validate.report import Extreme, Interval, Refused, Report, Rival, Session, Stat, Step, software
+from calibrate.validate.report import (
+    Collected,
+    Extreme,
+    Interval,
+    Refused,
+    Report,
+    Rival,
+    Session,
+    Stat,
+    Step,
+    software,
+)
 from calibrate.validate.run import CEILING, REPEATED, Outcome
 from calibrate.validate.sources import Opened, one_source
 from calibrate.validate.stats import summarise
 from calibrate.validate.steps import Row
 from calibrate.validation import brush_of
 from model.ccdbsm import DomainError, ccdbsm
+from sessions.history import history_of
+from sessions.show import details
 
 MEASURES = ("csim", "ssim")
 MOST_CELLS = 60
@@ -121,7 +134,7 @@ def _extremes(outcome: Outcome, model: str) -> tuple[tuple[Extreme, ...], tuple[
             ssim=_round(100.0 * float(scores[k, 1])),
         )
 
-    count = min(EXTREMES, -(-len(order) // 2))
+    count = min(EXTREMES, max(1, len(order) // 2))
     return tuple(extreme(int(k)) for k in order[::-1][:count]), tuple(extreme(int(k)) for k in order[:count])
 
 
@@ -185,6 +198,22 @@ def _session(outcome: Outcome, number: int, one: Opened) -> Session:
         fit=one.fit.digest if one.fit is not None else "",
         length_ratio=length,
         width_ratio=width,
+        collected=_collected(one),
+    )
+
+
+def _collected(one: Opened) -> Collected | None:
+    folder = one.recording.path.parent
+    history = history_of(folder)
+    if history is None:
+        return None
+    return Collected(
+        planned=details(folder).planned,
+        photographed=history.photographed,
+        pressed_again=history.pressed_again,
+        left_out=history.left_out,
+        touches=tuple(f"{found.method} {found.touch_z_mm:.2f} mm" for found in history.found),
+        moved_mm=_round(history.moved_mm),
     )
 
 

@@ -11,7 +11,7 @@ from calibrate.loop.scores import AGAIN, ANOTHER
 from calibrate.loop.table import LoopRecord
 from calibrate.validate import contenders as who
 from calibrate.validate.paper import ORDER
-from calibrate.validate.report import Report, Stat
+from calibrate.validate.report import Report, Session, Stat
 from calibrate.validate.run import CEILING
 from calibrate.written.images import Polarity
 from calibrate.written.scores import REFERENCE
@@ -25,6 +25,9 @@ FEW_REPEATS = 3
 WIDE_SCALE = 0.005
 """Relative width of the interval of pix2len from which it matters: half a percent of every length."""
 MUCH_REFUSED = 0.05
+MOVED_MM = 0.3
+"""Between two zero touches of one session: more than their repeatability together."""
+MOST_NAMED = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +171,9 @@ def trust(report: Report) -> Iterator[Point]:
         words = f"{lost} of {strokes} strokes could not be used; each is named below, with the reason."
         yield Point(lost <= MUCH_REFUSED * strokes, words)
     else:
-        yield Point(True, "Every captured stroke was used.")
+        yield Point(True, "Every stroke that counted was used.")
+    for one in report.sessions:
+        yield from _collection(one)
     cut = sum(len(s.cut) for s in report.sessions)
     if cut:
         yield Point(False, f"{cut} strokes are cut by the edge of their photograph or cell: their scores are too low.")
@@ -198,6 +203,24 @@ def trust(report: Report) -> Iterator[Point]:
     if any("in sample" in rival.basis for rival in report.rivals):
         words = "Rows “in sample” were fitted to the very strokes that they predict: read the held-out rows instead."
         yield Point(None, words)
+
+
+def _collection(one: Session) -> Iterator[Point]:
+    """What the recording alone does not show: what was planned and never counted, and paper that moved."""
+    told = one.collected
+    if told is None:
+        return
+    if told.left_out:
+        of = "" if told.planned is None else f" of {told.planned} planned"
+        some = ", ".join(told.left_out[:MOST_NAMED]) + (", ..." if len(told.left_out) > MOST_NAMED else "")
+        words = f"{one.session_id}: {len(told.left_out)}{of} strokes were left out while it was collected: {some}."
+        yield Point(False, words)
+    if told.pressed_again:
+        takes = f"{len(told.pressed_again)} of {told.photographed} takes"
+        yield Point(None, f"{one.session_id}: {takes} did not count and were pressed again: what is left was selected.")
+    if told.moved_mm > MOVED_MM:
+        words = f"the paper was found {told.moved_mm:.2f} mm apart ({', '.join(told.touches[:MOST_NAMED])})"
+        yield Point(False, f"{one.session_id}: {words}: presses of one H are not of one depth.")
 
 
 def _verdict(loop: LoopRecord) -> Iterator[Point]:

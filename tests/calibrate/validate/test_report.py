@@ -16,7 +16,9 @@ from brushloop import app
 from calibrate.errors import CalibrationError
 from calibrate.field import Alignment, Tone
 from calibrate.validate.gates import GateMissed, parse_gate
-from calibrate.validate.report import Report, load_report
+from calibrate.validate.page import _of_session
+from calibrate.validate.report import Collected, Report, load_report
+from calibrate.validate.words import trust
 from sessions.reader import Recording
 from sessions.remarks import Remark, add_remark
 
@@ -207,3 +209,19 @@ def test_ablations_show_lambda_and_the_number_of_strokes(session: Path, tmp_path
     assert "λ = π/2" in page
     assert "similarity against the number of fitted presses" in page
     assert "validation losses" in page
+
+
+def test_what_was_left_out_selected_or_pressed_on_other_paper_is_told_before_anyone_trusts(report: Report) -> None:
+    def said(**changes: object) -> str:
+        told = Collected(
+            planned=8, photographed=8, pressed_again=(), left_out=(), touches=("taught 1 mm",), moved_mm=0.0
+        )
+        session = report.sessions[0].model_copy(update={"collected": told.model_copy(update=changes)})
+        one = report.model_copy(update={"sessions": (session,)})
+        return " ".join([*(point.text for point in trust(one)), *dict(_of_session(session)).values()])
+
+    assert "left out while" not in said()
+    assert "8 planned, 8 photographed" in said()
+    assert "2 of 8 planned strokes were left out while it was collected: a, b." in said(left_out=("a", "b"))
+    assert "1 of 8 takes did not count and were pressed again" in said(pressed_again=("a",))
+    assert "found 2.00 mm apart (taught 1 mm, jog 3 mm)" in said(moved_mm=2.0, touches=("taught 1 mm", "jog 3 mm"))
