@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibrate.preprocess import Gray, Params
+from calibrate.preprocess import PX_PER_MM, Gray, Params
 from calibrate.scale import PlaneFit
 from collect.quality import ink_checks, picture_checks, shape_checks
 from collect.quality.config import QualityConfig
@@ -69,8 +69,10 @@ def check_drawing(
     limits: QualityConfig,
     previous: Gray | None = None,
 ) -> Verdict:
-    """Judge a figure, drawn down to `height_mm`, from the (h, w) photograph taken after it: exposure, blur, and whether
-    there is ink in its cell that `previous` does not show. Its shape is not judged: no two figures have one in common.
+    """Judge a figure, drawn down to `height_mm`, from the (h, w) photograph taken after it.
+
+    Exposure, blur, whether its cell holds ink that `previous` does not show, and none across the cell's edge, as an arm
+    would that is still in the picture. Its shape is not judged: no two figures have one in common.
     """
     frame = check_frame(image, plane, limits)
     if not frame.passed:
@@ -78,7 +80,9 @@ def check_drawing(
     inked = take(image, plane.image_to_paper, cell.rect_mm, Params()).inked(limits.ink_gate)
     if previous is not None:
         inked = inked & ~take(previous, plane.image_to_paper, cell.rect_mm, Params()).inked(limits.ink_gate)
-    return Verdict((*frame.checks, ink_checks.blank(mm2(inked), height_mm, limits)))
+    edge = np.concatenate([inked[0], inked[-1], inked[1:-1, 0], inked[1:-1, -1]])
+    crossing = ink_checks.crossing(float(edge.sum()) / PX_PER_MM)
+    return Verdict((*frame.checks, crossing, ink_checks.blank(mm2(inked), height_mm, limits)))
 
 
 def cell_is_blank(

@@ -9,6 +9,9 @@ from collect.quality.ink import Ink
 from collect.quality.mark import Mark
 from collect.quality.verdict import Check, Failure
 
+CROSSING_MM = 4.0
+"""Ink across the edge of a cell: more than the end of one stroke that went too far."""
+
 
 def before_press(cell: int, area_mm2: float, limits: QualityConfig) -> Check:
     """The cell holds no ink before its press."""
@@ -34,6 +37,12 @@ def neighbour(ink: Ink, limits: QualityConfig) -> Check:
     )
     reason = f"{area_mm2:.1f} mm^2 of ink in the cell are not the stroke's: {source}."
     return _most(Failure.NEIGHBOUR, area_mm2, "mm^2", limits.foreign_mm2, reason)
+
+
+def crossing(length_mm: float) -> Check:
+    """No new ink across the edge of a figure's cell."""
+    reason = f"New ink, or the arm, lies across {length_mm:.0f} mm of the cell's edge. Is the arm out of the picture?"
+    return _most(Failure.NEIGHBOUR, length_mm, "mm", CROSSING_MM, reason)
 
 
 def blank(own_mm2: float, height_mm: float, limits: QualityConfig) -> Check:

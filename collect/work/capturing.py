@@ -20,6 +20,7 @@ from sessions.schemas import Check, Quality, Stroke
 
 KEEP, AGAIN, SKIP = Choice("g", "good all the same: it counts"), Choice("r", "press it again"), Choice("k", "skip it")
 PICTURE_MARGIN_PX = 40
+LATE = (Failure.BLANK, Failure.NEIGHBOUR)
 
 
 async def capture(job: Job) -> Result:
@@ -75,8 +76,8 @@ async def _judged(job: Job, image: Gray, cell: Cell) -> Verdict | None:
     job.recorder.quality(Quality(stroke_id=stroke_id, checks=checks), job.attempt.serial)
     if verdict.cause is not None:
         bench.progress.log(f"{stroke_id}: {verdict.reason}", warning=True)
-        # A camera that is late shows the cell as it was: look once more before a whole figure is drawn again.
-        late = verdict.cause.name is Failure.BLANK and _drawn(job) and job.attempt.attempt == 1
+        # A camera that is late shows the cell as it was, or the arm: look once more before a figure is drawn again.
+        late = verdict.cause.name in LATE and _drawn(job) and job.attempt.attempt == 1
         if verdict.cause.name.family is Family.PICTURE or late:
             raise BadPicture(verdict.cause.reason)
     return verdict

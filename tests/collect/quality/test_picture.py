@@ -136,6 +136,11 @@ def test_a_figure_is_sound_where_its_cell_has_new_ink_and_blank_where_it_has_non
     assert late.cause is not None
     assert late.cause.name is Failure.BLANK
     assert judge(paper()).cause == judge(paper(), previous=paper(seed=1)).cause
+    arm = drawn.copy()
+    cv2.circle(arm, (420, 260), 90, 60, -1)  # over the right edge of the cell
+    shaded = judge(arm, previous=before)
+    assert shaded.cause is not None
+    assert shaded.cause.name is Failure.NEIGHBOUR
     dark = judge(np.asarray(drawn * 0.2, np.uint8))
     assert dark.cause is not None
     assert dark.cause.name is Failure.EXPOSURE
