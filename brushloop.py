@@ -126,12 +126,13 @@ def main() -> None:
         else:
             app()
     except Exception as error:
-        # A path of the user's that cannot be read or written is no defect of ours.
-        code = 2 if isinstance(error, OSError) and error.filename else None
-        code = getattr(error, "exit_code", code)
+        code, said = getattr(error, "exit_code", None), str(error)
+        if code is None and isinstance(error, OSError) and error.filename:
+            # A path of the user's that cannot be read or written is no defect of ours.
+            code, said = 2, f"{error.filename}: {error.strerror}"
         if not isinstance(code, int):
             raise
-        words = " ".join([str(error), *getattr(error, "__notes__", [])])
+        words = " ".join([said, *getattr(error, "__notes__", [])])
         try:
             sys.stderr.write(f"brushloop: {words}\n")
         except OSError:

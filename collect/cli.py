@@ -80,7 +80,9 @@ def collect(
 def plan(
     config: Annotated[Path, typer.Option(help="The rig: addresses, frames, limits.")],
     protocol: Annotated[Path, typer.Option(help="What would be done.")],
-    picture: Annotated[Path | None, typer.Option(help="Draw the sheets into this file, as plan.png.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Draw the sheets into this file: .png, .svg, .pdf or .jpg.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
     ask: Annotated[
         bool, typer.Option("--ask", help="Ask the arm's controller whether it reaches every pose; moves nothing.")
@@ -100,6 +102,10 @@ def plan(
     from collect.planning.summary import make_plan
     from collect.protocols.loading import load_protocol
 
+    if picture is not None:
+        from collect.planning.picture import check_picture
+
+        check_picture(picture)
     rig, wanted = load_rig(config), load_protocol(protocol)
     check_protocol(config, protocol, rig, wanted)
     made = make_plan(rig, wanted)

@@ -6,14 +6,15 @@ Any value can be overridden from the environment: `BRUSHLOOP_ROBOT__HOST=192.0.2
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, SettingsError
 
 from calibrate.scale import BoardSpec
 from collect.config_base import Config, Finite, Positive
 from collect.config_devices import CameraConfig, ForceConfig, InkDeviceConfig, RobotConfig
+from collect.config_environment import DELIMITER, PREFIX, overrides, unreadable
 from collect.errors import ConfigError
 from collect.optics import with_optics
 from collect.quality.config import QualityConfig
@@ -103,7 +104,7 @@ class MotionConfig(Config):
 class RigConfig(BaseSettings):
     """Everything about the rig: `rig.toml`, with the environment on top."""
 
-    model_config = SettingsConfigDict(frozen=True, extra="forbid", env_prefix="BRUSHLOOP_", env_nested_delimiter="__")
+    model_config = SettingsConfigDict(frozen=True, extra="forbid", env_prefix=PREFIX, env_nested_delimiter=DELIMITER)
 
     name: str
     robot: RobotConfig
@@ -160,22 +161,17 @@ class RigConfig(BaseSettings):
         return env_settings, init_settings
 
 
-_M = TypeVar("_M", bound=BaseModel)
-
-
 def load_rig(path: Path) -> RigConfig:
     """Read `rig.toml` and its lens file, with overrides from the environment. Raises `ConfigError`."""
-    rig = _validate(path, RigConfig, read_toml(path, MAX_CONFIG_BYTES))
-    return rig.model_copy(update={"camera": with_optics(path, rig.camera)})
-
-
-def _validate(path: Path, kind: type[_M], values: dict[str, Any]) -> _M:
+    values = read_toml(path, MAX_CONFIG_BYTES)
     for name in values:
         if name.startswith("_"):
             raise ConfigError(path, name, "is not a table of this file")
+    environment = overrides(RigConfig)
     try:
-        return kind(**values)
+        rig = RigConfig(**values)
     except SettingsError as error:
-        raise ConfigError("environment", "", f"{error}".splitlines()[0]) from None
+        raise unreadable(RigConfig, error) from None
     except ValidationError as error:
-        raise refusal(path, error) from None
+        raise refusal(path, error, RigConfig, environment=environment) from None
+    return rig.model_copy(update={"camera": with_optics(path, rig.camera)})

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
+from collect.changed import changed
 from collect.config import RigConfig, load_rig
 from collect.dry_run import lifted
 from collect.errors import ConfigError
@@ -17,12 +18,13 @@ from collect.rig import Rig
 from collect.steps import StepKind
 from drivers.clock import Clock
 from drivers.samples import Identity
+from sessions.difference import differences
 from sessions.errors import SessionDamaged
 from sessions.journal import JOURNAL_NAME, replay
 from sessions.schemas import Header, Source
-from sessions.store import SessionStore, Snapshots, differences, next_session_id, open_sessions
+from sessions.store import SessionStore, Snapshots, next_session_id, open_sessions
 
-COMPARED = ("protocol.effective.json", "rig.effective.json")
+COMPARED = ("rig.effective.json", "protocol.effective.json")
 MACHINE_NAMES = {
     "robot": {"host", "port", "rtde_port"},
     "camera": {"source"},
@@ -83,20 +85,15 @@ def find_resumable(opening: Opening) -> Path | None:
     """
     if not opening.root.is_dir():
         return None
-    changed: list[tuple[Path, str]] = []
+    refusals: list[ConfigError] = []
     for folder in reversed(open_sessions(opening.root)) if not opening.new else ():
-        difference = differences(folder, {name: opening.snapshots[name] for name in COMPARED})
-        if not difference:
+        found = differences(folder, {name: opening.snapshots[name] for name in COMPARED})
+        if not found:
             return folder
-        changed.append((folder, difference))
-    if changed:
-        folder, difference = changed[0]
-        raise ConfigError(
-            opening.root,
-            "",
-            f"session {folder.name} is open, but was started with another configuration:\n{difference}\n"
-            "Go on with the old configuration, or start a new session with --new.",
-        )
+        given = {"rig.toml": opening.rig_path, "protocol.toml": opening.protocol_path}
+        refusals.append(changed(folder, found, given, {name: opening.snapshots[name] for name in given}))
+    if refusals:
+        raise refusals[0]
     if opening.sheet is None and any(map(_has_pressed, opening.root.glob(f"*/{JOURNAL_NAME}"))):
         raise ConfigError(
             opening.root,

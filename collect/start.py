@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Literal
 
 from collect.engine import Engine
+from collect.finished import ending
 from collect.headless import run_headless
 from collect.live import LiveView
 from collect.opening import Opening, check_writable, find_resumable, open_store
 from collect.planning.limits import check_protocol
+from collect.rehearsal import Rehearsal
 from drivers.clock import HostClock
 
 Kind = Literal["auto", "cells", "off"]
@@ -20,14 +22,20 @@ Kind = Literal["auto", "cells", "off"]
 
 
 def engine_for(
-    opening: Opening, *, watched: bool, live: LiveView | None = None, guided: bool = False, preview: bool = False
+    opening: Opening,
+    *,
+    watched: bool,
+    live: LiveView | None = None,
+    guided: bool = False,
+    preview: bool = False,
+    make: type[Engine] = Engine,
 ) -> Engine:
     """An engine that goes on with the open session, or makes a new one. Raises `ConfigError`; connects nothing yet."""
     check_protocol(opening.rig_path, opening.protocol_path, opening.rig, opening.protocol)
     resume = find_resumable(opening)
     check_writable(resume or opening.root)
     clock = HostClock()
-    return Engine(
+    return make(
         opening.rig,
         opening.protocol,
         lambda rig: open_store(opening, resume, rig, clock),
@@ -43,24 +51,41 @@ def engine_for(
 def start(
     opening: Opening, *, on_screen: bool, live: LiveView | None = None, guided: bool = False, preview: Kind = "cells"
 ) -> int:
-    """Run to the end and return how many strokes had to be given up. Raises what ended the run."""
+    """Run to the end, say where the recording lies and what comes next, and return how many strokes had to be given up.
+
+    Raises what ended the run.
+    """
     engine = engine_for(opening, watched=on_screen, live=live, guided=guided, preview=on_screen and preview != "off")
     with contextlib.ExitStack() as stack:
         if live is not None:
             live.start()
             stack.callback(live.close)
-        if on_screen:
-            from collect.tui.running import run_screen
-
-            run_screen(engine, preview)
-        else:
-            run_headless(engine)
-    return engine.snapshot().given_up
+        _run(engine, preview, on_screen=on_screen)
+    now = engine.snapshot()
+    _say(ending(Path(now.folder), opening.protocol.kind))
+    return now.given_up
 
 
 def dry_run(config: Path, protocol: Path, height_mm: float, *, armed: bool, on_screen: bool) -> None:
     """Walk through the protocol in the air; what is recorded is thrown away, so that no cell counts as used."""
     with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:
         opening = Opening.load(Path(folder), config, protocol, armed=armed, dry_run_mm=height_mm)
-        start(opening, on_screen=on_screen)
-    sys.stdout.write("dry run done; nothing was kept\n")
+        _run(engine_for(opening, watched=on_screen, preview=on_screen, make=Rehearsal), "cells", on_screen=on_screen)
+    _say("dry run done; nothing was kept\n")
+
+
+def _run(engine: Engine, preview: Kind, *, on_screen: bool) -> None:
+    if on_screen:
+        from collect.tui.running import run_screen
+
+        run_screen(engine, preview)
+    else:
+        run_headless(engine)
+
+
+def _say(text: str) -> None:
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except OSError:
+        sys.stdout = None  # nobody reads any more; Python would try again at its exit, and change the code

@@ -17,6 +17,7 @@ SESSION = typer.Argument(help="A session's folder, or its .mcap file.")
 def show(
     session: Annotated[Path, SESSION],
     as_json: Annotated[bool, typer.Option("--json", help="Everything, as one JSON object.")] = False,
+    files: Annotated[bool, typer.Option("--files", help="List every step's file too.")] = False,
 ) -> None:
     """Show what is in a session: steps, strokes per cell of the grid, sheets, files, devices."""
     import json
@@ -32,7 +33,7 @@ def show(
 
     from sessions.show_text import renderables
 
-    for part in renderables(told):
+    for part in renderables(told, files=files):
         Console().print(part)
 
 

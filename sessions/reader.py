@@ -17,6 +17,7 @@ from sessions.errors import InputError, SessionDamaged, in_one_line
 from sessions.journal import JOURNAL_NAME, is_open, replay
 from sessions.messages import decode_gray, decode_still
 from sessions.remarks import remarks_of
+from sessions.renamed import check_name
 from sessions.schemas import Event, Header, StepEvent, Stroke, Topic
 from sessions.writer import HEADER_METADATA, file_sha256, header_crc
 
@@ -114,6 +115,7 @@ def _find_mcap(path: Path) -> Path:
     if not path.is_dir():
         raise InputError(path, "no such session: give a session's folder or its .mcap file")
     merged = path / f"{path.resolve().name}.mcap"
+    check_name(path)
     if (path / JOURNAL_NAME).is_file() and is_open(replay(path / JOURNAL_NAME)):
         raise InputError(path, "is still open: run the same `brushloop collect` again to finish it")
     if not merged.is_file():

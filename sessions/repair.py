@@ -12,6 +12,7 @@ from pathlib import Path
 from sessions.errors import InputError, SessionDamaged, disk_error
 from sessions.journal import JOURNAL_NAME
 from sessions.reader import parse_header
+from sessions.renamed import check_name
 from sessions.repair_folder import FolderRepair, Report, kept_words
 from sessions.rewrite import replace_damaged, with_their_stills
 from sessions.salvage import scan
@@ -24,6 +25,7 @@ from sessions.writer import HEADER_METADATA, header_crc
 def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
     """Repair a session's folder, or one MCAP file. Raises `SessionDamaged` where nothing can be rebuilt.
 
+    `InputError` for what is no session, and for a folder that was renamed: there is nothing to repair about that.
     `SessionLocked` while another process has the session, `DiskFull` and `SessionError` where the disk fails.
     """
     target = path.resolve()
@@ -32,6 +34,7 @@ def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
     try:
         if target.is_file():
             return _repair_file(target)
+        check_name(path)
         files = [file.name for file in target.glob("*.mcap*")]
         if not (target / JOURNAL_NAME).exists() and not any(map(SEGMENT_NAME.fullmatch, files)):
             final = target / f"{target.name}.mcap"

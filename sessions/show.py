@@ -14,6 +14,7 @@ from sessions.journal import JOURNAL_NAME, Replay, read_lines, replay
 from sessions.lines import Line
 from sessions.reader import Recording
 from sessions.remarks import remarks_of
+from sessions.renamed import check_name
 from sessions.schemas import Header, Stroke, Topic
 from sessions.store import counts_of, read_header
 
@@ -84,6 +85,7 @@ class Details:
 def details(path: Path) -> Details:
     """Look at a session's folder or an MCAP file. Raises `InputError`, `SessionDamaged`."""
     if (path / JOURNAL_NAME).is_file():
+        check_name(path)
         return _of_journal(path.resolve())
     if not path.exists():
         raise InputError(path, "no such session: give a session's folder or its .mcap file")

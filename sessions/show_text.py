@@ -10,23 +10,20 @@ from rich.table import Column, Table
 
 from sessions.show import Details, Sheet
 
-MAX_ROWS = 40
-"""Files shown one by one; --json has them all."""
 
-
-def renderables(told: Details) -> Iterator[RenderableType]:
-    """One after the other, top to bottom."""
-    yield _facts(told)
+def renderables(told: Details, *, files: bool = False) -> Iterator[RenderableType]:
+    """One after the other, top to bottom; `files`: each step's file as well, which may be hundreds of lines."""
+    yield _facts(told, files=files)
     if told.grid:
         yield _grid(told)
-    if told.segments:
+    if files and told.segments:
         yield _segments(told)
     for title, lines in (("Cut attempts", told.void), ("Repaired", told.repairs)):
         if lines:
             yield f"[bold]{title}[/bold]\n" + "\n".join(f"  {escape(line)}" for line in lines)
 
 
-def _facts(told: Details) -> Table:
+def _facts(told: Details, *, files: bool) -> Table:
     table = Table(show_header=False, box=None)
     table.add_row("session", f"[bold]{escape(told.session_id)}[/bold], {told.state}, {escape(told.source)}")
     of = f" of {told.planned} planned" if told.planned else ""
@@ -45,8 +42,10 @@ def _facts(told: Details) -> Table:
     table.add_row("recorded by", escape(f"{told.software}, schema {told.schema_version}{processes}"))
     messages = ", ".join(f"{count} {topic}" for topic, count in sorted(told.messages.items()))
     table.add_row("messages", escape(messages or "none"))
+    if told.segments:
+        table.add_row("files", f"{_files(told)}{'' if files else ' (--files lists them)'}")
     if told.file:
-        table.add_row("file", escape(f"{told.file}, {_size(told.size_bytes)}"))
+        table.add_row("recording", escape(f"{told.file}, {_size(told.size_bytes)}"))
     return table
 
 
@@ -64,12 +63,17 @@ def _grid(told: Details) -> Table:
 def _segments(told: Details) -> Table:
     file = Column("file", overflow="fold")
     table = Table(file, "step", "size", "messages", title=f"{len(told.segments)} finished steps")
-    for segment in told.segments[:MAX_ROWS]:
+    for segment in told.segments:
         messages = ", ".join(f"{count} {topic}" for topic, count in segment.messages.items())
         table.add_row(escape(segment.file), escape(segment.step), _size(segment.size_bytes), escape(messages))
-    if len(told.segments) > MAX_ROWS:
-        table.add_row(f"and {len(told.segments) - MAX_ROWS} more", "", "", "")
     return table
+
+
+def _files(told: Details) -> str:
+    """`2 of finished steps, 0.01 MB, 1 missing`."""
+    sizes = [segment.size_bytes for segment in told.segments]
+    missing = f", {sizes.count(None)} missing" if None in sizes else ""
+    return f"{len(sizes)} of finished steps, {_size(sum(size or 0 for size in sizes))}{missing}"
 
 
 def ranges(sheet: Sheet) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime as dt
-import difflib
 import os
 import re
 from collections import Counter
@@ -285,14 +284,3 @@ def open_sessions(root: Path) -> list[Path]:
     """Folders under `root` whose journal was opened and has no `closed` event, oldest first."""
     folders = sorted(path.parent for path in root.glob(f"*/{JOURNAL_NAME}"))
     return [folder for folder in folders if is_open(replay(folder / JOURNAL_NAME))]
-
-
-def differences(folder: Path, snapshots: Snapshots) -> str:
-    """A unified diff from the session's configuration to the given one; empty where they are the same."""
-    lines: list[str] = []
-    for name, text in snapshots.items():
-        stored = (folder / name).read_text(encoding="utf-8") if (folder / name).exists() else ""
-        lines += difflib.unified_diff(
-            stored.splitlines(), text.splitlines(), f"session/{name}", f"now/{name}", lineterm="", n=0
-        )
-    return "\n".join(lines)

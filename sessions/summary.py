@@ -9,6 +9,7 @@ from pathlib import Path
 from sessions.errors import InputError, SessionError
 from sessions.journal import JOURNAL_NAME, is_open, replay
 from sessions.reader import Recording
+from sessions.renamed import recording_of_renamed
 from sessions.schemas import Source, Topic
 
 
@@ -42,8 +43,11 @@ def _summary(folder: Path) -> Summary | None:
         strokes = sum(line["counts"].get(Topic.STROKE, 0) for line in state.segments)
         return Summary(folder.name, "open", "", strokes, "")
     merged = folder / f"{folder.name}.mcap"
-    if not merged.is_file():
+    renamed = None if merged.is_file() else recording_of_renamed(folder)
+    if renamed is None and not merged.is_file():
         return None
-    recording = Recording(merged)
+    recording = Recording(renamed or merged)
     state_name = "imported" if recording.header.source is Source.IMPORT else "closed"
+    if renamed is not None:
+        return Summary(folder.name, "renamed", recording.header.source, recording.strokes(), renamed.name)
     return Summary(folder.name, state_name, recording.header.source, recording.strokes(), merged.name)

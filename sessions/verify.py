@@ -16,6 +16,7 @@ from sessions.lines import Line
 from sessions.merge import verify as verify_digest
 from sessions.messages import decode_gray, decode_still
 from sessions.reader import Recording
+from sessions.renamed import check_name
 from sessions.salvage import Scan, salvaged, scan
 from sessions.schemas import Stroke, Topic
 from sessions.store import SEGMENT_NAME, counts_of
@@ -53,11 +54,12 @@ class Verdict:
 
 
 def verify_session(path: Path) -> Verdict:
-    """Check a session's folder, or one MCAP file. Raises `InputError` where it is neither."""
+    """Check a session's folder, or one MCAP file. Raises `InputError` where it is neither, or was renamed."""
     if path.is_file():
         return _verify_file(path, path.name)
     if not path.is_dir():
         raise InputError(path, "no such session: give a session's folder or its .mcap file")
+    check_name(path)
     name = path.resolve().name
     collected = (path / JOURNAL_NAME).is_file() or any(SEGMENT_NAME.fullmatch(p.name) for p in path.glob("*.mcap*"))
     if not collected:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from collect.config import RigConfig
+from collect.errors import ConfigError
 from collect.plane import to_paper
 from collect.planning.summary import Placed, Plan
 from collect.planning.walk import sheet_of
@@ -18,14 +19,28 @@ from collect.touch.selfcheck import partners
 
 Axes = Any
 """matplotlib's, whose types are incomplete."""
+ENDINGS = (".png", ".svg", ".pdf", ".jpg")
 MOST_SHEETS = 11
 """With the view of the whole place a picture of twelve panels."""
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 """Of the palette of Okabe and Ito, which people who see few colours can tell apart; the marks differ in shape too."""
 
 
+def check_picture(path: Path) -> None:
+    """Raise `ConfigError` where no picture can be made at this path: before a plan is worked out for nothing."""
+    if path.suffix.lower() not in ENDINGS:
+        raise ConfigError("--picture", "", f"{path} must end in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
+    if not path.parent.is_dir():
+        raise ConfigError("--picture", "", f"{path}: there is no folder {path.parent}")
+    if path.is_dir():
+        raise ConfigError("--picture", "", f"{path} is a folder")
+
+
 def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Path) -> None:
-    """Write the picture; its format is that of the file's name. Raises OSError where it cannot be written."""
+    """Write the picture; its format is that of the file's name. `check_picture` must have passed.
+
+    Raises OSError where it cannot be written.
+    """
     from matplotlib.figure import Figure as Picture
 
     shown = min(plan.sheets, MOST_SHEETS) if plan.placed else 0
@@ -131,7 +146,11 @@ def _sheet(
     axes.plot(*zip(*plan.touches_mm, strict=True), "x", color=ORANGE, markersize=7, mew=2.0)
     axes.set_xlim(-3.0, config.paper.size_mm[0] + 3.0)
     axes.set_ylim(-3.0, config.paper.size_mm[1] + 3.0)
-    note = "" if placed and placed[0].drawn else ": # order, H mm, a deg; darker is deeper; + touch height of the press"
+    note = (
+        ""
+        if placed and placed[0].drawn
+        else ": # order, H mm, a deg; darker is deeper; + where the tip meets the paper"
+    )
     _finish(axes, f"sheet {number}, {len(placed)} strokes{note}")
 
 

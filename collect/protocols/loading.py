@@ -38,7 +38,7 @@ def load_protocol(path: Path) -> ProtocolConfig:
     try:
         return _PROTOCOL.validate_python(values)
     except ValidationError as error:
-        raise refusal(path, error, tagged=True) from None
+        raise refusal(path, error, TaggedProtocol, tagged=True) from None
 
 
 def _fill_strokes(path: Path, values: dict[str, Any]) -> None:

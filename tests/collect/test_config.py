@@ -41,7 +41,16 @@ def test_the_rig_that_the_simulator_writes_is_valid(tmp_path: Path) -> None:
     [
         ("port = 30004", "port = 70000", r"rig.toml: robot.port: .*65535.*given: 70000"),
         ("radius_mm = 6.0", "radius_mm = -1.0", r"brush.radius_mm: .*greater than 0"),
-        ("radius_mm = 6.0", "radius = 6.0", r"brush.*(radius_mm|radius)"),
+        ("radius_mm = 6.0", "radius = 6.0", r"rig.toml: brush.radius: unknown field; did you mean radius_mm\?$"),
+        ("radius_mm = 6.0", "weight-g = 6.0", r"brush.weight-g: unknown field; known are name, radius_mm, length_mm, "),
+        ("[brush]", "[bursh]", r"rig.toml: bursh: unknown table; did you mean brush, which is missing\?$"),
+        ('kind = "ink-station"\n', "", r"ink.device.kind: is missing: one of 'ink-station', 'modbus-pump'$"),
+        ('kind = "ink-station"', 'kind = "kettle"', r"ink.device.kind: 'kettle' is not one of 'ink-station', "),
+        (
+            "[ink.device]\n",
+            "[ink.device]\nkeep-level = 1.0\n",
+            r"ink.device.keep-level: unknown field; did you mean keep_level\?$",
+        ),
         ("touch_z_mm = 120.030", "touch_z_mm = nan", r"paper.touch_z_mm: .*finite"),
         ("touch_z_mm = 120.030", "", r"paper.touch_z_mm: Field required"),
         ("x_mm = [200.0, 640.0]", "x_mm = [640.0, 200.0]", r"robot.limits: .*x_mm = \[640.0, 200.0\]"),
@@ -65,13 +74,57 @@ def test_the_environment_names_machines(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("ROBOT__PORT", "abc", r"^environment variable BRUSHLOOP_ROBOT__PORT: robot.port: .*integer.*given: 'abc'"),
+        ("INK__DEVICE__DOSE_ML", "x", r"^environment variable BRUSHLOOP_INK__DEVICE__DOSE_ML: ink.device.dose_ml: "),
+        ("INK__DEVICE__KIND", "x", r"^environment variable BRUSHLOOP_INK__DEVICE__KIND: ink.device.kind: 'x' is not"),
+        ("PAPER__CELL_MM", "[40, -2]", r"^environment variable BRUSHLOOP_PAPER__CELL_MM: paper.cell_mm.1: .*greater"),
+        ("PAPER__CELL_MM", "40 x 24", r"^environment variable BRUSHLOOP_PAPER__CELL_MM: paper.cell_mm: is not JSON"),
+        ("ROBOT__PROT", "5", r"^environment variable BRUSHLOOP_ROBOT__PROT: robot.prot: .*did you mean port\?"),
+        ("ROBOTT__PORT", "5", r"BRUSHLOOP_ROBOTT__PORT: sets nothing of rig.toml; did you mean BRUSHLOOP_ROBOT__PORT"),
+        ("ROBOT_PORT", "5", r"BRUSHLOOP_ROBOT_PORT: sets nothing of rig.toml; did you mean BRUSHLOOP_ROBOT__PORT\?"),
+        ("NAME__HOST", "5", r"BRUSHLOOP_NAME__HOST: sets nothing of rig.toml"),
+        ("XYZZY", "5", r"BRUSHLOOP_XYZZY: sets nothing of rig.toml: BRUSHLOOP_TABLE__FIELD would"),
+        (
+            "PAPER__TOUCH_Z_MM",
+            "500",
+            r"rig.toml: motion.safe_z_mm = .*; the environment sets BRUSHLOOP_PAPER__TOUCH_Z_MM",
+        ),
+    ],
+)
+def test_a_value_from_the_environment_is_refused_by_its_variable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: str, message: str
+) -> None:
+    # Another one that is in order is not blamed.
+    monkeypatch.setenv("BRUSHLOOP_ROBOT__HOST", "192.0.2.7")
+    monkeypatch.setenv(f"BRUSHLOOP_{name}", value)
+    with pytest.raises(ConfigError, match=message) as refused:
+        load_rig(rig_file(tmp_path))
+    assert refused.value.exit_code == 2
+    assert "ROBOT__HOST" not in str(refused.value)
+
+
+def test_what_is_wrong_in_the_file_is_not_blamed_on_the_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("BRUSHLOOP_ROBOT__HOST", "192.0.2.7")
+    with pytest.raises(ConfigError, match=r"rig.toml: robot.port: .*70000\)$"):
+        load_rig(rig_file(tmp_path, "port = 30004", "port = 70000"))
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("", r"kind: is missing: one of 'grid', 'adaptive', 'list', 'replay', 'write', 'calibration'$"),
+        (PROTOCOL.replace('"grid"', '"gird"'), r"kind: 'gird' is not one of 'grid', 'adaptive', "),
+        (PROTOCOL.replace("heights_mm", "height_mm"), r"height_mm: unknown field; did you mean heights_mm, which is m"),
         (PROTOCOL.replace("repeats = 2", "repeats = 0"), r"repeats: .*1"),
         (PROTOCOL.replace("[11.0, 20.0]", "[]"), r"heights_mm: .*at least 1"),
         (PROTOCOL.replace("[11.0, 20.0]", "[11.0, 11.0]"), r"heights_mm has the same value twice"),
         (PROTOCOL.replace("[0.0, 10.0]", "[-5.0]"), r"tilts_deg.0: .*greater than or equal to 0"),
-        (PROTOCOL + "speed = 3\n", r"speed: Extra inputs"),
+        (PROTOCOL + "speed = 3\n", r"speed: unknown field; did you mean seed\?$"),
+        (PROTOCOL + "hurry = 3\n", r"hurry: unknown field; known are board_every, kind, heights_mm, .*dwell_s$"),
     ],
 )
 def test_a_bad_protocol_is_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:

@@ -149,7 +149,7 @@ def test_a_changed_protocol_is_refused_with_the_difference(lab: Lab) -> None:
     run_and_stop(lab.engine(), lambda now: now.strokes_done == 1)
 
     lab.write_protocol(heights="[11.0, 16.0]")
-    with pytest.raises(ConfigError, match=r"(?s)protocol.effective.json.*-    15.0\n\+    16.0.*--new"):
+    with pytest.raises(ConfigError, match=r"(?s)protocol.toml: heights_mm: \[11.0, 15.0\] -> \[11.0, 16.0\]\n.*--new"):
         lab.engine()
     with pytest.raises(ConfigError, match="--sheet 1"):
         lab.engine(new=True)
@@ -201,7 +201,7 @@ def test_what_the_environment_changes_is_recorded_and_held_against_a_resume(
     [folder] = lab.sessions.iterdir()
     assert '"touch_z_mm": 121.0' in (folder / "rig.effective.json").read_text()
     monkeypatch.delenv("BRUSHLOOP_PAPER__TOUCH_Z_MM")
-    with pytest.raises(ConfigError, match=r'-    "touch_z_mm": 121.0'):
+    with pytest.raises(ConfigError, match=r"rig.toml: paper.touch_z_mm: 121.0 -> 120.03\n.*with the environment, and"):
         lab.engine()
 
 

@@ -38,9 +38,13 @@ def test_a_signal_stops_the_arm_and_the_same_command_goes_on(lab: Lab, number: s
     assert lab.rig.world.tool() == still
 
     again = lab.process()
-    _, stderr = again.communicate(timeout=60)
+    stdout, stderr = again.communicate(timeout=60)
     assert again.returncode == 0, stderr
     [folder] = lab.sessions.iterdir()
+    assert stdout.splitlines() == [
+        f"recorded: {folder / folder.name}.mcap",
+        f"next:     brushloop calibrate {folder}",
+    ]
     assert len({c.stroke.stroke_id for c in Recording(folder).captures()}) == 4
 
 

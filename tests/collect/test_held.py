@@ -113,6 +113,10 @@ def test_a_dry_run_moves_all_the_way_and_leaves_neither_ink_nor_session(lab: Lab
     ran = subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout == "dry run done; nothing was kept\n"
+    assert "rehearsal: nothing is pressed, dipped or kept" in ran.stderr
+    assert "rehearsal: every move was made" in ran.stderr
+    assert "brushloop-dry-" not in ran.stderr
+    assert "session" not in ran.stderr
     assert not lab.sessions.exists()
     assert not lab.rig.world.presses
     assert lab.rig.world.well.ml == well_ml

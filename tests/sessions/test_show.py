@@ -92,6 +92,18 @@ def test_the_command_prints_it_and_json_holds_all_of_it(collected):
     assert as_json["segments"][1]["messages"] == {"/camera/still": 1, "/stroke": 1}
 
 
+def test_files_are_counted_and_listed_only_where_that_is_asked_for(collected):
+    names = [segment.file for segment in details(collected.folder).segments]
+    (collected.folder / names[0]).unlink()
+    size_bytes = sum((collected.folder / name).stat().st_size for name in names[1:])
+    wide = CliRunner(env={"COLUMNS": "160"})
+    ran = wide.invoke(app, ["show", str(collected.folder)])
+    assert f"4 of finished steps, {size_bytes / 1e6:.2f} MB, 1 missing (--files lists them)" in ran.output
+    assert not [name for name in names if name in ran.output]
+    listed = wide.invoke(app, ["show", str(collected.folder), "--files"])
+    assert [name for name in names if name not in listed.output] == []
+
+
 def test_what_is_not_there_is_refused(tmp_path):
     with pytest.raises(InputError, match="no such session"):
         details(tmp_path / "gone")

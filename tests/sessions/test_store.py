@@ -15,7 +15,7 @@ from sessions.journal import JOURNAL_NAME, Journal
 from sessions.lines import with_crc
 from sessions.merge import count_messages
 from sessions.reader import Recording
-from sessions.store import SessionStore, differences, next_session_id, open_sessions
+from sessions.store import SessionStore, next_session_id, open_sessions
 
 CRC = re.compile(rb',"crc":"[0-9a-f]{8}"\}$')
 
@@ -211,13 +211,6 @@ def test_open_sessions_are_listed_oldest_first_without_the_closed(make, tmp_path
             store.close()
         store.release()
     assert [folder.name for folder in open_sessions(tmp_path)] == ["a", "c"]
-
-
-def test_differences_are_told_as_a_unified_diff(make, store):
-    assert differences(store.folder, make.snapshots) == ""
-    changed = {**make.snapshots, "protocol.toml": "repeats = 3\n"}
-    told = differences(store.folder, changed).splitlines()
-    assert told == ["--- session/protocol.toml", "+++ now/protocol.toml", "@@ -1 +1 @@", "-repeats = 2", "+repeats = 3"]
 
 
 def test_session_ids_count_up_until_the_day_is_full(tmp_path):

@@ -81,6 +81,34 @@ def test_every_kind_has_a_picture(rig_path: Path, tmp_path: Path, name: str) -> 
     assert image.std() > 10.0
 
 
+@pytest.mark.parametrize("ending", [".svg", ".pdf", ".JPG"])
+def test_a_picture_has_the_format_of_its_ending(rig_path: Path, tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"plan{ending}"
+    plan(rig_path, "protocol.toml", "--picture", str(path))
+    head = {".svg": b"<?xml", ".pdf": b"%PDF", ".JPG": b"\xff\xd8"}
+    assert path.read_bytes().startswith(head[ending])
+
+
+@pytest.mark.parametrize(
+    ("picture", "message"),
+    [
+        ("plan.xyz", r"^--picture: .*plan\.xyz must end in \.png, \.svg, \.pdf or \.jpg$"),
+        ("plan", r"^--picture: .*plan must end in \.png"),
+        ("nope/plan.png", r"^--picture: .*nope/plan\.png: there is no folder .*nope$"),
+        ("folder.png", r"^--picture: .*folder\.png is a folder$"),
+    ],
+)
+def test_a_picture_that_cannot_be_made_is_refused_before_anything_else(
+    rig_path: Path, tmp_path: Path, picture: str, message: str
+) -> None:
+    (tmp_path / "folder.png").mkdir()
+    rig_path.write_text("[robot")  # is not even read
+    with pytest.raises(ConfigError, match=message) as refused:
+        plan(rig_path, "protocol.toml", "--picture", str(tmp_path / picture))
+    assert refused.value.exit_code == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["folder.png", "rig.toml"]
+
+
 def test_a_picture_shows_names_that_no_font_here_has(rig_path: Path, tmp_path: Path) -> None:
     text = (EXAMPLES / "protocol-write.toml").read_text().replace('"shi"', '"永$x"')
     (tmp_path / "protocol.toml").write_text(text)

@@ -1,0 +1,73 @@
+"""What differs between the configuration that a session was started with and another one, field by field."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+ABSENT = object()
+"""The value of a field that one of the two does not have."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One field, or a whole list where its length changed. An empty `field` is the file: it cannot be compared."""
+
+    file: str
+    field: tuple[str, ...]
+    """Its path in the file: names, and numbers of items from 0."""
+    old: Any
+    new: Any
+
+    def __str__(self) -> str:
+        """`paper.cell_mm: [80.0, 80.0] -> [40.0, 24.0]`."""
+        if not self.field:
+            return "how it was then is missing or damaged"
+        return f"{'.'.join(self.field)}: {_words(self.old)} -> {_words(self.new)}"
+
+
+def differences(folder: Path, snapshots: Mapping[str, str]) -> list[Difference]:
+    """From the session's JSON files of these names to the given texts, in the order of the files; empty: the same."""
+    found: list[Difference] = []
+    for name, text in snapshots.items():
+        try:
+            old = json.loads((folder / name).read_text(encoding="utf-8"))
+        except (FileNotFoundError, ValueError, RecursionError):
+            found.append(Difference(name, (), ABSENT, ABSENT))
+        else:
+            found += _compared(name, (), old, json.loads(text))
+    return found
+
+
+def _compared(file: str, at: tuple[str, ...], old: Any, new: Any) -> Iterator[Difference]:
+    if isinstance(old, dict) and isinstance(new, dict):
+        before, after = cast("dict[str, Any]", old), cast("dict[str, Any]", new)
+        for name in {**after, **before}:
+            yield from _compared(file, (*at, name), before.get(name, ABSENT), after.get(name, ABSENT))
+    elif len(before := _tables(old)) == len(after := _tables(new)) > 0:
+        for number, (one, other) in enumerate(zip(before, after, strict=True)):
+            yield from _compared(file, (*at, str(number)), one, other)
+    elif old != new:
+        yield Difference(file, at, old, new)
+
+
+def _tables(value: Any) -> list[Any]:
+    """The items of a list of tables; nothing for any other value."""
+    items = cast("list[Any]", value) if isinstance(value, list) else []
+    return items if any(isinstance(item, dict) for item in items) else []
+
+
+def _words(value: Any) -> str:
+    if value is ABSENT:
+        return "not there"
+    if value is None:
+        return "left out"
+    if items := _tables(value):
+        return f"{len(items)} items" if len(items) > 1 else "1 item"
+    if isinstance(value, dict):
+        return "given"
+    told = json.dumps(value, ensure_ascii=False)
+    return told if len(told) <= 40 else f"{told[:37]}..."

@@ -1,0 +1,136 @@
+"""A session that was begun with another configuration: what differs is named field by field, and the way back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from collect.errors import ConfigError
+from collect.opening import Opening, find_resumable
+from drivers.clock import HostClock
+from drivers.sim.config import SimConfig
+from drivers.sim.rig_toml import Addresses, rig_toml
+from sessions.difference import Difference
+from sessions.schemas import Header, Source
+from sessions.store import SessionStore
+
+RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
+GRID = 'kind = "grid"\nheights_mm = [11.0, 20.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
+
+
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Both files and an open session that was begun with them, seen from the folder that holds all of it."""
+    monkeypatch.chdir(tmp_path)
+    Path("rig.toml").write_text(RIG)
+    Path("protocol.toml").write_text(GRID)
+    begin()
+    return tmp_path
+
+
+def begin() -> None:
+    header = Header(session_id="grid-01", source=Source.LOOPBACK, software="brushloop 0")
+    SessionStore.create(Path("sessions/grid-01"), header, opening().snapshots, HostClock().now_ns).release()
+
+
+def opening() -> Opening:
+    return Opening.load(Path("sessions"), Path("rig.toml"), Path("protocol.toml"))
+
+
+def edit(name: str, old: str, new: str) -> None:
+    text = Path(name).read_text()
+    assert old in text
+    Path(name).write_text(text.replace(old, new))
+
+
+def refused() -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        find_resumable(opening())
+    assert caught.value.exit_code == 2
+    return str(caught.value).splitlines()
+
+
+def test_what_did_not_change_is_gone_on_with(lab: Path) -> None:
+    edit("rig.toml", "port = 30004", "port = 31004")  # where a device is may change
+    edit("rig.toml", "[paper]", "# measured again\n[paper]")
+    assert find_resumable(opening()) == Path("sessions/grid-01")
+
+
+def test_file_field_old_and_new_value_are_told_and_where_the_old_file_lies(lab: Path) -> None:
+    edit("rig.toml", "cell_mm = [40.0, 24.0]", "cell_mm = [80.0, 80.0]")
+    assert refused() == [
+        "sessions/grid-01: was begun with another configuration:",
+        "rig.toml: paper.cell_mm: [40.0, 24.0] -> [80.0, 80.0]",
+        "Go on with the old one: --config sessions/grid-01/rig.toml; or start a new session with --new.",
+    ]
+    # and what it says is true
+    old = Path("sessions/grid-01")
+    assert find_resumable(Opening.load(Path("sessions"), old / "rig.toml", Path("protocol.toml"))) == old
+
+
+def test_both_files_and_the_environment_are_told_apart(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    edit("rig.toml", "radius_mm = 6.0", "radius_mm = 5.0")
+    edit("protocol.toml", "repeats = 2", "repeats = 3")
+    monkeypatch.setenv("BRUSHLOOP_PAPER__TOUCH_Z_MM", "121.0")
+    *lines, way_out = refused()
+    assert lines[1:] == [
+        "rig.toml: brush.radius_mm: 6.0 -> 5.0",
+        "rig.toml: paper.touch_z_mm: 120.03 -> 121.0 (by BRUSHLOOP_PAPER__TOUCH_Z_MM)",
+        "protocol.toml: repeats: 2 -> 3",
+    ]
+    assert way_out == (
+        "Go on with the old one: --config sessions/grid-01/rig.toml --protocol sessions/grid-01/protocol.toml "
+        "without BRUSHLOOP_PAPER__TOUCH_Z_MM in the environment; or start a new session with --new."
+    )
+
+
+def test_another_kind_of_protocol_fits_on_a_small_terminal(lab: Path) -> None:
+    Path("protocol.toml").write_text('kind = "list"\npresses = [{height_mm = 11.0}, {height_mm = 12.0}]\n')
+    lines = refused()
+    assert lines[1] == 'protocol.toml: kind: "grid" -> "list"'
+    assert lines[-2].startswith("and ")
+    assert sum(1 + len(f"brushloop: {line}") // 80 for line in lines) <= 12
+
+
+def test_a_changed_row_of_a_side_file_is_named_by_its_number(lab: Path) -> None:
+    Path("p.csv").write_text("height_mm\n11\n12\n")
+    Path("protocol.toml").write_text('kind = "list"\nfile = "p.csv"\n')
+    (lab / "sessions/grid-01").rename(lab / "elsewhere")
+    begin()
+    Path("p.csv").write_text("height_mm\n11\n13\n")
+    assert refused()[1:] == [
+        "protocol.toml: presses.1.height_mm: 12.0 -> 13.0",
+        "Go on with the old one: with the environment, and the files that it names, as they were then; "
+        "or start a new session with --new.",
+    ]
+    Path("p.csv").write_text("height_mm\n11\n")
+    assert refused()[1] == "protocol.toml: presses: 2 items -> 1 item"
+
+
+def test_an_old_file_that_names_others_must_lie_beside_them(lab: Path) -> None:
+    Path("p.csv").write_text("height_mm\n11\n")
+    Path("protocol.toml").write_text('kind = "list"\nfile = "p.csv"\n')
+    (lab / "sessions/grid-01").rename(lab / "elsewhere")
+    begin()
+    edit("protocol.toml", "file", "repeats = 3\nfile")
+    assert "(copied beside protocol.toml: it names other files)" in refused()[-1]
+
+
+def test_a_field_that_the_brushloop_of_then_did_not_know_is_told_as_that(lab: Path) -> None:
+    edit("sessions/grid-01/rig.effective.json", '"retakes": 2,', "")
+    assert refused()[1:] == [
+        "rig.toml: quality.retakes: not there -> 2",
+        "Go on with the old one: with the brushloop that began it, whose files had other fields; "
+        "or start a new session with --new.",
+    ]
+
+
+def test_values_of_any_length_and_kind_have_short_words() -> None:
+    assert str(Difference("a", ("x",), list(range(99)), None)) == f"x: [{', '.join(map(str, range(12)))}... -> left out"
+    assert str(Difference("a", ("force",), None, {"kind": "x"})) == "force: left out -> given"
+
+
+def test_a_session_whose_old_values_cannot_be_read_is_not_gone_on_with(lab: Path) -> None:
+    Path("sessions/grid-01/rig.effective.json").write_text("{")
+    assert refused()[1] == "rig.toml: how it was then is missing or damaged"

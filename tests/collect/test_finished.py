@@ -1,0 +1,36 @@
+"""What is told when a session is finished: where its recording lies, and the next command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from collect.finished import ending
+from collect.opening import Opening
+from collect.start import start
+
+if TYPE_CHECKING:
+    from conftest import Lab
+
+
+def test_the_recording_and_what_comes_next(tmp_path: Path) -> None:
+    folder = tmp_path / "grid-01"
+    recorded = f"recorded: {folder}/grid-01.mcap\n"
+    assert ending(folder, "grid") == f"{recorded}next:     brushloop calibrate {folder}\n"
+    (folder / "calibration").mkdir(parents=True)
+    assert ending(folder, "list") == f"{recorded}next:     brushloop validate {folder}\n"
+    assert ending(folder, "calibration") == recorded
+
+
+def test_it_is_told_after_the_screen_too(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lab.write_protocol("[11.0]", "[0.0]")
+    monkeypatch.setattr("collect.tui.running.run_screen", lambda engine, _preview: (engine.start(), engine.join()))
+    opening = Opening.load(lab.sessions, lab.folder / "rig.toml", lab.folder / "protocol.toml")
+    assert start(opening, on_screen=True, preview="off") == 0
+    [folder] = lab.sessions.iterdir()
+    assert capsys.readouterr().out == ending(folder, "grid")
+    assert (folder / f"{folder.name}.mcap").is_file()
