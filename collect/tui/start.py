@@ -45,6 +45,11 @@ WELCOME = (
     "you about each measurement; then the strokes follow.\n\nd asks every device of the rig whether it is well. "
     "Nothing moves from this screen."
 )
+SIGNS = {
+    "open": ("▶", "bold $text-warning"),
+    "damaged": ("!", "bold $text-error"),
+    "renamed": ("!", "bold $text-warning"),
+}
 FRESH = "A new session: is a blank sheet in as its sheet 1?"
 Begin = Callable[[str | None], None]
 """Goes on with a session of that name; None is a new one."""
@@ -63,7 +68,7 @@ class StartScreen(Screen[None]):
     StartScreen #files Line { width: auto; padding: 0 1; }
     StartScreen #files Input { width: 1fr; height: 1; border: none; padding: 0; }
     StartScreen #health { height: auto; max-height: 8; padding: 0 1; border-top: solid $foreground 40%; }
-    StartScreen #trouble { height: auto; max-height: 6; padding: 0 1; color: $text-error; text-style: bold; }
+    StartScreen #trouble { height: auto; max-height: 10; padding: 0 1; color: $text-error; text-style: bold; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("n", "new", "New session"),
@@ -209,7 +214,7 @@ class StartScreen(Screen[None]):
 
 
 def _row_content(row: Summary) -> Content:
-    sign, style = {"open": ("▶", "bold $text-warning"), "damaged": ("!", "bold $text-error")}.get(row.state, ("✓", ""))
+    sign, style = SIGNS.get(row.state, ("✓", ""))
     return Content.assemble((sign, style), f" {one_line(row.session_id)} {row.state}")
 
 
