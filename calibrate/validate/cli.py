@@ -42,9 +42,7 @@ def validate(
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the session's newest by default.")] = None,
     fit: Annotated[Path | None, typer.Option(help="Brush fit; the session's newest by default.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the report; <session>/validation by default.")] = None,
-    gate: Annotated[
-        list[str] | None, typer.Option(help="As 'csim_avg>=0.90', quoted; exit code 5 if missed.")
-    ] = None,
+    gate: Annotated[list[str] | None, typer.Option(help="As 'csim_avg>=0.90', quoted; exit code 5 if missed.")] = None,
     ablations: Annotated[bool, typer.Option("--ablations", help="Lambdas, and similarity by number of fits.")] = False,
     curves: Annotated[list[str] | None, typer.Option(help="NAME=FOLDER of a training, for figures 9 and 12.")] = None,
     held_out: Annotated[bool, typer.Option(help="Fit to other cells, each cell left out in turn.")] = True,
