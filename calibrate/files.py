@@ -16,6 +16,19 @@ MAX_BYTES = 1024 * 1024
 MAX_PHOTOGRAPH_BYTES = 256 * 1024 * 1024
 
 
+def check_target(path: Path, ending: str, *inputs: Path | None) -> None:
+    """Before any work: whether a file may be written there. Raises `CalibrationError`.
+
+    Another ending might be a recording's or a photograph's, and what is read is never overwritten.
+    """
+    if path.suffix.lower() != ending:
+        raise CalibrationError(str(path), f"must end in {ending}")
+    if path.is_dir():
+        raise CalibrationError(str(path), "is a folder")
+    if any(one is not None and one.exists() and path.exists() and path.samefile(one) for one in inputs):
+        raise CalibrationError(str(path), "is what is read; it is not overwritten")
+
+
 def write_whole(path: Path, text: str) -> None:
     """Write beside, then rename: a reader sees the old file or the new one. Raises OSError; the part is then gone."""
     part = path.with_name(path.name + ".part")

@@ -31,10 +31,12 @@ def invert(
 
     from calibrate.errors import CalibrationError
     from calibrate.field import Field
+    from calibrate.files import check_target
     from calibrate.invert import Settings, invert_recording, off_command
     from calibrate.invert_write import write_inversion
     from model.inversion.press import Range
 
+    check_target(out, ".csv")
     try:
         within = Range(height_range, tilt_range)
         if tilt_range[1] > 30 or not tilt_range[0] <= assume_tilt <= tilt_range[1]:

@@ -61,7 +61,7 @@ def test_nobody_imports_the_front_door_and_nobody_outside_it_the_loopback_rig(pa
         (("collect", "--config", "no.toml", "--protocol", "no.toml", "--no-tui"), "no.toml: no such file"),
         (("sessions", "import", "nowhere", "--csv", "no.csv"), "nowhere: is not a folder"),
         (("sessions", "list", "nowhere"), "nowhere: is not a folder"),
-        (("sim", "--write-rig", "no/rig.toml"), "brushloop: no/rig.toml.part: No such file or directory\n"),
+        (("sim", "--write-rig", "no/rig.toml"), "brushloop: no/rig.toml: there is no folder no\n"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:

@@ -21,7 +21,16 @@ Rectangle = tuple[float, float, float, float]
 
 
 def write_pdf(board: Board, path: Path, page: str = "a4") -> Path:
-    """Write the board on one page, turned where it fits only so. Raises `CalibrationError` where it does not fit."""
+    """Write the board on one page, turned where it fits only so.
+
+    Raises `CalibrationError` where it does not fit, and for a path that is no PDF's: nothing else is overwritten.
+    """
+    if path.suffix.lower() != ".pdf":
+        raise CalibrationError(str(path), "must end in .pdf")
+    if not path.parent.is_dir():
+        raise CalibrationError(str(path), f"there is no folder {path.parent}")
+    if path.exists() and not (path.is_file() and path.read_bytes().startswith(b"%PDF")):
+        raise CalibrationError(str(path), "is there already and is no PDF; it is not overwritten")
     page_mm = _page(board, page)
     content = _content(board, page_mm)
     path.write_bytes(_document(page_mm, content))

@@ -79,8 +79,10 @@ def preprocess(
     out: Annotated[Path, typer.Option(help="The picture; the numbers go beside it as .json.")] = Path("stages.png"),
 ) -> None:
     """Show every stage of one capture as one picture, and write down each number that was fitted on the way."""
+    from calibrate.files import check_target
     from calibrate.prepare.show import show_photograph, show_stroke
 
+    check_target(out, ".png", capture, before)
     if capture.suffix.lower() in (".png", ".jpg", ".jpeg"):
         trace = show_photograph(capture, px_per_mm, before, out)
     else:

@@ -140,6 +140,7 @@ def captures(
     from rich.markup import escape
 
     from calibrate.errors import CalibrationError
+    from calibrate.files import check_target
     from calibrate.validate.captures_file import lay_captures, write_captures
     from calibrate.validate.sources import open_session
 
@@ -150,6 +151,7 @@ def captures(
         except ValueError:
             raise CalibrationError(f"--leave-out {text}", "expected H/alpha, as 13/5") from None
         cells.append((height, tilt))
+    check_target(out, ".safetensors", generator)
     opened = [open_session(place, out.parent / "work", calibration, None) for place in session]
     laid = lay_captures(opened, generator)
     count = write_captures(laid, out, cells)

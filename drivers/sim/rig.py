@@ -159,12 +159,14 @@ async def _serve(
 
 
 class RigFileExists(Exception):
-    """The file is there and is not a loopback rig's: it may be a lab's own."""
+    """The file cannot be written: there is no such folder, or it is not a loopback rig's and may be a lab's own."""
 
     exit_code: ClassVar[int] = 2
 
 
 def _refuse_to_overwrite(path: Path) -> None:
+    if not path.parent.is_dir():
+        raise RigFileExists(f"{path}: there is no folder {path.parent}")
     if path.exists() and not (path.is_file() and path.read_bytes().startswith(LOOPBACK_HEAD.encode())):
         raise RigFileExists(f"{path}: exists and was not written by a loopback rig; it is not overwritten")
 

@@ -59,3 +59,18 @@ def test_a_board_that_does_not_fit_the_page_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match="has no room for a board of 312 x 240 mm"):
         write_pdf(BoardSpec(squares=(26, 20), square_mm=12, marker_mm=9, origin_mm=(0, 0)), tmp_path / "x.pdf")
     assert not (tmp_path / "x.pdf").exists()
+
+
+def test_only_a_pdf_is_ever_overwritten(tmp_path: Path) -> None:
+    recording = tmp_path / "board.pdf"
+    recording.write_bytes(b"\x89MCAP0\r\n")
+    for path, why in (
+        (tmp_path / "s.mcap", "must end in .pdf"),
+        (tmp_path / "no" / "board.pdf", "there is no folder"),
+        (recording, "is no PDF; it is not overwritten"),
+    ):
+        with pytest.raises(CalibrationError, match=why):
+            write_pdf(BOARD, path)
+    assert recording.read_bytes() == b"\x89MCAP0\r\n"
+    twice = [write_pdf(BOARD, tmp_path / "b.PDF").read_bytes() for _ in range(2)]
+    assert twice[0] == twice[1]

@@ -1,0 +1,44 @@
+"""What may be written where: nothing that was recorded or is being read is ever overwritten."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from brushloop import app
+from calibrate.errors import CalibrationError
+from calibrate.files import check_target
+
+
+def test_a_target_has_the_ending_of_what_is_written_and_is_not_what_is_read(tmp_path: Path) -> None:
+    photograph = tmp_path / "a.png"
+    photograph.write_bytes(b"ink")
+    check_target(tmp_path / "new.PNG", ".png", photograph, None)
+    check_target(photograph, ".png")
+    for path, why in ((tmp_path / "s.mcap", r"must end in \.png"), (photograph, "is what is read")):
+        with pytest.raises(CalibrationError, match=why):
+            check_target(path, ".png", photograph)
+    (tmp_path / "folder.png").mkdir()
+    with pytest.raises(CalibrationError, match="is a folder"):
+        check_target(tmp_path / "folder.png", ".png")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("invert", "{s}", "--out", "{s}"),
+        ("validate", "captures", "{s}", "--generator", "g.safetensors", "--out", "{s}"),
+        ("calibrate", "preprocess", "{s}", "--out", "{s}"),
+    ],
+)
+def test_a_recording_is_not_overwritten_by_what_comes_of_it(tmp_path: Path, words: tuple[str, ...]) -> None:
+    recording = tmp_path / "s.mcap"
+    recording.write_bytes(b"recorded")
+    ran = CliRunner().invoke(app, [word.format(s=recording) for word in words])
+    assert ran.exit_code != 0
+    assert isinstance(ran.exception, CalibrationError)
+    assert "must end in" in str(ran.exception)
+    assert recording.read_bytes() == b"recorded"
+    assert [path.name for path in tmp_path.iterdir()] == ["s.mcap"]
