@@ -279,7 +279,8 @@ def test_an_edited_table_3_or_another_picture_is_refused(lab: Path, place: Path)
         assert said.startswith(f"{figure}: ")
         assert words in said
     figure.unlink()
-    assert f"{figure} is not there" in invoke(place, "--written", path)
+    # A terminal breaks a long path anywhere.
+    assert f"{figure} is not there".replace(" ", "") in invoke(place, "--written", path).replace(" ", "")
     # Rows of another source, sealed anew by somebody's script.
     rows = (*table_of(source=Source.IMPORT), *table_of())
     path.write_text(written_record(rows).to_json())
@@ -323,6 +324,6 @@ def test_a_report_of_before_there_were_such_fields_is_still_read_and_intact(plac
     told["digest"] = hashlib.sha256(text.encode()).hexdigest()
     path.write_text(json.dumps(told))
     assert load_report(path).loops == ()
-    path.write_text(json.dumps(told | {"command": "brushloop"}))
+    path.write_text(json.dumps(told | {"command": "brushloop validate another"}))
     with pytest.raises(CalibrationError, match="was edited"):
         load_report(path)

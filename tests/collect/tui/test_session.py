@@ -112,6 +112,7 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
         yield made
 
 
+@pytest.mark.soak
 @pytest.mark.timeout(400)
 async def test_a_day_at_the_rig(lab: Lab) -> None:
     world, rig_toml = lab.rig.world, lab.folder / "rig.toml"
