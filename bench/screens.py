@@ -101,7 +101,7 @@ class _Tour:
             return
         if Flaw.SPLIT in asked.question and not self.asked_split:
             return
-        for words, key in (("keep it", "k"), ("try again", "g")):
+        for words, key in (("it counts", "g"), ("try again", "g")):
             if words in str(asked.choices):
                 await self.pilot.press(key)
                 await self.pilot.pause(0.2)
@@ -143,6 +143,8 @@ async def _tour(app: OperatorApp, rig: LoopbackRig, out: Path) -> None:
             await tour.until(lambda: tour.asked("+1.0"))
             if touch == 0:
                 await tour.take("set-up-jog")
+            await pilot.press("1")
+            await tour.until(lambda: tour.asked(" +0.0") or tour.asked(" -0.0"))
             await pilot.press("t")
         await tour.until(lambda: tour.asked("Zero touch and plane"))
         await pilot.press("g")
