@@ -51,7 +51,7 @@ class SetUpScreen(Screen[None]):
     SetUpScreen.-picture #set-up-camera { display: block; width: 100%; }
     SetUpScreen.-narrow.-picture #steps, SetUpScreen.-narrow.-picture #found-pane { display: none; }
     SetUpScreen #live { height: 5; padding: 0 1; border-top: solid $foreground 40%; text-wrap: nowrap; }
-    SetUpScreen #question-box { height: auto; max-height: 11; padding: 0 1; border: heavy $warning; display: none; }
+    SetUpScreen #question-box { height: auto; max-height: 13; padding: 0 1; border: heavy $warning; display: none; }
     SetUpScreen.-asking #question-box { display: block; }
     SetUpScreen #set-up-note { height: 1; padding: 0 1; background: $panel; }
     """

@@ -10,8 +10,10 @@ from textual.pilot import Pilot
 
 from collect.states import State
 from collect.tui.app import OperatorApp
+from collect.tui.finish import FinishScreen
+from sessions.verify import Verdict
 from tests.collect.tui.desk import FakeDesk, a_review
-from tests.collect.tui.fake import DONE, FAILED, PAUSED, SET_UP, SPLIT, TOUCHED, FakeEngine, full_picture
+from tests.collect.tui.fake import DONE, FAILED, JOGGED, PAUSED, SET_UP, SPLIT, TOUCHED, FakeEngine, full_picture
 
 SIZES = {"80x24": (80, 24), "120x40": (120, 40), "200x60": (200, 60)}
 NOW = {
@@ -20,6 +22,7 @@ NOW = {
     "failed": FAILED,
     "done": DONE,
     "asking": full_picture(state=State.ASKING, prompt=SPLIT),
+    "jog": full_picture(state=State.RUNNING, step="zero touch", set_up=SET_UP, prompt=JOGGED),
     "set-up": full_picture(state=State.ASKING, step="zero touch", set_up=SET_UP, prompt=TOUCHED),
 }
 Press = Callable[[Pilot[None]], Awaitable[None]]
@@ -51,7 +54,7 @@ async def settled(pilot: Pilot[None]) -> None:
 
 
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("name", ["running", "asking", "set-up"])
+@pytest.mark.parametrize("name", ["running", "asking", "set-up", "jog"])
 def test_run(snap_compare: Callable[..., bool], name: str, size: str) -> None:
     app = OperatorApp(FakeEngine(NOW[name]), now_s=lambda: 1010.0)
     assert snap_compare(app, terminal_size=SIZES[size], run_before=pressing())
@@ -86,6 +89,27 @@ def test_without_a_run(snap_compare: Callable[..., bool], tmp_path: Path, name: 
         assert snap_compare(app, terminal_size=SIZES[size], run_before=review)
     else:
         assert snap_compare(app, terminal_size=SIZES[size], run_before=pressing("d"))
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_end_of_a_session(snap_compare: Callable[..., bool], monkeypatch: pytest.MonkeyPatch, size: str) -> None:
+    sound = Verdict("2026-11-21-grid-01", "closed", files=44, strokes=12, messages=22528)
+    monkeypatch.setattr("collect.tui.finish.verified", lambda _folder: sound)
+    app = OperatorApp(desk=FakeDesk())
+
+    async def finish(pilot: Pilot[None]) -> None:
+        await settled(pilot)
+        app.push_screen(FinishScreen(Path("sessions/2026-11-21-grid-01"), is_open=False))
+        await settled(pilot)
+
+    assert snap_compare(app, terminal_size=SIZES[size], run_before=finish)
+
+
+@pytest.mark.parametrize("size", ["120x40", "200x60"])
+@pytest.mark.parametrize(("name", "keys"), [("help", ["?"]), ("leave", ["q"])])
+def test_over_a_larger_run(snap_compare: Callable[..., bool], name: str, keys: list[str], size: str) -> None:
+    app = OperatorApp(FakeEngine(full_picture()))
+    assert snap_compare(app, terminal_size=SIZES[size], run_before=pressing(*keys))
 
 
 def test_light(snap_compare: Callable[..., bool]) -> None:
