@@ -103,7 +103,7 @@ class FinishScreen(ModalScreen[None]):
             ("t", "bold $text-accent"),
             f"  brushloop fit {self._folder}\n",
             ("w", "bold $text-accent"),
-            f"  brushloop validate {self._folder}      (the report)\n",
+            f"  brushloop validate {self._folder}  (report)\n",
             ("escape", "bold $text-accent"),
             "  back",
         )

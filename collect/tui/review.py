@@ -15,7 +15,6 @@ from textual.containers import Horizontal, Vertical
 from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Input, OptionList
-from textual.widgets.option_list import Option
 
 from collect.reviewing import Looked, Review, Seen, counts
 from collect.tui.finish import FinishScreen
@@ -23,6 +22,7 @@ from collect.tui.host import host
 from collect.tui.keys import STOP_KEY, KeyBar
 from collect.tui.line import Line
 from collect.tui.pictures import Pictures, binary_picture
+from collect.tui.rows import Rows
 from collect.tui.text import SOFTWARE_STOP, one_line, plain
 from sessions.errors import SessionError
 from sessions.remarks import Remark, add_remark
@@ -82,7 +82,7 @@ class ReviewScreen(Screen[None]):
         self._looked: Looked | None = None
         self._alike: dict[tuple[float, float], tuple[float, int] | None] = {}
         self._title, self._words = Line("review-title"), Line("words")
-        self._options = OptionList(id="captures", markup=False)
+        self._options = Rows("captures")
         self._photo, self._binary = pictures.make("review-photo"), pictures.make("review-binary")
         self._keys, self._stop_note = KeyBar(KEYS), Line("at-work")
         self._note = Input(placeholder="note, enter keeps it, escape leaves it", id="note-line", compact=True)
@@ -188,8 +188,7 @@ class ReviewScreen(Screen[None]):
         good = sum(map(counts, self._rows))
         state = "open" if self._review.open else "closed"
         self._title.show(f"Review   {one_line(self._review.folder.name)} ({state})   {good} of {len(self._rows)} count")
-        self._options.clear_options()
-        self._options.add_options(Option(_row_content(row)) for row in self._rows)
+        self._options.fill([(None, _row_content(row)) for row in self._rows])
         if self._rows:
             self._options.highlighted = min(at, len(self._rows) - 1)
         else:

@@ -13,7 +13,6 @@ from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Input, OptionList
-from textual.widgets.option_list import Option
 
 from collect.desk import Desk
 from collect.errors import ConfigError
@@ -21,6 +20,7 @@ from collect.tui.confirm import Confirm
 from collect.tui.host import host
 from collect.tui.keys import KeyBar
 from collect.tui.line import Line
+from collect.tui.rows import Rows
 from collect.tui.text import one_line, plain
 from sessions.errors import SessionError
 
@@ -85,7 +85,7 @@ class StartScreen(Screen[None]):
         self._rows: list[Summary] = []
         self._title, self._standing = Line("start-title"), Line("standing-text")
         self._health, self._trouble = Line("health-text"), Line("trouble")
-        self._options = OptionList(id="sessions", markup=False)
+        self._options = Rows("sessions")
         self._keys = KeyBar(KEYS)
         paths = desk.paths
         self._config = Input(str(paths.config), id="config", compact=True, select_on_focus=False)
@@ -127,8 +127,7 @@ class StartScreen(Screen[None]):
         except (SessionError, OSError) as error:
             self.trouble(str(error))
             return
-        self._options.clear_options()
-        self._options.add_options(Option(_row_content(row), id=row.session_id) for row in self._rows)
+        self._options.fill([(row.session_id, _row_content(row)) for row in self._rows])
         if self._rows:
             self._options.highlighted = 0
         else:
