@@ -7,24 +7,22 @@ recovered and pressed again by the commands that an operator would use, on a rig
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from bench.brushfit_brushes import FROZEN
-from bench.harness import BenchError, Result, machine
-from bench.processes import ROOT, started
+from bench.harness import Result, machine
+from bench.processes import brushloop, started
 
 HEIGHTS_MM = [11.0, 15.0, 20.0]
 TILTS_DEG = [0.0, 5.0, 10.0]
 REPEATS = 3
 RATE = 20.0
 GOAL_POINTS = 1.0
-LEFT_OUT = 3
-"""Exit code of a collection that finished without some strokes; fewer pairs are told as such."""
+ENDS = (0, 3)
+"""3 is a collection that finished without some strokes; fewer pairs are told as such."""
 
 
 def run(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
@@ -56,15 +54,8 @@ def close_the_loop(folder: Path, brush: int, seed: int) -> dict[str, Any]:
     grid = f'kind = "grid"\nheights_mm = {HEIGHTS_MM}\ntilts_deg = {TILTS_DEG}\nrepeats = {REPEATS}\nseed = {seed}\n'
     protocol.write_text(grid, encoding="utf-8")
     with started("bench.loop_rig", str(rig), str(brush), str(RATE)) as process:
-        _brushloop("collect", "--config", rig, "--protocol", protocol, "--out", sessions, "--no-tui")
+        brushloop("collect", "--config", rig, "--protocol", protocol, "--out", sessions, "--no-tui", ends=ENDS)
         [session] = sessions.iterdir()
         process.ask()
-        _brushloop("loop", session, "--config", rig, "--sheet", "1", "--no-tui", "--seed", str(seed))
+        brushloop("loop", session, "--config", rig, "--sheet", "1", "--no-tui", "--seed", str(seed), ends=ENDS)
     return json.loads((session / "loop" / "loop.json").read_text(encoding="utf-8"))
-
-
-def _brushloop(*words: str | Path) -> None:
-    command = [sys.executable, "-m", "brushloop", *map(str, words)]
-    ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    if ran.returncode not in (0, LEFT_OUT):
-        raise BenchError(f"`{' '.join(command[2:])}` ended with {ran.returncode}: {ran.stderr.strip()[-400:]}")

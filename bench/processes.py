@@ -12,7 +12,7 @@ import contextlib
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
 
 from bench.harness import BenchError
@@ -59,6 +59,15 @@ def started(*arguments: str) -> Iterator[Process]:
                 running.wait(10.0)
             except subprocess.TimeoutExpired:
                 running.kill()
+
+
+def brushloop(*words: str | Path, ends: Container[int] = (0,)) -> subprocess.CompletedProcess[str]:
+    """Run a command as an operator does. Raises BenchError unless it ends with one of these exit codes."""
+    command = [sys.executable, "-m", "brushloop", *map(str, words)]
+    ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if ran.returncode not in ends:
+        raise BenchError(f"`{' '.join(command[2:])}` ended with {ran.returncode}: {ran.stderr.strip()[-400:]}")
+    return ran
 
 
 async def lines_of_input() -> asyncio.StreamReader:

@@ -7,14 +7,13 @@ reports say `imported photographs`). The commands are the ones that a user gives
 from __future__ import annotations
 
 import itertools
-import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 from bench.brushfit_brushes import FROZEN
 from bench.harness import BenchError, Result, machine
+from bench.processes import brushloop
 from bench.validate import CELLS, session
 from calibrate.field import Alignment, Tone
 from calibrate.validate.contenders import BEZIER_REFITTED, FITTED_HELD_OUT, GENERATOR_HELD_OUT
@@ -39,17 +38,17 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     out: list[Result] = []
     with tempfile.TemporaryDirectory() as folder:
         under = Path(folder)
-        _brushloop(
+        brushloop(
             *("train", "--target", "anchored", "--out", str(under / "generator")),
             *("--steps", str(TRAIN_STEPS), "--seed", str(seed)),
         )
         for number, spec in enumerate(brushes, 1):
             count = REPEATS * len(CELLS)
             place = session(under, f"brush-{number}", count, seed, spec, count)
-            _brushloop("fit", str(place))
+            brushloop("fit", str(place))
             generator = ("--generator", str(under / "generator" / "generator.safetensors"))
             report = under / f"report-{number}"
-            _brushloop("validate", str(place), "--out", str(report), *generator, "--tune", str(TUNE_STEPS))
+            brushloop("validate", str(place), "--out", str(report), *generator, "--tune", str(TUNE_STEPS))
             out += _figures(number, load_report(report / "report.json"), count, seed)
     return out
 
@@ -82,9 +81,3 @@ def _average(report: Report, model: str, alignment: Alignment) -> float:
     if stat is None:
         raise BenchError(f"the report has no {model}")
     return stat.avg
-
-
-def _brushloop(*words: str) -> None:
-    ran = subprocess.run([sys.executable, "-m", "brushloop", *words], capture_output=True, text=True, check=False)
-    if ran.returncode:
-        raise BenchError(f"brushloop {words[0]}: {ran.stderr[-300:]}")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from calibrate.camera.lens import Lens, lens_of
-from calibrate.errors import CalibrationError
+from calibrate.errors import CalibrationError, invalid
 from calibrate.files import read_bounded, write_whole
 from calibrate.scale import BoardSpec, apply
 
@@ -59,8 +59,7 @@ def load_artefact(path: Path, kind: type[A]) -> A:
     try:
         made = kind.model_validate_json(data)
     except ValidationError as error:
-        first = error.errors()[0]
-        raise CalibrationError(str(path), f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise invalid(str(path), error) from None
     if hashlib.sha256(data).hexdigest()[:HASH_CHARS] != path.stem:
         raise CalibrationError(str(path), "was edited: its name is not the hash of its contents")
     return made

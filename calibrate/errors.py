@@ -6,7 +6,10 @@ CalibrationError       the captures do not allow the number that was asked for; 
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
 
 
 class CalibrationError(Exception):
@@ -18,6 +21,12 @@ class CalibrationError(Exception):
         self.where = where
         self.what = what
         super().__init__(f"{where}: {what}")
+
+
+def invalid(where: str, error: ValidationError) -> CalibrationError:
+    """The first thing that is wrong with a file's contents, in one line that names the field."""
+    first = error.errors()[0]
+    return CalibrationError(where, f"{'.'.join(map(str, first['loc']))}: {first['msg']}")
 
 
 class CaptureRefused(CalibrationError):

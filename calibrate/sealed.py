@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from calibrate.errors import CalibrationError
+from calibrate.errors import CalibrationError, invalid
 from calibrate.files import read_bounded
 
 
@@ -65,8 +65,7 @@ def load_sealed(path: Path, kind: type[S], most_bytes: int) -> S:
     try:
         made = kind.model_validate(named)
     except ValidationError as error:
-        first = error.errors()[0]
-        raise CalibrationError(str(path), f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise invalid(str(path), error) from None
     if named["digest"] != found:
         raise CalibrationError(str(path), "was edited: its digest is not that of its contents")
     return made

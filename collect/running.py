@@ -48,6 +48,8 @@ class Control(Interface):
         ...
 
 
+ITS_OWN_TROUBLE = (MotionError, RpcError, ForceTooHigh)
+"""After these the arm is not moved before a person has looked."""
 KEEP_SHEET = Choice("o", "keep the old one in")
 
 
@@ -173,7 +175,7 @@ class Run:
     async def _ask(self, step: Step | None, error: StepError | DeviceError) -> None:
         """Let a person decide; raises `error` again where the answer is to stop."""
         in_order = False
-        if not isinstance(error, MotionError | RpcError | ForceTooHigh):
+        if not isinstance(error, ITS_OWN_TROUBLE):
             with contextlib.suppress(StepError, DeviceError):
                 await self._recover()  # a person is about to reach under the arm
                 in_order = True
@@ -194,7 +196,7 @@ class Run:
     async def _lift(self, error: StepError | DeviceError | SessionError) -> None:
         """Leave no brush in the paper, where the arm itself is in order: not after its own trouble, nor where the brush
         met something hard that a person must look at first."""
-        if isinstance(error, MotionError | RpcError | ForceTooHigh) or getattr(error, "device", "") == "robot":
+        if isinstance(error, ITS_OWN_TROUBLE) or getattr(error, "device", "") == "robot":
             return
         try:
             await self._recover()

@@ -212,7 +212,7 @@ def _board(checkerboard: str, charuco: str, square_mm: float, marker_mm: float, 
     from pydantic import ValidationError
 
     from calibrate.camera.boards import Checkerboard
-    from calibrate.errors import CalibrationError
+    from calibrate.errors import CalibrationError, invalid
     from calibrate.scale import BoardSpec
 
     if bool(checkerboard) == bool(charuco):
@@ -228,8 +228,7 @@ def _board(checkerboard: str, charuco: str, square_mm: float, marker_mm: float, 
             origin_mm=(0.0, 0.0),
         )
     except ValidationError as error:
-        first = error.errors()[0]
-        raise CalibrationError("board", f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise invalid("board", error) from None
 
 
 def _pair(text: str) -> tuple[int, int]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from calibrate.camera.boards import Board, Checkerboard
 from calibrate.errors import CalibrationError
+from calibrate.files import check_target
 from calibrate.scale import charuco_board
 
 POINTS_PER_MM = 72.0 / 25.4
@@ -25,8 +26,7 @@ def write_pdf(board: Board, path: Path, page: str = "a4") -> Path:
 
     Raises `CalibrationError` where it does not fit, and for a path that is no PDF's: nothing else is overwritten.
     """
-    if path.suffix.lower() != ".pdf":
-        raise CalibrationError(str(path), "must end in .pdf")
+    check_target(path, ".pdf")
     if not path.parent.is_dir():
         raise CalibrationError(str(path), f"there is no folder {path.parent}")
     if path.exists() and not (path.is_file() and path.read_bytes().startswith(b"%PDF")):

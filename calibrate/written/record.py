@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from calibrate.errors import CalibrationError
+from calibrate.errors import CalibrationError, invalid
 from calibrate.field import SIZE_PX, Image
 from calibrate.files import read_bounded
 from sessions.errors import SessionDamaged
@@ -127,8 +127,7 @@ def load_plan(path: Path) -> PlanRecord:
     try:
         return PlanRecord.model_validate_json(read_bounded(path, MAX_PLAN_BYTES))
     except ValidationError as error:
-        first = error.errors()[0]
-        raise CalibrationError(str(path), f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise invalid(str(path), error) from None
 
 
 def points_digest(strokes: Sequence[Any]) -> str:

@@ -17,6 +17,7 @@ from textual.geometry import Size
 from textual.strip import Strip
 from textual.widget import Widget
 
+from collect.tui.gray import fitted, runs
 from collect.tui.sixel import SixelPicture
 
 if TYPE_CHECKING:
@@ -123,26 +124,14 @@ def _pixels() -> Callable[[str], CellPicture | SixelPicture | ImagePicture]:
 def _strips(image: NDArray[np.uint8] | None, size: Size) -> list[Strip]:
     if image is None or not image.size or size.width < 1 or size.height < 1:
         return []
-    import cv2
-    import numpy as np
-
-    height, width = image.shape
     # A cell is about twice as high as wide: a half-cell is a square.
-    scale = min(size.width / width, 2 * size.height / height)
-    columns, lines = max(1, int(width * scale)), max(1, int(height * scale / 2))
-    small = np.asarray(cv2.resize(image, (columns, 2 * lines), interpolation=cv2.INTER_AREA), np.int64)
-    levels = (small * (LEVELS - 1) + 127) // 255
-    return [_strip(levels[2 * y], levels[2 * y + 1]) for y in range(lines)]
+    levels = fitted(image, size.width, 2 * size.height, LEVELS, step=2)
+    return [_strip(levels[y], levels[y + 1]) for y in range(0, len(levels), 2)]
 
 
 def _strip(top: NDArray[np.int64], bottom: NDArray[np.int64]) -> Strip:
-    import numpy as np
-
     pair = top * LEVELS + bottom
-    starts = np.flatnonzero(np.concatenate(([True], pair[1:] != pair[:-1])))
-    ends = np.append(starts[1:], len(pair))
-    segments = [Segment(HALF * int(b - a), _style(int(pair[a]))) for a, b in zip(starts, ends, strict=True)]
-    return Strip(segments, len(pair))
+    return Strip([Segment(HALF * count, _style(value)) for value, count in runs(pair)], len(pair))
 
 
 @lru_cache(maxsize=LEVELS * LEVELS)

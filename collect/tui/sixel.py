@@ -21,6 +21,8 @@ from textual.geometry import Region, Size
 from textual.strip import Strip
 from textual.widget import Widget
 
+from collect.tui.gray import fitted, runs
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -103,16 +105,12 @@ def lines_of(
     """Gray levels, `NOTHING` beside the picture: an array of a cell's height for each line that the picture reaches."""
     if image is None or not image.size or not size.area:
         return []
-    import cv2
     import numpy as np
 
-    width_px, height_px = size.width * cell[0], size.height * cell[1]
-    height, width = image.shape
-    scale = min(width_px / width, height_px / height)
-    columns, rows = max(1, int(width * scale)), max(1, int(height * scale))
-    small = np.asarray(cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA), np.int64)
+    levels = fitted(image, size.width * cell[0], size.height * cell[1], LEVELS)
+    rows, columns = levels.shape
     ground = np.full((-(-rows // cell[1]) * cell[1], columns), NOTHING)
-    ground[:rows] = (small * (LEVELS - 1) + 127) // 255
+    ground[:rows] = levels
     return [ground[y : y + cell[1]] for y in range(0, len(ground), cell[1])]
 
 
@@ -138,12 +136,8 @@ def sixels(levels: NDArray[np.int64]) -> str:
 
 
 def _runs(bits: NDArray[np.int64]) -> str:
-    import numpy as np
-
-    starts = np.flatnonzero(np.concatenate(([True], bits[1:] != bits[:-1])))
-    counts = np.diff(np.append(starts, len(bits)))
-    signs = [chr(63 + int(bits[at])) for at in starts]
-    return "".join(f"!{n}{c}" if n > 3 else c * n for n, c in zip(counts.tolist(), signs, strict=True))
+    signs = [(chr(63 + column), n) for column, n in runs(bits)]
+    return "".join(f"!{n}{c}" if n > 3 else c * n for c, n in signs)
 
 
 def cell_px() -> tuple[int, int]:
