@@ -77,7 +77,11 @@ class CameraConfig(Config):
     source: str = Field(min_length=1)
     """Stream URL, file, folder of images, or device number as text."""
     latency_ms: Annotated[float, Field(ge=0.0, le=10_000.0)] = 250.0
-    """Longest time from exposure to arrival; frames that may be older than a request are not used for it."""
+    """From exposure to arrival, roughly: used by `doctor` and the live picture. A run measures it."""
+    max_delay_ms: Annotated[float, Field(ge=50.0, le=10_000.0)] = 1500.0
+    """A camera whose pictures are measured to come later is refused."""
+    max_jitter_ms: Annotated[float, Field(ge=10.0, le=10_000.0)] = 500.0
+    """A camera whose measured delay varies by more is refused."""
     timeout_s: Annotated[float, Field(gt=0.0, le=120.0)] = 10.0
     lens: str = ""
     """Its name, for the record."""

@@ -4,8 +4,10 @@ ConfigError            a file of the user cannot be used: file, field, allowed r
 StepError              a step failed in a way that is understood; says what it leaves and what comes next
  +-- StepVoid          the press was cut: its paper cell is burnt, do it again on a new one
  +-- BadPicture        the photograph cannot be used: take it again
+ |    +-- ArmInPicture something hides the sheet: it says nothing about ink
  +-- ForceTooHigh      the press met more force than allowed: the arm was stopped where it was
  +-- NeedsOperator     something that only a person can put right
+ |    +-- CameraLate   the camera's delay is too long, not steady, or cannot be measured
  +-- SheetFull         no free cell is left on the sheet
 CollectAborted         the session stopped before its protocol was finished; it can be resumed
  +-- Parked            between two steps, as was asked for, with the arm parked
@@ -45,6 +47,17 @@ class BadPicture(StepError):
     """The photograph shows too little of the stroke. Leaves the arm parked and the stroke as it is."""
 
 
+class ArmInPicture(BadPicture):
+    """Something stays in the picture that should not be there. Leaves the arm parked and the stroke as it is."""
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        super().__init__(
+            f"something moves or stays in the picture {seconds:g} s after the arm parked: the arm, a hand or a shadow, "
+            "or camera or sheet were moved. Clear the view; the arm must be out of it at motion.park_mm."
+        )
+
+
 class ForceTooHigh(StepError):
     """The brush met something hard. Leaves the arm stopped, perhaps with the brush down; a person must look first."""
 
@@ -59,6 +72,10 @@ class ForceTooHigh(StepError):
 
 class NeedsOperator(StepError):
     """Leaves the arm where the step began, at safe height; says what a person must put right."""
+
+
+class CameraLate(NeedsOperator):
+    """Photographs could be older than they seem. Leaves the arm parked; nothing was pressed meanwhile."""
 
 
 class SheetFull(StepError):

@@ -66,7 +66,8 @@ class Performer:
         await self._bench.procedures.retreat()
 
     def answered(self, error: StepError | DeviceError) -> None:
-        """A person has put right what `error` said: a full sheet was changed."""
+        """A person has put right what `error` said: a full sheet was changed, or something at the camera."""
+        self._bench.procedures.photographer.forget()
         if isinstance(error, SheetFull):
             self.fresh_sheet()
 
@@ -74,6 +75,7 @@ class Performer:
         """A person has put a fresh sheet in."""
         self._bench.store.fresh_sheet()
         self._bench.known.sound_frame = None
+        self._bench.procedures.photographer.forget()
         self._bench.progress.sheet_in(self._bench.store.state.sheet)
 
     @property

@@ -35,7 +35,11 @@ def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
         case StepKind.PRESS | StepKind.DRAW, DeviceTimeout(device="force"):
             # Stopped because nothing was felt any more; if the sensor is not back, the next press says so at once.
             action = Action.RETRY
-        case StepKind.CAPTURE | StepKind.BOARD, DeviceTimeout(device="camera") | BadPicture():
+        case StepKind.PRESS | StepKind.DRAW | StepKind.SELF_CHECK, BadPicture():
+            return Action.ASK  # another try would burn another cell
+        case _, BadPicture():
+            action = Action.RETRY
+        case StepKind.CAPTURE | StepKind.BOARD, DeviceTimeout(device="camera"):
             action = Action.RETRY
         case _:
             return Action.ABORT

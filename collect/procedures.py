@@ -8,11 +8,12 @@ from dataclasses import dataclass
 
 from collect.config import RigConfig, WashConfig
 from collect.errors import StepVoid
-from collect.plane import PaperPlane
+from collect.photograph.photographer import Photographer, Ways
+from collect.plane import PaperPlane, to_paper
 from collect.rig import Rig, limits_of
 from collect.sheet import Cell, to_base
 from drivers.geometry import brush_pose, lean
-from drivers.samples import Frame, Pose, Stamp
+from drivers.samples import Frame, Pose
 
 CLEARANCE_MM = 8.0
 """Height above the paper at which the fast approach ends."""
@@ -39,6 +40,20 @@ class Procedures:
         self.plane = PaperPlane(rig.config.paper.touch_z_mm)
         """The taught height, level, until touches say better."""
         self._dips = 0
+        over = over_sheet_move(rig.config)
+        self.photographer = Photographer(
+            rig.robot,
+            rig.camera,
+            rig.config.camera,
+            rig.clock,
+            Ways(
+                over_mm=over.target.position_mm,
+                park_mm=rig.config.motion.park_mm,
+                over=lambda: self.go(over),
+                park=self._park,
+                over_sheet=self._over_sheet,
+            ),
+        )
 
     async def retreat(self) -> None:
         """Lift along the tool axis to safe height, then park. A killed process may have left the brush down."""
@@ -86,10 +101,18 @@ class Procedures:
         return depth_mm
 
     async def capture(self) -> Frame:
-        """Park, then the first frame exposed after the arm had settled there."""
+        """Park, then the first frame exposed after the camera has shown the arm gone."""
+        return await self.photographer.photograph()
+
+    async def _park(self) -> None:
         for move in park_moves(self._config):
             await self.go(move)
-        return await self._rig.camera.fresh(Stamp(self._rig.clock.now_ns()))
+
+    async def _over_sheet(self) -> bool:
+        here = await self._rig.robot.where()
+        x_mm, y_mm = to_paper(self._config.paper, here.x_mm, here.y_mm)
+        width_mm, height_mm = self._config.paper.size_mm
+        return 0.0 <= x_mm <= width_mm and 0.0 <= y_mm <= height_mm
 
     async def go(self, move: Move) -> None:
         """One move, to its end."""
@@ -119,6 +142,13 @@ def retreat_moves(config: RigConfig, here: Pose) -> list[Move]:
 def park_moves(config: RigConfig) -> list[Move]:
     """To the place where the arm waits, out of the camera's view."""
     return [Move(_upright(config, *config.motion.park_mm), config.motion.travel_speed_mm_s)]
+
+
+def over_sheet_move(config: RigConfig) -> Move:
+    """Over the middle of the sheet at travel height, where the camera must see the arm."""
+    width_mm, height_mm = config.paper.size_mm
+    x_mm, y_mm = to_base(config.paper, 0.5 * width_mm, 0.5 * height_mm)
+    return Move(_upright(config, x_mm, y_mm, config.motion.safe_z_mm), config.motion.travel_speed_mm_s)
 
 
 def zero_touch_moves(config: RigConfig) -> list[Move]:

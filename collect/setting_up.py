@@ -21,7 +21,7 @@ def facts_of(kind: StepKind, result: Result, config: RigConfig) -> tuple[Fact, .
     """What a finished set-up step found, from its result in the journal."""
     match kind:
         case StepKind.BOARD:
-            return _board(result)
+            return _board(result, config)
         case StepKind.ZERO_TOUCH:
             return _touch(result, config)
         case StepKind.SELF_CHECK:
@@ -72,7 +72,7 @@ def _listed(kind: StepKind, result: Result | None, config: RigConfig, now: bool)
     return SetUpStep(kind, Standing.GOOD if good else Standing.DOUBTFUL, facts)
 
 
-def _board(result: Result) -> tuple[Fact, ...]:
+def _board(result: Result, config: RigConfig) -> tuple[Fact, ...]:
     facts = [
         Fact("corners seen", str(result["corners"])),
         Fact("scale (pix2len)", f"{result['mm_per_px']:.4f} mm/px"),
@@ -82,6 +82,12 @@ def _board(result: Result) -> tuple[Fact, ...]:
         facts.append(
             Fact("residual of corners", f"{rms_px:.2f} px", f"at most {WORST_RMS_PX:g}", rms_px <= WORST_RMS_PX)
         )
+    if "camera_delay_ms" in result:
+        for name, value_ms, limit_ms in (
+            ("delay of the camera", float(result["camera_delay_ms"]), config.camera.max_delay_ms),
+            ("it varies by", float(result["camera_jitter_ms"]), config.camera.max_jitter_ms),
+        ):
+            facts.append(Fact(name, f"{value_ms:.0f} ms", f"at most {limit_ms:g}", value_ms <= limit_ms))
     for check in result.get("checks", ()):
         name, score = str(check["name"]), float(check["score"])
         if name == "blurred":

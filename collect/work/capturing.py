@@ -8,19 +8,18 @@ from collect.asking import Choice, Prompt
 from collect.errors import BadPicture, NeedsOperator, StepError
 from collect.last_capture import LastCapture, pictures_of, published_mark
 from collect.quality.check import check_capture, check_drawing
-from collect.quality.verdict import Failure, Family, Verdict
+from collect.quality.verdict import Family, Verdict
 from collect.sheet import Cell
 from collect.steps import Result
 from collect.wishes import Wish
 from collect.work.choosing import measured
 from collect.work.context import Bench, Job
-from collect.work.looking import Gray, image_plane, photograph
+from collect.work.looking import Gray, camera_delay, image_plane, photograph
 from collect.work.waiting import uninterrupted
 from sessions.schemas import Check, Quality, Stroke
 
 KEEP, AGAIN, SKIP = Choice("g", "good all the same: it counts"), Choice("r", "press it again"), Choice("k", "skip it")
 PICTURE_MARGIN_PX = 40
-LATE = (Failure.BLANK, Failure.NEIGHBOUR)
 
 
 async def capture(job: Job) -> Result:
@@ -57,6 +56,7 @@ async def capture(job: Job) -> Result:
         "tilt_deg": job.number("tilt_deg"),
         "kept": kept,
         "retake": retake,
+        **camera_delay(job),
         "verdict": "" if verdict is None or verdict.cause is None else str(verdict.cause.name),
         **(await measured(job, image, cell) if job.step.params.get("measured") else {}),
     }
@@ -76,9 +76,7 @@ async def _judged(job: Job, image: Gray, cell: Cell) -> Verdict | None:
     job.recorder.quality(Quality(stroke_id=stroke_id, checks=checks), job.attempt.serial)
     if verdict.cause is not None:
         bench.progress.log(f"{stroke_id}: {verdict.reason}", warning=True)
-        # A camera that is late shows the cell as it was, or the arm: look once more before a figure is drawn again.
-        late = verdict.cause.name in LATE and _drawn(job) and job.attempt.attempt == 1
-        if verdict.cause.name.family is Family.PICTURE or late:
+        if verdict.cause.name.family is Family.PICTURE:
             raise BadPicture(verdict.cause.reason)
     return verdict
 

@@ -25,6 +25,7 @@ async def board(job: Job) -> Result:
         "corners": plane.corners,
         "mm_per_px": plane.mm_per_px,
         "rms_px": plane.rms_px,
+        **camera_delay(job),
         "checks": [
             {"name": str(c.name), "score": c.score, "threshold": c.threshold, "passed": c.passed} for c in checks
         ],
@@ -52,11 +53,24 @@ async def look_at_sheet(job: Job) -> None:
 
 async def photograph(job: Job) -> Gray:
     """Park, take a fresh frame, record it as the still of this attempt, and hand it over in gray."""
+    photographer = job.bench.procedures.photographer
+    known = photographer.delay
     with job.recorder.sections.timed("wait for a fresh frame"):
         frame = await job.bench.procedures.capture()
+    if photographer.delay is not known:
+        job.recorder.log(f"camera delay: {photographer.delay}")
+        job.bench.progress.log(f"camera delay: {photographer.delay}")
     with job.recorder.sections.timed("encode still"):
         await uninterrupted(job.recorder.still, frame, job.attempt.serial)
     return await uninterrupted(straightened, job.bench.rig.config.camera, gray(frame.image))
+
+
+def camera_delay(job: Job) -> Result:
+    """What is known of the camera's delay, for the journal."""
+    delay = job.bench.procedures.photographer.delay
+    if delay is None:
+        return {}
+    return {"camera_delay_ms": round(1e3 * delay.delay_s, 1), "camera_jitter_ms": round(1e3 * delay.spread_s, 1)}
 
 
 def image_plane(bench: Bench, image: Gray) -> PlaneFit:

@@ -83,6 +83,12 @@ class View:
     blur_px: float = 0.7
     fps: float = 8.0
     jpeg_quality: int = 95
+    delay_s: float = 0.0
+    """Real seconds that a picture waits before it is sent, besides drawing and coding it."""
+    delay_jitter_s: float = 0.0
+    """Up to so much more, at random; pictures never overtake each other."""
+    delay_drift: float = 0.0
+    """Seconds by which the delay grows in each second of the stream."""
     stamp_strip: bool = False
     """Draw the host time into the top rows, for tests of `fresh(after)`."""
 

@@ -35,7 +35,8 @@ class LoopbackRig:
         self.world = World(config)
         self.arcs = ArcsServer(self.world)
         self.rtde = RtdeServer(self.arcs.cabinet)
-        self.camera = MjpegServer(Scene(self.world), fps=config.view.fps, jpeg_quality=config.view.jpeg_quality)
+        view = config.view
+        self.camera = MjpegServer(Scene(self.world), fps=view.fps, jpeg_quality=view.jpeg_quality, view=view)
         self.force = _force(self.world) if config.force_sensor else None
         self.ink = None if config.ink_device == "none" else PtyLine(_ink(self.world, config.ink_device))
         board = None if self.force is None else self.force.board

@@ -53,6 +53,8 @@ acc_mm_s2 = 1000.0
 kind = "opencv"
 source = "http://{at.host}:{at.camera_port}/stream.mjpg"
 latency_ms = 250.0
+max_delay_ms = 3000.0     # drawn and coded beside you on one machine, a picture may have to wait for it
+max_jitter_ms = 2000.0
 lens = "simulated, {view.px_per_mm:g} px/mm, no distortion"
 
 [brush]

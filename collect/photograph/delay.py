@@ -1,0 +1,134 @@
+"""The camera's delay, measured: the arm goes over the sheet and back, and the picture shows it later than it was.
+
+Nobody knows at which point of its way the arm comes into the picture. But it enters and leaves at the same point, so
+the time for which it was seen, held against the way that it went, gives that point, and with it the delay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+GOOD_SHARE, GOOD_S = 0.1, 0.03
+"""The delay is known well enough to a tenth of it, or to 30 ms."""
+MOST_GAP_S = 1.0
+"""A longer silence of camera or arm hides when something happened."""
+SLACK_S = 0.05
+"""For what a busy computer does to the times of single poses and frames."""
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What one frame showed."""
+
+    arrival_s: float
+    changed: float
+    """Share of the picture that differs from the view without the arm."""
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """Where the arm was at one time."""
+
+    t_s: float
+    way: float
+    """0 at its place out of the picture, 1 over the sheet."""
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """The delay by one trip over the sheet and back."""
+
+    delay_s: float
+    resolution_s: float
+    """The delay may be off by so much, because camera and arm are only heard of once a period."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraDelay:
+    """The delay by several trips."""
+
+    looks: tuple[Look, ...]
+
+    @property
+    def delay_s(self) -> float:
+        """From an event to the arrival of the first frame that shows it."""
+        return float(np.mean([look.delay_s for look in self.looks]))
+
+    @property
+    def spread_s(self) -> float:
+        """Between the shortest and the longest."""
+        delays_s = [look.delay_s for look in self.looks]
+        return max(delays_s) - min(delays_s)
+
+    @property
+    def resolution_s(self) -> float:
+        """How well the delay is known by its looks."""
+        return float(np.median([look.resolution_s for look in self.looks])) / len(self.looks) ** 0.5
+
+    @property
+    def bound_s(self) -> float:
+        """The longest that was seen, and what may have been missed between two frames."""
+        return max(look.delay_s + look.resolution_s for look in self.looks)
+
+    @property
+    def known(self) -> bool:
+        """Whether the looks differ by no more than the camera's period explains, and are enough to even that out."""
+        good_s = max(GOOD_SHARE * self.delay_s, GOOD_S)
+        coarsest_s = max(look.resolution_s for look in self.looks)
+        return self.spread_s <= max(2.0 * coarsest_s, good_s) and self.resolution_s <= good_s
+
+    def __str__(self) -> str:
+        delay_ms, resolution_ms, spread_ms = (1e3 * v for v in (self.delay_s, self.resolution_s, self.spread_s))
+        return f"{delay_ms:.0f} ms (to {resolution_ms:.0f}), varying by {spread_ms:.0f} ms over {len(self.looks)} looks"
+
+
+def look(seen: Sequence[Seen], placed: Sequence[Placed]) -> Look | None:
+    """The delay by one trip; None where a silence, or a picture that does not fit the trip, tells nothing.
+
+    `seen` begins and ends without the arm; `placed` goes from 0 to 1 and back.
+    """
+    arrival_s = np.array([one.arrival_s for one in seen])
+    changed = np.array([one.changed for one in seen])
+    t_s, way = np.array([one.t_s for one in placed]), np.array([one.way for one in placed])
+    if len(seen) < 3 or len(placed) < 3 or max(np.diff(arrival_s).max(), np.diff(t_s).max()) > MOST_GAP_S:
+        return None
+    half = 0.5 * float(changed.max())
+    inside = np.flatnonzero(changed >= half)
+    first, last = int(inside[0]), int(inside[-1])
+    if first == 0 or last == len(seen) - 1 or float(changed.max()) <= 0.0:
+        return None
+    entered_s, coarse_in = _crossing(arrival_s, changed, first, half)
+    left_s, coarse_out = _crossing(arrival_s[::-1], changed[::-1], len(seen) - 1 - last, half)
+    turn = int(np.argmax(way))
+    points = np.linspace(0.02, 0.98, 97)
+    there_s = np.interp(points, np.maximum.accumulate(way[: turn + 1]), t_s[: turn + 1])
+    back_s = np.interp(points, np.maximum.accumulate(way[turn:][::-1]), t_s[turn:][::-1])
+    # The farther the point, the shorter the arm is beyond it: the best is where that is as long as it was seen.
+    misfit_s = np.abs((back_s - there_s) - (left_s - entered_s))
+    at = int(np.argmin(misfit_s))
+    if float(misfit_s[at]) > coarse_in + coarse_out + SLACK_S:
+        return None  # it was seen for longer, or shorter, than it was there: that was another trip
+    delay_s = 0.5 * float((entered_s - there_s[at]) + (left_s - back_s[at]))
+    coarse_s = 0.5 * (coarse_in + coarse_out + _gap(t_s, there_s[at]) + _gap(t_s, back_s[at]))
+    return Look(max(delay_s, 0.0), coarse_s)
+
+
+def _crossing(arrival_s: Floats, changed: Floats, first: int, half: float) -> tuple[float, float]:
+    """(when the change passed `half` between frame `first` - 1 and `first`, how uncertain that is), in s."""
+    before, after = float(changed[first - 1]), float(changed[first])
+    share = (half - before) / (after - before)
+    gap_s = abs(float(arrival_s[first] - arrival_s[first - 1]))
+    at_s = float(arrival_s[first - 1] + share * (arrival_s[first] - arrival_s[first - 1]))
+    # Frames on the way show where the arm was; a jump from nothing to all leaves the whole gap open.
+    return at_s, 0.5 * gap_s * min(1.0, (after - before) / (2.0 * half))
+
+
+def _gap(t_s: Floats, at_s: float) -> float:
+    """Half the time between the two samples around `at_s`."""
+    after = min(max(int(np.searchsorted(t_s, at_s)), 1), len(t_s) - 1)
+    return 0.5 * float(t_s[after] - t_s[after - 1])

@@ -1,0 +1,117 @@
+"""The camera's frames one after the other, each held against the view without the arm."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncGenerator, Callable
+from dataclasses import dataclass
+
+from collect.photograph.changes import Thumbnail, changed_share, thumbnail
+from collect.photograph.delay import Seen
+from drivers.protocols import Camera
+from drivers.samples import Frame, Stamp
+
+ARM_SHARE = 0.02
+"""An arm over the sheet hides a far larger share of the picture than a stroke, or a drawn figure, covers with ink."""
+STILL_SHARE = 0.005
+"""Two frames that differ by less show nothing that moves; a clock that a camera writes into its picture is less."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One frame and what differs in it."""
+
+    frame: Frame
+    small: Thumbnail
+    changed: float
+    """Share of the picture that differs from the reference; 0 where there is none yet."""
+    moved: float
+    """Share that differs from the frame before; 1 for the first."""
+
+    @property
+    def arm(self) -> bool:
+        """Whether something is in the picture that the reference does not show."""
+        return self.changed >= ARM_SHARE
+
+    @property
+    def still(self) -> bool:
+        """Whether nothing moved since the frame before."""
+        return self.moved < STILL_SHARE
+
+
+Wanted = Callable[[View], bool]
+
+
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    wanted: Wanted
+    until_s: float
+    answer: asyncio.Future[View | None]
+
+
+class Frames:
+    """What the camera shows from now on."""
+
+    def __init__(self, reference: Thumbnail | None) -> None:
+        self._reference = reference
+        self._before: Thumbnail | None = None
+        self._waiting: list[_Waiting] = []
+        self._failure: Exception | None = None
+        self.seen: list[Seen] = []
+        """Every frame so far."""
+
+    async def first(self, wanted: Wanted, *, within_s: float) -> View | None:
+        """The first frame from now on that is `wanted`, or None where those of `within_s` are not.
+
+        Raises `DeviceError` where the camera shows nothing at all.
+        """
+        if self._failure is not None:
+            raise self._failure
+        loop = asyncio.get_running_loop()
+        waiting = _Waiting(wanted, loop.time() + within_s, loop.create_future())
+        self._waiting.append(waiting)
+        try:
+            return await waiting.answer
+        finally:
+            self._waiting.remove(waiting)
+
+    async def follow(self, camera: Camera) -> None:
+        """Look at frame after frame, until cancelled or the camera fails."""
+        after = Stamp(0)
+        try:
+            while True:
+                frame = await camera.fresh(after)
+                after = Stamp(frame.exposed_after_ns + 1)
+                self._show(await asyncio.to_thread(self._view, frame))
+        except Exception as error:
+            self._failure = error
+            for waiting in self._waiting:
+                if not waiting.answer.done():
+                    waiting.answer.set_exception(error)
+
+    def _show(self, view: View) -> None:
+        self._before = view.small
+        self.seen.append(Seen(view.frame.stamp.host_ns / 1e9, view.changed))
+        now_s = asyncio.get_running_loop().time()
+        for waiting in self._waiting:
+            if not waiting.answer.done() and (waiting.wanted(view) or now_s > waiting.until_s):
+                waiting.answer.set_result(view if waiting.wanted(view) else None)
+
+    def _view(self, frame: Frame) -> View:
+        small = thumbnail(frame.image)
+        changed = 0.0 if self._reference is None else changed_share(small, self._reference)
+        moved = 1.0 if self._before is None else changed_share(small, self._before)
+        return View(frame, small, changed, moved)
+
+
+@contextlib.asynccontextmanager
+async def watching(camera: Camera, reference: Thumbnail | None) -> AsyncGenerator[Frames]:
+    """Within the block, look at every frame; `reference` is the view without the arm."""
+    frames = Frames(reference)
+    task = asyncio.create_task(frames.follow(camera), name="camera frames")
+    try:
+        yield frames
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)

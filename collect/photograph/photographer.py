@@ -1,0 +1,226 @@
+"""Takes photographs of the sheet that are known to show it as it is, without the arm.
+
+How late a camera's pictures come is not known from its data sheet, and changes with the load of the computer. So no
+photograph is believed because of when it came: first the camera must show the arm over the sheet, then the arm parks,
+and only what the camera shows after it has shown the arm gone is a photograph of what lies there now.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from collections.abc import AsyncGenerator, Awaitable, Callable
+from dataclasses import dataclass, replace
+
+from collect.config_devices import CameraConfig
+from collect.errors import ArmInPicture, CameraLate
+from collect.photograph.changes import Thumbnail
+from collect.photograph.delay import CameraDelay, Look, Placed, look
+from collect.photograph.frames import ARM_SHARE, Frames, View, watching
+from drivers.clock import Clock
+from drivers.errors import DeviceError
+from drivers.protocols import Camera, Robot
+from drivers.samples import Frame
+
+FEWEST_LOOKS, MOST_LOOKS = 2, 6
+ATTEMPTS = 3
+"""How often the measurement begins anew where a stall, or a picture from before, has spoilt it."""
+PATIENCE_S = 1.5
+"""Beyond the longest delay that is allowed, so that a camera that is too late is told from one that shows nothing."""
+STAY_S = 0.15
+"""By so much each trip over the sheet is longer than the one before."""
+POSE_PERIOD_S = 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class Ways:
+    """How the arm gets over the sheet, and away."""
+
+    over_mm: tuple[float, float, float]
+    """Where the tip is over the middle of the sheet, in the base frame."""
+    park_mm: tuple[float, float, float]
+    over: Callable[[], Awaitable[None]]
+    """Go over the middle of the sheet at travel height."""
+    park: Callable[[], Awaitable[None]]
+    """Go to the park position."""
+    over_sheet: Callable[[], Awaitable[bool]]
+    """Whether the arm is over the sheet now."""
+
+
+class Photographer:
+    """One camera over one sheet, for one run."""
+
+    def __init__(self, robot: Robot, camera: Camera, config: CameraConfig, clock: Clock, ways: Ways) -> None:
+        self._robot = robot
+        self._camera = camera
+        self._config = config
+        self._clock = clock
+        self._ways = ways
+        self._reference: Thumbnail | None = None
+        """The sheet without the arm, as it was seen last."""
+        self.delay: CameraDelay | None = None
+        """What was measured in this process."""
+
+    def forget(self) -> None:
+        """What was known of camera and view no longer holds: somebody has been at the rig."""
+        self._reference = self.delay = None
+
+    async def photograph(self) -> Frame:
+        """Park, and return the first frame that was exposed after the arm was gone.
+
+        Raises `CameraLate`, `ArmInPicture`, or `DeviceError` where the camera shows nothing.
+        """
+        delay, reference = self.delay, self._reference
+        if delay is None or reference is None:
+            delay, reference = self.delay, self._reference = await self._measured()
+            # The arm has just been seen to go: nothing is left but to wait for a frame from after that.
+            async with watching(self._camera, reference) as frames:
+                return await self._clear(frames, delay, self._clock.now_ns())
+        async with watching(self._camera, reference) as frames:
+            if not await self._ways.over_sheet():
+                await self._ways.over()
+            arrived_ns = self._clock.now_ns()
+            shown = await frames.first(
+                lambda v: v.arm and v.frame.stamp.host_ns >= arrived_ns, within_s=self._patience_s
+            )
+            if shown is None:
+                raise self._not_shown()
+            await self._ways.park()
+            return await self._clear(frames, delay, self._clock.now_ns())
+
+    async def _clear(self, frames: Frames, delay: CameraDelay, parked_ns: int) -> Frame:
+        """The first frame without the arm that was exposed after `parked_ns`. Raises `CameraLate`, `ArmInPicture`."""
+        bound_ns = round(delay.bound_s * 1e9)
+        clear = await frames.first(
+            lambda v: not v.arm and v.still and v.frame.stamp.host_ns - bound_ns >= parked_ns,
+            within_s=self._patience_s,
+        )
+        if clear is None:
+            raise ArmInPicture(self._patience_s)
+        self._check_drift(frames, delay, parked_ns / 1e9)
+        self._reference = clear.small
+        return replace(clear.frame, exposed_after_ns=parked_ns)
+
+    def _check_drift(self, frames: Frames, delay: CameraDelay, parked_s: float) -> None:
+        """A frame that shows the arm after it had parked is as old as that at least. Raises `CameraLate`."""
+        late_s = max((one.arrival_s for one in frames.seen if one.changed >= ARM_SHARE), default=parked_s) - parked_s
+        if late_s > self._config.max_delay_ms / 1e3:
+            self.forget()
+            raise self._too_late(f"{1e3 * late_s:.0f} ms at least")
+        if late_s > delay.bound_s:
+            self.delay = CameraDelay((*delay.looks, Look(late_s, 0.0)))
+
+    async def _measured(self) -> tuple[CameraDelay, Thumbnail]:
+        """Send the arm over the sheet and back until the delay is known. Raises `CameraLate`.
+
+        Returns the delay, and the view without the arm.
+        """
+        shown = False
+        for attempt in range(ATTEMPTS):
+            # What the first view showed may have been gone long ago: from then on wait until all of that has passed.
+            view = await self._view_without_arm(still_s=self._patience_s if attempt else 0.0)
+            looks: list[Look] = []
+            for number in range(MOST_LOOKS):
+                # Trips of different lengths: one cannot be taken for the one before it.
+                seen = await self._trip(view, stay_s=number * STAY_S)
+                if seen is None:
+                    break
+                shown = True
+                view, found = seen
+                if found is not None:
+                    looks.append(found)
+                if len(looks) >= FEWEST_LOOKS and CameraDelay(tuple(looks)).known:
+                    break
+            if len(looks) >= FEWEST_LOOKS:
+                return self._accepted(CameraDelay(tuple(looks))), view
+        raise self._uneven() if shown else self._not_shown()
+
+    def _accepted(self, delay: CameraDelay) -> CameraDelay:
+        if 1e3 * delay.delay_s > self._config.max_delay_ms:
+            raise self._too_late(str(delay))
+        if 1e3 * delay.spread_s > self._config.max_jitter_ms:
+            raise self._uneven(str(delay))
+        return delay
+
+    async def _trip(self, without_arm: Thumbnail, *, stay_s: float) -> tuple[Thumbnail, Look | None] | None:
+        """Over the sheet and back: the view after it, and the delay where no silence has spoilt it.
+
+        None where the picture did not change when the arm came, or not back when it went.
+        """
+        within_s = self._patience_s
+        async with watching(self._camera, without_arm) as frames, self._placed() as placed:
+            if await frames.first(lambda v: not v.arm, within_s=within_s) is None:
+                return None
+            await self._ways.over()
+            if await frames.first(lambda v: v.arm and v.still, within_s=within_s) is None:
+                return None
+            await asyncio.sleep(stay_s)
+            await self._ways.park()
+            clear = await frames.first(lambda v: not v.arm and v.still, within_s=within_s)
+        return None if clear is None else (clear.small, look(frames.seen, placed))
+
+    async def _view_without_arm(self, *, still_s: float) -> Thumbnail:
+        """A view with the arm parked, once nothing has moved in it for `still_s`. Raises `ArmInPicture`."""
+        await self._ways.park()
+        moved_s = 0.0
+
+        def settled(view: View) -> bool:
+            nonlocal moved_s
+            arrival_s = view.frame.stamp.host_ns / 1e9
+            moved_s = moved_s if view.still else arrival_s
+            return view.still and arrival_s - moved_s >= still_s
+
+        async with watching(self._camera, None) as frames:
+            view = await frames.first(settled, within_s=3.0 * self._patience_s)
+        if view is None:
+            raise ArmInPicture(3.0 * self._patience_s)
+        return view.small
+
+    @contextlib.asynccontextmanager
+    async def _placed(self) -> AsyncGenerator[list[Placed]]:
+        """Within the block, note where the arm is on its way from park to the middle of the sheet."""
+        placed: list[Placed] = []
+        way_mm = [b - a for a, b in zip(self._ways.park_mm, self._ways.over_mm, strict=True)]
+        length_mm = math.hypot(*way_mm)
+
+        async def note() -> None:
+            while True:
+                with contextlib.suppress(DeviceError):
+                    sample = self._robot.latest()
+                    gone_mm = [p - a for p, a in zip(sample.pose.position_mm, self._ways.park_mm, strict=True)]
+                    way = sum(g * w for g, w in zip(gone_mm, way_mm, strict=True)) / length_mm**2
+                    t_s = sample.stamp.host_ns / 1e9
+                    if not placed or t_s > placed[-1].t_s:
+                        placed.append(Placed(t_s, way))
+                await asyncio.sleep(POSE_PERIOD_S)
+
+        task = asyncio.create_task(note(), name="note the arm's way")
+        try:
+            yield placed
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+    def _too_late(self, what: str) -> CameraLate:
+        return CameraLate(
+            f"the camera's delay is too long: {what}; camera.max_delay_ms = {self._config.max_delay_ms:g}. "
+            "Use a cable instead of Wi-Fi, MJPEG instead of H.264, fewer frames or pixels, or no buffer in between."
+        )
+
+    def _uneven(self, what: str = "frames come too unevenly to measure it") -> CameraLate:
+        return CameraLate(
+            f"the camera's delay is not steady: {what}; camera.max_jitter_ms = {self._config.max_jitter_ms:g}. "
+            "Use a cable instead of Wi-Fi, fewer frames or pixels, and give the computer less to do."
+        )
+
+    def _not_shown(self) -> CameraLate:
+        return CameraLate(
+            f"the camera did not show within {self._patience_s:g} s that the arm went over the sheet and away again: "
+            "it looks elsewhere, stands still, or its delay is far longer than camera.max_delay_ms = "
+            f"{self._config.max_delay_ms:g}. Point it at the sheet, and see that nothing else moves in its view."
+        )
+
+    @property
+    def _patience_s(self) -> float:
+        return self._config.max_delay_ms / 1e3 + PATIENCE_S

@@ -1,0 +1,121 @@
+"""A photograph is fresh because the camera has shown the arm over the sheet, and then gone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from collect.errors import ArmInPicture, CameraLate
+from drivers.samples import Frame
+from tests.collect.photograph.theatre import OUT_MM, OVER_MM, PERIOD_S, Theatre
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cameras that show nothing are given up sooner than in a lab."""
+    monkeypatch.setattr("collect.photograph.photographer.PATIENCE_S", 0.4)
+
+
+def age_s(theatre: Theatre, frame: Frame, since_s: float) -> float:
+    """How long after `since_s` the frame was exposed; negative for one from before."""
+    return theatre.start_s + theatre.exposures_s[frame.stamp.seq] - since_s
+
+
+def arm_is_in(theatre: Theatre, frame: Frame) -> bool:
+    exposed_s = theatre.start_s + theatre.exposures_s[frame.stamp.seq]
+    return theatre.way(exposed_s) * OVER_MM[0] > OUT_MM
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.05, 0.4])
+async def test_a_steady_delay_is_told(delay_s: float):
+    theatre = Theatre(lambda _t_s: delay_s)
+    photographer = theatre.photographer()
+    await photographer.photograph()
+    assert photographer.delay is not None
+    # Coarser than a frame's period it is only on a machine that is busy with other things.
+    assert photographer.delay.delay_s == pytest.approx(delay_s, abs=max(0.2 * delay_s, 2.0 * PERIOD_S))
+
+
+@pytest.mark.parametrize(
+    ("name", "delay"),
+    [
+        ("steady", lambda _t_s: 0.2),
+        ("jittering", lambda t_s: 0.1 + 0.15 * ((t_s * 7919.0) % 1.0)),
+        ("growing", lambda t_s: min(0.05 + 0.1 * t_s, 0.5)),
+    ],
+)
+async def test_no_photograph_shows_the_arm_or_the_sheet_of_before(name: str, delay: Callable[[float], float]):
+    theatre = Theatre(delay)
+    photographer = theatre.photographer(max_jitter_ms=1500)
+    for _ in range(3):
+        await theatre.go(1.0)
+        theatre.ink += 1
+        inked_s = theatre.clock.now_ns() / 1e9
+        frame = await photographer.photograph()
+        assert age_s(theatre, frame, inked_s) >= 0.0
+        assert not arm_is_in(theatre, frame)
+
+
+async def test_an_arm_that_is_parked_already_is_shown_once_more():
+    """After a change of sheets nothing else tells a new picture from one of the old sheet."""
+    theatre = Theatre(lambda _t_s: 0.2)
+    photographer = theatre.photographer()
+    await photographer.photograph()
+    changed_s = theatre.clock.now_ns() / 1e9
+    assert age_s(theatre, await photographer.photograph(), changed_s) >= 0.0
+
+
+async def test_a_camera_that_is_too_late_is_refused_with_the_figure_and_the_way_out():
+    theatre = Theatre(lambda _t_s: 0.3)
+    with pytest.raises(CameraLate, match=r"too long: (2[5-9]|3[0-5])\d ms .*max_delay_ms = 200.* cable"):
+        await theatre.photographer(max_delay_ms=200).photograph()
+
+
+async def test_a_camera_that_is_not_steady_is_refused():
+    theatre = Theatre(lambda t_s: 0.02 if t_s % 0.6 < 0.3 else 0.32)
+    with pytest.raises(CameraLate, match=r"not steady: .*max_jitter_ms = 50"):
+        await theatre.photographer(max_jitter_ms=50).photograph()
+
+
+async def test_a_camera_that_looks_elsewhere_is_refused():
+    theatre = Theatre(lambda _t_s: 0.0)
+    theatre.way = lambda t_s: 0.0  # type: ignore[method-assign]
+    with pytest.raises(CameraLate, match=r"did not show .* that the arm went over the sheet"):
+        await theatre.photographer(max_delay_ms=50).photograph()
+
+
+async def test_a_delay_that_has_grown_past_its_limit_is_refused_later():
+    theatre = Theatre(lambda _t_s: 0.05)
+    photographer = theatre.photographer(max_delay_ms=300)
+    await photographer.photograph()
+    theatre.delay = lambda _t_s: 0.6
+    with pytest.raises(CameraLate, match=r"too long: [4-9]"):
+        await photographer.photograph()
+    assert photographer.delay is None  # measured again once somebody has been there
+
+
+async def test_a_hand_in_the_picture_is_named_and_gives_no_photograph():
+    theatre = Theatre(lambda _t_s: 0.05)
+    photographer = theatre.photographer(max_delay_ms=200)
+    await photographer.photograph()
+    theatre.intruder = True
+    with pytest.raises(ArmInPicture, match="the arm, a hand or a shadow"):
+        await photographer.photograph()
+    theatre.intruder = False
+    await photographer.photograph()
+
+
+async def test_frames_that_waited_for_a_stalled_computer_are_not_taken_for_new():
+    """All that was exposed in the meantime arrives at once when it goes on."""
+    theatre = Theatre(lambda _t_s: 0.05)
+    photographer = theatre.photographer()
+    await photographer.photograph()
+    stall_s = theatre.clock.now_ns() / 1e9 - theatre.start_s + 0.1
+    theatre.delay = lambda t_s: max(0.05, stall_s + 0.6 - t_s) if t_s >= stall_s else 0.05
+    for _ in range(3):
+        await theatre.go(1.0)
+        inked_s = theatre.clock.now_ns() / 1e9
+        frame = await photographer.photograph()
+        assert age_s(theatre, frame, inked_s) >= 0.0
+        assert not arm_is_in(theatre, frame)
