@@ -26,6 +26,7 @@ class Process:
 
     def __init__(self, running: subprocess.Popen[str]) -> None:
         self._running = running
+        self.pid = running.pid
         self.first = self.answer()
 
     def answer(self) -> str:
