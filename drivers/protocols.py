@@ -49,7 +49,7 @@ class Robot(Protocol):
         ...
 
     async def confirm(self) -> None:
-        """Raise `ArmMoved` or `SettingsChanged` unless the arm is as it was left; asks only."""
+        """Asks only. Raises `SettingsChanged`, then `ArmMoved`, unless the arm is as it was left."""
         ...
 
     async def take_up(self) -> Pose:

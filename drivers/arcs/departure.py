@@ -49,9 +49,9 @@ class Departure:
         return self.left
 
     async def confirm(self) -> None:
-        """Raise `ArmMoved`, `SettingsChanged` or `RobotNotSafe` unless all is as it was left."""
-        await self._require_rest("confirm")
+        """Raise `RobotNotSafe`, `SettingsChanged`, then `ArmMoved`, unless all is as it was left."""
         await self._require_settings("confirm")
+        await self._require_rest("confirm")
         self._require_place("confirm", await self._controller.pose())
 
     async def ready(self, op: str, limits: Limits, poses: Sequence[Pose]) -> Pose:
@@ -71,13 +71,13 @@ class Departure:
         return start
 
     async def _require_settings(self, op: str) -> None:
+        self._require_enabled(op)
         found = await read_back(self._controller)
         await self._controller.require_safe(op)
         require_same(op, self._settings, found)
 
     async def _require_rest(self, op: str) -> None:
-        if not self._settings:
-            raise NotConnected(DEVICE, op, "not enabled")
+        self._require_enabled(op)
         loop = asyncio.get_running_loop()
         until = loop.time() + RESTS_S
         while not await self._controller.at_rest():
@@ -85,6 +85,10 @@ class Departure:
                 await self._controller.require_safe(op)  # a safety stop holds its path: that is what to tell
                 raise ArmMoved(DEVICE, op, *self._off(await self._controller.pose()), moving=True)
             await asyncio.sleep(POLL_S)
+
+    def _require_enabled(self, op: str) -> None:
+        if not self._settings:
+            raise NotConnected(DEVICE, op, "not enabled")
 
     def _require_place(self, op: str, here: Pose) -> None:
         if self._moved(here):

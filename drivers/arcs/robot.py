@@ -224,7 +224,7 @@ class AuboArcs:
         return await self._motion.pose()
 
     async def confirm(self) -> None:
-        """Asks only. Raises `ArmMoved`, `SettingsChanged` or `RobotNotSafe` unless all is as this driver left it."""
+        """Asks only. Raises `RobotNotSafe`, `SettingsChanged`, then `ArmMoved`, unless all is as it was left."""
         await self._departure.confirm()
 
     async def take_up(self) -> Pose:
