@@ -22,7 +22,7 @@ from collect.setting_up import question as set_up_question
 from collect.states import State
 from collect.steps import Protocol, Result, Step, StepKind
 from collect.wishes import Wish, Wishes
-from drivers.errors import ArmMoved, DeviceError, MotionError, RpcError
+from drivers.errors import ArmMoved, DeviceError, LimitExceeded, MotionError, RpcError
 from sessions.errors import SessionError
 from sessions.store import SessionStore
 
@@ -87,7 +87,8 @@ class Run:
                 step = protocol.send(await self._result(step))
 
     async def _willing(self, act: Callable[[], Awaitable[None]], *, released: bool = False) -> None:
-        """Between steps: an arm that is held, or that somebody else has, may be released while somebody watches.
+        """Between steps: an arm that is held, or that somebody else has or left outside the limits, may be put right
+        while somebody watches.
 
         `released`: a person has had the arm. Its power and tool are set anew before anything else.
         """
@@ -96,7 +97,7 @@ class Run:
                 if released:
                     await self.rig.robot.enable()
                 return await act()
-            except MotionError as error:
+            except (MotionError, LimitExceeded) as error:
                 if not self.asker.watched:
                     raise
                 await self._ask(error)

@@ -141,6 +141,28 @@ def test_an_arm_that_somebody_still_moves_is_asked_about_and_left_alone(lab: Lab
     assert engine.snapshot().strokes_done == 4
 
 
+def test_an_arm_that_was_left_outside_its_limits_is_not_moved_until_it_is_jogged_back(lab: Lab) -> None:
+    engine = lab.engine(watched=True)
+    engine.start()
+    until(engine, lambda now: now.strokes_done == 1)
+    engine.pause()
+    until(engine, lambda now: now.state is State.PAUSED)
+    second_client(lab, brush_pose(480.0, 40.0, 250.0, tilt_deg=60.0))
+    sent = lines_sent(lab)
+    engine.resume()
+    prompt = until(engine, lambda now: now.prompt is not None).prompt
+    assert prompt is not None
+    assert "the arm stands where tilt = 60.000 deg" in prompt.question
+    assert "Jog the arm up" in prompt.question
+    assert not sent
+    second_client(lab, UNDER)
+    sent.clear()
+    engine.answer(prompt.number, "g")
+    engine.join()
+    assert_up_along_the_tool_first(sent)
+    assert engine.snapshot().strokes_done == 4
+
+
 SHORTER = {"RobotConfig_setTcpOffset": {"offset": [0.0, 0.0, 0.17, 0.0, 0.0, 0.0]}}
 """10 mm short: every press would be 10 mm deeper than it says."""
 
