@@ -30,16 +30,19 @@ from collect.running import Run
 from collect.set_up_steps import SetUpStep
 from collect.setting_up import board_first, listed
 from collect.snapshot import Snapshot
-from collect.states import State
+from collect.states import FINAL, State
 from collect.telemetry import NotedRobot, Telemetry
 from collect.wishes import Wish, Wishes
 from collect.work.waiting import uninterrupted
 from drivers.clock import Clock
-from drivers.errors import DeviceError, NotConnected
+from drivers.errors import DeviceError, NotConnected, Stale
 from sessions.store import SessionStore
 
 PARKED_MM = 2.0
 """How near to the park position counts as parked."""
+
+SILENT_S = 1.0
+"""So long without a pose is told: the arm, or the way to it, is dead."""
 
 OpenStore = Callable[[Rig], SessionStore]
 """Makes or resumes the session, once the devices have said who they are and before anything is powered."""
@@ -103,15 +106,20 @@ class Engine:
     def snapshot(self) -> Snapshot:
         """The engine now; from any thread."""
         tip_mm = force_n = None
+        no_pose_s, state = 0.0, self._control.state
         if (rig := self._rig) is not None:
-            with contextlib.suppress(DeviceError):
+            try:
                 tip_mm = self._telemetry.tip_mm = rig.robot.latest().pose.position_mm
+            except Stale as stale:
+                no_pose_s = stale.age_ms / 1e3
+            except DeviceError:
+                pass
             with contextlib.suppress(DeviceError):
                 force_n = math.hypot(*rig.force.latest_n()) if rig.force is not None else None
         if force_n is not None:
             self._telemetry.note_force(force_n, self._clock.now_ns())
         return replace(
-            self._progress.snapshot(self._control.state, tip_mm, force_n, self._asker.prompt),
+            self._progress.snapshot(state, tip_mm, force_n, self._asker.prompt),
             target_mm=self._telemetry.target_mm,
             parked=self._parked(),
             rest_unknown=self._rest_unknown,
@@ -119,6 +127,7 @@ class Engine:
             picture=self._telemetry.picture,
             wishes=self._wishes.open,
             set_up=self._set_up(),
+            no_pose_s=no_pose_s if no_pose_s >= SILENT_S and state not in FINAL else None,
         )
 
     def _parked(self) -> bool:

@@ -18,7 +18,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar
 
-from drivers.errors import DeviceError, LimitExceeded, MotionRefused, NotConnected, RobotNotSafe
+from drivers.errors import (
+    ArmMoved,
+    DeviceError,
+    LimitExceeded,
+    MotionRefused,
+    NotConnected,
+    RobotNotSafe,
+    SettingsChanged,
+)
 
 
 class ConfigError(Exception):
@@ -102,7 +110,9 @@ class Parked(CollectAborted):
 
 def rest_is_unknown(error: BaseException | None) -> bool:
     """Whether after this error nobody knows that the arm rests: it was lost, or did not answer the stop."""
-    known = RobotNotSafe | LimitExceeded | MotionRefused | NotConnected
+    if isinstance(error, ArmMoved):
+        return error.moving
+    known = RobotNotSafe | LimitExceeded | MotionRefused | NotConnected | SettingsChanged
     return isinstance(error, DeviceError) and error.device == "robot" and not isinstance(error, known)
 
 

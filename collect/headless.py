@@ -58,7 +58,7 @@ def run_headless(engine: RunnableEngine) -> None:
 
 
 def _show(engine: RunnableEngine, console: Console) -> None:
-    shown = 0
+    shown, silent = 0, False
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -74,9 +74,13 @@ def _show(engine: RunnableEngine, console: Console) -> None:
             for line in now.messages[max(shown - now.messages_before, 0) :]:
                 progress.console.print(line, markup=False, highlight=False)
             shown = now.messages_before + len(now.messages)
+            if (now.no_pose_s is not None) is not silent:
+                silent = now.no_pose_s is not None
+                words = f"warning: {no_pose_text(now)}" if silent else "the arm tells its pose again"
+                progress.console.print(words, markup=False, highlight=False)
             progress.update(
                 task,
-                description=f"{now.state}: {now.step}",
+                description=", ".join(part for part in (f"{now.state}: {now.step}", no_pose_text(now)) if part),
                 completed=now.strokes_done,
                 total=now.strokes_planned,
                 eta=eta_text(now),
@@ -99,6 +103,13 @@ def eta_text(now: Snapshot) -> str:
         return ""
     minutes, seconds = divmod(round(now.eta_s), 60)
     return f"ETA {minutes}:{seconds:02d}"
+
+
+def no_pose_text(now: Snapshot) -> str:
+    """`no pose for 1.4 s`, or nothing while the arm tells where it is."""
+    if now.no_pose_s is None:
+        return ""
+    return f"no pose for {now.no_pose_s:.{1 if now.no_pose_s < 10.0 else 0}f} s"
 
 
 @contextmanager

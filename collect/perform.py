@@ -25,9 +25,12 @@ from collect.wishes import Wish, Wishes
 from collect.work import capturing, choosing, dipping, looking, marking, reviewed, touching
 from collect.work.context import Bench, Job
 from collect.work.waiting import uninterrupted
-from drivers.errors import DeviceError
+from drivers.errors import ArmMoved, DeviceError
 from sessions.schemas import StepEvent
 from sessions.store import SessionStore
+
+HEIGHTS = MARKING | {StepKind.ZERO_TOUCH, StepKind.TOUCH}
+"""Steps that count only if the tool is still the one that was set: their heights would be false."""
 
 
 class Performer:
@@ -121,6 +124,9 @@ class Performer:
             try:
                 with guard.also(self._telemetry.force) if self._telemetry is not None else contextlib.nullcontext():
                     result = await self._do(Job(bench, step, cell, more, attempt, recorder, guard))
+                if step.kind in HEIGHTS:
+                    with contextlib.suppress(ArmMoved):  # where it is now does not matter to what was done
+                        await rig.robot.confirm()
             finally:
                 guard.deafen()
                 rig.robot.listen(None)

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 from collect.errors import BadPicture, ForceTooHigh, NeedsOperator, SheetFull, StepError, StepVoid
 from collect.steps import Step, StepKind
-from drivers.errors import DeviceError, DeviceTimeout, RobotNotSafe
+from drivers.errors import ArmMoved, DeviceError, DeviceTimeout, RobotNotSafe, SettingsChanged
 from drivers.ink.errors import InkRefused
 
 MAX_FAILURES = 3
@@ -29,6 +29,9 @@ def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
     match step.kind, error:
         # What only a person can put right: paper, ink, the arm's own stops, and what lies under the brush.
         case _, SheetFull() | NeedsOperator() | ForceTooHigh() | InkRefused() | RobotNotSafe():
+            return Action.ASK
+        # Somebody else has had the arm.
+        case _, ArmMoved() | SettingsChanged():
             return Action.ASK
         case StepKind.PRESS | StepKind.DRAW, StepVoid():
             action = Action.RETRY

@@ -57,7 +57,7 @@ class Procedures:
 
     async def retreat(self) -> None:
         """Lift along the tool axis to safe height, then park. A killed process may have left the brush down."""
-        here = await self._rig.robot.where()
+        here = await self._rig.robot.take_up()
         limits_of(self._config).check_start("robot", here)
         for move in retreat_moves(self._config, here):
             await self.go(move)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collect.asking import Choice, Prompt
 from collect.errors import ForceTooHigh, SheetFull, StepError, told
-from drivers.errors import DeviceError, MotionError
+from drivers.errors import ArmMoved, DeviceError, MotionError, SettingsChanged
 from drivers.ink.errors import InkRefused
 
 STOP = Choice("x", "stop the run")
@@ -21,6 +21,10 @@ def question(error: StepError | DeviceError, sheet: int) -> Prompt:
             words, go_on = f"{told(error)}", Choice(GO_ON, "there is ink, dip again")
         case ForceTooHigh():
             words, go_on = told(error), Choice(GO_ON, "nothing is under the brush, lift it and go on")
+        case ArmMoved():
+            words, go_on = told(error), Choice(GO_ON, "nobody else has the arm, lift it and go on")
+        case SettingsChanged():
+            words, go_on = told(error), Choice(GO_ON, "nobody else has the arm: set it anew, lift it and go on")
         case MotionError():
             words, go_on = told(error), Choice(GO_ON, "the arm is released and clear, lift it and go on")
         case _:

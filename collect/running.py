@@ -22,7 +22,7 @@ from collect.setting_up import question as set_up_question
 from collect.states import State
 from collect.steps import Protocol, Result, Step, StepKind
 from collect.wishes import Wish, Wishes
-from drivers.errors import DeviceError, MotionError, RpcError
+from drivers.errors import ArmMoved, DeviceError, LimitExceeded, MotionError, RpcError
 from sessions.errors import SessionError
 from sessions.store import SessionStore
 
@@ -86,15 +86,22 @@ class Run:
             while True:
                 step = protocol.send(await self._result(step))
 
-    async def _willing(self, act: Callable[[], Awaitable[None]]) -> None:
-        """Between steps: an arm that is held by its safety system may be released while somebody watches."""
+    async def _willing(self, act: Callable[[], Awaitable[None]], *, released: bool = False) -> None:
+        """Between steps: an arm that is held, or that somebody else has or left outside the limits, may be put right
+        while somebody watches.
+
+        `released`: a person has had the arm. Its power and tool are set anew before anything else.
+        """
         while True:
             try:
+                if released:
+                    await self.rig.robot.enable()
                 return await act()
-            except DeviceError as error:
-                if not self.asker.watched or not isinstance(error, MotionError):
+            except (MotionError, LimitExceeded) as error:
+                if not self.asker.watched:
                     raise
-                await self._ask(None, error)
+                await self._ask(error)
+                released = True
 
     async def _result(self, step: Step) -> Result:
         known = self.store.state.done.get(step.key)
@@ -121,24 +128,42 @@ class Run:
                     await self._lift(error)
                     raise
                 if action is Action.ASK:
-                    await self._ask(step, error)
+                    await self._ask(error)
                     failures = 0
-                await self._willing(self._recover)
+                released = action is Action.ASK and isinstance(error, MotionError)
+                await self._willing(self._recover, released=released)
             except SessionError as error:
                 await self._lift(error)  # the disk is at fault, the arm is in order
                 raise
 
     async def _between(self, step: Step) -> None:
-        """Before each step: park or pause where that was asked for; before a stroke, a new sheet and a new touch."""
+        """Before each step: park or pause where that was asked for, and see that the arm is as it was left; before a
+        stroke, a new sheet and a new touch."""
         if self.control.park_wanted:
             await self._park()
         await self.control.pause_point()
         if self.control.park_wanted:
             await self._park()
+        await self._back_in_control()
         if step.kind is StepKind.DIP and self.wishes.take(Wish.NEW_SHEET):
             await self._new_sheet()
         if step.kind is StepKind.DIP and self.wishes.take(Wish.JOG):
             await self._touch_again(step)
+
+    async def _back_in_control(self) -> None:
+        """Somebody else may have had the arm, in a pause, in a question, or with a client of his own: where it is not
+        as it was left, it first goes up along its tool axis."""
+        released = False
+        try:
+            return await self.rig.robot.confirm()
+        except ArmMoved:
+            pass
+        except MotionError as error:
+            if not self.asker.watched:
+                raise
+            await self._ask(error)
+            released = True
+        await self._willing(self._recover, released=released)
 
     async def _park(self) -> None:
         await self._willing(self._recover)
@@ -172,7 +197,7 @@ class Run:
             await self._park()
         return answer
 
-    async def _ask(self, step: Step | None, error: StepError | DeviceError) -> None:
+    async def _ask(self, error: StepError | DeviceError) -> None:
         """Let a person decide; raises `error` again where the answer is to stop."""
         in_order = False
         if not isinstance(error, ITS_OWN_TROUBLE):
@@ -190,8 +215,6 @@ class Run:
                 raise Parked(f"stopped at a question, parked: {told(error)}") from error
             raise error
         self.performer.answered(error)
-        if isinstance(error, MotionError) and step is not None:
-            await self._willing(self.rig.robot.enable)
 
     async def _lift(self, error: StepError | DeviceError | SessionError) -> None:
         """Leave no brush in the paper, where the arm itself is in order: not after its own trouble, nor where the brush
@@ -206,5 +229,9 @@ class Run:
     async def _recover(self) -> None:
         self.control.move_to(State.RECOVERING)
         self.progress.doing("retreat")
+        try:
+            await self.rig.robot.confirm()
+        except ArmMoved as moved:
+            self.progress.log(told(moved), warning=True)  # told before it moves
         await self.performer.retreat()
         self.control.move_to(self.control.running())

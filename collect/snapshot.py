@@ -92,6 +92,8 @@ class Snapshot:
     """Of a guided set-up; empty once it is over, and where there is none."""
     folder: str = ""
     """Of the session, once there is one."""
+    no_pose_s: float | None = None
+    """For so long the arm has told no pose, though it should; None below a second. Nothing on the screen is live."""
 
 
 class EngineView(Protocol):

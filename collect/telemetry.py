@@ -105,6 +105,14 @@ class NotedRobot:
         """See `Robot`."""
         return await self._robot.where()
 
+    async def confirm(self) -> None:
+        """See `Robot`."""
+        await self._robot.confirm()
+
+    async def take_up(self) -> Pose:
+        """See `Robot`."""
+        return await self._robot.take_up()
+
     def listen(self, on_sample: Callable[[PoseSample], None] | None) -> None:
         """See `Robot`."""
         self._robot.listen(on_sample)

@@ -13,6 +13,8 @@ DeviceError
       +-- MotionRefused     the controller did not accept the command
       +-- MotionFailed      accepted, but the arm did not arrive
       +-- RobotNotSafe      protective, safeguard or emergency stop, violation or fault
+      +-- ArmMoved          somebody else has moved the arm, or moves it now
+      +-- SettingsChanged   the tool offset, or what else a press depends on, is not as it was set
 """
 
 from __future__ import annotations
@@ -112,3 +114,37 @@ class RobotNotSafe(MotionError):
     def __init__(self, device: str, op: str, mode: str, condition: str, remedy: str) -> None:
         self.mode = mode
         super().__init__(device, op, f"safety mode is {mode}", condition=condition, remedy=remedy)
+
+
+class ArmMoved(MotionError):
+    """The arm is not where it was left: `off_mm` and `off_deg` from there, and `moving` still."""
+
+    def __init__(self, device: str, op: str, off_mm: float, off_deg: float, *, moving: bool = False) -> None:
+        self.off_mm = off_mm
+        self.off_deg = off_deg
+        self.moving = moving
+        super().__init__(
+            device,
+            op,
+            "the arm is moving, and not from here"
+            if moving
+            else f"the arm is {off_mm:.1f} mm and {off_deg:.1f} deg from where it was left",
+            condition="Another client or a person has it; nothing was sent to it.",
+            remedy="Wait until it rests, and close the other client."
+            if moving
+            else "Nothing may stand in the way of the brush: the first motion is back along the tool axis.",
+        )
+
+
+class SettingsChanged(MotionError):
+    """The controller is not set up as it was; `changes` names each setting as found and as set."""
+
+    def __init__(self, device: str, op: str, changes: tuple[str, ...]) -> None:
+        self.changes = changes
+        super().__init__(
+            device,
+            op,
+            "; ".join(changes),
+            condition="Nothing was sent to the arm; where the tip is may be other than it seems.",
+            remedy="Find out who changed it, the pendant or another client. Enabling the arm again sets it anew.",
+        )

@@ -65,3 +65,18 @@ def interpolate(a: Pose, b: Pose, s: float) -> Pose:
     qx, qy, qz, qw = (float(v) for v in (start * Rotation.from_rotvec(s * turn)).as_quat())
     x, y, z = (p + s * (q - p) for p, q in zip(a.position_mm, b.position_mm, strict=True))
     return Pose(x, y, z, qx, qy, qz, qw)
+
+
+def steepest_deg(a: Pose, b: Pose) -> float:
+    """The largest tilt on the way from a to b, in deg: two poses within a cone may have steeper ones between them."""
+    start = Rotation.from_quat(a.quaternion)
+    turn = (Rotation.from_quat(b.quaternion) * start.inv()).as_rotvec()
+    ferrule = -start.as_matrix()[:, 2]
+    angle = float(np.linalg.norm(turn))
+    axis = turn / angle if angle > 1e-9 else np.array([0.0, 0.0, 1.0])
+    # How upright the ferrule is after a turn by t: along + even cos t + odd sin t.
+    along = float(axis @ ferrule) * float(axis[2])
+    even, odd = float(ferrule[2]) - along, float(np.cross(axis, ferrule)[2])
+    lowest = (math.atan2(odd, even) + math.pi) % math.tau
+    upright = min(along + even * math.cos(t) + odd * math.sin(t) for t in (0.0, angle, min(lowest, angle)))
+    return math.degrees(math.acos(max(-1.0, min(1.0, upright))))

@@ -6,11 +6,15 @@ import math
 from dataclasses import dataclass
 
 from drivers.errors import LimitExceeded
-from drivers.geometry import distance, lean
+from drivers.geometry import distance, lean, steepest_deg
 from drivers.samples import Pose
 
 TILT_SLACK_DEG = 1e-6
 """Rounding of a pose that goes through Euler angles must not refuse a tilt that equals the limit."""
+REST_SLACK_MM, REST_SLACK_DEG = 0.1, 0.2
+"""An arm that was sent to a limit may rest a little beyond it."""
+ALONG_DEG = 1.0
+"""How far from the tool axis a way may lead that still counts as along it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,19 +39,31 @@ class Limits:
         return max(min(speed_mm_s, self.turn_deg_s * travel_mm / turn_deg), 0.1)
 
     def check_start(self, device: str, here: Pose) -> None:
-        """Raise `LimitExceeded` where the arm stands outside the box or the cone: no line from there is known."""
-        try:
-            self.check(device, here, speed_mm_s=self.speed_mm_s, acc_mm_s2=self.acc_mm_s2)
-        except LimitExceeded as error:
-            raise LimitExceeded(
-                device,
-                f"the arm stands where {error.field}",
-                error.value,
-                error.low,
-                error.high,
-                error.unit,
-                remedy="The brush may be down. Jog the arm up, into the box and upright, then start again.",
-            ) from None
+        """Raise `LimitExceeded` where the arm stands outside the box or the cone: no line from there is known.
+
+        Below the floor it may stand: up along the tool axis is a way out.
+        """
+        for field, value, (low, high), slack, unit in (
+            ("x", here.x_mm, self.x_mm, REST_SLACK_MM, "mm"),
+            ("y", here.y_mm, self.y_mm, REST_SLACK_MM, "mm"),
+            ("z", max(here.z_mm, self.z_mm[0]), self.z_mm, REST_SLACK_MM, "mm"),
+            ("tilt", lean(here)[0], (0.0, self.tilt_deg), REST_SLACK_DEG, "deg"),
+        ):
+            if not low - slack <= value <= high + slack:
+                raise _stands_outside(device, field, value, low, high, unit)
+
+    def check_way(self, device: str, start: Pose, target: Pose) -> None:
+        """Raise `LimitExceeded` unless the whole line to a target that was checked lies within the limits.
+
+        A box that holds both ends holds the line; a tilt cone may not. From below the floor only the way up along the
+        tool axis is allowed.
+        """
+        self.check_start(device, start)
+        if start.z_mm < self.z_mm[0] - REST_SLACK_MM and not _rises_along_tool(start, target):
+            raise _stands_outside(device, "z", start.z_mm, *self.z_mm, "mm")
+        steepest = steepest_deg(start, target)
+        if steepest > self.tilt_deg + REST_SLACK_DEG:
+            raise LimitExceeded(device, "tilt on the way", steepest, 0.0, self.tilt_deg, "deg")
 
     def check(self, device: str, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
         """Raise `LimitExceeded` naming the first field that is out of range; NaN is out of every range."""
@@ -66,3 +82,19 @@ class Limits:
         for field, value, low, high, unit in checks:
             if not low <= value <= high:
                 raise LimitExceeded(device, field, value, low, high, unit)
+
+
+def _stands_outside(device: str, field: str, value: float, low: float, high: float, unit: str) -> LimitExceeded:
+    remedy = "The brush may be down. Jog the arm up, into the box and upright, then start again."
+    return LimitExceeded(device, f"the arm stands where {field}", value, low, high, unit, remedy=remedy)
+
+
+def _rises_along_tool(start: Pose, target: Pose) -> bool:
+    """Whether the way leads up along the ferrule, without a turn."""
+    travel_mm, turn_deg = distance(start, target)
+    tilt_deg, heading_deg = lean(start)
+    out, up = math.sin(math.radians(tilt_deg)), math.cos(math.radians(tilt_deg))
+    ferrule = (out * math.cos(math.radians(heading_deg)), out * math.sin(math.radians(heading_deg)), up)
+    way = [b - a for a, b in zip(start.position_mm, target.position_mm, strict=True)]
+    along_mm = sum(a * b for a, b in zip(ferrule, way, strict=True))
+    return turn_deg < ALONG_DEG and along_mm > 0.0 and along_mm >= travel_mm * math.cos(math.radians(ALONG_DEG))

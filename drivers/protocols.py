@@ -22,7 +22,11 @@ class Robot(Protocol):
         ...
 
     async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
-        """Move the tip in a straight line; returns when the arm has settled within tolerance."""
+        """Move the tip in a straight line; returns when the arm has settled within tolerance.
+
+        The whole way is checked, from where the arm is. Raises `ArmMoved` where it is not where it was left, and
+        `SettingsChanged` before a way down with another tool, payload or speed than was set.
+        """
         ...
 
     async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float) -> None:
@@ -42,6 +46,14 @@ class Robot(Protocol):
 
     async def where(self) -> Pose:
         """The pose now, asked of the controller."""
+        ...
+
+    async def confirm(self) -> None:
+        """Asks only. Raises `SettingsChanged`, then `ArmMoved`, unless the arm is as it was left."""
+        ...
+
+    async def take_up(self) -> Pose:
+        """Where the arm rests, whoever brought it there; the next move may begin here. Raises while it moves."""
         ...
 
     def listen(self, on_sample: Callable[[PoseSample], None] | None) -> None:

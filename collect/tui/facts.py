@@ -7,7 +7,7 @@ import math
 from rich.cells import cell_len
 from textual.content import Content
 
-from collect.headless import eta_text
+from collect.headless import eta_text, no_pose_text
 from collect.snapshot import Snapshot
 from collect.states import FINAL
 from collect.tui.text import bar_text, minutes_text, one_line, tip_text
@@ -23,7 +23,7 @@ def facts_content(now: Snapshot, width: int) -> Content:
         ("Strokes", _strokes(now, width), ""),
         ("Time", _time(now), ""),
         ("Counts", *_counts(now)),
-        ("Tip", tip_text(now.tip_mm), "" if now.tip_mm else "bold $text-warning"),
+        ("Tip", no_pose_text(now) or tip_text(now.tip_mm), "" if now.tip_mm else "bold $text-warning"),
         ("Target", target_text(now), ""),
         ("Force", _force(now, width - LABEL), ""),
     )

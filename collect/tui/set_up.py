@@ -12,6 +12,7 @@ from textual.content import Content
 from textual.screen import Screen
 
 from collect.asking import Prompt
+from collect.headless import no_pose_text
 from collect.set_up_steps import Fact, SetUpStep, Standing
 from collect.snapshot import EngineView, Snapshot
 from collect.steps import StepKind
@@ -43,6 +44,7 @@ class SetUpScreen(Screen[None]):
 
     DEFAULT_CSS = """
     SetUpScreen #set-up-title { height: 1; padding: 0 1; background: $panel; text-style: bold; text-wrap: nowrap; }
+    SetUpScreen #set-up-title.-silent { background: $error; color: $text; }
     SetUpScreen #set-up-body { height: 1fr; }
     SetUpScreen #steps { width: 26; padding: 0 1; border-right: solid $foreground 40%; height: 100%; }
     SetUpScreen #found { width: 1fr; height: 1fr; padding: 0 1; }
@@ -97,7 +99,9 @@ class SetUpScreen(Screen[None]):
     def show(self, now: Snapshot) -> None:
         """Draw what differs."""
         session = one_line(now.session_id) or "no session yet"
-        self._title.show(f"Set-up   {session}   {now.state}: {one_line(now.step)}")
+        doing = ", ".join(part for part in (f"{now.state}: {one_line(now.step)}", no_pose_text(now)) if part)
+        self._title.show(f"Set-up   {session}   {doing}")
+        self._title.set_class(now.no_pose_s is not None, "-silent")
         self._steps.show(steps_content(now.set_up))
         self._found.show(found_content(now.set_up))
         self._live.show(live_content(now))
@@ -149,7 +153,8 @@ def live_content(now: Snapshot) -> Content:
     force = f"{force_bar(now.force_n, FORCE_SCALE_N, BAR)} {spark(now.trace_n, 20)}"
     if now.force_n is not None and not _zeroed(now.set_up):
         force = f"{now.force_n:.3f} N, weight of the holder included: set to zero with zero touch"
-    rows = (("Tip", tip_text(now.tip_mm)), ("Target", target_text(now)), ("Force", force), ("Focus", blur))
+    tip = no_pose_text(now) or tip_text(now.tip_mm)
+    rows = (("Tip", tip), ("Target", target_text(now)), ("Force", force), ("Focus", blur))
     return Content("\n").join(Content.assemble((name.ljust(8), "dim"), text) for name, text in rows)
 
 

@@ -7,6 +7,7 @@ from textual.app import ComposeResult
 from textual.containers import Horizontal, ScrollableContainer, Vertical, VerticalScroll
 from textual.content import Content
 
+from collect.headless import no_pose_text
 from collect.snapshot import Snapshot
 from collect.states import FINAL, State
 from collect.tui.capture import CapturePane
@@ -48,6 +49,7 @@ class RunView(Vertical):
     RunView #state.-paused { background: $primary; }
     RunView #state.-stopped, RunView #state.-failed { background: $error; }
     RunView #state.-done { background: $success-darken-2; }
+    RunView #state.-silent { background: $error; }
     RunView #facts { width: 1fr; height: 7; text-wrap: nowrap; text-overflow: ellipsis; }
     RunView #body { height: 1fr; }
     RunView .pane {
@@ -156,7 +158,7 @@ class RunView(Vertical):
         """Draw what differs from the last snapshot."""
         self._session.show(f"brushloop  {one_line(now.session_id) or 'no session yet'}")
         self._source.show(f"source: {one_line(now.source) or 'not known yet'}")
-        self._show_state(now.state)
+        self._show_state(now)
         self._facts.show(facts_content(now, self._facts.content_size.width))
         self.set_class(bool(now.error), "-wrong")
         failed = now.state is State.FAILED
@@ -175,16 +177,19 @@ class RunView(Vertical):
             self._camera.show(now.picture.image)
         self._note.show(note_content(now))
 
-    def _show_state(self, state: State) -> None:
+    def _show_state(self, now: Snapshot) -> None:
+        state = now.state
         self._stop_sent = self._stop_sent and state not in FINAL | {State.STOPPING}
-        self._state.show(STOP_SENT if self._stop_sent else _state_content(state))
+        words = [STOP_SENT if self._stop_sent else _state_text(state), no_pose_text(now)]
+        self._state.show("\n".join(filter(None, words)))
+        self._state.set_class(now.no_pose_s is not None, "-silent")
         for known in State:
             self._state.set_class(known is (State.STOPPING if self._stop_sent else state), f"-{known}")
 
 
-def _state_content(state: State) -> Content:
+def _state_text(state: State) -> str:
     word = state.upper()
-    return Content(f"{word}\nafter this step") if state is State.PAUSING else Content(word)
+    return f"{word}\nafter this step" if state is State.PAUSING else word
 
 
 def _message_content(line: str) -> Content:

@@ -8,17 +8,17 @@ from drivers.arcs.controller import Controller, accepted
 from drivers.arcs.errors import WrongOperationalMode
 from drivers.arcs.options import ArcsOptions
 from drivers.arcs.rpc import DEVICE
-from drivers.errors import RpcError
-
-METHOD_NOT_FOUND = -32601
+from drivers.arcs.settings import OPERATIONAL_MODE, Settings, Value, configured, read_back, require_same
 
 
-async def make_ready(controller: Controller, options: ArcsOptions, on_notice: Callable[[str], None]) -> None:
-    """Check the operational mode and safety, then set tool, payload, collision level and speed, where configured.
+async def make_ready(controller: Controller, options: ArcsOptions, on_notice: Callable[[str], None]) -> Settings:
+    """Check the operational mode, then set tool, payload, collision level and speed, where configured, and read all
+    back: a return code is no proof, least of all `ignored`.
 
-    Raises `WrongOperationalMode`, `RobotNotSafe`, or `MotionRefused` for what the controller does not take.
+    Raises `WrongOperationalMode`, `MotionRefused` for what the controller does not take, and `SettingsChanged` for what
+    it says that it took and has not.
     """
-    await _require_automatic(controller, on_notice)
+    _require_automatic((await read_back(controller))[OPERATIONAL_MODE], on_notice)
     await controller.set_tcp_offset(options.tcp_offset_mm)
     if options.payload_kg is not None:
         params = {
@@ -34,18 +34,18 @@ async def make_ready(controller: Controller, options: ArcsOptions, on_notice: Ca
     if options.speed_fraction is not None:
         code = await controller.ask("MotionControl.setSpeedFraction", fraction=options.speed_fraction)
         accepted("setSpeedFraction", code)
+    found = await read_back(controller)
+    require_same("power on", configured(options), found)
+    for name in (name for name, value in found.items() if value is None and name != OPERATIONAL_MODE):
+        on_notice(f"the controller does not tell its {name}: whether it changes cannot be seen")
+    return found
 
 
-async def _require_automatic(controller: Controller, on_notice: Callable[[str], None]) -> None:
+def _require_automatic(mode: Value, on_notice: Callable[[str], None]) -> None:
     """Manual, or a word that is none, is for a person beside the arm."""
-    try:
-        mode = str(await controller.ask("RobotManage.getOperationalMode"))
-    except RpcError as error:
-        if error.code != METHOD_NOT_FOUND:
-            raise
+    if mode is None:
         on_notice("the controller has no operational mode to check")
-        return
-    if mode == "Disabled":
+    elif mode == "Disabled":
         on_notice("operational modes are disabled on this cabinet")
     elif mode != "Automatic":
-        raise WrongOperationalMode(DEVICE, "power on", mode)
+        raise WrongOperationalMode(DEVICE, "power on", str(mode))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Coroutine, Sequence
 
 from drivers.arcs.codes import LOOPBACK_CONTROL_BOX, RobotMode
 from drivers.arcs.controller import Condition, Controller
+from drivers.arcs.departure import Departure
 from drivers.arcs.following import feed, legs_of
 from drivers.arcs.generation import open_arcs
 from drivers.arcs.joints import checked_path, reachable
@@ -56,6 +57,7 @@ class AuboArcs:
         self._telemetry = Telemetry(self._state, options, clock, on_notice)
         self._watchdog = Watchdog(self._state.connection, options.watchdog_s, on_notice)
         self._messages = Messages(self._motion)
+        self._departure = Departure(self._motion)
         self._motion.on_notice = on_notice
 
     async def connect(self) -> Identity:
@@ -90,7 +92,7 @@ class AuboArcs:
     async def enable(self) -> None:
         """Check the mode, set the tool, power on, release the brakes, arm the watchdog; moves nothing.
 
-        Raises `WrongOperationalMode`, `RobotNotSafe`, `MotionRefused`, `DeviceTimeout`.
+        Raises `WrongOperationalMode`, `RobotNotSafe`, `MotionRefused`, `SettingsChanged`, `DeviceTimeout`.
         """
         self._enabled = True
         if not await self._motion.at_rest():
@@ -100,13 +102,14 @@ class AuboArcs:
             except MotionFailed:
                 await self._motion.require_safe("power on")  # a safety stop holds its path: that is what to tell
                 raise
-        await make_ready(self._motion, self._options, self._notice)
+        settings = await make_ready(self._motion, self._options, self._notice)
         await self._motion.require_safe("power on")
         if await self._motion.mode() != RobotMode.RUNNING:
             await self._motion.ask("RobotManage.poweron")
             await self._until_mode({RobotMode.IDLE, RobotMode.RUNNING})
             await self._motion.ask("RobotManage.startup")
             await self._until_mode({RobotMode.RUNNING})
+        await self._departure.enabled(settings)
         await self._messages.begin()
         await self._watchdog.arm()
         await self._telemetry.read()
@@ -122,11 +125,11 @@ class AuboArcs:
     async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
         """moveLine, then wait until the queue is empty, the arm steady and the pose within tolerance.
 
-        Any failure, cancellation included, stops the arm before it is passed on.
+        The whole way is checked, from where the arm really is. Any failure, cancellation included, stops the arm before
+        it is passed on.
         """
         self.check(target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
-        await self._restore_stop()
-        start = await self._motion.pose()
+        start = await self._depart("moveLine", [target])
         speed_mm_s = self._limits.turn_capped(start, target, speed_mm_s)
         expected_s = planned_s(start, target, speed_mm_s, acc_mm_s2)
         await self._carry_out(self._motion.move_line(target, speed_mm_s, acc_mm_s2), target, expected_s)
@@ -134,15 +137,14 @@ class AuboArcs:
     async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float) -> None:
         """Lines through all poses without a halt between them, then wait as `move` does at the last.
 
-        Every pose is checked before the first line is sent; between two of them the box holds by itself, being convex.
-        Raises ValueError for no poses.
+        Every pose, and the way between two of them, is checked before the first line is sent. Raises ValueError for no
+        poses.
         """
         if not poses:
             raise ValueError("follow: no poses")
         for pose in poses:
             self.check(pose, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
-        await self._restore_stop()
-        start = await self._motion.pose()
+        start = await self._depart("moveLine", poses)
         legs = legs_of(start, poses, self._limits, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=blend_mm)
         stops, options = self._stops, self._options
         feeding = feed(
@@ -161,19 +163,19 @@ class AuboArcs:
 
         Only for an arm that is enabled: before, its tool is not set and the poses are of something else.
         """
-        self._require_enabled("moveJoint")
-        await self._restore_stop()
+        await self._depart("moveJoint", [])
         target, expected_s = await checked_path(self._motion, self._limits, joints_rad, speed_rad_s, acc_rad_s2)
         await self._carry_out(self._motion.move_joint([*joints_rad], speed_rad_s, acc_rad_s2), target, expected_s)
 
     async def reachable(self, target: Pose) -> bool:
         """Whether the controller finds joints for the tip pose. Raises `NotConnected` before `enable`."""
-        self._require_enabled("reachable")
+        if not self._enabled:
+            raise NotConnected(DEVICE, "reachable", "not enabled")
         return await reachable(self._motion, target)
 
     async def _carry_out(self, command: Coroutine[None, None, None], target: Pose, expected_s: float) -> None:
         options = self._options
-        self._unsettled = True
+        self._unsettled, self._departure.left = True, None
         try:
             await command
             await until_settled(
@@ -183,7 +185,7 @@ class AuboArcs:
                 planned_s=expected_s,
                 poll_s=options.poll_s,
             )
-            self._unsettled = False
+            self._unsettled, self._departure.left = False, target
         except BaseException as error:
             note = ""
             try:
@@ -197,9 +199,14 @@ class AuboArcs:
                 raise cause from error
             raise
 
-    def _require_enabled(self, op: str) -> None:
-        if not self._enabled:
-            raise NotConnected(DEVICE, op, "not enabled")
+    async def _depart(self, op: str, poses: Sequence[Pose]) -> Pose:
+        """Where the arm is, once it is known that it may go through `poses` from there; see `Departure`."""
+        stops = self._stops
+        await self._restore_stop()
+        start = await self._departure.ready(op, self._limits, poses)
+        if self._stops != stops:
+            raise MotionFailed(DEVICE, op, "the arm was told to stop", condition="Nothing was sent to it.")
+        return start
 
     async def stop(self) -> None:
         """Decelerate along the path, drop whatever is queued, and return once the arm is seen at rest.
@@ -215,6 +222,14 @@ class AuboArcs:
     async def where(self) -> Pose:
         """The pose as the controller tells it now, whatever telemetry does."""
         return await self._motion.pose()
+
+    async def confirm(self) -> None:
+        """Asks only. Raises `RobotNotSafe`, `SettingsChanged`, then `ArmMoved`, unless all is as it was left."""
+        await self._departure.confirm()
+
+    async def take_up(self) -> Pose:
+        """Where the arm rests, whoever brought it there: the next move may begin here. Raises as `confirm` does."""
+        return await self._departure.take_up()
 
     def _own_stop(self) -> asyncio.Task[None]:
         """A stop that goes on although whoever asked for it is cancelled; `close` waits for it."""
@@ -258,6 +273,7 @@ class AuboArcs:
         for controller in (self._motion, self._stop, self._state):
             await controller.connection.close()
         self._connected = self._enabled = False
+        self._departure = Departure(self._motion)
 
     async def _until_mode(self, wanted: set[RobotMode]) -> None:
         options = self._options

@@ -144,6 +144,14 @@ async def test_enabling_readies_the_arm_and_moves_nothing(enabled: Enabled):
 
 
 @pytest.mark.moves
+async def test_an_arm_that_nobody_else_had_is_as_it_was_left(enabled: Enabled):
+    await enabled.robot.confirm()
+    await enabled.robot.move(enabled.top, **GENTLY)
+    await enabled.robot.confirm()
+    assert_there(await enabled.robot.take_up(), enabled.top)
+
+
+@pytest.mark.moves
 async def test_a_move_arrives(enabled: Enabled):
     for target in (raised(enabled.start, LIFT_MM / 2), enabled.top, enabled.start):
         await enabled.robot.move(target, **GENTLY)

@@ -4,9 +4,10 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from drivers.errors import DeviceError, LimitExceeded
-from drivers.geometry import brush_pose, from_wire, to_wire
+from drivers.geometry import brush_pose, from_wire, interpolate, lean, steepest_deg, to_wire
 from drivers.limits import Limits
 from drivers.samples import Pose
 
@@ -70,3 +71,33 @@ def test_a_tool_that_points_up_is_far_outside_the_tilt_cone():
     with pytest.raises(LimitExceeded) as caught:
         LIMITS.check("robot", up, speed_mm_s=100.0, acc_mm_s2=500.0)
     assert caught.value.value == pytest.approx(180.0)
+
+
+def leaning(tilt_deg: float, toward_deg: float, wrist_deg: float, z_mm: float = 200.0) -> Pose:
+    """A pose that another client may have left: the wrist is turned whichever way the tool leans."""
+    upright = Rotation.from_euler("x", 180.0, degrees=True)
+    turned = Rotation.from_euler("zyz", [wrist_deg, tilt_deg, toward_deg], degrees=True) * upright
+    qx, qy, qz, qw = (float(v) for v in turned.as_quat())
+    return Pose(400.0, 0.0, z_mm, qx, qy, qz, qw)
+
+
+def test_a_way_between_two_poses_within_the_cone_may_leave_it() -> None:
+    start, target = leaning(14.0, 0.0, 0.0), leaning(14.0, 90.0, 90.0)
+    LIMITS.check("robot", start, speed_mm_s=100.0, acc_mm_s2=500.0)
+    LIMITS.check("robot", target, speed_mm_s=100.0, acc_mm_s2=500.0)
+    with pytest.raises(LimitExceeded, match=r"tilt on the way = 19\.702 deg is outside \[0.000, 15.000\] deg"):
+        LIMITS.check_way("robot", start, target)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.tuples(*[st.floats(0.0, 40.0), *[st.floats(-180.0, 180.0)] * 2] * 2))
+def test_the_steepest_tilt_on_a_way_is_that_of_its_steepest_pose(angles: tuple[float, ...]) -> None:
+    start, target = leaning(*angles[:3]), leaning(*angles[3:])
+    sampled = max(lean(interpolate(start, target, k / 100))[0] for k in range(101))
+    assert sampled - 1e-4 <= steepest_deg(start, target) <= sampled + 0.05
+
+
+def test_an_arm_that_rests_a_little_beyond_a_limit_may_leave_it() -> None:
+    for start in (brush_pose(400.0, 0.0, 94.95), brush_pose(640.05, 0.0, 200.0), leaning(15.1, 30.0, 0.0)):
+        LIMITS.check_start("robot", start)
+        LIMITS.check_way("robot", start, brush_pose(400.0, 0.0, 200.0))

@@ -106,6 +106,9 @@ class Bench:
     async def where(self) -> Pose:
         return self.target
 
+    async def take_up(self) -> Pose:
+        return self.target
+
     def latest(self) -> PoseSample:
         return PoseSample(Stamp(self.clock.now_ns()), self.target)
 

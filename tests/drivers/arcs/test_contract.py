@@ -58,11 +58,12 @@ async def test_a_move_arrives_and_the_same_again_is_done(arm: AuboArcs, cabinet:
         assert off_deg <= 0.1
 
 
-async def test_an_arm_without_power_refuses(sleeping_arm: AuboArcs, cabinet: ArcsServer):
+async def test_an_arm_whose_power_went_refuses(arm: AuboArcs, cabinet: ArcsServer):
+    cabinet.cabinet.power_off()
     with pytest.raises(MotionRefused) as caught:
-        await sleeping_arm.move(NEAR, **QUICK)
+        await arm.move(NEAR, **QUICK)
     assert caught.value.code == -1
-    assert cabinet.mode == RobotMode.POWER_OFF
+    assert cabinet.mode != RobotMode.RUNNING
 
 
 async def test_a_protective_stop_in_mid_move_ends_it_and_the_path_is_dropped(arm: AuboArcs, cabinet: ArcsServer):

@@ -56,11 +56,17 @@ async def test_a_cabinet_of_another_make_is_not_taken_for_the_loopback_rig(cabin
     await arm.close()
 
 
-async def test_an_arm_without_power_refuses_to_move(sleeping_arm: AuboArcs, cabinet: ArcsServer):
-    with pytest.raises(MotionRefused, match="Power the arm on") as caught:
+async def test_an_arm_that_was_not_enabled_is_not_moved(sleeping_arm: AuboArcs, cabinet: ArcsServer):
+    with pytest.raises(NotConnected, match="not enabled"):
         await sleeping_arm.move(NEAR, **QUICK)
-    assert caught.value.code == -1
     assert cabinet.mode == RobotMode.POWER_OFF
+
+
+async def test_an_arm_whose_power_went_refuses_to_move(arm: AuboArcs, cabinet: ArcsServer):
+    cabinet.cabinet.power_off()
+    with pytest.raises(MotionRefused, match="Power the arm on") as caught:
+        await arm.move(NEAR, **QUICK)
+    assert caught.value.code == -1
 
 
 async def test_enabling_runs_the_arm_and_sets_the_tool_but_moves_nothing(sleeping_arm: AuboArcs, cabinet: ArcsServer):
@@ -245,4 +251,5 @@ async def test_closing_twice_is_fine_and_later_calls_say_that_it_is_closed(arm: 
 async def test_a_closed_arm_can_be_connected_again(arm: AuboArcs):
     await arm.close()
     await arm.connect()
+    await arm.enable()
     await arm.move(NEAR, **QUICK)

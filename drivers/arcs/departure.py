@@ -1,0 +1,102 @@
+"""What must hold before a line is sent: the arm rests where it was left, it is set up as it was, and the whole way is
+allowed. Another client may have had the arm since the last line; nothing of what was known then is taken for granted.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import Sequence
+
+from drivers.arcs.controller import Controller
+from drivers.arcs.rpc import DEVICE
+from drivers.arcs.settings import Settings, read_back, require_same
+from drivers.errors import ArmMoved, NotConnected
+from drivers.geometry import distance
+from drivers.limits import Limits
+from drivers.samples import Pose
+
+MOVED_MM, MOVED_DEG = 0.5, 0.5
+"""Beyond the tolerance of any settled move: somebody else moved the arm."""
+DOWN_MM = 0.01
+"""A line that ends so much lower goes down."""
+RESTS_S, POLL_S = 0.5, 0.02
+"""An arm that has just settled may take a moment to say so."""
+
+
+class Departure:
+    """Where one arm was left, and how it was set up when it was enabled."""
+
+    def __init__(self, controller: Controller) -> None:
+        self._controller = controller
+        self._settings: Settings = {}
+        self.left: Pose | None = None
+        """Where the last line ended, or where the arm was taken up; None where a line was cut."""
+
+    async def enabled(self, settings: Settings) -> None:
+        """The arm was set up so, and stands where it stands."""
+        self._settings = settings
+        self.left = await self._controller.pose()
+
+    async def take_up(self) -> Pose:
+        """Where the arm rests, whoever brought it there: the next line may begin here.
+
+        Raises `ArmMoved` while it moves, `SettingsChanged` where a pose would be of another tool, `RobotNotSafe`.
+        """
+        await self._require_rest("take up")
+        await self._require_settings("take up")
+        self.left = await self._controller.pose()
+        return self.left
+
+    async def confirm(self) -> None:
+        """Raise `RobotNotSafe`, `SettingsChanged`, then `ArmMoved`, unless all is as it was left."""
+        await self._require_settings("confirm")
+        await self._require_rest("confirm")
+        self._require_place("confirm", await self._controller.pose())
+
+    async def ready(self, op: str, limits: Limits, poses: Sequence[Pose]) -> Pose:
+        """Where the arm is, from where it may now go through `poses`.
+
+        Raises as `confirm` does, and `LimitExceeded` for a way that leaves the limits.
+        """
+        await self._require_rest(op)
+        start = await self._controller.pose()
+        way = [start, *poses]
+        down = any(b.z_mm < a.z_mm - DOWN_MM for a, b in itertools.pairwise(way))
+        if down or self._moved(start):
+            await self._require_settings(op)  # another tool would look like another place
+        self._require_place(op, start)
+        for a, b in itertools.pairwise(way):
+            limits.check_way(DEVICE, a, b)
+        return start
+
+    async def _require_settings(self, op: str) -> None:
+        self._require_enabled(op)
+        found = await read_back(self._controller)
+        await self._controller.require_safe(op)
+        require_same(op, self._settings, found)
+
+    async def _require_rest(self, op: str) -> None:
+        self._require_enabled(op)
+        loop = asyncio.get_running_loop()
+        until = loop.time() + RESTS_S
+        while not await self._controller.at_rest():
+            if loop.time() > until:
+                await self._controller.require_safe(op)  # a safety stop holds its path: that is what to tell
+                raise ArmMoved(DEVICE, op, *self._off(await self._controller.pose()), moving=True)
+            await asyncio.sleep(POLL_S)
+
+    def _require_enabled(self, op: str) -> None:
+        if not self._settings:
+            raise NotConnected(DEVICE, op, "not enabled")
+
+    def _require_place(self, op: str, here: Pose) -> None:
+        if self._moved(here):
+            raise ArmMoved(DEVICE, op, *self._off(here))
+
+    def _moved(self, here: Pose) -> bool:
+        off_mm, off_deg = self._off(here)
+        return off_mm > MOVED_MM or off_deg > MOVED_DEG
+
+    def _off(self, here: Pose) -> tuple[float, float]:
+        return (0.0, 0.0) if self.left is None else distance(self.left, here)

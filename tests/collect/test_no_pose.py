@@ -1,0 +1,109 @@
+"""An arm that tells no pose any more: the screens say so after a second, long before a call has timed out for good."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from collect import headless
+from collect.config import load_rig
+from collect.engine import Engine
+from collect.protocols.config import GridConfig
+from collect.rig import Rig, make_robot
+from collect.snapshot import Snapshot
+from collect.states import State
+from collect.tui.app import OperatorApp
+from drivers.geometry import brush_pose
+from drivers.samples import Identity
+from drivers.sim.config import SimConfig
+from drivers.sim.rig_toml import Addresses, rig_toml
+from tests.collect.tui.fake import SET_UP, FakeEngine, picture
+
+WHO = Identity("robot", "aubo_i5", "", True)
+
+
+class HandClock:
+    """Time that a test sets."""
+
+    seconds = 0.0
+
+    def now_ns(self) -> int:
+        return round(self.seconds * 1e9)
+
+
+def test_the_snapshot_says_for_how_long_no_pose_has_come(tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text(rig_toml(SimConfig(), Addresses("127.0.0.1", 1, 1, 1, 1, None)))
+    config, clock = load_rig(tmp_path / "rig.toml"), HandClock()
+    robot = make_robot(config, clock, print)
+    devices: Any = robot
+    engine = Engine(config, GridConfig(kind="grid", heights_mm=[11.0], tilts_deg=[0.0]), devices, clock)
+    assert engine.snapshot().no_pose_s is None, "not connected yet"
+    engine._rig = Rig(config, clock, robot, devices, WHO, WHO)
+    assert engine.snapshot().no_pose_s is None, "no pose yet"
+    robot._telemetry._take(brush_pose(300.0, 0.0, 200.0))
+
+    for seconds, told in ((0.4, None), (0.9, None), (1.4, 1.4), (20.0, 20.0)):
+        clock.seconds = seconds
+        now = engine.snapshot()
+        assert now.no_pose_s == (None if told is None else pytest.approx(told))
+        assert (now.tip_mm is None) is (seconds > 0.5)
+    robot._telemetry._take(brush_pose(300.0, 0.0, 200.0))
+    assert engine.snapshot().no_pose_s is None, "it tells again"
+    clock.seconds += 30.0
+    engine._control.end(State.FAILED)
+    assert engine.snapshot().no_pose_s is None, "a run that is over has let the arm go"
+
+
+async def test_the_run_screen_is_not_green_without_a_pose() -> None:
+    engine = FakeEngine(picture())
+    app = OperatorApp(engine)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await pilot.pause(0.15)
+        state = app.screen.query_one("#state")
+        green = state.styles.background
+        engine.now = picture(tip_mm=None, no_pose_s=1.44)
+        await pilot.pause(0.15)
+        assert str(state.render()) == "RUNNING\nno pose for 1.4 s"
+        assert state.styles.background != green
+        assert "no pose for 1.4 s" in str(app.screen.query_one("#facts").render())
+        engine.now = picture(state=State.PAUSED, tip_mm=None, no_pose_s=75.2)
+        await pilot.pause(0.15)
+        assert str(state.render()) == "PAUSED\nno pose for 75 s"
+        engine.now = picture()
+        await pilot.pause(0.15)
+        assert (str(state.render()), state.styles.background) == ("RUNNING", green)
+
+
+async def test_the_set_up_says_it_in_its_title_and_beside_the_tip() -> None:
+    app = OperatorApp(FakeEngine(picture(set_up=SET_UP, tip_mm=None, no_pose_s=1.44)))
+    async with app.run_test(size=(110, 30)) as pilot:
+        await pilot.pause(0.15)
+        assert str(app.screen.query_one("#set-up-title").render()).endswith("press H15-a5-r02, no pose for 1.4 s")
+        assert "Tip     no pose for 1.4 s" in str(app.screen.query_one("#live").render())
+
+
+def test_without_a_screen_it_is_one_line_when_it_begins_and_one_when_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Scripted(FakeEngine):
+        def __init__(self, shots: Iterator[Snapshot]) -> None:
+            super().__init__(next(shots))
+            self._shots = shots
+
+        def snapshot(self) -> Snapshot:
+            self.now = next(self._shots, self.now)
+            return self.now
+
+        @property
+        def finished(self) -> bool:
+            return self.now.state is State.DONE
+
+    shots = [picture(messages=(), no_pose_s=s) for s in (None, None, 1.04, 1.1, 2.0, None)]
+    out = io.StringIO()
+    monkeypatch.setattr(headless, "REFRESH_S", 0.0)
+    headless._show(Scripted(iter([*shots, picture(state=State.DONE, messages=())])), Console(file=out))
+    told = [line for line in out.getvalue().splitlines() if "pose" in line]
+    assert told == ["warning: no pose for 1.0 s", "the arm tells its pose again"]

@@ -1,0 +1,226 @@
+"""A second client of the controller, as a pendant or a forgotten script is one: nothing that it did is missed."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from collect.snapshot import Snapshot
+from collect.states import State
+from drivers.arcs.controller import Controller
+from drivers.arcs.rpc import RpcConnection
+from drivers.arcs.waiting import Tolerance, until_settled
+from drivers.errors import MotionFailed, SettingsChanged
+from drivers.geometry import brush_pose, from_wire, lean
+from sessions.journal import read_lines
+
+if TYPE_CHECKING:
+    from conftest import Lab
+
+    from collect.engine import Engine
+    from drivers.samples import Pose
+
+
+PAPER_Z_MM, SAFE_Z_MM = 120.0, 180.0
+UNDER = brush_pose(480.0, 40.0, PAPER_Z_MM - 20.0, tilt_deg=10.0)
+"""20 mm under the paper, leaning."""
+
+
+@pytest.fixture
+def lab(lab: Lab) -> Lab:
+    lab.write_protocol("[11.0]", "[0.0]", repeats=2)
+    return lab
+
+
+def until(engine: Engine, condition: Callable[[Snapshot], bool], timeout_s: float = 60.0) -> Snapshot:
+    deadline = time.monotonic() + timeout_s
+    while not condition(now := engine.snapshot()):
+        assert time.monotonic() < deadline, f"waited in vain: {now}"
+        assert not engine.finished, f"over too early: {now}"
+        time.sleep(0.005)
+    return now
+
+
+def start_and_pause(engine: Engine) -> None:
+    engine.start()
+    until(engine, lambda now: now.strokes_done == 1)
+    engine.pause()
+    until(engine, lambda now: now.state is State.PAUSED)
+
+
+def second_client(lab: Lab, target: Pose | None = None, **calls: dict[str, Any]) -> None:
+    """Sets what it is told to set, then moves the arm, without any limits."""
+
+    async def act() -> None:
+        client = Controller(RpcConnection("127.0.0.1", lab.rig.arcs.port))
+        client.robot = "rob1"
+        await client.connection.open()
+        try:
+            for method, params in calls.items():
+                assert await client.ask(method.replace("_", "."), **params) == 0
+            if target is not None:
+                await client.move_line(target, 200.0, 800.0)
+                await until_settled(client, target, Tolerance(0.05, 0.1), planned_s=5.0, poll_s=0.01)
+        finally:
+            await client.connection.close()
+
+    asyncio.run(act())
+
+
+def lines_sent(lab: Lab) -> list[Pose]:
+    """Every line from here on, as it is asked for."""
+    sent: list[Pose] = []
+    methods = lab.rig.arcs._methods
+    move_line = methods["rob1.MotionControl.moveLine"]
+
+    def seen(params: dict[str, Any]) -> Any:
+        sent.append(from_wire(params["pose"]))
+        return move_line(params)
+
+    methods["rob1.MotionControl.moveLine"] = seen
+    return sent
+
+
+def assert_up_along_the_tool_first(sent: list[Pose]) -> None:
+    up = sent[0]
+    assert up.z_mm == pytest.approx(SAFE_Z_MM, abs=0.01)
+    risen_mm = SAFE_Z_MM - UNDER.z_mm
+    assert up.x_mm - UNDER.x_mm == pytest.approx(risen_mm * 0.17632698, abs=0.05)  # tan 10 deg
+    assert up.y_mm == pytest.approx(UNDER.y_mm, abs=0.05)
+    assert lean(up)[0] == pytest.approx(10.0, abs=0.05)
+
+
+def test_an_arm_that_was_put_under_the_paper_in_a_pause_first_goes_up_along_its_tool(lab: Lab) -> None:
+    engine = lab.engine()
+    start_and_pause(engine)
+    second_client(lab, UNDER)
+    sent = lines_sent(lab)
+    engine.resume()
+    engine.join()
+    assert_up_along_the_tool_first(sent)
+    now = engine.snapshot()
+    assert now.strokes_done == 2
+    [told] = [line for line in now.messages if "from where it was left" in line]
+    assert told.startswith("warning: ")
+
+
+def test_an_arm_that_was_moved_at_a_question_first_goes_up_along_its_tool(lab: Lab) -> None:
+    """A jog asks at every step, with the brush near the paper."""
+    text = (lab.folder / "rig.toml").read_text()
+    (lab.folder / "rig.toml").write_text(text + '\n[touch]\nmethod = "jog"\ntouches = 1\n')
+    engine = lab.engine(watched=True)
+    engine.start()
+    jog = until(engine, lambda now: now.prompt is not None).prompt
+    assert jog is not None
+    assert "Jog until" in jog.question
+    second_client(lab, UNDER)
+    sent = lines_sent(lab)
+    engine.answer(jog.number, "3")
+    moved = until(engine, lambda now: now.prompt is not None and now.prompt.number != jog.number).prompt
+    assert moved is not None
+    assert "from where it was left" in moved.question
+    assert not sent, "nothing moves before a person has looked"
+    engine.answer(moved.number, "g")
+    until(engine, lambda now: now.prompt is not None and now.prompt.number not in (jog.number, moved.number))
+    assert_up_along_the_tool_first(sent)
+    engine.stop()
+    with pytest.raises(Exception, match="stopped"):
+        engine.join()
+
+
+def test_an_arm_that_somebody_still_moves_is_asked_about_and_left_alone(lab: Lab) -> None:
+    engine = lab.engine(watched=True)
+    start_and_pause(engine)
+    here = lab.rig.world.tool()
+    second_client(lab, MotionControl_speedLine={"xd": [0.0, 0.0, 0.00005, 0.0, 0.0, 0.0], "a": 1.0, "t": 600.0})
+    sent = lines_sent(lab)
+    engine.resume()
+    prompt = until(engine, lambda now: now.prompt is not None).prompt
+    assert prompt is not None
+    assert "the arm is moving, and not from here" in prompt.question
+    assert not sent
+    assert lab.rig.world.tool().z_mm > here.z_mm, "it is not stopped either"
+    engine.answer(prompt.number, "g")
+    engine.join()
+    assert engine.snapshot().strokes_done == 2
+
+
+def test_an_arm_that_was_left_outside_its_limits_is_not_moved_until_it_is_jogged_back(lab: Lab) -> None:
+    engine = lab.engine(watched=True)
+    start_and_pause(engine)
+    second_client(lab, brush_pose(480.0, 40.0, 250.0, tilt_deg=60.0))
+    sent = lines_sent(lab)
+    engine.resume()
+    prompt = until(engine, lambda now: now.prompt is not None).prompt
+    assert prompt is not None
+    assert "the arm stands where tilt = 60.000 deg" in prompt.question
+    assert "Jog the arm up" in prompt.question
+    assert not sent
+    second_client(lab, UNDER)
+    sent.clear()
+    engine.answer(prompt.number, "g")
+    engine.join()
+    assert_up_along_the_tool_first(sent)
+    assert engine.snapshot().strokes_done == 2
+
+
+SHORTER = {"RobotConfig_setTcpOffset": {"offset": [0.0, 0.0, 0.17, 0.0, 0.0, 0.0]}}
+"""10 mm short: every press would be 10 mm deeper than it says."""
+
+
+def test_with_another_tool_offset_nothing_is_pressed(lab: Lab) -> None:
+    engine = lab.engine()
+    start_and_pause(engine)
+    second_client(lab, **SHORTER)
+    pressed = len(lab.rig.world.presses)
+    engine.resume()
+    with pytest.raises(SettingsChanged, match=r"tool offset is \(0, 0, 170\) mm, \(0, 0, 0\) deg, not \(0, 0, 180\)"):
+        engine.join()
+    assert len(lab.rig.world.presses) == pressed
+    now = engine.snapshot()
+    assert (now.state, now.strokes_done, now.rest_unknown) == (State.FAILED, 1, False)
+
+
+def test_a_tool_offset_that_changes_after_the_last_look_leaves_a_void_and_no_stroke(lab: Lab) -> None:
+    """Between the driver's look and the controller's own reading of the line there is always a moment."""
+    lab.write_protocol("[11.0]", "[0.0]")
+    methods = lab.rig.arcs._methods
+    move_line = methods["rob1.MotionControl.moveLine"]
+
+    def tampered(params: dict[str, Any]) -> Any:
+        if from_wire(params["pose"]).z_mm == pytest.approx(PAPER_Z_MM + 0.03 - 11.0, abs=0.01):
+            lab.rig.arcs.cabinet.tcp_offset = [0.0, 0.0, 0.17, 0.0, 0.0, 0.0]
+        return move_line(params)
+
+    methods["rob1.MotionControl.moveLine"] = tampered
+    engine = lab.engine()
+    engine.start()
+    with pytest.raises((SettingsChanged, MotionFailed)):
+        engine.join()
+    [folder] = lab.sessions.iterdir()
+    lines = list(read_lines(folder / "journal.jsonl"))
+    pressed = {line["key"] for line in lines if line["event"] == "begin" and line["kind"] == "press"}
+    assert pressed
+    assert not [line for line in lines if line["event"] == "done" and line["key"] in pressed]
+    assert [line for line in lines if line["event"] == "void" and line["key"] in pressed]
+    assert engine.snapshot().strokes_done == 0
+
+
+def test_whoever_watches_has_the_tool_set_anew_and_goes_on(lab: Lab) -> None:
+    engine = lab.engine(watched=True)
+    start_and_pause(engine)
+    second_client(lab, **SHORTER)
+    engine.resume()
+    prompt = until(engine, lambda now: now.prompt is not None).prompt
+    assert prompt is not None
+    assert "tool offset is (0, 0, 170) mm" in prompt.question
+    assert prompt.default == "x"
+    engine.answer(prompt.number, "g")
+    engine.join()
+    assert engine.snapshot().strokes_done == 2
+    assert lab.rig.arcs.tcp_offset[2] == 0.18
+    assert max(press.depth_mm for press in lab.rig.world.presses) < 11.1, "none went deeper than asked"
