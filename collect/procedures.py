@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 from dataclasses import dataclass
 
@@ -12,13 +11,17 @@ from collect.photograph.photographer import Photographer, Ways
 from collect.plane import PaperPlane, to_paper
 from collect.rig import Rig, limits_of
 from collect.sheet import Cell, to_base
-from drivers.geometry import brush_pose, lean
-from drivers.samples import Frame, Pose
+from drivers.geometry import brush_pose, interpolate, lean
+from drivers.samples import Frame, Pose, QueuedLine
 
 CLEARANCE_MM = 8.0
 """Height above the paper at which the fast approach ends."""
 DEPTH_TOLERANCE_MM = 0.1
 """How far the depth at the end of the dwell may be from the one asked for."""
+LEAST_DWELL_S = 0.1
+"""Time at depth, however short a dwell is asked for: the depth must be seen."""
+DWELL_MM = 0.05
+"""Way of the dwell: the end of the descent, so slow that it lasts as long. ARCS can wait in its queue only by moving."""
 TOUCH_TOLERANCE_MM = 0.1
 """How far the arm may rest from the taught height at zero touch."""
 
@@ -29,6 +32,8 @@ class Move:
 
     target: Pose
     speed_mm_s: float
+    least_s: float = 0.0
+    """How long it takes at least."""
 
 
 class Procedures:
@@ -89,15 +94,15 @@ class Procedures:
 
     async def press(self, cell: Cell, height_mm: float, tilt_deg: float, dwell_s: float) -> float:
         """Press once; returns the depth reached below the paper along its normal, in mm."""
-        before, after = press_moves(self._config, self.plane, cell, height_mm, tilt_deg)
+        before, pressing = press_moves(self._config, self.plane, cell, height_mm, tilt_deg, dwell_s)
         for move in before:
             await self.go(move)
-        await asyncio.sleep(dwell_s)
-        depth_mm = -self.plane.above_mm(self._config.paper, await self._rig.robot.where())
-        for move in after:
-            await self.go(move)
+        # From here on the arm lifts by itself, whatever becomes of this program.
+        lines = [QueuedLine(move.target, move.speed_mm_s, move.least_s) for move in pressing]
+        seen = await self._rig.robot.sequence(lines, acc_mm_s2=self._config.motion.acc_mm_s2)
+        depth_mm = max((-self.plane.above_mm(self._config.paper, pose) for pose in seen), default=0.0)
         if abs(depth_mm - height_mm) > DEPTH_TOLERANCE_MM:
-            raise StepVoid(f"pressed {depth_mm:.3f} mm deep, {height_mm:g} mm were asked for")
+            raise StepVoid(f"was seen {depth_mm:.3f} mm deep, {height_mm:g} mm were asked for")
         return depth_mm
 
     async def capture(self) -> Frame:
@@ -194,10 +199,11 @@ def wash_moves(config: RigConfig, wash: WashConfig) -> list[Move]:
 
 
 def press_moves(
-    config: RigConfig, plane: PaperPlane, cell: Cell, height_mm: float, tilt_deg: float
+    config: RigConfig, plane: PaperPlane, cell: Cell, height_mm: float, tilt_deg: float, dwell_s: float = 0.0
 ) -> tuple[list[Move], list[Move]]:
-    """(down to depth, up again): over the cell, tilt about the tip at clearance, touch height, descend H.
+    """(over the cell and tilted about the tip at clearance; touch height, descend H, dwell and up again).
 
+    The second list is one that the controller carries out by itself: it must end above the paper.
     Tilting about the tip just above the paper instead of on it leaves the same pose at touch and no smear.
     """
     motion, paper = config.motion, config.paper
@@ -206,18 +212,20 @@ def press_moves(
     def pose(above_mm: float, tilt: float) -> Pose:
         return plane.pose(paper, *cell.anchor_mm, above_mm, tilt_deg=tilt)
 
-    down = [
+    touch, deep = pose(0.0, tilt_deg), pose(-height_mm, tilt_deg)
+    before = [
         Move(above, motion.travel_speed_mm_s),
         Move(pose(CLEARANCE_MM, 0.0), motion.travel_speed_mm_s),
         Move(pose(CLEARANCE_MM, tilt_deg), motion.press_speed_mm_s),
-        Move(pose(0.0, tilt_deg), motion.press_speed_mm_s),
-        Move(pose(-height_mm, tilt_deg), motion.press_speed_mm_s),
     ]
-    up = [
+    pressing = [
+        Move(touch, motion.press_speed_mm_s),
+        Move(interpolate(touch, deep, max(0.5, 1.0 - DWELL_MM / height_mm)), motion.press_speed_mm_s),
+        Move(deep, motion.press_speed_mm_s, max(dwell_s, LEAST_DWELL_S)),
         Move(pose(CLEARANCE_MM, tilt_deg), motion.press_speed_mm_s),
         Move(above, motion.travel_speed_mm_s),
     ]
-    return down, up
+    return before, pressing
 
 
 def _upright(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Pose:

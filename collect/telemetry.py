@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from drivers.force.samples import ForceSample
 from drivers.protocols import Robot
-from drivers.samples import Identity, Pose, PoseSample
+from drivers.samples import Identity, Pose, PoseSample, QueuedLine
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -92,6 +92,11 @@ class NotedRobot:
         """See `Robot`."""
         self._telemetry.target_mm = poses[-1].position_mm if poses else None
         await self._robot.follow(poses, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=blend_mm)
+
+    async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
+        """See `Robot`."""
+        self._telemetry.target_mm = min((line.target.position_mm for line in lines), key=lambda at: at[2], default=None)
+        return await self._robot.sequence(lines, acc_mm_s2=acc_mm_s2)
 
     async def stop(self) -> None:
         """See `Robot`."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
 from drivers.force.samples import ForceSample
-from drivers.samples import Frame, Identity, Pose, PoseSample, Stamp
+from drivers.samples import Frame, Identity, Pose, PoseSample, QueuedLine, Stamp
 
 
 @runtime_checkable
@@ -33,6 +33,14 @@ class Robot(Protocol):
         """Move the tip through all poses without halting between them; returns when it has settled at the last.
 
         Corners may be rounded within `blend_mm` of a pose. Every pose is checked before the arm moves.
+        """
+        ...
+
+    async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
+        """Carry out all lines, which the arm's controller holds before the first begins: once they have begun, they are
+        carried out to the end even if this program dies. Returns the poses that were seen on the way.
+
+        Every pose is checked before anything is sent. The last one is not where the arm began. A stop drops them all.
         """
         ...
 

@@ -43,6 +43,15 @@ class Pose:
 
 
 @dataclass(frozen=True, slots=True)
+class QueuedLine:
+    """A straight line to `target`, from rest to rest, that takes `least_s` or longer."""
+
+    target: Pose
+    speed_mm_s: float
+    least_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class PoseSample:
     """A pose that the robot reported."""
 

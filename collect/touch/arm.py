@@ -10,7 +10,7 @@ from collect.errors import ForceTooHigh
 from collect.rig import Rig
 from collect.sheet import to_base
 from drivers.geometry import brush_pose
-from drivers.samples import Pose
+from drivers.samples import Pose, QueuedLine
 
 
 class TouchArm:
@@ -33,6 +33,15 @@ class TouchArm:
         """Slowly to a height; returns the one at which the arm rests."""
         await self._move(self._pose(x_mm, y_mm, z_mm), self._slow_mm_s)
         return (await self._rig.robot.where()).z_mm
+
+    async def press(self, x_mm: float, y_mm: float, z_mm: float) -> None:
+        """Slowly down to a height and up to travel height; the arm lifts by itself even if this program dies."""
+        motion = self._rig.config.motion
+        lines = [
+            QueuedLine(self._pose(x_mm, y_mm, z_mm), self._slow_mm_s),
+            QueuedLine(self._pose(x_mm, y_mm, motion.safe_z_mm), motion.press_speed_mm_s),
+        ]
+        await self._rig.robot.sequence(lines, acc_mm_s2=motion.acc_mm_s2)
 
     async def lift(self) -> None:
         """Straight up to travel height from wherever the tip is."""

@@ -99,10 +99,12 @@ class Controller:
         if self._reduced and not reduced and self.on_notice is not None:
             self.on_notice("safety mode is ReducedMode: the arm may be slower than asked")
 
-    async def move_line(self, target: Pose, speed_mm_s: float, acc_mm_s2: float, blend_mm: float = 0.0) -> None:
+    async def move_line(
+        self, target: Pose, speed_mm_s: float, acc_mm_s2: float, blend_mm: float = 0.0, least_s: float = 0.0
+    ) -> None:
         """Queue a straight line. Raises `RobotNotSafe` or `MotionRefused`; already there is fine.
 
-        The next line may begin `blend_mm` before its end: 0 halts there, else 1 mm to 1 m.
+        The next line may begin `blend_mm` before its end: 0 halts there, else 1 mm to 1 m. `least_s` stretches it.
         """
         code = await self.ask(
             "MotionControl.moveLine",
@@ -110,7 +112,7 @@ class Controller:
             a=acc_mm_s2 / 1e3,
             v=speed_mm_s / 1e3,
             blend_radius=blend_mm / 1e3,
-            duration=0.0,
+            duration=least_s,
         )
         if code not in (ReturnCode.OK, ReturnCode.REQUEST_IGNORED):
             await self.require_safe("moveLine")
@@ -135,6 +137,21 @@ class Controller:
         if type(running) is not int or type(size) is not int or size < 0:
             raise ProtocolViolation(DEVICE, "getQueueSize", f"expected two counts, got {running!r} and {size!r}")
         return running, size
+
+    async def hold_path(self) -> None:
+        """Carry out nothing from now on, but take lines and keep them."""
+        accepted("stopMove", await self.ask("MotionControl.stopMove", quick=True, all_tasks=True))
+
+    async def release(self) -> None:
+        """End a hold over an empty queue, which moves nothing; where there is none, whatever the answer is."""
+        await self.ask("MotionControl.startMove")
+
+    async def go_on(self) -> None:
+        """Carry out what was kept. Raises `RobotNotSafe` or `MotionRefused`."""
+        code = await self.ask("MotionControl.startMove")
+        if code not in (ReturnCode.OK, ReturnCode.REQUEST_IGNORED):
+            await self.require_safe("startMove")
+        accepted("startMove", code)
 
     async def halt(self, acc_m_s2: float) -> None:
         """Decelerate along the path, then drop whatever is queued, the second also where the first fails."""

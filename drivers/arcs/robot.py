@@ -13,6 +13,7 @@ from drivers.arcs.generation import open_arcs
 from drivers.arcs.joints import checked_path, reachable
 from drivers.arcs.messages import Messages
 from drivers.arcs.options import ArcsOptions
+from drivers.arcs.queued import capped, queue_all
 from drivers.arcs.readying import make_ready
 from drivers.arcs.rpc import DEVICE, RpcConnection
 from drivers.arcs.stopping import Stopper
@@ -22,7 +23,7 @@ from drivers.arcs.watchdog import Watchdog
 from drivers.clock import Clock
 from drivers.errors import DeviceError, MotionFailed, NotConnected
 from drivers.limits import Limits
-from drivers.samples import Identity, Pose, PoseSample
+from drivers.samples import Identity, Pose, PoseSample, QueuedLine
 
 __all__ = ["ArcsOptions", "AuboArcs", "Condition"]
 
@@ -52,6 +53,8 @@ class AuboArcs:
         """How often the arm was told to stop: no line of a way may follow."""
         self._unsettled = False
         """True from the moment a line is sent until the arm was seen at rest."""
+        self._held = False
+        """Whether the controller may hold its path."""
         self._connected = False
         self._enabled = False
         self._telemetry = Telemetry(self._state, options, clock, on_notice)
@@ -109,6 +112,8 @@ class AuboArcs:
             await self._until_mode({RobotMode.IDLE, RobotMode.RUNNING})
             await self._motion.ask("RobotManage.startup")
             await self._until_mode({RobotMode.RUNNING})
+        self._held = True  # a process that was killed may have left it so
+        await self._ready()
         await self._departure.enabled(settings)
         await self._messages.begin()
         await self._watchdog.arm()
@@ -158,6 +163,30 @@ class AuboArcs:
         )
         await self._carry_out(feeding, poses[-1], sum(leg.seconds for leg in legs))
 
+    async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
+        """All lines are queued while the controller holds its path, then it is let go and waited for as in `move`.
+
+        Raises ValueError for no lines and for lines that end where the arm is.
+        """
+        for line in lines:
+            self.check(line.target, speed_mm_s=line.speed_mm_s, acc_mm_s2=acc_mm_s2)
+        start = await self._depart("sequence", [line.target for line in lines])
+        options = self._options
+        tolerance = Tolerance(options.position_tolerance_mm, options.rotation_tolerance_deg)
+        if not lines or tolerance.holds(start, lines[-1].target):
+            raise ValueError("sequence: it must end elsewhere than it begins")
+        stops = self._stops
+        lines, expected_s = capped(start, lines, self._limits, acc_mm_s2)
+        self._held = True
+        queueing = queue_all(
+            self._motion, start, lines, acc_mm_s2, stopped=lambda: self._stops != stops, tolerance=tolerance
+        )
+        with self._telemetry.seeing() as seen:
+            await self._carry_out(queueing, lines[-1].target, expected_s)
+            self._held = False
+            await self._telemetry.reaching(lines[-1].target, tolerance)
+            return [*seen]
+
     async def move_joint(self, joints_rad: Sequence[float], *, speed_rad_s: float, acc_rad_s2: float) -> None:
         """moveJoint, then wait as `move` does. The whole way is checked, by poses that the controller computes.
 
@@ -202,7 +231,7 @@ class AuboArcs:
     async def _depart(self, op: str, poses: Sequence[Pose]) -> Pose:
         """Where the arm is, once it is known that it may go through `poses` from there; see `Departure`."""
         stops = self._stops
-        await self._restore_stop()
+        await self._ready()
         start = await self._departure.ready(op, self._limits, poses)
         if self._stops != stops:
             raise MotionFailed(DEVICE, op, "the arm was told to stop", condition="Nothing was sent to it.")
@@ -278,6 +307,13 @@ class AuboArcs:
     async def _until_mode(self, wanted: set[RobotMode]) -> None:
         options = self._options
         await until_mode(self._motion, wanted, timeout_s=options.power_timeout_s, poll_s=options.poll_s)
+
+    async def _ready(self) -> None:
+        """Before each motion: a way to stop it, and a controller that does not hold its path."""
+        await self._restore_stop()
+        if self._held and await self._motion.at_rest():
+            await self._motion.release()  # nothing is queued
+            self._held = False
 
     async def _restore_stop(self) -> None:
         """No motion without a way to stop it: a controller may have dropped the idle connection."""

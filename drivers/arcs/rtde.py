@@ -34,6 +34,8 @@ class RtdeStream:
         self._reader: asyncio.StreamReader | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._segments: tuple[str, ...] = ()
+        self.older: list[list[Any]] = []
+        """What had piled up before the newest sample when that was read, oldest first."""
 
     async def open(self, segments: Sequence[str], frequency_hz: float) -> None:
         """Connect, read the greeting, subscribe. Raises `ConnectionLost`, `DeviceTimeout`, `ProtocolViolation`."""
@@ -58,29 +60,32 @@ class RtdeStream:
     async def newest(self) -> list[Any]:
         """The values of the newest sample, in the order of the segments.
 
-        Where several have piled up, the older ones are dropped: nobody knows any more when they came. Raises
+        Where several have piled up, nobody knows any more when the others came; they are left in `older`. Raises
         `DeviceTimeout` after silence, `ConnectionLost`, `ProtocolViolation`.
         """
         if self._reader is None:
             raise NotConnected(DEVICE, "read", "not connected")
-        newest: list[Any] | None = None
+        samples: list[list[Any]] = []
         try:
             async with asyncio.timeout(self._timeout_s):
-                while newest is None:
+                while not samples:
                     data = await self._reader.read(MAX_MESSAGE_BYTES)
                     if not data:
                         raise ConnectionLost(DEVICE, "read", "the controller closed the connection")
                     for payload in self._decoder.feed(data):
                         head, values = decode_message(payload, DEVICE)
-                        newest = values if head == CHANNEL else newest
+                        if head == CHANNEL:
+                            samples.append(values)
         except TimeoutError:
             raise DeviceTimeout(DEVICE, "read", f"no sample in {self._timeout_s:g} s") from None
         except OSError as error:
             if isinstance(error, ConnectionLost):
                 raise
             raise ConnectionLost(DEVICE, "read", error.strerror or str(error)) from None
-        if len(newest) != len(self._segments):
-            raise ProtocolViolation(DEVICE, "read", f"{len(newest)} values for {len(self._segments)} segments")
+        for values in samples:
+            if len(values) != len(self._segments):
+                raise ProtocolViolation(DEVICE, "read", f"{len(values)} values for {len(self._segments)} segments")
+        *self.older, newest = samples
         return newest
 
     async def close(self) -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 
 from drivers.arcs.controller import Controller
 from drivers.arcs.numbers import numbers
 from drivers.arcs.options import ArcsOptions
 from drivers.arcs.rpc import DEVICE
 from drivers.arcs.rtde import RtdeStream
+from drivers.arcs.waiting import Tolerance
 from drivers.clock import Clock
 from drivers.errors import DeviceError, NotConnected, ProtocolViolation, Stale
 from drivers.geometry import from_wire
@@ -31,6 +32,7 @@ class Telemetry:
         self._latest: PoseSample | None = None
         self._task: asyncio.Task[None] | None = None
         self._stream: RtdeStream | None = None
+        self._seen: list[Pose] | None = None
         self.listener: Callable[[PoseSample], None] | None = None
 
     @property
@@ -61,6 +63,22 @@ class Telemetry:
         if age_ms > self._options.stale_after_ms:
             raise Stale(DEVICE, age_ms, self._options.stale_after_ms)
         return self._latest
+
+    @contextlib.contextmanager
+    def seeing(self) -> Generator[list[Pose]]:
+        """Collect every pose that comes within the block, those included that come too late to be stamped."""
+        self._seen = seen = []
+        try:
+            yield seen
+        finally:
+            self._seen = None
+
+    async def reaching(self, target: Pose, tolerance: Tolerance) -> None:
+        """Wait until a pose at `target` has come: all before it have come by then. Gives up where it is stale."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(self._options.stale_after_ms / 1e3):
+                while self._latest is None or not tolerance.holds(self._latest.pose, target):
+                    await asyncio.sleep(0.5 / self._options.telemetry_hz)
 
     async def read(self) -> None:
         """Ask for the pose once."""
@@ -95,6 +113,8 @@ class Telemetry:
     async def _pushed(self, stream: RtdeStream) -> tuple[Pose, tuple[float, ...]]:
         pose, joints = await stream.newest()
         try:
+            if self._seen is not None:
+                self._seen += [from_wire(numbers(older, 6)) for older, _ in stream.older]
             return from_wire(numbers(pose, 6)), tuple(numbers(joints, 6))
         except ValueError as error:
             raise ProtocolViolation(DEVICE, "sample", str(error)) from None
@@ -111,5 +131,7 @@ class Telemetry:
     def _take(self, pose: Pose, joints_rad: tuple[float, ...] | None = None) -> None:
         seq = self._latest.stamp.seq + 1 if self._latest else 0
         self._latest = PoseSample(Stamp(self._clock.now_ns(), None, seq), pose, joints_rad)
+        if self._seen is not None:
+            self._seen.append(pose)
         if self.listener is not None:
             self.listener(self._latest)

@@ -28,6 +28,11 @@ class Tolerance:
     position_mm: float
     rotation_deg: float
 
+    def holds(self, here: Pose, target: Pose) -> bool:
+        """Whether `here` is at `target`."""
+        off_mm, off_deg = distance(here, target)
+        return off_mm <= self.position_mm and off_deg <= self.rotation_deg
+
 
 async def until_mode(controller: Controller, wanted: set[RobotMode], *, timeout_s: float, poll_s: float) -> None:
     """Return once the robot mode is one of `wanted`. Raises `RobotNotSafe`, `DeviceTimeout`."""

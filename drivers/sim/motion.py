@@ -25,6 +25,7 @@ STEADY_LAG_S = 0.08
 """The controller reports steady a little after its queue is empty."""
 SAME_POSE_MM = 1e-4
 SAME_POSE_DEG = 1e-4
+RESTS_KEPT = 64
 AGREES = 1e-6
 """mm, rad or those per second: two timings that differ by less are one."""
 
@@ -76,6 +77,14 @@ class Segment:
         return [self.path.pose(self.enter + total * k / pieces) for k in range(pieces + 1)]
 
 
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """The tip came to rest here, be it for a moment."""
+
+    at_s: float
+    pose: Pose
+
+
 class MotionQueue:
     """First in, first out. `on_path(start, end)` is told of every stretch once it has been travelled."""
 
@@ -93,6 +102,8 @@ class MotionQueue:
         """Every move that is not over, in order."""
         self._corners: Corners = {}
         self._next_id: int = 0
+        self.rests: deque[Rest] = deque(maxlen=RESTS_KEPT)
+        """Where and when the arm came to rest, the newest ones."""
 
     @property
     def full(self) -> bool:
@@ -173,6 +184,8 @@ class MotionQueue:
         way = segment.way()
         self._rest, self._rest_since_s = way[-1], segment.end_s
         self.near = segment.joints(segment.end_s) or self.near
+        if segment.ramp.v_out == 0.0:
+            self.rests.append(Rest(segment.end_s, way[-1]))
         if segment.ramp.length:
             for start, end in itertools.pairwise(way):
                 self._on_path(start, end)

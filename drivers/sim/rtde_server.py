@@ -18,6 +18,7 @@ from drivers.sim.arcs_methods import runtime_state
 from drivers.sim.faults.board import FaultBoard
 from drivers.sim.faults.truth import Truth
 from drivers.sim.faults.vocabulary import ALWAYS, KINDS, Device, Fault
+from drivers.sim.motion import Rest
 from drivers.sim.server import LoopbackServer
 
 MAX_HZ = 500.0
@@ -43,6 +44,7 @@ class RtdeServer(LoopbackServer):
         super().__init__()
         self.faults = FaultBoard(Truth(cabinet.world))
         """What goes wrong here; a rig puts one board in all its servers."""
+        self._cabinet = cabinet
         self._muted: int | None = None
         self.pings = 0
         """Keep-alives seen, for tests."""
@@ -95,14 +97,38 @@ class RtdeServer(LoopbackServer):
 
     async def _push(self, topic: Topic, writer: asyncio.StreamWriter) -> None:
         loop = asyncio.get_running_loop()
-        due = loop.time()
+        due, before_s = loop.time(), self._cabinet.now_s()
         while not writer.is_closing():
+            now_s = self._cabinet.now_s()
             if writer.transport.get_write_buffer_size() < BACKLOG_BYTES:
+                for rest in self._rests(before_s, now_s):
+                    self._push_once(topic, writer, rest)
                 self._push_once(topic, writer)
+            before_s = now_s
             due = max(due + topic.period_s, loop.time())
             await asyncio.sleep(due - loop.time())
 
-    def _push_once(self, topic: Topic, writer: asyncio.StreamWriter) -> None:
+    def _rests(self, after_s: float, until_s: float) -> list[Rest]:
+        """Where the arm rested between two pushes. A clock that runs faster than life leaves so much between them that
+        a whole press might pass unseen."""
+        world = self._cabinet.world
+        world.motion.advance(until_s)
+        return [rest for rest in world.motion.rests if after_s < rest.at_s <= until_s] if world.clock.rate > 1.0 else []
+
+    def _value(self, name: str, rest: Rest | None) -> Any:
+        if rest is not None:
+            match name:
+                case "timestamp":
+                    return rest.at_s
+                case "R1_actual_TCP_pose":
+                    return to_wire(self._cabinet.configured(rest.pose))
+                case "R1_actual_q" | "R1_target_q":
+                    return list(self._cabinet.motion.near_joints(rest.pose))
+                case _:
+                    pass
+        return self._outputs[name][1]()
+
+    def _push_once(self, topic: Topic, writer: asyncio.StreamWriter, rest: Rest | None = None) -> None:
         fault = self.faults.meet(Device.TELEMETRY, "push", KINDS[Device.TELEMETRY])
         match fault.kind if fault is not None else "":
             case "mute":
@@ -112,7 +138,7 @@ class RtdeServer(LoopbackServer):
             case "drop":
                 writer.close()
             case _:
-                writer.write(encode_sample(topic.chanel, [self._outputs[name][1]() for name in topic.segments]))
+                writer.write(encode_sample(topic.chanel, [self._value(name, rest) for name in topic.segments]))
 
 
 def topic_of(payload: bytes) -> Topic:

@@ -10,6 +10,8 @@ from drivers.sim.config import Table
 
 ON_PAPER_MM = 0.1
 """Nobody teaches the paper's height exactly: a tip that ends or rests so little above it counts as on it."""
+ALL_BUT_THERE_MM = 0.1
+"""A dwell is the end of a descent, very slow."""
 LIFT_MM = 10.0
 """Rising counts as lifting from so low on."""
 HOME_MM = 1.0
@@ -21,7 +23,7 @@ class Phase(StrEnum):
     DIPPING = "dipping"
     """Over the well, and below its rim or on the way there."""
     PRESSED = "pressed"
-    """At rest on or below the paper plane, over the sheet."""
+    """On or below the paper plane, over the sheet: at rest, or in the last tenth of a millimetre of the way down."""
     DESCENDING = "descending"
     """Over the sheet, on a line down that ends on or below the paper plane."""
     LIFTING = "lifting"
@@ -57,6 +59,8 @@ def phase_of(table: Table, home: Spot, here: Spot, to: Spot | None) -> Phase:
         if over_sheet and here.height_mm <= ON_PAPER_MM:
             return Phase.PRESSED
         return Phase.PARKED if here.distance_mm(home) <= HOME_MM else Phase.RESTING
+    if over_sheet and here.height_mm < 0.0 and 0.0 <= here.height_mm - to.height_mm <= ALL_BUT_THERE_MM:
+        return Phase.PRESSED
     if over_sheet and to.height_mm < here.height_mm and to.height_mm <= ON_PAPER_MM:
         return Phase.DESCENDING
     if over_sheet and to.height_mm > here.height_mm and here.height_mm <= LIFT_MM:

@@ -25,7 +25,7 @@ FAST = 300.0
 RPC_TIMEOUT_S = 0.8
 CONFIRM_S = 1.2
 CAMERA_TIMEOUT_S = 1.0
-PROTOCOL = 'kind = "grid"\nheights_mm = [15.0]\ntilts_deg = [0.0]\nrepeats = 1\ndwell_s = 0.0\n'
+PROTOCOL = 'kind = "grid"\nheights_mm = [15.0]\ntilts_deg = [0.0]\nrepeats = 1\ndwell_s = 1.0\n'
 
 
 class Gears(SimClock):

@@ -32,6 +32,8 @@ SLOW, FAST = 0.5, 300.0
 BOUND_S = 20.0
 """Every run is over within this time, on a machine that is busy with other tests."""
 LINE, POLL = "rob1.MotionControl.moveLine", "getSafetyModeType"
+WAITING, LET_GO = f"rob1.RobotState.{POLL}", "rob1.MotionControl.startMove"
+"""All lines of a press are sent before the first begins: its phases show while the driver waits."""
 STRUCK = {"on": POLL, "nth": 3}
 """In a move: the third time that the driver asks while it waits, some hundredths of a second after the start."""
 
@@ -54,9 +56,9 @@ PHASES: dict[str, Moment] = {
     "zero touch": Moment(LINE, "zero touch", Phase.DESCENDING),
     "dip": Moment(LINE, "dip", Phase.DIPPING),
     "travel": Moment(LINE, "press", Phase.TRAVELLING),
-    "descent": Moment(LINE, "press", Phase.DESCENDING, deep=True),
-    "at depth": Moment(LINE, "press", Phase.DESCENDING, deep=True),
-    "lift": Moment(LINE, "press", Phase.LIFTING),
+    "descent": Moment(WAITING, "press", Phase.DESCENDING, deep=True),
+    "at depth": Moment(WAITING, "press", Phase.DESCENDING, deep=True),
+    "lift": Moment(WAITING, "press", Phase.LIFTING),
     "parking": Moment(LINE, "capture"),
 }
 STILL = ("connecting", "powering")
@@ -173,18 +175,28 @@ def arm_the_fault(stage: Stage, engine: Engine, name: str, phase: str) -> list[P
     def watched(params: dict[str, Any]) -> Any:
         if targets:
             return original(params)
-        stage.gears.shift(SLOW)  # or a line would be over before anyone has looked at it
+        if moment.method != WAITING:
+            stage.gears.shift(SLOW)  # or a line would be over before anyone has looked at it
         result = original(params)
         if now():
             targets.append(rig.faults.truth.target())
             rig.faults.hang(fault)
-        if not targets or moment.method != LINE or name == "frozen camera":
+        if moment.method == WAITING and not targets:
+            return result
+        if not targets or moment.method not in (LINE, WAITING) or name == "frozen camera":
             stage.gears.shift(FAST)
         elif TABLE[name][0] is DONE:
             stage.loop.call_later(2.5 if phase == "at depth" else 0.3, stage.gears.shift, FAST)
         return result
 
-    methods[moment.method] = watched
+    let_go: Callable[[dict[str, Any]], Any] = methods[LET_GO]
+
+    def slowly(params: dict[str, Any]) -> Any:
+        if moment.method == WAITING and not targets and engine.snapshot().step.startswith(moment.step):
+            stage.gears.shift(SLOW)
+        return let_go(params)
+
+    methods[moment.method], methods[LET_GO] = watched, slowly
     return targets
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,7 +18,7 @@ from collect.rig import Rig, limits_of
 from collect.touch.tap import ForceTap
 from drivers.force.samples import ForceSample
 from drivers.geometry import brush_pose
-from drivers.samples import Frame, Identity, Pose, PoseSample, Stamp
+from drivers.samples import Frame, Identity, Pose, PoseSample, QueuedLine, Stamp
 from drivers.sim.config import SimConfig, Table, View
 from drivers.sim.rig_toml import Addresses, rig_toml
 from drivers.sim.scene import Scene
@@ -102,6 +102,11 @@ class Bench:
         self.world.motion.add(self.bent(target), speed_mm_s, acc_mm_s2, self.clock.seconds)
         self.clock.seconds += 1e3
         self.world.motion.advance(self.clock.seconds)
+
+    async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
+        for line in lines:
+            await self.move(line.target, speed_mm_s=line.speed_mm_s, acc_mm_s2=acc_mm_s2)
+        return [line.target for line in lines]
 
     async def where(self) -> Pose:
         return self.target
