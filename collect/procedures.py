@@ -21,7 +21,7 @@ DEPTH_TOLERANCE_MM = 0.1
 LEAST_DWELL_S = 0.1
 """Time at depth, however short a dwell is asked for: the depth must be seen."""
 DWELL_MM = 0.05
-"""Way of the dwell: the end of the descent, so slow that it lasts as long. ARCS can wait in its queue only by moving."""
+"""Way of the dwell: the end of the descent, as slow as it has to last. ARCS cannot wait in its queue but by moving."""
 TOUCH_TOLERANCE_MM = 0.1
 """How far the arm may rest from the taught height at zero touch."""
 

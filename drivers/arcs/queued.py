@@ -17,7 +17,9 @@ from drivers.limits import Limits
 from drivers.samples import Pose, QueuedLine
 
 
-def capped(start: Pose, lines: Sequence[QueuedLine], limits: Limits, acc_mm_s2: float) -> tuple[list[QueuedLine], float]:
+def capped(
+    start: Pose, lines: Sequence[QueuedLine], limits: Limits, acc_mm_s2: float
+) -> tuple[list[QueuedLine], float]:
     """The lines, each as slow as its turn of the tool asks for, and an upper estimate of how long they take, in s."""
     made: list[QueuedLine] = []
     seconds, before = 0.0, start

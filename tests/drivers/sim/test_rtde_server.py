@@ -12,6 +12,7 @@ import pytest
 
 from drivers.arcs.frames import FrameDecoder, encode, encode_short
 from drivers.arcs.rtde_wire import PING, encode_topic
+from drivers.geometry import brush_pose
 from drivers.sim.arcs_server import ArcsServer
 from drivers.sim.rig import HOST
 from drivers.sim.rtde_server import RtdeServer
@@ -157,3 +158,17 @@ async def test_nothing_is_left_when_a_subscriber_goes(rtde: RtdeServer, client: 
     await asyncio.sleep(0.05)
     assert rtde.clients == 0
     assert not [t for t in asyncio.all_tasks() if t.get_name() == "rtde push"]
+
+
+async def test_where_the_arm_rested_between_two_pushes_is_told_where_time_runs_fast(
+    client: Client, cabinet: ArcsServer
+):
+    await client.greeting()
+    client.writer.write(encode_topic(0, ["R1_actual_TCP_pose", "timestamp"], 10.0))
+    await client.pushes(0.15)
+    motion, now_s = cabinet._world.motion, cabinet._now_s
+    for z_mm in (250.0, 260.0):  # over in a second of the arm's time, which is half of what lies between two pushes
+        motion.add(brush_pose(250.0, -230.0, z_mm), 100.0, 1000.0, now_s)
+    got = [(round(pose[2], 6), at_s) for _, pose, at_s in await client.pushes(0.3)]
+    assert 0.25 in [z_m for z_m, _ in got]
+    assert got == sorted(got, key=lambda sample: sample[1])
