@@ -6,7 +6,7 @@ from enum import StrEnum
 
 from collect.errors import BadPicture, ForceTooHigh, NeedsOperator, SheetFull, StepError, StepVoid
 from collect.steps import Step, StepKind
-from drivers.errors import ArmMoved, DeviceError, DeviceTimeout, RobotNotSafe, SettingsChanged
+from drivers.errors import ArmMoved, DeviceError, DeviceTimeout, RobotNotSafe, SettingsChanged, Stuck
 from drivers.ink.errors import InkRefused
 
 MAX_FAILURES = 3
@@ -27,8 +27,8 @@ class Action(StrEnum):
 def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
     """The action for the `failures`-th failure of `step`. Motion is never blindly repeated."""
     match step.kind, error:
-        # What only a person can put right: paper, ink, the arm's own stops, and what lies under the brush.
-        case _, SheetFull() | NeedsOperator() | ForceTooHigh() | InkRefused() | RobotNotSafe():
+        # What only a person can put right: paper, ink, a sensor, the arm's own stops, and what lies under the brush.
+        case _, SheetFull() | NeedsOperator() | ForceTooHigh() | InkRefused() | RobotNotSafe() | Stuck():
             return Action.ASK
         # Somebody else has had the arm.
         case _, ArmMoved() | SettingsChanged():

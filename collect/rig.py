@@ -5,12 +5,8 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import socket
-import tempfile
 from collections.abc import AsyncGenerator, Callable, Generator
 from dataclasses import dataclass
-from pathlib import Path
-
-from filelock import FileLock, Timeout
 
 from collect.config import RigConfig
 from collect.config_devices import ForceConfig, InkDeviceConfig, InkStationConfig
@@ -24,6 +20,7 @@ from drivers.ink.station import InkStation, StationOptions
 from drivers.limits import Limits
 from drivers.protocols import Camera, ForceSensor, Ink, Robot
 from drivers.samples import Identity
+from drivers.sole import Claimed, claimed
 
 FORCE_CONNECT_S = 10.0
 """To open the bus, through a gateway as well, and get a first round."""
@@ -132,18 +129,15 @@ def _resolved(host: str) -> str:
 
 @contextlib.contextmanager
 def sole_driver(config: RigConfig) -> Generator[None]:
-    """Hold the arm at this address against other processes of this machine."""
+    """Hold the arm at this address against other processes of this machine, of any user. Raises `ConfigError`."""
     address = f"{_resolved(config.robot.host)}:{config.robot.port}"
-    name = f"brushloop-{hashlib.sha256(address.encode()).hexdigest()[:16]}.lock"
-    lock = FileLock(Path(tempfile.gettempdir()) / name, timeout=0)
-    try:
-        lock.acquire()
-    except (Timeout, PermissionError):
-        raise ConfigError("rig.toml", "robot", f"another brushloop is driving the arm at {address}") from None
-    try:
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(claimed(f"brushloop-arm-{hashlib.sha256(address.encode()).hexdigest()[:16]}"))
+        except Claimed as who:
+            what = f"another brushloop is driving the arm at {address}: {who}"
+            raise ConfigError("rig.toml", "robot", what) from None
         yield
-    finally:
-        lock.release()
 
 
 @contextlib.asynccontextmanager

@@ -5,6 +5,7 @@ DeviceError
  +-- ConnectionLost         the peer went away in mid-operation
  +-- DeviceTimeout          no answer in time
  |    +-- Stale             the newest sample is too old to act on
+ +-- Stuck                  samples come, and all are the same
  +-- ProtocolViolation      bytes that the wire format does not allow
  +-- WrongGeneration        the cabinet runs software that this driver does not speak
  +-- RpcError               the controller answered with an error object
@@ -54,6 +55,15 @@ class Stale(DeviceTimeout):
     def __init__(self, device: str, age_ms: float, limit_ms: float) -> None:
         self.age_ms = age_ms
         super().__init__(device, "latest", f"newest sample is {age_ms:.0f} ms old, limit {limit_ms:.0f} ms")
+
+
+class Stuck(DeviceError):
+    """A sensor sends, but always the same: it measures no more."""
+
+    def __init__(self, device: str, alike_ms: float, samples: int) -> None:
+        self.alike_ms = alike_ms
+        what = f"the sensor is stuck: {samples} samples in {alike_ms:.0f} ms were exactly alike, without any noise"
+        super().__init__(device, "latest", what, remedy="Switch the sensor's board off and on, and check its wiring.")
 
 
 class ProtocolViolation(DeviceError, ValueError):

@@ -160,8 +160,7 @@ class FirstInkTouch:
         x, y, z = spot
         await self._arm.over(x, y)
         await self._arm.near(x, y, z + self._config.above_mm)
-        await self._arm.to(x, y, z)
-        await self._arm.lift()
+        await self._arm.press(x, y, z)
         self._since_dip += 1
         self._last = None
 

@@ -17,7 +17,7 @@ from collect.touch.measure import measure_plane
 from collect.touch.results import PlaneResult
 from collect.touch.selfcheck import self_check, triangle_on
 from collect.touch.tap import ForceTap
-from collect.work.context import Job
+from collect.work.context import Bench, Job
 from collect.work.dipping import fill_brush
 from drivers.samples import Frame
 from sessions.messages import Transform
@@ -70,15 +70,21 @@ async def touch(job: Job) -> Result:
     if config.method == "camera":
         raise StepError("single touches cannot be found by camera: use force, jog or taught in [touch]")
     if config.method == "taught":
-        *down, up = touch_moves(bench.rig.config, bench.procedures.plane, *point)
-        for move in down:
-            await bench.procedures.go(move)
-        z_mm = (await bench.rig.robot.where()).z_mm
-        await bench.procedures.go(up)
+        z_mm = await job.guard.guarded(_visited(bench, point))
         return {"x_mm": point[0], "y_mm": point[1], "z_mm": z_mm, "method": "taught"}
     found = await _measured(job, config.model_copy(update={"points_mm": [point]}))
     x_mm, y_mm, z_mm = found.points[0].mean
     return {"x_mm": x_mm, "y_mm": y_mm, "z_mm": z_mm, "span_mm": found.points[0].span_mm, "method": found.method}
+
+
+async def _visited(bench: Bench, point: tuple[float, float]) -> float:
+    """The height at which the arm rests where the surface is thought to be."""
+    *down, up = touch_moves(bench.rig.config, bench.procedures.plane, *point)
+    for move in down:
+        await bench.procedures.go(move)
+    z_mm = (await bench.rig.robot.where()).z_mm
+    await bench.procedures.go(up)
+    return z_mm
 
 
 async def check_rig(job: Job) -> Result:

@@ -9,6 +9,10 @@ from drivers.samples import Stamp
 Wrench = tuple[float, float, float, float, float, float]
 """Fx, Fy, Fz in N and Mx, My, Mz in Nm, in the sensor's frame."""
 
+LOOPBACK_CHANNEL = "loopback-force-board"
+"""The loopback rig's bus on a socketcand gateway. Longer than the 15 characters that a network interface's name may
+have, so no gateway to a real bus can serve it."""
+
 
 @dataclass(frozen=True, slots=True)
 class ForceSample:

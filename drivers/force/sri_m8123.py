@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers.clock import Clock
-from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, LimitExceeded, NotConnected, Stale
+from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, LimitExceeded, NotConnected, Stale, Stuck
 from drivers.force.rounds import BITRATE, RoundAssembler
 from drivers.force.samples import ForceHealth, ForceSample, Wrench
 from drivers.force.stream import BusSettings, RoundStream
@@ -22,6 +22,8 @@ from drivers.samples import Identity, Stamp
 DEVICE = "force"
 AXES = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 MIN_BIAS_ROUNDS = 10
+MIN_ALIKE_ROUNDS = 10
+"""Fewer may be alike by chance, on a sensor that is slow or coarse."""
 MAX_BIAS_S = 60.0
 NO_BIAS: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -37,6 +39,8 @@ class SriOptions:
     """Of a CAN gateway, for the interface `socketcand`."""
     port: int | None = None
     stale_after_ms: float = 100.0
+    stuck_after_ms: float = 100.0
+    """Rounds that come for so long and are alike to the last bit in all six values are those of a stuck sensor."""
     connect_timeout_s: float = 2.0
     round_ms: float = 5.0
     """The longest from the first to the third frame of a round. Shorter than the sensor's period, or two rounds that
@@ -115,17 +119,21 @@ class SriM8123:
         return Identity(DEVICE, f"SRI M8123B2 on {stream.channel_info}", "", stream.virtual)
 
     def latest_n(self) -> tuple[float, float, float]:
-        """The newest force in N, less the bias; never blocks. Raises `Stale`, `ConnectionLost`, `NotConnected`."""
+        """The newest force in N, less the bias; never blocks. Raises what `latest` raises."""
         return self.latest().force_n
 
     def latest(self) -> ForceSample:
-        """The newest sample; never blocks. Raises `Stale`, `ConnectionLost`, `NotConnected`."""
-        newest = self._require("latest").newest
+        """The newest sample; never blocks. Raises `Stale`, `Stuck`, `ConnectionLost`, `NotConnected`."""
+        stream = self._require("latest")
+        newest, alike = stream.newest, stream.alike
         if newest is None:
             raise NotConnected(DEVICE, "latest", "no sample yet")
         age_ms = (self._clock.now_ns() - newest[0].host_ns) / 1e6
         if age_ms > self._options.stale_after_ms:
             raise Stale(DEVICE, age_ms, self._options.stale_after_ms)
+        alike_ms = (newest[0].host_ns - stream.alike_since_ns) / 1e6
+        if alike >= MIN_ALIKE_ROUNDS and alike_ms > self._options.stuck_after_ms:
+            raise Stuck(DEVICE, alike_ms, alike)
         return self._sample(*newest)
 
     def listen(self, on_sample: Callable[[ForceSample], None] | None) -> None:

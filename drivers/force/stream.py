@@ -16,7 +16,7 @@ import can
 
 from drivers.clock import Clock
 from drivers.force.rounds import COMMAND_ID, START, STOP, RoundAssembler
-from drivers.force.samples import ForceHealth, Wrench
+from drivers.force.samples import LOOPBACK_CHANNEL, ForceHealth, Wrench
 from drivers.samples import Stamp
 
 RECEIVE_S = 0.05
@@ -25,9 +25,6 @@ BUS_OFF = 0x40
 RATE_WINDOW = 200
 SILENT_S = 1.0
 """A board that streamed and then sends nothing for so long is lost: a gateway that goes away never says so."""
-LOOPBACK_CHANNEL = "loopback-force-board"
-"""The loopback rig's bus on a socketcand gateway. Longer than the 15 characters that a network interface's name may
-have, so no gateway to a real bus can serve it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +70,10 @@ class RoundStream:
         self._arrivals_ns: deque[int] = deque(maxlen=RATE_WINDOW)
         self._rounds = self._gaps = self._bus_errors = 0
         self.newest: tuple[Stamp, Wrench] | None = None
+        self.alike = 0
+        """Rounds that were exactly as the one before, up to the newest; a strain gauge is never that still."""
+        self.alike_since_ns = 0
+        """When the first that was like the newest came."""
         self.loss: Loss | None = None
         self.channel_info = ""
         self.virtual = False
@@ -152,6 +153,10 @@ class RoundStream:
         self._arrivals_ns.append(now_ns)
         stamp = Stamp(now_ns, device_ns, self._rounds)
         self._rounds += 1
+        if self.newest is not None and wrench == self.newest[1]:
+            self.alike += 1
+        else:
+            self.alike, self.alike_since_ns = 0, now_ns
         self.newest = (stamp, wrench)
         if (collecting := self.collecting) is not None:
             collecting.append(wrench)

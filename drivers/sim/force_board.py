@@ -29,6 +29,7 @@ class Fault(StrEnum):
     INF = "Mx is infinite"
     BUS_ERROR = "an error frame comes in between"
     BUS_OFF = "the bus goes off"
+    STUCK = "the round is the one before once more"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +54,7 @@ class ForceBoard:
         self._noise = (noise_n,) * 3 + (noise_nm,) * 3
         self._random = random.Random(seed)
         self._faults: deque[Fault] = deque()
+        self._before: Wrench | None = None
 
     def fail(self, *faults: Fault) -> None:
         """Let the next rounds meet these, one each."""
@@ -78,6 +80,9 @@ class ForceBoard:
             return
         values = self._force(t_s)
         fx, fy, fz, mx, my, mz = (v + self._random.gauss(0.0, s) for v, s in zip(values, self._noise, strict=True))
+        if fault is Fault.STUCK and self._before is not None:
+            fx, fy, fz, mx, my, mz = self._before
+        self._before = (fx, fy, fz, mx, my, mz)
         wrench = (fx, fy, math.nan if fault is Fault.NAN else fz, math.inf if fault is Fault.INF else mx, my, mz)
         left_out = {Fault.NO_FIRST: 0, Fault.NO_SECOND: 1, Fault.NO_THIRD: 2}
         for place, (can_id, data) in enumerate(encode_round(wrench)):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.force.stream import LOOPBACK_CHANNEL
+from drivers.force.samples import LOOPBACK_CHANNEL
 from drivers.sim.config import SimConfig
 
 LOOPBACK_HEAD = "# The loopback rig"
@@ -76,7 +76,7 @@ touch_point_mm = [2.0, 2.0]
 name = "simulated ink"
 well_mm = [{table.well_mm[0]}, {table.well_mm[1]}]
 dip_z_mm = {table.paper_z_mm + table.ink_level_mm - 8.0}
-{_ink_device(config, at)}{_force(at)}
+{_ink_device(config, at)}{_force(config, at)}
 [board]
 squares = [{table.board_squares[0]}, {table.board_squares[1]}]
 square_mm = {table.board_square_mm}
@@ -103,7 +103,7 @@ def _ink_device(config: SimConfig, at: Addresses) -> str:
             return ""
 
 
-def _force(at: Addresses) -> str:
+def _force(config: SimConfig, at: Addresses) -> str:
     if at.force_port is None:
         return ""
     return f"""
@@ -113,5 +113,13 @@ interface = "socketcand"
 channel = "{LOOPBACK_CHANNEL}"
 host = "{at.host}"
 port = {at.force_port}
-stale_ms = 1000.0    # simulated beside you on one machine, the sensor may have to wait for it
-"""
+{_staleness(config)}"""
+
+
+def _staleness(config: SimConfig) -> str:
+    """As of a real sensor, unless time runs faster than life: then no time of the host's means anything to the arm."""
+    if config.rate <= 1.0:
+        return "stale_ms = 100.0\n"
+    return (
+        f"stale_ms = 1000.0    # allowed on this bus alone: simulated time runs {config.rate:g} times as fast as life\n"
+    )

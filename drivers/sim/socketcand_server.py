@@ -15,7 +15,7 @@ import asyncio
 import time
 
 from drivers.errors import ProtocolViolation
-from drivers.force.stream import LOOPBACK_CHANNEL
+from drivers.force.samples import LOOPBACK_CHANNEL
 from drivers.sim.clock import SimClock
 from drivers.sim.force_board import CanFrame, ForceBoard
 from drivers.sim.reaction import Reaction

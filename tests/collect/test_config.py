@@ -57,6 +57,7 @@ def test_the_rig_that_the_simulator_writes_is_valid(tmp_path: Path) -> None:
         ('kind = "aubo-arcs"', 'kind = "teapot"', r"robot.kind: .*'aubo-arcs'"),
         ("[robot]", "[robot", r"is not TOML"),
         ("tilt_deg = 15.0", "tilt_deg = 80.0", r"robot.limits.tilt_deg: .*30"),
+        ("stale_ms = 100.0", "stale_ms = 3000.0", r"force: stale_ms = 3000: must be from 20 to 2000;"),
     ],
 )
 def test_a_bad_rig_is_refused_in_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -64,6 +65,14 @@ def test_a_bad_rig_is_refused_in_one_line(tmp_path: Path, old: str, new: str, me
         load_rig(rig_file(tmp_path, old, new))
     assert refused.value.exit_code == 2
     assert "\n" not in str(refused.value) or "TOML" in message
+
+
+def test_a_real_sensor_is_never_waited_for_longer_than_a_tenth_of_a_second(tmp_path: Path) -> None:
+    path = rig_file(tmp_path, 'channel = "loopback-force-board"', 'channel = "can0"')
+    assert load_rig(path).force is not None
+    path.write_text(path.read_text().replace("stale_ms = 100.0", "stale_ms = 100.1"))
+    with pytest.raises(ConfigError, match=r"rig.toml: force: .*stale_ms = 100.1: must be from 20 to 100;"):
+        load_rig(path)
 
 
 def test_the_environment_names_machines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

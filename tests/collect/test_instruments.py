@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 
 from collect.errors import ForceTooHigh, NeedsOperator
 from collect.states import State
-from drivers.errors import ConnectionLost
+from drivers.errors import ConnectionLost, Stuck
 from drivers.ink.errors import InkRefused
 from drivers.sim.force_board import Fault
 from sessions.journal import replay
@@ -43,6 +43,8 @@ def slowly(lab: Lab) -> None:
     path = lab.folder / "rig.toml"
     path.write_text(path.read_text(encoding="utf-8").replace("press_speed_mm_s = 20.0", "press_speed_mm_s = 2.0"))
     lab.write_protocol("[11.0]", "[0.0]")
+    protocol = lab.folder / "protocol.toml"
+    protocol.write_text(protocol.read_text(encoding="utf-8").replace("dwell_s = 0.0", "dwell_s = 30.0"))
 
 
 def at_rest(lab: Lab) -> bool:
@@ -90,11 +92,11 @@ def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_d
     def silent_once(depth_mm: float, tilt_deg: float) -> float:
         if depth_mm > 4.0 and not silenced:
             silenced.append(depth_mm)
-            board.fail(*[Fault.SILENCE] * 60)  # .3 s
+            board.fail(*[Fault.SILENCE] * 120)  # .6 s
         return push_n(depth_mm, tilt_deg)
 
     monkeypatch.setattr(lab.rig.world.reaction, "push_n", silent_once)
-    text = (lab.folder / "rig.toml").read_text(encoding="utf-8").replace("stale_ms = 1000.0", "stale_ms = 150.0")
+    text = (lab.folder / "rig.toml").read_text(encoding="utf-8").replace("stale_ms = 1000.0", "stale_ms = 400.0")
     (lab.folder / "rig.toml").write_text(text, encoding="utf-8")
     slowly(lab)
     engine = lab.engine()
@@ -103,6 +105,29 @@ def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_d
     now = engine.snapshot()
     assert (now.state, now.strokes_done, now.voids) == (State.DONE, 1, 1)
     assert any("newest sample" in line for line in now.messages)
+
+
+def test_a_sensor_that_is_stuck_in_mid_press_stops_the_arm_and_ends_the_run_with_its_name(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert lab.rig.force is not None
+    board, push_n = lab.rig.force.board, lab.rig.world.reaction.push_n
+    stuck: list[float] = []
+
+    def stick_once(depth_mm: float, tilt_deg: float) -> float:
+        if depth_mm > 2.0 and not stuck:
+            stuck.append(depth_mm)
+            board.fail(*[Fault.STUCK] * 400)  # 2 s
+        return push_n(depth_mm, tilt_deg)
+
+    monkeypatch.setattr(lab.rig.world.reaction, "push_n", stick_once)
+    slowly(lab)
+    with pytest.raises(Stuck, match="the sensor is stuck"):
+        run(lab.engine())
+    state = replay(only_session(lab) / "journal.jsonl")
+    assert (state.voids, len(state.used_cells)) == (1, 1)
+    assert at_rest(lab)
+    assert lab.rig.world.tool().z_mm > 170.0, "a sensor is at fault, the arm is in order: the brush was lifted"
 
 
 def test_a_bus_that_goes_off_ends_the_run_with_the_arm_parked(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:

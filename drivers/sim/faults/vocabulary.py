@@ -40,7 +40,7 @@ KINDS: dict[Device, frozenset[str]] = {
         {"deaf", "mute", "garbage", "late", "split", "damaged", "mistaken", "echo", "unplug"}
     ),  # the names of drivers.sim.ink_station.Fault
     Device.FORCE: frozenset(
-        {"silence", "no-first", "no-second", "no-third", "short", "nan", "inf", "bus-error", "bus-off"}
+        {"silence", "no-first", "no-second", "no-third", "short", "nan", "inf", "bus-error", "bus-off", "stuck"}
     ),  # the names of drivers.sim.force_board.Fault
 }
 HANDED_OVER = frozenset({Device.INK, Device.FORCE})

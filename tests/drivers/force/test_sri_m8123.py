@@ -14,7 +14,7 @@ import pytest
 from can.interfaces.virtual import VirtualBus
 
 from drivers.clock import HostClock
-from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, LimitExceeded, NotConnected, Stale
+from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, LimitExceeded, NotConnected, Stale, Stuck
 from drivers.force.rounds import encode_round
 from drivers.force.samples import ForceSample, Wrench
 from drivers.force.sri_m8123 import SriM8123, SriOptions
@@ -39,7 +39,9 @@ def board(channel: str) -> Iterator[SimForceSensor]:
 
 def sensor_on(channel: str, **options: float) -> SriM8123:
     # round_ms is wide: on a busy machine the simulated board may pause within a round.
-    made = SriOptions("virtual", channel, **{"round_ms": 200.0, "stale_after_ms": 250.0, "gap_ms": 150.0, **options})
+    # Most boards here measure without noise.
+    steady = {"round_ms": 200.0, "stale_after_ms": 250.0, "stuck_after_ms": math.inf, "gap_ms": 150.0}
+    made = SriOptions("virtual", channel, **{**steady, **options})
     return SriM8123(made, HostClock())
 
 
@@ -169,6 +171,32 @@ async def test_silence_makes_the_sample_stale_and_leaves_a_gap(board: SimForceSe
     assert stale.value.age_ms > 250.0
     await until(lambda: sensor.health().gaps == 1)
     assert sensor.latest_n() == WRENCH[:3]
+
+
+async def test_a_sensor_that_says_the_same_again_and_again_is_named_as_stuck(channel: str):
+    with SimForceSensor(channel, lambda _: WRENCH, rate_hz=200.0, noise_n=0.002, noise_nm=2e-4) as board:
+        sensor = sensor_on(board.channel, stuck_after_ms=100.0)
+        await sensor.connect()
+        await asyncio.sleep(0.2)
+        assert sensor.latest_n() == pytest.approx(WRENCH[:3], abs=0.02)
+        board.fail(*[Fault.STUCK] * 60)
+        with pytest.raises(Stuck, match=r"the sensor is stuck: \d\d samples in \d+ ms were exactly alike.*off and on"):
+            await until(lambda: sensor.latest_n() is None)
+        before = sensor.health().rounds
+        await until(lambda: sensor.health().rounds > before + 70)
+        assert sensor.latest_n()
+        await sensor.close()
+
+
+async def test_a_few_rounds_that_are_alike_are_chance(channel: str):
+    with SimForceSensor(channel, lambda _: WRENCH, rate_hz=20.0) as board:
+        sensor = sensor_on(board.channel, stuck_after_ms=100.0)
+        await sensor.connect()
+        await until(lambda: sensor.health().rounds == 5)
+        assert sensor.latest_n() == WRENCH[:3]
+        with pytest.raises(Stuck):
+            await until(lambda: sensor.latest_n() is None)
+        await sensor.close()
 
 
 @pytest.mark.parametrize("fault", [Fault.NO_FIRST, Fault.NO_SECOND, Fault.NO_THIRD, Fault.SHORT])

@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator
 import pytest
 
 from drivers.clock import HostClock
-from drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation
+from drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation, Stuck
 from drivers.force.sri_m8123 import SriM8123, SriOptions
 from drivers.ink.station import InkStation, StationOptions
 from drivers.sim.faults.rig_faults import Faults
@@ -24,7 +24,7 @@ async def faults(rig: LoopbackRig) -> AsyncIterator[Faults]:
     """The rig's servers with two instruments of this test's own."""
     with (
         PtyLine(StationFirmware()) as ink,
-        SimForceSensor("faulty board", lambda _: (0.0, 0.0, 1.0, 0.0, 0.0, 0.0)) as force,
+        SimForceSensor("faulty board", lambda _: (0.0, 0.0, 1.0, 0.0, 0.0, 0.0), noise_n=0.002) as force,
     ):
         faults = Faults(rig.world, rig.arcs, rig.rtde, rig.camera, ink=ink, force=force)
         faults.line = ink.path  # type: ignore[attr-defined]
@@ -84,6 +84,15 @@ async def test_a_bus_that_goes_off_is_a_lost_connection_with_what_to_check(fault
     with pytest.raises(ConnectionLost, match="off after too many errors") as caught:
         await until_it_fails(sensor)
     assert "termination" in caught.value.remedy
+    await sensor.close()
+
+
+async def test_a_sensor_can_be_stuck_for_a_while(faults: Faults):
+    sensor = SriM8123(SriOptions("virtual", "faulty board", stale_after_ms=1000.0), HostClock())
+    await sensor.connect()
+    faults.hang(Fault(device=Device.FORCE, kind="stuck", count=200))
+    with pytest.raises(Stuck, match="exactly alike"):
+        await until_it_fails(sensor)
     await sensor.close()
 
 

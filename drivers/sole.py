@@ -1,0 +1,84 @@
+"""One driver for one thing, whoever runs it and wherever his temporary files go.
+
+On Linux a claim is a name that the kernel keeps (an abstract socket): it leaves no file behind, ends with its process
+however that ends, and every user of the machine meets it. A container with a network of its own does not. Elsewhere it
+is a lock on a file that everybody may open, in a folder that is the same for everybody.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import socket
+import struct
+import sys
+from collections.abc import Generator
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+WAITING = 64
+"""So many who are refused may ask who has it; nobody ever answers them."""
+
+
+class Claimed(Exception):
+    """Somebody has it: `pid` and `uid` of the process, where they are known."""
+
+    def __init__(self, pid: int | None = None, uid: int | None = None) -> None:
+        self.pid = pid
+        self.uid = uid
+        who = "a process that cannot be named" if pid is None else f"process {pid} of {_user(uid)}"
+        super().__init__(who)
+
+
+@contextlib.contextmanager
+def claimed(name: str) -> Generator[None]:
+    """Hold `name` on this machine until the block, or the process, ends. Raises `Claimed`."""
+    with _named_socket(name) if sys.platform == "linux" else _file(name):
+        yield
+
+
+@contextlib.contextmanager
+def _named_socket(name: str) -> Generator[None]:
+    address = f"\0{name}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as claim:
+        try:
+            claim.bind(address)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+            raise Claimed(*_holder(address)) from None
+        claim.listen(WAITING)
+        yield
+
+
+def _holder(address: str) -> tuple[int | None, int | None]:
+    """Process and user who listen there, as the kernel knows them."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
+        asking.setblocking(False)
+        try:
+            asking.connect(address)
+            pid, uid, _ = struct.unpack("3i", asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+        except OSError:
+            return None, None
+    return (pid, uid) if pid else (None, None)
+
+
+@contextlib.contextmanager
+def _file(name: str) -> Generator[None]:
+    folder = Path(os.environ.get("PROGRAMDATA", "C:/ProgramData")) if os.name == "nt" else Path("/tmp")
+    try:
+        with FileLock(folder / f"{name}.lock", timeout=0, mode=0o666):
+            yield
+    except Timeout:
+        raise Claimed from None
+
+
+def _user(uid: int | None) -> str:
+    try:
+        import pwd
+
+        return pwd.getpwuid(uid).pw_name if uid is not None else "an unknown user"
+    except (ImportError, KeyError):
+        return f"user {uid}"

@@ -1,0 +1,117 @@
+"""One arm, one driver: whatever the temporary folder, whoever the user, and for no longer than the process lives."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from collect.config import RigConfig, load_rig
+from collect.errors import ConfigError
+from collect.rig import sole_driver
+from drivers import sole
+from drivers.sim.config import SimConfig
+from drivers.sim.rig_toml import Addresses, rig_toml
+
+HOLD = """
+import encodings.idna, os, sys, time
+from pathlib import Path
+from collect.config import load_rig
+from collect.rig import sole_driver
+rig = load_rig(Path(sys.argv[1]))
+if len(sys.argv) > 2:
+    os.setuid(int(sys.argv[2]))
+with sole_driver(rig):
+    print("has it", flush=True)
+    time.sleep(600)
+"""
+NOBODY = 65534
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    # No other test has this address; nothing connects to it.
+    path = tmp_path / "rig.toml"
+    path.write_text(rig_toml(SimConfig(), Addresses("127.0.0.1", 1 + os.getpid() % 60_000, 1, 1, 1, None)))
+    return path
+
+
+@pytest.fixture
+def rig(path: Path) -> RigConfig:
+    return load_rig(path)
+
+
+@pytest.fixture
+def holder(path: Path, tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Another process that has the arm, with a temporary folder of its own."""
+    processes: list[subprocess.Popen[str]] = []
+
+    def hold(*more: str) -> subprocess.Popen[str]:
+        (tmp_path / "its own").mkdir()
+        process = subprocess.Popen(
+            [sys.executable, "-c", HOLD, str(path), *more],
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "TMPDIR": str(tmp_path / "its own")},
+        )
+        processes.append(process)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "has it\n"
+        return process
+
+    yield hold
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+def test_another_temporary_folder_gets_no_second_driver_and_the_first_is_named(
+    rig: RigConfig, holder: Callable[..., subprocess.Popen[str]]
+):
+    process = holder()
+    with pytest.raises(ConfigError, match=rf"another brushloop is driving the arm at 127.*: process {process.pid} of "):
+        sole_driver(rig).__enter__()
+    process.kill()
+    process.wait()
+    with sole_driver(rig):
+        pass
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root becomes another user")
+def test_another_user_is_refused_while_it_lasts_and_not_afterwards(
+    rig: RigConfig, holder: Callable[..., subprocess.Popen[str]]
+):
+    process = holder(str(NOBODY))
+    with pytest.raises(ConfigError, match=rf"process {process.pid} of (nobody|user {NOBODY})"):
+        sole_driver(rig).__enter__()
+    process.kill()
+    process.wait()
+    with sole_driver(rig):
+        pass
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a name in the kernel")
+def test_nothing_is_left_that_could_refuse_anybody(rig: RigConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    (tmp_path / "tmp").mkdir()
+    for _ in range(2):
+        with sole_driver(rig):
+            for _ in range(sole.WAITING + 10):
+                with pytest.raises(ConfigError, match="another brushloop"):
+                    sole_driver(rig).__enter__()
+            assert not list((tmp_path / "tmp").iterdir())
+
+
+def test_where_the_kernel_keeps_no_names_a_lock_that_all_may_open_does(rig: RigConfig, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sole.sys, "platform", "darwin")
+    for _ in range(2):
+        with sole_driver(rig), pytest.raises(ConfigError, match="cannot be named"):
+            sole_driver(rig).__enter__()
+    for left in Path("/tmp").glob("brushloop-arm-*.lock"):
+        assert left.stat().st_mode & 0o777 == 0o666
+        left.unlink()
