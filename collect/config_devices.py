@@ -51,7 +51,7 @@ class RobotConfig(Config):
     """Where poses are pushed from (30010); left out, they are polled for."""
     watchdog_s: Annotated[float, Field(ge=0.5, le=60.0)] | None = None
     """Dead-man on the controller: without a sign of life for so long it goes into a protective stop, which only a
-    person releases. Left out, none is armed."""
+    person releases, and which leaves the brush where it is. Left out, none is armed, and a press lifts by itself."""
     speed_fraction: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
     collision_level: Annotated[int, Field(ge=1, le=9)] | None = None
     """1 to 9, most sensitive; left out, what the pendant has stays."""

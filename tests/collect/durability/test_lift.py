@@ -54,13 +54,16 @@ def own_rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OwnRig]:
 def kill(rig: OwnRig, seed: int, when: Callable[[], None]) -> tuple[str, float]:
     """(phase of the arm at the kill, height above the paper in mm `WITHIN_S` later). `when` returns at the moment."""
     command = [sys.executable, "-m", "tests.collect.durability.pressing", str(rig.toml), str(seed)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            assert process.stdout.readline() == "pressing\n"
-            when()
-        finally:
-            process.kill()
+    killed = False
+    while not killed:
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+            try:
+                assert process.stdout is not None
+                if process.stdout.readline() == "pressing\n":
+                    when()
+                    killed = process.poll() is None  # it may end by itself, where the rig has no time to answer it
+            finally:
+                process.kill()
     killed_s, _, phase = rig.state()
     while True:
         now_s, above_mm, _ = rig.state()
