@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
@@ -44,7 +45,7 @@ def slowly(lab: Lab) -> None:
     path.write_text(path.read_text(encoding="utf-8").replace("press_speed_mm_s = 20.0", "press_speed_mm_s = 2.0"))
     lab.write_protocol("[11.0]", "[0.0]")
     protocol = lab.folder / "protocol.toml"
-    protocol.write_text(protocol.read_text(encoding="utf-8").replace("dwell_s = 0.0", "dwell_s = 30.0"))
+    protocol.write_text(protocol.read_text(encoding="utf-8").replace("dwell_s = 0.0", "dwell_s = 60.0"))
 
 
 def at_rest(lab: Lab) -> bool:
@@ -92,15 +93,19 @@ def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_d
     def silent_once(depth_mm: float, tilt_deg: float) -> float:
         if depth_mm > 4.0 and not silenced:
             silenced.append(depth_mm)
-            board.fail(*[Fault.SILENCE] * 120)  # .6 s
+            board.fail(*[Fault.SILENCE] * 4000)  # 20 s
         return push_n(depth_mm, tilt_deg)
 
     monkeypatch.setattr(lab.rig.world.reaction, "push_n", silent_once)
-    text = (lab.folder / "rig.toml").read_text(encoding="utf-8").replace("stale_ms = 1000.0", "stale_ms = 400.0")
+    text = (lab.folder / "rig.toml").read_text(encoding="utf-8").replace("stale_ms = 1000.0", "stale_ms = 600.0")
     (lab.folder / "rig.toml").write_text(text, encoding="utf-8")
     slowly(lab)
     engine = lab.engine()
-    run(engine)
+    engine.start()
+    while engine.snapshot().voids == 0 and not engine.finished:
+        time.sleep(0.005)
+    board._faults.clear()
+    engine.join()
 
     now = engine.snapshot()
     assert (now.state, now.strokes_done, now.voids) == (State.DONE, 1, 1)
