@@ -8,7 +8,7 @@ from collect.errors import SheetFull, StepVoid
 from collect.policy import MAX_FAILURES, Action, decide
 from collect.states import FINAL, TRANSITIONS, IllegalTransition, State, check_transition
 from collect.steps import Step, StepKind
-from drivers.errors import DeviceError, DeviceTimeout, MotionFailed, RobotNotSafe
+from drivers.errors import DeviceError, DeviceTimeout, MotionFailed, RobotNotSafe, Stuck
 
 
 def test_stop_is_possible_from_every_state_that_is_not_over() -> None:
@@ -46,6 +46,7 @@ LATE_CAMERA = DeviceTimeout("camera", "fresh", "no new frame")
         (PRESS, StepVoid("rests too high"), MAX_FAILURES, Action.ASK),
         (PRESS, MotionFailed("robot", "moveLine", "out of reach"), 1, Action.ABORT),
         (PRESS, RobotNotSafe("robot", "moveLine", "ProtectiveStop", "", ""), 1, Action.ASK),
+        (PRESS, Stuck("force", 120.0, 24), 1, Action.ASK),
         (PRESS, SheetFull(42, 1), 1, Action.ASK),
         (PRESS, LATE_CAMERA, 1, Action.ABORT),
         (CAPTURE, LATE_CAMERA, 1, Action.RETRY),

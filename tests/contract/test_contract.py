@@ -21,7 +21,7 @@ from drivers.arcs.rpc import RpcConnection
 from drivers.clock import HostClock
 from drivers.errors import LimitExceeded, MotionError, NotConnected
 from drivers.geometry import distance
-from drivers.samples import Pose, PoseSample
+from drivers.samples import Pose, PoseSample, QueuedLine
 from tests.contract.motion import ACC_MM_S2, LIFT_MM, SLOW_MM_S, SPEED_MM_S, Enabled, raised
 
 GENTLY = {"speed_mm_s": SPEED_MM_S, "acc_mm_s2": ACC_MM_S2}
@@ -195,6 +195,20 @@ async def test_a_stop_of_an_idle_arm_is_harmless_also_twice_and_at_once(enabled:
     await asyncio.gather(enabled.robot.stop(), enabled.robot.stop())
     assert_there(await assert_still(enabled.robot), enabled.start)
     await enabled.robot.move(raised(enabled.start, LIFT_MM / 2), **GENTLY)
+
+
+@pytest.mark.moves
+async def test_lines_that_are_handed_over_as_one_are_carried_out_with_their_dwell(enabled: Enabled):
+    """Whether a cabinet takes lines while it holds its path, and lets a short line last, shows here first."""
+    middle, dwell_s = LIFT_MM / 2, 1.0
+    lines = [
+        QueuedLine(raised(enabled.start, middle), SPEED_MM_S),
+        QueuedLine(raised(enabled.start, middle + 0.05), SPEED_MM_S, dwell_s),
+        QueuedLine(enabled.top, SPEED_MM_S),
+    ]
+    seen = await enabled.robot.sequence(lines, acc_mm_s2=ACC_MM_S2)
+    assert_there(await assert_still(enabled.robot), enabled.top)
+    assert any(abs(pose.z_mm - enabled.start.z_mm - middle) < 0.1 for pose in seen)
 
 
 @pytest.mark.moves
