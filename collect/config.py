@@ -99,6 +99,8 @@ class MotionConfig(Config):
     travel_speed_mm_s: Annotated[float, Field(gt=0.0, le=500.0)] = 150.0
     press_speed_mm_s: Annotated[float, Field(gt=0.0, le=100.0)] = 20.0
     acc_mm_s2: Annotated[float, Field(gt=0.0, le=5000.0)] = 500.0
+    least_dwell_s: Annotated[float, Field(ge=0.05, le=60.0)] = 0.1
+    """Time at depth, however short a dwell is asked for: the depth must be seen."""
 
 
 class RigConfig(BaseSettings):

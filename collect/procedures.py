@@ -18,8 +18,6 @@ CLEARANCE_MM = 8.0
 """Height above the paper at which the fast approach ends."""
 DEPTH_TOLERANCE_MM = 0.1
 """How far the depth at the end of the dwell may be from the one asked for."""
-LEAST_DWELL_S = 0.1
-"""Time at depth, however short a dwell is asked for: the depth must be seen."""
 DWELL_MM = 0.05
 """Way of the dwell: the end of the descent, as slow as it has to last. ARCS cannot wait in its queue but by moving."""
 TOUCH_TOLERANCE_MM = 0.1
@@ -221,7 +219,7 @@ def press_moves(
     pressing = [
         Move(touch, motion.press_speed_mm_s),
         Move(interpolate(touch, deep, max(0.5, 1.0 - DWELL_MM / height_mm)), motion.press_speed_mm_s),
-        Move(deep, motion.press_speed_mm_s, max(dwell_s, LEAST_DWELL_S)),
+        Move(deep, motion.press_speed_mm_s, max(dwell_s, motion.least_dwell_s)),
         Move(pose(CLEARANCE_MM, tilt_deg), motion.press_speed_mm_s),
         Move(above, motion.travel_speed_mm_s),
     ]

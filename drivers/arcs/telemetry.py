@@ -13,12 +13,15 @@ from drivers.arcs.rpc import DEVICE
 from drivers.arcs.rtde import RtdeStream
 from drivers.arcs.waiting import Tolerance
 from drivers.clock import Clock
-from drivers.errors import DeviceError, NotConnected, ProtocolViolation, Stale
+from drivers.errors import DeviceError, DeviceTimeout, NotConnected, ProtocolViolation, Stale
 from drivers.geometry import from_wire
 from drivers.samples import Pose, PoseSample, Stamp
 
 POSE_SEGMENT = "R1_actual_TCP_pose"
 JOINTS_SEGMENT = "R1_actual_q"
+MOST_SILENCES = 3
+"""Of half a second each, in a row: a machine that is busy may be silent for one or two."""
+GIVE_UP_S = 2.0
 
 
 class Telemetry:
@@ -74,9 +77,9 @@ class Telemetry:
             self._seen = None
 
     async def reaching(self, target: Pose, tolerance: Tolerance) -> None:
-        """Wait until a pose at `target` has come: all before it have come by then. Gives up where it is stale."""
+        """Wait until a pose at `target` has come: all before it have come by then. Gives up after `GIVE_UP_S`."""
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(self._options.stale_after_ms / 1e3):
+            async with asyncio.timeout(GIVE_UP_S):
                 while self._latest is None or not tolerance.holds(self._latest.pose, target):
                     await asyncio.sleep(0.5 / self._options.telemetry_hz)
 
@@ -96,8 +99,7 @@ class Telemetry:
     async def _run(self) -> None:
         if self._stream is not None:
             try:
-                while True:
-                    self._take(*await self._pushed(self._stream))
+                await self._listen(self._stream)
             except DeviceError as error:
                 await self._fall_back(error)
         loop = asyncio.get_running_loop()
@@ -109,6 +111,20 @@ class Telemetry:
                 await self.read()
             due = max(due + period_s, loop.time())
             await asyncio.sleep(due - loop.time())
+
+    async def _listen(self, stream: RtdeStream) -> None:
+        """Take what is pushed. A short silence is bridged by asking: what piled up meanwhile will still come."""
+        silences = 0
+        while True:
+            try:
+                self._take(*await self._pushed(stream))
+                silences = 0
+            except DeviceTimeout:
+                silences += 1
+                if silences > MOST_SILENCES:
+                    raise
+                with contextlib.suppress(DeviceError):
+                    await self.read()
 
     async def _pushed(self, stream: RtdeStream) -> tuple[Pose, tuple[float, ...]]:
         pose, joints = await stream.newest()

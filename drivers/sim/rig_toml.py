@@ -10,6 +10,8 @@ from drivers.sim.config import SimConfig
 LOOPBACK_HEAD = "# The loopback rig"
 TAUGHT_TOUCH_ERROR_MM = 0.03
 """Nobody teaches a touch height exactly."""
+SEEN_S = 0.05
+"""Real time that a pose needs to be seen in."""
 PUMP_ML = 0.1
 """What one revolution of the loopback pump delivers."""
 
@@ -90,7 +92,7 @@ park_mm = [{config.home_mm[0]}, {config.home_mm[1]}, {config.home_mm[2]}]
 travel_speed_mm_s = 200.0
 press_speed_mm_s = 20.0
 acc_mm_s2 = 800.0
-"""
+{_dwell(config)}"""
 
 
 def _ink_device(config: SimConfig, at: Addresses) -> str:
@@ -114,6 +116,13 @@ channel = "{LOOPBACK_CHANNEL}"
 host = "{at.host}"
 port = {at.force_port}
 {_staleness(config)}"""
+
+
+def _dwell(config: SimConfig) -> str:
+    """Where time runs faster than life, a tenth of a second is over before anybody looks."""
+    if config.rate <= 2.0:
+        return ""
+    return f"least_dwell_s = {SEEN_S * config.rate:g}    # simulated time runs {config.rate:g} times as fast as life\n"
 
 
 def _staleness(config: SimConfig) -> str:

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.arcs import telemetry
 from drivers.arcs.frames import FrameDecoder, encode, encode_short
 from drivers.arcs.options import ArcsOptions
 from drivers.arcs.robot import AuboArcs
@@ -266,10 +267,24 @@ async def test_a_port_that_is_silent_from_the_start_is_not_fatal(
     assert "no sample" in notices[0]
 
 
+async def test_a_silence_that_ends_is_bridged_by_asking(rtde: RtdeServer, make_arm: MakeArm, notices: list[str]):
+    arm = make_arm(rtde.port)
+    await arm.connect()
+    rtde.mute = True
+    await asyncio.sleep(0.7)
+    assert arm.latest()
+    rtde.mute = False
+    await asyncio.sleep(0.1)
+    assert len(await samples_of(arm, 0.2)) >= 3
+    assert not notices
+    assert arm._telemetry.source == "RTDE"
+
+
 @pytest.mark.parametrize("fault", ["mute", "hang up"])
 async def test_a_stream_that_ends_later_is_told_and_poses_go_on(
-    rtde: RtdeServer, make_arm: MakeArm, notices: list[str], fault: str
+    rtde: RtdeServer, make_arm: MakeArm, notices: list[str], fault: str, monkeypatch: pytest.MonkeyPatch
 ):
+    monkeypatch.setattr(telemetry, "MOST_SILENCES", 0)
     arm = make_arm(rtde.port)
     await arm.connect()
     if fault == "mute":
