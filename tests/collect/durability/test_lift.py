@@ -22,8 +22,8 @@ WITHIN_S = 5.0
 """Of the rig's time, from the kill to a brush above the paper."""
 PRESS_S = 6.0
 """The same for a whole press, its way there included."""
-BELOW_S = 4.0
-"""From the end of the approach to the brush above the paper again."""
+BELOW_S = 3.0
+"""From the beginning of the descent to the brush above the paper again."""
 
 
 class OwnRig:
@@ -91,7 +91,7 @@ def test_killed_with_the_brush_in_the_paper_it_lifts_by_itself(own_rig: OwnRig, 
 @pytest.mark.soak
 @pytest.mark.timeout(1800)
 def test_fifty_random_moments_of_presses(own_rig: OwnRig):
-    """A third at any moment, the way to the cell included; the others from the end of the approach on."""
+    """A third at any moment, the way to the cell included; the others from the beginning of the descent on."""
     rng, at, deep = random.Random(50), Counter[str](), 0
     for number in range(50):
         anywhere = number % 3 == 0
@@ -100,7 +100,7 @@ def test_fifty_random_moments_of_presses(own_rig: OwnRig):
         def moment(anywhere: bool = anywhere, after_s: float = after_s) -> None:
             nonlocal deep
             if not anywhere:
-                until(own_rig, lambda at_mm, _: at_mm < 8.5)
+                until(own_rig, lambda at_mm, _: at_mm < 7.5)
             time.sleep(after_s)
             _, at_mm, phase = own_rig.state()
             at[phase] += 1
