@@ -1,14 +1,16 @@
-"""What is checked and set before an arm is powered: each step may refuse, none moves or clears anything."""
+"""What is checked and set before an arm is powered, and powering it: each step may refuse, none moves or clears."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
+from drivers.arcs.codes import RobotMode
 from drivers.arcs.controller import Controller, accepted
 from drivers.arcs.errors import WrongOperationalMode
 from drivers.arcs.options import ArcsOptions
 from drivers.arcs.rpc import DEVICE
 from drivers.arcs.settings import OPERATIONAL_MODE, Settings, Value, configured, read_back, require_same
+from drivers.arcs.waiting import until_mode
 
 
 async def make_ready(controller: Controller, options: ArcsOptions, on_notice: Callable[[str], None]) -> Settings:
@@ -39,6 +41,20 @@ async def make_ready(controller: Controller, options: ArcsOptions, on_notice: Ca
     for name in (name for name, value in found.items() if value is None and name != OPERATIONAL_MODE):
         on_notice(f"the controller does not tell its {name}: whether it changes cannot be seen")
     return found
+
+
+async def power_on(controller: Controller, options: ArcsOptions) -> None:
+    """Power the arm and release its brakes, where that was not done. Raises `RobotNotSafe`, `DeviceTimeout`."""
+
+    async def until(*wanted: RobotMode) -> None:
+        await until_mode(controller, {*wanted}, timeout_s=options.power_timeout_s, poll_s=options.poll_s)
+
+    await controller.require_safe("power on")
+    if await controller.mode() != RobotMode.RUNNING:
+        await controller.ask("RobotManage.poweron")
+        await until(RobotMode.IDLE, RobotMode.RUNNING)
+        await controller.ask("RobotManage.startup")
+        await until(RobotMode.RUNNING)
 
 
 def _require_automatic(mode: Value, on_notice: Callable[[str], None]) -> None:

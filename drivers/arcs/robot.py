@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Coroutine, Sequence
 
-from drivers.arcs.codes import LOOPBACK_CONTROL_BOX, RobotMode
+from drivers.arcs.codes import LOOPBACK_CONTROL_BOX
 from drivers.arcs.controller import Condition, Controller
 from drivers.arcs.departure import Departure
 from drivers.arcs.following import feed, legs_of
@@ -14,11 +14,11 @@ from drivers.arcs.joints import checked_path, reachable
 from drivers.arcs.messages import Messages
 from drivers.arcs.options import ArcsOptions
 from drivers.arcs.queued import capped, queue_all
-from drivers.arcs.readying import make_ready
+from drivers.arcs.readying import make_ready, power_on
 from drivers.arcs.rpc import DEVICE, RpcConnection
 from drivers.arcs.stopping import Stopper
 from drivers.arcs.telemetry import Telemetry
-from drivers.arcs.waiting import Tolerance, planned_s, until_mode, until_settled
+from drivers.arcs.waiting import Tolerance, planned_s, until_settled
 from drivers.arcs.watchdog import Watchdog
 from drivers.clock import Clock
 from drivers.errors import DeviceError, MotionFailed, NotConnected
@@ -106,12 +106,7 @@ class AuboArcs:
                 await self._motion.require_safe("power on")  # a safety stop holds its path: that is what to tell
                 raise
         settings = await make_ready(self._motion, self._options, self._notice)
-        await self._motion.require_safe("power on")
-        if await self._motion.mode() != RobotMode.RUNNING:
-            await self._motion.ask("RobotManage.poweron")
-            await self._until_mode({RobotMode.IDLE, RobotMode.RUNNING})
-            await self._motion.ask("RobotManage.startup")
-            await self._until_mode({RobotMode.RUNNING})
+        await power_on(self._motion, self._options)
         self._held = True  # a process that was killed may have left it so
         await self._ready()
         await self._departure.enabled(settings)
@@ -303,10 +298,6 @@ class AuboArcs:
             await controller.connection.close()
         self._connected = self._enabled = False
         self._departure = Departure(self._motion)
-
-    async def _until_mode(self, wanted: set[RobotMode]) -> None:
-        options = self._options
-        await until_mode(self._motion, wanted, timeout_s=options.power_timeout_s, poll_s=options.poll_s)
 
     async def _ready(self) -> None:
         """Before each motion: a way to stop it, and a controller that does not hold its path."""
