@@ -52,7 +52,7 @@ class Plan:
     seconds: float
     seconds_by_kind: dict[str, float]
     touches_mm: tuple[tuple[float, float], ...]
-    """In the paper frame, the taught point first."""
+    """In the paper frame, those of zero touch first."""
     warnings: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
@@ -67,7 +67,8 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
     changes: list[str] = []
     kinds: Counter[str] = Counter()
     seconds: dict[str, float] = {}
-    touches = [config.paper.touch_point_mm]
+    measured = config.touch.method != "taught" and config.touch.points_mm
+    touches = list(measured or [config.paper.touch_point_mm])
     dips = poses = 0
     here = park_moves(config)[-1].target
     for walked in walk(config, protocol):

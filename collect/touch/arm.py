@@ -7,14 +7,13 @@ import contextlib
 from collections.abc import AsyncGenerator
 
 from collect.errors import ForceTooHigh
+from collect.procedures import Move
 from collect.rig import Rig
-from collect.sheet import to_base
-from drivers.geometry import brush_pose
-from drivers.samples import Pose
+from collect.touch import moves
 
 
 class TouchArm:
-    """A vertical brush over points of the paper frame; every move goes through the limits of the driver."""
+    """A vertical brush over points of the paper frame; its targets are those of `touch.moves`."""
 
     def __init__(self, rig: Rig, slow_mm_s: float) -> None:
         self._rig = rig
@@ -22,25 +21,26 @@ class TouchArm:
 
     async def over(self, x_mm: float, y_mm: float) -> None:
         """To travel height over a point."""
-        motion = self._rig.config.motion
-        await self._move(self._pose(x_mm, y_mm, motion.safe_z_mm), motion.travel_speed_mm_s)
+        await self.go(moves.over(self._rig.config, x_mm, y_mm))
 
     async def near(self, x_mm: float, y_mm: float, z_mm: float) -> None:
         """From travel height down to where the slow approach begins."""
-        await self._move(self._pose(x_mm, y_mm, z_mm), self._rig.config.motion.press_speed_mm_s)
+        await self.go(moves.near(self._rig.config, x_mm, y_mm, z_mm))
 
     async def to(self, x_mm: float, y_mm: float, z_mm: float) -> float:
         """Slowly to a height; returns the one at which the arm rests."""
-        await self._move(self._pose(x_mm, y_mm, z_mm), self._slow_mm_s)
+        await self.go(Move(moves.upright(self._rig.config, x_mm, y_mm, z_mm), self._slow_mm_s))
         return (await self._rig.robot.where()).z_mm
 
     async def lift(self) -> None:
         """Straight up to travel height from wherever the tip is."""
-        here = await self._rig.robot.where()
-        motion = self._rig.config.motion
-        if here.z_mm < motion.safe_z_mm:
-            up = Pose(here.x_mm, here.y_mm, motion.safe_z_mm, *here.quaternion)
-            await self._move(up, motion.press_speed_mm_s)
+        for move in moves.lift(self._rig.config, await self._rig.robot.where()):
+            await self.go(move)
+
+    async def go(self, move: Move) -> None:
+        """One move, to its end."""
+        acc_mm_s2 = self._rig.config.motion.acc_mm_s2
+        await self._rig.robot.move(move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=acc_mm_s2)
 
     @contextlib.asynccontextmanager
     async def lifted_after(self) -> AsyncGenerator[None]:
@@ -56,10 +56,3 @@ class TouchArm:
                 error.add_note(f"The brush could not be lifted: {trouble}")
             raise
         await self.lift()
-
-    def _pose(self, x_mm: float, y_mm: float, z_mm: float) -> Pose:
-        base_x, base_y = to_base(self._rig.config.paper, x_mm, y_mm)
-        return brush_pose(base_x, base_y, z_mm, heading_deg=self._rig.config.paper.yaw_deg)
-
-    async def _move(self, target: Pose, speed_mm_s: float) -> None:
-        await self._rig.robot.move(target, speed_mm_s=speed_mm_s, acc_mm_s2=self._rig.config.motion.acc_mm_s2)
