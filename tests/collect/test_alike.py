@@ -87,14 +87,16 @@ def test_nobody_looks_at_the_paper_between_dip_and_press(sharp_lab: Lab, targets
     folder = run(sharp_lab)
     assert targets[targets.index("ink") :][:3] == ["ink", "paper", "park"]
     assert screen[screen.index("dip") :][:4] == ["dip", "look whether the sheet is blank", "dip", "press H13-a0-r01"]
-    [press] = results(folder, "press")
+    presses = results(folder, "press")  # more than one where a photograph was late and the stroke was made again
+    waits = [press["dip_to_touch_s"] for press in presses]
+    assert min(waits) > 0.0
     recording = Recording(folder)
     [capture] = recording.captures()
-    assert capture.stroke.dip_to_touch_s == press["dip_to_touch_s"] > 0.0
-    assert [seen.waited_s for seen in Review(folder).captures] == [press["dip_to_touch_s"]]
-    [(_, _, message)] = container.messages(recording.path, [str(Topic.QUALITY)])
+    assert capture.stroke.dip_to_touch_s == waits[-1]
+    assert [seen.waited_s for seen in Review(folder).captures] == waits
+    *_, (_, _, message) = container.messages(recording.path, [str(Topic.QUALITY)])
     remark = Quality.model_validate_json(message.data).checks[-1]
-    assert (remark.name, remark.score, remark.passed) == ("dip_to_touch", press["dip_to_touch_s"], True)
+    assert (remark.name, remark.score, remark.passed) == ("dip_to_touch", waits[-1], True)
 
 
 def test_a_brush_that_waited_with_its_ink_dips_again(
@@ -166,6 +168,5 @@ def test_a_stroke_that_waited_unlike_the_others_is_named_and_still_counts(
     engine.join()
     [folder] = lab.sessions.iterdir()
     assert engine.snapshot().strokes_done == 4
-    named = [seen for seen in Review(folder).captures if seen.unlike]
-    assert [seen.stroke_id for seen in named] == ["H11-a0-r03"]
-    assert "after its dip, the others after" in named[0].unlike
+    named = {seen.stroke_id: seen.unlike for seen in Review(folder).captures if seen.unlike}
+    assert "after its dip, the others after" in named["H11-a0-r03"]
