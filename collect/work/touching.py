@@ -102,8 +102,9 @@ class _Hands:
         return await self._job.bench.procedures.zero_touch()
 
     async def dip(self) -> None:
-        """Into the well and out again."""
+        """Into the well and out again; the touch that follows takes ink, so no press may count on this dip."""
         await fill_brush(self._job)
+        self._job.bench.known.left_ink_ns = None
 
     async def capture(self) -> Frame:
         """Park, and a fresh frame."""

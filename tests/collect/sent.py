@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,20 @@ from collect.procedures import Move, park_moves
 from collect.touch.moves import Room
 from drivers.geometry import distance
 from drivers.samples import Pose
+from drivers.sim.motion import MotionQueue
 
 SAME_MM, SAME_DEG = 1e-6, 1e-4
+
+
+def noting(motion: MotionQueue, note: Callable[[Pose], None]) -> None:
+    """Tell `note` of every line that reaches the arm's queue from now on, whatever sent it."""
+    add = motion.add
+
+    def noted(target: Pose, *pace: float, **more: Any) -> bool:
+        note(target)
+        return add(target, *pace, **more)
+
+    motion.add = noted  # type: ignore[method-assign]
 
 
 def same(a: Pose, b: Pose) -> bool:

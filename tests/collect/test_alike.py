@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
@@ -13,11 +14,14 @@ from collect.protocols.loading import load_protocol
 from collect.protocols.plans import steps
 from collect.reviewing import Review
 from collect.steps import StepKind
-from collect.work import waited
+from collect.work import touching, waited
+from collect.work.context import Known
+from drivers.samples import Pose
 from sessions import container
 from sessions.journal import read_lines
 from sessions.reader import Recording
 from sessions.schemas import Quality, Topic
+from tests.collect.sent import noting
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -63,23 +67,21 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 @pytest.fixture
-def targets(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def targets(request: pytest.FixtureRequest) -> list[str]:
     """Where the arm was sent, as far as it matters: "ink", "paper", "park"."""
     lab: Lab = request.getfixturevalue("sharp_lab" if "sharp_lab" in request.fixturenames else "lab")
     sent: list[str] = []
     config = load_rig(lab.folder / "rig.toml")
-    add = lab.rig.world.motion.add
 
-    def noted(target: Any, *pace: float, **more: Any) -> bool:
+    def note(target: Pose) -> None:
         if target.position_mm == pytest.approx(config.motion.park_mm, abs=1e-3):
             sent.append("park")
         elif target.z_mm == pytest.approx(config.ink.dip_z_mm, abs=1e-3):
             sent.append("ink")
         elif target.z_mm < config.paper.touch_z_mm - 1.0:
             sent.append("paper")
-        return add(target, *pace, **more)
 
-    monkeypatch.setattr(lab.rig.world.motion, "add", noted)
+    noting(lab.rig.world.motion, note)
     return sent
 
 
@@ -108,6 +110,17 @@ def test_a_brush_that_waited_with_its_ink_dips_again(
     run(lab)
     assert targets.count("ink") == 2
     assert screen[screen.index("press H11-a0-r01") :][:3] == ["press H11-a0-r01", "dip", "press H11-a0-r01"]
+
+
+async def test_a_dip_of_zero_touch_or_the_self_check_is_none_for_a_press(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = Known()
+
+    async def dipped(_job: Any) -> None:
+        known.left_ink_ns = 1
+
+    monkeypatch.setattr(touching, "fill_brush", dipped)
+    await touching._Hands(cast(Any, SimpleNamespace(bench=SimpleNamespace(known=known)))).dip()
+    assert known.left_ink_ns is None
 
 
 @pytest.mark.parametrize(("protocol", "kind"), [(LIST, "press"), (FIGURE, "draw")])

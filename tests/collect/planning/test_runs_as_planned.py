@@ -19,7 +19,7 @@ from collect.work import choosing
 from collect.work.context import Job
 from drivers.samples import Pose
 from tests.collect.conftest import Lab
-from tests.collect.sent import not_checked, not_sent
+from tests.collect.sent import not_checked, not_sent, noting
 
 EXTRAS = """
 [ink.wipe]
@@ -39,7 +39,6 @@ JOG = '\n[touch]\nmethod = "jog"\ntouches = 1\nresidual_mm = 3.0\npoints_mm = [[
 TWO_PRESSES = "presses = [{height_mm = 9.0, tilt_deg = 5.0}, {height_mm = 11.0}]\n"
 KINDS = {
     "grid": 'kind = "grid"\nheights_mm = [9.0]\ntilts_deg = [5.0]\nrepeats = 2\nboard_every = 1\n',
-    "list": f'kind = "list"\n{TWO_PRESSES}',
     "replay": 'kind = "replay"\nof = "s"\npresses = [{stroke_id = "b", height_mm = 9.0, tilt_deg = 1.0}]\n',
     "adaptive": 'kind = "adaptive"\nheights_mm = [9.0]\ntilts_deg = [5.0]\nleast_presses = 3\nenough_points = 50.0\n',
     "write": f'kind = "write"\ncell_mm = [60.0, 60.0]\n{FIGURE}',
@@ -62,7 +61,7 @@ class Made:
 def made(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> list[Made]:
     steps: list[Made] = []
     at_work: list[Made] = []
-    do, add = Performer._do, lab.rig.world.motion.add
+    do = Performer._do
 
     async def noted(self: Performer, job: Job) -> Result:
         procedures = job.bench.procedures
@@ -72,13 +71,12 @@ def made(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> list[Made]:
         finally:
             steps.append(at_work.pop())
 
-    def added(target: Pose, *pace: float, **more: object) -> bool:
+    def added(target: Pose) -> None:
         for one in at_work:
             one.sent.append(target)
-        return add(target, *pace, **more)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Performer, "_do", noted)
-    monkeypatch.setattr(lab.rig.world.motion, "add", added)
+    noting(lab.rig.world.motion, added)
     return steps
 
 
@@ -133,7 +131,7 @@ def test_what_a_run_sends_the_plan_has_checked(
 
 
 def test_a_plane_found_by_jog_is_checked_where_it_is_touched(lab: Lab, made: list[Made]) -> None:
-    run(lab, KINDS["list"], EXTRAS + JOG)
+    run(lab, f'kind = "list"\n{TWO_PRESSES}', EXTRAS + JOG)
     hold_against_the_plan(lab, made)
     [touch] = [one for one in made if one.step.kind is StepKind.ZERO_TOUCH]
     assert len({(round(pose.x_mm), round(pose.y_mm)) for pose in touch.sent}) == 2
