@@ -147,6 +147,11 @@ def over_sheet_move(config: RigConfig) -> Move:
     return Move(_upright(config, x_mm, y_mm, config.motion.safe_z_mm), config.motion.travel_speed_mm_s)
 
 
+def photograph_moves(config: RigConfig) -> list[Move]:
+    """Over the sheet, unless the arm is there, and out of the camera's view."""
+    return [over_sheet_move(config), *park_moves(config)]
+
+
 def zero_touch_moves(config: RigConfig) -> list[Move]:
     """Over the touch point, down to clearance, slowly to the taught height, and up."""
     motion, touch_mm = config.motion, config.paper.touch_z_mm

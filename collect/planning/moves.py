@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from collect.config import RigConfig
 from collect.drawing import Drawn, stroke_moves
 from collect.plane import PaperPlane
-from collect.procedures import Move, inking_moves, park_moves, press_moves, zero_touch_moves
+from collect.procedures import Move, inking_moves, photograph_moves, press_moves, zero_touch_moves
 from collect.sheet import Cell
 from collect.steps import Step, StepKind
 from collect.touch.config import TouchConfig
@@ -61,7 +61,7 @@ def moves_of(
         case StepKind.CHOOSE | StepKind.REVIEW:
             return StepMoves()
         case StepKind.BOARD | StepKind.CAPTURE:
-            return StepMoves([*park_moves(config)], captures=1)
+            return StepMoves([*photograph_moves(config)], captures=1)
         case StepKind.PRESS:
             assert cell is not None
             down, up = press_moves(config, plane, cell, _number(step, "height_mm"), _number(step, "tilt_deg"))
@@ -73,7 +73,7 @@ def moves_of(
                 for number, place_mm in enumerate(triangle_on((cell, *more), config.self_check))
                 for move in (*inking_moves(config, dips + number), *mark_moves(config, plane, *place_mm))
             ]
-            return StepMoves([*park_moves(config), *moves, *park_moves(config)], dips=3, captures=2)
+            return StepMoves([*photograph_moves(config), *moves, *photograph_moves(config)], dips=3, captures=2)
         case StepKind.DRAW:
             assert cell is not None
             return _figure(config, plane, Drawn.of(step), cell, dips)
@@ -108,7 +108,7 @@ def _touches(config: RigConfig, plane: PaperPlane, step: Step, dips: int) -> Ste
         return StepMoves(parts)
     count = sum(-(-spots // touch.camera.spots_per_dip) for spots in patch_spots(config.paper, touch))
     inked = [move for number in range(count) for move in inking_moves(config, dips + number)]
-    return StepMoves([*park_moves(config), *inked, *parts, *park_moves(config)], dips=count)
+    return StepMoves([*photograph_moves(config), *inked, *parts, *photograph_moves(config)], dips=count)
 
 
 def _figure(config: RigConfig, plane: PaperPlane, drawn: Drawn, cell: Cell, dips: int) -> StepMoves:

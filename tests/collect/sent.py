@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from collect.config import RigConfig
 from collect.plane import to_paper
 from collect.planning.moves import StepMoves, Way
-from collect.procedures import Move, park_moves
+from collect.procedures import Move, over_sheet_move, photograph_moves
 from collect.touch.moves import Room
 from drivers.geometry import distance
 from drivers.samples import Pose
@@ -56,14 +56,18 @@ def on_paper(config: RigConfig, pose: Pose) -> NDArray[np.float64]:
 
 
 def not_checked(config: RigConfig, sent: Iterable[Pose], parts: Sequence[Move | Way | Room]) -> list[Pose]:
-    """What was sent though no plan has checked it; to park is always allowed."""
-    allowed = [*parts, *park_moves(config)]
+    """What was sent though no plan has checked it; to photograph the sheet is always allowed."""
+    allowed = [*parts, *photograph_moves(config)]
     return [pose for pose in sent if not any(within(config, pose, part) for part in allowed)]
 
 
-def not_sent(planned: StepMoves, sent: Sequence[Pose]) -> list[Pose]:
-    """What was checked though it was not sent, where no touch decides by itself."""
-    fixed: list[Move | Way | Room] = [part for part in planned.parts if not isinstance(part, Room)]
+def not_sent(config: RigConfig, planned: StepMoves, sent: Sequence[Pose]) -> list[Pose]:
+    """What was checked though it was not sent, where no touch decides by itself. An arm that is over the sheet already
+    does not go there to be seen."""
+    over_sheet = over_sheet_move(config)
+    fixed: list[Move | Way | Room] = [
+        part for part in planned.parts if not isinstance(part, Room) and part != over_sheet
+    ]
     return [pose for pose, _ in StepMoves(fixed).poses if not any(same(pose, one) for one in sent)]
 
 

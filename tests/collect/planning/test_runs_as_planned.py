@@ -106,7 +106,7 @@ def hold_against_the_plan(lab: Lab, made: list[Made]) -> None:
         # Where the ink had to wait, a press dips again.
         again = inking_moves(config, one.dips) if one.step.kind in MARKING else []
         assert not not_checked(config, one.sent, [*planned.parts, *again]), one.step
-        assert not not_sent(planned, one.sent), one.step
+        assert not not_sent(config, planned, one.sent), one.step
         checked = {rounded(pose) for pose, _, _ in all_poses(config, protocol, one.plane, every_cell=True)}
         assert {rounded(pose) for pose, _ in planned.poses} <= checked, one.step
 

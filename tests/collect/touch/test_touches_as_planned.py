@@ -57,7 +57,7 @@ async def test_no_touch_leaves_what_was_checked(make_bench: MakeBench, method: s
     await measure_plane(bench.rig, bench.hands, asked, tap=bench.tap, next_jog=down)
     planned = moves_of(config, PaperPlane(config.paper.touch_z_mm), TOUCH, None)
     assert not not_checked(config, sent, planned.parts)
-    assert not not_sent(planned, sent)
+    assert not not_sent(config, planned, sent)
 
 
 async def test_touches_that_each_find_the_paper_lower_do_not_add_up(make_bench: MakeBench) -> None:
@@ -84,7 +84,7 @@ async def test_the_self_check_presses_as_deep_as_was_checked(make_bench: MakeBen
     await self_check(bench.rig, bench.hands, triangle_on(cells, config.self_check), plane)
     planned = moves_of(config, plane, CHECK, cells[0], cells[1:])
     assert not not_checked(config, sent, planned.parts)
-    assert not not_sent(planned, sent)
+    assert not not_sent(config, planned, sent)
     assert lowest_mm(sent) == 120.0 - config.self_check.depth_mm
 
 
