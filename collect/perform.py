@@ -65,7 +65,7 @@ class Performer:
 
     async def retreat(self) -> None:
         """Bring the arm up and away from wherever it is; belongs to no step and is not recorded."""
-        self._bench.known.inked = False
+        self._bench.known.left_ink_ns = None
         await self._bench.procedures.retreat()
 
     def answered(self, error: StepError | DeviceError) -> None:
@@ -98,7 +98,10 @@ class Performer:
         rig, store, progress = bench.rig, bench.store, bench.progress
         progress.doing(_in_words(step))
         used = bench.used_cells()
-        cell = bench.sheet.free(used, store.state.sheet + 1) if step.kind in MARKING else None
+        marks = step.kind in MARKING
+        # Before the dip as well: a brush full of ink does not wait for a fresh sheet.
+        free = bench.sheet.free(used, store.state.sheet + 1) if marks or step.kind == StepKind.DIP else None
+        cell = free if marks else None
         more = partners(bench.sheet, cell, used) if cell is not None and step.kind == StepKind.SELF_CHECK else ()
         notes: dict[str, Any] = {"params": dict(step.params)}
         if more:
@@ -133,7 +136,7 @@ class Performer:
             recorder.cadence()
             recorder.step(event.model_copy(update={"phase": "end"}))
         except BaseException as error:
-            bench.known.inked = False
+            bench.known.left_ink_ns = None
             progress.cut(place)
             why = "stopped by the operator" if isinstance(error, asyncio.CancelledError) else told(error)
             await uninterrupted(store.void, attempt, why)

@@ -82,11 +82,7 @@ class Procedures:
 
     async def dip(self) -> None:
         """Into the well and out again, wiped; washed before, where it is time for that."""
-        wash = self._config.ink.wash
-        if wash is not None and self._dips % wash.every_dips == wash.every_dips - 1:
-            for move in wash_moves(self._config, wash):
-                await self.go(move)
-        for move in dip_moves(self._config):
+        for move in inking_moves(self._config, self._dips):
             await self.go(move)
         self._dips += 1
 
@@ -154,6 +150,11 @@ def over_sheet_move(config: RigConfig) -> Move:
     return Move(_upright(config, x_mm, y_mm, config.motion.safe_z_mm), config.motion.travel_speed_mm_s)
 
 
+def photograph_moves(config: RigConfig) -> list[Move]:
+    """Over the sheet, unless the arm is there, and out of the camera's view."""
+    return [over_sheet_move(config), *park_moves(config)]
+
+
 def zero_touch_moves(config: RigConfig) -> list[Move]:
     """Over the touch point, down to clearance, slowly to the taught height, and up."""
     motion, touch_mm = config.motion, config.paper.touch_z_mm
@@ -164,6 +165,13 @@ def zero_touch_moves(config: RigConfig) -> list[Move]:
         Move(_upright(config, x_mm, y_mm, touch_mm), motion.press_speed_mm_s / 4),
         Move(_upright(config, x_mm, y_mm, motion.safe_z_mm), motion.travel_speed_mm_s),
     ]
+
+
+def inking_moves(config: RigConfig, dips: int) -> list[Move]:
+    """A dip after so many others of the same process, and the wash before it where it is time for one."""
+    wash = config.ink.wash
+    washed = wash is not None and dips % wash.every_dips == wash.every_dips - 1
+    return [*(wash_moves(config, wash) if wash is not None and washed else ()), *dip_moves(config)]
 
 
 def dip_moves(config: RigConfig) -> list[Move]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import Counter, deque
+from collections.abc import Generator
 from dataclasses import replace
 
 from collect.asking import Prompt
@@ -93,6 +95,14 @@ class Progress:
         """A step, in words."""
         with self._lock:
             self._step = what
+
+    @contextlib.contextmanager
+    def meanwhile(self, what: str) -> Generator[None]:
+        """Something else in the midst of a step, in words; within the block."""
+        before = self._step
+        self.doing(what)
+        yield
+        self.doing(before)
 
     def begun(self, step: Step, place: Place | None) -> None:
         """A step begins; `place` is the sheet and cell that it marks."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Generator, Iterable
 from typing import TYPE_CHECKING
 
 from collect.cadence import Arrivals, Sections
@@ -49,11 +49,23 @@ class Recorder:
         self._clock = clock
         self._poses = Arrivals(Topic.TCP, POSE_HZ)
         self._forces = None if force_hz is None else Arrivals(Topic.WRENCH, force_hz)
+        self._listeners: list[Callable[[PoseSample], None]] = []
         self.sections = Sections()
+
+    @contextlib.contextmanager
+    def also(self, on_sample: Callable[[PoseSample], None]) -> Generator[None]:
+        """Hand every pose to one more listener, within the block."""
+        self._listeners.append(on_sample)
+        try:
+            yield
+        finally:
+            self._listeners.remove(on_sample)
 
     def pose(self, sample: PoseSample) -> None:
         """A pose, and the joints where they came with it, stamped when the host got them."""
         stamp = sample.stamp
+        for listener in self._listeners:
+            listener(sample)
         self._poses.arrived(stamp.host_ns)
         self._sample(Topic.TCP, stamp, pose_message(stamp.host_ns, sample.pose.position_mm, sample.pose.quaternion))
         if sample.joints_rad is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import statistics
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,7 @@ from sessions.lines import Line
 from sessions.messages import decode_gray, decode_still
 from sessions.remarks import Remark, remarks_of
 from sessions.schemas import Stroke, Topic
+from sessions.waits import unlike, waits_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -42,6 +43,10 @@ class Seen:
     """Name of the check that it failed; empty where it passed."""
     file: str
     remark: Remark | None
+    waited_s: float | None = None
+    """From dip to touch; None where the session does not tell."""
+    unlike: str = ""
+    """Why that is far from the other strokes of the session; empty where it is not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +80,10 @@ class Review:
         """Read the journal and the remarks again."""
         state, remarks = replay(self.folder / JOURNAL_NAME), remarks_of(self.folder)
         self.open = is_open(state)
-        self.captures = tuple(_seen(line, remarks) for line in state.segments if line["kind"] == "capture")
+        waits = waits_of(state.segments)
+        odd = unlike(waits)
+        captures = [_seen(line, remarks) for line in state.segments if line["kind"] == "capture"]
+        self.captures = tuple(replace(c, waited_s=waits.get(c.still), unlike=odd.get(c.still, "")) for c in captures)
 
     def look(self, seen: Seen) -> Looked:
         """The pictures of one capture; kept once made. Takes a tenth of a second: call it off a screen's loop.

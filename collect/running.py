@@ -175,6 +175,7 @@ class Run:
         choices = (Choice(GO_ON, f"sheet {sheet + 2} is in, and blank"), KEEP_SHEET)
         await self._willing(self._recover)
         self.control.move_to(State.ASKING)
+        self.progress.doing("wait for an answer")
         if await self.asker.ask(Prompt(words, choices, KEEP_SHEET.key)) == GO_ON:
             self.performer.fresh_sheet()
         await self._willing(self._recover)
@@ -191,6 +192,7 @@ class Run:
     async def _ask_about(self, step: Step, result: Result) -> str:
         """What a set-up step measured, for a person to accept. Raises `Parked` where the answer is to stop."""
         self.control.move_to(State.ASKING)
+        self.progress.doing("wait for an answer")
         answer = await self.asker.ask(set_up_question(step.kind, result, self.rig.config))
         self.control.move_to(self.control.running())
         if answer == STOP.key:

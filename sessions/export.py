@@ -23,7 +23,8 @@ from sessions.errors import InputError, SessionDamaged, disk_error
 from sessions.journal import fsync_folder
 from sessions.messages import PNG_START
 from sessions.reader import Capture, Recording
-from sessions.schemas import StepEvent, Topic
+from sessions.schemas import StepEvent, Stroke, Topic
+from sessions.waits import WAIT, unlike
 
 FORMATS = ("png", "npz", "parquet")
 Row = dict[str, Any]
@@ -55,6 +56,8 @@ class Export:
     recording: Recording
     names: dict[str, str]
     """Stroke -> file name of its image, without a suffix: nothing that a file system could refuse."""
+    odd: frozenset[str] = frozenset()
+    """Strokes that waited for their touch unlike the others."""
 
     def captures(self) -> Iterator[tuple[Row, Capture]]:
         """Each stroke as a row of plain values, None where the recording does not tell, with its photograph."""
@@ -84,6 +87,13 @@ class Export:
                 yield PoseRow(current, frame, *times, message.sequence, position, quaternion)
                 frame += 1
 
+    def _wait(self, stroke: Stroke) -> Row:
+        told = stroke.dip_to_touch_s is not None
+        return {
+            WAIT: stroke.dip_to_touch_s,
+            "dip_to_touch_unlike": float(stroke.stroke_id in self.odd) if told else None,
+        }
+
     def _row(self, index: int, capture: Capture) -> Row:
         stroke = capture.stroke
         header = self.recording.header
@@ -98,6 +108,7 @@ class Export:
             "kind": stroke.kind,
             "height_mm": stroke.height_mm,
             "tilt_deg": stroke.tilt_deg,
+            **self._wait(stroke),
             "heading_deg": stroke.heading_deg,
             **_pair("anchor", "mm", stroke.anchor_mm),
             **_pair("anchor", "px", stroke.anchor_px),
@@ -133,7 +144,7 @@ def export(source: Path, out: Path, kind: str) -> Path:
         check_room(out.parent, recording.path.stat().st_size)
         shutil.rmtree(stage, ignore_errors=True)  # left by an export that was killed: a copy
         stage.mkdir()
-        write(Export(recording, _file_names(recording)), stage)
+        write(Export(recording, _file_names(recording), _odd(recording)), stage)
         for path in (stage, *(p for p in stage.rglob("*") if p.is_dir())):
             fsync_folder(path)
         stage.rename(out)  # replaces an empty folder, and no other
@@ -172,6 +183,11 @@ def _file_names(recording: Recording) -> dict[str, str]:
         safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stroke.stroke_id)[:80]
         names[stroke.stroke_id] = f"{number:04d}-{safe}"
     return names
+
+
+def _odd(recording: Recording) -> frozenset[str]:
+    waits = {one.stroke_id: one.dip_to_touch_s for one in recording.stroke_records()}
+    return frozenset(unlike({name: wait for name, wait in waits.items() if wait is not None}))
 
 
 def write_durably(path: Path, data: bytes) -> None:

@@ -83,6 +83,8 @@ class Stroke(Event):
     """Scale in x and y, for imports that tell it."""
     again_of: str | None = None
     """The stroke of an earlier session that this one repeats."""
+    dip_to_touch_s: float | None = Field(default=None, ge=0.0)
+    """From the brush leaving the ink to its tip on the paper; of a figure that dips several times, the longest."""
     commanded: dict[str, float] = Field(default_factory=dict[str, float])
     """Whatever else the source commanded, by name with unit (`length_mm`, `bend_mm`, ...)."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from collect.config import RigConfig
@@ -121,6 +121,10 @@ def _marks(protocol: ProtocolConfig, cell: Cell) -> Iterator[tuple[float, float]
 def _check_touches(path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
     if not isinstance(protocol, CalibrationConfig):
         return
+    if protocol.touches_mm and rig.touch.method == "camera":
+        raise ConfigError(
+            path, "touches_mm", "single touches cannot be found by camera: use force, jog or taught in [touch]"
+        )
     width, height = rig.paper.size_mm
     for x_mm, y_mm in protocol.touches_mm:
         if not (0.0 <= x_mm <= width and 0.0 <= y_mm <= height):
@@ -131,8 +135,17 @@ def _check_touches(path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None
 
 def check_poses(rig_path: Path, rig: RigConfig, protocol: ProtocolConfig, plane: PaperPlane) -> None:
     """The same for poses over this plane: the taught one, or the one that was touched. Raises `ConfigError`."""
+    _check(rig_path, rig, all_poses(rig, protocol, plane))
+
+
+def check_step(rig_path: Path, rig: RigConfig, plane: PaperPlane, step: Step) -> None:
+    """The same for one step without a cell, which the operator asked for. Raises `ConfigError`."""
+    _check(rig_path, rig, ((*pose, step.kind) for pose in moves_of(rig, plane, step, None).poses))
+
+
+def _check(rig_path: Path, rig: RigConfig, poses: Iterable[tuple[Pose, float, str]]) -> None:
     limits, acc_mm_s2 = limits_of(rig), rig.motion.acc_mm_s2
-    for pose, speed_mm_s, where in all_poses(rig, protocol, plane):
+    for pose, speed_mm_s, where in poses:
         try:
             limits.check("robot", pose, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
         except LimitExceeded as error:
@@ -149,8 +162,22 @@ def all_poses(
     yield from ((move.target, move.speed_mm_s, "park") for move in park_moves(rig))
     sheet = sheet_of(rig, protocol)
     cells = [sheet.cell(i) for i in range(sheet.capacity)] if every_cell else sheet.corners
+    # Each step as if it were time for a wash: when that is depends on where a process began.
+    dips = 0 if rig.ink.wash is None else rig.ink.wash.every_dips - 1
     for step in distinct_steps(rig, protocol):
-        for cell in cells if step.kind in MARKING else [None]:
+        for cell, more in _places(step, cells):
             name = str(step.params.get("stroke_id", step.kind))
             where = f"{name} on cell {cell.index}" if cell is not None else name
-            yield from ((pose, speed, where) for pose, speed in moves_of(rig, plane, step, cell).poses)
+            moves = moves_of(rig, plane, step, cell, more, dips=dips)
+            yield from ((pose, speed, where) for pose, speed in moves.poses)
+
+
+def _places(step: Step, cells: list[Cell]) -> Iterator[tuple[Cell | None, tuple[Cell, ...]]]:
+    """Where a step may mark, as `moves_of` wants it: the self-check in one cell, or in the middle of each of three."""
+    if step.kind not in MARKING:
+        yield None, ()
+        return
+    for cell in cells:
+        yield cell, ()
+        if step.kind is StepKind.SELF_CHECK:
+            yield cell, (cell, cell)

@@ -1,4 +1,4 @@
-"""The moves of one step, as the procedures would make them."""
+"""The moves of one step: the lists that the run makes, put together for whoever checks, times or draws them."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from dataclasses import dataclass, field
 from collect.config import RigConfig
 from collect.drawing import Drawn, stroke_moves
 from collect.plane import PaperPlane
-from collect.procedures import CLEARANCE_MM, Move, dip_moves, park_moves, press_moves, wash_moves, zero_touch_moves
-from collect.sheet import Cell, to_base
+from collect.procedures import Move, inking_moves, photograph_moves, press_moves, zero_touch_moves
+from collect.sheet import Cell
 from collect.steps import Step, StepKind
+from collect.touch.config import TouchConfig
+from collect.touch.moves import Room, mark_moves, over, visit_moves
+from collect.touch.places import patch_spots, touch_rects
+from collect.touch.reach import lowest_z_mm
 from collect.touch.selfcheck import triangle_on
-from drivers.geometry import brush_pose
 from drivers.samples import Pose
 
 
@@ -27,81 +30,97 @@ class Way:
 class StepMoves:
     """What a step does, in order, and what it takes besides moving."""
 
-    parts: list[Move | Way] = field(default_factory=list["Move | Way"])
+    parts: list[Move | Way | Room] = field(default_factory=list["Move | Way | Room"])
     dwell_s: float = 0.0
     captures: int = 0
     dips: int = 0
 
     @property
     def poses(self) -> list[tuple[Pose, float]]:
-        """Every pose that is commanded, with its speed."""
+        """Every pose that is commanded, with its speed; the outermost ones where a touch decides by itself."""
         found: list[tuple[Pose, float]] = []
         for part in self.parts:
             match part:
                 case Move():
                     found.append((part.target, part.speed_mm_s))
-                case Way():
+                case Way() | Room():
                     found += [(pose, part.speed_mm_s) for pose in part.poses]
         return found
 
 
 def moves_of(
-    config: RigConfig, plane: PaperPlane, step: Step, cell: Cell | None, more: tuple[Cell, ...] = ()
+    config: RigConfig, plane: PaperPlane, step: Step, cell: Cell | None, more: tuple[Cell, ...] = (), *, dips: int = 0
 ) -> StepMoves:
-    """`cell` is where a press or a figure goes; `more` are the others that a self-check marks."""
+    """`cell` is where a press or a figure goes; `more` are the others that a self-check marks. `dips` were made before
+    the step: they tell where the brush is washed."""
     match step.kind:
-        case StepKind.ZERO_TOUCH:
-            return StepMoves([*zero_touch_moves(config)])
-        case StepKind.TOUCH:
-            return StepMoves([*touch_moves(config, plane, _number(step, "x_mm"), _number(step, "y_mm"))])
+        case StepKind.ZERO_TOUCH | StepKind.TOUCH:
+            return _touches(config, plane, step, dips)
         case StepKind.DIP:
-            wash = config.ink.wash
-            washed = [] if wash is None or step.index % wash.every_dips else wash_moves(config, wash)
-            return StepMoves([*washed, *dip_moves(config)], dips=1)
+            return StepMoves([*inking_moves(config, dips)], dips=1)
         case StepKind.CHOOSE | StepKind.REVIEW:
             return StepMoves()
         case StepKind.BOARD | StepKind.CAPTURE:
-            return StepMoves([*park_moves(config)], captures=1)
+            return StepMoves([*photograph_moves(config)], captures=1)
         case StepKind.PRESS:
             assert cell is not None
             down, up = press_moves(config, plane, cell, _number(step, "height_mm"), _number(step, "tilt_deg"))
             return StepMoves([*down, *up], dwell_s=_number(step, "dwell_s"))
         case StepKind.SELF_CHECK:
             assert cell is not None
-            places_mm = triangle_on((cell, *more), config.self_check)
             moves = [
                 move
-                for x_mm, y_mm in places_mm
-                for move in (*dip_moves(config), *touch_moves(config, plane, x_mm, y_mm))
+                for number, place_mm in enumerate(triangle_on((cell, *more), config.self_check))
+                for move in (*inking_moves(config, dips + number), *mark_moves(config, plane, *place_mm))
             ]
-            return StepMoves([*moves, *park_moves(config)], dips=3, captures=2)
+            return StepMoves([*photograph_moves(config), *moves, *photograph_moves(config)], dips=3, captures=2)
         case StepKind.DRAW:
             assert cell is not None
-            return _figure(config, plane, Drawn.of(step), cell)
+            return _figure(config, plane, Drawn.of(step), cell, dips)
 
 
-def touch_moves(config: RigConfig, plane: PaperPlane, x_mm: float, y_mm: float) -> list[Move]:
-    """Over a point of the sheet, down to clearance, slowly to where the surface is thought to be, and up."""
-    motion, paper = config.motion, config.paper
-    above = brush_pose(*to_base(paper, x_mm, y_mm), motion.safe_z_mm, heading_deg=paper.yaw_deg)
-    return [
-        Move(above, motion.travel_speed_mm_s),
-        Move(plane.pose(paper, x_mm, y_mm, CLEARANCE_MM), motion.travel_speed_mm_s),
-        Move(plane.pose(paper, x_mm, y_mm, 0.0), motion.press_speed_mm_s / 4),
-        Move(above, motion.travel_speed_mm_s),
-    ]
+def touch_of(config: RigConfig, step: Step) -> TouchConfig:
+    """How a ZERO_TOUCH or TOUCH step touches, and where. Raises ValueError for points too few for its method."""
+    asked: dict[str, object] = {}
+    if step.kind is StepKind.TOUCH:
+        asked["points_mm"] = [(_number(step, "x_mm"), _number(step, "y_mm"))]
+    if (method := step.params.get("method")) is not None:
+        # Asked for by the operator, who may also measure where a taught height is configured.
+        asked["method"] = method
+    return TouchConfig.model_validate(config.touch.model_dump() | asked) if asked else config.touch
 
 
-def _figure(config: RigConfig, plane: PaperPlane, drawn: Drawn, cell: Cell) -> StepMoves:
-    parts: list[Move | Way] = []
-    dips = 0
+def _touches(config: RigConfig, plane: PaperPlane, step: Step, dips: int) -> StepMoves:
+    """By force and by jog a touch decides how deep it goes, by camera also where its next spot lies."""
+    touch = touch_of(config, step)
+    if touch.method == "taught":
+        [point] = touch.points_mm if step.kind is StepKind.TOUCH else [None]
+        return StepMoves([*zero_touch_moves(config)] if point is None else [*visit_moves(config, plane, *point)])
+    parts: list[Move | Way | Room] = []
+    for rect_mm in touch_rects(config.paper, touch):
+        x_mm, y_mm, *_ = rect_mm
+        above = over(config, x_mm, y_mm)
+        extent_mm = touch.camera.extent_mm if touch.method == "camera" else 0.0
+        floor_mm = lowest_z_mm(config.paper, touch, x_mm, y_mm, extent_mm)
+        speed_mm_s = max(config.motion.travel_speed_mm_s, config.motion.press_speed_mm_s, touch.speed_mm_s)
+        parts += [above, Room.over(config, rect_mm, floor_mm, speed_mm_s), above]
+    if touch.method != "camera":
+        return StepMoves(parts)
+    count = sum(-(-spots // touch.camera.spots_per_dip) for spots in patch_spots(config.paper, touch))
+    inked = [move for number in range(count) for move in inking_moves(config, dips + number)]
+    return StepMoves([*photograph_moves(config), *inked, *parts, *photograph_moves(config)], dips=count)
+
+
+def _figure(config: RigConfig, plane: PaperPlane, drawn: Drawn, cell: Cell, dips: int) -> StepMoves:
+    parts: list[Move | Way | Room] = []
+    made = 0
     for number, points in enumerate(drawn.strokes):
         if drawn.dips_before(number):
-            parts += dip_moves(config)
-            dips += 1
+            parts += inking_moves(config, dips + made)
+            made += 1
         moves = stroke_moves(config, plane, cell, points, drawn.speed_mm_s)
         parts += [*moves.down, Way(moves.way, moves.speed_mm_s), *moves.up]
-    return StepMoves(parts, dips=dips)
+    return StepMoves(parts, dips=made)
 
 
 def _number(step: Step, name: str) -> float:

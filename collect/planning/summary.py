@@ -9,13 +9,15 @@ from typing import Any
 from collect.config import RigConfig
 from collect.planning.ink import InkNeed, ink_need
 from collect.planning.marks import reach_of
+from collect.planning.moves import StepMoves
 from collect.planning.timing import OMITTED, step_s
-from collect.planning.walk import sheet_of, walk
+from collect.planning.walk import Walked, sheet_of, walk
 from collect.procedures import park_moves
 from collect.protocols.config import AdaptiveConfig, ProtocolConfig, ReplayConfig, WriteConfig
 from collect.protocols.plans import planned
 from collect.sheet import Cell, Sheet
 from collect.steps import StepKind
+from drivers.samples import Pose
 
 STROKES = frozenset({StepKind.PRESS, StepKind.DRAW})
 
@@ -52,7 +54,7 @@ class Plan:
     seconds: float
     seconds_by_kind: dict[str, float]
     touches_mm: tuple[tuple[float, float], ...]
-    """In the paper frame, the taught point first."""
+    """In the paper frame, those of zero touch first."""
     warnings: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
@@ -67,14 +69,17 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
     changes: list[str] = []
     kinds: Counter[str] = Counter()
     seconds: dict[str, float] = {}
-    touches = [config.paper.touch_point_mm]
+    measured = config.touch.method != "taught" and config.touch.points_mm
+    touches = list(measured or [config.paper.touch_point_mm])
     dips = poses = 0
     here = park_moves(config)[-1].target
     for walked in walk(config, protocol):
         step = walked.step
         kind = str(step.kind)
         kinds[kind] += 1
+        wait_s = _wait_s(config, protocol, here, walked)
         took_s, here = step_s(config, here, walked.moves)
+        took_s += wait_s
         seconds[kind] = seconds.get(kind, 0.0) + took_s
         dips += walked.moves.dips
         poses += len(walked.moves.poses)
@@ -110,6 +115,14 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         touches_mm=tuple(dict.fromkeys(touches)),
         warnings=tuple(_warnings(config, protocol, sheet)),
     )
+
+
+def _wait_s(config: RigConfig, protocol: ProtocolConfig, here: Pose, walked: Walked) -> float:
+    """What a wait for the ink adds once the arm is over the cell; of a figure, before its first stroke."""
+    if protocol.wait_after_dip_s is None or walked.step.kind not in STROKES:
+        return 0.0
+    over_s, _ = step_s(config, here, StepMoves(walked.moves.parts[:1]))
+    return max(0.0, protocol.wait_after_dip_s - over_s)
 
 
 def _warnings(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list[str]:

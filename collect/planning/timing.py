@@ -8,6 +8,7 @@ from collect.config import RigConfig
 from collect.planning.moves import StepMoves, Way
 from collect.procedures import Move
 from collect.rig import limits_of
+from collect.touch.moves import Room
 from drivers.limits import Limits
 from drivers.samples import Pose
 
@@ -67,5 +68,9 @@ def step_s(config: RigConfig, here: Pose, moves: StepMoves) -> tuple[float, Pose
             case Way():
                 took_s = way_s(here, part, acc_mm_s2, limits)
                 here = part.poses[-1]
+            case Room():
+                # Once down: how often a measured touch comes down is not known before.
+                took_s = move_s(here, part.poses[0], part.speed_mm_s, acc_mm_s2, limits)
+                here = part.poses[0]
         total_s += took_s + SETTLE_S
     return total_s, here

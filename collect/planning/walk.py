@@ -57,7 +57,7 @@ def walk(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
     The sheet must have room for a cell.
     """
     plane, sheet = PaperPlane(config.paper.touch_z_mm), sheet_of(config, protocol)
-    number = 0
+    number = dips = 0
     used: set[int] = set()
     generator = steps_on(config, protocol)
     try:
@@ -77,7 +77,9 @@ def walk(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
             elif step.kind == StepKind.CAPTURE:
                 shown = int(step.params["sheet"] or 0)
                 cell = sheet.cell(int(step.params["cell"] or 0))
-            yield Walked(step, shown + 1, cell, moves_of(config, plane, step, cell, more), list(more))
+            moves = moves_of(config, plane, step, cell, more, dips=dips)
+            dips += moves.dips
+            yield Walked(step, shown + 1, cell, moves, list(more))
             step = generator.send(answer)
     except StopIteration:
         return

@@ -26,6 +26,11 @@ class ProtocolBase(Config):
     board_every: Annotated[int, Field(ge=1, le=MAX_STROKES)] | None = None
     """Look at the board again after so many strokes, to see whether camera or sheet moved; left out, only at the
     start."""
+    wait_after_dip_s: Annotated[float, Field(ge=0.0, le=600.0)] | None = Field(
+        default=None, exclude_if=lambda wait_s: wait_s is None
+    )
+    """Wait over the cell until so much time has passed since the brush left the ink; left out, it presses at once, and
+    a protocol reads as it did before there were waits."""
 
 
 class GridConfig(ProtocolBase):
@@ -233,6 +238,8 @@ class CalibrationConfig(ProtocolBase):
     def _apart(self) -> CalibrationConfig:
         if self.board_every is not None:
             raise ValueError("board_every counts strokes, and this protocol has none: use board_views")
+        if self.wait_after_dip_s is not None:
+            raise ValueError("wait_after_dip_s: this protocol has no dips")
         if len(set(self.touches_mm)) != len(self.touches_mm):
             raise ValueError("touches_mm has the same point twice: use rounds")
         _bounded((len(self.touches_mm) + self.board_views) * self.rounds)

@@ -19,7 +19,7 @@ from collect.touch.arm import TouchArm
 from collect.touch.config import CameraTouchConfig, TouchConfig
 from collect.touch.contact import first_ink
 from collect.touch.ink import gray, ink_at
-from collect.touch.reach import Known, Reach
+from collect.touch.reach import Known, Reach, lowest_z_mm
 from collect.touch.results import PointTouches, Touch, at_one_point
 from drivers.samples import Frame
 
@@ -46,7 +46,11 @@ class Hands(Protocol):
 class Patch:
     """The places of one point's spots, from its lower left: to and fro, so that neighbours in time are neighbours."""
 
-    def __init__(self, at_mm: tuple[float, float], config: CameraTouchConfig, sheet_mm: tuple[float, float]) -> None:
+    def __init__(
+        self, at_mm: tuple[float, float], config: CameraTouchConfig, sheet_mm: tuple[float, float], lowest_z_mm: float
+    ) -> None:
+        """No spot lies lower than `lowest_z_mm`."""
+        self.lowest_z_mm = lowest_z_mm
         self._at_mm = at_mm
         self._sheet_mm = sheet_mm
         self._config = config
@@ -99,15 +103,15 @@ class FirstInkTouch:
 
         Along a row the sheet's lean would else pass for height. Raises `StepError`.
         """
-        known = Known(self._rig.config.paper, self._config)
-        patches = [Patch(point, self._config.camera, self._rig.config.paper.size_mm) for point in points_mm]
+        paper, extent_mm = self._rig.config.paper, self._config.camera.extent_mm
+        known = Known(paper, self._config)
+        patches = [
+            Patch(point, self._config.camera, paper.size_mm, lowest_z_mm(paper, self._config, *point, extent_mm))
+            for point in points_mm
+        ]
         rough: list[Touch] = []
         for patch, point in zip(patches, points_mm, strict=True):
-            rough.append(
-                await self._coarse(
-                    patch, known.reach(*point, (self._config.camera.columns - 1) * self._config.camera.pitch_mm)
-                )
-            )
+            rough.append(await self._coarse(patch, known.reach(*point, extent_mm)))
             known.add(rough[-1].x_mm, rough[-1].y_mm, rough[-1].z_mm)
         rounds = [rough]
         for k in range(self._config.touches):
@@ -143,7 +147,8 @@ class FirstInkTouch:
         for k in range(fine_count(camera)):
             x, y = patch.take()
             along_mm = lean.touch_z_mm(x, y) - lean.touch_z_mm(around.x_mm, around.y_mm)
-            spots.append((x, y, around.z_mm + along_mm + highest_mm - k * camera.fine_step_mm))
+            z_mm = around.z_mm + along_mm + highest_mm - k * camera.fine_step_mm
+            spots.append((x, y, max(z_mm, patch.lowest_z_mm)))
             await self._touch(spots[-1])
         return self._between(spots, await self._ink(before, spots), camera.fine_step_mm)
 

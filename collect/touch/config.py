@@ -62,6 +62,11 @@ class CameraTouchConfig(Config):
     least_ink_mm2: Annotated[float, Field(gt=0.0, le=10.0)] = 0.25
     """Darkening that counts as ink: area times how much darker it became, 1 being black."""
 
+    @property
+    def extent_mm(self) -> float:
+        """Length of a row."""
+        return (self.columns - 1) * self.pitch_mm
+
 
 class JogTouchConfig(Config):
     """Zero touch by the operator's jog."""

@@ -18,22 +18,33 @@ Rect = tuple[float, float, float, float]
 """x, y, width, height in the paper frame."""
 
 
-def touched_rects(paper: PaperConfig, config: TouchConfig) -> list[Rect]:
-    """The paper that zero touch may ink: nothing for the taught height, a patch for each point by camera."""
+def touch_rects(paper: PaperConfig, config: TouchConfig) -> list[Rect]:
+    """Where a measured zero touch lets the tip down: at points, by camera within a patch for each point."""
     match config.method:
         case "taught":
             return []
         case "force" | "jog":
-            return [_around(*point) for point in config.points_mm or [paper.touch_point_mm]]
+            return [(x, y, 0.0, 0.0) for x, y in config.points_mm or [paper.touch_point_mm]]
         case "camera":
-            known, camera = Known(paper, config), config.camera
-            rects: list[Rect] = []
-            for x, y in config.points_mm:
-                reach = known.reach(x, y, (camera.columns - 1) * camera.pitch_mm)
-                spots = coarse_count(camera, reach) + config.touches * fine_count(camera)
-                rows = math.ceil(spots / camera.columns)
-                rects.append((x, y, (camera.columns - 1) * camera.pitch_mm, (rows - 1) * camera.pitch_mm))
-            return [(x - MARK_MM, y - MARK_MM, w + 2 * MARK_MM, h + 2 * MARK_MM) for x, y, w, h in rects]
+            pitch_mm, columns = config.camera.pitch_mm, config.camera.columns
+            rows = [math.ceil(spots / columns) for spots in patch_spots(paper, config)]
+            return [
+                (x, y, (columns - 1) * pitch_mm, (count - 1) * pitch_mm)
+                for (x, y), count in zip(config.points_mm, rows, strict=True)
+            ]
+
+
+def patch_spots(paper: PaperConfig, config: TouchConfig) -> list[int]:
+    """Spots of each point's patch by camera, at most."""
+    known, camera = Known(paper, config), config.camera
+    reaches = [known.reach(x, y, camera.extent_mm) for x, y in config.points_mm]
+    return [coarse_count(camera, reach) + config.touches * fine_count(camera) for reach in reaches]
+
+
+def touched_rects(paper: PaperConfig, config: TouchConfig) -> list[Rect]:
+    """The paper that zero touch may ink: nothing for the taught height."""
+    m = MARK_MM
+    return [(x - m, y - m, w + 2 * m, h + 2 * m) for x, y, w, h in touch_rects(paper, config)]
 
 
 def used_cells(sheet: Sheet, paper: PaperConfig, config: TouchConfig, check_mm: Triangle | None = None) -> set[int]:
@@ -41,13 +52,10 @@ def used_cells(sheet: Sheet, paper: PaperConfig, config: TouchConfig, check_mm: 
 
     A cell counts where a mark reaches more than `MARK_MM` into it: touch points in the sheet's margin cost no cell.
     """
-    rects = touched_rects(paper, config) + [_around(*place) for place in check_mm or ()]
+    m = MARK_MM
+    rects = touched_rects(paper, config) + [(x - m, y - m, 2 * m, 2 * m) for x, y in check_mm or ()]
     cells = [sheet.cell(index) for index in range(sheet.capacity)]
     return {cell.index for cell in cells for rect in rects if _reaches_into(rect, cell.rect_mm)}
-
-
-def _around(x_mm: float, y_mm: float) -> Rect:
-    return x_mm - MARK_MM, y_mm - MARK_MM, 2.0 * MARK_MM, 2.0 * MARK_MM
 
 
 def _reaches_into(rect: Rect, cell: Rect) -> bool:

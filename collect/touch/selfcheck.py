@@ -26,6 +26,7 @@ from collect.touch.camera import Hands
 from collect.touch.config import SelfCheckConfig
 from collect.touch.ink import gray
 from collect.touch.marks import new_marks
+from collect.touch.moves import CHECK_SPEED_MM_S, mark_moves
 from drivers.samples import Frame
 
 Floats = NDArray[np.float64]
@@ -38,8 +39,6 @@ MOST_OF_SHEET = 0.25
 """Share of a sheet's cells that a check may take; smaller sheets are checked in one cell."""
 MOST_MARK_MM2 = 400.0
 """Of ink: a brush that is pressed 10 mm deep leaves less."""
-APPROACH_MM = 4.0
-"""Height above the paper at which a mark's slow approach begins."""
 MIRRORS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "mirrored in x": ((-1.0, 0.0), (0.0, 1.0)),
     "mirrored in y": ((1.0, 0.0), (0.0, -1.0)),
@@ -121,25 +120,23 @@ def triangle_on(cells: Sequence[Cell], config: SelfCheckConfig) -> Triangle:
     return triangle_of(cells) if len(cells) == 3 else triangle_in(cells[0], config)
 
 
-async def self_check(
-    rig: Rig, hands: Hands, config: SelfCheckConfig, places_mm: Triangle, plane: PaperPlane, slow_mm_s: float = 5.0
-) -> SelfCheck:
+async def self_check(rig: Rig, hands: Hands, places_mm: Triangle, plane: PaperPlane) -> SelfCheck:
     """Press the marks, photograph them and judge. The arm begins and ends at travel height; the places are burnt.
 
     Raises `StepError` with the figures where the marks are not found, mirrored, turned, of another scale or displaced.
     """
-    commanded = np.array(places_mm, np.float64)
+    config, commanded = rig.config.self_check, np.array(places_mm, np.float64)
     if abs(float(np.linalg.det(commanded[1:] - commanded[0]))) < 1.0 or _second_best(commanded) < UNEVEN:
         raise StepError("the self-check's triangle is too even, or too flat, to tell a mirror image")
-    arm = TouchArm(rig, slow_mm_s)
+    arm = TouchArm(rig, CHECK_SPEED_MM_S)
     async with arm.lifted_after():
         before = await hands.capture()
         for x_mm, y_mm in places_mm:
             await hands.dip()
-            surface_z_mm = plane.touch_z_mm(x_mm, y_mm)
-            await arm.over(x_mm, y_mm)
-            await arm.near(x_mm, y_mm, surface_z_mm + APPROACH_MM)
-            await arm.press(x_mm, y_mm, surface_z_mm - config.depth_mm)
+            above, near, *pressing = mark_moves(rig.config, plane, x_mm, y_mm)
+            await arm.go(above)
+            await arm.go(near)
+            await arm.sequence(pressing)
         after = await hands.capture()
     found_mm = await asyncio.to_thread(_find, rig, before, after, config)
     return judge(commanded, found_mm, config)

@@ -217,7 +217,8 @@ class ReviewScreen(Screen[None]):
 def _row_content(seen: Seen) -> Content:
     sign, style = ("✓", "") if counts(seen) else ("!", "bold $text-warning")
     noted = " ✎" if seen.remark is not None and seen.remark.note else ""
-    return Content.assemble((sign, style), f" {one_line(seen.stroke_id)}{noted}")
+    waited = " dip?" if seen.unlike else ""
+    return Content.assemble((sign, style), f" {one_line(seen.stroke_id)}{noted}", (waited, "bold $text-warning"))
 
 
 def _words(
@@ -236,6 +237,10 @@ def _words(
         Content.assemble(("MCAP      ", "dim"), _where(seen, looked, folder)),
         Content.assemble(("Repeats   ", "dim"), _alike_text(alike, (seen.height_mm, seen.tilt_deg))),
     ]
+    if seen.unlike:
+        lines.append(Content.assemble(("Waited    ", "dim"), (f"! {seen.unlike}", "bold $text-warning")))
+    elif seen.waited_s is not None:
+        lines.append(Content.assemble(("Waited    ", "dim"), f"{seen.waited_s:.1f} s from dip to touch"))
     if seen.remark is not None and seen.remark.note:
         lines.append(Content.assemble(("Note      ", "dim"), plain(seen.remark.note)))
     return Content("\n").join(lines)

@@ -15,6 +15,7 @@ from collect.wishes import Wish
 from collect.work.choosing import measured
 from collect.work.context import Bench, Job
 from collect.work.looking import Gray, camera_delay, image_plane, photograph
+from collect.work.waited import wait_check
 from collect.work.waiting import uninterrupted
 from sessions.schemas import Check, Quality, Stroke
 
@@ -32,7 +33,8 @@ async def capture(job: Job) -> Result:
         raise StepError(f"{stroke_id} lies on another sheet than the one that is in")
     cell = bench.sheet.cell(int(job.number("cell")))
     image = await photograph(job)
-    verdict = await _judged(job, image, cell)
+    waited = wait_check(job)
+    verdict = await _judged(job, image, cell, waited)
     bench.known.sound_frame = image
     if bench.asker.watched:
         await uninterrupted(_show, job, verdict, image, cell, True)
@@ -48,7 +50,7 @@ async def capture(job: Job) -> Result:
     if not kept:
         bench.progress.looked_at(kept=False)
     if kept:
-        job.recorder.stroke(_stroke(job, cell))
+        job.recorder.stroke(_stroke(job, cell, None if waited is None else waited.score))
     return {
         "stroke_id": stroke_id,
         "still": job.attempt.serial,
@@ -62,8 +64,10 @@ async def capture(job: Job) -> Result:
     }
 
 
-async def _judged(job: Job, image: Gray, cell: Cell) -> Verdict | None:
-    bench = job.bench
+async def _judged(job: Job, image: Gray, cell: Cell, waited: Check | None) -> Verdict | None:
+    bench, stroke_id = job.bench, str(job.step.params["stroke_id"])
+    if waited is not None and not waited.passed:
+        bench.progress.log(f"{stroke_id}: {waited.reason}", warning=True)
     if not bench.rig.config.quality.enabled:
         return None
     with job.recorder.sections.timed("judge the capture"):
@@ -72,8 +76,8 @@ async def _judged(job: Job, image: Gray, cell: Cell) -> Verdict | None:
         Check(name=c.name, score=c.score, threshold=c.threshold, passed=c.passed, reason=c.reason)
         for c in verdict.checks
     )
-    stroke_id = str(job.step.params["stroke_id"])
-    job.recorder.quality(Quality(stroke_id=stroke_id, checks=checks), job.attempt.serial)
+    remarks = () if waited is None else (waited,)
+    job.recorder.quality(Quality(stroke_id=stroke_id, checks=(*checks, *remarks)), job.attempt.serial)
     if verdict.cause is not None:
         bench.progress.log(f"{stroke_id}: {verdict.reason}", warning=True)
         if verdict.cause.name.family is Family.PICTURE:
@@ -113,7 +117,8 @@ async def _decide(job: Job, verdict: Verdict, image: Gray, cell: Cell) -> tuple[
         f"{stroke_id}, take {take}: {verdict.reason}", (KEEP, AGAIN, SKIP), SKIP.key, image=_cut_out(bench, image, cell)
     )
     try:
-        answer = await bench.asker.ask(prompt)
+        with bench.progress.meanwhile("wait for an answer"):
+            answer = await bench.asker.ask(prompt)
     except NeedsOperator:
         bench.progress.log(f"{stroke_id}: given up", warning=True)
         return False, False
@@ -147,7 +152,7 @@ def _cut_out(bench: Bench, image: Gray, cell: Cell) -> Gray:
     return image[max(0, top - m) : bottom + m, max(0, left - m) : right + m]
 
 
-def _stroke(job: Job, cell: Cell) -> Stroke:
+def _stroke(job: Job, cell: Cell, dip_to_touch_s: float | None) -> Stroke:
     return Stroke(
         stroke_id=str(job.step.params["stroke_id"]),
         kind="drag" if _drawn(job) else "press",
@@ -157,4 +162,5 @@ def _stroke(job: Job, cell: Cell) -> Stroke:
         cell_mm=cell.rect_mm,
         anchor_mm=cell.anchor_mm,
         again_of=None if job.step.params.get("again_of") is None else str(job.step.params["again_of"]),
+        dip_to_touch_s=dip_to_touch_s,
     )

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 class Known:
     """What one process has found out and does not keep: a new one looks again."""
 
-    inked: bool = False
-    """Whether the brush was dipped and has not marked since."""
+    left_ink_ns: int | None = None
+    """When the brush left the ink, by the host's clock; None where it has marked since, or may have lost it."""
     image_plane: PlaneFit | None = None
     """Of the newest frame in which the board was seen."""
     sound_frame: Gray | None = None

@@ -1,14 +1,16 @@
-"""Into the ink and out again."""
+"""Into the ink and out again; looked at the paper before, so that the ink does not wait for that."""
 
 from __future__ import annotations
 
 from collect.inking import InkSeen
 from collect.steps import Result
 from collect.work.context import Job
+from collect.work.looking import look_at_sheet
 
 
 async def dip(job: Job) -> Result:
     """The DIP step."""
+    await look_at_sheet(job)
     seen = await fill_brush(job)
     return {} if seen.level is None else {"ink_level": seen.level, "dosed_ml": seen.dosed_ml}
 
@@ -16,10 +18,11 @@ async def dip(job: Job) -> Result:
 async def fill_brush(job: Job) -> InkSeen:
     """Fill up the well if need be, then dip."""
     bench = job.bench
-    seen = await bench.inking.before_dip()
-    if bench.rig.ink is not None:
-        job.recorder.ink(seen.level, seen.dosed_ml, seen.light)
-        bench.progress.inked(seen.level)
-    await job.guard.guarded(bench.procedures.dip())
-    bench.known.inked = True
+    with bench.progress.meanwhile("dip"):
+        seen = await bench.inking.before_dip()
+        if bench.rig.ink is not None:
+            job.recorder.ink(seen.level, seen.dosed_ml, seen.light)
+            bench.progress.inked(seen.level)
+        await job.guard.guarded(bench.procedures.dip())
+        bench.known.left_ink_ns = bench.rig.clock.now_ns()
     return seen

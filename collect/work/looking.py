@@ -35,14 +35,17 @@ async def board(job: Job) -> Result:
 async def look_at_sheet(job: Job) -> None:
     """Once for each sheet that is in: every free cell must be blank. Raises `NeedsOperator`.
 
-    The operator says that a fresh sheet is in; the camera says whether that is so before ink goes on ink.
+    The operator says that a fresh sheet is in; the camera says whether that is so before ink goes on ink. A brush that
+    was full of ink meanwhile counts as dry.
     """
     bench = job.bench
     sheet = bench.store.state.sheet
     if bench.known.looked_at_sheet == sheet or not bench.rig.config.quality.enabled:
         return
-    image = await photograph(job)
-    inked = await uninterrupted(_inked_cells, bench, image, job.cell.index if job.cell is not None else None)
+    bench.known.left_ink_ns = None
+    with bench.progress.meanwhile("look whether the sheet is blank"):
+        image = await photograph(job)
+        inked = await uninterrupted(_inked_cells, bench, image, job.cell.index if job.cell is not None else None)
     if inked:
         raise NeedsOperator(
             f"{len(inked)} cells of sheet {sheet + 1} that should be blank are not: {inked[0]} "

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from pathlib import Path
 
 from collect.asking import Choice, Prompt
 from collect.errors import ConfigError, StepError
 from collect.plane import PaperPlane
-from collect.planning.limits import check_poses
-from collect.planning.moves import touch_moves
+from collect.planning.limits import check_poses, check_step
+from collect.planning.moves import touch_of
 from collect.steps import Result
 from collect.touch.config import TouchConfig
 from collect.touch.jog import asked
 from collect.touch.measure import measure_plane
+from collect.touch.moves import visit_moves
 from collect.touch.results import PlaneResult
 from collect.touch.selfcheck import self_check, triangle_on
 from collect.touch.tap import ForceTap
@@ -30,12 +32,10 @@ async def zero_touch(job: Job) -> Result:
     await bench.inking.begin()
     if rig.force is not None and rig.config.force is not None:
         await rig.force.bias(rig.config.force.bias_s)
-    config = rig.config.touch
-    if (method := job.step.params.get("method")) is not None:
-        # Asked for by the operator, who may also measure where a taught height is configured.
-        config = TouchConfig.model_validate(config.model_dump() | {"method": method})
-    found = await _measured(job, config)
-    await _check_plane(job, found.plane)
+    if "method" in job.step.params:
+        await _check(check_step, "", rig.config, bench.procedures.plane, job.step)
+    found = await _measured(job, touch_of(rig.config, job.step))
+    await _check(check_poses, "over the paper as it was touched, ", rig.config, bench.protocol, found.plane)
     moved_mm = _moved_mm(found, bench.procedures.plane)
     if found.method != "taught":
         bench.progress.log(f"zero touch by {found.method}: the paper lies {moved_mm:+.2f} mm from where it was before")
@@ -64,22 +64,21 @@ async def _accepted(job: Job, moved_mm: float) -> None:
 
 
 async def touch(job: Job) -> Result:
-    """The TOUCH step: one point, by the method of the rig. Raises `StepError` by camera, which needs three."""
-    bench, point = job.bench, (job.number("x_mm"), job.number("y_mm"))
-    config = bench.rig.config.touch
-    if config.method == "camera":
-        raise StepError("single touches cannot be found by camera: use force, jog or taught in [touch]")
+    """The TOUCH step: one point, by the method of the rig."""
+    bench = job.bench
+    config = touch_of(bench.rig.config, job.step)
     if config.method == "taught":
+        [point] = config.points_mm
         z_mm = await job.guard.guarded(_visited(bench, point))
         return {"x_mm": point[0], "y_mm": point[1], "z_mm": z_mm, "method": "taught"}
-    found = await _measured(job, config.model_copy(update={"points_mm": [point]}))
+    found = await _measured(job, config)
     x_mm, y_mm, z_mm = found.points[0].mean
     return {"x_mm": x_mm, "y_mm": y_mm, "z_mm": z_mm, "span_mm": found.points[0].span_mm, "method": found.method}
 
 
 async def _visited(bench: Bench, point: tuple[float, float]) -> float:
     """The height at which the arm rests where the surface is thought to be."""
-    *down, up = touch_moves(bench.rig.config, bench.procedures.plane, *point)
+    *down, up = visit_moves(bench.rig.config, bench.procedures.plane, *point)
     for move in down:
         await bench.procedures.go(move)
     z_mm = (await bench.rig.robot.where()).z_mm
@@ -91,10 +90,9 @@ async def check_rig(job: Job) -> Result:
     """The SELF_CHECK step: an uneven triangle on cells of its own tells a mirrored, turned or stretched rig."""
     bench, cell = job.bench, job.cell
     assert cell is not None
-    config = bench.rig.config.self_check
     cells = (cell, *job.more_cells)
-    places_mm = triangle_on(cells, config)
-    checked = await job.guard.guarded(self_check(bench.rig, _Hands(job), config, places_mm, bench.procedures.plane))
+    places_mm = triangle_on(cells, bench.rig.config.self_check)
+    checked = await job.guard.guarded(self_check(bench.rig, _Hands(job), places_mm, bench.procedures.plane))
     marked = {"sheet": bench.store.state.sheet, "cell": cell.index, "cells": [one.index for one in cells]}
     return {**checked.as_dict(), **marked}
 
@@ -110,8 +108,9 @@ class _Hands:
         return await self._job.bench.procedures.zero_touch()
 
     async def dip(self) -> None:
-        """Into the well and out again."""
+        """Into the well and out again; the touch that follows takes ink, so no press may count on this dip."""
         await fill_brush(self._job)
+        self._job.bench.known.left_ink_ns = None
 
     async def capture(self) -> Frame:
         """Park, and a fresh frame."""
@@ -131,10 +130,9 @@ async def _measured(job: Job, config: TouchConfig) -> PlaneResult:
         return await job.guard.guarded(measured)
 
 
-async def _check_plane(job: Job, plane: PaperPlane) -> None:
-    bench = job.bench
+async def _check(check: Callable[..., None], where: str, *checked: object) -> None:
     try:
         # Seconds for a long protocol: beside the loop, so that a stop is heard meanwhile.
-        await asyncio.to_thread(check_poses, Path("rig.toml"), bench.rig.config, bench.protocol, plane)
+        await asyncio.to_thread(check, Path("rig.toml"), *checked)
     except ConfigError as error:
-        raise StepError(f"over the paper as it was touched, {error.what}") from None
+        raise StepError(f"{where}{error.what}") from None

@@ -166,6 +166,9 @@ def test_a_full_sheet_asks_for_a_fresh_one_and_goes_on_with_it(lab: Lab) -> None
 
     with pytest.raises(SheetFull, match="--sheet 2"):
         run(lab.engine())
+    [folder] = lab.sessions.iterdir()
+    begun = [line["kind"] for line in read_lines(folder / "journal.jsonl") if line["event"] == "begin"]
+    assert begun[-1] == "capture", "no brush was dipped for a sheet that was full"
     run_and_stop(lab.engine(sheet=2), lambda now: now.strokes_done == 5)
     with pytest.raises(ConfigError, match="only 2 or 3"):
         run(lab.engine(sheet=5))

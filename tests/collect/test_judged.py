@@ -85,13 +85,15 @@ def test_an_operator_who_watches_may_keep_it(sharp_lab: Lab) -> None:
     assert (engine.snapshot().strokes_done, engine.snapshot().given_up) == (1, 0)
 
 
-def test_ink_on_a_cell_that_should_be_blank_is_seen_before_the_press(sharp_lab: Lab) -> None:
+def test_ink_on_a_cell_that_should_be_blank_is_seen_before_the_brush_is_dipped(sharp_lab: Lab) -> None:
     world = sharp_lab.rig.world
+    ink_ml = world.well.ml
     world.paper.lay(world.brush.press(13.0, 0.0, ink_load=1.0, press_seed=5), 31.0, 159.0, 0.0)
     world.version += 1
     with pytest.raises(NeedsOperator, match=r"cells? of sheet 1 that should be blank"):
         run(sharp_lab.engine())
     assert not [press for press in world.presses if press.depth_mm > 1.0]
+    assert world.well.ml == ink_ml
 
 
 def test_a_full_sheet_is_changed_on_the_screen_and_the_run_goes_on(sharp_lab: Lab) -> None:

@@ -123,6 +123,53 @@ def test_what_cannot_be_done_is_named_before_anything_is_connected(
         check_protocol(tmp_path / "rig.toml", tmp_path / "protocol.toml", config, protocol(tmp_path, text))
 
 
+MOTION = "\n[motion]"
+BY_JOG = MOTION, '\n[touch]\nmethod = "jog"\npoints_mm = [[2.0, 2.0], [240.0, 9.0]]\n' + MOTION
+DEEP_TOUCH = MOTION, '\n[touch]\nmethod = "force"\ntravel_mm = 20.0\npoints_mm = [[200.0, 9.0]]\n' + MOTION
+DEEP_CHECK = MOTION, "\n[self_check]\nenabled = true\ndepth_mm = 10.0\n" + MOTION
+SOFT = "max_depth_mm = 22.0", "max_depth_mm = 9.5"
+FAR_POT = MOTION, "\n[ink.wash]\npot_mm = [360.0, 20.0]\ndip_z_mm = 125.0\nevery_dips = 2\n" + MOTION
+LISTED = 'kind = "list"\npresses = [{height_mm = 9.0}]\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "changes", "message"),
+    [
+        (LISTED, (BY_JOG, ("260.0]\nz_mm", "100.0]\nz_mm")), r"y = 130.000 mm is outside .*\(zero_touch\)"),
+        (LISTED, (DEEP_TOUCH,), r"z = 96\.\d+ mm is outside .*\(zero_touch\)"),
+        (LISTED, (DEEP_CHECK, SOFT), r"z = 110.030 mm is outside .*\(self_check on cell 0\)"),
+        (LISTED, (FAR_POT, ("260.0]\nz_mm", "240.0]\nz_mm")), r"y = 250.000 mm is outside .*\(dip\)"),
+        (figure(HERE, THERE), (FAR_POT, ("260.0]\nz_mm", "240.0]\nz_mm")), r"y = 250.000 mm is outside .*\(dip\)"),
+        (
+            'kind = "calibration"\ntouches_mm = [[9.0, 9.0]]\n',
+            ((MOTION, BY_JOG[1].replace("jog", "camera").replace("240.0, 9.0", "240.0, 9.0], [9.0, 90.0")),),
+            r"protocol.toml: touches_mm: single touches cannot be found by camera",
+        ),
+    ],
+)
+def test_touches_that_are_measured_the_self_check_and_the_wash_are_checked_as_they_will_be_made(
+    tmp_path: Path, text: str, changes: tuple[tuple[str, str], ...], message: str
+) -> None:
+    changed = RIG
+    for old, new in changes:
+        assert old in changed
+        changed = changed.replace(old, new)
+    config = rig(tmp_path, text=changed)
+    with pytest.raises(ConfigError, match=message):
+        check_protocol(tmp_path / "rig.toml", tmp_path / "protocol.toml", config, protocol(tmp_path, text))
+
+
+def test_washes_are_counted_where_they_fall_also_within_a_figure(tmp_path: Path) -> None:
+    config = rig(tmp_path, *FAR_POT)
+    washed: list[tuple[str, int]] = []
+    for one in walk(config, example("protocol-write.toml")):
+        assert config.ink.wash is not None
+        bottom = [pose for pose, _ in one.moves.poses if pose.z_mm == config.ink.wash.dip_z_mm]
+        washed.append((str(one.step.kind), len(bottom) // config.ink.wash.strokes))
+    # Every second dip of the process: the first figure's second one lies within it.
+    assert [pair for pair in washed if pair[0] in ("dip", "draw")] == [("dip", 0), ("draw", 1), ("dip", 0), ("draw", 1)]
+
+
 def test_the_outermost_cells_stand_for_all(tmp_path: Path) -> None:
     config, wanted, plane = rig(tmp_path), example("protocol.toml"), PaperPlane(120.0, 0.01, -0.02)
     corners = [pose for pose, _, _ in all_poses(config, wanted, plane)]

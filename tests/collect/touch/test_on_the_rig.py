@@ -8,13 +8,18 @@ from pathlib import Path
 import pytest
 
 from collect.config import load_rig
+from collect.plane import PaperPlane
+from collect.planning.moves import moves_of
 from collect.procedures import Procedures
 from collect.rig import connected
+from collect.steps import Step, StepKind
 from collect.touch.config import TouchConfig
 from collect.touch.measure import measure_plane
 from drivers.clock import HostClock
+from drivers.samples import Pose
 from drivers.sim.config import SimConfig, Table, View
 from drivers.sim.rig import LoopbackRig
+from tests.collect.sent import not_checked, noting
 
 VIEW = View(width_px=512, height_px=384, px_per_mm=1.56, fps=50.0)
 QUICK = {"fast_samples": 12, "medium_samples": 25, "slow_samples": 150, "sigma_mm": 0.03}
@@ -31,11 +36,17 @@ async def test_a_sheet_that_lies_lower_than_taught_is_found_and_the_brush_is_lif
         async with connected(config, HostClock(), lambda _notice: None) as rig:
             assert rig.force is not None
             await rig.robot.enable()
+            sent: list[Pose] = []
+            noting(loopback.world.motion, sent.append)
             await rig.force.bias(0.5)
             touch = TouchConfig(method="force", touches=2, force=QUICK)  # pyright: ignore[reportArgumentType]
             result = await measure_plane(rig, Procedures(rig), touch)
             at_mm = (await rig.robot.where()).position_mm
 
+    asked = config.model_copy(update={"touch": touch})
+    planned = moves_of(asked, PaperPlane(config.paper.touch_z_mm), Step(StepKind.ZERO_TOUCH, 0), None)
+    assert len(sent) > 10
+    assert not not_checked(config, sent, planned.parts)
     [point] = result.points
     truth_mm = table.surface_z_mm(*config.paper.touch_point_mm)
     assert [t.z_mm for t in point.touches] == pytest.approx([truth_mm] * 2, abs=0.12)

@@ -95,7 +95,7 @@ def test_no_turn_passes_for_a_mirror_nor_a_mirror_for_a_turn(noise: int, turn_de
 
 
 async def checked(bench: Bench, places: Triangle = PLACES) -> SelfCheck:
-    return await self_check(bench.rig, bench.hands, CONFIG, places, PaperPlane(120.0))
+    return await self_check(bench.rig, bench.hands, places, PaperPlane(120.0))
 
 
 async def test_marks_on_the_loopback_sheet_are_found_and_pass(make_bench: MakeBench) -> None:

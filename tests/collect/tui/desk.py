@@ -39,6 +39,9 @@ FINDINGS = [
 ]
 
 
+LATE = "touched the paper 10.2 s after its dip, the others after 1.1 s"
+
+
 class FakeDesk(Desk):
     """Two sessions, one cut in its middle, and a rig with trouble."""
 
@@ -82,9 +85,9 @@ class FakeReview(Review):
         self.open = False
         bad = Remark(7, "H13-a0-r02", True, "smudged, 墨 ran", 1)
         self.captures = (
-            Seen("H13-a0-r01", 13.0, 0.0, 4, True, "", "0004-capture-a.mcap", None),
+            Seen("H13-a0-r01", 13.0, 0.0, 4, True, "", "0004-capture-a.mcap", None, 1.24),
             Seen("H13-a0-r02", 13.0, 0.0, 7, True, "", "0007-capture-b.mcap", bad),
-            Seen("H13-a0-r03", 13.0, 0.0, 10, False, "split", "0010-capture-c.mcap", None),
+            Seen("H13-a0-r03", 13.0, 0.0, 10, False, "split", "0010-capture-c.mcap", None, 10.2, LATE),
         )
 
     def look(self, seen: Seen) -> Looked:

@@ -129,6 +129,8 @@ async def test_marks_and_notes_are_kept_beside_the_recording(tmp_path: Path) -> 
             "1 of 3 count",
             "mean CSIM 0.914 of every pair of 9 presses",
             "still 4  at 1795273966.402 s",
+            "Waited    1.2 s from dip to touch",
+            "H13-a0-r03 dip?",
             HALF,
         ):
             assert part in text
@@ -142,6 +144,8 @@ async def test_marks_and_notes_are_kept_beside_the_recording(tmp_path: Path) -> 
         text = await ready(app, pilot)
         assert "marked bad" in text
         assert "墨 ran" in text
+        await pilot.press("down")
+        assert "! touched the paper 10.2 s after its dip" in await ready(app, pilot)
         await pilot.press("escape")
         assert isinstance(app.screen, StartScreen)
 

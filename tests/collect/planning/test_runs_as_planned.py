@@ -1,0 +1,137 @@
+"""Every target that reaches the arm's queue is one that the plan has checked, for every kind of protocol."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import pytest
+
+from collect.config import load_rig
+from collect.perform import Performer
+from collect.plane import PaperPlane
+from collect.planning.limits import all_poses, check_protocol
+from collect.planning.moves import moves_of
+from collect.procedures import inking_moves
+from collect.protocols.loading import load_protocol
+from collect.steps import MARKING, Result, Step, StepKind
+from collect.work import choosing
+from collect.work.context import Job
+from drivers.samples import Pose
+from tests.collect.conftest import Lab
+from tests.collect.sent import not_checked, not_sent, noting
+
+EXTRAS = """
+[ink.wipe]
+rim_mm = [322.0, 20.0]
+z_mm = 130.0
+
+[ink.wash]
+pot_mm = [305.0, 80.0]
+dip_z_mm = 125.0
+every_dips = 2
+strokes = 1
+"""
+FIGURE = "[[figures]]\nname = 'a'\n" + "".join(
+    f"[[figures.strokes]]\npoints = [[12.0, {y}, 6.0, 4.0, 30.0], [24.0, {y}, 8.0, 0.0, 60.0]]\n" for y in (12.0, 24.0)
+)
+JOG = '\n[touch]\nmethod = "jog"\ntouches = 1\nresidual_mm = 3.0\npoints_mm = [[2.0, 2.0], [150.0, 3.0]]\n'
+TWO_PRESSES = "presses = [{height_mm = 9.0, tilt_deg = 5.0}, {height_mm = 11.0}]\n"
+KINDS = {
+    "grid": 'kind = "grid"\nheights_mm = [9.0]\ntilts_deg = [5.0]\nrepeats = 2\nboard_every = 1\n',
+    "replay": 'kind = "replay"\nof = "s"\npresses = [{stroke_id = "b", height_mm = 9.0, tilt_deg = 1.0}]\n',
+    "adaptive": 'kind = "adaptive"\nheights_mm = [9.0]\ntilts_deg = [5.0]\nleast_presses = 3\nenough_points = 50.0\n',
+    "write": f'kind = "write"\ncell_mm = [60.0, 60.0]\n{FIGURE}',
+    "calibration": 'kind = "calibration"\ntouches_mm = [[20.0, 20.0], [200.0, 20.0]]\n',
+}
+
+
+@dataclass
+class Made:
+    """A step that was done, and the targets that reached the arm's queue meanwhile."""
+
+    step: Step
+    job: Job
+    plane: PaperPlane
+    dips: int
+    sent: list[Pose] = field(default_factory=list)
+
+
+@pytest.fixture
+def made(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> list[Made]:
+    steps: list[Made] = []
+    at_work: list[Made] = []
+    do = Performer._do
+
+    async def noted(self: Performer, job: Job) -> Result:
+        procedures = job.bench.procedures
+        at_work.append(Made(job.step, job, procedures.plane, procedures._dips))
+        try:
+            return await do(self, job)
+        finally:
+            steps.append(at_work.pop())
+
+    def added(target: Pose) -> None:
+        for one in at_work:
+            one.sent.append(target)
+
+    monkeypatch.setattr(Performer, "_do", noted)
+    noting(lab.rig.world.motion, added)
+    return steps
+
+
+def run(lab: Lab, protocol: str, extra: str = EXTRAS) -> None:
+    """To its end; whoever jogs says at once that the tip touches."""
+    rig = lab.folder / "rig.toml"
+    rig.write_text(rig.read_text(encoding="utf-8") + extra, encoding="utf-8")
+    (lab.folder / "protocol.toml").write_text(protocol, encoding="utf-8")
+    engine = lab.engine(watched=True)
+    engine.start()
+    deadline = time.monotonic() + 60.0
+    while not engine.finished:
+        assert time.monotonic() < deadline, engine.snapshot()
+        if (prompt := engine.snapshot().prompt) is not None:
+            engine.answer(prompt.number, "t")
+        time.sleep(0.01)
+    engine.join()
+
+
+def hold_against_the_plan(lab: Lab, made: list[Made]) -> None:
+    rig_path, path = lab.folder / "rig.toml", lab.folder / "protocol.toml"
+    config, protocol = load_rig(rig_path), load_protocol(path)
+    check_protocol(rig_path, path, config, protocol)
+    for one in made:
+        cell, more = one.job.cell, one.job.more_cells
+        planned = moves_of(config, one.plane, one.step, cell, more, dips=one.dips)
+        # Where the ink had to wait, a press dips again.
+        again = inking_moves(config, one.dips) if one.step.kind in MARKING else []
+        assert not not_checked(config, one.sent, [*planned.parts, *again]), one.step
+        assert not not_sent(config, planned, one.sent), one.step
+        checked = {rounded(pose) for pose, _, _ in all_poses(config, protocol, one.plane, every_cell=True)}
+        assert {rounded(pose) for pose, _ in planned.poses} <= checked, one.step
+
+
+async def chosen(job: Job) -> Result:
+    """One press, without the seconds that a fit takes."""
+    return {"number": job.step.index, "stop": job.step.index > 0, "height_mm": 9.0, "tilt_deg": 5.0}
+
+
+def rounded(pose: Pose) -> tuple[float, ...]:
+    return tuple(round(v, 6) for v in (*pose.position_mm, *pose.quaternion))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_a_run_sends_the_plan_has_checked(
+    lab: Lab, made: list[Made], monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    monkeypatch.setattr(choosing, "choose", chosen)
+    run(lab, KINDS[kind])
+    hold_against_the_plan(lab, made)
+    assert {one.step.kind for one in made} >= {StepKind.ZERO_TOUCH, StepKind.BOARD}
+
+
+def test_a_plane_found_by_jog_is_checked_where_it_is_touched(lab: Lab, made: list[Made]) -> None:
+    run(lab, f'kind = "list"\n{TWO_PRESSES}', EXTRAS + JOG)
+    hold_against_the_plan(lab, made)
+    [touch] = [one for one in made if one.step.kind is StepKind.ZERO_TOUCH]
+    assert len({(round(pose.x_mm), round(pose.y_mm)) for pose in touch.sent}) == 2

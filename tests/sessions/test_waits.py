@@ -1,0 +1,64 @@
+"""Which strokes waited for their touch unlike the others of their session."""
+
+from __future__ import annotations
+
+import csv
+
+import pytest
+
+from sessions.export import export
+from sessions.schemas import Stroke
+from sessions.waits import unlike, waits_of
+
+
+def step(kind: str, stroke_id: str, **result: object) -> dict[str, object]:
+    return {"kind": kind, "result": {"stroke_id": stroke_id, **result}}
+
+
+def test_a_wait_belongs_to_the_take_that_the_photograph_shows():
+    lines = [
+        {"kind": "zero_touch", "result": {}},
+        step("press", "a", dip_to_touch_s=1.1),
+        step("capture", "a", still=3),
+        step("press", "a", dip_to_touch_s=7),  # pressed again
+        step("capture", "a", still=6),
+        step("press", "b"),  # from before waits were recorded
+        step("capture", "b", still=9),
+        step("draw", "c", dip_to_touch_s=2.5),
+        step("capture", "c", still=12),
+    ]
+    assert waits_of(lines) == {3: 1.1, 6: 7.0, 12: 2.5}
+
+
+def test_the_first_press_of_a_session_that_looked_after_its_dip_is_named():
+    waits = {"first": 10.2, "second": 1.1, "third": 1.2, "fourth": 1.0}
+    assert unlike(waits) == {"first": "touched the paper 10.2 s after its dip, the others after 1.1 s"}
+
+
+@pytest.mark.parametrize(
+    ("waits", "far"),
+    [
+        ([1.0, 1.1, 9.0], []),  # three cannot tell which of them is the odd one
+        ([1.0, 1.1, 1.2, 3.1], []),  # less than two seconds
+        ([1.0, 1.1, 1.2, 3.2], [3]),
+        ([4.0, 8.0, 12.0, 16.0, 20.0], []),  # a session whose waits spread widely anyhow
+        ([20.0, 20.1, 20.0, 5.0, 20.2], [3]),  # too early counts as well
+        ([], []),
+    ],
+)
+def test_far_is_two_seconds_and_three_median_deviations(waits: list[float], far: list[int]):
+    assert list(unlike(dict(enumerate(waits)))) == far
+
+
+def test_an_export_tells_the_wait_and_whose_is_unlike(make, tmp_path):
+    told = [{"dip_to_touch_s": wait} for wait in (1.0, 1.1, 10.0, 1.2)] + [{}]
+    messages = [message for n, one in enumerate(told) for message in (make.still(n), make.stroke(n, **one))]
+    export(make.record(tmp_path / "a.mcap", *messages), tmp_path / "out", "png")
+    with (tmp_path / "out" / "strokes.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["dip_to_touch_s"] for row in rows] == ["1.0", "1.1", "10.0", "1.2", ""]
+    assert [row["dip_to_touch_unlike"] for row in rows] == ["0.0", "0.0", "1.0", "0.0", ""]
+
+
+def test_strokes_of_older_sessions_are_read():
+    assert Stroke.model_validate_json('{"stroke_id": "a", "kind": "press", "still": 0}').dip_to_touch_s is None
