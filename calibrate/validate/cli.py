@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from calibrate.scales import MM_PER_PX
+
 if TYPE_CHECKING:
     from calibrate.validate.diff import Difference
     from calibrate.validate.steps import Progress
@@ -38,7 +40,7 @@ def validate(
     session: Annotated[list[str], typer.Argument(help="Sessions: folders, .mcap files, or URLs with a checksum.")],
     model: Annotated[list[str] | None, typer.Option(help="Only these models; all by default.")] = None,
     generator: Annotated[list[Path] | None, typer.Option(help="A trained generator.safetensors.")] = None,
-    mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = 0.3,
+    mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = MM_PER_PX,
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the session's newest by default.")] = None,
     fit: Annotated[Path | None, typer.Option(help="Brush fit; the session's newest by default.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the report; <session>/validation by default.")] = None,

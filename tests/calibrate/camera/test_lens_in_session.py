@@ -22,7 +22,7 @@ from calibrate.camera.boards import see
 from calibrate.camera.intrinsics import fit_lens
 from calibrate.camera.session import read_lens
 from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.field import Field
+from calibrate.field import Field, Tone, captured_mm
 from calibrate.prepare.params import PX_PER_MM, Params
 from calibrate.presses import prepare_press
 from calibrate.scale import see_board
@@ -189,6 +189,9 @@ def test_every_stage_is_shown_with_the_lens(photographed: Photographed, tmp_path
     numbers = json.loads(out.with_suffix(".json").read_text())["fitted"]
     assert numbers["threshold.reflectance"] == prepared.threshold
     assert numbers["binarise.area_mm2"] == prepared.mask.sum() / PX_PER_MM**2
+    assert numbers["resize.mm_per_px"] == Field().mm_per_px
+    compared = captured_mm(prepared, Tone.BINARY)
+    assert numbers["resize.area_mm2"] == pytest.approx(compared.sum() * Field().mm_per_px ** 2)
 
 
 @pytest.mark.soak
