@@ -23,7 +23,7 @@ def invert(
     anchor_sd: Annotated[float, typer.Option(min=0, max=5, help="How well the touch point is known, mm.")] = 0.1,
     assume_tilt: Annotated[float, typer.Option(min=0, max=30, help="alpha where there is no anchor, deg.")] = 0.0,
     mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = MM_PER_PX,
-    calibration: Annotated[Path | None, typer.Option(help="Artefact; the session's newest by default.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often the protocol presses each again.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of the order in which the protocol presses.")] = 1,
 ) -> None:

@@ -22,7 +22,7 @@ def fit(
         float | None,
         typer.Option(min=0.1, max=1.0, help=f"Scale of the images; {MM_PER_PX:g}, with --drags {DRAG_MM_PER_PX:g}."),
     ] = None,
-    calibration: Annotated[Path | None, typer.Option(help="Artefact; the session's newest by default.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
     correction: Annotated[bool, typer.Option("--correction", help="Print the zero-touch offset for rig.toml.")] = False,
     reference: Annotated[Path | None, typer.Option(help="An earlier fit of this brush, for --correction.")] = None,
     drags: Annotated[

@@ -15,12 +15,13 @@ from typer.testing import CliRunner
 
 from bench.preprocess_rigs import CAMERAS, Shot, lens_views, sheet, true_mask, true_scale
 from brushloop import app
-from calibrate.artefact import Calibration, LensUsed, load_artefact, newest
+from calibrate.artefact import Calibration, LensUsed, load_artefact
 from calibrate.calibration import FITTED, calibrate_session
 from calibrate.camera.artefact import LensFile, lens_file
 from calibrate.camera.boards import see
 from calibrate.camera.intrinsics import fit_lens
 from calibrate.camera.session import read_lens
+from calibrate.current import current
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.field import Field, Tone, captured_mm
 from calibrate.prepare.params import PX_PER_MM, Params
@@ -113,7 +114,7 @@ def test_a_lens_file_makes_scale_anchors_and_masks_right(
     ran = CliRunner().invoke(app, ["calibrate", str(session), "--lens", str(lens)])
     assert ran.exit_code == 0, ran.output
     assert f"lens: lens file {lens.stem}" in ran.output
-    path = newest(session)
+    path = current(session)
     assert path is not None
     made = load_artefact(path, Calibration)
     holds(made, shot)
@@ -147,6 +148,17 @@ def test_a_session_that_was_collected_with_a_lens_needs_no_other(
         calibrate_session(session, small)
     with pytest.raises(CalibrationError, match="No such file"):
         calibrate_session(session, tmp_path / "nosuch.json")
+
+
+def test_lens_a_then_b_then_a_leaves_a_in_use(
+    photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path
+) -> None:
+    session, other = collected(photographed, tmp_path / "s", shot), kept_lens(tmp_path, CAMERAS[BARREL].k1 + 0.004)
+    made = [calibrate_session(session, one) for one in (lens, other, lens)]
+    assert made[0] == made[2] != made[1]
+    assert current(session) == made[0]
+    shown = CliRunner().invoke(app, ["calibrate", "show", str(session)])
+    assert f'lens.source = "lens file {lens.stem}"' in shown.output
 
 
 def test_a_straight_camera_needs_no_lens(photographed: Photographed, tmp_path: Path) -> None:
