@@ -27,6 +27,7 @@ from calibrate.field import Field, Tone, captured_mm
 from calibrate.prepare.params import PX_PER_MM, Params
 from calibrate.presses import prepare_press
 from calibrate.scale import see_board
+from collect.reviewing import Review
 from sessions.reader import Recording
 from sessions.schemas import Stroke
 
@@ -182,6 +183,41 @@ def test_the_quick_look_at_a_board_knows_a_lens_too(tmp_path: Path, shot: Shot, 
     assert again.mm_per_px == pytest.approx(plane.mm_per_px, rel=2e-4)
     with pytest.raises(CalibrationError, match="the lens was calibrated at 2048 x 1536 px"):
         see_board(np.ascontiguousarray(shot.image[:, :-8]), shot.board, lens=known)
+
+
+def test_the_review_looks_through_the_lens_that_the_session_recorded(
+    photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path
+) -> None:
+    session = collected(photographed, tmp_path / "own", shot, read_lens(lens))
+    review = Review(session)
+    assert review.untold == ""
+    for seen in review.captures:
+        looked = review.look(seen)
+        assert looked.binary is not None
+        assert looked.photo.shape == (768, 768), "the field, not the whole photograph"
+        anchor = shot.anchors_mm[review.captures.index(seen)]
+        truth = true_mask(shot, Field().window_mm(anchor), 1.0 / Field().mm_per_px)
+        assert (looked.binary & truth).sum() / (looked.binary | truth).sum() >= 0.9
+    alike = review.repeatability(13.0, 5.0)
+    assert alike is not None
+    assert alike[1] == 2
+
+
+def test_the_review_follows_the_calibration_in_use(
+    photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path
+) -> None:
+    session = collected(photographed, tmp_path / "without", shot)
+    assert Review(session).repeatability(13.0, 5.0) is None
+    calibrate_session(session, lens)
+    assert Review(session).repeatability(13.0, 5.0) is not None
+
+
+def test_the_review_says_why_it_compares_nothing(photographed: Photographed, tmp_path: Path, shot: Shot) -> None:
+    session = collected(photographed, tmp_path / "spoilt", shot)
+    (session / "rig.effective.json").write_text('{"board": 7}')
+    review = Review(session)
+    assert "rig.effective.json: board: Input should be" in review.untold
+    assert review.look(review.captures[0]).photo.shape == shot.image.shape
 
 
 def test_every_stage_is_shown_with_the_lens(photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path) -> None:
