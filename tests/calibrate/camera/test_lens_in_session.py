@@ -240,6 +240,10 @@ def test_every_stage_is_shown_with_the_lens(photographed: Photographed, tmp_path
     assert numbers["resize.mm_per_px"] == Field().mm_per_px
     compared = captured_mm(prepared, Tone.BINARY)
     assert numbers["resize.area_mm2"] == pytest.approx(compared.sum() * Field().mm_per_px ** 2)
+    # So it is without an option from then on: by the calibration that the session uses.
+    again = CliRunner().invoke(app, command)
+    assert again.exit_code == 0, again.output
+    assert json.loads(out.with_suffix(".json").read_text())["fitted"] == pytest.approx(numbers)
 
 
 @pytest.mark.soak
