@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from calibrate.artefact import Artefact
 from calibrate.camera.intrinsics import Fitted
@@ -71,15 +71,24 @@ def lens_file(
 class RegistrationFile(Artefact):
     """Where the robot's points lie on the paper, with what each of them says."""
 
+    versions: ClassVar[tuple[int, ...]] = (1, 2)
+
     kind: Literal["registration"] = "registration"
-    schema_version: int = 1
+    schema_version: int = 2
+    """Version 1 told `turn_deg`, and took the board's corner for the origin of the paper frame."""
     software: str
     source: str
     """The table of points, or the session, and its sha256."""
     model: Literal["rigid", "similarity", "affine"]
     robot_to_paper: tuple[float, float, float, float, float, float]
     """(2, 3) row by row: mm in the robot's base frame to mm in the paper frame."""
-    turn_deg: float
+    turn_deg: float | None = None
+    """How far points turn on their way to the paper frame; in files of version 1 only."""
+    board_origin_mm: tuple[float, float] | None = None
+    """Lower left corner of the board in the paper frame, as it was taken."""
+    origin_mm: tuple[float, float] | None = None
+    yaw_deg: float | None = None
+    """Of the paper frame in the base frame, as in `[paper]` of rig.toml."""
     scale: float
     rms_mm: float
     left_out_rms_mm: float

@@ -166,30 +166,53 @@ def drift(
 def register(
     table: Annotated[Path, typer.Argument(help="CSV with name, robot_x_mm, robot_y_mm, image_x_px, image_y_px.")],
     photograph: Annotated[Path, typer.Option(help="Photograph of the board, taken as the marks were.")],
+    config: Annotated[Path | None, typer.Option(help="The rig.toml whose board and lens the photograph shows.")] = None,
+    write: Annotated[
+        Path | None, typer.Option(help="The rig.toml to write origin_mm and yaw_deg into; read as --config is.")
+    ] = None,
     charuco: Squares = "26x20",
     square_mm: Square = 12.0,
     marker_mm: Marker = 0.0,
     dictionary: Dictionary = "DICT_5X5_1000",
+    origin_mm: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Without a rig.toml: lower left corner of the board, seen from that of the sheet."),
+    ] = None,
     lens: LensOption = None,
     model: Annotated[
         Kind, typer.Option(help="rigid; similarity: scale too; affine: x and y on their own.")
     ] = Kind.RIGID,
     out: Annotated[Path, typer.Option(help="Folder for the registration file.")] = Path("camera"),
 ) -> None:
-    """Where the robot's points lie on the paper, from marks that it touched or pressed; with residuals."""
+    """Where the paper lies before the robot, from marks that it touched or pressed: the lines for rig.toml."""
     import hashlib
     from importlib.metadata import version
 
     from calibrate.camera.points import read_points, registration_file
     from calibrate.camera.register import register as fit
+    from calibrate.camera.rig_file import PaperLines, read_rig
     from calibrate.camera.session import read_lens
     from calibrate.camera.view import see_straight
+    from calibrate.errors import CalibrationError
     from calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
     from calibrate.scale import BoardSpec
 
-    spec = _board("", charuco, square_mm, marker_mm, dictionary)
-    assert isinstance(spec, BoardSpec)
+    if write is not None and model is not Kind.RIGID:
+        raise CalibrationError("--write", "needs --model rigid: rig.toml knows a place and a turn, and no scale")
+    rig_path = config or write
+    rig = read_rig(rig_path) if rig_path else None
+    target = read_rig(write) if write else None
+    if rig is not None:
+        spec = rig.board
+    elif origin_mm is not None:
+        flat = _board("", charuco, square_mm, marker_mm, dictionary)
+        assert isinstance(flat, BoardSpec)
+        spec = flat.model_copy(update={"origin_mm": origin_mm})
+    else:
+        told = "is not known: give --config rig.toml, or the board by its options and --origin-mm X Y"
+        raise CalibrationError("where the sheet lies on the board", told)
     points = read_points(table)
+    lens = lens or (rig.lens_file if rig else None)
     known = read_lens(lens) if lens else None
     plane, flags = see_straight(read_gray(photograph), spec, known.lens() if known else None, str(photograph))
     fitted = fit(points.names, points.robot_mm, plane.to_paper(points.image_px), model.value)
@@ -199,13 +222,22 @@ def register(
     seen = hashlib.sha256(read_bounded(photograph, MAX_PHOTOGRAPH_BYTES)).hexdigest()
     through = known.source if known else "no lens"
     source = f"{table.name}, sha256 {points.sha256}; {photograph.name}, sha256 {seen}; {through}"
-    file = registration_file(fitted, source, f"brushloop {version('brushloop')}")
+    file = registration_file(fitted, spec.origin_mm, source, f"brushloop {version('brushloop')}")
     for flag in flags:
         typer.echo(f"warning: {flag}")
     typer.echo(
-        f"turned by {file.turn_deg:.3f} deg, scale {file.scale:.5f}, residual {file.rms_mm:.3f} mm, "
+        f"scale {file.scale:.5f}, residual {file.rms_mm:.3f} mm, "
         f"{file.left_out_rms_mm:.3f} mm for a point that was left out\n{file.save(out)}"
     )
+    if model is not Kind.RIGID:
+        typer.echo("no lines for rig.toml, which knows a place and a turn, and no scale: use --model rigid")
+        return
+    lines = PaperLines(fitted.origin_mm, fitted.yaw_deg)
+    if target is not None:
+        typer.echo(f"{target.path}: written; as it was before: {target.write(lines)}")
+    else:
+        typer.echo("for [paper] of rig.toml:")
+    typer.echo(lines.toml)
 
 
 def _board(checkerboard: str, charuco: str, square_mm: float, marker_mm: float, dictionary: str) -> Board:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 SPEC = BoardSpec(squares=(9, 7), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_100", origin_mm=(0.0, 0.0))
 BOARD = ("--charuco", "9x7", "--square-mm", "20", "--dictionary", "DICT_5X5_100")
+CORNER = ("--origin-mm", "0", "0")
+FLAT = (*BOARD, *CORNER)
 PX_PER_MM = 8.0
 EDGE_PX = 60
 SLANT = np.array([[0.62, 0.02, 30.0], [-0.01, 0.62, 40.0], [1e-5, 2e-5, 1.0]])
@@ -159,7 +161,7 @@ def test_what_is_no_photograph_is_refused(tmp_path: Path, data: bytes | None, to
         path.write_bytes(data)
     refused(run("check", path, *BOARD), told)
     refused(run("intrinsics", path, *BOARD, "--out", tmp_path / "out"), told)
-    refused(run("register", points(tmp_path), "--photograph", path, *BOARD, "--out", tmp_path / "out"), told)
+    refused(run("register", points(tmp_path), "--photograph", path, *FLAT, "--out", tmp_path / "out"), told)
     assert not (tmp_path / "out").exists()
 
 
@@ -201,13 +203,29 @@ def points(folder: Path, change: str = "") -> Path:
     return table
 
 
+def test_register_must_know_where_the_sheet_lies_on_the_board(tmp_path: Path) -> None:
+    photograph, out = saved(tmp_path / "p.png", board()), tmp_path / "out"
+    ran = run("register", points(tmp_path), "--photograph", photograph, *BOARD, "--out", out)
+    refused(ran, "where the sheet lies on the board: is not known: give --config rig.toml")
+    assert not out.exists()
+
+
+def test_register_gives_no_lines_for_what_a_rig_cannot_hold(tmp_path: Path) -> None:
+    photograph = saved(tmp_path / "p.png", board())
+    given = ("register", points(tmp_path), "--photograph", photograph, *FLAT, "--model", "similarity")
+    ran = run(*given, "--out", tmp_path)
+    assert ran.output.splitlines()[-1].startswith("no lines for rig.toml")
+    assert "yaw_deg" not in ran.output
+    refused(run(*given, "--write", tmp_path / "rig.toml"), "--write: needs --model rigid")
+
+
 def test_register_finds_the_turn_and_names_all_that_it_was_made_of(tmp_path: Path) -> None:
     photograph, lens = saved(tmp_path / "p.png", board()), a_lens(tmp_path)
-    ran = run("register", points(tmp_path), "--photograph", photograph, *BOARD, "--lens", lens, "--out", tmp_path / "o")
+    ran = run("register", points(tmp_path), "--photograph", photograph, *FLAT, "--lens", lens, "--out", tmp_path / "o")
     assert ran.exit_code == 0, ran.output
     [path] = (tmp_path / "o").iterdir()
     made = json.loads(path.read_text())
-    assert made["turn_deg"] == pytest.approx(10.0, abs=0.01)
+    assert made["yaw_deg"] == pytest.approx(-10.0, abs=0.01)
     assert made["rms_mm"] < 0.05
     assert made["source"].count("sha256 ") == 2
     assert f"lens file {lens.stem}" in made["source"]
@@ -218,14 +236,14 @@ def test_register_writes_nothing_by_a_photograph_that_tells_nothing(
     tmp_path: Path, image: Gray, options: Sequence[str], told: str
 ) -> None:
     photograph, out = saved(tmp_path / "p.png", image), tmp_path / "out"
-    refused(run("register", points(tmp_path), "--photograph", photograph, *options, "--out", out), told)
+    refused(run("register", points(tmp_path), "--photograph", photograph, *options, *CORNER, "--out", out), told)
     assert not out.exists()
 
 
 def test_register_flags_what_can_be_used_with_care(tmp_path: Path) -> None:
     for image, told in ((half_hidden(0.5), "partly hidden"), (SATURATED, "are saturated")):
         photograph = saved(tmp_path / "p.png", image)
-        ran = run("register", points(tmp_path), "--photograph", photograph, *BOARD, "--out", tmp_path / "out")
+        ran = run("register", points(tmp_path), "--photograph", photograph, *FLAT, "--out", tmp_path / "out")
         assert ran.exit_code == 0, ran.output
         assert any(line.startswith("warning: ") and told in line for line in ran.output.splitlines()), ran.output
 
@@ -242,7 +260,7 @@ def test_register_flags_what_can_be_used_with_care(tmp_path: Path) -> None:
 def test_register_writes_nothing_by_a_bad_table(tmp_path: Path, change: str, told: str) -> None:
     out = tmp_path / "out"
     photograph = saved(tmp_path / "p.png", board())
-    refused(run("register", points(tmp_path, change), "--photograph", photograph, *BOARD, "--out", out), told)
+    refused(run("register", points(tmp_path, change), "--photograph", photograph, *FLAT, "--out", out), told)
     assert not out.exists()
 
 
