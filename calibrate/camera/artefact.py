@@ -12,8 +12,11 @@ from calibrate.camera.lens import Lens, lens_of
 class LensFile(Artefact):
     """Intrinsics with everything that is needed to judge them."""
 
+    versions: ClassVar[tuple[int, ...]] = (1, 2)
+
     kind: Literal["lens"] = "lens"
-    schema_version: int = 1
+    schema_version: int = 2
+    """Version 1 took the standard errors from corners alone, as if no two views were alike."""
     software: str
     photographs: dict[str, str]
     """Name of every photograph that was given, and the sha256 of its bytes."""
@@ -24,14 +27,15 @@ class LensFile(Artefact):
     """fx, fy, cx, cy in pixels, pixel centres on integers."""
     distortion: tuple[float, float, float, float, float]
     """k1, k2, p1, p2, k3 of OpenCV's model."""
-    focal_se_px: tuple[float, float]
+    focal_se_px: tuple[float, float] | None
+    """By leaving out each way in which the board was held; None where there were too few to tell."""
     rms_px: float
     rms_limit_px: float
     residuals_px: dict[str, float]
     dropped: dict[str, float]
     """Outlier views and their residuals."""
     unusable: dict[str, str]
-    """Photographs without a usable board, and why."""
+    """Photographs without a usable board, or that show nothing new, and why."""
     guidance: tuple[str, ...]
     warnings: tuple[str, ...]
 
@@ -44,7 +48,6 @@ def lens_file(
     fitted: Fitted,
     board: str,
     photographs: dict[str, str],
-    unusable: dict[str, str],
     rms_limit_px: float,
     software: str,
 ) -> LensFile:
@@ -62,7 +65,7 @@ def lens_file(
         rms_limit_px=rms_limit_px,
         residuals_px=fitted.residuals_px,
         dropped=fitted.dropped,
-        unusable=unusable,
+        unusable=fitted.unusable,
         guidance=fitted.guidance,
         warnings=fitted.warnings,
     )

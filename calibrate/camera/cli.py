@@ -56,6 +56,9 @@ def intrinsics(
     marker_mm: Marker = 0.0,
     dictionary: Dictionary = "DICT_5X5_1000",
     limit_px: Annotated[float, typer.Option(min=0.01, max=10.0, help="Residual above which it warns.")] = 0.5,
+    one_camera: Annotated[
+        bool, typer.Option("--one-camera", help="Go on though the photographs look like two cameras'.")
+    ] = False,
     out: Annotated[Path, typer.Option(help="Folder for the lens file.")] = Path("camera"),
 ) -> None:
     """Fit the lens; says what each photograph contributes, which were dropped, and what to photograph besides."""
@@ -66,36 +69,34 @@ def intrinsics(
     from calibrate.camera.boards import View, see
     from calibrate.camera.intrinsics import fit_lens
     from calibrate.camera.pdf import describe
+    from calibrate.camera.views import named
     from calibrate.errors import CalibrationError
     from calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
 
     made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
     seen, unusable, digests = list[View](), dict[str, str](), dict[str, str]()
-    for path in photographs:
+    for name, path in named(photographs).items():
         image = read_gray(path)
-        digests[path.name] = hashlib.sha256(read_bounded(path, MAX_PHOTOGRAPH_BYTES)).hexdigest()
+        digests[name] = hashlib.sha256(read_bounded(path, MAX_PHOTOGRAPH_BYTES)).hexdigest()
         try:
-            seen.append(see(image, made, path.name))
+            seen.append(see(image, made, name))
         except CalibrationError as error:
-            unusable[path.name] = error.what
-    try:
-        fitted = fit_lens(seen, limit_px)
-    except CalibrationError as error:
-        raise CalibrationError(
-            error.where, "; ".join([error.what, *(f"{n} {why}" for n, why in unusable.items())])
-        ) from None
-    file = lens_file(fitted, describe(made), digests, unusable, limit_px, f"brushloop {version('brushloop')}")
+            unusable[name] = error.what
+    fitted = fit_lens(seen, limit_px, unusable, one_camera=one_camera)
+    file = lens_file(fitted, describe(made), digests, limit_px, f"brushloop {version('brushloop')}")
     for name, residual in file.residuals_px.items():
         typer.echo(f"{name}: {residual:.3f} px, slanted by {fitted.slants_deg[name]:.0f} deg")
     for name, residual in file.dropped.items():
         typer.echo(f"{name}: {residual:.3f} px, dropped: it does not fit the others")
-    for name, why in unusable.items():
+    for name, why in file.unusable.items():
         typer.echo(f"{name}: {why}")
     fx, fy, cx, cy = file.matrix
+    reach = fitted.focal_reach_px
+    across, along = ("", "") if reach is None else (f" +- {reach[0]:.2f}", f" +- {reach[1]:.2f}")
     typer.echo(
-        f"fx {fx:.2f} +- {file.focal_se_px[0]:.2f} px, fy {fy:.2f} +- {file.focal_se_px[1]:.2f} px, "
+        f"fx {fx:.2f}{across} px, fy {fy:.2f}{along} px{'' if reach is None else ' (95 %)'}, "
         f"centre {cx:.1f}, {cy:.1f} px, k1 {file.distortion[0]:+.4f}\n"
-        f"residual {file.rms_px:.3f} px over {len(file.residuals_px)} views"
+        f"residual {file.rms_px:.3f} px over {len(file.residuals_px)} views, the board held in {fitted.ways} ways"
     )
     for line in (*(f"warning: {w}" for w in file.warnings), *(f"to do: {g}" for g in file.guidance)):
         typer.echo(line)

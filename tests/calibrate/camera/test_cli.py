@@ -305,7 +305,25 @@ def test_intrinsics_names_every_useless_photograph_and_writes_nothing(tmp_path: 
     images = {"blank": BLANK, "mirrored": MIRRORED, "two": TWO, "sound": board()}
     paths = [saved(tmp_path / f"{name}.png", image) for name, image in images.items()]
     ran = run("intrinsics", *paths, *BOARD, "--out", tmp_path / "out")
-    refused(ran, "1 usable views of the board, at least 4 needed")
-    for told in ("blank.png is blank", "mirrored.png is mirrored", "two.png shows two boards"):
+    refused(ran, "4 photographs: 1 usable views of the board, at least 4 needed")
+    for told in ("blank.png: is blank", "mirrored.png: is mirrored", "two.png: shows two boards"):
         assert told in str(ran.exception)
+    assert not (tmp_path / "out").exists()
+
+
+def test_intrinsics_says_of_every_photograph_why_none_was_of_use(tmp_path: Path) -> None:
+    """Also of photographs with one name in several folders, and of one that is given twice."""
+    (tmp_path / "left").mkdir()
+    (tmp_path / "right").mkdir()
+    paths = [saved(tmp_path / folder / "01.png", BLANK) for folder in ("left", "right")]
+    paths += [saved(tmp_path / "left" / "02.png", MIRRORED)] * 2
+    ran = run("intrinsics", *paths, *BOARD, "--out", tmp_path / "out")
+    refused(ran, "4 photographs: 0 usable views of the board, at least 4 needed; left/01.png, right/01.png: is blank")
+    assert "left/02.png, left/02.png (2): is mirrored" in str(ran.exception)
+
+
+def test_intrinsics_counts_one_photograph_given_five_times_once(tmp_path: Path) -> None:
+    path = saved(tmp_path / "a.png", board())
+    ran = run("intrinsics", *[path] * 5, *BOARD, "--out", tmp_path / "out")
+    refused(ran, "5 photographs: 1 usable views of the board, at least 4 needed; a.png (2), a.png (3), ")
     assert not (tmp_path / "out").exists()

@@ -251,6 +251,6 @@ def test_every_stage_is_shown_with_the_lens(photographed: Photographed, tmp_path
 @pytest.mark.parametrize("rig", [1, 2, 3, 4])
 def test_a_lens_from_slanted_boards_carries_a_session(photographed: Photographed, tmp_path: Path, rig: int) -> None:
     views = [see(image, sheet(rig, 1).board, f"{k}") for k, image in enumerate(lens_views(rig, 12))]
-    lens = lens_file(fit_lens(views), "a board", {}, {}, 0.5, "test").save(tmp_path)
+    lens = lens_file(fit_lens(views), "a board", {}, 0.5, "test").save(tmp_path)
     seen = sheet(rig, 15)
     holds(load_artefact(calibrate_session(collected(photographed, tmp_path / "s", seen), lens), Calibration), seen)
