@@ -28,7 +28,7 @@ APART = 0.65
 all its partitions left 0.82 to 0.92 (8 to 13 real photographs), with a board curled by 1 mm 0.83 at least."""
 WORSE = 1.5
 """How much worse the views of one camera fit the other's lens: one bad view among good ones is no camera."""
-NAMED_APART, ALIKE = 0.9, 0.9
+NAMED_APART, ALIKE = 0.97, 0.9
 """Where the files are named after the parts: of the residuals as above, and of the views that lie as they are named."""
 LEAST_NAMED = 8
 """Below, names and parts agree by chance."""

@@ -15,7 +15,7 @@ from calibrate.artefact import HASH_CHARS, load_artefact
 from calibrate.camera.artefact import LensFile, lens_file
 from calibrate.camera.boards import Checkerboard, View, see
 from calibrate.camera.cameras import two_cameras
-from calibrate.camera.intrinsics import fit_lens
+from calibrate.camera.intrinsics import fit_lens, guidance
 from calibrate.camera.lens import Lens, lens_of
 from calibrate.camera.zhang import solve
 from calibrate.errors import CalibrationError
@@ -181,6 +181,21 @@ def test_no_choice_of_one_cameras_photographs_is_taken_for_two_cameras(opencv: l
         assert two_cameras([opencv[k] for k in chosen], solve([opencv[k] for k in chosen], "test")) is None
 
 
+@pytest.mark.soak
+def test_how_often_two_cameras_are_told_and_one_is_taken_for_two() -> None:
+    """A stereo pair's lenses, their axes 20 px apart; and one camera whose files are named as if there were two."""
+    found, alarms = 0, 0
+    for seed in range(20):
+        left, right = views(7, seed=seed), views(7, seed=seed + 100, lens=other_camera(1.006, -14.0, 14.0))
+        for other, is_right in ((right, True), (views(7, seed=seed + 200), False)):
+            mixed = [*renamed(left, "left"), *renamed(other, "right")]
+            told = two_cameras(mixed, solve(mixed, "test")) is not None
+            found, alarms = found + (told and is_right), alarms + (told and not is_right)
+    print(f"told {found} of 20, false alarms {alarms} of 20")  # noqa: T201
+    assert found >= 10
+    assert alarms == 0
+
+
 def test_a_known_lens_is_found_within_its_standard_errors() -> None:
     fitted = fit_lens(views(12))
     assert fitted.focal_se_px is not None
@@ -213,7 +228,7 @@ def test_it_says_what_to_photograph_besides() -> None:
     told = " / ".join(fit_lens(one_corner).guidance)
     assert "take 5 more photographs" in told
     assert "right" in told
-    assert fit_lens(views(40)).guidance == ()
+    assert guidance(views(40), [20.0] * 40) == ()
 
 
 def test_too_few_photographs_or_mixed_sizes_are_refused() -> None:
