@@ -6,34 +6,32 @@ from pathlib import Path
 
 import numpy as np
 
-from calibrate.artefact import FOLDER, Calibration, Foreign, load_artefact
+from calibrate.artefact import Calibration, Foreign, load_artefact
 from calibrate.camera.boards import see
 from calibrate.camera.session import board_of, board_stills
 from calibrate.camera.view import paper_mm
+from calibrate.current import put_to_use
 from calibrate.errors import CalibrationError
 from sessions.reader import Recording
 from sessions.schemas import Source
 
 
 def apply_calibration(path: Path, session: Path, *, force: bool = False) -> Path:
-    """Save the calibration in the session's folder as the newest one; returns where.
+    """Put the calibration to use for the session; returns where it lies.
 
     Another recording's is refused unless forced; it then becomes an artefact of its own that names where it comes from
     and how far this session's board lies off under it. Raises `CalibrationError`.
     """
     recording, given = Recording(session), load_artefact(path, Calibration)
-    folder = recording.path.parent / FOLDER
+    folder = recording.path.parent
     if recording.header.source == Source.IMPORT:
         raise CalibrationError(str(recording.path), "is an import and brings its own scale: nothing is applied to it")
     if given.recording_sha256 == recording.sha256:
-        saved = given.save(folder)
-    elif force:
-        saved = _labelled(given, recording).save(folder)
-    else:
-        told = f"belongs to another recording ({given.session_id}); --force applies it, and labels every result"
-        raise CalibrationError(str(path), told)
-    saved.touch()  # the newest is what is used
-    return saved
+        return put_to_use(given, folder)
+    if force:
+        return put_to_use(_labelled(given, recording), folder)
+    told = f"belongs to another recording ({given.session_id}); --force applies it, and labels every result"
+    raise CalibrationError(str(path), told)
 
 
 def _labelled(given: Calibration, recording: Recording) -> Calibration:

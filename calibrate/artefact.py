@@ -73,12 +73,6 @@ def _version(data: bytes) -> object:
     return cast("dict[str, Any]", parsed).get("schema_version") if isinstance(parsed, dict) else None
 
 
-def newest(session: Path, folder: str = FOLDER) -> Path | None:
-    """The artefact written last in that folder of a session, if there is one."""
-    found = sorted((session / folder).glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
-    return found[-1] if found else None
-
-
 class LensUsed(BaseModel):
     """The lens by which photographs are straightened, and where it is known from."""
 

@@ -7,9 +7,10 @@ import hashlib
 from importlib.metadata import version
 from pathlib import Path
 
-from calibrate.artefact import FOLDER, Calibration, LensUsed
+from calibrate.artefact import Calibration, LensUsed
 from calibrate.camera.session import NO_BOARD, board_of, known_lens, sheet_of
 from calibrate.camera.view import see_straight
+from calibrate.current import put_to_use
 from calibrate.errors import CalibrationError
 from calibrate.preprocess import Params
 from sessions.messages import decode_gray
@@ -20,7 +21,7 @@ FITTED = "k1 fitted on the board"
 
 
 def calibrate_session(session: Path, lens: Path | None = None) -> Path:
-    """Calibrate and save beside the recording; returns the artefact's path.
+    """Calibrate, save beside the recording and use it from now on; returns the artefact's path.
 
     The lens is the file that is given, else the one that the session was collected with. Raises `CalibrationError`,
     also for a lens that visibly bends and is not known.
@@ -55,4 +56,4 @@ def calibrate_session(session: Path, lens: Path | None = None) -> Path:
         flags=flags,
         still_sha256=hashlib.sha256(stills[-1]).hexdigest(),
     )
-    return calibration.save(recording.path.parent / FOLDER)
+    return put_to_use(calibration, recording.path.parent)

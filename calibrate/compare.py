@@ -9,9 +9,10 @@ from typing import Any, cast
 
 import numpy as np
 
-from calibrate.artefact import Artefact, Calibration, load_artefact, newest
+from calibrate.artefact import Artefact, Calibration, load_artefact
 from calibrate.brushfit.artefact import BrushFit
 from calibrate.camera.artefact import LensFile, RegistrationFile
+from calibrate.current import current
 from calibrate.errors import CalibrationError
 from calibrate.files import read_bounded
 
@@ -25,9 +26,9 @@ KINDS: dict[str, type[Artefact]] = {
 
 
 def read_any(path: Path) -> tuple[Path, Artefact]:
-    """An artefact of any kind, or a session's newest calibration, and where it lies. Raises `CalibrationError`."""
+    """An artefact of any kind, or the calibration that a session uses, and where it lies. Raises `CalibrationError`."""
     if path.is_dir():
-        found = newest(path)
+        found = current(path)
         if found is None:
             raise CalibrationError(str(path), f"is not calibrated: run `brushloop calibrate {path}`")
         path = found

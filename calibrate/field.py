@@ -7,7 +7,7 @@ length and then takes the best shift. The second is how the paper's spread comes
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import cast
 
@@ -15,7 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.preprocess import Prepared
+from calibrate.errors import CaptureRefused
+from calibrate.preprocess import PX_PER_MM, Prepared
+from calibrate.scales import MM_PER_PX
 
 Image = NDArray[np.float32]
 SIZE_PX = 128
@@ -46,9 +48,9 @@ KEYS: tuple[Key, ...] = tuple(itertools.product(Alignment, Tone))
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """The millimetre field. 0.3 mm/px (38.4 mm) holds an anchored stroke of any cell of the grid; 0.2 does not."""
+    """The millimetre field: 128 x 128 px around the zero-touch point."""
 
-    mm_per_px: float = 0.3
+    mm_per_px: float = MM_PER_PX
     anchor_share: tuple[float, float] = (0.76, 0.5)
     """Where the zero-touch point lies, as a share of the field from the left and from the top."""
 
@@ -66,6 +68,35 @@ class Field:
         """(x, y, width, height) in the paper frame of the field around an anchor there (y upward)."""
         left, top = self.anchor_mm
         return anchor[0] - left, anchor[1] - (self.side_mm - top), self.side_mm, self.side_mm
+
+    def corner_px(self, anchor_px: tuple[float, float]) -> tuple[int, int]:
+        """Column and row on the 20 px/mm raster at which the field around an anchor there begins."""
+        left, top = self.anchor_mm
+        return round(anchor_px[0] - left * PX_PER_MM), round(anchor_px[1] - top * PX_PER_MM)
+
+
+def crop(prepared: Prepared, corner_px: tuple[int, int], view: Field) -> Prepared:
+    """As much of a raster as the field shows from that corner on; `cut` where ink is left out."""
+    side, (height, width) = round(view.side_mm * PX_PER_MM), prepared.mask.shape
+    left, top = min(max(corner_px[0], -side), width), min(max(corner_px[1], -side), height)
+    window = slice(top + side, top + 2 * side), slice(left + side, left + 2 * side)
+    mask, soft = (np.pad(part, side)[window] for part in (prepared.mask, prepared.soft))
+    anchor = prepared.anchor_px
+    return replace(
+        prepared,
+        mask=mask,
+        soft=soft,
+        anchor_px=None if anchor is None else (anchor[0] - left, anchor[1] - top),
+        cut=prepared.cut or bool(np.count_nonzero(mask) < np.count_nonzero(prepared.mask)),
+    )
+
+
+def crop_at_anchor(prepared: Prepared, anchor_px: tuple[float, float], view: Field) -> Prepared:
+    """The field around an anchor. Raises `CaptureRefused` where the stroke lies outside it."""
+    cropped = crop(prepared, view.corner_px(anchor_px), view)
+    if not cropped.mask.any():
+        raise CaptureRefused("anchor", "lies so far from the stroke that none of it is in the field")
+    return cropped
 
 
 def captured_mm(prepared: Prepared, tone: Tone) -> Image:

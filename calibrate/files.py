@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,10 +31,15 @@ def check_target(path: Path, ending: str, *inputs: Path | None) -> None:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write beside, then rename: a reader sees the old file or the new one. Raises OSError; the part is then gone."""
+    """Write beside, then rename: a reader sees the old file or the new one. Raises OSError; the part is then gone.
+
+    Line ends stay as they are, and who may read a file that was there already.
+    """
     part = path.with_name(path.name + ".part")
     try:
-        part.write_text(text, encoding="utf-8")
+        part.write_bytes(text.encode("utf-8"))
+        if path.exists():
+            shutil.copymode(path, part)
         part.replace(path)
     except OSError:
         part.unlink(missing_ok=True)

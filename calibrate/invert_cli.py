@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from calibrate.scales import MM_PER_PX
+
 
 def invert(
     session: Annotated[Path, typer.Argument(help="A session's folder or its .mcap file; imports count as sessions.")],
@@ -20,8 +22,8 @@ def invert(
     tilt_range: Annotated[tuple[float, float], typer.Option(help="Tilts to look for, deg; at most 30.")] = (0.0, 30.0),
     anchor_sd: Annotated[float, typer.Option(min=0, max=5, help="How well the touch point is known, mm.")] = 0.1,
     assume_tilt: Annotated[float, typer.Option(min=0, max=30, help="alpha where there is no anchor, deg.")] = 0.0,
-    mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = 0.3,
-    calibration: Annotated[Path | None, typer.Option(help="Artefact; the session's newest by default.")] = None,
+    mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = MM_PER_PX,
+    calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often the protocol presses each again.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of the order in which the protocol presses.")] = 1,
 ) -> None:

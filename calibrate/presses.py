@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from calibrate.artefact import Calibration
 from calibrate.errors import CaptureRefused
-from calibrate.field import Field
+from calibrate.field import Field, crop_at_anchor
 from calibrate.prepare.rectify import rectify_by
 from calibrate.preprocess import PX_PER_MM, Params, Prepared, on_raster, on_window, prepare, rescale
 from sessions.reader import Capture
@@ -33,22 +31,7 @@ def prepare_press(capture: Capture, calibration: Calibration | None, params: Par
     if stroke.anchor_px is None:
         raise CaptureRefused(stroke.stroke_id, "has no anchor (start_x_px, start_y_px): it cannot be laid on a model")
     anchor = on_raster(stroke.anchor_px, stroke.px_per_mm)
-    return _crop(prepare(raster, anchor, capture.where, params), view)
-
-
-def _crop(prepared: Prepared, view: Field) -> Prepared:
-    assert prepared.anchor_px is not None
-    side = round(view.side_mm * PX_PER_MM)
-    left = round(prepared.anchor_px[0] - view.anchor_mm[0] * PX_PER_MM)
-    top = round(prepared.anchor_px[1] - view.anchor_mm[1] * PX_PER_MM)
-    mask, soft = np.pad(prepared.mask, side), np.pad(prepared.soft, side)
-    rows, columns = slice(top + side, top + 2 * side), slice(left + side, left + 2 * side)
-    anchor = (prepared.anchor_px[0] - left, prepared.anchor_px[1] - top)
-    kept = mask[rows, columns]
-    if not kept.any():
-        raise CaptureRefused("anchor", "lies so far from the stroke that none of it is in the field")
-    cut = prepared.cut or bool(np.count_nonzero(kept) < np.count_nonzero(prepared.mask))
-    return Prepared(kept, soft[rows, columns], anchor, prepared.threshold, cut)
+    return crop_at_anchor(prepare(raster, anchor, capture.where, params), anchor, view)
 
 
 def _cell_px(stroke: Stroke, window: tuple[float, float, float, float]) -> tuple[int, int, int, int] | None:

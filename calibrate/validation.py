@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from calibrate.artefact import Calibration, load_artefact, newest
+from calibrate.artefact import Calibration, load_artefact
+from calibrate.current import current
 from calibrate.errors import CalibrationError
 from model.ccdbsm import Brush
 from sessions.reader import Recording
@@ -12,13 +13,13 @@ from sessions.schemas import Header, Stroke
 
 
 def calibration_of(recording: Recording, first: Stroke, digest: str, given: Path | None) -> Calibration | None:
-    """The artefact given, or the session's newest; None for an import, which brings its own scale.
+    """The artefact given, or the one that the session uses; None for an import, which brings its own scale.
 
     Raises `CalibrationError` where there is none, or it belongs to another recording.
     """
     if first.px_per_mm is not None:
         return None
-    path = given or newest(recording.path.parent)
+    path = given or current(recording.path.parent)
     if path is None:
         raise CalibrationError(
             str(recording.path), f"is not calibrated: run `brushloop calibrate {recording.path.parent}`"

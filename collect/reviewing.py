@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from calibrate.camera.session import board_of, lens_in_use
 from calibrate.errors import CalibrationError
-from calibrate.scale import PlaneFit, see_board
+from calibrate.scale import BoardSpec, PlaneFit, see_board
 from calibrate.similarity import csim
-from collect.config import RigConfig, load_rig
-from collect.errors import ConfigError
 from collect.last_capture import pictures_of
 from collect.sheet import Cell
 from sessions import container
@@ -27,6 +26,8 @@ from sessions.waits import unlike, waits_of
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+    from calibrate.camera.lens import Lens
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +64,9 @@ class Looked:
 class Review:
     """One session's folder, open or closed; reads, and writes nothing."""
 
+    untold: str = ""
+    """Why photographs are shown whole and presses are not compared; empty where the session tells board and lens."""
+
     def __init__(self, folder: Path) -> None:
         """Raises `InputError` where it was not collected here, `SessionDamaged`."""
         self.folder = folder
@@ -70,10 +74,15 @@ class Review:
             raise InputError(folder, f"holds no {JOURNAL_NAME}: imported photographs are looked at with `validate`")
         self._plane: PlaneFit | None = None
         self._looked: dict[int, Looked] = {}
+        self._board: BoardSpec | None = None
+        self._lens: Lens | None = None
         try:
-            self._config: RigConfig | None = load_rig(folder / "rig.toml")
-        except ConfigError:
-            self._config = None
+            # As the session recorded them: lens files lie beside the rig's own rig.toml, not beside its snapshot here.
+            lens = lens_in_use(folder)
+            self._lens = None if lens is None else lens.lens()
+            self._board = board_of(folder)
+        except CalibrationError as error:
+            self.untold = str(error)
         self.read()
 
     def read(self) -> None:
@@ -123,10 +132,14 @@ class Review:
         if image is None:
             raise SessionDamaged(path, f"holds no still {seen.still}")
         cell = self._cell(stroke)
-        if cell is None or self._config is None:
+        if cell is None or self._board is None:
             return Looked(image, None, log_ns)
+        if self._lens is not None:
+            if image.shape[::-1] != self._lens.size_px:
+                return Looked(image, None, log_ns)  # the lens says nothing of a photograph of another size
+            image = self._lens.straighten(image)
         try:
-            self._plane = see_board(image, self._config.board)
+            self._plane = see_board(image, self._board)
         except CalibrationError:
             if self._plane is None:
                 return Looked(image, None, log_ns)

@@ -26,7 +26,7 @@ from sessions.merge import Copier, count_messages
 from sessions.reader import Recording
 from sessions.schemas import Header, Quality, Stroke, Topic
 from sessions.store import SESSION_ID, SNAPSHOT_NAMES
-from sessions.writer import CHUNK_BYTES, HEADER_METADATA, header_metadata, note
+from sessions.writer import CHUNK_BYTES, HEADER_METADATA, header_metadata, media_type, note
 
 PARTS_NOTE = "brushloop.parts"
 JOINED = ("software", "robot_firmware", "camera", "origin", "licence")
@@ -140,7 +140,7 @@ def _write(parts: list[_Part], path: Path, header: Header, attachments: dict[str
         writer.add_metadata(HEADER_METADATA, header_metadata(header))
         writer.add_metadata(PARTS_NOTE, note({"parts": [_provenance(part) for part in parts]}))
         for name, data in attachments.items():
-            writer.add_attachment(0, 0, name, "application/toml", data)
+            writer.add_attachment(0, 0, name, media_type(name), data)
         copier = Copier(writer)
         for part in parts:
             for schema, channel, message in _moved(part):

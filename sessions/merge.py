@@ -15,7 +15,7 @@ from sessions.errors import SessionDamaged, disk_error, in_one_line
 from sessions.journal import fsync_folder
 from sessions.lines import Line
 from sessions.schemas import Header
-from sessions.writer import CHUNK_BYTES, HEADER_METADATA, file_sha256, header_metadata, note
+from sessions.writer import CHUNK_BYTES, HEADER_METADATA, file_sha256, header_metadata, media_type, note
 
 REPAIRS_NOTE = "brushloop.repairs"
 """Metadata of a merged file whose session was repaired: what was rewritten, with what missing, and what was lost."""
@@ -73,7 +73,7 @@ def _write(segments: list[Path], part: Path, header: Header, attachments: list[P
             writer.add_metadata(REPAIRS_NOTE, note({"repairs": list(repairs)}))
         copier = Copier(writer)
         for path in attachments:
-            writer.add_attachment(0, 0, path.name, "application/toml", path.read_bytes())
+            writer.add_attachment(0, 0, path.name, media_type(path.name), path.read_bytes())
         for segment in segments:
             for schema, channel, message in messages(segment):
                 copier.add(schema, channel, message)

@@ -19,7 +19,7 @@ from sessions.merge import Copier, count_messages
 from sessions.messages import decode_still
 from sessions.salvage import Scan, salvaged
 from sessions.schemas import Header, Stroke, Topic
-from sessions.writer import CHUNK_BYTES, HEADER_METADATA, header_metadata, note
+from sessions.writer import CHUNK_BYTES, HEADER_METADATA, header_metadata, media_type, note
 
 Messages = Iterable[tuple[Schema | None, Channel, Message]]
 
@@ -42,7 +42,7 @@ def replace_damaged(
             for name, values in notes.items():
                 writer.add_metadata(name, note(values))
             for name, data in attachments.items():
-                writer.add_attachment(0, 0, name, "application/toml", data)
+                writer.add_attachment(0, 0, name, media_type(name), data)
             copier = Copier(writer)
             for schema, channel, message in messages:
                 copier.add(schema, channel, message)

@@ -13,7 +13,7 @@ import time
 import zlib
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
 from mcap.writer import CompressionType, Writer
@@ -206,6 +206,12 @@ def header_crc(values: dict[str, str]) -> str:
 
     texts = {name: text for name, text in values.items() if name != "crc"}
     return f"{zlib.crc32(json.dumps(texts, sort_keys=True).encode()):08x}"
+
+
+def media_type(name: str) -> str:
+    """Of a file that travels inside a recording, by the ending of its name."""
+    endings = {".toml": "application/toml", ".json": "application/json"}
+    return endings.get(PurePath(name).suffix, "application/octet-stream")
 
 
 def note(values: dict[str, Any]) -> dict[str, str]:

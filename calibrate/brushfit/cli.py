@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calibrate.scales import DRAG_MM_PER_PX, MM_PER_PX
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -17,9 +19,10 @@ if TYPE_CHECKING:
 def fit(
     session: Annotated[Path, typer.Argument(help="A session of presses: its folder or its .mcap file.")],
     mm_per_px: Annotated[
-        float | None, typer.Option(min=0.1, max=1.0, help="Scale of the images; 0.3, with --drags 0.6.")
+        float | None,
+        typer.Option(min=0.1, max=1.0, help=f"Scale of the images; {MM_PER_PX:g}, with --drags {DRAG_MM_PER_PX:g}."),
     ] = None,
-    calibration: Annotated[Path | None, typer.Option(help="Artefact; the session's newest by default.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
     correction: Annotated[bool, typer.Option("--correction", help="Print the zero-touch offset for rig.toml.")] = False,
     reference: Annotated[Path | None, typer.Option(help="An earlier fit of this brush, for --correction.")] = None,
     drags: Annotated[
@@ -30,7 +33,7 @@ def fit(
     if drags:
         if correction or reference is not None:
             raise typer.BadParameter("--correction and --reference are for presses, not for --drags")
-        _fit_drags(session, mm_per_px or 0.6, calibration)
+        _fit_drags(session, mm_per_px or DRAG_MM_PER_PX, calibration)
         return
     import rich
     from rich.markup import escape
@@ -44,7 +47,7 @@ def fit(
     from sessions.reader import Recording
 
     before = load_artefact(reference, BrushFit) if reference is not None else None
-    view = Field(mm_per_px=mm_per_px or 0.3)
+    view = Field(mm_per_px=mm_per_px or MM_PER_PX)
     captures = read_presses(session, view, calibration)
     fitted = fit_session(captures, view)
     path = save(fitted, Recording(session).path.parent)

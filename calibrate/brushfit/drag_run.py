@@ -15,6 +15,7 @@ from calibrate.artefact import Artefact
 from calibrate.brushfit.artefact import FittedValue
 from calibrate.brushfit.drag_captures import Drawn
 from calibrate.brushfit.drags import INK_ABOVE, SPREAD_MM, DragFit, bootstrap, chance, fit_drags
+from calibrate.current import put_to_use
 from calibrate.errors import CalibrationError
 from model.drag import DragModel
 
@@ -107,8 +108,8 @@ def fit_drawn(drawn: Drawn) -> FittedDrags:
 
 
 def save(fitted: FittedDrags, session: Path) -> Path:
-    """Write the artefact into the session's folder."""
-    return fitted.artefact.save(session / FOLDER)
+    """Write the artefact into the session's folder and use it from now on."""
+    return put_to_use(fitted.artefact, session, FOLDER)
 
 
 def _chosen(drawn: Drawn, images: NDArray[np.int64]) -> tuple[list[Floats], NDArray[np.int64]]:

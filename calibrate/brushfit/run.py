@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.brushfit.artefact import BrushFit, FittedStage, FittedValue
+from calibrate.brushfit.artefact import FOLDER, BrushFit, FittedStage, FittedValue
 from calibrate.brushfit.captures import Captures
 from calibrate.brushfit.fit import STAGES, Fit, Grid, Pressed, bootstrap, fit_presses, zero_touch
 from calibrate.brushfit.heldout import HeldOut, by_cell, leave_cell_out
+from calibrate.current import put_to_use
 from calibrate.errors import CalibrationError
 from calibrate.field import Alignment, Field, Tone
 from calibrate.simulate import simulated
@@ -121,10 +122,8 @@ def correction(captures: Captures, artefact: BrushFit, reference: BrushFit | Non
 
 
 def save(fitted: Fitted, session: Path) -> Path:
-    """Write the artefact into the session's folder."""
-    from calibrate.brushfit.artefact import FOLDER
-
-    return fitted.artefact.save(session / FOLDER)
+    """Write the artefact into the session's folder and use it from now on."""
+    return put_to_use(fitted.artefact, session, FOLDER)
 
 
 def _interval(value: float, error: float) -> tuple[float, float]:

@@ -56,6 +56,9 @@ def intrinsics(
     marker_mm: Marker = 0.0,
     dictionary: Dictionary = "DICT_5X5_1000",
     limit_px: Annotated[float, typer.Option(min=0.01, max=10.0, help="Residual above which it warns.")] = 0.5,
+    one_camera: Annotated[
+        bool, typer.Option("--one-camera", help="Go on though the photographs look like two cameras'.")
+    ] = False,
     out: Annotated[Path, typer.Option(help="Folder for the lens file.")] = Path("camera"),
 ) -> None:
     """Fit the lens; says what each photograph contributes, which were dropped, and what to photograph besides."""
@@ -66,36 +69,34 @@ def intrinsics(
     from calibrate.camera.boards import View, see
     from calibrate.camera.intrinsics import fit_lens
     from calibrate.camera.pdf import describe
+    from calibrate.camera.views import named
     from calibrate.errors import CalibrationError
     from calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
 
     made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
     seen, unusable, digests = list[View](), dict[str, str](), dict[str, str]()
-    for path in photographs:
+    for name, path in named(photographs).items():
         image = read_gray(path)
-        digests[path.name] = hashlib.sha256(read_bounded(path, MAX_PHOTOGRAPH_BYTES)).hexdigest()
+        digests[name] = hashlib.sha256(read_bounded(path, MAX_PHOTOGRAPH_BYTES)).hexdigest()
         try:
-            seen.append(see(image, made, path.name))
+            seen.append(see(image, made, name))
         except CalibrationError as error:
-            unusable[path.name] = error.what
-    try:
-        fitted = fit_lens(seen, limit_px)
-    except CalibrationError as error:
-        raise CalibrationError(
-            error.where, "; ".join([error.what, *(f"{n} {why}" for n, why in unusable.items())])
-        ) from None
-    file = lens_file(fitted, describe(made), digests, unusable, limit_px, f"brushloop {version('brushloop')}")
+            unusable[name] = error.what
+    fitted = fit_lens(seen, limit_px, unusable, one_camera=one_camera)
+    file = lens_file(fitted, describe(made), digests, limit_px, f"brushloop {version('brushloop')}")
     for name, residual in file.residuals_px.items():
         typer.echo(f"{name}: {residual:.3f} px, slanted by {fitted.slants_deg[name]:.0f} deg")
     for name, residual in file.dropped.items():
         typer.echo(f"{name}: {residual:.3f} px, dropped: it does not fit the others")
-    for name, why in unusable.items():
+    for name, why in file.unusable.items():
         typer.echo(f"{name}: {why}")
     fx, fy, cx, cy = file.matrix
+    reach = fitted.focal_reach_px
+    across, along = ("", "") if reach is None else (f" +- {reach[0]:.2f}", f" +- {reach[1]:.2f}")
     typer.echo(
-        f"fx {fx:.2f} +- {file.focal_se_px[0]:.2f} px, fy {fy:.2f} +- {file.focal_se_px[1]:.2f} px, "
+        f"fx {fx:.2f}{across} px, fy {fy:.2f}{along} px{'' if reach is None else ' (95 %)'}, "
         f"centre {cx:.1f}, {cy:.1f} px, k1 {file.distortion[0]:+.4f}\n"
-        f"residual {file.rms_px:.3f} px over {len(file.residuals_px)} views"
+        f"residual {file.rms_px:.3f} px over {len(file.residuals_px)} views, the board held in {fitted.ways} ways"
     )
     for line in (*(f"warning: {w}" for w in file.warnings), *(f"to do: {g}" for g in file.guidance)):
         typer.echo(line)
@@ -166,30 +167,53 @@ def drift(
 def register(
     table: Annotated[Path, typer.Argument(help="CSV with name, robot_x_mm, robot_y_mm, image_x_px, image_y_px.")],
     photograph: Annotated[Path, typer.Option(help="Photograph of the board, taken as the marks were.")],
+    config: Annotated[Path | None, typer.Option(help="The rig.toml whose board and lens the photograph shows.")] = None,
+    write: Annotated[
+        Path | None, typer.Option(help="The rig.toml to write origin_mm and yaw_deg into; read as --config is.")
+    ] = None,
     charuco: Squares = "26x20",
     square_mm: Square = 12.0,
     marker_mm: Marker = 0.0,
     dictionary: Dictionary = "DICT_5X5_1000",
+    origin_mm: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Without a rig.toml: lower left corner of the board, seen from that of the sheet."),
+    ] = None,
     lens: LensOption = None,
     model: Annotated[
         Kind, typer.Option(help="rigid; similarity: scale too; affine: x and y on their own.")
     ] = Kind.RIGID,
     out: Annotated[Path, typer.Option(help="Folder for the registration file.")] = Path("camera"),
 ) -> None:
-    """Where the robot's points lie on the paper, from marks that it touched or pressed; with residuals."""
+    """Where the paper lies before the robot, from marks that it touched or pressed: the lines for rig.toml."""
     import hashlib
     from importlib.metadata import version
 
     from calibrate.camera.points import read_points, registration_file
     from calibrate.camera.register import register as fit
+    from calibrate.camera.rig_file import PaperLines, read_rig
     from calibrate.camera.session import read_lens
     from calibrate.camera.view import see_straight
+    from calibrate.errors import CalibrationError
     from calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
     from calibrate.scale import BoardSpec
 
-    spec = _board("", charuco, square_mm, marker_mm, dictionary)
-    assert isinstance(spec, BoardSpec)
+    if write is not None and model is not Kind.RIGID:
+        raise CalibrationError("--write", "needs --model rigid: rig.toml knows a place and a turn, and no scale")
+    rig_path = config or write
+    rig = read_rig(rig_path) if rig_path else None
+    target = read_rig(write) if write else None
+    if rig is not None:
+        spec = rig.board
+    elif origin_mm is not None:
+        flat = _board("", charuco, square_mm, marker_mm, dictionary)
+        assert isinstance(flat, BoardSpec)
+        spec = flat.model_copy(update={"origin_mm": origin_mm})
+    else:
+        told = "is not known: give --config rig.toml, or the board by its options and --origin-mm X Y"
+        raise CalibrationError("where the sheet lies on the board", told)
     points = read_points(table)
+    lens = lens or (rig.lens_file if rig else None)
     known = read_lens(lens) if lens else None
     plane, flags = see_straight(read_gray(photograph), spec, known.lens() if known else None, str(photograph))
     fitted = fit(points.names, points.robot_mm, plane.to_paper(points.image_px), model.value)
@@ -199,13 +223,22 @@ def register(
     seen = hashlib.sha256(read_bounded(photograph, MAX_PHOTOGRAPH_BYTES)).hexdigest()
     through = known.source if known else "no lens"
     source = f"{table.name}, sha256 {points.sha256}; {photograph.name}, sha256 {seen}; {through}"
-    file = registration_file(fitted, source, f"brushloop {version('brushloop')}")
+    file = registration_file(fitted, spec.origin_mm, source, f"brushloop {version('brushloop')}")
     for flag in flags:
         typer.echo(f"warning: {flag}")
     typer.echo(
-        f"turned by {file.turn_deg:.3f} deg, scale {file.scale:.5f}, residual {file.rms_mm:.3f} mm, "
+        f"scale {file.scale:.5f}, residual {file.rms_mm:.3f} mm, "
         f"{file.left_out_rms_mm:.3f} mm for a point that was left out\n{file.save(out)}"
     )
+    if model is not Kind.RIGID:
+        typer.echo("no lines for rig.toml, which knows a place and a turn, and no scale: use --model rigid")
+        return
+    lines = PaperLines(fitted.origin_mm, fitted.yaw_deg)
+    if target is not None:
+        typer.echo(f"{target.path}: written; as it was before: {target.write(lines)}")
+    else:
+        typer.echo("for [paper] of rig.toml:")
+    typer.echo(lines.toml)
 
 
 def _board(checkerboard: str, charuco: str, square_mm: float, marker_mm: float, dictionary: str) -> Board:

@@ -51,7 +51,9 @@ def read_points(table: Path) -> Points:
     return Points(names, numbers[:, :2], numbers[:, 2:], hashlib.sha256(data).hexdigest())
 
 
-def registration_file(fitted: Registration, source: str, software: str) -> RegistrationFile:
+def registration_file(
+    fitted: Registration, board_origin_mm: tuple[float, float], source: str, software: str
+) -> RegistrationFile:
     """The artefact of a registration."""
     a, b, x, c, d, y = (float(v) for v in fitted.matrix.ravel())
     residuals = {n: (float(r[0]), float(r[1])) for n, r in zip(fitted.names, fitted.residuals_mm, strict=True)}
@@ -60,7 +62,9 @@ def registration_file(fitted: Registration, source: str, software: str) -> Regis
         source=source,
         model=fitted.model,
         robot_to_paper=(a, b, x, c, d, y),
-        turn_deg=fitted.turn_deg,
+        board_origin_mm=board_origin_mm,
+        origin_mm=fitted.origin_mm,
+        yaw_deg=fitted.yaw_deg,
         scale=fitted.scale,
         rms_mm=fitted.rms_mm,
         left_out_rms_mm=fitted.left_out_rms_mm,

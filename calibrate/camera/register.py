@@ -44,9 +44,18 @@ class Registration:
         return _rms(self.left_out_mm[kept])
 
     @property
-    def turn_deg(self) -> float:
-        """Counter-clockwise, from the robot's x to the paper's."""
-        return float(np.degrees(np.arctan2(self.matrix[1, 0], self.matrix[0, 0])))
+    def yaw_deg(self) -> float:
+        """Of the paper frame in the base frame, counter-clockwise from base x to paper x, as `paper.yaw_deg` has it.
+
+        Points are turned the other way round on their way from the base frame to the paper frame.
+        """
+        return float(np.degrees(np.arctan2(-self.matrix[1, 0], self.matrix[0, 0])))
+
+    @property
+    def origin_mm(self) -> tuple[float, float]:
+        """Of the paper frame in the base frame, as `paper.origin_mm` has it."""
+        x, y = self.to_robot(np.zeros((1, 2)))[0]
+        return float(x), float(y)
 
     @property
     def scale(self) -> float:

@@ -1,4 +1,4 @@
-"""What a recording tells of its camera: the board, the lens, and the photographs of the board."""
+"""What a session tells of its camera: the board, the lens, and the photographs of the board."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import Any, TypeVar, cast
 
 from pydantic import BaseModel, ValidationError
 
-from calibrate.artefact import LensUsed, load_artefact
+from calibrate.artefact import Calibration, LensUsed, load_artefact
 from calibrate.camera.artefact import LensFile
 from calibrate.camera.lens import Gray
+from calibrate.current import current
 from calibrate.errors import CalibrationError
+from calibrate.files import read_bounded
 from calibrate.scale import BoardSpec
 from sessions import container
 from sessions.messages import decode_gray, decode_still
@@ -24,6 +26,10 @@ EFFECTIVE = "rig.effective.json"
 NO_BOARD = "holds no view of the board (a `board` step)"
 
 
+Told = Recording | Path
+"""A recording, or the folder of a session that may still be open."""
+
+
 class _Paper(BaseModel):
     size_mm: tuple[float, float]
 
@@ -31,13 +37,13 @@ class _Paper(BaseModel):
 M = TypeVar("M", bound=BaseModel)
 
 
-def board_of(recording: Recording) -> BoardSpec:
-    """The board of a session's rig. Raises `CalibrationError` where the recording names none."""
+def board_of(session: Told) -> BoardSpec:
+    """The board of a session's rig. Raises `CalibrationError` where the session names none."""
     try:
-        board = _rig(recording)["board"]
+        board = _rig(session)["board"]
     except KeyError:
-        raise CalibrationError(_where(recording), "holds no board") from None
-    return _parsed(recording, "board", BoardSpec, board)
+        raise CalibrationError(_where(session), "holds no board") from None
+    return _parsed(session, "board", BoardSpec, board)
 
 
 def sheet_of(recording: Recording) -> tuple[float, float] | None:
@@ -47,11 +53,21 @@ def sheet_of(recording: Recording) -> tuple[float, float] | None:
     return None if size is None else _parsed(recording, "paper", _Paper, {"size_mm": size}).size_mm
 
 
-def lens_of_session(recording: Recording) -> LensUsed | None:
+def lens_of_session(session: Told) -> LensUsed | None:
     """The lens that the session was collected with; None where its rig named none. Raises `CalibrationError`."""
-    camera = _rig(recording).get("camera")
+    camera = _rig(session).get("camera")
     optics = cast("dict[str, Any]", camera).get("optics") if isinstance(camera, dict) else None
-    return None if optics is None else _parsed(recording, "camera.optics", LensUsed, optics)
+    return None if optics is None else _parsed(session, "camera.optics", LensUsed, optics)
+
+
+def lens_in_use(folder: Path) -> LensUsed | None:
+    """The lens of the calibration that a session uses, else the one that it was collected with.
+
+    Raises `CalibrationError`.
+    """
+    path = current(folder)
+    lens = None if path is None else load_artefact(path, Calibration).lens
+    return lens if lens is not None else lens_of_session(folder)
 
 
 def read_lens(path: Path) -> LensUsed:
@@ -77,24 +93,25 @@ def board_stills(recording: Recording) -> Iterator[tuple[int, Gray]]:
             yield message.log_time, decode_gray(decode_still(message.data), str(recording.path))
 
 
-def _rig(recording: Recording) -> dict[str, Any]:
+def _rig(session: Told) -> dict[str, Any]:
+    data = read_bounded(session / EFFECTIVE) if isinstance(session, Path) else session.attachment(EFFECTIVE)
     try:
-        rig: Any = json.loads(recording.attachment(EFFECTIVE))
-    except (ValueError, KeyError, RecursionError):
+        rig: Any = json.loads(data)
+    except (ValueError, RecursionError):
         rig = None
     if not isinstance(rig, dict):
-        raise CalibrationError(_where(recording), "holds no board")
+        raise CalibrationError(_where(session), "holds no board")
     return cast("dict[str, Any]", rig)
 
 
-def _parsed(recording: Recording, name: str, kind: type[M], values: object) -> M:
+def _parsed(session: Told, name: str, kind: type[M], values: object) -> M:
     try:
         return kind.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join([name, *map(str, first["loc"])])
-        raise CalibrationError(_where(recording), f"{field}: {first['msg']}") from None
+        raise CalibrationError(_where(session), f"{field}: {first['msg']}") from None
 
 
-def _where(recording: Recording) -> str:
-    return f"{recording.path} {EFFECTIVE}"
+def _where(session: Told) -> str:
+    return str(session / EFFECTIVE) if isinstance(session, Path) else f"{session.path} {EFFECTIVE}"

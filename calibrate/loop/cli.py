@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from calibrate.scales import MM_PER_PX
+
 
 def compare(
     original: Annotated[Path, typer.Argument(help="The session whose strokes were pressed again.")],
@@ -14,7 +16,7 @@ def compare(
     fit: Annotated[
         Path | None, typer.Option(help="Brush fit that recovered depth and tilt; else CCD-BSM as published.")
     ] = None,
-    mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = 0.3,
+    mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = MM_PER_PX,
     out: Annotated[Path, typer.Option(help="Folder for loop.html, loop.png, loop.csv, loop.json.")] = Path("loop"),
 ) -> None:
     """Compare re-pressed strokes with their originals, beside the brush's own repeatability."""

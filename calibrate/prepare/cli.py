@@ -34,7 +34,7 @@ app.command(SESSION)(calibrate)
 def show(
     artefact: Annotated[Path, typer.Argument(help="A calibration, lens, registration or brush fit, or a session.")],
 ) -> None:
-    """What an artefact holds, or a session's newest calibration."""
+    """What an artefact holds, or the calibration that a session uses."""
     from calibrate.compare import described, read_any
 
     path, made = read_any(artefact)
@@ -43,7 +43,7 @@ def show(
 
 @app.command()
 def diff(
-    one: Annotated[Path, typer.Argument(help="An artefact, or a session: its newest calibration.")],
+    one: Annotated[Path, typer.Argument(help="An artefact, or a session: the calibration that it uses.")],
     other: Annotated[Path, typer.Argument(help="Another of the same kind.")],
 ) -> None:
     """What is different in another artefact, and for calibrations what that means on the paper."""

@@ -9,9 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibrate.camera.lens import Gray
+from calibrate.camera.lens import Gray, unknown_lens
+from calibrate.camera.plane import Plane
 from calibrate.camera.session import NO_BOARD, board_of, known_lens
 from calibrate.camera.view import see_straight
+from calibrate.current import current
 from calibrate.errors import CalibrationError
 from calibrate.field import Field
 from calibrate.files import read_gray, write_whole
@@ -19,17 +21,20 @@ from calibrate.prepare.difference import new_stroke
 from calibrate.prepare.params import Params
 from calibrate.prepare.picture import contact_sheet
 from calibrate.prepare.stages import Trace, trace_scaled, trace_seen
+from calibrate.validation import calibration_of
 from sessions.messages import decode_gray
 from sessions.reader import Capture, Recording
+from sessions.schemas import Stroke
 from sessions.sequence import SEQUENCE
 
 PAPER = 255
 
 
 def show_stroke(session: Path, stroke: str, out: Path, params: Params | None = None, lens: Path | None = None) -> Trace:
-    """A stroke of a session by its name, the first where that is empty; by a lens file, or the session's own lens.
+    """A stroke of a session by its name, the first where that is empty.
 
-    Raises `CalibrationError`.
+    Seen by the calibration that the session uses, as a validation sees it; by a lens file, or where there is none by
+    the session's own lens, on its last photograph of the board. Raises `CalibrationError`.
     """
     recording = Recording(session)
     before: Capture | None = None
@@ -41,12 +46,7 @@ def show_stroke(session: Path, stroke: str, out: Path, params: Params | None = N
         raise CalibrationError(str(recording.path), f"holds no stroke {stroke!r}")
     one, image, where = capture.stroke, capture.image(), f"{recording.path.name} {capture.stroke.stroke_id}"
     if one.anchor_mm is not None:
-        boards = list(recording.stills_of("board"))
-        if not boards:
-            raise CalibrationError(str(recording.path), NO_BOARD)
-        known = known_lens(recording, lens)
-        photograph = decode_gray(boards[-1], where)
-        plane, _ = see_straight(photograph, board_of(recording), known.lens() if known else None, where)
+        plane = _plane(recording, one, image, lens, where)
         window_mm, chosen = Field().window_mm(one.anchor_mm), params or Params()
         trace = trace_seen(image, plane, window_mm, one.anchor_mm, where, chosen, one.cell_mm)
     elif one.px_per_mm is not None:
@@ -56,6 +56,22 @@ def show_stroke(session: Path, stroke: str, out: Path, params: Params | None = N
     else:
         raise CalibrationError(where, "has neither an anchor on the sheet nor a scale of its own")
     return _written(trace, params or Params(), out)
+
+
+def _plane(recording: Recording, one: Stroke, image: Gray, lens: Path | None, where: str) -> Plane:
+    path = current(recording.path.parent) if lens is None else None
+    used = None if path is None else calibration_of(recording, one, recording.sha256, path)
+    if used is not None:
+        through = used.lens.lens() if used.lens is not None else unknown_lens((image.shape[1], image.shape[0]))
+        through.check_size(image, where)
+        reach, middle = (used.mm_per_px_low, used.mm_per_px_high), used.middle_px or (0.0, 0.0)
+        return Plane(through, used.homography(), used.mm_per_px, reach, used.rms_px, 0.0, middle, used.corners, ())
+    boards = list(recording.stills_of("board"))
+    if not boards:
+        raise CalibrationError(str(recording.path), NO_BOARD)
+    known = known_lens(recording, lens)
+    photograph = decode_gray(boards[-1], where)
+    return see_straight(photograph, board_of(recording), known.lens() if known else None, where)[0]
 
 
 def show_photograph(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import cast
 
 import cv2
 import numpy as np
@@ -11,11 +10,13 @@ import numpy as np
 from calibrate.camera.lens import Gray
 from calibrate.camera.plane import Plane
 from calibrate.errors import CaptureRefused
+from calibrate.field import Field, Tone, captured_mm, crop, crop_at_anchor
 from calibrate.prepare.components import components, fill_holes
 from calibrate.prepare.light import flatten
 from calibrate.prepare.params import PX_PER_MM, Mask, Params, Soft
 from calibrate.prepare.rectify import rectify_bent
 from calibrate.preprocess import (
+    Prepared,
     cell_window,
     find_level,
     on_raster,
@@ -26,14 +27,6 @@ from calibrate.preprocess import (
     to_levels,
     touches_edge,
 )
-
-SIZE_PX = 128
-MM_PER_PX = 0.2
-SHRINK = round(MM_PER_PX * PX_PER_MM)
-FIELD_PX = SIZE_PX * SHRINK
-"""25.6 mm at 20 px/mm."""
-HALF = 0.5
-"""Coverage from which a pixel of the small image is ink."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +45,7 @@ class Trace:
     where: str
     stages: tuple[Stage, ...]
     binary: Mask
-    """(128, 128), 0.2 mm/px, True where ink."""
+    """(128, 128) of the field, True where ink: the image that a validation compares."""
     soft: Soft
     """(128, 128) coverage from 0 to 1."""
     anchor_px: tuple[float, float] | None
@@ -127,14 +120,17 @@ def _from_raster(
     mask = fill_holes(chosen.mask, params)
     soft = soft_ink(reflectance, chosen.mask)
     flags = list(raise_flags(raster[window], mask[window], chosen))
-    crop_mask, crop_soft, corner, whole = _crop(mask, soft)
-    if not whole:
-        flags.append(f"too long: the stroke does not fit {FIELD_PX / PX_PER_MM:g} mm, its ends are cut off")
-    anchor = None if anchor_px is None else (anchor_px[0] - corner[0], anchor_px[1] - corner[1])
-    coverage = cv2.resize(crop_mask.astype(np.float32), (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA)
-    binary = np.asarray(coverage, np.float32) > HALF
-    small_soft = cast("Soft", cv2.resize(crop_soft, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA))
-    small_anchor = None if anchor is None else (anchor[0] / SHRINK, anchor[1] / SHRINK)
+    whole, view = Prepared(mask, soft, anchor_px, level.threshold, touches_edge(mask[window])), Field()
+    if anchor_px is None:
+        corner = _about(mask, view)
+        cropped = crop(whole, corner, view)
+    else:
+        corner, cropped = view.corner_px(anchor_px), crop_at_anchor(whole, anchor_px, view)
+    if np.count_nonzero(cropped.mask) < np.count_nonzero(mask):
+        flags.append(f"too long: the stroke does not fit {view.side_mm:g} mm, its ends are cut off")
+    anchor, binary = cropped.anchor_px, captured_mm(cropped, Tone.BINARY) > 0.5
+    shrink = view.mm_per_px * PX_PER_MM
+    small_anchor = None if anchor is None else (anchor[0] / shrink, anchor[1] / shrink)
     light = (raster / np.maximum(reflectance, 1e-3)).astype(np.float32)[window]
     after = (
         Stage("light", np.clip(light, 0, 255).astype(np.uint8), _range(light, "gray_level")),
@@ -158,26 +154,27 @@ def _from_raster(
                 "hole_mm2": params.hole_mm2,
             },
         ),
-        Stage("crop", _gray(crop_soft), {"left_px": float(corner[0]), "top_px": float(corner[1])}),
+        Stage("crop", _gray(cropped.soft), {"left_px": float(corner[0]), "top_px": float(corner[1])}),
         Stage(
-            "anchor", _cross(_gray(crop_soft), anchor), {} if anchor is None else {"x_px": anchor[0], "y_px": anchor[1]}
+            "anchor",
+            _cross(_gray(cropped.soft), anchor),
+            {} if anchor is None else {"x_px": anchor[0], "y_px": anchor[1]},
         ),
-        Stage("binarise", _shade(crop_mask), {"area_mm2": float(np.count_nonzero(crop_mask)) / PX_PER_MM**2}),
-        Stage("resize", _shade(binary), {"mm_per_px": MM_PER_PX, "area_mm2": float(binary.sum()) * MM_PER_PX**2}),
+        Stage("binarise", _shade(cropped.mask), {"area_mm2": float(np.count_nonzero(cropped.mask)) / PX_PER_MM**2}),
+        Stage(
+            "resize",
+            _shade(binary),
+            {"mm_per_px": view.mm_per_px, "area_mm2": float(binary.sum()) * view.mm_per_px**2},
+        ),
     )
-    return Trace(where, (*before, *after), binary, small_soft, small_anchor, tuple(flags))
+    return Trace(where, (*before, *after), binary, captured_mm(cropped, Tone.GRAY), small_anchor, tuple(flags))
 
 
-def _crop(mask: Mask, soft: Soft) -> tuple[Mask, Soft, tuple[int, int], bool]:
-    """25.6 mm around the middle of the stroke's box, (column, row) of its corner, and whether the stroke fits."""
+def _about(mask: Mask, view: Field) -> tuple[int, int]:
+    """(column, row) of the field's corner where no anchor is known: around the middle of the stroke's box."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    left = int(columns[0] + columns[-1] + 1 - FIELD_PX) // 2
-    top = int(rows[0] + rows[-1] + 1 - FIELD_PX) // 2
-    side = FIELD_PX
-    where = (slice(top + side, top + 2 * side), slice(left + side, left + 2 * side))
-    kept = np.pad(mask, side)[where]
-    whole = bool(np.count_nonzero(kept) == np.count_nonzero(mask)) and not touches_edge(kept)
-    return kept, np.pad(soft, side)[where], (left, top), whole
+    side = round(view.side_mm * PX_PER_MM)
+    return int(columns[0] + columns[-1] + 1 - side) // 2, int(rows[0] + rows[-1] + 1 - side) // 2
 
 
 def _range(values: Soft, name: str) -> dict[str, float]:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from calibrate.scales import MM_PER_PX
+
 if TYPE_CHECKING:
     from calibrate.validate.diff import Difference
     from calibrate.validate.steps import Progress
@@ -38,9 +40,9 @@ def validate(
     session: Annotated[list[str], typer.Argument(help="Sessions: folders, .mcap files, or URLs with a checksum.")],
     model: Annotated[list[str] | None, typer.Option(help="Only these models; all by default.")] = None,
     generator: Annotated[list[Path] | None, typer.Option(help="A trained generator.safetensors.")] = None,
-    mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = 0.3,
-    calibration: Annotated[Path | None, typer.Option(help="Artefact; the session's newest by default.")] = None,
-    fit: Annotated[Path | None, typer.Option(help="Brush fit; the session's newest by default.")] = None,
+    mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = MM_PER_PX,
+    calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
+    fit: Annotated[Path | None, typer.Option(help="Brush fit; the one in use by default.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the report; <session>/validation by default.")] = None,
     gate: Annotated[list[str] | None, typer.Option(help="As 'csim_avg>=0.90', quoted; exit code 5 if missed.")] = None,
     ablations: Annotated[bool, typer.Option("--ablations", help="Lambdas, and similarity by number of fits.")] = False,
@@ -133,7 +135,7 @@ def captures(
     generator: Annotated[Path, typer.Option(help="The generator.safetensors that is to be tuned.")],
     out: Annotated[Path, typer.Option(help="The file for `brushloop train tune`.")] = Path("captures.safetensors"),
     leave_out: Annotated[list[str] | None, typer.Option(help="A cell to keep for judging, H/alpha as 13/5.")] = None,
-    calibration: Annotated[Path | None, typer.Option(help="Artefact; the session's newest by default.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
 ) -> None:
     """Write captured presses as `brushloop train tune` reads them."""
     import rich

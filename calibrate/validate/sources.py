@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import os
 import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from calibrate.artefact import Calibration, load_artefact, newest
+from calibrate.artefact import FOLDER, Calibration, load_artefact
 from calibrate.brushfit.artefact import FOLDER as FITS
 from calibrate.brushfit.artefact import BrushFit
+from calibrate.current import MAX_POINTER_BYTES, POINTER, current, pointed
 from calibrate.errors import CalibrationError
 from calibrate.validation import calibration_of
 from sessions.errors import SessionDamaged
@@ -29,6 +31,8 @@ PIECE = 1024 * 1024
 MAX_DOWNLOAD_BYTES = 64 * 1024**3
 MAX_ARTEFACTS = 64
 MAX_ARTEFACT_BYTES = 4 * 1024 * 1024
+FORBIDDEN = 403
+"""What a bucket that may not be listed answers for a file that is not there."""
 URL = re.compile(r"^[a-z][a-z0-9+.-]+://", re.IGNORECASE)
 EXTRAS = {"http": "remote", "https": "remote", "s3": "s3", "s3a": "s3", "gs": "gs", "gcs": "gs"}
 """Kind of URL -> the extra that opens it."""
@@ -72,7 +76,7 @@ def open_session(place: str, work: Path, calibration: Path | None, fit: Path | N
     kinds = frozenset(stroke.kind for stroke in strokes)
     if len(kinds) > 1:
         raise CalibrationError(str(recording.path), "mixes presses and drags; validate them as two sessions")
-    found = fit or newest(recording.path.parent, FITS)
+    found = fit or current(recording.path.parent, FITS)
     return Opened(
         recording,
         digest,
@@ -124,7 +128,8 @@ def fetched(url: str, folder: Path) -> Path:
         target = folder / expected / PurePosixPath(where).name
         if not (target.is_file() and file_sha256(target) == expected):
             _copy(system, where, target, expected, address)
-        _copy_artefacts(system, where, target.parent)
+        for kind in (FOLDER, FITS):
+            _copy_artefacts(system, f"{where.rsplit('/', 1)[0]}/{kind}", target.parent / kind)
     except (OSError, ValueError, NotImplementedError, *_backend_errors()) as error:
         raise CalibrationError(address, f"cannot be read: {_line(error)}") from None
     return target
@@ -167,21 +172,53 @@ def _copy(system: Any, where: str, target: Path, expected: str, address: str) ->
         part.unlink(missing_ok=True)
 
 
-def _copy_artefacts(system: Any, where: str, folder: Path) -> None:
-    """Calibrations and fits: each is named after its own hash, which is checked when it is read.
+def _copy_artefacts(system: Any, there: str, here: Path) -> None:
+    """Artefacts of one kind as they lie beside a remote recording: the one that the pointer names, else all of them.
 
-    Whoever cannot list folders, as a plain web server, gives them by --calibration and --fit.
+    Each is named after its own hash, which is checked when it is read. Whoever cannot list folders, as a plain web
+    server, gives the one in use by a pointer, or by --calibration and --fit.
     """
-    for kind in ("calibration", FITS):
-        try:
-            names = sorted(system.glob(f"{where.rsplit('/', 1)[0]}/{kind}/*.json"))[:MAX_ARTEFACTS]
-        except (OSError, NotImplementedError):
+    pointer = _read(system, f"{there}/{POINTER}", MAX_POINTER_BYTES)
+    try:
+        names = [f"{there}/{pointed(pointer, POINTER)}"] if pointer else sorted(system.glob(f"{there}/*.json"))
+    except (OSError, NotImplementedError):
+        return
+    kept = here / POINTER
+    kept.unlink(missing_ok=True)
+    for old in here.glob("*.json"):
+        old.unlink()  # copies of an earlier visit
+    for name in names[:MAX_ARTEFACTS]:
+        data = _read(system, name, MAX_ARTEFACT_BYTES)
+        if data is None:
             continue
-        for name in names:
-            with system.open(name, "rb") as file:
-                data = file.read(MAX_ARTEFACT_BYTES)
-            (folder / kind).mkdir(exist_ok=True)
-            (folder / kind / PurePosixPath(name).name).write_bytes(data)
+        here.mkdir(exist_ok=True)
+        (here / PurePosixPath(name).name).write_bytes(data)
+        _keep_age(system, name, here / PurePosixPath(name).name)
+    if pointer:
+        here.mkdir(exist_ok=True)
+        kept.write_bytes(pointer)
+
+
+def _read(system: Any, name: str, most_bytes: int) -> bytes | None:
+    """The beginning of a remote file; None where there is none."""
+    try:
+        with system.open(name, "rb") as file:
+            return bytes(file.read(most_bytes))
+    except (FileNotFoundError, PermissionError):
+        return None
+    except _backend_errors() as error:
+        if getattr(error, "status", None) == FORBIDDEN:
+            return None
+        raise
+
+
+def _keep_age(system: Any, name: str, copy: Path) -> None:
+    """Without a pointer the one written last is in use: by the age that the place tells, where it tells one."""
+    try:
+        at_s = float(system.modified(name).timestamp())
+    except (AttributeError, NotImplementedError, OSError, ValueError, TypeError, KeyError):
+        return
+    os.utime(copy, (at_s, at_s))
 
 
 def _line(error: BaseException) -> str:

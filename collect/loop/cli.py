@@ -12,7 +12,7 @@ def loop(
     session: Annotated[Path, typer.Argument(help="The session whose presses are recovered and made again.")],
     config: Annotated[Path, typer.Option(help="The rig: addresses, frames, limits.")],
     out: Annotated[Path | None, typer.Option(help="Folder for what the loop makes; <session>/loop by default.")] = None,
-    fit: Annotated[Path | None, typer.Option(help="Brush fit; the session's newest, or made, by default.")] = None,
+    fit: Annotated[Path | None, typer.Option(help="Brush fit; the one in use, or made, by default.")] = None,
     repeats: Annotated[int, typer.Option(min=1, max=100, help="How often each is pressed again.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of the order.")] = 1,
     sheet: Annotated[int | None, typer.Option(min=1, help="Sheet N of the new session is in, as for collect.")] = None,

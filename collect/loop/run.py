@@ -11,7 +11,7 @@ import io
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibrate.artefact import newest
+from calibrate.current import artefacts, current
 from calibrate.files import read_bounded
 from collect.commands import GIVEN_UP, Say, run_command
 from collect.config import RigConfig, load_rig
@@ -36,7 +36,7 @@ class Wanted:
     config: Path
     out: Path
     fit: Path | None = None
-    """The newest of the session by default; fitted where there is none."""
+    """The one that the session uses by default; fitted where there is none."""
     repeats: int = 1
     seed: int = 1
     collect_options: tuple[str, ...] = ()
@@ -68,7 +68,7 @@ def run_loop(wanted: Wanted, say: Say) -> Path:
         again = finished_session(root, protocol)
     if again is None:
         raise ConfigError(root, "", "holds no finished session of the replay, though collection ended")
-    if newest(again) is None:
+    if not artefacts(again):
         run_command(say, "calibrate", again)
     run_command(say, "loop", "compare", folder, again, "--fit", fit, "--out", wanted.out)
     return wanted.out / PAGE
@@ -82,15 +82,15 @@ def _check_rig(path: Path, rig: RigConfig, header: Header) -> None:
 
 def _fit(wanted: Wanted, recording: Recording, say: Say) -> Path:
     folder = recording.path.parent
-    if recording.header.source is not Source.IMPORT and newest(folder) is None:
+    if recording.header.source is not Source.IMPORT and not artefacts(folder):
         run_command(say, "calibrate", folder)
     if wanted.fit is not None:
         return wanted.fit
     if (begun := begun_with(wanted.out)) is not None:
         return folder / FITS / f"{begun.fit}.json"  # whatever was fitted since
-    if newest(folder, FITS) is None:
+    if not artefacts(folder, FITS):
         run_command(say, "fit", folder)
-    fit = newest(folder, FITS)
+    fit = current(folder, FITS)
     if fit is None:
         raise ConfigError(folder, "", "was not fitted")
     return fit

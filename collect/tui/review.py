@@ -196,7 +196,7 @@ class ReviewScreen(Screen[None]):
 
     def _show_words(self) -> None:
         if self._seen is not None:
-            self._words.show(_words(self._seen, self._looked, self._alike, self._review.folder))
+            self._words.show(_words(self._seen, self._looked, self._alike, self._review))
 
     @work(exclusive=True, group="look")
     async def _load(self, seen: Seen) -> None:
@@ -225,7 +225,7 @@ def _words(
     seen: Seen,
     looked: Looked | None,
     alike: dict[tuple[float, float], tuple[float, int] | None],
-    folder: Path,
+    review: Review,
 ) -> Content:
     why = ""
     if not seen.kept:
@@ -234,8 +234,8 @@ def _words(
         why = "  marked bad"
     lines: list[Content] = [
         Content.assemble((seen.stroke_id, "bold"), f"  H {seen.height_mm:g} mm  α {seen.tilt_deg:g}°", (why, "bold")),
-        Content.assemble(("MCAP      ", "dim"), _where(seen, looked, folder)),
-        Content.assemble(("Repeats   ", "dim"), _alike_text(alike, (seen.height_mm, seen.tilt_deg))),
+        Content.assemble(("MCAP      ", "dim"), _where(seen, looked, review.folder)),
+        Content.assemble(("Repeats   ", "dim"), _alike_text(alike, (seen.height_mm, seen.tilt_deg), review.untold)),
     ]
     if seen.unlike:
         lines.append(Content.assemble(("Waited    ", "dim"), (f"! {seen.unlike}", "bold $text-warning")))
@@ -251,7 +251,11 @@ def _where(seen: Seen, looked: Looked | None, folder: Path) -> str:
     return f"{file}  still {seen.still}" + ("" if looked is None else f"  at {looked.log_ns / 1e9:.3f} s")
 
 
-def _alike_text(alike: dict[tuple[float, float], tuple[float, int] | None], cell: tuple[float, float]) -> str:
+def _alike_text(
+    alike: dict[tuple[float, float], tuple[float, int] | None], cell: tuple[float, float], untold: str
+) -> str:
+    if untold:
+        return f"not compared: {plain(untold)}"
     if cell not in alike:
         return "comparing ..."
     found = alike[cell]

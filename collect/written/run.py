@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibrate.artefact import newest
+from calibrate.current import artefacts
 from collect.commands import GIVEN_UP, Say, run_command
 from collect.config import load_rig
 from collect.errors import ConfigError
@@ -101,7 +101,7 @@ class Writing:
             session = finished_session(wanted.sessions, protocol)
         if session is None:
             raise ConfigError(wanted.sessions, "", "holds no finished session of the plan, though collection ended")
-        if newest(session) is None:
+        if not artefacts(session):
             self._do("calibrate", session)
         return session
 

@@ -67,13 +67,16 @@ def _photographed(
     for number, (stroke, image) in enumerate(presses, start=len(boards)):
         t_ns = T0_NS + number * MINUTE_NS
         marked = Outgoing(Topic.STROKE, t_ns, t_ns, number, stroke.model_copy(update={"still": number}))
-        _take(store, "capture", number, [_still(t_ns, number, image), marked])
+        pressed = {"stroke_id": stroke.stroke_id, "height_mm": stroke.height_mm, "tilt_deg": stroke.tilt_deg}
+        _take(store, "capture", number, [_still(t_ns, number, image), marked], pressed | {"still": number})
     store.close()
     store.release()
     return folder
 
 
-def _take(store: SessionStore, kind: str, number: int, messages: list[Outgoing]) -> None:
+def _take(
+    store: SessionStore, kind: str, number: int, messages: list[Outgoing], result: dict[str, Any] | None = None
+) -> None:
     attempt = store.begin(f"{kind} {number}", kind, cell=None, notes={"params": {}})
     event: dict[str, Any] = {"key": "k", "kind": kind, "index": number, "attempt": 1, "params": {}}
     begin, end = (
@@ -82,7 +85,7 @@ def _take(store: SessionStore, kind: str, number: int, messages: list[Outgoing])
     )
     for message in (begin, *messages, end):
         attempt.writer.write(message)
-    store.done(attempt, {})
+    store.done(attempt, result or {})
 
 
 def _still(t_ns: int, number: int, image: Gray) -> Outgoing:

@@ -14,8 +14,9 @@ from typer.testing import CliRunner, Result
 
 from bench.preprocess_rigs import board_of
 from brushloop import app
-from calibrate.artefact import HASH_CHARS, Calibration, load_artefact, newest
+from calibrate.artefact import HASH_CHARS, Calibration, load_artefact
 from calibrate.calibration import calibrate_session
+from calibrate.current import current, put_to_use
 from calibrate.errors import CalibrationError
 from calibrate.validation import calibration_of
 from drivers.geometry import brush_pose
@@ -54,7 +55,7 @@ def sessions(tmp_path_factory: pytest.TempPathFactory, photographed: Photographe
 def pair(sessions: tuple[Path, Path], tmp_path: Path) -> tuple[Path, Path, Path]:
     """Copies of both sessions, and the calibration of the first."""
     one, other = (Path(shutil.copytree(folder, tmp_path / folder.name)) for folder in sessions)
-    made = newest(one)
+    made = current(one)
     assert made is not None
     return one, other, made
 
@@ -70,7 +71,7 @@ def used(session: Path) -> Calibration:
     return found
 
 
-def test_show_tells_every_value_of_an_artefact_or_of_a_sessions_newest(pair: tuple[Path, Path, Path]) -> None:
+def test_show_tells_every_value_of_an_artefact_or_of_the_one_a_session_uses(pair: tuple[Path, Path, Path]) -> None:
     one, other, made = pair
     for what in (made, one):
         told = run("show", what)
@@ -126,8 +127,7 @@ def test_another_sessions_calibration_is_refused_unless_forced_and_then_labelled
 
 def test_a_sessions_own_calibration_is_put_back_without_a_label(pair: tuple[Path, Path, Path]) -> None:
     one, _, made = pair
-    later = load_artefact(made, Calibration).model_copy(update={"rms_px": 0.5}).save(one / "calibration")
-    later.touch()
+    put_to_use(load_artefact(made, Calibration).model_copy(update={"rms_px": 0.5}), one)
     assert used(one).rms_px == 0.5
     assert run("apply", made, one).output == f"{made}\n"
     assert used(one).digest == made.stem

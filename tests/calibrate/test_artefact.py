@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import re
 from pathlib import Path
 
 import pytest
 
-from calibrate.artefact import Calibration, load_artefact, newest
+from calibrate.artefact import Calibration, load_artefact
+from calibrate.current import current, put_to_use
 from calibrate.errors import CalibrationError
 
 MADE = Calibration(
@@ -55,8 +58,59 @@ def test_what_is_no_artefact_is_refused_in_one_line(tmp_path: Path, text: str) -
     assert "\n" not in str(refused.value)
 
 
-def test_the_newest_is_the_one_written_last(tmp_path: Path) -> None:
-    assert newest(tmp_path) is None
-    MADE.save(tmp_path / "calibration")
-    last = MADE.model_copy(update={"rms_px": 0.1}).save(tmp_path / "calibration")
-    assert newest(tmp_path) == last
+def made(rms_px: float) -> Calibration:
+    return MADE.model_copy(update={"rms_px": rms_px})
+
+
+def test_what_was_put_to_use_last_is_in_use_and_no_artefact_changes(tmp_path: Path) -> None:
+    """Lens A, lens B, lens A again."""
+    assert current(tmp_path) is None
+    a, b = put_to_use(made(0.1), tmp_path), put_to_use(made(0.2), tmp_path)
+    assert current(tmp_path) == b
+    before = {path: path.stat().st_mtime_ns for path in (a, b)}
+    assert put_to_use(made(0.1), tmp_path) == a == current(tmp_path)
+    assert {path: path.stat().st_mtime_ns for path in (a, b)} == before
+    a.touch()
+    b.touch()
+    assert current(tmp_path) == a, "no matter what a copy or a backup did to the times"
+    assert sorted(path.name for path in a.parent.iterdir()) == sorted([a.name, b.name, "current"])
+
+
+def test_each_kind_of_artefact_has_a_pointer_of_its_own(tmp_path: Path) -> None:
+    calibration, fit = put_to_use(made(0.1), tmp_path), put_to_use(made(0.2), tmp_path, "brushfit")
+    assert (current(tmp_path), current(tmp_path, "brushfit")) == (calibration, fit)
+
+
+def test_a_session_without_a_pointer_uses_the_artefact_written_last_and_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "calibration"
+    only = made(0.1).save(folder)
+    assert current(tmp_path) == only
+    assert caplog.messages == [], "one candidate is no question"
+    last = made(0.2).save(folder)
+    os.utime(only, (1, 1))
+    assert current(tmp_path) == last
+    [told] = caplog.messages
+    assert f"holds 2 artefacts, and no file `current` says which is in use: {last.name} is taken" in told
+    assert f"choose with `brushloop calibrate apply {folder}/<hash>.json {tmp_path}`" in told
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "holds no name of an artefact"),
+        ("../../secret.json", "holds no name of an artefact"),
+        ("0123456789abcdef.json\n0123456789abcdef.json", "holds no name of an artefact"),
+        ("x" * 1000, "is larger than 256 bytes"),
+        ("0123456789abcdef.json", "names 0123456789abcdef.json, which is not there: choose with `brushloop calibrate"),
+    ],
+    ids=["empty", "elsewhere", "two", "long", "missing"],
+)
+def test_a_pointer_that_leads_nowhere_is_refused_and_never_guessed_around(tmp_path: Path, text: str, told: str) -> None:
+    path = put_to_use(MADE, tmp_path)
+    (path.parent / "current").write_text(text)
+    with pytest.raises(CalibrationError, match=re.escape(told)) as refused:
+        current(tmp_path)
+    assert "\n" not in str(refused.value)
+    assert put_to_use(MADE, tmp_path) == path == current(tmp_path), "calibrating again mends it"

@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 
 from bench.preprocess_rigs import board_of
 from brushloop import app
-from calibrate.artefact import Calibration, load_artefact, newest
+from calibrate.artefact import Calibration, load_artefact
+from calibrate.current import current
 from calibrate.errors import CalibrationError
 from calibrate.scale import BoardSpec
 from drivers.geometry import brush_pose
@@ -78,7 +79,7 @@ def test_what_can_be_used_with_care_is_flagged_in_the_artefact(
     ran = CliRunner().invoke(app, ["calibrate", str(session)])
     assert ran.exit_code == 0, ran.output
     assert told in " ".join(ran.output.split())
-    path = newest(session)
+    path = current(session)
     assert path is not None
     assert any(told in flag for flag in load_artefact(path, Calibration).flags)
 

@@ -10,8 +10,9 @@ from calibrate.camera.plane import Plane
 from calibrate.camera.view import see_plane
 from calibrate.prepare.params import PX_PER_MM, Params
 from calibrate.prepare.rectify import rectify_bent
-from calibrate.prepare.stages import MM_PER_PX, trace_seen
+from calibrate.prepare.stages import trace_seen
 from calibrate.preprocess import prepare
+from calibrate.scales import MM_PER_PX
 
 
 def overlaps(shot: Shot, plane: Plane) -> list[float]:

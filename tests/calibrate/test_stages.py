@@ -11,9 +11,11 @@ import pytest
 from typer.testing import CliRunner
 
 from calibrate.errors import CaptureRefused
+from calibrate.field import Field
 from calibrate.prepare.cli import app
 from calibrate.prepare.params import Params
 from calibrate.prepare.stages import trace_scaled
+from calibrate.scales import MM_PER_PX
 
 
 def photograph(*strokes: tuple[int, int], glare: tuple[int, int] | None = None, paper: int = 225) -> np.ndarray:
@@ -32,13 +34,29 @@ def trace(image: np.ndarray, anchor: tuple[float, float] | None = None, params: 
     return trace_scaled(image, (10.0, 10.0), anchor, "photograph", params or Params())
 
 
-def test_a_stroke_comes_out_at_a_fifth_of_a_millimetre_with_its_anchor() -> None:
+def test_a_stroke_comes_out_at_the_scale_of_the_validation_with_its_anchor() -> None:
     found = trace(photograph((400, 300)), (430.0, 310.0))
     assert found.binary.shape == (128, 128)
-    assert found.binary.sum() * 0.04 == pytest.approx(np.pi * 6 * 2, rel=0.03)
-    assert found.anchor_px == pytest.approx((64 + 15, 64 + 5), abs=1.0)
+    assert found.log["resize.mm_per_px"] == Field().mm_per_px
+    assert found.binary.sum() * MM_PER_PX**2 == pytest.approx(np.pi * 6 * 2, rel=0.05)
+    left, top = (v / MM_PER_PX for v in Field().anchor_mm)
+    assert found.anchor_px == pytest.approx((left, top), abs=0.1)
+    rows, columns = np.nonzero(found.binary)
+    assert (columns.mean(), rows.mean()) == pytest.approx((left - 3.0 / MM_PER_PX, top - 1.0 / MM_PER_PX), abs=1.0)
     assert found.log["components.others"] == 0
     assert found.flags == ()
+
+
+def test_without_an_anchor_the_stroke_lies_in_the_middle() -> None:
+    found = trace(photograph((200, 150)))
+    rows, columns = np.nonzero(found.binary)
+    assert (columns.mean(), rows.mean()) == pytest.approx((63.5, 63.5), abs=1.0)
+    assert found.anchor_px is None
+
+
+def test_an_anchor_far_from_the_stroke_is_refused() -> None:
+    with pytest.raises(CaptureRefused, match="none of it is in the field"):
+        trace(photograph((200, 150)), (700.0, 500.0))
 
 
 def test_eight_strokes_in_one_crop_are_flagged() -> None:
@@ -69,7 +87,7 @@ def test_holes_of_glare_are_filled_where_that_is_asked_for() -> None:
     image = photograph((400, 300))
     cv2.circle(image, (400, 300), 5, 225, -1)
     kept, filled = trace(image), trace(image, params=Params(hole_mm2=1.0))
-    assert filled.binary.sum() - kept.binary.sum() == pytest.approx(np.pi * 0.25 / 0.04, abs=6)
+    assert filled.binary.sum() - kept.binary.sum() == pytest.approx(np.pi * 0.25 / MM_PER_PX**2, abs=4)
 
 
 def test_the_command_shows_every_stage_and_writes_the_numbers(tmp_path: Path) -> None:

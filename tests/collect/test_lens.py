@@ -13,6 +13,7 @@ from calibrate.calibration import calibrate_session
 from calibrate.camera.artefact import LensFile
 from collect.config import load_rig
 from collect.errors import ConfigError, StepError
+from collect.reviewing import Review, counts
 from collect.states import State
 from sessions import container
 from sessions.journal import read_lines, replay
@@ -66,6 +67,12 @@ def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> No
     assert schema is not None
     assert (schema.name, told.width, told.height) == ("foxglove.CameraCalibration", 2048, 1536)
     assert (list(told.D), told.K[0]) == ([K1, 0.0, 0.0, 0.0, 0.0], 2048.0)
+
+    # The review looks through the recorded lens: the file that rig.toml names does not lie beside its snapshot.
+    review = Review(folder)
+    looked = review.look(next(seen for seen in review.captures if counts(seen)))
+    assert looked.binary is not None
+    assert looked.binary.any()
 
     made = load_artefact(calibrate_session(folder), Calibration)
     assert made.lens is not None

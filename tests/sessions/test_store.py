@@ -10,6 +10,8 @@ import threading
 import pytest
 from mcap.reader import make_reader
 
+from sessions.combine import combine
+from sessions.container import attachments
 from sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked
 from sessions.journal import JOURNAL_NAME, Journal
 from sessions.lines import with_crc
@@ -146,6 +148,20 @@ def test_the_merged_file_holds_what_the_journal_counted_and_the_configuration(ma
     recording = Recording(store.folder)
     assert recording.header == make.header
     assert recording.attachment("rig.toml").decode() == make.snapshots["rig.toml"]
+
+
+def test_each_attached_file_says_what_it_is(make, tmp_path):
+    """In the merged file of a session, and in one of several sessions."""
+    snapshots = {**make.snapshots, "rig.effective.json": '{"name": "bench"}\n'}
+    finals = []
+    for name in ("monday", "tuesday"):
+        store = SessionStore.create(tmp_path / name, make.header, snapshots, make.clock())
+        make.perform(store, name)
+        finals.append(store.close())
+        store.release()
+    expected = dict.fromkeys(make.snapshots, "application/toml") | {"rig.effective.json": "application/json"}
+    for path in (*finals, combine([final.parent for final in finals], tmp_path / "week.mcap")):
+        assert {a.name: a.media_type for a in attachments(path)} == expected
 
 
 def test_a_closed_session_is_not_opened_for_writing_again(make, store, resume):

@@ -11,10 +11,11 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop import app
-from calibrate.artefact import load_artefact, newest
+from calibrate.artefact import load_artefact
 from calibrate.brushfit.drag_captures import commanded_path, figures_of, read_drags
 from calibrate.brushfit.drag_run import FOLDER, LAGGING, STAMPS, DragArtefact
 from calibrate.brushfit.drags import chance, fit_drags
+from calibrate.current import current
 from calibrate.errors import CalibrationError
 from drivers.sim.brush import Brush, BrushSpec, Waypoint
 from model.drag import DragModel
@@ -57,7 +58,7 @@ def test_dragged_strokes_are_fitted_and_written(session: Path) -> None:
     assert ran.exit_code == 0, ran.output
     for words in ("bristle lag", "circle stamps", "leash_mm", "condition"):
         assert words in ran.output
-    path = newest(session, FOLDER)
+    path = current(session, FOLDER)
     assert path is not None
     fit = load_artefact(path, DragArtefact)
     assert (fit.images, fit.strokes) == (6, 6)

@@ -10,10 +10,11 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop import app
-from calibrate.artefact import load_artefact, newest
+from calibrate.artefact import load_artefact
 from calibrate.brushfit.artefact import FOLDER, BrushFit
 from calibrate.brushfit.captures import read_presses
 from calibrate.brushfit.run import correction, fit_session
+from calibrate.current import current
 from calibrate.errors import CalibrationError
 from calibrate.field import Alignment, Field, Tone
 from calibrate.validate.report import load_report
@@ -56,7 +57,7 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     said = " ".join(ran.output.split())
     for words in ("leave one cell out", "refitted Bezier", "uncalibrated", "condition", "paper.touch_z_mm: add"):
         assert words in said
-    path = newest(session, FOLDER)
+    path = current(session, FOLDER)
     assert path is not None
     fit = load_artefact(path, BrushFit)
     assert fit.strokes == 5

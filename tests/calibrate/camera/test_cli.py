@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 SPEC = BoardSpec(squares=(9, 7), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_100", origin_mm=(0.0, 0.0))
 BOARD = ("--charuco", "9x7", "--square-mm", "20", "--dictionary", "DICT_5X5_100")
+CORNER = ("--origin-mm", "0", "0")
+FLAT = (*BOARD, *CORNER)
 PX_PER_MM = 8.0
 EDGE_PX = 60
 SLANT = np.array([[0.62, 0.02, 30.0], [-0.01, 0.62, 40.0], [1e-5, 2e-5, 1.0]])
@@ -159,7 +161,7 @@ def test_what_is_no_photograph_is_refused(tmp_path: Path, data: bytes | None, to
         path.write_bytes(data)
     refused(run("check", path, *BOARD), told)
     refused(run("intrinsics", path, *BOARD, "--out", tmp_path / "out"), told)
-    refused(run("register", points(tmp_path), "--photograph", path, *BOARD, "--out", tmp_path / "out"), told)
+    refused(run("register", points(tmp_path), "--photograph", path, *FLAT, "--out", tmp_path / "out"), told)
     assert not (tmp_path / "out").exists()
 
 
@@ -201,13 +203,29 @@ def points(folder: Path, change: str = "") -> Path:
     return table
 
 
+def test_register_must_know_where_the_sheet_lies_on_the_board(tmp_path: Path) -> None:
+    photograph, out = saved(tmp_path / "p.png", board()), tmp_path / "out"
+    ran = run("register", points(tmp_path), "--photograph", photograph, *BOARD, "--out", out)
+    refused(ran, "where the sheet lies on the board: is not known: give --config rig.toml")
+    assert not out.exists()
+
+
+def test_register_gives_no_lines_for_what_a_rig_cannot_hold(tmp_path: Path) -> None:
+    photograph = saved(tmp_path / "p.png", board())
+    given = ("register", points(tmp_path), "--photograph", photograph, *FLAT, "--model", "similarity")
+    ran = run(*given, "--out", tmp_path)
+    assert ran.output.splitlines()[-1].startswith("no lines for rig.toml")
+    assert "yaw_deg" not in ran.output
+    refused(run(*given, "--write", tmp_path / "rig.toml"), "--write: needs --model rigid")
+
+
 def test_register_finds_the_turn_and_names_all_that_it_was_made_of(tmp_path: Path) -> None:
     photograph, lens = saved(tmp_path / "p.png", board()), a_lens(tmp_path)
-    ran = run("register", points(tmp_path), "--photograph", photograph, *BOARD, "--lens", lens, "--out", tmp_path / "o")
+    ran = run("register", points(tmp_path), "--photograph", photograph, *FLAT, "--lens", lens, "--out", tmp_path / "o")
     assert ran.exit_code == 0, ran.output
     [path] = (tmp_path / "o").iterdir()
     made = json.loads(path.read_text())
-    assert made["turn_deg"] == pytest.approx(10.0, abs=0.01)
+    assert made["yaw_deg"] == pytest.approx(-10.0, abs=0.01)
     assert made["rms_mm"] < 0.05
     assert made["source"].count("sha256 ") == 2
     assert f"lens file {lens.stem}" in made["source"]
@@ -218,14 +236,14 @@ def test_register_writes_nothing_by_a_photograph_that_tells_nothing(
     tmp_path: Path, image: Gray, options: Sequence[str], told: str
 ) -> None:
     photograph, out = saved(tmp_path / "p.png", image), tmp_path / "out"
-    refused(run("register", points(tmp_path), "--photograph", photograph, *options, "--out", out), told)
+    refused(run("register", points(tmp_path), "--photograph", photograph, *options, *CORNER, "--out", out), told)
     assert not out.exists()
 
 
 def test_register_flags_what_can_be_used_with_care(tmp_path: Path) -> None:
     for image, told in ((half_hidden(0.5), "partly hidden"), (SATURATED, "are saturated")):
         photograph = saved(tmp_path / "p.png", image)
-        ran = run("register", points(tmp_path), "--photograph", photograph, *BOARD, "--out", tmp_path / "out")
+        ran = run("register", points(tmp_path), "--photograph", photograph, *FLAT, "--out", tmp_path / "out")
         assert ran.exit_code == 0, ran.output
         assert any(line.startswith("warning: ") and told in line for line in ran.output.splitlines()), ran.output
 
@@ -242,7 +260,7 @@ def test_register_flags_what_can_be_used_with_care(tmp_path: Path) -> None:
 def test_register_writes_nothing_by_a_bad_table(tmp_path: Path, change: str, told: str) -> None:
     out = tmp_path / "out"
     photograph = saved(tmp_path / "p.png", board())
-    refused(run("register", points(tmp_path, change), "--photograph", photograph, *BOARD, "--out", out), told)
+    refused(run("register", points(tmp_path, change), "--photograph", photograph, *FLAT, "--out", out), told)
     assert not out.exists()
 
 
@@ -287,7 +305,25 @@ def test_intrinsics_names_every_useless_photograph_and_writes_nothing(tmp_path: 
     images = {"blank": BLANK, "mirrored": MIRRORED, "two": TWO, "sound": board()}
     paths = [saved(tmp_path / f"{name}.png", image) for name, image in images.items()]
     ran = run("intrinsics", *paths, *BOARD, "--out", tmp_path / "out")
-    refused(ran, "1 usable views of the board, at least 4 needed")
-    for told in ("blank.png is blank", "mirrored.png is mirrored", "two.png shows two boards"):
+    refused(ran, "4 photographs: 1 usable views of the board, at least 4 needed")
+    for told in ("blank.png: is blank", "mirrored.png: is mirrored", "two.png: shows two boards"):
         assert told in str(ran.exception)
+    assert not (tmp_path / "out").exists()
+
+
+def test_intrinsics_says_of_every_photograph_why_none_was_of_use(tmp_path: Path) -> None:
+    """Also of photographs with one name in several folders, and of one that is given twice."""
+    (tmp_path / "left").mkdir()
+    (tmp_path / "right").mkdir()
+    paths = [saved(tmp_path / folder / "01.png", BLANK) for folder in ("left", "right")]
+    paths += [saved(tmp_path / "left" / "02.png", MIRRORED)] * 2
+    ran = run("intrinsics", *paths, *BOARD, "--out", tmp_path / "out")
+    refused(ran, "4 photographs: 0 usable views of the board, at least 4 needed; left/01.png, right/01.png: is blank")
+    assert "left/02.png, left/02.png (2): is mirrored" in str(ran.exception)
+
+
+def test_intrinsics_counts_one_photograph_given_five_times_once(tmp_path: Path) -> None:
+    path = saved(tmp_path / "a.png", board())
+    ran = run("intrinsics", *[path] * 5, *BOARD, "--out", tmp_path / "out")
+    refused(ran, "5 photographs: 1 usable views of the board, at least 4 needed; a.png (2), a.png (3), ")
     assert not (tmp_path / "out").exists()

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from calibrate.artefact import load_artefact
+from calibrate.artefact import HASH_CHARS, load_artefact
 from calibrate.camera.artefact import LensFile, lens_file
 from calibrate.camera.boards import Checkerboard, View, see
-from calibrate.camera.intrinsics import fit_lens
-from calibrate.camera.lens import Lens
+from calibrate.camera.cameras import two_cameras
+from calibrate.camera.intrinsics import fit_lens, guidance
+from calibrate.camera.lens import Lens, lens_of
+from calibrate.camera.zhang import solve
 from calibrate.errors import CalibrationError
 from calibrate.scale import BoardSpec, charuco_board
 
@@ -39,8 +44,8 @@ def charuco() -> np.ndarray:
     return cv2.copyMakeBorder(picture, 50, 50, 50, 50, cv2.BORDER_CONSTANT, value=255)
 
 
-def views(count: int, noise_px: float = 0.1, seed: int = 0) -> list[View]:
-    """Corners as `TRUE` sees them, each by `noise_px` off."""
+def views(count: int, noise_px: float = 0.1, seed: int = 0, lens: Lens = TRUE) -> list[View]:
+    """Corners as a lens sees them, each by `noise_px` off."""
     rng = np.random.default_rng(seed)
     ids = np.arange(54)
     board = np.column_stack([ids % 9 + 1.0, ids // 9 + 1.0]) * 25.0
@@ -49,7 +54,7 @@ def views(count: int, noise_px: float = 0.1, seed: int = 0) -> list[View]:
         turn = np.array([rng.uniform(-0.6, 0.6), rng.uniform(-0.6, 0.6), rng.uniform(-3, 3)])
         place = np.array([rng.uniform(-220, 40), rng.uniform(-180, 40), rng.uniform(420, 700)])
         flat = np.column_stack([board, np.zeros(54)])
-        pixels, _ = cv2.projectPoints(flat, turn, place, TRUE.matrix, TRUE.distortion)
+        pixels, _ = cv2.projectPoints(flat, turn, place, lens.matrix, lens.distortion)
         pixels = pixels.reshape(-1, 2)
         if pixels.min() > 0 and (pixels < TRUE.size_px).all():
             noisy = pixels + rng.normal(0, noise_px, pixels.shape)
@@ -57,10 +62,27 @@ def views(count: int, noise_px: float = 0.1, seed: int = 0) -> list[View]:
     return made
 
 
+def renamed(seen: Sequence[View], stem: str) -> list[View]:
+    return [dataclasses.replace(view, name=f"{stem}{k:02d}.png") for k, view in enumerate(seen)]
+
+
+def jogged(view: View, name: str, noise_px: float = 0.1) -> View:
+    """Another photograph of a board that nobody moved."""
+    noise = np.random.default_rng(9).normal(0, noise_px, view.pixels.shape)
+    return dataclasses.replace(view, name=name, pixels=view.pixels + noise)
+
+
+@pytest.fixture(scope="module")
+def opencv() -> list[View]:
+    """OpenCV's 13 photographs by one camera."""
+    return [see(cv2.imread(str(path), 0), CHECKERS, path.name) for path in sorted(DATA.glob("left[0-9]*.jpg"))]
+
+
 @real
-def test_opencvs_own_photographs_give_its_own_lens() -> None:
-    seen = [see(cv2.imread(str(path), 0), CHECKERS, path.name) for path in sorted(DATA.glob("left[0-9]*.jpg"))]
-    fitted = fit_lens(seen)
+def test_opencvs_own_photographs_give_its_own_lens(opencv: list[View]) -> None:
+    fitted = fit_lens(opencv)
+    assert fitted.focal_reach_px is not None
+    assert fitted.focal_reach_px[0] < 3.0
     assert len(fitted.residuals_px) == 13
     assert fitted.rms_px <= 0.20
     assert fitted.lens.matrix[0, 0] == pytest.approx(535.92, rel=0.01)
@@ -72,8 +94,111 @@ def test_a_real_charuco_board_is_seen_whole() -> None:
     assert len(see(cv2.imread(str(DATA / "choriginal.jpg"), 0), CHARUCO, "photograph").ids) == 24
 
 
+@pytest.mark.parametrize("times", [1, 3], ids=["each once", "each three times"])
+def test_a_photograph_that_is_given_again_counts_once(times: int) -> None:
+    seen = views(2)
+    given = [jogged(view, f"{k}-{view.name}", 0.0 if k < 2 else 0.1) for view in seen for k in range(times)]
+    with pytest.raises(CalibrationError) as refused:
+        fit_lens(given)
+    told = str(refused.value)
+    assert told.startswith(f"{len(given)} photographs: 2 usable views of the board, at least 4 needed")
+    if times > 1:
+        assert "1-0.png, 2-0.png: shows the board where 0-0.png does: they count once" in told
+    assert "\n" not in told
+
+
+def test_views_given_again_do_not_make_a_lens_surer() -> None:
+    seen = views(8)
+    again = [*seen, *(jogged(view, f"again-{view.name}") for view in seen)]
+    once, twice = fit_lens(seen), fit_lens(again)
+    assert twice.focal_reach_px == pytest.approx(once.focal_reach_px, rel=1e-5)
+    assert len(twice.residuals_px) == 8
+    assert set(twice.unusable) == {f"again-{view.name}" for view in seen}
+
+
+@pytest.mark.parametrize("slant", [0.0, 0.4], ids=["face on", "slanted alike"])
+def test_a_board_that_is_always_held_alike_tells_no_lens(slant: float) -> None:
+    rng, made = np.random.default_rng(3), list[View]()
+    for view in views(10):
+        turn = np.array([slant, 0.0, 0.0]) + rng.normal(0, 0.01, 3)
+        place = np.array([rng.uniform(-180, 0), rng.uniform(-150, 0), rng.uniform(450, 650)])
+        flat = np.column_stack([view.board_mm, np.zeros(54)])
+        pixels, _ = cv2.projectPoints(flat, turn, place, TRUE.matrix, TRUE.distortion)
+        made.append(dataclasses.replace(view, pixels=pixels.reshape(-1, 2) + rng.normal(0, 0.1, (54, 2))))
+    with pytest.raises(CalibrationError, match=r"10 usable views, but the board is held in \d ways, at least 4 needed"):
+        fit_lens(made)
+
+
+def test_an_interval_is_told_where_the_views_earn_it_and_then_holds_the_truth() -> None:
+    few = fit_lens(views(5))
+    assert few.focal_se_px is None
+    assert few.focal_reach_px is None
+    assert any("more ways (5 so far): fewer than 6 earn no interval" in line for line in few.guidance)
+    held = 0
+    for seed in range(6):
+        fitted = fit_lens(views(7, seed=seed))
+        assert fitted.focal_reach_px is not None
+        held += abs(fitted.lens.matrix[0, 0] - TRUE.matrix[0, 0]) <= fitted.focal_reach_px[0]
+    assert held >= 5
+
+
+def other_camera(f: float, x_px: float, y_px: float) -> Lens:
+    """One like TRUE, its focal length f times as long, its axis so many px away."""
+    (fx, _, cx), (_, fy, cy), _ = TRUE.matrix
+    return lens_of((f * fx, f * fy, cx + x_px, cy + y_px), (-0.21, 0.06, 0.001, -0.0005, 0.0), TRUE.size_px)
+
+
+def test_two_cameras_in_one_set_are_told_apart_whatever_the_files_are_called() -> None:
+    one, other = views(7), views(6, seed=5, lens=other_camera(1.06, -45.0, 20.0))
+    mixed = renamed([view for pair in zip(one, other, strict=False) for view in pair], "p")
+    with pytest.raises(CalibrationError, match="12 photographs: are of two cameras: ") as refused:
+        fit_lens(mixed)
+    told = str(refused.value)
+    for part in (mixed[0::2], mixed[1::2]):
+        assert ", ".join(view.name for view in part) in told
+    assert len(fit_lens(mixed, one_camera=True).residuals_px) == 12
+
+
+@real
+def test_left_and_right_cameras_mixed_are_named(opencv: list[View]) -> None:
+    """A second camera as a stereo rig has it: its axis 14 px away, its focal length 0.6 % longer."""
+    middle = np.array([319.5, 239.5])
+    there = [(view.pixels - middle) * 1.006 + middle + [-14.0, 14.0] for view in opencv]
+    names = [view.name.replace("left", "right") for view in opencv]
+    right = [dataclasses.replace(v, name=n, pixels=p) for v, n, p in zip(opencv, names, there, strict=True)]
+    told = r"are of two cameras: .*left01\.jpg.* leave .*right14\.jpg"
+    for mixed in ([*opencv, *right], [*opencv[:7], *right[7:]]):
+        with pytest.raises(CalibrationError, match=told) as refused:
+            fit_lens(mixed)
+        assert "left" not in str(refused.value).split("so do")[1]
+
+
+@real
+def test_no_choice_of_one_cameras_photographs_is_taken_for_two_cameras(opencv: list[View]) -> None:
+    rng = np.random.default_rng(4)
+    for count in (6, 8, 8, 10, 10):
+        chosen = sorted(rng.choice(13, count, replace=False))
+        assert two_cameras([opencv[k] for k in chosen], solve([opencv[k] for k in chosen], "test")) is None
+
+
+@pytest.mark.soak
+def test_how_often_two_cameras_are_told_and_one_is_taken_for_two() -> None:
+    """A stereo pair's lenses, their axes 20 px apart; and one camera whose files are named as if there were two."""
+    found, alarms = 0, 0
+    for seed in range(20):
+        left, right = views(7, seed=seed), views(7, seed=seed + 100, lens=other_camera(1.006, -14.0, 14.0))
+        for other, is_right in ((right, True), (views(7, seed=seed + 200), False)):
+            mixed = [*renamed(left, "left"), *renamed(other, "right")]
+            told = two_cameras(mixed, solve(mixed, "test")) is not None
+            found, alarms = found + (told and is_right), alarms + (told and not is_right)
+    print(f"told {found} of 20, false alarms {alarms} of 20")  # noqa: T201
+    assert found >= 10
+    assert alarms == 0
+
+
 def test_a_known_lens_is_found_within_its_standard_errors() -> None:
     fitted = fit_lens(views(12))
+    assert fitted.focal_se_px is not None
     for k in (0, 1):
         assert abs(fitted.lens.matrix[k, k] - TRUE.matrix[k, k]) < 4 * fitted.focal_se_px[k]
     assert fitted.rms_px == pytest.approx(0.1 * 2**0.5, rel=0.1)
@@ -103,7 +228,7 @@ def test_it_says_what_to_photograph_besides() -> None:
     told = " / ".join(fit_lens(one_corner).guidance)
     assert "take 5 more photographs" in told
     assert "right" in told
-    assert fit_lens(views(40)).guidance == ()
+    assert guidance(views(40), [20.0] * 40) == ()
 
 
 def test_too_few_photographs_or_mixed_sizes_are_refused() -> None:
@@ -111,7 +236,8 @@ def test_too_few_photographs_or_mixed_sizes_are_refused() -> None:
         fit_lens(views(3))
     mixed = views(5)
     mixed[0] = View("big.png", (1280, 960), mixed[0].pixels, mixed[0].board_mm, mixed[0].ids)
-    with pytest.raises(CalibrationError, match="640 x 480, 1280 x 960"):
+    told = r"have several sizes, .*640 x 480 px: 1\.png, 2\.png, 3\.png, 4\.png; 1280 x 960 px: big\.png"
+    with pytest.raises(CalibrationError, match=told):
         fit_lens(mixed)
 
 
@@ -149,8 +275,12 @@ def test_what_is_seen_but_not_as_it_should_be_is_flagged() -> None:
 
 
 def test_a_lens_file_cannot_be_edited(tmp_path: Path) -> None:
-    path = lens_file(fit_lens(views(8)), "a board", {"0.png": "ab"}, {}, 0.5, "test").save(tmp_path)
+    path = lens_file(fit_lens(views(8)), "a board", {"0.png": "ab"}, 0.5, "test").save(tmp_path)
     assert load_artefact(path, LensFile).lens().matrix[0, 0] == pytest.approx(800.0, rel=0.01)
+    old = path.read_text().replace('"schema_version": 2', '"schema_version": 1')
+    of_version_1 = tmp_path / f"{hashlib.sha256(old.encode()).hexdigest()[:HASH_CHARS]}.json"
+    of_version_1.write_text(old)
+    assert load_artefact(of_version_1, LensFile).digest == of_version_1.stem
     path.write_text(path.read_text().replace('"a board"', '"another"'))
     with pytest.raises(CalibrationError, match="was edited"):
         load_artefact(path, LensFile)

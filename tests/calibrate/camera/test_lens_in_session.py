@@ -15,17 +15,19 @@ from typer.testing import CliRunner
 
 from bench.preprocess_rigs import CAMERAS, Shot, lens_views, sheet, true_mask, true_scale
 from brushloop import app
-from calibrate.artefact import Calibration, LensUsed, load_artefact, newest
+from calibrate.artefact import Calibration, LensUsed, load_artefact
 from calibrate.calibration import FITTED, calibrate_session
 from calibrate.camera.artefact import LensFile, lens_file
 from calibrate.camera.boards import see
 from calibrate.camera.intrinsics import fit_lens
 from calibrate.camera.session import read_lens
+from calibrate.current import current
 from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.field import Field
+from calibrate.field import Field, Tone, captured_mm
 from calibrate.prepare.params import PX_PER_MM, Params
 from calibrate.presses import prepare_press
 from calibrate.scale import see_board
+from collect.reviewing import Review
 from sessions.reader import Recording
 from sessions.schemas import Stroke
 
@@ -113,7 +115,7 @@ def test_a_lens_file_makes_scale_anchors_and_masks_right(
     ran = CliRunner().invoke(app, ["calibrate", str(session), "--lens", str(lens)])
     assert ran.exit_code == 0, ran.output
     assert f"lens: lens file {lens.stem}" in ran.output
-    path = newest(session)
+    path = current(session)
     assert path is not None
     made = load_artefact(path, Calibration)
     holds(made, shot)
@@ -149,6 +151,17 @@ def test_a_session_that_was_collected_with_a_lens_needs_no_other(
         calibrate_session(session, tmp_path / "nosuch.json")
 
 
+def test_lens_a_then_b_then_a_leaves_a_in_use(
+    photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path
+) -> None:
+    session, other = collected(photographed, tmp_path / "s", shot), kept_lens(tmp_path, CAMERAS[BARREL].k1 + 0.004)
+    made = [calibrate_session(session, one) for one in (lens, other, lens)]
+    assert made[0] == made[2] != made[1]
+    assert current(session) == made[0]
+    shown = CliRunner().invoke(app, ["calibrate", "show", str(session)])
+    assert f'lens.source = "lens file {lens.stem}"' in shown.output
+
+
 def test_a_straight_camera_needs_no_lens(photographed: Photographed, tmp_path: Path) -> None:
     straight = sheet(0, 1)
     made = load_artefact(calibrate_session(collected(photographed, tmp_path / "straight", straight)), Calibration)
@@ -172,6 +185,41 @@ def test_the_quick_look_at_a_board_knows_a_lens_too(tmp_path: Path, shot: Shot, 
         see_board(np.ascontiguousarray(shot.image[:, :-8]), shot.board, lens=known)
 
 
+def test_the_review_looks_through_the_lens_that_the_session_recorded(
+    photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path
+) -> None:
+    session = collected(photographed, tmp_path / "own", shot, read_lens(lens))
+    review = Review(session)
+    assert review.untold == ""
+    for seen in review.captures:
+        looked = review.look(seen)
+        assert looked.binary is not None
+        assert looked.photo.shape == (768, 768), "the field, not the whole photograph"
+        anchor = shot.anchors_mm[review.captures.index(seen)]
+        truth = true_mask(shot, Field().window_mm(anchor), 1.0 / Field().mm_per_px)
+        assert (looked.binary & truth).sum() / (looked.binary | truth).sum() >= 0.9
+    alike = review.repeatability(13.0, 5.0)
+    assert alike is not None
+    assert alike[1] == 2
+
+
+def test_the_review_follows_the_calibration_in_use(
+    photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path
+) -> None:
+    session = collected(photographed, tmp_path / "without", shot)
+    assert Review(session).repeatability(13.0, 5.0) is None
+    calibrate_session(session, lens)
+    assert Review(session).repeatability(13.0, 5.0) is not None
+
+
+def test_the_review_says_why_it_compares_nothing(photographed: Photographed, tmp_path: Path, shot: Shot) -> None:
+    session = collected(photographed, tmp_path / "spoilt", shot)
+    (session / "rig.effective.json").write_text('{"board": 7}')
+    review = Review(session)
+    assert "rig.effective.json: board: Input should be" in review.untold
+    assert review.look(review.captures[0]).photo.shape == shot.image.shape
+
+
 def test_every_stage_is_shown_with_the_lens(photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path) -> None:
     session, out = collected(photographed, tmp_path / "bent", shot), tmp_path / "stages.png"
     command = ["calibrate", "preprocess", str(session), "--out", str(out)]
@@ -189,6 +237,13 @@ def test_every_stage_is_shown_with_the_lens(photographed: Photographed, tmp_path
     numbers = json.loads(out.with_suffix(".json").read_text())["fitted"]
     assert numbers["threshold.reflectance"] == prepared.threshold
     assert numbers["binarise.area_mm2"] == prepared.mask.sum() / PX_PER_MM**2
+    assert numbers["resize.mm_per_px"] == Field().mm_per_px
+    compared = captured_mm(prepared, Tone.BINARY)
+    assert numbers["resize.area_mm2"] == pytest.approx(compared.sum() * Field().mm_per_px ** 2)
+    # So it is without an option from then on: by the calibration that the session uses.
+    again = CliRunner().invoke(app, command)
+    assert again.exit_code == 0, again.output
+    assert json.loads(out.with_suffix(".json").read_text())["fitted"] == pytest.approx(numbers)
 
 
 @pytest.mark.soak
@@ -196,6 +251,6 @@ def test_every_stage_is_shown_with_the_lens(photographed: Photographed, tmp_path
 @pytest.mark.parametrize("rig", [1, 2, 3, 4])
 def test_a_lens_from_slanted_boards_carries_a_session(photographed: Photographed, tmp_path: Path, rig: int) -> None:
     views = [see(image, sheet(rig, 1).board, f"{k}") for k, image in enumerate(lens_views(rig, 12))]
-    lens = lens_file(fit_lens(views), "a board", {}, {}, 0.5, "test").save(tmp_path)
+    lens = lens_file(fit_lens(views), "a board", {}, 0.5, "test").save(tmp_path)
     seen = sheet(rig, 15)
     holds(load_artefact(calibrate_session(collected(photographed, tmp_path / "s", seen), lens), Calibration), seen)

@@ -23,7 +23,7 @@ def seen(turn_deg: float = -90.0, scale: float = 1.0, noise_mm: float = 0.05) ->
 
 def test_turn_and_place_are_found_and_every_point_tells_its_residual() -> None:
     found = register(NAMES, ROBOT, seen())
-    assert found.turn_deg == pytest.approx(-90.0, abs=0.05)
+    assert found.yaw_deg == pytest.approx(90.0, abs=0.05)
     assert found.scale == pytest.approx(1.0)
     assert found.rms_mm < 0.1
     assert found.rms_mm < found.left_out_rms_mm < 0.2
@@ -36,7 +36,7 @@ def test_a_point_that_slipped_is_dropped_by_name_and_does_not_pull() -> None:
     found = register(NAMES, ROBOT, marks)
     assert found.dropped == ("touch 3",)
     assert found.residuals_mm[3] == pytest.approx([4.0, -2.0], abs=0.3)
-    assert found.turn_deg == pytest.approx(-90.0, abs=0.05)
+    assert found.yaw_deg == pytest.approx(90.0, abs=0.05)
 
 
 def test_a_board_printed_too_small_shows_as_a_scale() -> None:
@@ -69,6 +69,6 @@ def test_the_table_of_points_is_read_and_its_faults_are_named(tmp_path: Path) ->
 
 
 def test_a_registration_becomes_a_file_named_after_its_contents(tmp_path: Path) -> None:
-    file = registration_file(register(NAMES, ROBOT, seen()), "points.csv", "test")
+    file = registration_file(register(NAMES, ROBOT, seen()), (-34.0, -34.0), "points.csv", "test")
     assert file.save(tmp_path).stem == file.digest
     assert file.robot_to_paper[2] == pytest.approx(110.0, abs=0.5)

@@ -5,20 +5,26 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
+import shutil
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 import fsspec
 import pytest
 
+from calibrate.artefact import Calibration
+from calibrate.current import current, put_to_use
 from calibrate.errors import CalibrationError
 from calibrate.validate import sources
 from calibrate.validate.sources import open_session
 from sessions.errors import SessionDamaged
+from tests.calibrate.given import CALIBRATION
 
 
 @pytest.fixture
@@ -32,6 +38,10 @@ def remote(session: Path) -> str:
 
 def digest(session: Path) -> str:
     return hashlib.sha256((session / "presses.mcap").read_bytes()).hexdigest()
+
+
+def made(rms_px: float) -> Calibration:
+    return CALIBRATION.model_copy(update={"rms_px": rms_px})
 
 
 def test_a_url_with_its_checksum_opens_like_a_folder(session: Path, remote: str, tmp_path: Path) -> None:
@@ -60,6 +70,23 @@ def test_calibrations_and_fits_beside_come_along(session: Path, remote: str, tmp
     fsspec.filesystem("memory").pipe("/lab/presses/calibration/0123.json", b"{}")
     open_session(f"{remote}#sha256={digest(session)}", tmp_path, None, None)
     assert [path.name for path in tmp_path.rglob("calibration/*.json")] == ["0123.json"]
+
+
+def test_of_several_calibrations_beside_the_pointed_one_is_used(session: Path, remote: str, tmp_path: Path) -> None:
+    """Neither the last by name, nor the one written last."""
+    memory, url = fsspec.filesystem("memory"), f"{remote}#sha256={digest(session)}"
+    first, *_, last = names = sorted(made(rms).save(tmp_path / "made").name for rms in (0.1, 0.2, 0.3))
+    for name in (last, *names[:-1]):
+        memory.pipe(f"/lab/presses/calibration/{name}", (tmp_path / "made" / name).read_bytes())
+    beside = open_session(url, tmp_path, None, None).recording.path.parent
+    assert current(beside) == beside / "calibration" / names[1], "without a pointer, as in a folder: written last"
+    memory.pipe("/lab/presses/calibration/current", f"{first}\n".encode())
+    assert current(open_session(url, tmp_path, None, None).recording.path.parent) == beside / "calibration" / first
+    memory.pipe("/lab/presses/calibration/current", f"{last}\n".encode())
+    assert current(open_session(url, tmp_path, None, None).recording.path.parent) == beside / "calibration" / last
+    memory.pipe("/lab/presses/calibration/current", b"../../../etc/passwd")
+    with pytest.raises(CalibrationError, match="holds no name of an artefact"):
+        open_session(url, tmp_path, None, None)
 
 
 @pytest.mark.parametrize(
@@ -102,12 +129,15 @@ def test_a_file_url_is_a_url_too(session: Path, tmp_path: Path) -> None:
     assert open_session(url, tmp_path, None, None).count == 11
 
 
-@pytest.fixture
-def web(session: Path) -> Iterator[str]:
+@contextmanager
+def served(session: Path, *, lists: bool = True) -> Iterator[str]:
     pytest.importorskip("aiohttp", reason="needs the extra [remote]")
 
     class Quiet(SimpleHTTPRequestHandler):
         def log_message(self, *_: object) -> None: ...
+
+        def list_directory(self, path: object) -> Any:
+            return super().list_directory(path) if lists else self.send_error(404)  # type: ignore[arg-type]
 
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(session.parent))) as server:
         thread = Thread(target=server.serve_forever)
@@ -115,6 +145,25 @@ def web(session: Path) -> Iterator[str]:
         yield f"http://127.0.0.1:{server.server_address[1]}/{session.name}"
         server.shutdown()
         thread.join()
+
+
+@pytest.fixture
+def web(session: Path) -> Iterator[str]:
+    with served(session) as url:
+        yield url
+
+
+def test_a_web_server_that_lists_nothing_gives_the_calibration_in_use(session: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "presses"
+    folder.mkdir()
+    shutil.copy(session / "presses.mcap", folder)
+    used = put_to_use(made(0.1), folder)
+    made(0.2).save(used.parent)
+    with served(folder, lists=False) as url:
+        opened = open_session(f"{url}/presses.mcap#sha256={digest(session)}", tmp_path / "work", None, None)
+    found = current(opened.recording.path.parent)
+    assert found is not None
+    assert found.name == used.name
 
 
 def test_a_web_server_is_a_place_like_any_other(web: str, session: Path, tmp_path: Path) -> None:

@@ -1,0 +1,166 @@
+"""`camera register` on the loopback rig: place and turn of a sheet that are known come out as rig.toml means them."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import tomllib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from brushloop import app
+from calibrate.camera.rig_file import PaperLines, read_rig
+from calibrate.errors import CalibrationError
+from collect.config import PaperConfig, RigConfig, load_rig
+from collect.sheet import to_base
+from drivers.geometry import brush_pose
+from drivers.sim.config import SimConfig, Table, View
+from drivers.sim.rig_toml import Addresses, rig_toml
+from drivers.sim.scene import Scene
+from drivers.sim.world import World
+
+VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125)
+AT = Addresses("127.0.0.1", 1, 2, 3, None, None)
+MARKS = [(10.0, 10.0), (230.0, 15.0), (220.0, 160.0), (15.0, 155.0), (120.0, 80.0)]
+"""Where the robot touched, in the paper frame."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Laid:
+    """A sheet that lies somewhere, and what an operator has of it: marks, a photograph, and an old rig.toml."""
+
+    truth: PaperConfig
+    table: Path
+    photograph: Path
+    rig: Path
+
+    def register(self, *options: object) -> Result:
+        told = ["camera", "register", self.table, "--photograph", self.photograph, "--out", self.rig.parent / "camera"]
+        return CliRunner().invoke(app, [str(word) for word in (*told, *options)])
+
+
+@pytest.fixture(scope="module", params=[(73.2, (431.5, -92.25)), (-110.0, (380.0, 140.0))], ids=["left", "right"])
+def laid(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Laid:
+    yaw_deg, origin_mm = request.param
+    world = World(SimConfig(view=VIEW, table=Table(origin_mm=origin_mm, yaw_deg=yaw_deg)))
+    scene = Scene(world)
+    folder = tmp_path_factory.mktemp("laid")
+    photograph, table, rig = folder / "marks.png", folder / "marks.csv", folder / "rig.toml"
+    cv2.imwrite(str(photograph), scene.render(0, brush_pose(*world.config.home_mm)))
+    truth = PaperConfig(origin_mm=origin_mm, yaw_deg=yaw_deg, touch_z_mm=120.0, size_mm=world.config.table.sheet_mm)
+    rows = ["name,robot_x_mm,robot_y_mm,image_x_px,image_y_px"]
+    for k, mark in enumerate(MARKS):
+        x, y = to_base(truth, *mark)
+        assert world.to_paper(x, y) == pytest.approx(mark), "the rig's own geometry is the same"
+        u, v = scene.optics.image_of(np.array([mark]))[0]
+        rows.append(f"mark {k},{x:.4f},{y:.4f},{u:.3f},{v:.3f}")
+    table.write_text("\n".join(rows) + "\n")
+    rig.write_text(rig_toml(SimConfig(), AT).replace("yaw_deg = 90.0\n", "yaw_deg = 90.0  # by eye\n"))
+    return Laid(truth, table, photograph, rig)
+
+
+def lies_there(paper: PaperConfig, truth: PaperConfig) -> None:
+    """Wherever a press is meant on the sheet, the arm goes there to within a tenth of a millimetre."""
+    for mark in MARKS:
+        assert to_base(paper, *mark) == pytest.approx(to_base(truth, *mark), abs=0.1)
+    assert paper.yaw_deg == pytest.approx(truth.yaw_deg, abs=0.03)
+
+
+def test_the_last_two_lines_are_those_of_the_rig(laid: Laid) -> None:
+    ran = laid.register("--config", laid.rig)
+    assert ran.exit_code == 0, ran.output
+    pasted = tomllib.loads("\n".join(ran.output.splitlines()[-2:]))
+    assert list(pasted) == ["origin_mm", "yaw_deg"]
+    lies_there(laid.truth.model_copy(update=pasted), laid.truth)
+
+
+def test_write_changes_these_two_values_and_nothing_else(laid: Laid, tmp_path: Path) -> None:
+    laid = dataclasses.replace(laid, rig=Path(shutil.copy(laid.rig, tmp_path)))
+    before, old = laid.rig.read_bytes(), load_rig(laid.rig)
+    laid.rig.chmod(0o640)
+    ran = laid.register("--write", laid.rig)
+    assert ran.exit_code == 0, ran.output
+    new = load_rig(laid.rig)
+    lies_there(new.paper, laid.truth)
+    assert rest(new) == rest(old)
+    changed = [k for k, row in enumerate(laid.rig.read_text().splitlines()) if row != before.decode().splitlines()[k]]
+    assert len(changed) == 2
+    assert "  # by eye" in laid.rig.read_text().splitlines()[changed[1]]
+    assert laid.rig.with_name("rig.toml.bak").read_bytes() == before
+    assert laid.rig.stat().st_mode & 0o777 == 0o640
+
+    laid.register("--write", laid.rig)
+    assert laid.rig.with_name("rig.toml.bak").read_bytes() == before, "what was kept is never overwritten"
+    assert laid.rig.with_name("rig.toml.bak-2").exists()
+
+
+def rest(rig: RigConfig) -> object:
+    return rig.model_dump(exclude={"paper": {"origin_mm", "yaw_deg"}})
+
+
+BOARD = "[board]\nsquares = [9, 7]\nsquare_mm = 20.0\nmarker_mm = 15.0\norigin_mm = [-3.0, -4.0]\n"
+SOUND = f"{BOARD}[paper]\norigin_mm = [1, 2] # here\nyaw_deg = 0\n"
+LINES = PaperLines((460.12345, -0.00001), 90.00001)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (SOUND, f"{BOARD}[paper]\norigin_mm = [460.123, 0.0] # here\nyaw_deg = 90.0\n"),
+        (SOUND.replace("\n", "\r\n"), f"{BOARD}[paper]\norigin_mm = [460.123, 0.0] # here\nyaw_deg = 90.0\n"),
+        (
+            f"[ paper ] # sheet\nyaw_deg=1\n  origin_mm=[1,\t2]\n{BOARD}",
+            f"[ paper ] # sheet\nyaw_deg=90.0\n  origin_mm=[460.123, 0.0]\n{BOARD}",
+        ),
+    ],
+    ids=["plain", "line ends of Windows", "another order"],
+)
+def test_only_the_values_change_in_the_text(tmp_path: Path, text: str, expected: str) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_bytes(text.encode())
+    ends = "\r\n" if "\r" in text else "\n"
+    read_rig(path).write(LINES)
+    assert path.read_bytes().decode() == expected.replace("\n", ends)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (BOARD, "paper: is not a table of its own"),
+        (f"paper = {{origin_mm = [1, 2], yaw_deg = 0}}\n{BOARD}", "paper: is not a table of its own"),
+        (SOUND.replace("yaw_deg = 0\n", ""), "paper.yaw_deg: is not found on a line of its own"),
+        (SOUND.replace("[1, 2]", "[1,\n2]"), "paper.origin_mm: is not found on a line of its own"),
+        (f'{SOUND}name = """\nyaw_deg = 5\n"""\n', "cannot be changed without changing something else"),
+        (f'name = """\n[paper]\norigin_mm = [1, 2]\nyaw_deg = 5\n"""\n{SOUND}', "without changing something else"),
+    ],
+    ids=["none", "inline", "no yaw", "two lines", "yaw in a text", "table in a text"],
+)
+def test_what_cannot_be_found_for_sure_is_not_touched(tmp_path: Path, text: str, told: str) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(text)
+    with pytest.raises(CalibrationError, match=r"nothing is written\. Put in by hand: origin_mm = ") as refused:
+        read_rig(path).write(LINES)
+    assert told in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert path.read_text() == text
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "rig.toml: [board] is missing"),
+        ("[board", "is not TOML"),
+        ("[board]\nsquares = [9, 7]\n", "board.square_mm: Field required"),
+    ],
+)
+def test_a_rig_without_a_board_is_refused_by_name(tmp_path: Path, text: str, told: str) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(text)
+    with pytest.raises(CalibrationError) as refused:
+        read_rig(path)
+    assert told in str(refused.value)
