@@ -18,15 +18,15 @@ from mcap.writer import CompressionType, Writer
 from pydantic import ValidationError
 
 from sessions import container
+from sessions.codec import Line
 from sessions.disk import check_room, publish
 from sessions.errors import InputError, SessionDamaged, disk_error
 from sessions.journal import fsync_folder
-from sessions.lines import Line
 from sessions.merge import Copier, count_messages
 from sessions.reader import Recording
 from sessions.schemas import Header, Quality, Stroke, Topic
 from sessions.store import SESSION_ID, SNAPSHOT_NAMES
-from sessions.writer import CHUNK_BYTES, HEADER_METADATA, header_metadata, note
+from sessions.writer import CHUNK_BYTES, HEADER_METADATA, header_metadata, note, read_note
 
 PARTS_NOTE = "brushloop.parts"
 JOINED = ("software", "robot_firmware", "camera", "origin", "licence")
@@ -118,18 +118,42 @@ def _attachments(recordings: list[Recording]) -> dict[str, bytes]:
 def _parts(recordings: list[Recording]) -> list[_Part]:
     several = len({recording.header.session_id for recording in recordings}) > 1
     parts: list[_Part] = []
-    seen: dict[tuple[str, str], Path] = {}
+    digests: dict[str, Path] = {}
+    strokes: dict[tuple[str, str], Path] = {}
     offset = 0
     for recording in recordings:
-        session = recording.header.session_id
+        session, merged = recording.header.session_id, _merged(recording)
+        for digest in (recording.sha256, *(str(part["sha256"]) for part in merged)):
+            if digest in digests:
+                raise InputError(recording.path, f"is, or holds, the same recording as {digests[digest]}")
+            digests[digest] = recording.path
         for stroke in recording.stroke_records():
-            known = seen.setdefault((session, stroke.stroke_id), recording.path)
-            if known != recording.path:
-                raise InputError(recording.path, f"holds stroke {stroke.stroke_id} of {session}, as does {known.name}")
+            whose, name = _origin(merged, session, stroke.stroke_id)
+            if (whose, name) in strokes:
+                raise InputError(recording.path, f"holds stroke {name} of {whose}, as does {strokes[whose, name]}")
+            strokes[whose, name] = recording.path
         parts.append(_Part(recording, f"{session}/" if several else "", offset))
         stills = container.messages(recording.path, [Topic.STILL])
         offset += 1 + max((message.sequence for _, _, message in stills), default=-1)
     return parts
+
+
+def _merged(recording: Recording) -> list[Line]:
+    """What a recording that was itself merged says of its parts."""
+    notes = [read_note(m.metadata) for m in container.metadata(recording.path) if m.name == PARTS_NOTE]
+    parts = [part for note in notes for part in (note or {}).get("parts", ())]
+    if not all(isinstance(part, dict) and {"sha256", "stroke_prefix", "header"} <= part.keys() for part in parts):
+        raise SessionDamaged(recording.path, "does not say what it was merged from")
+    return parts
+
+
+def _origin(merged: list[Line], session: str, stroke_id: str) -> tuple[str, str]:
+    """The session and the name that a stroke was recorded under."""
+    for part in merged:
+        prefix = str(part["stroke_prefix"])
+        if prefix and stroke_id.startswith(prefix):
+            return prefix.removesuffix("/"), stroke_id.removeprefix(prefix)
+    return session if not merged else str(merged[0]["header"].get("session_id", session)), stroke_id
 
 
 def _write(parts: list[_Part], path: Path, header: Header, attachments: dict[str, bytes]) -> Counter[str]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from sessions.codec import Line
 from sessions.journal import JOURNAL_NAME, replay
-from sessions.lines import Line
 
 CAPTURE, DIP, ZERO_TOUCH = "capture", "dip", "zero_touch"
 

@@ -178,7 +178,7 @@ def test_where_nobody_knows_which_cell_was_pressed_the_sheet_is_not_used_again(m
     journal.write_bytes(b"".join(line for line in lines if b'"file":"0001-press' not in line))
     cut(folder / "0001-press-H13-a05-.mcap.part", 0.1)
     report = repair(folder)
-    assert "nothing more is pressed on sheet 1; go on with a fresh one, --sheet 2" in report.lost[0]
+    assert "nothing more is pressed on sheet 1; go on with a fresh one, --sheet 2" in report.lost[1]
     store = go_on(folder)
     with pytest.raises(SessionError, match="run the same command with --sheet 2"):
         store.begin("H15-a05", "press", cell=7, notes={})
