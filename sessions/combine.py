@@ -123,7 +123,7 @@ def _parts(recordings: list[Recording]) -> list[_Part]:
     offset = 0
     for recording in recordings:
         session, merged = recording.header.session_id, _merged(recording)
-        for digest in (recording.sha256, *(str(part["sha256"]) for part in merged)):
+        for digest in (recording.sha256, *(part.sha256 for part in merged)):
             if digest in digests:
                 raise InputError(recording.path, f"is, or holds, the same recording as {digests[digest]}")
             digests[digest] = recording.path
@@ -138,22 +138,37 @@ def _parts(recordings: list[Recording]) -> list[_Part]:
     return parts
 
 
-def _merged(recording: Recording) -> list[Line]:
-    """What a recording that was itself merged says of its parts."""
-    notes = [read_note(m.metadata) for m in container.metadata(recording.path) if m.name == PARTS_NOTE]
-    parts = [part for note in notes for part in (note or {}).get("parts", ())]
-    if not all(isinstance(part, dict) and {"sha256", "stroke_prefix", "header"} <= part.keys() for part in parts):
-        raise SessionDamaged(recording.path, "does not say what it was merged from")
-    return parts
+@dataclass(frozen=True, slots=True)
+class _Merged:
+    """A recording that was merged into another one."""
+
+    prefix: str
+    session: str
+    sha256: str
 
 
-def _origin(merged: list[Line], session: str, stroke_id: str) -> tuple[str, str]:
+def _merged(recording: Recording) -> list[_Merged]:
+    """What a recording says that it was merged from, and these in turn; the outermost first."""
+    try:
+        notes = {record.name: record.metadata for record in container.metadata(recording.path)}
+        return list(_parts_in(notes, ""))
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise SessionDamaged(recording.path, "does not say what it was merged from") from None
+
+
+def _parts_in(notes: dict[str, dict[str, str]], prefix: str) -> Iterator[_Merged]:
+    for part in (read_note(notes[PARTS_NOTE]) or {})["parts"] if PARTS_NOTE in notes else ():
+        inner = prefix + str(part["stroke_prefix"])
+        yield _Merged(inner, str(part["header"]["session_id"]), str(part["sha256"]))
+        yield from _parts_in(part["notes"], inner)
+
+
+def _origin(merged: list[_Merged], session: str, stroke_id: str) -> tuple[str, str]:
     """The session and the name that a stroke was recorded under."""
-    for part in merged:
-        prefix = str(part["stroke_prefix"])
-        if prefix and stroke_id.startswith(prefix):
-            return prefix.removesuffix("/"), stroke_id.removeprefix(prefix)
-    return session if not merged else str(merged[0]["header"].get("session_id", session)), stroke_id
+    for part in reversed(merged):
+        if stroke_id.startswith(part.prefix):
+            return part.session, stroke_id.removeprefix(part.prefix)
+    return session, stroke_id
 
 
 def _write(parts: list[_Part], path: Path, header: Header, attachments: dict[str, bytes]) -> Counter[str]:

@@ -20,6 +20,7 @@ from sessions.repair_journal import Report, kept_words, repaired_journal, write_
 from sessions.rewrite import lost_words, replace_damaged, with_their_stills
 from sessions.salvage import Scan, scan
 from sessions.schemas import Topic
+from sessions.soundness import file_problems
 from sessions.store import closed_line, counts_of, merge_session, read_header
 from sessions.union import Record, Source, identity_of, united
 from sessions.verify import step_words
@@ -64,7 +65,9 @@ class FolderRepair:
             for name in self._strays:
                 kept = self._move_aside(self._folder / name)
                 self._report.did.append(f"put {name} aside: it is a copy of another step{kept_words(kept)}")
-            if self._state.closed is not None and not self._final_sound:
+            if self._state.closed is None:
+                self._left_by_a_close()
+            elif not self._final_sound:
                 self._merge_again()
         finally:
             self._journal.close()
@@ -224,6 +227,15 @@ class FolderRepair:
         why = "; ".join(found.damage) or "has changed"
         self._report.did.append(f"wrote {self._final.name} again from what can be read of it: {why}{kept_words(kept)}")
         return lost_words(strokes, before, counts)
+
+    def _left_by_a_close(self) -> None:
+        """A merged file of a session that is open: it is merged again in any case."""
+        problems = file_problems(self._final)[1] if self._final.is_file() else []
+        if problems:
+            kept = self._move_aside(self._final)
+            self._report.did.append(
+                f"put {self._final.name} aside, which no close was journalled for{kept_words(kept)}"
+            )
 
     def _log(self, line: Line) -> None:
         t_ns = self._now_ns()

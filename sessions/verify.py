@@ -107,6 +107,10 @@ def _verify_folder(folder: Path) -> Verdict:
     if state.closed is not None:
         verdict.state = "closed"
         _final(verdict, folder, evidence)
+    elif (final := folder / f"{folder.name}.mcap").is_file():
+        # Of a close that was cut, or whose line is lost: it was read back before it got its name.
+        verdict.files += 1
+        verdict.findings += [Finding(final.name, problem) for problem in file_problems(final)[1]]
     if verdict.sound:
         _shown(verdict, folder)
     _count(verdict, Counter(counts_of(state)))
