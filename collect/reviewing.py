@@ -20,6 +20,7 @@ from sessions.errors import InputError, SessionDamaged
 from sessions.journal import JOURNAL_NAME, is_open, replay
 from sessions.lines import Line
 from sessions.messages import decode_gray, decode_still
+from sessions.names import check_folder
 from sessions.remarks import Remark, remarks_of
 from sessions.schemas import Stroke, Topic
 
@@ -59,10 +60,11 @@ class Review:
     """One session's folder, open or closed; reads, and writes nothing."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises `InputError` where it was not collected here, `SessionDamaged`."""
+        """Raises `InputError` where it was not collected here or holds links, `SessionDamaged`."""
         self.folder = folder
         if not (folder / JOURNAL_NAME).is_file():
             raise InputError(folder, f"holds no {JOURNAL_NAME}: imported photographs are looked at with `validate`")
+        check_folder(folder)
         self._plane: PlaneFit | None = None
         self._looked: dict[int, Looked] = {}
         try:
@@ -75,7 +77,10 @@ class Review:
         """Read the journal and the remarks again."""
         state, remarks = replay(self.folder / JOURNAL_NAME), remarks_of(self.folder)
         self.open = is_open(state)
-        self.captures = tuple(_seen(line, remarks) for line in state.segments if line["kind"] == "capture")
+        try:
+            self.captures = tuple(_seen(line, remarks) for line in state.segments if line["kind"] == "capture")
+        except (KeyError, TypeError, ValueError) as error:
+            raise SessionDamaged(self.folder / JOURNAL_NAME, f"a capture lacks or spoils {error}") from None
 
     def look(self, seen: Seen) -> Looked:
         """The pictures of one capture; kept once made. Takes a tenth of a second: call it off a screen's loop.

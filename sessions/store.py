@@ -286,4 +286,6 @@ def next_session_id(root: Path, label: str, today: dt.date) -> str:
 def open_sessions(root: Path) -> list[Path]:
     """Folders under `root` whose journal was opened and has no `closed` event, oldest first."""
     folders = sorted(path.parent for path in root.glob(f"*/{JOURNAL_NAME}"))
+    for folder in folders:
+        check_folder(folder)
     return [folder for folder in folders if is_open(replay(folder / JOURNAL_NAME))]
