@@ -16,8 +16,12 @@ from sessions.names import bare_name
 SCHEMA_VERSION = 1
 
 
-BareName = Annotated[str, AfterValidator(bare_name)]
-"""A name that becomes that of a file or folder, and so must not lead to another one."""
+def _bare_or_empty(value: str) -> str:
+    return bare_name(value) if value else value
+
+
+BareName = Annotated[str, AfterValidator(_bare_or_empty)]
+"""A name that becomes that of a file or folder, and so must not lead to another one; empty before it is known."""
 
 
 class Topic(StrEnum):
