@@ -27,7 +27,7 @@ from sessions.store import SessionStore
 from sessions.verify import verify_session
 
 STROKES = 3
-QUICK = 60
+QUICK = 15
 
 
 @dataclass
