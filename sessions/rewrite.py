@@ -68,6 +68,8 @@ class Strokes:
     """Strokes whose still cannot be read."""
     numbers_lost: tuple[int, ...]
     """Which strokes of the recording, counted from 1, cannot be read themselves."""
+    names_lost: tuple[str, ...]
+    """What their chunks still show of their names, as far as that can be read."""
     total: int
     """Strokes that the recording held, as far as anything tells."""
 
@@ -99,17 +101,16 @@ def with_their_stills(found: Scan) -> Strokes:
         number += count
     kept = tuple(name for name, whole in names.items() if whole)
     lost = tuple(name for name, whole in names.items() if not whole)
-    return Strokes(found, kept, lost, tuple(missing), number)
+    return Strokes(found, kept, lost, tuple(missing), tuple(glimpsed(found)) if missing else (), number)
 
 
 def lost_words(strokes: Strokes, before: Counter[str], now: dict[str, int]) -> list[str]:
     """What was lost: each stroke by its name, or by its number where its name is lost with it, then the rest."""
     lost = [f"stroke {name}: its photograph is lost" for name in strokes.photograph_lost]
-    names = glimpsed(strokes.found)
-    named = len(names) == len(strokes.numbers_lost)
+    named = len(strokes.names_lost) == len(strokes.numbers_lost)
     for at, number in enumerate(strokes.numbers_lost):
-        name = f" {names[at]}," if named else ""
-        lost.append(f"stroke{name} number {number} of {strokes.total} in the recording: it cannot be read")
+        name = f"{strokes.names_lost[at]}, " if named else ""
+        lost.append(f"stroke {name}number {number} of {strokes.total} in the recording: it cannot be read")
     told = len(strokes.numbers_lost) + len(strokes.photograph_lost)
     unknown = before[Topic.STROKE] - now.get(Topic.STROKE, 0) - told
     if unknown > 0:
