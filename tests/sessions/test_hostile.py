@@ -13,9 +13,10 @@ from typer.main import get_command
 
 from brushloop import app
 from sessions.codec import encode_line
+from sessions.errors import InputError
 from sessions.journal import JOURNAL_NAME
 from sessions.names import bare_name
-from sessions.store import SessionStore
+from sessions.store import SessionStore, open_sessions
 
 BRUSHLOOP = get_command(app)
 SECRET = b"the key to the safe"
@@ -201,9 +202,11 @@ def test_a_session_that_is_gone_on_with_holds_no_link(make, place):
     make.store(folder).release()
     (folder / "rig.toml").unlink()
     (folder / "rig.toml").symlink_to(place / "outside" / "victim.toml")
-    with pytest.raises(Exception, match=r"rig\.toml: is a link, which nothing in a session's folder may be") as caught:
+    with pytest.raises(InputError, match=r"rig\.toml: is a link, which nothing in a session's folder may be") as caught:
         SessionStore(folder, None, make.clock())
     assert caught.value.exit_code == 2
+    with pytest.raises(InputError, match="is a link"):
+        open_sessions(folder.parent)
 
 
 @pytest.mark.parametrize(
