@@ -19,7 +19,7 @@ from collect.steps import StepKind
 from drivers.clock import Clock
 from drivers.samples import Identity
 from sessions.difference import differences
-from sessions.errors import SessionDamaged
+from sessions.errors import SessionError
 from sessions.journal import JOURNAL_NAME, replay
 from sessions.schemas import Header, Source
 from sessions.store import SessionStore, Snapshots, next_session_id, open_sessions
@@ -118,7 +118,7 @@ def check_writable(folder: Path) -> None:
 def _has_pressed(journal: Path) -> bool:
     try:
         return bool(replay(journal).used_cells)
-    except SessionDamaged:
+    except SessionError:
         return True  # nobody knows; ask
 
 

@@ -19,6 +19,7 @@ from sessions.errors import InputError, SessionDamaged
 from sessions.journal import JOURNAL_NAME, is_open, replay
 from sessions.lines import Line
 from sessions.messages import decode_gray, decode_still
+from sessions.names import check_folder
 from sessions.remarks import Remark, remarks_of
 from sessions.schemas import Stroke, Topic
 from sessions.waits import unlike, waits_of
@@ -68,10 +69,11 @@ class Review:
     """Why photographs are shown whole and presses are not compared; empty where the session tells board and lens."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises `InputError` where it was not collected here, `SessionDamaged`."""
+        """Raises `InputError` where it was not collected here or holds links, `SessionDamaged`."""
         self.folder = folder
         if not (folder / JOURNAL_NAME).is_file():
             raise InputError(folder, f"holds no {JOURNAL_NAME}: imported photographs are looked at with `validate`")
+        check_folder(folder)
         self._plane: PlaneFit | None = None
         self._looked: dict[int, Looked] = {}
         self._board: BoardSpec | None = None
@@ -91,7 +93,10 @@ class Review:
         self.open = is_open(state)
         waits = waits_of(state.segments)
         odd = unlike(waits)
-        captures = [_seen(line, remarks) for line in state.segments if line["kind"] == "capture"]
+        try:
+            captures = [_seen(line, remarks) for line in state.segments if line["kind"] == "capture"]
+        except (KeyError, TypeError, ValueError) as error:
+            raise SessionDamaged(self.folder / JOURNAL_NAME, f"a capture's {error} is missing or not valid") from None
         self.captures = tuple(replace(c, waited_s=waits.get(c.still), unlike=odd.get(c.still, "")) for c in captures)
 
     def look(self, seen: Seen) -> Looked:

@@ -18,15 +18,15 @@ from mcap.writer import CompressionType, Writer
 from pydantic import ValidationError
 
 from sessions import container
+from sessions.codec import Line
 from sessions.disk import check_room, publish
 from sessions.errors import InputError, SessionDamaged, disk_error
 from sessions.journal import fsync_folder
-from sessions.lines import Line
 from sessions.merge import Copier, count_messages
 from sessions.reader import Recording
 from sessions.schemas import Header, Quality, Stroke, Topic
 from sessions.store import SESSION_ID, SNAPSHOT_NAMES
-from sessions.writer import CHUNK_BYTES, HEADER_METADATA, header_metadata, media_type, note
+from sessions.writer import CHUNK_BYTES, HEADER_METADATA, header_metadata, media_type, note, read_note
 
 PARTS_NOTE = "brushloop.parts"
 JOINED = ("software", "robot_firmware", "camera", "origin", "licence")
@@ -118,18 +118,57 @@ def _attachments(recordings: list[Recording]) -> dict[str, bytes]:
 def _parts(recordings: list[Recording]) -> list[_Part]:
     several = len({recording.header.session_id for recording in recordings}) > 1
     parts: list[_Part] = []
-    seen: dict[tuple[str, str], Path] = {}
+    digests: dict[str, Path] = {}
+    strokes: dict[tuple[str, str], Path] = {}
     offset = 0
     for recording in recordings:
-        session = recording.header.session_id
+        session, merged = recording.header.session_id, _merged(recording)
+        for digest in (recording.sha256, *(part.sha256 for part in merged)):
+            if digest in digests:
+                raise InputError(recording.path, f"is, or holds, the same recording as {digests[digest]}")
+            digests[digest] = recording.path
         for stroke in recording.stroke_records():
-            known = seen.setdefault((session, stroke.stroke_id), recording.path)
-            if known != recording.path:
-                raise InputError(recording.path, f"holds stroke {stroke.stroke_id} of {session}, as does {known.name}")
+            whose, name = _origin(merged, session, stroke.stroke_id)
+            if (whose, name) in strokes:
+                raise InputError(recording.path, f"holds stroke {name} of {whose}, as does {strokes[whose, name]}")
+            strokes[whose, name] = recording.path
         parts.append(_Part(recording, f"{session}/" if several else "", offset))
         stills = container.messages(recording.path, [Topic.STILL])
         offset += 1 + max((message.sequence for _, _, message in stills), default=-1)
     return parts
+
+
+@dataclass(frozen=True, slots=True)
+class _Merged:
+    """A recording that was merged into another one."""
+
+    prefix: str
+    session: str
+    sha256: str
+
+
+def _merged(recording: Recording) -> list[_Merged]:
+    """What a recording says that it was merged from, and these in turn; the outermost first."""
+    try:
+        notes = {record.name: record.metadata for record in container.metadata(recording.path)}
+        return list(_parts_in(notes, ""))
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise SessionDamaged(recording.path, "does not say what it was merged from") from None
+
+
+def _parts_in(notes: dict[str, dict[str, str]], prefix: str) -> Iterator[_Merged]:
+    for part in (read_note(notes[PARTS_NOTE]) or {})["parts"] if PARTS_NOTE in notes else ():
+        inner = prefix + str(part["stroke_prefix"])
+        yield _Merged(inner, str(part["header"]["session_id"]), str(part["sha256"]))
+        yield from _parts_in(part["notes"], inner)
+
+
+def _origin(merged: list[_Merged], session: str, stroke_id: str) -> tuple[str, str]:
+    """The session and the name that a stroke was recorded under."""
+    for part in reversed(merged):
+        if stroke_id.startswith(part.prefix):
+            return part.session, stroke_id.removeprefix(part.prefix)
+    return session, stroke_id
 
 
 def _write(parts: list[_Part], path: Path, header: Header, attachments: dict[str, bytes]) -> Counter[str]:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from sessions.codec import Line
+from sessions.errors import SessionDamaged, in_one_line
+from sessions.events import NONSENSE
 from sessions.journal import JOURNAL_NAME, replay
-from sessions.lines import Line
 
 CAPTURE, DIP, ZERO_TOUCH = "capture", "dip", "zero_touch"
 
@@ -46,6 +48,13 @@ def history_of(folder: Path) -> History | None:
     if not journal.is_file():
         return None
     done = replay(journal).segments
+    try:
+        return _history(done)
+    except NONSENSE as error:
+        raise SessionDamaged(journal, f"a result makes no sense: {in_one_line(error)}") from None
+
+
+def _history(done: list[Line]) -> History:
     captures = [line["result"] for line in done if line["kind"] == CAPTURE]
     dips = [line["result"] for line in done if line["kind"] == DIP]
     rejected = [result for result in captures if not result.get("kept", True)]

@@ -8,32 +8,36 @@ clock was set back), `closed`. A repair adds `repaired`, `held`, `lost`, `doubt`
 from __future__ import annotations
 
 import os
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from sessions.codec import Chain, Line, digest, encode_line
 from sessions.errors import SessionDamaged, disk_error
-from sessions.lines import Line, encode_line
+from sessions.events import NONSENSE, check_event, serial_of
+from sessions.lines import Fault, Reading, read, read_journal
 from sessions.lines import read_lines as read_lines
-from sessions.schemas import TornTail
+from sessions.names import check_file
+from sessions.schemas import Topic, TornTail
 
 JOURNAL_NAME = "journal.jsonl"
-_SERIAL = re.compile(r"\d+(?=-)")
-DONE_FIELDS = {"key": str, "kind": str, "file": str, "sha256": str, "counts": dict, "result": dict}
 
 
 class Journal:
     """Appends to one journal file. One process at a time: the caller holds the session's lock.
 
-    `t_ns` is when it is opened, for the note about a torn tail. Raises `SessionError` where the disk fails.
+    `t_ns` is when it is opened, for the note about a torn tail. Lines are chained where `session`, an id, is given:
+    from the first line on, or from here on where the lines so far are not. Raises `SessionError` where the disk
+    fails, and `InputError` where the file is a link.
     """
 
-    def __init__(self, path: Path, t_ns: int) -> None:
+    def __init__(self, path: Path, t_ns: int, session: str = "") -> None:
         self.path = path
+        self._session = session
         try:
-            created = not path.exists()
-            if not created:
-                _set_torn_tail_aside(path, t_ns)
+            created = not check_file(path)
+            self._next = None if created else _whole_lines(path, t_ns, session)
+            if created:
+                self._next = next_chain(b"", session)
             self._fd = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
             self._size = os.fstat(self._fd).st_size
             if created:
@@ -43,7 +47,7 @@ class Journal:
 
     def append(self, t_ns: int, line: Line) -> None:
         """Write one event and wait until it is on disk. Raises `SessionError` where that fails."""
-        data = encode_line(t_ns, line)
+        data = encode_line(t_ns, line, self._next)
         try:
             if os.fstat(self._fd).st_size != self._size:
                 os.ftruncate(self._fd, self._size)  # part of a line that did not fit on the disk
@@ -54,6 +58,7 @@ class Journal:
         except OSError as error:
             raise disk_error(self.path, "cannot write", error) from error
         self._size += len(data)
+        self._next = _after(self._next, data)
 
     def close(self) -> None:
         """Close the file; the session stays open until a `closed` event says otherwise."""
@@ -69,17 +74,36 @@ def fsync_folder(folder: Path) -> None:
         os.close(fd)
 
 
-def _set_torn_tail_aside(path: Path, t_ns: int) -> None:
-    data = path.read_bytes()
+def next_chain(data: bytes, session: str) -> Chain | None:
+    """What the next line of a journal with these bytes, all of them whole lines, carries; None without a session."""
+    if not session:
+        return None
+    *lines, _end = data.split(b"\n")
+    chained = bool(lines) and not read(lines[-1] + b"\n").unchained
+    return Chain(len(lines) + 1, session, digest(lines[-1] if chained else data))
+
+
+def _after(chain: Chain | None, data: bytes) -> Chain | None:
+    return None if chain is None else Chain(chain.seq + 1, chain.session, digest(data.rstrip(b"\n")))
+
+
+def _whole_lines(path: Path, t_ns: int, session: str) -> Chain | None:
+    """Make the journal end with a whole line; returns what the next one carries."""
+    data = read_journal(path)
     keep = data.rfind(b"\n") + 1
     if keep == len(data):
-        return
-    # Longer than what it overwrites, and one write: a crash here leaves the old tail or the note, never neither.
-    note = encode_line(t_ns, TornTail(hex=data[keep:].hex()).model_dump())
+        return next_chain(data, session)
+    chain = next_chain(data[:keep], session)
+    if read(data).torn:
+        # Longer than what it overwrites, and one write: a crash here leaves the old tail or the note, never neither.
+        note, at = encode_line(t_ns, TornTail(hex=data[keep:].hex()).model_dump(), chain), keep
+    else:
+        note, at = b"\n", len(data)  # only that was cut off
     with path.open("r+b", buffering=0) as file:
-        file.seek(keep)
+        file.seek(at)
         file.write(note)
         os.fsync(file.fileno())
+    return next_chain(data[:at] + note, session)
 
 
 @dataclass(slots=True)
@@ -106,16 +130,55 @@ class Replay:
     """Time of the latest line, to notice a clock that was set back."""
 
 
-def replay(path: Path) -> Replay:
-    """Fold a journal. Raises `SessionDamaged` where it makes no sense."""
-    state = Replay()
-    for line in read_lines(path):
+@dataclass(slots=True)
+class Account:
+    """A journal, read and folded: what it says, and what in it makes no sense."""
+
+    reading: Reading
+    lines: list[Line] = field(default_factory=list[Line])
+    """Lines that can be trusted and make sense, in the order in which they were written."""
+    state: Replay = field(default_factory=Replay)
+    faults: list[Fault] = field(default_factory=list[Fault])
+    """Everything that is wrong, in the order of the file: the one list that all commands go by."""
+    spoilt: list[bytes] = field(default_factory=list[bytes])
+    """Lines that are there, and say nothing."""
+    twice: list[Line] = field(default_factory=list[Line])
+    """Lines that say of a step that it is done though it is."""
+
+
+def account(data: bytes) -> Account:
+    """What the bytes of a journal say. Raises nothing."""
+    found = Account(read(data))
+    found.faults += found.reading.faults
+    found.spoilt += [span for _, span in found.reading.spoilt]
+    for entry in found.reading.entries:
         try:
-            fold(state, line)
-        except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-            raise SessionDamaged(path, f"event {line['event']!r} lacks or spoils {error}") from None
-    state.voids = state.begun - len(state.segments)
-    return state
+            fold(found.state, entry.line)
+        except DoneTwice as error:
+            found.faults.append(Fault(entry.number, str(error)))
+            found.twice.append(entry.line)
+        except NONSENSE as error:
+            found.faults.append(Fault(entry.number, f"makes no sense: {error}"))
+            found.spoilt.append(entry.raw)
+        else:
+            found.lines.append(entry.line)
+    found.faults.sort(key=lambda fault: fault.number)
+    found.state.voids = found.state.begun - len(found.state.segments)
+    return found
+
+
+def replay(path: Path) -> Replay:
+    """Fold a journal. Raises `SessionDamaged` where anything in it is wrong."""
+    return replay_lines(path)[0]
+
+
+def replay_lines(path: Path) -> tuple[Replay, list[Line]]:
+    """The same, and the lines themselves."""
+    found = account(read_journal(path))
+    if found.faults:
+        more = f" (and {len(found.faults) - 1} more)" if len(found.faults) > 1 else ""
+        raise SessionDamaged(path, f"{found.faults[0]}{more}")
+    return found.state, found.lines
 
 
 def is_open(state: Replay) -> bool:
@@ -123,69 +186,72 @@ def is_open(state: Replay) -> bool:
     return state.opened is not None and state.closed is None
 
 
+class DoneTwice(ValueError):
+    """A step is journalled as done that is done already: its strokes would be there twice."""
+
+
 def fold(state: Replay, line: Line) -> None:
-    """Take one line into the memory. Raises `KeyError`, `TypeError`, `ValueError` for what makes no sense."""
-    state.last_ns = int(line.get("t_ns", 0))
+    """Take one line into the memory, or raise one of `NONSENSE` and leave the memory as it was."""
+    check_event(line)
     match line["event"]:
         case "open":
             state.opened = line
         case "begin":
             _begin(state, line)
         case "done":
-            for name, kind in DONE_FIELDS.items():
-                if not isinstance(line[name], kind):
-                    raise TypeError(name)
-            _check_counts(line["counts"])
-            state.done[str(line["key"])] = line
+            _check_once(state, line)
+            state.done[line["key"]] = line
             state.segments.append(line)
         case "sheet":
-            state.sheet = int(line["sheet"])
+            state.sheet = line["sheet"]
         case "closed":
             state.closed = line
         case "repaired" | "held" | "lost":
             _repair(state, line)
         case "doubt":
-            state.doubtful_sheets.add(int(line["sheet"]))
+            state.doubtful_sheets.add(line["sheet"])
             state.begun = max(state.begun, _next_serial(line))
         case _:
             pass  # `process`, `void`, `clock`, `journal` and `torn` are for people who read the journal
+    state.last_ns = line.get("t_ns", 0)
+
+
+def _check_once(state: Replay, line: Line) -> None:
+    """Set-up steps are done again under one key, each time as another attempt; a stroke never is."""
+    for other in state.segments:
+        same = other["key"] == line["key"] and other.get("attempt", 1) == line.get("attempt", 1)
+        again = other["key"] == line["key"] and Topic.STROKE in {**other["counts"], **line["counts"]}
+        if same or again or other["file"] == line["file"]:
+            raise DoneTwice(f"says that {line['file']} is done: its step was done already, in {other['file']}")
 
 
 def _begin(state: Replay, line: Line) -> None:
-    key, sheet = str(line["key"]), int(line["sheet"])
+    key, sheet = line["key"], line["sheet"]
     # A line that was lost must not give its number, which names stills as well, to another attempt.
     state.begun = max(state.begun + 1, _next_serial(line))
-    state.attempts[key] = max(state.attempts.get(key, 0), int(line["attempt"]))
+    state.attempts[key] = max(state.attempts.get(key, 0), line["attempt"])
     state.sheet = max(state.sheet, sheet)
     if line["cell"] is not None:
-        state.used_cells |= {(sheet, int(cell)) for cell in (line["cell"], *line.get("more_cells", ()))}
+        state.used_cells |= {(sheet, cell) for cell in (line["cell"], *line.get("more_cells", ()))}
 
 
 def _next_serial(line: Line) -> int:
-    serial = _SERIAL.match(str(line.get("file", "")))
-    return int(serial[0]) + 1 if serial else 0
+    serial = serial_of(line)
+    return 0 if serial is None else serial + 1
 
 
 def _repair(state: Replay, line: Line) -> None:
-    file = str(line["file"])
     for at, segment in enumerate(state.segments):
-        if segment["file"] != file:
+        if segment["file"] != line["file"]:
             continue
-        key = str(segment["key"])
         if line["event"] == "lost":
             del state.segments[at]
-            if state.done.get(key, segment)["file"] == file:
-                state.done.pop(key, None)
+            if state.done.get(segment["key"], segment)["file"] == line["file"]:
+                state.done.pop(segment["key"], None)
         elif line["event"] == "held":
-            state.segments[at] = {**segment, "held": str(line["by"])}
+            state.segments[at] = {**segment, "held": line["by"]}
         else:
-            _check_counts(line["counts"])
-            state.segments[at] = {**segment, "sha256": str(line["sha256"]), "counts": line["counts"]}
+            state.segments[at] = {**segment, "sha256": line["sha256"], "counts": line["counts"]}
         break
     if line["event"] != "held":
         state.repairs.append(line)
-
-
-def _check_counts(counts: Line) -> None:
-    if not all(type(count) is int for count in counts.values()):
-        raise TypeError("counts")

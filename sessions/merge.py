@@ -10,11 +10,11 @@ from pathlib import Path
 from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
 
+from sessions.codec import Line
 from sessions.container import messages
 from sessions.errors import SessionDamaged, disk_error, in_one_line
 from sessions.journal import fsync_folder
-from sessions.lines import Line
-from sessions.schemas import Header
+from sessions.schemas import Header, Topic
 from sessions.writer import CHUNK_BYTES, HEADER_METADATA, file_sha256, header_metadata, media_type, note
 
 REPAIRS_NOTE = "brushloop.repairs"
@@ -106,3 +106,5 @@ class Copier:
             sequence=message.sequence,
             data=message.data,
         )
+        if channel.topic == Topic.STROKE:
+            self._writer.flush()  # a chunk of its own: what damages it costs this one stroke

@@ -16,6 +16,7 @@ from sessions import container
 from sessions.errors import InputError, SessionDamaged, in_one_line
 from sessions.journal import JOURNAL_NAME, is_open, replay
 from sessions.messages import decode_gray, decode_still
+from sessions.names import check_companions
 from sessions.remarks import remarks_of
 from sessions.renamed import check_name
 from sessions.schemas import Event, Header, StepEvent, Stroke, Topic
@@ -111,11 +112,12 @@ class Recording:
 
 def _find_mcap(path: Path) -> Path:
     if path.is_file():
+        check_companions(path.parent)
         return path
     if not path.is_dir():
         raise InputError(path, "no such session: give a session's folder or its .mcap file")
-    merged = path / f"{path.resolve().name}.mcap"
     check_name(path)
+    merged = path / f"{path.resolve().name}.mcap"
     if (path / JOURNAL_NAME).is_file() and is_open(replay(path / JOURNAL_NAME)):
         raise InputError(path, "is still open: run the same `brushloop collect` again to finish it")
     if not merged.is_file():

@@ -6,11 +6,13 @@ from pathlib import Path
 
 from sessions.errors import InputError, SessionDamaged
 from sessions.journal import JOURNAL_NAME, is_open, replay
+from sessions.names import check_folder
 from sessions.store import SEGMENT_NAME
 
 
 def check_name(folder: Path) -> None:
-    """Raise `InputError` where the folder was renamed; says what to do."""
+    """Raise `InputError` where the folder was renamed, or holds links; says what to do."""
+    check_folder(folder)
     recording = recording_of_renamed(folder)
     if recording is not None:
         raise InputError(

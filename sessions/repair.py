@@ -6,6 +6,7 @@ started again, a repair comes to the same end.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,8 +14,9 @@ from sessions.errors import InputError, SessionDamaged, disk_error
 from sessions.journal import JOURNAL_NAME
 from sessions.reader import parse_header
 from sessions.renamed import check_name
-from sessions.repair_folder import FolderRepair, Report, kept_words
-from sessions.rewrite import replace_damaged, with_their_stills
+from sessions.repair_folder import FolderRepair
+from sessions.repair_journal import Report, kept_words
+from sessions.rewrite import lost_words, replace_damaged, with_their_stills
 from sessions.salvage import scan
 from sessions.schemas import Topic
 from sessions.store import SEGMENT_NAME, lock
@@ -64,19 +66,18 @@ def _repair_file(path: Path) -> Report:
     header = parse_header(path, metadata)
     if metadata.get("crc", "") not in ("", header_crc(metadata)):
         report.lost.append("the certainty of its header: it does not match its CRC, and is kept as it reads")
-    messages, strokes = with_their_stills(found)
+    strokes = with_their_stills(found)
     notes = {name: values for name, values in found.notes.items() if name != HEADER_METADATA}
     files = {attachment.name: attachment.data for attachment in found.attachments}
-    kept, counts = replace_damaged(path, header, notes, files, messages)
+    kept, counts = replace_damaged(path, header, notes, files, strokes.messages())
     why = "; ".join(finding.what for finding in verdict.findings)
     report.did.append(f"wrote {path.name} again from what can be read of it: {why}{kept_words(kept)}")
     report.strokes = counts.get(Topic.STROKE, 0)
-    report.lost += [f"stroke {name}: its photograph is lost" for name in strokes]
+    report.lost += lost_words(strokes, Counter(found.stated or {}), counts)
+    if found.stated is None and (not found.complete or any(part.counts is None for part in found.parts)):
+        report.lost.append("whatever else lay behind the damage: without its index nobody knows how much that was")
     if found.stated is None:
-        report.lost.append("whatever lay behind the damage: without its index nobody knows how much that was")
         return report
-    gone = {topic: count - counts.get(topic, 0) for topic, count in found.stated.items()}
-    report.lost += [f"messages on {topic}: {count}" for topic, count in gone.items() if count > 0]
     if len(files) < found.stated_attachments or len(found.notes) < found.stated_notes:
         report.lost.append("an attached file, or a note of what was done to the recording")
     return report

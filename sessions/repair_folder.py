@@ -1,47 +1,33 @@
-"""The repair of a session's folder: journal first, then configuration, steps, and the merged file."""
+"""The repair of a session's folder: journal first, then configuration, steps, and the merged file.
+
+A step is put together again from every file that still holds some of it: its own, the merged file, and files that
+have another's name. The merged file is merged again from the steps.
+"""
 
 from __future__ import annotations
 
-import os
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from pydantic import ValidationError
-
+from sessions.codec import Line
 from sessions.disk import set_aside
 from sessions.errors import SessionDamaged
-from sessions.evidence import Evidence, final_is_sound, gather
-from sessions.journal import JOURNAL_NAME, Journal, fold, fsync_folder, replay
-from sessions.lines import Line, encode_line
+from sessions.evidence import final_is_sound, gather
+from sessions.journal import JOURNAL_NAME, fold, fsync_folder, replay
 from sessions.merge import REPAIRS_NOTE, verify
-from sessions.rewrite import replace_damaged, with_their_stills
-from sessions.salvage import Scan, salvaged, scan
-from sessions.schemas import StepEvent, Topic
+from sessions.repair_journal import Report, kept_words, repaired_journal, write_anew
+from sessions.rewrite import lost_words, replace_damaged, with_their_stills
+from sessions.salvage import Scan, scan
+from sessions.schemas import Topic
+from sessions.soundness import file_problems
 from sessions.store import closed_line, counts_of, merge_session, read_header
+from sessions.union import Record, Source, identity_of, united
 from sessions.verify import step_words
 from sessions.writer import BEGIN_NOTE, DONE_NOTE, file_sha256
 
 MEASURED = (str(Topic.STILL), str(Topic.STROKE))
 """Without these a step is worth nothing and is done again; a gap in anything else is told and kept."""
-
-
-@dataclass(slots=True)
-class Report:
-    """What a repair did."""
-
-    session: str
-    did: list[str] = field(default_factory=list[str])
-    lost: list[str] = field(default_factory=list[str])
-    """What could not be given back, in words; empty for a repair without loss."""
-    strokes: int = 0
-    """Finished strokes that the session now holds."""
-
-    @property
-    def lossless(self) -> bool:
-        """Whether everything recorded was given back."""
-        return not self.lost
 
 
 class FolderRepair:
@@ -54,28 +40,34 @@ class FolderRepair:
         self._report = Report(folder.name)
         self._lost_steps: list[str] = []
         """Told as lost unless the merged file holds them."""
+        self._scans: dict[tuple[int, int, int], tuple[Scan, tuple[str, int] | None]] = {}
+        """Of each file that was looked at, by its inode, size and time: what it holds, and whose it is."""
         evidence = gather(folder)
-        self._rewrite_journal(evidence)
-        self._journal = Journal(folder / JOURNAL_NAME, now_ns())
+        self._strays = evidence.strays
+        self._begins = [told for told in evidence.all_lines if told["event"] == "begin"]
+        self._header = read_header(folder, evidence.state)
+        self._journal = repaired_journal(evidence, self._header.session_id, now_ns, self._report)
         try:
-            self._add_lines(evidence)
             self._state = replay(folder / JOURNAL_NAME)
-            self._header = read_header(folder, self._state)
+            self._final_sound = final_is_sound(folder, self._state)
+            self._totals = Counter[str](counts_of(self._state))
+            self._merged = self._steps_of_merged()
         except BaseException:
             self._journal.close()
             raise
-        self._final_sound = final_is_sound(folder, self._state)
 
     def run(self) -> Report:
-        """Configuration, merged file, steps; a merged file that could not be repaired alone is merged again."""
+        """Configuration, steps, merged file."""
         try:
             self._snapshots()
-            closed = self._state.closed is not None
-            if closed and not self._final_sound:
-                self._final_alone()
             for line in list(self._state.segments):
                 self._segment(line)
-            if closed and not self._final_sound:
+            for name in self._strays:
+                kept = self._move_aside(self._folder / name)
+                self._report.did.append(f"put {name} aside: it is a copy of another step{kept_words(kept)}")
+            if self._state.closed is None:
+                self._left_by_a_close()
+            elif not self._final_sound:
                 self._merge_again()
         finally:
             self._journal.close()
@@ -84,63 +76,26 @@ class FolderRepair:
         self._report.strokes = counts.get(Topic.STROKE, 0)
         return self._report
 
-    def _rewrite_journal(self, evidence: Evidence) -> None:
-        """A journal that cannot be read is written again from what is intact and what the files tell."""
-        if evidence.intact:
-            return
-        path = self._folder / JOURNAL_NAME
-        kept = set_aside(path, "damaged").name if path.exists() else ""
-        fresh = path.with_name(path.name + ".repair")
-        with fresh.open("wb") as file:
-            for line in evidence.all_lines:
-                file.write(_encoded(line))
-            lost = len(evidence.spoilt)
-            words = {"event": "journal", "aside": kept, "rebuilt": len(evidence.rebuilt), "lost": lost}
-            file.write(encode_line(self._now_ns(), words))
-            file.flush()
-            os.fsync(file.fileno())
-        fresh.replace(path)
-        fsync_folder(self._folder)
-        self._report.did.append(
-            f"wrote {JOURNAL_NAME} again: {len(evidence.lines)} lines as they were, {len(evidence.rebuilt)} rebuilt "
-            f"from the files{f'; the damaged one is kept as {kept}' if kept else ''}"
-        )
-        if lost:
-            self._report.lost.append(f"{lost} lines of {JOURNAL_NAME} that no file tells")
-
-    def _add_lines(self, evidence: Evidence) -> None:
-        if evidence.intact:
-            for line in evidence.rebuilt:
-                self._journal.append(int(line["t_ns"]), _without_time(line))
-                what = step_words(line) if line["event"] != "closed" else "the session"
-                self._report.did.append(f"journalled {line['event']!r} of {what}, which {_file(line)} shows")
-        sheet = evidence.state.sheet
-        if evidence.doubtful and sheet not in evidence.state.doubtful_sheets:
-            for name in evidence.doubtful:
-                self._journal.append(self._now_ns(), {"event": "doubt", "file": name, "sheet": sheet})
-                self._report.lost.append(
-                    f"which cell {name} pressed: nothing more is pressed on sheet {sheet + 1}; "
-                    f"go on with a fresh one, --sheet {sheet + 2}"
-                )
+    def _steps_of_merged(self) -> dict[str, Counter[str]]:
+        """File of a step -> messages by topic that precede it in the merged file; empty where nobody can tell."""
+        before: dict[str, Counter[str]] = {}
+        number = Counter[str]()
+        for line in self._state.segments:
+            before[line["file"]] = number.copy()
+            number.update(line["counts"])
+        closed = self._state.closed or {}
+        return before if closed.get("counts", self._totals) == self._totals else {}
 
     def _snapshots(self) -> None:
         for name, text in (self._state.opened or {}).get("snapshots", {}).items():
-            path = self._folder / Path(str(name)).name
-            data = str(text).encode()
-            if path.is_file() and path.read_bytes() == data:
-                continue
-            kept = set_aside(path, "damaged").name if path.is_file() else ""
-            fresh = path.with_name(path.name + ".repair")
-            with fresh.open("wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            fresh.replace(path)
-            fsync_folder(self._folder)
-            self._report.did.append(f"wrote {path.name} again from the journal{kept_words(kept)}")
+            path = self._folder / name
+            data = text.encode()
+            if not path.is_file() or path.read_bytes() != data:
+                kept = write_anew(path, data)
+                self._report.did.append(f"wrote {path.name} again from the journal{kept_words(kept)}")
 
     def _segment(self, line: Line) -> None:
-        path = self._folder / str(line["file"])
+        path = self._folder / line["file"]
         held = "held" in line
         if held and self._final_sound:
             return
@@ -154,11 +109,11 @@ class FolderRepair:
 
     def _damaged(self, path: Path, line: Line, why: str) -> None:
         step = step_words(line)
-        found = scan(path) if path.is_file() else Scan(path)
+        found = self._look(path)[0] if path.is_file() else Scan(path)
         why = "; ".join(found.damage) or why
         counts = Counter[str](line["counts"])
-        ours = _is_ours(found, line) and not found.counts - counts
-        missing = counts - found.counts if ours else counts
+        records = united(line, self._sources(path, line, counts))
+        missing = counts - Counter(channel.topic for _schema, channel, _message in records)
         if missing and self._final_sound:
             kept = self._move_aside(path)
             self._log({"event": "held", "key": line["key"], "file": path.name, "by": self._final.name, "why": why})
@@ -166,16 +121,42 @@ class FolderRepair:
         elif any(topic in missing for topic in _needed(counts)):
             self._lose(path, line, why)
         else:
-            self._write_again(path, line, found if ours else Scan(path), dict(missing), why)
+            self._write_again(path, line, found, records, dict(missing), why)
 
-    def _write_again(self, path: Path, line: Line, found: Scan, missing: dict[str, int], why: str) -> None:
+    def _sources(self, path: Path, line: Line, counts: Counter[str]) -> Iterator[Source]:
+        """Where messages of the step may be: its own file, the merged file, and any that says it is this step's."""
+        identity, nothing = (line["key"], line.get("attempt", 1)), Counter[str]()
+        others = (other for other in sorted(self._folder.glob("*.mcap*")) if other not in (path, self._final))
+        for place in (path, self._final, *others):
+            if not place.is_file():
+                continue
+            if place != self._final:
+                found, whose = self._look(place)
+                if whose == identity:
+                    yield Source(found, counts, nothing)
+            elif path.name in self._merged:
+                yield Source(self._look(place)[0], self._totals, self._merged[path.name])
+
+    def _look(self, path: Path) -> tuple[Scan, tuple[str, int] | None]:
+        """What a file holds, and whose it is; read only once, whatever name it is given meanwhile."""
+        told = path.stat()
+        known = (told.st_ino, told.st_size, told.st_mtime_ns)
+        if known not in self._scans:
+            found = scan(path)
+            self._scans[known] = found, None if path == self._final else identity_of(found)
+        self._scans[known][0].path = path
+        return self._scans[known]
+
+    def _write_again(
+        self, path: Path, line: Line, found: Scan, records: list[Record], missing: dict[str, int], why: str
+    ) -> None:
         begin = {"t_ns": line["t_ns"], "header": self._header.model_dump(mode="json"), "line": self._begin_of(line)}
-        fields = ("key", "kind", "attempt", "result", "counts", "t_ns")
-        notes = {
-            BEGIN_NOTE: found.notes.get(BEGIN_NOTE, begin),
-            DONE_NOTE: {name: line[name] for name in fields} | {"counts": dict(found.counts)},
-        }
-        kept, counts = replace_damaged(path, self._header, notes, {}, salvaged(found))
+        if self._look(path)[1] == (line["key"], line.get("attempt", 1)) if path.is_file() else False:
+            begin = found.notes.get(BEGIN_NOTE, begin)
+        counts = dict(Counter(channel.topic for _schema, channel, _message in records))
+        done = {name: line[name] for name in ("key", "kind", "result", "t_ns")}
+        notes = {BEGIN_NOTE: begin, DONE_NOTE: {**done, "attempt": line.get("attempt", 1), "counts": counts}}
+        kept, counts = replace_damaged(path, self._header, notes, {}, records)
         event: Line = {"event": "repaired", "key": line["key"], "file": path.name, "sha256": file_sha256(path)}
         self._log({**event, "counts": counts, "missing": missing, "aside": kept, "why": why})
         words = ", ".join(f"{count} of {topic}" for topic, count in missing.items())
@@ -186,6 +167,9 @@ class FolderRepair:
 
     def _begin_of(self, line: Line) -> Line:
         """The attempt's `begin` line as the journal has it; what `done` knows of it where it has none."""
+        for told in self._begins:
+            if told["file"] == line["file"]:
+                return {name: value for name, value in told.items() if name != "t_ns"}
         known = {"event": "begin", "key": line["key"], "kind": line["kind"], "attempt": line.get("attempt", 1)}
         return {**known, "sheet": line["result"].get("sheet", self._state.sheet), "cell": None, "file": line["file"]}
 
@@ -219,17 +203,10 @@ class FolderRepair:
         fsync_folder(self._folder)
         return kept.name
 
-    def _final_alone(self) -> None:
-        """Where every message of the merged file can be read, it is written again from itself."""
-        found = scan(self._final) if self._final.is_file() else Scan(self._final)
-        if dict(found.counts) == (self._state.closed or {}).get("counts", {}):
-            self._rewrite_final(found)
-            self._final_sound = True
-
     def _merge_again(self) -> None:
         """From the steps' files, or from what can be read of the merged file where that holds more strokes."""
-        found = scan(self._final) if self._final.is_file() else Scan(self._final)
-        if found.counts[Topic.STROKE] > counts_of(self._state).get(Topic.STROKE, 0):
+        found = self._look(self._final)[0] if self._final.is_file() else Scan(self._final)
+        if not self._merged and len(with_their_stills(found).kept) > counts_of(self._state).get(Topic.STROKE, 0):
             self._lost_steps = self._rewrite_final(found)
             return
         why = "; ".join(found.damage) or ("has changed" if self._final.is_file() else "is missing")
@@ -240,18 +217,25 @@ class FolderRepair:
 
     def _rewrite_final(self, found: Scan) -> list[str]:
         """Returns what was lost, in words."""
-        messages, strokes = with_their_stills(found)
+        strokes = with_their_stills(found)
         names = (self._state.opened or {}).get("snapshots", {})
-        files = {a.name: a.data for a in found.attachments} | {str(k): str(v).encode() for k, v in names.items()}
+        files = {a.name: a.data for a in found.attachments} | {name: text.encode() for name, text in names.items()}
         notes: dict[str, Line] = {REPAIRS_NOTE: {"repairs": self._state.repairs}} if self._state.repairs else {}
-        kept, counts = replace_damaged(self._final, self._header, notes, files, messages)
-        before = (self._state.closed or {}).get("counts", {})
+        kept, counts = replace_damaged(self._final, self._header, notes, files, strokes.messages())
+        before = Counter[str]((self._state.closed or {}).get("counts", {}))
         self._log(closed_line(self._final, counts))
         why = "; ".join(found.damage) or "has changed"
         self._report.did.append(f"wrote {self._final.name} again from what can be read of it: {why}{kept_words(kept)}")
-        gone = {topic: count - counts.get(topic, 0) for topic, count in before.items()}
-        lost = [f"stroke {name}: its photograph is lost" for name in strokes]
-        return lost + [f"messages on {topic}: {count}" for topic, count in gone.items() if count > 0]
+        return lost_words(strokes, before, counts)
+
+    def _left_by_a_close(self) -> None:
+        """A merged file of a session that is open: it is merged again in any case."""
+        problems = file_problems(self._final)[1] if self._final.is_file() else []
+        if problems:
+            kept = self._move_aside(self._final)
+            self._report.did.append(
+                f"put {self._final.name} aside, which no close was journalled for{kept_words(kept)}"
+            )
 
     def _log(self, line: Line) -> None:
         t_ns = self._now_ns()
@@ -262,37 +246,3 @@ class FolderRepair:
 def _needed(counts: Counter[str]) -> tuple[str, ...]:
     """A photograph that is no stroke's (the board) is found by the event of its step."""
     return MEASURED if counts[Topic.STROKE] or not counts[Topic.STILL] else (*MEASURED, str(Topic.STEP))
-
-
-def _is_ours(found: Scan, line: Line) -> bool:
-    """Whether a damaged file shows that it is this attempt's: readable does not mean that it belongs here."""
-    identity = (line["key"], line.get("attempt"))
-    begin = found.notes.get(BEGIN_NOTE, {}).get("line", {})
-    done = found.notes.get(DONE_NOTE, {})
-    if identity in ((begin.get("key"), begin.get("attempt")), (done.get("key"), done.get("attempt"))):
-        return True
-    for _schema, channel, message in salvaged(found):
-        if channel.topic == Topic.STEP:
-            try:
-                event = StepEvent.model_validate_json(message.data)
-            except ValidationError:
-                return False
-            return (event.key, event.attempt) == identity
-    return False
-
-
-def _encoded(line: Line) -> bytes:
-    return encode_line(int(line.get("t_ns", 0)), _without_time(line))
-
-
-def _without_time(line: Line) -> Line:
-    return {name: value for name, value in line.items() if name != "t_ns"}
-
-
-def _file(line: Line) -> str:
-    return str(line.get("file", "the header"))
-
-
-def kept_words(name: str) -> str:
-    """Where the damaged file went."""
-    return f"; the damaged file is kept as {name}" if name else ""

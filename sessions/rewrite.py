@@ -3,29 +3,29 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from google.protobuf.message import DecodeError
-from mcap.records import Channel, Message, Schema
+from mcap.records import Message
 from mcap.writer import CompressionType, Writer
 from pydantic import ValidationError
 
+from sessions.codec import Line
 from sessions.disk import set_aside
 from sessions.errors import disk_error
 from sessions.journal import fsync_folder
-from sessions.lines import Line
 from sessions.merge import Copier, count_messages
 from sessions.messages import decode_still
-from sessions.salvage import Scan, salvaged
+from sessions.salvage import Record, Scan, glimpsed, salvaged
 from sessions.schemas import Header, Stroke, Topic
 from sessions.writer import CHUNK_BYTES, HEADER_METADATA, header_metadata, media_type, note
 
-Messages = Iterable[tuple[Schema | None, Channel, Message]]
-
 
 def replace_damaged(
-    path: Path, header: Header, notes: dict[str, Line], attachments: dict[str, bytes], messages: Messages
+    path: Path, header: Header, notes: dict[str, Line], attachments: dict[str, bytes], messages: Iterable[Record]
 ) -> tuple[str, dict[str, int]]:
     """Write a file with these contents in place of `path`, which is kept beside it.
 
@@ -58,24 +58,65 @@ def replace_damaged(
     return kept, counts
 
 
-def with_their_stills(found: Scan) -> tuple[Iterator[tuple[Schema | None, Channel, Message]], list[str]]:
-    """The messages of a salvaged recording without strokes whose still is lost; and the names of those strokes."""
-    there = {m.sequence for _, channel, m in salvaged(found) if channel.topic == Topic.STILL and _shows(m)}
-    lost: list[str] = []
-    for _schema, channel, message in salvaged(found):
-        if channel.topic == Topic.STROKE:
-            stroke = _stroke(message)
-            if stroke is not None and stroke.still not in there:
-                lost.append(stroke.stroke_id)
-    gone = set(lost)
+@dataclass(frozen=True, slots=True)
+class Strokes:
+    """What can be given back of a recording that stands alone: strokes with their photographs, each once."""
 
-    def kept() -> Iterator[tuple[Schema | None, Channel, Message]]:
-        for schema, channel, message in salvaged(found):
+    found: Scan
+    kept: tuple[str, ...]
+    photograph_lost: tuple[str, ...]
+    """Strokes whose still cannot be read."""
+    numbers_lost: tuple[int, ...]
+    """Which strokes of the recording, counted from 1, cannot be read themselves."""
+    names_lost: tuple[str, ...]
+    """What their chunks still show of their names, as far as that can be read."""
+    total: int
+    """Strokes that the recording held, as far as anything tells."""
+
+    def messages(self) -> Iterator[Record]:
+        """Everything that can be read, less strokes without their photograph and those that are there already."""
+        gone, seen = set(self.photograph_lost), set[str]()
+        for schema, channel, message in salvaged(self.found):
             stroke = _stroke(message) if channel.topic == Topic.STROKE else None
-            if stroke is None or stroke.stroke_id not in gone:
-                yield schema, channel, message
+            if stroke is not None:
+                if stroke.stroke_id in gone | seen:
+                    continue
+                seen.add(stroke.stroke_id)
+            yield schema, channel, message
 
-    return kept(), lost
+
+def with_their_stills(found: Scan) -> Strokes:
+    """Which strokes of a salvaged recording are there with their stills, and which are lost."""
+    there = {m.sequence for _, channel, m in salvaged(found) if channel.topic == Topic.STILL and _shows(m)}
+    names: dict[str, bool] = {}
+    for _schema, channel, message in salvaged(found):
+        stroke = _stroke(message) if channel.topic == Topic.STROKE else None
+        if stroke is not None:
+            names[stroke.stroke_id] = names.get(stroke.stroke_id, False) or stroke.still in there
+    missing: list[int] = []
+    number = 0
+    for part in found.parts:
+        count = (part.counts or Counter[str]())[Topic.STROKE]
+        missing += [] if part.sound else range(number + 1, number + count + 1)
+        number += count
+    kept = tuple(name for name, whole in names.items() if whole)
+    lost = tuple(name for name, whole in names.items() if not whole)
+    return Strokes(found, kept, lost, tuple(missing), tuple(glimpsed(found)) if missing else (), number)
+
+
+def lost_words(strokes: Strokes, before: Counter[str], now: dict[str, int]) -> list[str]:
+    """What was lost: each stroke by its name, or by its number where its name is lost with it, then the rest."""
+    lost = [f"stroke {name}: its photograph is lost" for name in strokes.photograph_lost]
+    named = len(strokes.names_lost) == len(strokes.numbers_lost)
+    for at, number in enumerate(strokes.numbers_lost):
+        name = f"{strokes.names_lost[at]}, " if named else ""
+        lost.append(f"stroke {name}number {number} of {strokes.total} in the recording: it cannot be read")
+    told = len(strokes.numbers_lost) + len(strokes.photograph_lost)
+    unknown = before[Topic.STROKE] - now.get(Topic.STROKE, 0) - told
+    if unknown > 0:
+        lost.append(f"{unknown} strokes of which nothing is left that names them")
+    gone = {topic: count - now.get(topic, 0) for topic, count in before.items() if topic != Topic.STROKE}
+    return lost + [f"messages on {topic}: {count}" for topic, count in gone.items() if count > 0]
 
 
 def _shows(message: Message) -> bool:

@@ -7,6 +7,7 @@ where the other chunks lie. A torn tail never yields a wrong record.
 from __future__ import annotations
 
 import io
+import re
 import struct
 import zlib
 from collections import Counter
@@ -15,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
@@ -25,7 +27,23 @@ from sessions.container import MAX_RECORD_BYTES, UNREADABLE, BoundedFile, check_
 from sessions.errors import InputError, in_one_line
 from sessions.writer import HEADER_METADATA, header_crc, read_note
 
+Record = tuple[Schema | None, Channel, Message]
+_STROKE_NAME = re.compile(rb'"stroke_id":"([^"\\]{1,100})","kind"')
+"""As a stroke's message begins."""
 _START = struct.Struct("<BQ")
+_PIECE_BYTES = 256
+_MESSAGE_INDEX = struct.Struct("<HI")
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One chunk of a file, readable or not."""
+
+    offset: int
+    counts: Counter[str] | None
+    """Messages by topic; None where nothing tells them."""
+    sound: bool
+    """Whether it reads back with its CRC."""
 
 
 @dataclass(slots=True)
@@ -33,8 +51,12 @@ class Scan:
     """Where the sound parts of a file lie, and what is wrong with the rest."""
 
     path: Path
-    chunks: list[int] = field(default_factory=list[int])
-    """Offsets of the chunks that read back with their CRC, in order."""
+    parts: list[Part] = field(default_factory=list[Part])
+    """Every chunk that is known of, in order."""
+    complete: bool = False
+    """Whether no other chunk can be there: the walk came to the end, or the index is sound."""
+    indexed: dict[int, dict[int, int]] = field(default_factory=dict[int, dict[int, int]])
+    """Offset of a chunk -> number of a channel -> messages, as the records behind it tell."""
     schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
     channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
     notes: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
@@ -68,21 +90,66 @@ def scan(path: Path) -> Scan:
             return found
         for offset in sorted(offsets):
             try:
-                for _schema, channel, _message in _chunk(file, offset, found):
-                    found.counts[channel.topic] += 1
+                counts = Counter(channel.topic for _schema, channel, _message in _chunk(file, offset, found))
             except UNREADABLE as error:
                 found.damage.append(f"a chunk at byte {offset} cannot be read ({in_one_line(error)})")
+                found.parts.append(Part(offset, None, sound=False))
             else:
-                found.chunks.append(offset)
+                found.counts += counts
+                found.parts.append(Part(offset, counts, sound=True))
+    found.parts = [part if part.sound else Part(part.offset, _told(found, part.offset), False) for part in found.parts]
     return found
 
 
-def salvaged(found: Scan) -> Iterator[tuple[Schema | None, Channel, Message]]:
+def _told(found: Scan, offset: int) -> Counter[str] | None:
+    """What the index of a chunk says of the messages in it."""
+    by_channel = found.indexed.get(offset)
+    if not by_channel or not by_channel.keys() <= found.channels.keys():
+        return None
+    return Counter({found.channels[number].topic: count for number, count in by_channel.items()})
+
+
+def salvaged(found: Scan) -> Iterator[Record]:
     """The messages of the sound chunks, in the order in which they were written. Raises `OSError`."""
-    if found.chunks:
-        with BoundedFile(found.path) as file:
-            for offset in found.chunks:
-                yield from _chunk(file, offset, found)
+    for part in found.parts:
+        if part.sound:
+            yield from read_part(found, part)
+
+
+def read_part(found: Scan, part: Part) -> Iterator[Record]:
+    """The messages of one sound chunk. Raises `OSError`."""
+    with BoundedFile(found.path) as file:
+        yield from _chunk(file, part.offset, found)
+
+
+def glimpsed(found: Scan) -> list[str]:
+    """Names of strokes that chunks without a CRC that holds still show, up to where they cannot be unpacked."""
+    names: dict[str, None] = {}
+    with BoundedFile(found.path) as file:
+        for part in found.parts:
+            if part.sound:
+                continue
+            try:
+                check_chunk_at(file, part.offset)
+                file.seek(part.offset)
+                _opcode, length = _START.unpack(file.read(_START.size))
+                chunk = Chunk.read(ReadDataStream(io.BytesIO(file.read(length))))
+                data = _unpacked(chunk.data) if chunk.compression else chunk.data
+            except UNREADABLE:
+                continue
+            names |= {name.decode("utf-8", "replace"): None for name in _STROKE_NAME.findall(data)}
+    return list(names)
+
+
+def _unpacked(data: bytes) -> bytes:
+    unpacked = bytearray()
+    stream = zstandard.ZstdDecompressor().decompressobj()
+    try:
+        for at in range(0, len(data), _PIECE_BYTES):
+            unpacked += stream.decompress(data[at : at + _PIECE_BYTES])
+    except zstandard.ZstdError:
+        pass  # what came before is worth showing
+    return bytes(unpacked)
 
 
 def _walk(file: BoundedFile, found: Scan) -> list[int]:
@@ -106,11 +173,22 @@ def _walk(file: BoundedFile, found: Scan) -> list[int]:
             return offsets
         if opcode == Opcode.CHUNK:
             offsets.append(at)
+        elif opcode == Opcode.MESSAGE_INDEX and offsets:
+            _message_index(file, found, offsets[-1])
         else:
             _record(file, found, opcode, at, length)
         at += _START.size + length
         if opcode == Opcode.DATA_END:
+            found.complete = True
             return offsets
+
+
+def _message_index(file: BoundedFile, found: Scan, chunk: int) -> None:
+    """The number of a channel, and the length of one entry of 16 bytes for each of its messages in the chunk."""
+    start = file.read(_MESSAGE_INDEX.size)
+    if len(start) == _MESSAGE_INDEX.size:
+        channel, length = _MESSAGE_INDEX.unpack(start)
+        found.indexed.setdefault(chunk, {})[channel] = length // 16
 
 
 def _record_at(file: BoundedFile, found: Scan, offset: int) -> None:
@@ -163,6 +241,12 @@ def _from_index(file: BoundedFile, found: Scan, known: set[int]) -> list[int]:
     found.stated = {found.channels[key].topic: count for key, count in counts.items() if key in found.channels}
     found.stated_attachments = len(summary.attachment_indexes)
     found.stated_notes = len({index.name for index in summary.metadata_indexes} - {HEADER_METADATA})
+    found.complete = True
+    for index in summary.chunk_indexes:
+        if index.chunk_start_offset not in known:
+            for offset in index.message_index_offsets.values():
+                file.seek(offset + _START.size)
+                _message_index(file, found, index.chunk_start_offset)
     missed = [index.chunk_start_offset for index in summary.chunk_indexes if index.chunk_start_offset not in known]
     for index in summary.metadata_indexes:
         if index.name not in found.metadata:
@@ -172,7 +256,7 @@ def _from_index(file: BoundedFile, found: Scan, known: set[int]) -> list[int]:
     return missed
 
 
-def _chunk(file: BoundedFile, offset: int, found: Scan) -> Iterator[tuple[Schema | None, Channel, Message]]:
+def _chunk(file: BoundedFile, offset: int, found: Scan) -> Iterator[Record]:
     """Messages of one chunk, all of them or an error."""
     check_chunk_at(file, offset)
     file.seek(offset)

@@ -9,9 +9,19 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from sessions.names import bare_name
 
 SCHEMA_VERSION = 1
+
+
+def _bare_or_empty(value: str) -> str:
+    return bare_name(value) if value else value
+
+
+BareName = Annotated[str, AfterValidator(_bare_or_empty)]
+"""A name that becomes that of a file or folder, and so must not lead to another one; empty before it is known."""
 
 
 class Topic(StrEnum):
@@ -159,7 +169,7 @@ class Header(Event):
     """Who made this recording, on what, with what. Written first, into every file of a session."""
 
     schema_version: int = SCHEMA_VERSION
-    session_id: str
+    session_id: BareName
     source: Source
     software: str
     robot: str = ""

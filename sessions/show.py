@@ -8,10 +8,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from sessions import container
-from sessions.errors import InputError
-from sessions.journal import JOURNAL_NAME, Replay, read_lines, replay
-from sessions.lines import Line
+from sessions.codec import Line
+from sessions.errors import InputError, SessionDamaged, in_one_line
+from sessions.events import NONSENSE
+from sessions.journal import JOURNAL_NAME, Replay, replay_lines
 from sessions.reader import Recording
 from sessions.remarks import remarks_of
 from sessions.renamed import check_name
@@ -105,11 +108,18 @@ def _of_header(header: Header, state: str) -> Details:
 
 
 def _of_journal(folder: Path) -> Details:
-    state = replay(folder / JOURNAL_NAME)
+    """Raises `SessionDamaged` also for what reads well and makes no sense, as a grid of no numbers."""
+    state, lines = replay_lines(folder / JOURNAL_NAME)
+    try:
+        return _told(folder, state, lines)
+    except (*NONSENSE, ValidationError) as error:
+        raise SessionDamaged(folder / JOURNAL_NAME, f"makes no sense: {in_one_line(error)}") from None
+
+
+def _told(folder: Path, state: Replay, lines: list[Line]) -> Details:
     header = read_header(folder, state)
     told = _of_header(header, "open" if state.closed is None else "closed")
     told.session_id = folder.name
-    lines = list(read_lines(folder / JOURNAL_NAME))
     told.processes = sum(line["event"] == "process" for line in lines)
     told.finished = dict(Counter(str(line["kind"]) for line in state.segments))
     told.void, told.next = _voids(lines, state)

@@ -14,11 +14,12 @@ from typing import Any
 from filelock import FileLock, Timeout
 from pydantic import ValidationError
 
+from sessions.codec import Line
 from sessions.disk import check_room, free_bytes, set_aside
 from sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked, disk_error, in_one_line
 from sessions.journal import JOURNAL_NAME, Journal, Replay, fsync_folder, is_open, replay
-from sessions.lines import Line
 from sessions.merge import merge, verify
+from sessions.names import check_folder
 from sessions.schemas import Header, Recorded
 from sessions.writer import QUEUE_LIMIT, SegmentWriter, file_sha256
 
@@ -57,19 +58,21 @@ class SessionStore:
     ) -> None:
         self.folder = folder
         self._now_ns = now_ns
-        if header is None and not (folder / JOURNAL_NAME).is_file():
-            raise InputError(folder, f"holds no {JOURNAL_NAME}: not a session that was collected")
+        if header is None:
+            if not (folder / JOURNAL_NAME).is_file():
+                raise InputError(folder, f"holds no {JOURNAL_NAME}: not a session that was collected")
+            check_folder(folder)
         self._lock = lock(folder)
         self._journal: Journal | None = None
         try:
-            if header is None and replay(folder / JOURNAL_NAME).closed is not None:
+            self.state = Replay() if header is not None else replay(folder / JOURNAL_NAME)
+            if self.state.closed is not None:
                 raise InputError(folder, "is closed; a finished recording is never changed")
-            self._journal = Journal(folder / JOURNAL_NAME, now_ns())
-            self.state = Replay()
+            self.header = header or read_header(folder, self.state)
+            self._journal = Journal(folder / JOURNAL_NAME, now_ns(), self.header.session_id)
             if header is not None:
                 self._log(open_line(header, snapshots or {}))
-            self.state: Replay = replay(folder / JOURNAL_NAME)
-            self.header = read_header(folder, self.state)
+                self.state = replay(folder / JOURNAL_NAME)
             self._check_serials()
             self._log({"event": "process"})
         except SessionDamaged as error:
@@ -283,4 +286,6 @@ def next_session_id(root: Path, label: str, today: dt.date) -> str:
 def open_sessions(root: Path) -> list[Path]:
     """Folders under `root` whose journal was opened and has no `closed` event, oldest first."""
     folders = sorted(path.parent for path in root.glob(f"*/{JOURNAL_NAME}"))
+    for folder in folders:
+        check_folder(folder)
     return [folder for folder in folders if is_open(replay(folder / JOURNAL_NAME))]

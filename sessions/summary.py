@@ -8,6 +8,7 @@ from pathlib import Path
 
 from sessions.errors import InputError, SessionError
 from sessions.journal import JOURNAL_NAME, is_open, replay
+from sessions.names import check_folder
 from sessions.reader import Recording
 from sessions.renamed import recording_of_renamed
 from sessions.schemas import Source, Topic
@@ -38,6 +39,7 @@ def summaries(root: Path) -> Iterator[Summary]:
 
 
 def _summary(folder: Path) -> Summary | None:
+    check_folder(folder)
     collected = (folder / JOURNAL_NAME).is_file()
     if collected and is_open(state := replay(folder / JOURNAL_NAME)):
         strokes = sum(line["counts"].get(Topic.STROKE, 0) for line in state.segments)

@@ -6,22 +6,17 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from google.protobuf.message import DecodeError
-from pydantic import ValidationError
-
+from sessions.codec import Line
 from sessions.errors import InputError, SessionDamaged, SessionError
 from sessions.evidence import Evidence, gather
 from sessions.journal import JOURNAL_NAME
-from sessions.lines import Line
 from sessions.merge import verify as verify_digest
-from sessions.messages import decode_gray, decode_still
 from sessions.reader import Recording
 from sessions.renamed import check_name
-from sessions.salvage import Scan, salvaged, scan
-from sessions.schemas import Stroke, Topic
+from sessions.schemas import Topic
+from sessions.show import details
+from sessions.soundness import file_problems
 from sessions.store import SEGMENT_NAME, counts_of
-
-IMAGES = (Topic.STILL, Topic.PREVIEW)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +49,10 @@ class Verdict:
 
 
 def verify_session(path: Path) -> Verdict:
-    """Check a session's folder, or one MCAP file. Raises `InputError` where it is neither, or was renamed."""
+    """Check a session's folder, or one MCAP file.
+
+    Raises `InputError` where it is neither, was renamed, or holds links.
+    """
     if path.is_file():
         return _verify_file(path, path.name)
     if not path.is_dir():
@@ -68,32 +66,6 @@ def verify_session(path: Path) -> Verdict:
             raise InputError(path, f"holds neither {JOURNAL_NAME} nor {final.name}: not a session")
         return _verify_file(final, name)
     return _verify_folder(path.resolve())
-
-
-def file_problems(path: Path) -> tuple[Scan, list[str]]:
-    """Read a file in full: its chunks and index, every image, and that every stroke has its still."""
-    found = scan(path)
-    problems = list(found.damage)
-    if found.stated is not None and not problems and found.stated != dict(found.counts):
-        problems.append(f"holds {dict(found.counts)}, but its index says {found.stated}")
-    stills: set[int] = set()
-    try:
-        for _schema, channel, message in salvaged(found):
-            if channel.topic in IMAGES:
-                decode_gray(decode_still(message.data), f"the image {message.sequence} on {channel.topic}")
-            if channel.topic == Topic.STILL:
-                stills.add(message.sequence)
-            elif channel.topic == Topic.STROKE:
-                stroke = Stroke.model_validate_json(message.data)
-                if stroke.still not in stills:
-                    problems.append(f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there")
-    except SessionDamaged as error:
-        problems.append(f"{error.path} {error.what}")
-    except (DecodeError, ValidationError) as error:
-        problems.append(f"a message does not fit its schema ({type(error).__name__})")
-    except OSError as error:
-        problems.append(f"cannot be read: {error.strerror}")
-    return found, problems
 
 
 def step_words(line: Line) -> str:
@@ -135,6 +107,12 @@ def _verify_folder(folder: Path) -> Verdict:
     if state.closed is not None:
         verdict.state = "closed"
         _final(verdict, folder, evidence)
+    elif (final := folder / f"{folder.name}.mcap").is_file():
+        # Of a close that was cut, or whose line is lost: it was read back before it got its name.
+        verdict.files += 1
+        verdict.findings += [Finding(final.name, problem) for problem in file_problems(final)[1]]
+    if verdict.sound:
+        _shown(verdict, folder)
     _count(verdict, Counter(counts_of(state)))
     verdict.notes += [f"{line['file']}: {_repair_words(line)}" for line in state.repairs]
     kept = [p for p in folder.iterdir() if ".damaged-" in p.name or ".superseded-" in p.name]
@@ -154,16 +132,31 @@ def _repair_words(line: Line) -> str:
     return f"was repaired; missing: {missing or 'nothing'}"
 
 
+def _shown(verdict: Verdict, folder: Path) -> None:
+    """What `show` and every reader refuse is not sound."""
+    try:
+        details(folder)
+        if verdict.state == "closed":
+            Recording(folder)
+    except (InputError, SessionDamaged) as error:
+        verdict.findings.append(Finding(error.path.name, error.what))
+
+
 def _journal(verdict: Verdict, evidence: Evidence) -> None:
-    journal = evidence.journal
+    verdict.findings += [Finding(JOURNAL_NAME, str(fault)) for fault in evidence.faults]
+    if evidence.lost:
+        verdict.notes.append(f"{JOURNAL_NAME}: {evidence.lost} of its lines are beyond rebuilding")
+    elif evidence.faults:
+        verdict.notes.append(f"{JOURNAL_NAME}: what is wrong with it can be made good from the files")
     if evidence.data is None:
         verdict.findings.append(Finding(JOURNAL_NAME, "is missing, though the folder holds recordings"))
-    if journal.torn:
+    if evidence.torn:
         verdict.notes.append(f"{JOURNAL_NAME}: its last line was cut off; the next process sets it aside")
-    if evidence.data is not None and not journal.whole:
-        spoilt = len(evidence.journal.spoilt)
-        what = f"{spoilt} lines are damaged" if spoilt else "a line end is damaged"
-        verdict.findings.append(Finding(JOURNAL_NAME, f"{what}, {len(evidence.spoilt)} of them beyond rebuilding"))
+    if evidence.unchained:
+        verdict.notes.append(
+            f"{JOURNAL_NAME}: {evidence.unchained} of {len(evidence.lines)} lines are unchained, as older versions "
+            "wrote them: that one of these was taken out or put in would not be noticed"
+        )
     for line in evidence.rebuilt:
         match line["event"]:
             case "begin":
@@ -174,6 +167,8 @@ def _journal(verdict: Verdict, evidence: Evidence) -> None:
                 verdict.notes.append(f"{line['file']} is complete, but not journalled as closed")
             case _:
                 verdict.findings.append(Finding(JOURNAL_NAME, "does not say how the session was opened"))
+    for name in evidence.strays:
+        verdict.findings.append(Finding(name, "holds a step that the journal knows by another file"))
     for name in evidence.doubtful:
         verdict.findings.append(Finding(name, "nothing tells which cell of which sheet it pressed"))
 

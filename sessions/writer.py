@@ -14,7 +14,7 @@ import zlib
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from mcap.writer import CompressionType, Writer
 
@@ -172,7 +172,7 @@ class ChannelTable:
             sequence=outgoing.sequence,
             data=message.model_dump_json().encode() if isinstance(message, Event) else message.SerializeToString(),
         )
-        if new:
+        if new or outgoing.topic == Topic.STROKE:  # what damages a chunk costs one stroke
             self._writer.flush()
 
     def _register(self, outgoing: Outgoing) -> int:
@@ -223,13 +223,16 @@ def note(values: dict[str, Any]) -> dict[str, str]:
 
 
 def read_note(metadata: dict[str, str]) -> dict[str, Any] | None:
-    """The values of a note; None where it does not match its CRC."""
+    """The values of a note; None where it does not match its CRC. Raises `ValueError` where it is no note."""
     import json
 
     text = metadata.get("json", "")
     if metadata.get("crc") != f"{zlib.crc32(text.encode()):08x}":
         return None
-    return json.loads(text)
+    values = json.loads(text)
+    if not isinstance(values, dict):
+        raise ValueError("holds no values")
+    return cast("dict[str, Any]", values)
 
 
 def file_sha256(path: Path) -> str:

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from calibrate.files import read_bounded, write_whole
 from collect.errors import ConfigError
+from sessions.schemas import BareName
 
 FILE = "settings.json"
 
@@ -20,7 +21,7 @@ class Settings(BaseModel):
     original: str
     """Session id."""
     original_sha256: str
-    fit: str
+    fit: BareName
     """Digest of the brush fit that recovers depth and tilt."""
     height_range_mm: tuple[float, float]
     tilt_range_deg: tuple[float, float]

@@ -73,8 +73,9 @@ class Make:
         writer.finish()
         return path
 
-    def store(self, folder: Path) -> SessionStore:
-        return SessionStore.create(folder, self.header, self.snapshots, self.clock())
+    def store(self, folder: Path, **fields: Any) -> SessionStore:
+        header = self.header.model_copy(update=fields)
+        return SessionStore.create(folder, header, self.snapshots, self.clock())
 
     def perform(self, store: SessionStore, key: str, cell: int | None = None) -> None:
         """One step from begin to done, with a still and a stroke in it."""

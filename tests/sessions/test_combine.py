@@ -101,6 +101,32 @@ def test_a_stroke_that_is_there_twice_is_refused(tmp_path, closed):
         combine([monday, segment], tmp_path / "week.mcap")
 
 
+def test_the_same_recording_twice_is_refused_whatever_it_is_called(tmp_path, closed):
+    monday = closed("monday")
+    copy = tmp_path / "copy.mcap"
+    copy.write_bytes((monday / "monday.mcap").read_bytes())
+    for again in (monday, monday / "monday.mcap", copy):
+        with pytest.raises(InputError, match=r"is, or holds, the same recording as .*/monday\.mcap") as caught:
+            combine([monday, again], tmp_path / "week.mcap")
+        assert "\n" not in str(caught.value)
+    assert not list(tmp_path.glob("*week*"))
+
+
+def test_a_recording_is_refused_beside_a_file_that_it_was_merged_into(make, tmp_path, closed):
+    monday, tuesday = closed("monday"), closed("tuesday")
+    week = combine([monday, tuesday], tmp_path / "week.mcap")
+    with pytest.raises(InputError, match=r"monday\.mcap: is, or holds, the same recording as .*/week\.mcap"):
+        combine([week, monday], tmp_path / "month.mcap")
+    with pytest.raises(InputError, match=r"holds stroke H13-a05-r01 of tuesday, as does .*/week\.mcap"):
+        combine([week, sorted(tuesday.glob("*-capture-*.mcap"))[1]], tmp_path / "month.mcap")
+
+
+def test_a_step_of_no_stroke_is_refused_twice_as_well(tmp_path, closed):
+    board = next(closed("monday").glob("*-board-*.mcap"))
+    with pytest.raises(InputError, match="the same recording"):
+        combine([board, board], tmp_path / "boards.mcap")
+
+
 def test_an_existing_file_is_never_written_over(tmp_path, closed):
     out = tmp_path / "week.mcap"
     out.write_bytes(b"precious")

@@ -9,11 +9,13 @@ from typer.testing import CliRunner
 
 from sessions import merge, rewrite, writer
 from sessions.cli import app
+from sessions.codec import encode_line
 from sessions.errors import DiskFull, InputError, SessionDamaged, SessionError, SessionLocked
 from sessions.journal import JOURNAL_NAME
 from sessions.lines import read_lines
 from sessions.reader import Recording
 from sessions.repair import repair_session
+from sessions.show import details
 from sessions.store import SessionStore
 from sessions.verify import verify_session
 
@@ -178,7 +180,7 @@ def test_where_nobody_knows_which_cell_was_pressed_the_sheet_is_not_used_again(m
     journal.write_bytes(b"".join(line for line in lines if b'"file":"0001-press' not in line))
     cut(folder / "0001-press-H13-a05-.mcap.part", 0.1)
     report = repair(folder)
-    assert "nothing more is pressed on sheet 1; go on with a fresh one, --sheet 2" in report.lost[0]
+    assert "nothing more is pressed on sheet 1; go on with a fresh one, --sheet 2" in report.lost[1]
     store = go_on(folder)
     with pytest.raises(SessionError, match="run the same command with --sheet 2"):
         store.begin("H15-a05", "press", cell=7, notes={})
@@ -332,3 +334,76 @@ def test_close_refuses_while_another_process_has_the_session(make, store):
     make.collect(store)
     ran = CliRunner().invoke(app, ["close", str(store.folder)])
     assert isinstance(ran.exception, SessionLocked)
+
+
+def test_two_steps_under_each_others_names_are_known_by_what_they_hold(make, folder, repair, go_on):
+    one, other = file_of(folder, "H13-a05-r00 capture"), file_of(folder, "H13-a05-r01 capture")
+    one.rename(folder / "between")
+    other.rename(one)
+    (folder / "between").rename(other)
+    assert repair(folder).lossless
+    assert make.stroke_names(go_on(folder).close()) == ["H13-a05-r00", "H13-a05-r01"]
+
+
+def test_a_stroke_in_halves_is_put_together_from_its_file_and_the_merged_one(make, closed, repair):
+    path, final = file_of(closed, "H13-a05-r00 capture"), closed / f"{closed.name}.mcap"
+    messages = make.messages(final)
+    cut(path, 0.5)
+    with final.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    data = bytearray(final.read_bytes())
+    data[chunks[-1].chunk_start_offset + chunks[-1].chunk_length // 2] ^= 1  # of the other stroke
+    final.write_bytes(data)
+    assert repair(closed).lossless
+    assert make.messages(final) == messages
+
+
+def test_one_flipped_byte_of_a_lone_recording_costs_one_stroke_and_names_it(make, tmp_path, repair):
+    store = make.store(tmp_path / make.header.session_id)
+    make.collect(store, 6)
+    path = tmp_path / "alone" / "lone.mcap"
+    path.parent.mkdir()
+    shutil.copy(store.close(), path)
+    store.release()
+    with path.open("rb") as file:
+        chunk = make_reader(file).get_summary().chunk_indexes[2]
+    data = bytearray(path.read_bytes())
+    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
+    path.write_bytes(data)
+    report = repair(path)
+    assert make.stroke_names(path) == [f"H13-a05-r{number:02d}" for number in (0, 1, 3, 4, 5)]
+    assert report.lost[0].endswith("number 3 of 6 in the recording: it cannot be read")
+
+
+@pytest.mark.parametrize(
+    ("event", "field"),
+    [
+        ("open", "header"),
+        ("begin", "attempt"),
+        ("begin", "kind"),
+        ("done", "file"),
+        ("done", "kind"),
+        ("void", "attempt"),
+        ("sheet", "sheet"),
+    ],
+)
+def test_a_line_that_lacks_a_field_is_damage_for_every_command(folder, repair, event, field):
+    lines = [*read_lines(folder / JOURNAL_NAME), {"t_ns": 1, "event": "sheet", "sheet": 0}]
+    changed = [{k: v for k, v in line.items() if line["event"] != event or k != field} for line in lines]
+    (folder / JOURNAL_NAME).write_bytes(b"".join(encode_line(line.pop("t_ns"), line) for line in changed))
+    told = f"'{field}' of event '{event}' is missing"
+    with pytest.raises(SessionDamaged, match=told):
+        details(folder)
+    assert told in str(verify_session(folder).findings)
+    repair(folder)
+    assert verify_session(folder).sound
+
+
+def test_verify_calls_nothing_sound_that_show_refuses(make, tmp_path):
+    store = make.store(tmp_path / "s", protocol='{"heights_mm": ["deep"], "tilts_deg": [0], "repeats": 1}')
+    make.perform(store, "a")
+    store.release()
+    with pytest.raises(SessionDamaged, match="makes no sense"):
+        details(store.folder)
+    [finding] = verify_session(store.folder).findings
+    assert "makes no sense" in finding.what

@@ -60,7 +60,8 @@ def test_what_is_missing_is_named(folder):
 def test_a_damaged_journal_line_is_told_and_whether_the_files_make_up_for_it(folder):
     journal = folder / JOURNAL_NAME
     flip(journal, journal.read_bytes().index(b'"depth_mm"'))
-    assert words(folder) == ["journal.jsonl: 1 lines are damaged, 0 of them beyond rebuilding"]
+    assert words(folder) == ["journal.jsonl: line 8 is not JSON"]
+    assert "journal.jsonl: what is wrong with it can be made good from the files" in verify_session(folder).notes
 
 
 def test_an_image_that_does_not_decode_is_damage_though_every_crc_holds(make, store):

@@ -1,0 +1,222 @@
+"""A folder from a stranger: whatever it says, nothing outside it is written, renamed, or read as its data.
+
+An audit hook sees every file that the process opens, links, renames or removes, whoever does it and by what name.
+"""
+
+import os
+import shutil
+import sys
+
+import pytest
+from click.testing import CliRunner
+from typer.main import get_command
+
+from brushloop import app
+from sessions.codec import encode_line
+from sessions.errors import InputError
+from sessions.journal import JOURNAL_NAME
+from sessions.names import bare_name
+from sessions.store import SessionStore, open_sessions
+
+BRUSHLOOP = get_command(app)
+SECRET = b"the key to the safe"
+WATCHED = {
+    "open",
+    "os.rename",
+    "os.link",
+    "os.symlink",
+    "os.remove",
+    "os.truncate",
+    "os.mkdir",
+    "os.rmdir",
+    "os.listdir",
+}
+COMMANDS = {
+    "list": ["sessions", "list", "{root}"],
+    "show": ["sessions", "show", "{session}", "--files"],
+    "show json": ["sessions", "show", "{session}", "--json"],
+    "verify": ["sessions", "verify", "{session}"],
+    "repair": ["sessions", "repair", "{session}"],
+    "close": ["sessions", "close", "{session}"],
+    "merge": ["sessions", "merge", "{out}.mcap", "{session}", "{file}"],
+    "export": ["sessions", "export", "{session}", "{out}"],
+    "export a file": ["sessions", "export", "{file}", "{out}-2"],
+    "calibrate": ["calibrate", "{session}"],
+    "fit": ["fit", "{session}"],
+    "validate": ["validate", "{session}"],
+    "validate a file": ["validate", "{file}"],
+}
+
+
+@pytest.fixture(scope="session")
+def opened_outside():
+    """Paths under `watch[0]` that were touched while the list has an item; one hook for the whole run."""
+    watch, seen = [], []
+
+    def hook(event, args):
+        if not watch or event not in WATCHED:
+            return
+        for path in args[:2]:
+            if isinstance(path, str | bytes | os.PathLike):
+                where = os.path.realpath(os.fsdecode(path))
+                if where == watch[0] or where.startswith(watch[0] + os.sep):
+                    seen.append(f"{event} {where}")
+
+    sys.addaudithook(hook)
+    return watch, seen
+
+
+@pytest.fixture
+def place(make, tmp_path):
+    """`outside` with precious files, and `root` with a session to spoil, closed, its files beside it."""
+    outside = tmp_path / "outside"
+    (outside / "calibration").mkdir(parents=True)
+    for name in (
+        "victim.mcap",
+        "victim.toml",
+        "victim.mcap.part",
+        "journal.jsonl",
+        "calibration/0123456789abcdef.json",
+    ):
+        (outside / name).write_bytes(SECRET)
+    store = make.store(tmp_path / "root" / make.header.session_id)
+    make.collect(store)
+    store.close()
+    store.release()
+    make.record(outside / "whole.mcap", *make.strokes(2))
+    return tmp_path
+
+
+def rewritten(folder, change):
+    """The journal again, unchained as a stranger may write it, with `change` made to each of its lines."""
+    from sessions.lines import read_lines
+
+    lines = [change(dict(line)) for line in read_lines(folder / JOURNAL_NAME)]
+    data = b"".join(encode_line(line.pop("t_ns"), line) for line in lines)
+    (folder / JOURNAL_NAME).write_bytes(data)
+
+
+def named(name, event="done"):
+    """Every line of this event names the file `name`."""
+    return lambda folder, _: rewritten(
+        folder,
+        lambda line: (
+            {**line, "file": name.format(out=folder.parents[1] / "outside")} if line["event"] == event else line
+        ),
+    )
+
+
+def snapshot(name):
+    def spoil(folder, outside):
+        told = {name.format(out=outside): "written by a stranger"}
+        rewritten(folder, lambda line: {**line, "snapshots": told} if line["event"] == "open" else line)
+
+    return spoil
+
+
+def linked(pattern, to):
+    """A file or folder of the session is a link."""
+
+    def spoil(folder, outside):
+        path = next(iter(sorted(folder.glob(pattern))), folder / pattern)
+        if path.is_dir():
+            shutil.rmtree(path)
+        path.unlink(missing_ok=True)
+        path.symlink_to(outside / to)
+
+    return spoil
+
+
+def session_id(folder, _):
+    """The header names a folder elsewhere."""
+    told = "../../outside/calibration"
+    rewritten(
+        folder,
+        lambda line: {**line, "header": {**line["header"], "session_id": told}} if line["event"] == "open" else line,
+    )
+
+
+WAYS = {
+    "absolute path in done": named("{out}/victim.mcap"),
+    "path upwards in done": named("../../outside/victim.mcap"),
+    "path upwards in begin": named("../../outside/victim.mcap", "begin"),
+    "two dots": named(".."),
+    "nul": named("a\0b.mcap"),
+    "snapshot upwards": snapshot("../../outside/victim.toml"),
+    "absolute snapshot": snapshot("{out}/victim.toml"),
+    "session id": session_id,
+    "step is a link": linked("*-press-*.mcap", "whole.mcap"),
+    "cut step is a link": linked("*.mcap.part", "victim.mcap.part"),
+    "merged file is a link": linked("2026-01-02-grid-01.mcap", "whole.mcap"),
+    "journal is a link": linked(JOURNAL_NAME, "journal.jsonl"),
+    "remarks are a link": linked("remarks.jsonl", "journal.jsonl"),
+    "configuration is a link": linked("rig.toml", "victim.toml"),
+    "lock is a link": linked(".lock", "victim.toml"),
+    "calibration is a link": linked("calibration", "calibration"),
+    "brush fit is a link": linked("brushfit", "calibration"),
+    "validation is a link": linked("validation", "calibration"),
+    "a kept copy is a link": linked("rig.toml.damaged-1", "nowhere"),
+    "a copy in the making is a link": linked("journal.jsonl.repair", "victim.toml"),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_nothing_outside_the_folder_is_touched(make, place, opened_outside, way, monkeypatch):
+    outside, folder = place / "outside", place / "root" / make.header.session_id
+    before = make.tree(outside)
+    WAYS[way](folder, outside)
+    monkeypatch.chdir(place)
+    watch, seen = opened_outside
+    places = {"root": folder.parent, "session": folder, "out": place / "out", "file": folder / f"{folder.name}.mcap"}
+    for name, words in COMMANDS.items():
+        seen.clear()
+        watch.append(str(outside))
+        try:
+            ran = CliRunner().invoke(BRUSHLOOP, [word.format(**places) for word in words])
+        finally:
+            watch.clear()
+        given = name in ("merge", "export a file", "validate a file") and way == "merged file is a link"
+        assert given or not seen, f"{name}: {seen}"
+        assert SECRET.decode() not in ran.output
+        assert (
+            ran.exception is None or isinstance(getattr(ran.exception, "code", None), int) or ran.exception.exit_code
+        ), name
+        assert make.tree(outside) == before, f"{name} changed something outside"
+    written = [path for path in folder.rglob("*") if path.is_file() and not path.is_symlink()]
+    assert not any(SECRET in path.read_bytes() for path in written)
+
+
+def test_a_link_among_the_sessions_is_what_the_user_made(make, place):
+    """The folder itself may be on another disk; what is in it may not."""
+    folder = place / "root" / make.header.session_id
+    elsewhere = place / "disk" / folder.name
+    elsewhere.parent.mkdir()
+    folder.rename(elsewhere)
+    folder.symlink_to(elsewhere)
+    ran = CliRunner().invoke(BRUSHLOOP, ["sessions", "verify", str(folder)])
+    assert (ran.exit_code, "is sound" in ran.output) == (0, True)
+
+
+def test_a_session_that_is_gone_on_with_holds_no_link(make, place):
+    folder = place / "root" / "2026-01-03-grid-01"
+    make.store(folder).release()
+    (folder / "rig.toml").unlink()
+    (folder / "rig.toml").symlink_to(place / "outside" / "victim.toml")
+    with pytest.raises(InputError, match=r"rig\.toml: is a link, which nothing in a session's folder may be") as caught:
+        SessionStore(folder, None, make.clock())
+    assert caught.value.exit_code == 2
+    with pytest.raises(InputError, match="is a link"):
+        open_sessions(folder.parent)
+
+
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", "/etc/passwd", "../x", "a/b", "a\\b", "a\0b", "a\nb", "x" * 300, 3, None]
+)
+def test_what_is_no_bare_name(name):
+    with pytest.raises(ValueError, match=r"is not a string|allowed is the name of a file"):
+        bare_name(name)
+
+
+def test_a_bare_name():
+    assert bare_name("0001-press-1f3a9c02.mcap") == "0001-press-1f3a9c02.mcap"
+    assert bare_name("übung 10:30.mcap")

@@ -1,0 +1,275 @@
+"""Bytes and whole lines of a session damaged at random: what is intact comes back once, and nothing false is sound.
+
+What is intact is told from the session as it was before, by the mcap library alone: a message is where its chunk was
+not hit, in its step's file or in the merged one.
+"""
+
+import io
+import json
+import random
+import shutil
+import struct
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+from mcap.data_stream import ReadDataStream
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, Message
+from mcap.stream_reader import breakup_chunk
+
+from sessions.codec import with_crc
+from sessions.journal import JOURNAL_NAME
+from sessions.repair import repair_session
+from sessions.schemas import Topic
+from sessions.store import SessionStore
+from sessions.verify import verify_session
+
+STROKES = 3
+QUICK = 15
+
+
+@dataclass
+class Whole:
+    """A session before the damage, and what its files hold where."""
+
+    folder: Path
+    foreign: list[bytes]
+    """Lines of another session."""
+    closed: bool
+    messages: Counter
+    chunks: dict[str, list] = field(default_factory=dict)
+    """File -> (first byte, byte behind the last, messages) of each chunk."""
+
+    @property
+    def lines(self):
+        return (self.folder / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
+
+
+@dataclass
+class Damage:
+    """What was done to a copy."""
+
+    words: list[str] = field(default_factory=list)
+    hit: dict[str, list] = field(default_factory=lambda: defaultdict(list))
+    """File -> ranges of bytes that are not what they were."""
+
+
+def collect(make, folder):
+    """Set-up done twice, a cut press, a change of sheet and a second process, as in a real session."""
+    store = make.store(folder)
+    make.take(store, "touch", "zero_touch", [make.pose(1)], {"touch_z_mm": 1.0})
+    make.collect(store, STROKES - 1)
+    store.fresh_sheet()
+    store.release()
+    store = SessionStore(folder, None, make.clock())
+    make.take(store, "touch", "zero_touch", [make.pose(2)], {"touch_z_mm": 1.1})
+    stroke = {"stroke_id": "H13-a05-r09", "sheet": 1, "cell": 0}
+    make.take(store, "H13-a05-r09 press", "press", [make.pose(900 + n) for n in range(5)], stroke, 0)
+    shown = [make.still(9), make.stroke(9)]
+    make.take(store, "H13-a05-r09 capture", "capture", shown, {"stroke_id": "H13-a05-r09", "still": 9})
+    return store
+
+
+@pytest.fixture(scope="module", params=["open", "closed"])
+def whole(request, make, tmp_path_factory):
+    folder = tmp_path_factory.mktemp(request.param) / "2026-01-02-grid-01"
+    store = collect(make, folder)
+    store.release()
+    twin = tmp_path_factory.mktemp("twin") / folder.name
+    shutil.copytree(folder, twin)
+    store = SessionStore(folder if request.param == "closed" else twin, None, make.clock())
+    messages = make.messages(store.close())
+    store.release()
+    other = make.store(tmp_path_factory.mktemp("other") / "2026-01-02-other-01", session_id="2026-01-02-other-01")
+    make.collect(other)
+    other.release()
+    foreign = (other.folder / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
+    made = Whole(folder, foreign, request.param == "closed", messages)
+    made.chunks = {path.name: chunks_of(path) for path in folder.glob("*.mcap")}
+    return made
+
+
+def chunks_of(path):
+    data = path.read_bytes()
+    with path.open("rb") as file:
+        indexes = make_reader(file).get_summary().chunk_indexes
+    found = []
+    topics = {}
+    for index in indexes:
+        start = index.chunk_start_offset
+        _opcode, length = struct.unpack_from("<BQ", data, start)
+        stream = ReadDataStream(io.BytesIO(data[start + 9 : start + 9 + length]))
+        messages = set()
+        for record in breakup_chunk(Chunk.read(stream)):
+            if isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Message):
+                topic = topics[record.channel_id]
+                name = json.loads(record.data)["stroke_id"] if topic == Topic.STROKE else ""
+                messages.add((topic, record.sequence, name))
+        found.append((start, start + 9 + length, messages))
+    return found
+
+
+def intact_strokes(whole, damage):
+    """Strokes of which both the record and its photograph are outside of what was hit, in one file or in two."""
+    there = set()
+    for name, chunks in whole.chunks.items():
+        for start, end, messages in chunks:
+            if not any(start < b and a < end for a, b in damage.hit[name]):
+                there |= messages
+    stills = {number for topic, number, _ in there if topic == Topic.STILL}
+    return {name for topic, number, name in there if topic == Topic.STROKE and number in stills}
+
+
+def bytes_of(whole, folder, chosen, damage):
+    """One bit, or everything behind a place, of a file."""
+    paths = [path for path in sorted(folder.iterdir()) if path.stat().st_size and path.name in whole.chunks]
+    path = chosen.choice([*paths, folder / JOURNAL_NAME])
+    data = bytearray(path.read_bytes())
+    at = chosen.randrange(len(data))
+    if chosen.random() < 0.3:
+        del data[at:]
+        damage.hit[path.name].append((at, 1 << 60))
+        damage.words.append(f"{path.name} cut at {at}")
+    else:
+        data[at] ^= 1 << chosen.randrange(8)
+        damage.hit[path.name].append((at, at + 1))
+        damage.words.append(f"{path.name} a bit at {at}")
+    path.write_bytes(data)
+
+
+def exchanged(whole, folder, chosen, damage):
+    """Two steps' files under each other's names, or one that is gone."""
+    one, other = chosen.sample(sorted(path.name for path in folder.glob("0*.mcap")), 2)
+    if chosen.random() < 0.3:
+        (folder / one).unlink()
+        damage.hit[one].append((0, 1 << 60))
+        damage.words.append(f"{one} gone")
+        return
+    (folder / one).rename(folder / "between")
+    (folder / other).rename(folder / one)
+    (folder / "between").rename(folder / other)
+    damage.words.append(f"{one} and {other} exchanged")
+
+
+def lines_of(whole, folder, chosen, damage):
+    """Whole lines taken out, doubled, exchanged, put in from another session, or edited by a program."""
+    path = folder / JOURNAL_NAME
+    lines = path.read_bytes().splitlines(keepends=True)
+    kind = chosen.choice(["delete", "double", "exchange", "foreign", "edit", "edit badly"])
+    at = chosen.randrange(len(lines))
+    if kind == "delete":
+        del lines[at : at + chosen.choice([1, 1, 1, 2, 5])]
+    elif kind == "double":
+        lines.insert(chosen.randrange(len(lines) + 1), lines[at])
+    elif kind == "exchange":
+        other = chosen.randrange(len(lines))
+        lines[at], lines[other] = lines[other], lines[at]
+    elif kind == "foreign":
+        lines.insert(at, chosen.choice(whole.foreign))
+    else:
+        at = chosen.randrange(len(lines) - 1)
+        lines[at] = edited(lines[at], chosen, well=kind == "edit")
+    damage.words.append(f"line {at + 1}: {kind}")
+    path.write_bytes(b"".join(lines))
+
+
+def edited(line, chosen, *, well):
+    """Another digit somewhere in what the line says; with the CRC made right, or as it was."""
+    body, crc = line.rstrip(b"\n").rsplit(b',"crc":', 1)
+    digits = [at for at, byte in enumerate(body) if chr(byte).isdigit()]
+    at = chosen.choice(digits)
+    body = body[:at] + str((body[at] - 48 + chosen.randrange(1, 10)) % 10).encode() + body[at + 1 :]
+    return with_crc(body + b"}") + b"\n" if well else body + b',"crc":' + crc + b"\n"
+
+
+def may_be_sound(whole, folder, before, damage):
+    """Where nothing is damaged: all as it was, or a journal that ends earlier, as after a kill, and files for it."""
+    if {name: data for name, data in before.items() if data is not None} == contents(whole.folder):
+        return True
+    journal = b"".join(whole.lines)
+    others = {name for name, data in contents(whole.folder).items() if name != JOURNAL_NAME and before[name] != data}
+    return not others and journal.startswith(before[JOURNAL_NAME])
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file() and path.name != ".lock"}
+
+
+def check(make, whole, root, chosen):
+    folder = root / "sessions" / whole.folder.name
+    shutil.copytree(whole.folder, folder)
+    (root / "beside.txt").write_text("not the session's")
+    damage = Damage()
+    ways = [lines_of] * 5 + [bytes_of] * 4 + [exchanged]
+    for way in chosen.choice([[chosen.choice(ways)]] * 3 + [[lines_of, lines_of], [bytes_of, bytes_of]]):
+        way(whole, folder, chosen, damage)
+    try:
+        return judged(make, whole, root, folder, damage)
+    except Exception as error:
+        error.add_note("; ".join(damage.words))
+        raise
+
+
+def judged(make, whole, root, folder, damage):
+    before = contents(folder)
+    verdict = verify_session(folder)
+    assert not verdict.sound or may_be_sound(whole, folder, before, damage), "verify says sound"
+    assert contents(folder) == before, "verify changed something"
+    report = repair_session(folder, make.clock())
+    again = verify_session(folder)
+    assert again.sound, again.findings
+    kept = [path.read_bytes() for path in folder.iterdir() if path.is_file()]
+    for name, data in before.items():
+        torn = data[data.rfind(b"\n") + 1 :].hex().encode() if name == JOURNAL_NAME else b""
+        assert any(data in other or (torn and torn in other) for other in kept), f"the bytes of {name} are gone"
+    final = folder / f"{folder.name}.mcap"
+    if again.state == "open":
+        store = SessionStore(folder, None, make.clock())
+        final = store.close()
+        store.release()
+    names = make.stroke_names(final)
+    assert len(names) == len(set(names)), "a stroke came twice"
+    messages = make.messages(final)
+    assert not messages - whole.messages, "something came back changed"
+    gone = intact_strokes(whole, damage) - set(names)
+    assert not gone, f"intact strokes were given up: {gone}; {report}"
+    for name in set(intact_strokes(whole, Damage())) - set(names):
+        assert any(name in line for line in report.lost), f"{name} is lost and not named: {report.lost}"
+    if report.lossless:
+        assert messages == whole.messages
+    outside = sorted(str(path.relative_to(root)) for path in root.rglob("*") if folder not in path.parents)
+    assert outside == ["beside.txt", "sessions", f"sessions/{folder.name}"]
+    assert (root / "beside.txt").read_text() == "not the session's"
+    return "lossless" if report.lossless else "lossy"
+
+
+def run(make, whole, root, seed, count):
+    ends = Counter()
+    chosen = random.Random(seed)
+    for number in range(count):
+        place = root / str(number)
+        place.mkdir()
+        try:
+            ends[check(make, whole, place, chosen)] += 1
+        except Exception as error:
+            error.add_note(f"seed {seed}, number {number}")
+            raise
+        shutil.rmtree(place)
+    return ends
+
+
+def test_no_damage_gives_up_what_is_intact_or_makes_it_twice(make, whole, tmp_path):
+    ends = run(make, whole, tmp_path, 3, QUICK)
+    assert ends["lossless"] > QUICK / 3
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("seed", range(5))
+def test_a_thousand_damages(make, whole, tmp_path, seed):
+    """Five seeds of 100 each, of an open and of a closed session."""
+    assert run(make, whole, tmp_path, seed, 100).total() == 100
