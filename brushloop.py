@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from traceback import format_exc
 from typing import Annotated
 
 import typer
@@ -21,6 +22,7 @@ import collect.loop.cli
 import collect.written.cli
 import model.train.cli
 import sessions.cli
+from sessions.terminal import plain, say
 
 app = typer.Typer(
     help="Press a Chinese brush with a robot arm, record it, and measure how well a stroke model predicts the ink.",
@@ -74,7 +76,7 @@ def sim(
     from drivers.sim.rig import serve
 
     config = SimConfig(seed=seed, rate=rate, arcs_port=arcs_port, camera_port=camera_port, brush=BrushSpec(seed=seed))
-    serve(config, write_rig, idle_exit, typer.echo, faults=faults, control=control)
+    serve(config, write_rig, idle_exit, say, faults=faults, control=control)
 
 
 @app.command()
@@ -99,7 +101,7 @@ def fault(
 
     options = {"after_s": after_s, "on": on, "nth": nth, "phase": phase, "press": press, "count": count}
     request = request_of(what, kind, options | {"for_s": for_s, "late_s": late_s, "id": ident})
-    typer.echo(dumps(ask(control, request), indent=2))
+    say(*dumps(ask(control, request), indent=2).split("\n"))
 
 
 @app.command()
@@ -130,11 +132,12 @@ def main() -> None:
         if code is None and isinstance(error, OSError) and error.filename:
             # A path of the user's that cannot be read or written is no defect of ours.
             code, said = 2, f"{error.filename}: {error.strerror}"
-        if not isinstance(code, int):
-            raise
-        words = " ".join([said, *getattr(error, "__notes__", [])])
+        if isinstance(code, int):
+            words = plain(" ".join(["brushloop:", said, *getattr(error, "__notes__", [])]))
+        else:
+            code, words = 1, plain(format_exc().rstrip(), keep="\n")  # a defect of ours
         try:
-            sys.stderr.write(f"brushloop: {words}\n")
+            sys.stderr.write(f"{words}\n")
         except OSError:
             sys.stderr = None  # the terminal is gone; Python would try again at its exit, and change the code
         sys.exit(code)

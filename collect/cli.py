@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from sessions.terminal import say
+
 
 class Preview(StrEnum):
     """How the screen shows the camera."""
@@ -72,7 +74,7 @@ def collect(
         preview=preview.value,
     )
     if given_up:
-        typer.echo(f"finished; {given_up} strokes came out badly every time and were left out", err=True)
+        say(f"finished; {given_up} strokes came out badly every time and were left out", err=True)
         raise typer.Exit(3)
 
 
@@ -92,8 +94,6 @@ def plan(
     import asyncio
     import json
     import sys
-
-    from rich.console import Console
 
     from collect.config import load_rig
     from collect.plane import PaperPlane
@@ -122,9 +122,9 @@ def plan(
     if as_json:
         sys.stdout.write(json.dumps(made.as_json() | {"poses_in_reach": asked}) + "\n")
         return
-    Console().print(plan_table(made))
+    say(plan_table(made))
     if asked is not None:
-        Console().print(f"The controller finds joints for all {asked} poses.")
+        say(f"The controller finds joints for all {asked} poses.")
 
 
 def doctor(
@@ -144,10 +144,8 @@ def doctor(
     if as_json:
         sys.stdout.writelines(json.dumps(finding.as_json()) + "\n" for finding in findings)
     else:
-        from rich.console import Console
-
         from collect.doctor_table import doctor_table
 
-        Console().print(doctor_table(findings))
+        say(doctor_table(findings))
     if not all(finding.well for finding in findings):
         raise typer.Exit(4)

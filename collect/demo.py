@@ -16,6 +16,7 @@ from collect.commands import run_command
 from collect.config import RigConfig, load_rig
 from collect.errors import CollectAborted
 from sessions.store import open_sessions
+from sessions.terminal import say
 
 HEIGHTS_MM = [11.0, 13.0, 15.0, 17.0, 20.0]
 TILTS_DEG = [0.0, 5.0, 10.0]
@@ -37,21 +38,19 @@ def run_demo(out: Path, repeats: int, rate: float, seed: int) -> None:
     try:
         sheet = ("--sheet", "1") if finished else ()
         run_command(
-            _say, "collect", "--config", rig_toml, "--protocol", protocol_toml, "--out", sessions, "--no-tui", *sheet
+            say, "collect", "--config", rig_toml, "--protocol", protocol_toml, "--out", sessions, "--no-tui", *sheet
         )
     finally:
         if rig is not None and rig.poll() is not None:
-            sys.stderr.write(f"the loopback rig ended with {rig.returncode}; see {out / 'rig.log'}\n")
+            say(f"the loopback rig ended with {rig.returncode}; see {out / 'rig.log'}", err=True)
     session = max(sessions.iterdir(), key=lambda path: path.stat().st_mtime_ns)
-    run_command(_say, "calibrate", session)
-    run_command(_say, "fit", session)
-    run_command(_say, "validate", session)
+    run_command(say, "calibrate", session)
+    run_command(say, "fit", session)
+    run_command(say, "validate", session)
     if rig is not None:
         rig.terminate()
         rig.wait()
-    sys.stdout.write(
-        f"\nReport: {session / 'validation' / 'report.html'}\nMCAP:   {session / f'{session.name}.mcap'}\n"
-    )
+    say("", f"Report: {session / 'validation' / 'report.html'}", f"MCAP:   {session / f'{session.name}.mcap'}")
 
 
 def _serving(rig_toml: Path, rate: float, seed: int, *, fresh: bool) -> subprocess.Popen[bytes] | None:
@@ -80,11 +79,6 @@ def _serving(rig_toml: Path, rate: float, seed: int, *, fresh: bool) -> subproce
             raise CollectAborted(f"the loopback rig did not start; see {rig_toml.parent / 'rig.log'}")
         time.sleep(0.1)
     return process
-
-
-def _say(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 def _free_port() -> int:

@@ -16,6 +16,7 @@ from collect.opening import Opening, check_writable, find_resumable, open_store
 from collect.planning.limits import check_protocol
 from collect.rehearsal import Rehearsal
 from drivers.clock import HostClock
+from sessions.terminal import plain
 
 Kind = Literal["auto", "cells", "off"]
 """How the camera is shown on a screen: in pixels where the terminal has them, in half-cells, or not at all."""
@@ -85,7 +86,7 @@ def _run(engine: Engine, preview: Kind, *, on_screen: bool) -> None:
 
 def _say(text: str) -> None:
     try:
-        sys.stdout.write(text)
+        sys.stdout.write(plain(text, keep="\n"))
         sys.stdout.flush()
     except OSError:
         sys.stdout = None  # nobody reads any more; Python would try again at its exit, and change the code

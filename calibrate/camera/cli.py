@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sessions.terminal import say
+
 if TYPE_CHECKING:
     from calibrate.camera.boards import Board
 
@@ -44,7 +46,7 @@ def board(
     from calibrate.camera.pdf import describe, write_pdf
 
     made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
-    typer.echo(f"{write_pdf(made, out, page)}: {describe(made)}")
+    say(f"{write_pdf(made, out, page)}: {describe(made)}")
 
 
 @app.command()
@@ -86,20 +88,20 @@ def intrinsics(
         ) from None
     file = lens_file(fitted, describe(made), digests, unusable, limit_px, f"brushloop {version('brushloop')}")
     for name, residual in file.residuals_px.items():
-        typer.echo(f"{name}: {residual:.3f} px, slanted by {fitted.slants_deg[name]:.0f} deg")
+        say(f"{name}: {residual:.3f} px, slanted by {fitted.slants_deg[name]:.0f} deg")
     for name, residual in file.dropped.items():
-        typer.echo(f"{name}: {residual:.3f} px, dropped: it does not fit the others")
+        say(f"{name}: {residual:.3f} px, dropped: it does not fit the others")
     for name, why in unusable.items():
-        typer.echo(f"{name}: {why}")
+        say(f"{name}: {why}")
     fx, fy, cx, cy = file.matrix
-    typer.echo(
+    say(
         f"fx {fx:.2f} +- {file.focal_se_px[0]:.2f} px, fy {fy:.2f} +- {file.focal_se_px[1]:.2f} px, "
-        f"centre {cx:.1f}, {cy:.1f} px, k1 {file.distortion[0]:+.4f}\n"
-        f"residual {file.rms_px:.3f} px over {len(file.residuals_px)} views"
+        f"centre {cx:.1f}, {cy:.1f} px, k1 {file.distortion[0]:+.4f}",
+        f"residual {file.rms_px:.3f} px over {len(file.residuals_px)} views",
     )
     for line in (*(f"warning: {w}" for w in file.warnings), *(f"to do: {g}" for g in file.guidance)):
-        typer.echo(line)
-    typer.echo(str(file.save(out)))
+        say(line)
+    say(str(file.save(out)))
 
 
 @app.command()
@@ -123,12 +125,12 @@ def check(
     assert isinstance(spec, BoardSpec)
     plane, warnings = preflight(read_gray(photograph), spec, load_artefact(lens, LensFile) if lens else None, limit_px)
     low, high = plane.interval_mm_per_px
-    typer.echo(
+    say(
         f"pix2len {plane.mm_per_px:.5f} mm/px (95 %: {low:.5f} to {high:.5f}), residual {plane.rms_px:.3f} px over "
         f"{plane.corners} corners, k1 {float(plane.lens.distortion[0]):+.4f}"
     )
     for warning in warnings:
-        typer.echo(f"warning: {warning}")
+        say(f"warning: {warning}")
     if warnings:
         raise typer.Exit(5)
 
@@ -149,15 +151,15 @@ def drift(
     for seen in found.seen:
         low, high = (seen.mm_per_px * (1.0 + side * seen.reach) for side in (-1.0, 1.0))
         after_s = (seen.t_ns - found.seen[0].t_ns) / 1e9
-        typer.echo(
+        say(
             f"{after_s:8.0f} s: {seen.mm_per_px:.5f} mm/px (95 %: {low:.5f} to {high:.5f}), "
             f"residual {seen.plane.rms_px:.3f} px, board moved {seen.moved_px:.2f} px"
         )
     if found.trend is not None:
         low, high = found.trend.interval
-        typer.echo(f"trend {100 * found.trend.slope:+.4f} % per hour (95 %: {100 * low:+.4f} to {100 * high:+.4f})")
+        say(f"trend {100 * found.trend.slope:+.4f} % per hour (95 %: {100 * low:+.4f} to {100 * high:+.4f})")
     for warning in found.warnings:
-        typer.echo(f"warning: {warning}")
+        say(f"warning: {warning}")
     if found.warnings:
         raise typer.Exit(5)
 
@@ -195,16 +197,17 @@ def register(
     fitted = fit(points.names, points.robot_mm, plane.to_paper(points.image_px), model.value)
     for name, (dx, dy) in zip(fitted.names, fitted.residuals_mm.tolist(), strict=True):
         out_of_it = ", dropped: it does not fit the others" if name in fitted.dropped else ""
-        typer.echo(f"{name}: {dx:+.3f}, {dy:+.3f} mm{out_of_it}")
+        say(f"{name}: {dx:+.3f}, {dy:+.3f} mm{out_of_it}")
     seen = hashlib.sha256(read_bounded(photograph, MAX_PHOTOGRAPH_BYTES)).hexdigest()
     through = known.source if known else "no lens"
     source = f"{table.name}, sha256 {points.sha256}; {photograph.name}, sha256 {seen}; {through}"
     file = registration_file(fitted, source, f"brushloop {version('brushloop')}")
     for flag in flags:
-        typer.echo(f"warning: {flag}")
-    typer.echo(
+        say(f"warning: {flag}")
+    say(
         f"turned by {file.turn_deg:.3f} deg, scale {file.scale:.5f}, residual {file.rms_mm:.3f} mm, "
-        f"{file.left_out_rms_mm:.3f} mm for a point that was left out\n{file.save(out)}"
+        f"{file.left_out_rms_mm:.3f} mm for a point that was left out",
+        str(file.save(out)),
     )
 
 

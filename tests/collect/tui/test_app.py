@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import pytest
 from textual.pilot import Pilot
+from textual.widgets import Static
 
 from collect.states import FINAL, State
 from collect.tui.app import OperatorApp
@@ -286,6 +287,16 @@ async def test_what_comes_from_outside_is_shown_as_it_is() -> None:
         assert text.count(markup) == 4
         assert "a�[31mb" in text
         assert "\x1b" not in text
+
+
+async def test_no_widget_can_hand_a_control_character_to_the_terminal() -> None:
+    app = OperatorApp(FakeEngine(picture()))
+    async with app.run_test(size=(80, 24)) as pilot:
+        await app.screen.mount(Static("a\x1b]0;owned\x07b \x9b31m \u202eltr", markup=False, id="hostile"))
+        await pilot.pause()
+        text = shown(app)
+        assert "a]0;ownedb 31m ltr" in text
+        assert not set(text) & set("\x1b\x07\x9b\u202e")
 
 
 async def test_chinese_takes_its_two_columns() -> None:
