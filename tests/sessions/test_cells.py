@@ -16,7 +16,7 @@ FORMULAS = ['=cmd|"/c calc"!A1', "+1+2", "-1+2", "@SUM(A1)", "\tx", "\r=1", "'=1
 @pytest.mark.parametrize("text", FORMULAS)
 def test_a_formula_is_written_as_text_and_read_as_it_was(text):
     out = io.StringIO()
-    CsvWriter(out).writerow([text, "plain"])
+    CsvWriter(out, "\r\n").writerow([text, "plain"])
     cell, other = next(csv.reader(io.StringIO(out.getvalue(), newline="")))
     assert cell == f"'{text}"
     assert (as_text(cell), other) == (text, "plain")
