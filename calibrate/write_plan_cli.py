@@ -37,6 +37,7 @@ def plan(
     from calibrate.artefact import load_artefact
     from calibrate.brushfit.drag_run import DragArtefact
     from calibrate.errors import CalibrationError
+    from calibrate.files import check_folder
     from calibrate.write_plan import Settings
     from calibrate.write_plan import plan as planned
     from calibrate.write_plan_files import PICTURE, write_plan
@@ -46,6 +47,7 @@ def plan(
     from model.characters.plan import Cell
     from model.registry import UnknownModelError, stroke_model
 
+    check_folder(out)
     lagging = load_artefact(drag, DragArtefact) if drag is not None else None
     try:
         if tilt_range[1] > 30 or height_range[0] <= 0:

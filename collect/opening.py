@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime as dt
-import os
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -19,6 +18,7 @@ from collect.steps import StepKind
 from drivers.clock import Clock
 from drivers.samples import Identity
 from sessions.difference import differences
+from sessions.disk import unwritable
 from sessions.errors import SessionDamaged
 from sessions.journal import JOURNAL_NAME, replay
 from sessions.schemas import Header, Source
@@ -108,11 +108,8 @@ def find_resumable(opening: Opening) -> Path | None:
 
 def check_writable(folder: Path) -> None:
     """Raise `ConfigError` unless sessions can be written there, or made; before anything is connected."""
-    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
-    if not there.is_dir():
-        raise ConfigError(there, "", "is a file; a folder for sessions is needed")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise ConfigError(there, "", "may not be written: it is read-only, or another user's")
+    if (found := unwritable(folder)) is not None:
+        raise ConfigError(found[0], "", found[1])
 
 
 def _has_pressed(journal: Path) -> bool:

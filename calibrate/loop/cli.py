@@ -23,9 +23,11 @@ def compare(
     import sys
 
     from calibrate.field import Field
+    from calibrate.files import check_folder
     from calibrate.loop.compare import compare_sessions
     from calibrate.loop.report import PICTURE, summary, write_loop
 
+    check_folder(out)
     closed = compare_sessions(original, again, fit, Field(mm_per_px=mm_per_px))
     report = write_loop(closed, out, " ".join(["brushloop", *sys.argv[1:]]))
     for line in summary(closed):

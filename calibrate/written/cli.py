@@ -25,11 +25,13 @@ def compare(
 
     from calibrate.errors import CalibrationError
     from calibrate.field import Image
+    from calibrate.files import check_folder
     from calibrate.written.compare import compare_written
     from calibrate.written.images import read_reference
     from calibrate.written.record import load_plan
     from calibrate.written.report import PICTURE, summary, write_written
 
+    check_folder(out)
     references: dict[str, tuple[str, Image]] = {}
     for given in reference or []:
         name, equals, path = given.partition("=")
@@ -51,12 +53,13 @@ def learn(
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written next.")] = 1,
 ) -> None:
     """Move a plan's trajectories by what their ink was off, for the next writing."""
-
+    from calibrate.files import check_folder
     from calibrate.write_plan_files import write_record
     from calibrate.written.compare import compare_written
     from calibrate.written.learn import learned
     from calibrate.written.record import load_plan
 
+    check_folder(out)
     made, lessons = learned(compare_written(session, load_plan(plan), {}), gain)
     out.mkdir(parents=True, exist_ok=True)
     protocol = write_record(made, repeats, out)
