@@ -5,9 +5,10 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 from traceback import format_exc
-from typing import Annotated
+from typing import Annotated, Any, cast
 
 import typer
+from typer.core import TyperGroup
 
 import calibrate.brushfit.cli
 import calibrate.camera.cli
@@ -24,7 +25,32 @@ import model.train.cli
 import sessions.cli
 from sessions.terminal import plain, say
 
+
+class OptionRefused(Exception):
+    """A number given on the command line is none, or lies outside its range."""
+
+    exit_code = 2
+
+
+class FrontDoor(TyperGroup):
+    """Says of such a number what was given and what is allowed; typer names one end of the range, also for `nan`."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command. Raises `OptionRefused`."""
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as error:
+            param, cause = error.param, error.__cause__
+            ends = {word: getattr(param, name, None) for word, name in (("from", "min"), ("to", "max"))}
+            words = " ".join(f"{word} {end:g}" for word, end in ends.items() if end is not None)
+            if param is None or cause is None or not words:
+                raise
+            given = cast("Any", cause).errors()[0]["input"]  # pydantic's, which typer asks
+            raise OptionRefused(f"{param.opts[-1]} is {given!r}, allowed: a number {words}") from None
+
+
 app = typer.Typer(
+    cls=FrontDoor,
     help="Press a Chinese brush with a robot arm, record it, and measure how well a stroke model predicts the ink.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,

@@ -16,7 +16,7 @@ from sessions.lines import Line
 from sessions.merge import verify as verify_digest
 from sessions.messages import decode_gray, decode_still
 from sessions.reader import Recording
-from sessions.renamed import check_name
+from sessions.renamed import check_name, not_a_session
 from sessions.salvage import Scan, salvaged, scan
 from sessions.schemas import Stroke, Topic
 from sessions.store import SEGMENT_NAME, counts_of
@@ -55,17 +55,17 @@ class Verdict:
 
 def verify_session(path: Path) -> Verdict:
     """Check a session's folder, or one MCAP file. Raises `InputError` where it is neither, or was renamed."""
+    check_name(path)
     if path.is_file():
         return _verify_file(path, path.name)
     if not path.is_dir():
         raise InputError(path, "no such session: give a session's folder or its .mcap file")
-    check_name(path)
     name = path.resolve().name
     collected = (path / JOURNAL_NAME).is_file() or any(SEGMENT_NAME.fullmatch(p.name) for p in path.glob("*.mcap*"))
     if not collected:
         final = path / f"{name}.mcap"
         if not final.is_file():
-            raise InputError(path, f"holds neither {JOURNAL_NAME} nor {final.name}: not a session")
+            raise not_a_session(path)
         return _verify_file(final, name)
     return _verify_folder(path.resolve())
 
