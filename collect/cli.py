@@ -86,6 +86,9 @@ def plan(
         Path | None, typer.Option(help="Draw the sheets into this file: .png, .svg, .pdf or .jpg.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
+    arm: Annotated[
+        bool, typer.Option("--arm", help="As it is run with --arm: with the self-check; moves nothing.")
+    ] = False,
     ask: Annotated[
         bool, typer.Option("--ask", help="Ask the arm's controller whether it reaches every pose; moves nothing.")
     ] = False,
@@ -107,6 +110,8 @@ def plan(
 
         check_picture(picture)
     rig, wanted = load_rig(config), load_protocol(protocol)
+    if arm and rig.self_check.enabled is None:
+        rig = rig.checking_itself(True)
     check_protocol(config, protocol, rig, wanted)
     made = make_plan(rig, wanted)
     asked = None

@@ -121,6 +121,10 @@ class RigConfig(BaseSettings):
     self_check: SelfCheckConfig = SelfCheckConfig()
     quality: QualityConfig = QualityConfig()
 
+    def checking_itself(self, enabled: bool) -> RigConfig:
+        """The same with the self-check on or off."""
+        return self.model_copy(update={"self_check": self.self_check.model_copy(update={"enabled": enabled})})
+
     @model_validator(mode="after")
     def _clear_of_the_paper(self) -> RigConfig:
         lowest_mm = self.paper.touch_z_mm + TRAVEL_CLEARANCE_MM

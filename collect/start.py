@@ -32,8 +32,10 @@ def engine_for(
     make: type[Engine] = Engine,
 ) -> Engine:
     """An engine that goes on with the open session, or makes a new one. Raises `ConfigError`; connects nothing yet."""
-    check_protocol(opening.rig_path, opening.protocol_path, opening.rig, opening.protocol)
     resume = find_resumable(opening)
+    if resume is not None:
+        opening = opening.as_begun(resume)
+    check_protocol(opening.rig_path, opening.protocol_path, opening.rig, opening.protocol)
     check_writable(resume or opening.root)
     clock = HostClock()
     return make(
