@@ -140,7 +140,8 @@ def demo(
     """Collect, calibrate and validate a short session on the loopback rig; run again, it goes on where it stopped."""
     from collect.demo import run_demo
 
-    run_demo(out, repeats, rate, seed)
+    if code := run_demo(out, repeats, rate, seed):
+        raise typer.Exit(code)
 
 
 def main() -> None:

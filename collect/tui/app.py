@@ -22,8 +22,9 @@ from collect.states import FINAL, State
 from collect.tui.ask import AskScreen
 from collect.tui.confirm import AT_WORK, AT_WORK_KEYS, NOT_AT_REST, NOT_PARKED, NOT_PARKED_KEYS, Confirm
 from collect.tui.help import HelpScreen
+from collect.tui.keys import CAN_PAUSE, CAN_RESUME
 from collect.tui.pictures import Pictures
-from collect.tui.run import CAN_PAUSE, CAN_RESUME, RunScreen
+from collect.tui.run import RunScreen
 from collect.tui.set_up import SetUpScreen
 from collect.tui.start import StartScreen
 from collect.tui.terminal import PlainApp, TerminalDriver
