@@ -160,11 +160,12 @@ def main() -> None:
             # A path of the user's that cannot be read or written is no defect of ours.
             code, said = 2, f"{error.filename}: {error.strerror}"
         if isinstance(code, int):
-            words = plain(" ".join(["brushloop:", said, *getattr(error, "__notes__", [])]))
+            words = " ".join(["brushloop:", said, *getattr(error, "__notes__", [])])
         else:
-            code, words = 1, plain(format_exc().rstrip(), keep="\n")  # a defect of ours
+            code, words = 1, format_exc().rstrip()  # a defect of ours
         try:
-            sys.stderr.write(f"{words}\n")
+            # A configuration that changed is told line by line.
+            sys.stderr.write(plain(words, keep="\n") + "\n")
         except OSError:
             sys.stderr = None  # the terminal is gone; Python would try again at its exit, and change the code
         sys.exit(code)

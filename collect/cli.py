@@ -110,8 +110,8 @@ def plan(
 
         check_picture(picture)
     rig, wanted = load_rig(config), load_protocol(protocol)
-    if arm and rig.self_check.enabled is None:
-        rig = rig.checking_itself(True)
+    if arm or not rig.robot.on_this_machine:
+        rig = rig.settled(arm)
     check_protocol(config, protocol, rig, wanted)
     made = make_plan(rig, wanted)
     asked = None

@@ -121,6 +121,12 @@ class RigConfig(BaseSettings):
     self_check: SelfCheckConfig = SelfCheckConfig()
     quality: QualityConfig = QualityConfig()
 
+    def settled(self, armed: bool) -> RigConfig:
+        """The same with the self-check decided, where it was left out: on wherever real hardware may come to move."""
+        if self.self_check.enabled is not None:
+            return self
+        return self.checking_itself(armed or not self.robot.on_this_machine)
+
     def checking_itself(self, enabled: bool) -> RigConfig:
         """The same with the self-check on or off."""
         return self.model_copy(update={"self_check": self.self_check.model_copy(update={"enabled": enabled})})

@@ -235,7 +235,7 @@ class Engine:
             store = self._open_store(rig)
             try:
                 self._progress.opened(store, sheet_of(self._rig_config, self._protocol_config))
-                if self._armed and self.presses and not self._rig_config.self_check.enabled:
+                if (self._armed or not rig.simulated) and self.presses and not self._rig_config.self_check.enabled:
                     self._progress.log(UNCHECKED, warning=True)
                 async with (
                     watching(self._live, rig.camera, self._progress.log),

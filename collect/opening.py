@@ -69,9 +69,7 @@ class Opening:
     ) -> Opening:
         """Read both files once; a dry run is lifted by so much. Raises `ConfigError`."""
         rig, protocol = load_rig(rig_path), load_protocol(protocol_path)
-        left_out = rig.self_check.enabled is None
-        if left_out:
-            rig = rig.checking_itself(armed)
+        left_out, rig = rig.self_check.enabled is None, rig.settled(armed)
         if dry_run_mm is not None:
             rig = lifted(rig, protocol, dry_run_mm)
         snapshots = {

@@ -147,6 +147,8 @@ def test_a_session_whose_old_values_cannot_be_read_is_not_gone_on_with(lab: Path
 def test_where_hardware_may_move_the_rig_is_checked_first_unless_it_is_switched_off(lab: Path) -> None:
     assert StepKind.SELF_CHECK in kinds(opening(armed=True))
     assert StepKind.SELF_CHECK not in kinds(opening())
+    edit("rig.toml", 'host = "127.0.0.1"', 'host = "192.168.1.7"')  # to be armed on the screen
+    assert StepKind.SELF_CHECK in kinds(opening())
     edit("rig.toml", "[motion]", "[self_check]\nenabled = false\n\n[motion]")
     assert StepKind.SELF_CHECK not in kinds(opening(armed=True))
 
