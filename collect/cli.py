@@ -96,7 +96,6 @@ def plan(
     """Walk a protocol without moving: limits, sheets, dips, ink, time, and a picture of the sheets."""
     import asyncio
     import json
-    import sys
 
     from collect.config import load_rig
     from collect.plane import PaperPlane
@@ -125,7 +124,7 @@ def plan(
 
         draw_plan(rig, wanted, made, picture)
     if as_json:
-        sys.stdout.write(json.dumps(made.as_json() | {"poses_in_reach": asked}) + "\n")
+        say(json.dumps(made.as_json() | {"poses_in_reach": asked}))
         return
     say(plan_table(made))
     if asked is not None:
@@ -139,7 +138,6 @@ def doctor(
     """Ask every configured device who it is and what is wrong. Powers nothing and moves nothing."""
     import asyncio
     import json
-    import sys
 
     from collect.config import load_rig
     from collect.doctor import examine
@@ -147,7 +145,7 @@ def doctor(
 
     findings = asyncio.run(examine(load_rig(config), HostClock()))
     if as_json:
-        sys.stdout.writelines(json.dumps(finding.as_json()) + "\n" for finding in findings)
+        say(*(json.dumps(finding.as_json()) for finding in findings))
     else:
         from collect.doctor_table import doctor_table
 

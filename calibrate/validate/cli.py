@@ -93,7 +93,7 @@ def validate(
     with _shown() as progress:
         made = run(request, progress)
     if json and made.report is not None:
-        say(*made.report.to_json().splitlines())
+        say(*made.report.to_json().rstrip("\n").split("\n"))
     else:
         for drags in made.drags:
             say(*drag_summary(drags))
