@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from traceback import format_exc
+from typing import Annotated, Any, cast
 
 import typer
+from typer.core import TyperGroup
 
 import calibrate.brushfit.cli
 import calibrate.camera.cli
@@ -21,8 +23,34 @@ import collect.loop.cli
 import collect.written.cli
 import model.train.cli
 import sessions.cli
+from sessions.terminal import plain, say
+
+
+class OptionRefused(Exception):
+    """A number given on the command line is none, or lies outside its range."""
+
+    exit_code = 2
+
+
+class FrontDoor(TyperGroup):
+    """Says of such a number what was given and what is allowed; typer names one end of the range, also for `nan`."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command. Raises `OptionRefused`."""
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as error:
+            param, cause = error.param, error.__cause__
+            ends = {word: getattr(param, name, None) for word, name in (("from", "min"), ("to", "max"))}
+            words = " ".join(f"{word} {end:g}" for word, end in ends.items() if end is not None)
+            if param is None or cause is None or not words:
+                raise
+            given = cast("Any", cause).errors()[0]["input"]  # pydantic's, which typer asks
+            raise OptionRefused(f"{param.opts[-1]} is {given!r}, allowed: a number {words}") from None
+
 
 app = typer.Typer(
+    cls=FrontDoor,
     help="Press a Chinese brush with a robot arm, record it, and measure how well a stroke model predicts the ink.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -74,7 +102,7 @@ def sim(
     from drivers.sim.rig import serve
 
     config = SimConfig(seed=seed, rate=rate, arcs_port=arcs_port, camera_port=camera_port, brush=BrushSpec(seed=seed))
-    serve(config, write_rig, idle_exit, typer.echo, faults=faults, control=control)
+    serve(config, write_rig, idle_exit, say, faults=faults, control=control)
 
 
 @app.command()
@@ -99,7 +127,7 @@ def fault(
 
     options = {"after_s": after_s, "on": on, "nth": nth, "phase": phase, "press": press, "count": count}
     request = request_of(what, kind, options | {"for_s": for_s, "late_s": late_s, "id": ident})
-    typer.echo(dumps(ask(control, request), indent=2))
+    say(*dumps(ask(control, request), indent=2).split("\n"))
 
 
 @app.command()
@@ -112,7 +140,8 @@ def demo(
     """Collect, calibrate and validate a short session on the loopback rig; run again, it goes on where it stopped."""
     from collect.demo import run_demo
 
-    run_demo(out, repeats, rate, seed)
+    if code := run_demo(out, repeats, rate, seed):
+        raise typer.Exit(code)
 
 
 def main() -> None:
@@ -130,11 +159,13 @@ def main() -> None:
         if code is None and isinstance(error, OSError) and error.filename:
             # A path of the user's that cannot be read or written is no defect of ours.
             code, said = 2, f"{error.filename}: {error.strerror}"
-        if not isinstance(code, int):
-            raise
-        words = " ".join([said, *getattr(error, "__notes__", [])])
+        if isinstance(code, int):
+            words = " ".join(["brushloop:", said, *getattr(error, "__notes__", [])])
+        else:
+            code, words = 1, format_exc().rstrip()  # a defect of ours
         try:
-            sys.stderr.write(f"brushloop: {words}\n")
+            # A configuration that changed is told line by line.
+            sys.stderr.write(plain(words, keep="\n") + "\n")
         except OSError:
             sys.stderr = None  # the terminal is gone; Python would try again at its exit, and change the code
         sys.exit(code)

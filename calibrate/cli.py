@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from sessions.terminal import say
+
 
 def calibrate(
     session: Annotated[Path, typer.Argument(help="A session's folder or its .mcap file.")],
@@ -15,8 +17,6 @@ def calibrate(
     ] = None,
 ) -> None:
     """Fit scale and paper plane from the board in view; writes an immutable calibration/<hash>.json."""
-    import rich
-    from rich.markup import escape
 
     from calibrate.artefact import Calibration, load_artefact
     from calibrate.calibration import calibrate_session
@@ -24,9 +24,10 @@ def calibrate(
     path = calibrate_session(session, lens)
     made = load_artefact(path, Calibration)
     for flag in made.flags:
-        rich.print(escape(f"warning: {flag}"))
-    rich.print(
+        say(f"warning: {flag}")
+    say(
         f"pix2len {made.mm_per_px:.5f} mm/px (95 %: {made.mm_per_px_low:.5f} to {made.mm_per_px_high:.5f}), "
-        f"board residual {made.rms_px:.3f} px over {made.corners} corners, {made.source}\n"
-        f"lens: {made.lens.source if made.lens else 'none'}\n{escape(str(path))}"
+        f"board residual {made.rms_px:.3f} px over {made.corners} corners, {made.source}",
+        f"lens: {made.lens.source if made.lens else 'none'}",
+        str(path),
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calibrate.errors import CalibrationError
+from sessions.disk import unwritable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,8 +27,15 @@ def check_target(path: Path, ending: str, *inputs: Path | None) -> None:
         raise CalibrationError(str(path), f"must end in {ending}")
     if path.is_dir():
         raise CalibrationError(str(path), "is a folder")
+    check_folder(path.parent)
     if any(one is not None and one.exists() and path.exists() and path.samefile(one) for one in inputs):
         raise CalibrationError(str(path), "is what is read; it is not overwritten")
+
+
+def check_folder(folder: Path) -> None:
+    """Before any work: whether files can be written into a folder, or it can be made. Raises `CalibrationError`."""
+    if (found := unwritable(folder)) is not None:
+        raise CalibrationError(str(found[0]), found[1])
 
 
 def write_whole(path: Path, text: str) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from calibrate.scales import MM_PER_PX
+from sessions.terminal import say
 
 
 def invert(
@@ -28,8 +29,6 @@ def invert(
     seed: Annotated[int, typer.Option(min=0, help="Of the order in which the protocol presses.")] = 1,
 ) -> None:
     """Recover depth and tilt of every captured press; writes a CSV and a protocol that presses them again."""
-    import rich
-    from rich.markup import escape
 
     from calibrate.errors import CalibrationError
     from calibrate.field import Field
@@ -65,24 +64,18 @@ def invert(
     settings = Settings(model, fitted, lam, within, anchor_sd, assume_tilt, Field(mm_per_px=mm_per_px))
     made = invert_recording(session, settings, calibration)
     protocol = write_inversion(made, out, repeats, seed)
-    rich.print(
-        escape(f"{made.header.session_id}: {len(made.rows)} presses recovered by {model} ({made.header.source})")
-    )
+    say(f"{made.header.session_id}: {len(made.rows)} presses recovered by {model} ({made.header.source})")
     for name, mean, sd, inside, n in off_command(made.rows):
         unit = "mm" if name == "H" else "deg"
-        rich.print(
-            escape(
-                f"{name}: recovered - commanded {mean:+.3f} {unit}, sd {sd:.3f}; {inside:.0%} of {n} in the interval"
-            )
-        )
+        say(f"{name}: recovered - commanded {mean:+.3f} {unit}, sd {sd:.3f}; {inside:.0%} of {n} in the interval")
     unknown = sum("alpha_unknown" in row.flags for row in made.rows)
     if unknown:
-        rich.print(f"warning: {unknown} without a zero-touch anchor: their alpha is assumed, shape does not tell it")
+        say(f"warning: {unknown} without a zero-touch anchor: their alpha is assumed, shape does not tell it")
     bound = sum("at_bound" in row.flags for row in made.rows)
     if 2 * bound > len(made.rows):
-        rich.print(f"warning: {bound} at a bound: the model does not fit this brush; do not press these again")
+        say(f"warning: {bound} at a bound: the model does not fit this brush; do not press these again")
     elif bound:
-        rich.print(f"warning: {bound} at a bound of the range: their interval holds for one side at most")
+        say(f"warning: {bound} at a bound of the range: their interval holds for one side at most")
     for stroke_id, why in made.refused:
-        rich.print(escape(f"not used: {stroke_id}: {why}"))
-    rich.print(escape(f"{out}\n{protocol}"))
+        say(f"not used: {stroke_id}: {why}")
+    say(str(out), str(protocol))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import json
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 from calibrate.errors import CalibrationError
 from calibrate.files import write_whole
 from calibrate.invert import Inversion
+from sessions.cells import CsvWriter
 
 PROTOCOL = "protocol-replay.toml"
 MAX_ROWS = 10_000
@@ -42,7 +42,7 @@ def write_inversion(made: Inversion, out: Path, repeats: int = 1, seed: int = 1)
 def recovered_csv(made: Inversion) -> str:
     """One row a stroke. Depths and tilts go to the hundredth that an arm can hold, deviations to three figures."""
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
+    writer = CsvWriter(out)
     writer.writerow(COLUMNS)
     for row in made.rows:
         asked = ["" if v is None else f"{v:g}" for v in (row.commanded_height_mm, row.commanded_tilt_deg)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rich.markup import escape
 from rich.table import Table
 
 from calibrate.drags import DEPTH_NAMES, LENGTH_NAME, DragResults
@@ -15,11 +14,11 @@ from calibrate.write import DragValidation
 def summary(validation: DragValidation) -> Iterator[Table | str]:
     """Renderables for the terminal."""
     results = validation.results
-    yield escape(f"{validation.header.session_id}: {source_note(validation.header.source)}")
+    yield f"{validation.header.session_id}: {source_note(validation.header.source)}"
     yield _drags(results)
-    yield from (escape(sentence) for sentence in fit_sentences(results))
+    yield from fit_sentences(results)
     for stroke_id, why in results.refused:
-        yield escape(f"not used: {stroke_id}: {why}")
+        yield f"not used: {stroke_id}: {why}"
 
 
 def _drags(results: DragResults) -> Table:
@@ -33,5 +32,5 @@ def _drags(results: DragResults) -> Table:
         m = drag.measured
         sizes = (f"{m.length_mm:.2f}", f"{m.width_mm:.2f}", f"{m.mid_width_mm:.2f}", f"{m.area_mm2:.1f}")
         values = (f"{drag.commanded[n]:.2f}" if n in drag.commanded else "" for n in shown)
-        out.add_row(escape(drag.stroke_id), *values, *sizes, "no" if drag.cut else "yes")
+        out.add_row(drag.stroke_id, *values, *sizes, "no" if drag.cut else "yes")
     return out

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import platform
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from calibrate.drags import DragResults
 from calibrate.files import write_whole
 from calibrate.pages import render
 from calibrate.wording import DRAG_LIMITS, fit_sentences, source_note
+from sessions.cells import CsvWriter
 from sessions.schemas import Header
 
 MAX_THUMBNAILS = 60
@@ -59,7 +59,7 @@ def drags_csv(results: DragResults, source: str) -> str:
     """Commanded beside measured, one row a stroke."""
     names = sorted({name for drag in results.strokes for name in drag.commanded})
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
+    writer = CsvWriter(out)
     columns = ["measured_length_mm", "measured_width_mm", "measured_mid_width_mm", "measured_area_mm2", "cut", "source"]
     writer.writerow(["stroke_id", *(f"commanded_{name}" for name in names), *columns])
     for drag in results.strokes:

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from sessions.terminal import say
+
 
 def plan(
     what: Annotated[str, typer.Argument(help="Characters (字 子 永 are shipped), or a .csv or .json trajectory.")],
@@ -32,12 +34,10 @@ def plan(
     """Plan characters: depth from the stroke's width, heading along it, refined through the model's image."""
     import math
 
-    import rich
-    from rich.markup import escape
-
     from calibrate.artefact import load_artefact
     from calibrate.brushfit.drag_run import DragArtefact
     from calibrate.errors import CalibrationError
+    from calibrate.files import check_folder
     from calibrate.write_plan import Settings
     from calibrate.write_plan import plan as planned
     from calibrate.write_plan_files import PICTURE, write_plan
@@ -47,6 +47,7 @@ def plan(
     from model.characters.plan import Cell
     from model.registry import UnknownModelError, stroke_model
 
+    check_folder(out)
     lagging = load_artefact(drag, DragArtefact) if drag is not None else None
     try:
         if tilt_range[1] > 30 or height_range[0] <= 0:
@@ -72,16 +73,14 @@ def plan(
     )
     protocol = write_plan(figures, settings, by, of.label, repeats, out)
     if lagging is None:
-        rich.print(f"simulated by {escape(model)}, marks laid over each other along the way: not ink")
+        say(f"simulated by {model}, marks laid over each other along the way: not ink")
     else:
-        rich.print(f"simulated with the bristle lag of {escape(lagging.session_id)}, {lagging.source}: not ink")
+        say(f"simulated with the bristle lag of {lagging.session_id}, {lagging.source}: not ink")
     for figure in figures:
         first_csim, first_ssim, last_csim, last_ssim = figure.scores()
         points = sum(len(stroke) for stroke in figure.strokes)
-        rich.print(
-            escape(
-                f"{figure.wanted.name}: {len(figure.strokes)} strokes, {points} points, ink = 1: "
-                f"CSIM {first_csim:.4f} -> {last_csim:.4f}, SSIM {first_ssim:.4f} -> {last_ssim:.4f}"
-            )
+        say(
+            f"{figure.wanted.name}: {len(figure.strokes)} strokes, {points} points, ink = 1: "
+            f"CSIM {first_csim:.4f} -> {last_csim:.4f}, SSIM {first_ssim:.4f} -> {last_ssim:.4f}"
         )
-    rich.print(escape(f"{protocol}\n{out / PICTURE}"))
+    say(str(protocol), str(out / PICTURE))

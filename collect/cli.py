@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from sessions.terminal import say
+
 
 class Preview(StrEnum):
     """How the screen shows the camera."""
@@ -72,7 +74,7 @@ def collect(
         preview=preview.value,
     )
     if given_up:
-        typer.echo(f"finished; {given_up} strokes came out badly every time and were left out", err=True)
+        say(f"finished; {given_up} strokes came out badly every time and were left out", err=True)
         raise typer.Exit(3)
 
 
@@ -84,6 +86,9 @@ def plan(
         Path | None, typer.Option(help="Draw the sheets into this file: .png, .svg, .pdf or .jpg.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
+    arm: Annotated[
+        bool, typer.Option("--arm", help="As it is run with --arm: with the self-check; moves nothing.")
+    ] = False,
     ask: Annotated[
         bool, typer.Option("--ask", help="Ask the arm's controller whether it reaches every pose; moves nothing.")
     ] = False,
@@ -91,9 +96,6 @@ def plan(
     """Walk a protocol without moving: limits, sheets, dips, ink, time, and a picture of the sheets."""
     import asyncio
     import json
-    import sys
-
-    from rich.console import Console
 
     from collect.config import load_rig
     from collect.plane import PaperPlane
@@ -107,6 +109,8 @@ def plan(
 
         check_picture(picture)
     rig, wanted = load_rig(config), load_protocol(protocol)
+    if arm or not rig.robot.on_this_machine:
+        rig = rig.settled(arm)
     check_protocol(config, protocol, rig, wanted)
     made = make_plan(rig, wanted)
     asked = None
@@ -120,11 +124,11 @@ def plan(
 
         draw_plan(rig, wanted, made, picture)
     if as_json:
-        sys.stdout.write(json.dumps(made.as_json() | {"poses_in_reach": asked}) + "\n")
+        say(json.dumps(made.as_json() | {"poses_in_reach": asked}))
         return
-    Console().print(plan_table(made))
+    say(plan_table(made))
     if asked is not None:
-        Console().print(f"The controller finds joints for all {asked} poses.")
+        say(f"The controller finds joints for all {asked} poses.")
 
 
 def doctor(
@@ -134,7 +138,6 @@ def doctor(
     """Ask every configured device who it is and what is wrong. Powers nothing and moves nothing."""
     import asyncio
     import json
-    import sys
 
     from collect.config import load_rig
     from collect.doctor import examine
@@ -142,12 +145,10 @@ def doctor(
 
     findings = asyncio.run(examine(load_rig(config), HostClock()))
     if as_json:
-        sys.stdout.writelines(json.dumps(finding.as_json()) + "\n" for finding in findings)
+        say(*(json.dumps(finding.as_json()) for finding in findings))
     else:
-        from rich.console import Console
-
         from collect.doctor_table import doctor_table
 
-        Console().print(doctor_table(findings))
+        say(doctor_table(findings))
     if not all(finding.well for finding in findings):
         raise typer.Exit(4)

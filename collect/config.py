@@ -121,6 +121,16 @@ class RigConfig(BaseSettings):
     self_check: SelfCheckConfig = SelfCheckConfig()
     quality: QualityConfig = QualityConfig()
 
+    def settled(self, armed: bool) -> RigConfig:
+        """The same with the self-check decided, where it was left out: on wherever real hardware may come to move."""
+        if self.self_check.enabled is not None:
+            return self
+        return self.checking_itself(armed or not self.robot.on_this_machine)
+
+    def checking_itself(self, enabled: bool) -> RigConfig:
+        """The same with the self-check on or off."""
+        return self.model_copy(update={"self_check": self.self_check.model_copy(update={"enabled": enabled})})
+
     @model_validator(mode="after")
     def _clear_of_the_paper(self) -> RigConfig:
         lowest_mm = self.paper.touch_z_mm + TRAVEL_CLEARANCE_MM

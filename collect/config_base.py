@@ -6,8 +6,10 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+MOST = 1e6
+"""Of any number: a length of a kilometre is a slip of the pen, to be told as one."""
+Positive = Annotated[float, Field(gt=0.0, le=MOST, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-MOST, le=MOST, allow_inf_nan=False)]
 Range = tuple[Finite, Finite]
 
 

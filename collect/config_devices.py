@@ -61,6 +61,11 @@ class RobotConfig(Config):
     """Its centre, from the flange."""
     limits: LimitsConfig
 
+    @property
+    def on_this_machine(self) -> bool:
+        """Whether its controller is reached over loopback, as that of the loopback rig is."""
+        return self.host in ("localhost", "::1") or self.host.startswith("127.")
+
 
 class LockedConfig(Config):
     """Settings of a camera device that must not drift; left out means left as it is. The device's own units."""

@@ -12,10 +12,12 @@ import sys
 import time
 from pathlib import Path
 
-from collect.commands import run_command
+from collect.commands import GIVEN_UP, run_command
 from collect.config import RigConfig, load_rig
 from collect.errors import CollectAborted
+from collect.finished import finished_session
 from sessions.store import open_sessions
+from sessions.terminal import say
 
 HEIGHTS_MM = [11.0, 13.0, 15.0, 17.0, 20.0]
 TILTS_DEG = [0.0, 5.0, 10.0]
@@ -23,8 +25,12 @@ START_S = 60.0
 IDLE_EXIT_S = 60.0
 
 
-def run_demo(out: Path, repeats: int, rate: float, seed: int) -> None:
-    """Collect, calibrate, fit, validate under `out`; prints the path of the report and of the MCAP at the end."""
+def run_demo(out: Path, repeats: int, rate: float, seed: int) -> int:
+    """Collect, calibrate, fit, validate under `out`; prints the path of the report and of the MCAP at the end.
+
+    Returns the exit code: 3 where the collection left strokes out. A session without its report is gone on with; only
+    after one that has it is a new one begun.
+    """
     out.mkdir(parents=True, exist_ok=True)
     rig_toml, protocol_toml, sessions = out / "rig.toml", out / "protocol.toml", out / "sessions"
     protocol = (
@@ -32,26 +38,35 @@ def run_demo(out: Path, repeats: int, rate: float, seed: int) -> None:
     )
     if not protocol_toml.exists() or protocol_toml.read_text(encoding="utf-8") != protocol:
         protocol_toml.write_text(protocol, encoding="utf-8")
+    if (session := finished_session(sessions, protocol_toml)) is not None and not _report(session).is_file():
+        say(f"goes on with {session}, which is collected")
+        _evaluate(session)
+        return 0
     finished = sessions.is_dir() and any(sessions.iterdir()) and not open_sessions(sessions)
     rig = _serving(rig_toml, rate, seed, fresh=finished)
     try:
         sheet = ("--sheet", "1") if finished else ()
-        run_command(
-            _say, "collect", "--config", rig_toml, "--protocol", protocol_toml, "--out", sessions, "--no-tui", *sheet
-        )
+        files = ("--config", rig_toml, "--protocol", protocol_toml, "--out", sessions)
+        code = run_command(say, "collect", *files, "--no-tui", *sheet, accepts=(0, GIVEN_UP))
     finally:
         if rig is not None and rig.poll() is not None:
-            sys.stderr.write(f"the loopback rig ended with {rig.returncode}; see {out / 'rig.log'}\n")
+            say(f"the loopback rig ended with {rig.returncode}; see {out / 'rig.log'}", err=True)
     session = max(sessions.iterdir(), key=lambda path: path.stat().st_mtime_ns)
-    run_command(_say, "calibrate", session)
-    run_command(_say, "fit", session)
-    run_command(_say, "validate", session)
+    _evaluate(session)
     if rig is not None:
         rig.terminate()
         rig.wait()
-    sys.stdout.write(
-        f"\nReport: {session / 'validation' / 'report.html'}\nMCAP:   {session / f'{session.name}.mcap'}\n"
-    )
+    return code
+
+
+def _evaluate(session: Path) -> None:
+    for command in ("calibrate", "fit", "validate"):
+        run_command(say, command, session)
+    say("", f"Report: {_report(session)}", f"MCAP:   {session / f'{session.name}.mcap'}")
+
+
+def _report(session: Path) -> Path:
+    return session / "validation" / "report.html"
 
 
 def _serving(rig_toml: Path, rate: float, seed: int, *, fresh: bool) -> subprocess.Popen[bytes] | None:
@@ -80,11 +95,6 @@ def _serving(rig_toml: Path, rate: float, seed: int, *, fresh: bool) -> subproce
             raise CollectAborted(f"the loopback rig did not start; see {rig_toml.parent / 'rig.log'}")
         time.sleep(0.1)
     return process
-
-
-def _say(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 def _free_port() -> int:

@@ -73,7 +73,7 @@ class Desk:
         from collect.planning.summary import make_plan
         from collect.protocols.loading import load_protocol
 
-        made = make_plan(load_rig(self.paths.config), load_protocol(self.paths.protocol))
+        made = make_plan(load_rig(self.paths.config).settled(armed=False), load_protocol(self.paths.protocol))
         sheets = "1 sheet" if made.sheets == 1 else f"{made.sheets} sheets"
         return f"{len(made.placed)} strokes on {sheets}, about {made.seconds / 60:.0f} min"
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from collect.doctor import Finding
 
@@ -14,9 +14,9 @@ def doctor_table(findings: list[Finding]) -> Table:
         "device", "verdict", "who answers", "latency", "notes, what is wrong, how to mend it", show_lines=True
     )
     for finding in findings:
-        verdict = "[green]well[/]" if finding.well else "[red]trouble[/]" if finding.answers else "[red]no answer[/]"
+        verdict = Text("well", "green") if finding.well else Text("trouble" if finding.answers else "no answer", "red")
         who = " ".join(part for part in (finding.identity or finding.address, finding.firmware) if part)
         latency = "" if finding.latency_ms is None else f"{finding.latency_ms:.1f} ms"
         words = [finding.notes, finding.problem and f"{finding.problem}.", finding.remedy]
-        table.add_row(finding.device, verdict, escape(who), latency, escape("\n".join(w for w in words if w)))
+        table.add_row(finding.device, verdict, who, latency, "\n".join(w for w in words if w))
     return table

@@ -25,12 +25,11 @@ def lifted(rig: RigConfig, protocol: ProtocolConfig, by_mm: float) -> RigConfig:
             "",
             f"{by_mm:g} mm is outside [{low_mm:g}, {high_mm:g}] mm: above the deepest press, below travel",
         )
-    return rig.model_copy(
+    return rig.checking_itself(False).model_copy(
         update={
             "paper": rig.paper.model_copy(update={"touch_z_mm": rig.paper.touch_z_mm + by_mm}),
             "ink": _lifted_ink(rig.ink, by_mm),
             "touch": rig.touch.model_copy(update={"method": "taught", "points_mm": []}),
-            "self_check": rig.self_check.model_copy(update={"enabled": False}),
             "quality": rig.quality.model_copy(update={"enabled": False}),
         }
     )

@@ -13,6 +13,7 @@ import math
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from typing import ClassVar
 
 from collect.arming import arm
 from collect.asking import Asker
@@ -43,6 +44,10 @@ PARKED_MM = 2.0
 
 SILENT_S = 1.0
 """So long without a pose is told: the arm, or the way to it, is dead."""
+UNCHECKED = (
+    "no self-check: it is switched off in rig.toml, or this session was begun without it. Nothing tells whether arm, "
+    "camera and configuration agree"
+)
 
 OpenStore = Callable[[Rig], SessionStore]
 """Makes or resumes the session, once the devices have said who they are and before anything is powered."""
@@ -50,6 +55,9 @@ OpenStore = Callable[[Rig], SessionStore]
 
 class Engine:
     """Runs one session. `start`, then look at `snapshot` until `finished`, then `join`."""
+
+    presses: ClassVar[bool] = True
+    """Whether this is a real run: one without its self-check says so."""
 
     def __init__(
         self,
@@ -227,6 +235,8 @@ class Engine:
             store = self._open_store(rig)
             try:
                 self._progress.opened(store, sheet_of(self._rig_config, self._protocol_config))
+                if (self._armed or not rig.simulated) and self.presses and not self._rig_config.self_check.enabled:
+                    self._progress.log(UNCHECKED, warning=True)
                 async with (
                     watching(self._live, rig.camera, self._progress.log),
                     previewing(self._telemetry, rig.camera, wanted=self._preview),

@@ -8,6 +8,7 @@ StepError              a step failed in a way that is understood; says what it l
  +-- ForceTooHigh      the press met more force than allowed: the arm was stopped where it was
  +-- NeedsOperator     something that only a person can put right
  |    +-- CameraLate   the camera's delay is too long, not steady, or cannot be measured
+ +-- JogGivenUp        the operator did not find the paper by jog: its height is what it was
  +-- SheetFull         no free cell is left on the sheet
 CollectAborted         the session stopped before its protocol was finished; it can be resumed
  +-- Parked            between two steps, as was asked for, with the arm parked
@@ -84,6 +85,14 @@ class NeedsOperator(StepError):
 
 class CameraLate(NeedsOperator):
     """Photographs could be older than they seem. Leaves the arm parked; nothing was pressed meanwhile."""
+
+
+class JogGivenUp(StepError):
+    """Leaves the brush lifted; the height that was known before can be kept."""
+
+    def __init__(self, number: int, of: int, height: str) -> None:
+        self.height = height
+        super().__init__(f"the operator gave up at touch {number} of {of}")
 
 
 class SheetFull(StepError):

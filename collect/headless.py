@@ -11,10 +11,10 @@ from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
 from typing import Protocol
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from collect.snapshot import EngineView, Snapshot
+from sessions.console import PlainConsole
 
 REFRESH_S = 0.1
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -52,32 +52,32 @@ def run_headless(engine: RunnableEngine) -> None:
         try:
             # A terminal or a pipe that is gone; rich makes a broken pipe a SystemExit.
             with contextlib.suppress(OSError, SystemExit):
-                _show(engine, Console(stderr=True))
+                _show(engine)
         finally:
             _end(engine)
 
 
-def _show(engine: RunnableEngine, console: Console) -> None:
+def _show(engine: RunnableEngine) -> None:
     shown, silent = 0, False
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TextColumn("{task.fields[eta]}"),
     )
-    with Progress(*columns, console=console) as progress:
+    with Progress(*columns, console=PlainConsole(stderr=True)) as progress:
         task = progress.add_task("connect", total=None, eta="")
         while True:
             over = engine.finished
             now = engine.snapshot()
             for line in now.messages[max(shown - now.messages_before, 0) :]:
-                progress.console.print(line, markup=False, highlight=False)
+                progress.console.print(line, highlight=False)
             shown = now.messages_before + len(now.messages)
             if (now.no_pose_s is not None) is not silent:
                 silent = now.no_pose_s is not None
                 words = f"warning: {no_pose_text(now)}" if silent else "the arm tells its pose again"
-                progress.console.print(words, markup=False, highlight=False)
+                progress.console.print(words, highlight=False)
             progress.update(
                 task,
                 description=", ".join(part for part in (f"{now.state}: {now.step}", no_pose_text(now)) if part),

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import datetime as dt
-import os
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -19,12 +19,14 @@ from collect.steps import StepKind
 from drivers.clock import Clock
 from drivers.samples import Identity
 from sessions.difference import differences
+from sessions.disk import unwritable
 from sessions.errors import SessionError
 from sessions.journal import JOURNAL_NAME, replay
 from sessions.schemas import Header, Source
 from sessions.store import SessionStore, Snapshots, next_session_id, open_sessions
 
-COMPARED = ("rig.effective.json", "protocol.effective.json")
+RIG_EFFECTIVE = "rig.effective.json"
+COMPARED = (RIG_EFFECTIVE, "protocol.effective.json")
 MACHINE_NAMES = {
     "robot": {"host", "port", "rtde_port"},
     "camera": {"source"},
@@ -50,6 +52,8 @@ class Opening:
     """The number of the sheet that is in, counted from 1: the operator's word for it."""
     armed: bool = False
     """The operator has looked at the cell: real hardware may move."""
+    self_check_left_out: bool = False
+    """rig.toml does not say whether there is a self-check: `armed` does, and for an open session how it was begun."""
 
     @classmethod
     def load(
@@ -65,17 +69,33 @@ class Opening:
     ) -> Opening:
         """Read both files once; a dry run is lifted by so much. Raises `ConfigError`."""
         rig, protocol = load_rig(rig_path), load_protocol(protocol_path)
+        left_out, rig = rig.self_check.enabled is None, rig.settled(armed)
         if dry_run_mm is not None:
             rig = lifted(rig, protocol, dry_run_mm)
         snapshots = {
             "rig.toml": rig_path.read_text(encoding="utf-8"),
             "protocol.toml": protocol_path.read_text(encoding="utf-8"),
             # What really holds, the environment included: a touch height from there is part of the record.
-            "rig.effective.json": rig.model_dump_json(indent=2, exclude=MACHINE_NAMES) + "\n",
+            RIG_EFFECTIVE: _effective(rig),
             # With the rows of the files that it names.
             "protocol.effective.json": protocol.model_dump_json(indent=2) + "\n",
         }
-        return cls(root, rig_path, protocol_path, rig, protocol, snapshots, new, sheet, armed)
+        return cls(root, rig_path, protocol_path, rig, protocol, snapshots, new, sheet, armed, left_out)
+
+    def as_begun(self, folder: Path) -> Opening:
+        """The same for going on with that session: where rig.toml leaves the self-check out, as it was begun."""
+        if not self.self_check_left_out:
+            return self
+        try:
+            begun = json.loads((folder / RIG_EFFECTIVE).read_text(encoding="utf-8"))["self_check"]["enabled"]
+        except (OSError, ValueError, LookupError, TypeError, RecursionError):
+            return self
+        rig = self.rig.checking_itself(begun is True)
+        return replace(self, rig=rig, snapshots={**self.snapshots, RIG_EFFECTIVE: _effective(rig)})
+
+
+def _effective(rig: RigConfig) -> str:
+    return rig.model_dump_json(indent=2, exclude=MACHINE_NAMES) + "\n"
 
 
 def find_resumable(opening: Opening) -> Path | None:
@@ -87,7 +107,7 @@ def find_resumable(opening: Opening) -> Path | None:
         return None
     refusals: list[ConfigError] = []
     for folder in reversed(open_sessions(opening.root)) if not opening.new else ():
-        found = differences(folder, {name: opening.snapshots[name] for name in COMPARED})
+        found = differences(folder, {name: opening.as_begun(folder).snapshots[name] for name in COMPARED})
         if not found:
             return folder
         given = {"rig.toml": opening.rig_path, "protocol.toml": opening.protocol_path}
@@ -108,11 +128,8 @@ def find_resumable(opening: Opening) -> Path | None:
 
 def check_writable(folder: Path) -> None:
     """Raise `ConfigError` unless sessions can be written there, or made; before anything is connected."""
-    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
-    if not there.is_dir():
-        raise ConfigError(there, "", "is a file; a folder for sessions is needed")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise ConfigError(there, "", "may not be written: it is read-only, or another user's")
+    if (found := unwritable(folder)) is not None:
+        raise ConfigError(found[0], "", found[1])
 
 
 def _has_pressed(journal: Path) -> bool:

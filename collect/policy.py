@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from collect.errors import BadPicture, ForceTooHigh, NeedsOperator, SheetFull, StepError, StepVoid
+from collect.errors import BadPicture, ForceTooHigh, JogGivenUp, NeedsOperator, SheetFull, StepError, StepVoid
 from collect.steps import Step, StepKind
 from drivers.errors import ArmMoved, DeviceError, DeviceTimeout, RobotNotSafe, SettingsChanged, Stuck
 from drivers.ink.errors import InkRefused
@@ -32,6 +32,8 @@ def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
             return Action.ASK
         # Somebody else has had the arm.
         case _, ArmMoved() | SettingsChanged():
+            return Action.ASK
+        case StepKind.ZERO_TOUCH, JogGivenUp():
             return Action.ASK
         case StepKind.PRESS | StepKind.DRAW, StepVoid():
             action = Action.RETRY

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collect.asking import Choice, Prompt
-from collect.errors import ForceTooHigh, SheetFull, StepError, told
+from collect.errors import ForceTooHigh, JogGivenUp, SheetFull, StepError, told
 from drivers.errors import ArmMoved, DeviceError, MotionError, SettingsChanged
 from drivers.ink.errors import InkRefused
 
 STOP = Choice("x", "stop the run")
 GO_ON = "g"
+KEEP = "k"
 
 
 def question(error: StepError | DeviceError, sheet: int) -> Prompt:
@@ -25,6 +26,9 @@ def question(error: StepError | DeviceError, sheet: int) -> Prompt:
             words, go_on = told(error), Choice(GO_ON, "nobody else has the arm, lift it and go on")
         case SettingsChanged():
             words, go_on = told(error), Choice(GO_ON, "nobody else has the arm: set it anew, lift it and go on")
+        case JogGivenUp(height=height):
+            words = f"{told(error)}. {height[0].upper()}{height[1:]} can be kept: H is then counted from there."
+            return Prompt(words, (Choice(KEEP, "keep that height, go on"), Choice("a", "jog again"), STOP), STOP.key)
         case MotionError():
             words, go_on = told(error), Choice(GO_ON, "the arm is released and clear, lift it and go on")
         case _:

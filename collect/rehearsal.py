@@ -12,7 +12,9 @@ OVER = "rehearsal: every move was made"
 
 
 class Rehearsal(Engine):
-    """Makes every move, lifted; what it records is nobody's."""
+    """Makes every move, lifted; its recording is discarded."""
+
+    presses = False
 
     def snapshot(self) -> Snapshot:
         """The engine now, its log without the paths that will be gone."""

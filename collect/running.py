@@ -128,7 +128,7 @@ class Run:
                     await self._lift(error)
                     raise
                 if action is Action.ASK:
-                    await self._ask(error)
+                    step = again(step, await self._ask(error))
                     failures = 0
                 released = action is Action.ASK and isinstance(error, MotionError)
                 await self._willing(self._recover, released=released)
@@ -199,8 +199,8 @@ class Run:
             await self._park()
         return answer
 
-    async def _ask(self, error: StepError | DeviceError) -> None:
-        """Let a person decide; raises `error` again where the answer is to stop."""
+    async def _ask(self, error: StepError | DeviceError) -> str:
+        """Let a person decide; returns the answer, and raises `error` again where it is to stop."""
         in_order = False
         if not isinstance(error, ITS_OWN_TROUBLE):
             with contextlib.suppress(StepError, DeviceError):
@@ -217,6 +217,7 @@ class Run:
                 raise Parked(f"stopped at a question, parked: {told(error)}") from error
             raise error
         self.performer.answered(error)
+        return answer
 
     async def _lift(self, error: StepError | DeviceError | SessionError) -> None:
         """Leave no brush in the paper, where the arm itself is in order: not after its own trouble, nor where the brush

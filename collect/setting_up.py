@@ -8,13 +8,13 @@ from dataclasses import replace
 from calibrate.scale import WORST_RMS_PX
 from collect.asking import Choice, Prompt
 from collect.config import RigConfig
-from collect.questions import GO_ON, STOP
+from collect.questions import GO_ON, KEEP, STOP
 from collect.set_up_steps import SET_UP, TITLES, Fact, SetUpStep, Standing
 from collect.steps import Protocol, Result, Step, StepKind
 
 AGAIN = Choice("a", "measure again")
 BY_JOG, BY_FORCE = Choice("b", "measure by jog"), Choice("f", "measure by force")
-METHODS = {BY_JOG.key: "jog", BY_FORCE.key: "force"}
+METHODS = {BY_JOG.key: "jog", BY_FORCE.key: "force", KEEP: "kept"}
 
 
 def facts_of(kind: StepKind, result: Result, config: RigConfig) -> tuple[Fact, ...]:
@@ -101,16 +101,17 @@ def _board(result: Result, config: RigConfig) -> tuple[Fact, ...]:
 
 def _touch(result: Result, config: RigConfig) -> tuple[Fact, ...]:
     touch, method = config.touch, str(result["method"])
-    facts = [Fact("method", "taught height, visited" if method == "taught" else method)]
+    named = {"taught": "taught height, visited", "kept": "none: the height from before is kept"}
+    facts = [Fact("method", named.get(method, method))]
     for number, point in enumerate(result["points"], 1):
         where = f"point {number} ({point['x_mm']:.0f}, {point['y_mm']:.0f})"
-        if method == "taught":
-            facts.append(Fact(where, f"rests at {point['z_mm']:.2f} mm"))
+        if method in named:
+            facts.append(Fact(where, f"{'rests' if method == 'taught' else 'lies'} at {point['z_mm']:.2f} mm"))
             continue
         span_mm, limit_mm = float(point["span_mm"]), touch.repeatability_mm
         facts.append(Fact(where, f"{point['z_mm']:.3f} mm", "", None))
         facts.append(Fact("  its touches span", f"{span_mm:.3f} mm", f"at most {limit_mm:g}", span_mm <= limit_mm))
-    if method != "taught" and "moved_mm" in result:
+    if method not in named and "moved_mm" in result:
         moved_mm = float(result["moved_mm"])
         near = abs(moved_mm) <= touch.moved_mm
         facts.append(Fact("from the height before", f"{moved_mm:+.3f} mm", f"at most {touch.moved_mm:g}", near))

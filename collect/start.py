@@ -16,6 +16,7 @@ from collect.opening import Opening, check_writable, find_resumable, open_store
 from collect.planning.limits import check_protocol
 from collect.rehearsal import Rehearsal
 from drivers.clock import HostClock
+from sessions.terminal import plain
 
 Kind = Literal["auto", "cells", "off"]
 """How the camera is shown on a screen: in pixels where the terminal has them, in half-cells, or not at all."""
@@ -31,8 +32,10 @@ def engine_for(
     make: type[Engine] = Engine,
 ) -> Engine:
     """An engine that goes on with the open session, or makes a new one. Raises `ConfigError`; connects nothing yet."""
-    check_protocol(opening.rig_path, opening.protocol_path, opening.rig, opening.protocol)
     resume = find_resumable(opening)
+    if resume is not None:
+        opening = opening.as_begun(resume)
+    check_protocol(opening.rig_path, opening.protocol_path, opening.rig, opening.protocol)
     check_writable(resume or opening.root)
     clock = HostClock()
     return make(
@@ -85,7 +88,7 @@ def _run(engine: Engine, preview: Kind, *, on_screen: bool) -> None:
 
 def _say(text: str) -> None:
     try:
-        sys.stdout.write(text)
+        sys.stdout.write(plain(text, keep="\n"))
         sys.stdout.flush()
     except OSError:
         sys.stdout = None  # nobody reads any more; Python would try again at its exit, and change the code

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from sessions import cli_care, cli_import, cli_share
+from sessions.terminal import say
 
 app = typer.Typer(help="Inspect, check, repair, import and export recordings.", no_args_is_help=True)
 
@@ -17,7 +18,6 @@ def list_(
     root: Annotated[Path, typer.Argument(help="Folder that holds sessions.")] = Path("sessions"),
 ) -> None:
     """List the sessions under a folder: closed, imported, or still open."""
-    from rich.console import Console
     from rich.table import Table
 
     from sessions.summary import summaries
@@ -25,7 +25,7 @@ def list_(
     table = Table("session", "state", "source", "strokes", "file")
     for row in summaries(root):
         table.add_row(row.session_id, row.state, row.source, str(row.strokes), row.file)
-    Console().print(table)
+    say(table)
 
 
 for command in (cli_care.show, cli_care.verify, cli_care.repair, cli_care.close, cli_share.merge, cli_share.export):

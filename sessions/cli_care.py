@@ -10,6 +10,8 @@ from typing import Annotated
 
 import typer
 
+from sessions.terminal import say
+
 LOSSY, DAMAGED = 3, 6
 SESSION = typer.Argument(help="A session's folder, or its .mcap file.")
 
@@ -27,14 +29,12 @@ def show(
 
     told = details(session)
     if as_json:
-        typer.echo(json.dumps(asdict(told), ensure_ascii=False))
+        say(json.dumps(asdict(told), ensure_ascii=False))
         return
-    from rich.console import Console
 
     from sessions.show_text import renderables
 
-    for part in renderables(told, files=files):
-        Console().print(part)
+    say(*renderables(told, files=files))
 
 
 def verify(session: Annotated[Path, SESSION]) -> None:
@@ -46,14 +46,14 @@ def verify(session: Annotated[Path, SESSION]) -> None:
 
     verdict = verify_session(session)
     for finding in verdict.findings:
-        typer.echo(f"damaged: {finding.file}: {finding.what}")
+        say(f"damaged: {finding.file}: {finding.what}")
     for note in verdict.notes:
-        typer.echo(f"note: {note}")
+        say(f"note: {note}")
     read = f"{verdict.files} files, {verdict.strokes} strokes, {verdict.messages} messages"
     if verdict.sound:
-        typer.echo(f"{verdict.session} ({verdict.state}) is sound: {read}")
+        say(f"{verdict.session} ({verdict.state}) is sound: {read}")
         return
-    typer.echo(f"{verdict.session} ({verdict.state}) is damaged. Try `brushloop sessions repair {session}`")
+    say(f"{verdict.session} ({verdict.state}) is damaged. Try `brushloop sessions repair {session}`")
     raise typer.Exit(DAMAGED)
 
 
@@ -69,14 +69,14 @@ def repair(session: Annotated[Path, SESSION]) -> None:
 
     report = repair_session(session, time.time_ns)
     for line in report.did:
-        typer.echo(line)
+        say(line)
     for line in report.lost:
-        typer.echo(f"lost: {line}")
+        say(f"lost: {line}")
     if report.lossless:
         what = "nothing was lost" if report.did else "was sound; nothing was changed"
-        typer.echo(f"{report.session}: {what}, {report.strokes} strokes")
+        say(f"{report.session}: {what}, {report.strokes} strokes")
         return
-    typer.echo(f"{report.session}: {report.strokes} strokes were given back whole, the rest is named above")
+    say(f"{report.session}: {report.strokes} strokes were given back whole, the rest is named above")
     raise typer.Exit(LOSSY)
 
 
@@ -91,4 +91,4 @@ def close(session: Annotated[Path, typer.Argument(help="The folder of a session 
         final = store.close()
     finally:
         store.release()
-    typer.echo(f"Closed: {final}")
+    say(f"Closed: {final}")

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from sessions.terminal import say
+
 Out = Annotated[Path | None, typer.Option(help="New session folder; sessions/<folder's name> by default.")]
 Licence = Annotated[str, typer.Option(help="Licence of the photographs, kept in the recording.")]
 Origin = Annotated[str, typer.Option(help="Where they come from, kept in the recording.")]
@@ -45,7 +47,7 @@ def import_sequence(
     options = ImportOptions("drag", px_per_mm, licence, origin, brush)
     target = out or Path("sessions") / folder.resolve().name
     path = run(folder, csv, target, options, f"brushloop {version('brushloop')}", time.time_ns, page)
-    typer.echo(f"Imported into {path}")
+    say(f"Imported into {path}")
 
 
 def import_scans(
@@ -70,4 +72,4 @@ def import_scans(
     options = ImportOptions(kind, None, licence, origin, brush, brush_radius_mm, brush_length_mm)
     target = out or Path("sessions") / folder.resolve().name
     path = run(folder, csv, target, options, f"brushloop {version('brushloop')}", time.time_ns, dpi)
-    typer.echo(f"Imported into {path}")
+    say(f"Imported into {path}")

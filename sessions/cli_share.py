@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from sessions.cli_import import Length, Radius
+from sessions.terminal import say
 
 
 def import_(
@@ -31,7 +32,7 @@ def import_(
     options = ImportOptions(kind, px_per_mm, licence, origin, brush, brush_radius_mm, brush_length_mm)
     target = out or Path("sessions") / folder.resolve().name
     path = import_photographs(folder, csv, target, options, f"brushloop {version('brushloop')}", time.time_ns)
-    typer.echo(f"Imported into {path}")
+    say(f"Imported into {path}")
 
 
 def merge(
@@ -44,7 +45,7 @@ def merge(
     """
     from sessions.combine import combine
 
-    typer.echo(f"Merged into {combine(parts, out)}")
+    say(f"Merged into {combine(parts, out)}")
 
 
 def export(
@@ -55,4 +56,4 @@ def export(
     """Export strokes and poses: images with CSV, NumPy arrays, or Parquet that Hugging Face `datasets` loads."""
     from sessions.export import export as write
 
-    typer.echo(f"Exported into {write(session, out, kind)}")
+    say(f"Exported into {write(session, out, kind)}")

@@ -85,3 +85,13 @@ def _link(path: Path, kept: Path) -> None:
             shutil.copyfileobj(source, target)
             target.flush()
             os.fsync(target.fileno())
+
+
+def unwritable(folder: Path) -> tuple[Path, str] | None:
+    """What stands in the way of writing into a folder, or of making it, and why; None where nothing does."""
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    if not there.is_dir():
+        return there, "is a file; a folder is needed"
+    if not os.access(there, os.W_OK | os.X_OK):
+        return there, "may not be written: it is read-only, or another user's"
+    return None

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sessions.cells import CsvWriter
 from sessions.export import Export, PoseRow, Row, write_durably
 
 if TYPE_CHECKING:
@@ -54,12 +54,12 @@ def write_png(export: Export, folder: Path) -> None:
         rows.append(row)
     columns = list(dict.fromkeys(name for row in rows for name in row))
     with (folder / "strokes.csv").open("x", newline="", encoding="utf-8") as file:
-        table = csv.DictWriter(file, columns)
-        table.writeheader()
-        table.writerows(rows)
+        table = CsvWriter(file, "\r\n")
+        table.writerow(columns)
+        table.writerows([row.get(name) for name in columns] for row in rows)
         _sync(file)
     with (folder / "poses.csv").open("x", newline="", encoding="utf-8") as file:
-        lines = csv.writer(file)
+        lines = CsvWriter(file, "\r\n")
         lines.writerow(POSE_COLUMNS)
         lines.writerows(map(pose_values, export.poses()))
         _sync(file)

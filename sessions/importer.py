@@ -82,7 +82,7 @@ def store_rows(
     """
     encoded = encoded or _whole
     digests = [_check(encoded(row), row.image) for row in rows]
-    first = None if opening is None else _read_bytes(opening)
+    first = None if opening is None else read_bounded(opening)
     if first is not None and opening is not None:
         _check(first, opening)
     header = Header(
@@ -144,7 +144,7 @@ def _kind(data: bytes) -> str:
 
 
 def _whole(row: Row) -> bytes:
-    return _read_bytes(row.image)
+    return read_bounded(row.image)
 
 
 def _check(data: bytes, path: Path) -> bytes:
@@ -156,7 +156,8 @@ def _check(data: bytes, path: Path) -> bytes:
     return hashlib.sha256(data).digest()
 
 
-def _read_bytes(path: Path) -> bytes:
+def read_bounded(path: Path) -> bytes:
+    """A photograph's bytes. Raises `InputError` where there are too many, or they cannot be read."""
     try:
         size = path.stat().st_size
         if size > MAX_IMAGE_BYTES:

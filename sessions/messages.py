@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from collections.abc import Iterable, Sequence
@@ -23,8 +24,13 @@ if TYPE_CHECKING:
 
 MAX_IMAGE_BYTES = 256 * 1024 * 1024
 MAX_IMAGE_PIXELS = 200_000_000
+MAX_JPEG_SCANS = 100
+MAX_SCANNED_PIXELS = 4_000_000_000
+"""Pixels times scans of a JPEG: each scan of a progressive one goes over the whole image, at about 1 ns a pixel."""
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
-JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+JPEG_START = b"\xff\xd8"
+_MARKER = re.compile(rb"\xff+([^\x00\x01\xd0-\xd8\xff])")
+"""A marker that begins a segment or ends the file; in what a scan holds, 0xFF stands before 0 or a restart only."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,8 +168,13 @@ def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
     size = _png_size(data) or _jpeg_size(data)
     if size is None:
         raise SessionDamaged(where, "is no whole PNG or JPEG image")
-    if size[0] * size[1] > MAX_IMAGE_PIXELS:
-        raise SessionDamaged(where, f"image of {size[0]} x {size[1]} pixels exceeds {MAX_IMAGE_PIXELS}")
+    width, height, scans = size
+    if width * height > MAX_IMAGE_PIXELS:
+        raise SessionDamaged(where, f"image of {width} x {height} pixels exceeds {MAX_IMAGE_PIXELS}")
+    # A scan that changes nothing takes ten bytes, so that a small file could keep us busy for minutes.
+    most = min(MAX_JPEG_SCANS, MAX_SCANNED_PIXELS // max(width * height, 1))
+    if scans > most:
+        raise SessionDamaged(where, f"JPEG of {width} x {height} pixels in more than {most} scans")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     except cv2.error as error:
@@ -173,8 +184,8 @@ def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
     return cast("NDArray[np.uint8]", image)
 
 
-def _png_size(data: bytes) -> tuple[int, int] | None:
-    """Size from the header chunk; None where a chunk fails its CRC: libpng would say so on our stderr."""
+def _png_size(data: bytes) -> tuple[int, int, int] | None:
+    """Width, height and one scan, from the header; None where a chunk fails its CRC: libpng would say so on stderr."""
     at = len(PNG_START)
     while data.startswith(PNG_START) and data[12:16] == b"IHDR" and at + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, at)
@@ -183,20 +194,23 @@ def _png_size(data: bytes) -> tuple[int, int] | None:
             return None
         if name == PNG_END:
             width, height = struct.unpack_from(">II", data, 16)
-            return width, height
+            return width, height, 1
         at = crc_at + 4
     return None
 
 
-def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Size from the start-of-frame segment; None for a file that ends before its end mark."""
-    at = len(JPEG_START)
-    while data.startswith(JPEG_START) and at + 9 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack_from(">HH", data, at + 5)
-            # An end mark before the frame is a thumbnail's; cv2 would pad the rest of a cut photograph with gray.
-            return (width, height) if data.find(JPEG_END, at) >= 0 else None
-        filler = marker == 0xFF
-        at += 1 if filler else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return None
+def _jpeg_size(data: bytes) -> tuple[int, int, int] | None:
+    """Width, height and number of scans, counted no further than is allowed; None for a file without its end mark."""
+    size, scans, at = None, 0, len(JPEG_START)
+    while data.startswith(JPEG_START) and (found := _MARKER.search(data, at)) and scans <= MAX_JPEG_SCANS:
+        marker, at = found[1][0], found.end()
+        if marker == 0xD9:  # an end mark before the frame would be a thumbnail's, which lies in a segment
+            break
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC) and len(data) >= at + 7:
+            size = struct.unpack_from(">HH", data, at + 3)
+        scans += marker == 0xDA
+        at += int.from_bytes(data[at : at + 2], "big")
+    else:
+        # cv2 would pad the rest of a cut photograph with gray.
+        size = size if scans > MAX_JPEG_SCANS else None
+    return (size[1], size[0], scans) if size is not None else None

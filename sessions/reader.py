@@ -18,7 +18,7 @@ from sessions.journal import JOURNAL_NAME, is_open, replay
 from sessions.messages import decode_gray, decode_still
 from sessions.names import check_companions
 from sessions.remarks import remarks_of
-from sessions.renamed import check_name
+from sessions.renamed import check_name, not_a_session
 from sessions.schemas import Event, Header, StepEvent, Stroke, Topic
 from sessions.writer import HEADER_METADATA, file_sha256, header_crc
 
@@ -111,17 +111,17 @@ class Recording:
 
 
 def _find_mcap(path: Path) -> Path:
+    check_name(path)
     if path.is_file():
         check_companions(path.parent)
         return path
     if not path.is_dir():
         raise InputError(path, "no such session: give a session's folder or its .mcap file")
-    check_name(path)
     merged = path / f"{path.resolve().name}.mcap"
     if (path / JOURNAL_NAME).is_file() and is_open(replay(path / JOURNAL_NAME)):
         raise InputError(path, "is still open: run the same `brushloop collect` again to finish it")
     if not merged.is_file():
-        raise InputError(path, f"holds no {merged.name}")
+        raise not_a_session(path)
     return merged
 
 

@@ -11,8 +11,12 @@ from sessions.store import SEGMENT_NAME
 
 
 def check_name(folder: Path) -> None:
-    """Raise `InputError` where the folder was renamed, or holds links; says what to do."""
-    check_folder(folder)
+    """Raise `InputError` for a folder that was renamed or holds links, and for an unfinished file; says what to do."""
+    if folder.suffix == ".part" and folder.is_file():
+        what = "was never finished, a step or a merge was cut: it is kept as evidence and is no recording"
+        raise InputError(folder, f"{what}. Give the session's folder, {folder.parent}")
+    if folder.is_dir():
+        check_folder(folder)
     recording = recording_of_renamed(folder)
     if recording is not None:
         raise InputError(
@@ -32,6 +36,17 @@ def recording_of_renamed(folder: Path) -> Path | None:
     if (folder / f"{name}.mcap").exists() or len(recordings) != 1 or _is_open(folder):
         return None
     return recordings[0]
+
+
+def not_a_session(folder: Path) -> InputError:
+    """What is wrong with a folder without a recording of its name, and what to give instead."""
+    name = f"{folder.resolve().name}.mcap"
+    if (folder / JOURNAL_NAME).is_file():
+        return InputError(folder, f"has lost its recording {name}: `brushloop sessions repair {folder}` makes it again")
+    inside = sorted(path for path in folder.iterdir() if (path / JOURNAL_NAME).is_file() or any(path.glob("*.mcap")))
+    if inside:
+        return InputError(folder, f"is no session, but holds {len(inside)} of them: give one, as {inside[0]}")
+    return InputError(folder, f"is no session: neither {JOURNAL_NAME} nor a recording {name} is in it")
 
 
 def _is_open(folder: Path) -> bool:

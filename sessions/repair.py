@@ -13,7 +13,7 @@ from pathlib import Path
 from sessions.errors import InputError, SessionDamaged, disk_error
 from sessions.journal import JOURNAL_NAME
 from sessions.reader import parse_header
-from sessions.renamed import check_name
+from sessions.renamed import check_name, not_a_session
 from sessions.repair_folder import FolderRepair
 from sessions.repair_journal import Report, kept_words
 from sessions.rewrite import lost_words, replace_damaged, with_their_stills
@@ -34,14 +34,14 @@ def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
     if not target.exists():
         raise InputError(path, "no such session: give a session's folder or its .mcap file")
     try:
+        check_name(path)
         if target.is_file():
             return _repair_file(target)
-        check_name(path)
         files = [file.name for file in target.glob("*.mcap*")]
         if not (target / JOURNAL_NAME).exists() and not any(map(SEGMENT_NAME.fullmatch, files)):
             final = target / f"{target.name}.mcap"
             if not final.is_file():
-                raise InputError(path, f"holds neither {JOURNAL_NAME} nor {final.name}: not a session")
+                raise not_a_session(path)
             return _repair_file(final)
         held = lock(target)
         try:

@@ -8,8 +8,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sessions.errors import InputError, SessionDamaged, in_one_line
-from sessions.importer import ImportOptions, check_target, store_rows
+from sessions.errors import InputError, SessionDamaged
+from sessions.importer import ImportOptions, check_target, read_bounded, store_rows
 from sessions.messages import PNG_START, decode_gray, encode_png
 from sessions.table import Row, parse_table, read_text
 
@@ -55,7 +55,7 @@ def import_scans(
 
     def cut(row: Row) -> bytes:
         if not boxed:
-            return _bytes(row.image)
+            return read_bounded(row.image)
         image = gray(row.image)
         left, top, width, height = (round(row.stroke.commanded[name]) for name in BOX)
         inside = min(left, top) >= 0 and left + width <= image.shape[1] and top + height <= image.shape[0]
@@ -85,7 +85,7 @@ def dpi_of(data: bytes) -> tuple[float, float] | None:
 
 
 def _scaled(row: Row, dpi: float | None) -> Row:
-    told = (dpi, dpi) if dpi is not None else dpi_of(_bytes(row.image))
+    told = (dpi, dpi) if dpi is not None else dpi_of(read_bounded(row.image))
     if told is None:
         raise InputError(row.image, "does not say its dpi; give --dpi")
     if not all(LEAST_DPI <= value <= MOST_DPI for value in told):
@@ -96,13 +96,6 @@ def _scaled(row: Row, dpi: float | None) -> Row:
 
 def _gray(path: Path) -> NDArray[np.uint8]:
     try:
-        return decode_gray(_bytes(path), str(path))
+        return decode_gray(read_bounded(path), str(path))
     except SessionDamaged as error:
         raise InputError(path, error.what) from None
-
-
-def _bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(path, f"cannot read: {in_one_line(error)}") from None

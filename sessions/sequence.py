@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sessions.errors import InputError, SessionDamaged, in_one_line
-from sessions.importer import ImportOptions, check_target, store_rows
+from sessions.importer import ImportOptions, check_target, read_bounded, store_rows
 from sessions.messages import decode_gray
 from sessions.table import Row, parse_table, read_text
 
@@ -101,7 +101,7 @@ def _with_scale(text: str, px_per_mm: tuple[float, float]) -> str:
 
 def _text(lines: list[list[str]]) -> str:
     out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows(lines)
+    csv.writer(out, lineterminator="\n").writerows(lines)  # noqa: TID251 - read again at once
     return out.getvalue()
 
 
@@ -114,9 +114,7 @@ def _frame(folder: Path, named: Path, name: str) -> Path:
 
 def _size(path: Path) -> tuple[int, int]:
     try:
-        height, width = decode_gray(path.read_bytes(), str(path)).shape
+        height, width = decode_gray(read_bounded(path), str(path)).shape
     except SessionDamaged as error:
         raise InputError(path, error.what) from None
-    except OSError as error:
-        raise InputError(path, f"cannot read: {in_one_line(error)}") from None
     return width, height

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from rich.console import RenderableType
-from rich.markup import escape
 from rich.table import Column, Table
+from rich.text import Text
 
 from sessions.show import Details, Sheet
 
@@ -20,32 +20,33 @@ def renderables(told: Details, *, files: bool = False) -> Iterator[RenderableTyp
         yield _segments(told)
     for title, lines in (("Cut attempts", told.void), ("Repaired", told.repairs)):
         if lines:
-            yield f"[bold]{title}[/bold]\n" + "\n".join(f"  {escape(line)}" for line in lines)
+            yield Text(title, "bold")
+            yield from (f"  {line}" for line in lines)
 
 
 def _facts(told: Details, *, files: bool) -> Table:
     table = Table(show_header=False, box=None)
-    table.add_row("session", f"[bold]{escape(told.session_id)}[/bold], {told.state}, {escape(told.source)}")
+    table.add_row("session", Text.assemble((told.session_id, "bold"), f", {told.state}, {told.source}"))
     of = f" of {told.planned} planned" if told.planned else ""
     bad = f", and {told.marked_bad} marked bad" if told.marked_bad else ""
     table.add_row("strokes", f"{told.strokes}{of}{bad}")
     steps = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in told.finished.items())
     if told.finished or told.void:
-        table.add_row("steps", escape(f"finished: {steps or 'none'}; cut: {len(told.void)}"))
+        table.add_row("steps", f"finished: {steps or 'none'}; cut: {len(told.void)}")
     if told.next:
-        table.add_row("next", escape(f"{told.next} (was being done when the last process ended)"))
+        table.add_row("next", f"{told.next} (was being done when the last process ended)")
     for sheet in told.sheets:
         table.add_row(f"sheet {sheet.sheet}", f"{len(sheet.used_cells)} cells used: {ranges(sheet)}")
     for name, value in told.devices.items():
-        table.add_row(name.replace("_", " "), escape(value))
+        table.add_row(name.replace("_", " "), value)
     processes = f", {told.processes} processes" if told.processes else ""
-    table.add_row("recorded by", escape(f"{told.software}, schema {told.schema_version}{processes}"))
+    table.add_row("recorded by", f"{told.software}, schema {told.schema_version}{processes}")
     messages = ", ".join(f"{count} {topic}" for topic, count in sorted(told.messages.items()))
-    table.add_row("messages", escape(messages or "none"))
+    table.add_row("messages", messages or "none")
     if told.segments:
         table.add_row("files", f"{_files(told)}{'' if files else ' (--files lists them)'}")
     if told.file:
-        table.add_row("recording", escape(f"{told.file}, {_size(told.size_bytes)}"))
+        table.add_row("recording", f"{told.file}, {_size(told.size_bytes)}")
     return table
 
 
@@ -65,7 +66,7 @@ def _segments(told: Details) -> Table:
     table = Table(file, "step", "size", "messages", title=f"{len(told.segments)} finished steps")
     for segment in told.segments:
         messages = ", ".join(f"{count} {topic}" for topic, count in segment.messages.items())
-        table.add_row(escape(segment.file), escape(segment.step), _size(segment.size_bytes), escape(messages))
+        table.add_row(segment.file, segment.step, _size(segment.size_bytes), messages)
     return table
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from sessions.cells import as_text
 from sessions.errors import InputError, in_one_line
 from sessions.schemas import MAX_PX_PER_MM, MIN_PX_PER_MM, Stroke
 
@@ -22,6 +23,12 @@ FRACTIONS = ("frac", "px", "nominal", "ratio")
 PAIRS = (("px_per_mm_x", "px_per_mm_y"), ("start_x_px", "start_y_px"))
 SPECIAL = {"file", "name", "px_per_mm", "height_mm", "tilt_deg", *PAIRS[0], *PAIRS[1]}
 """Columns that become fields of a stroke; all others are kept in `commanded`."""
+DEPTHS = ("height", "depth")
+"""How the names of columns begin that hold a depth: it counts from the touch of the paper down."""
+DEEPEST_MM = 500.0
+STEEPEST_DEG = 90.0
+MOST = 1e6
+"""Of any other number; a length of a kilometre is a slip of the pen."""
 MAX_NAME_CHARS = 100
 
 
@@ -64,7 +71,7 @@ def parse_table(
         for cells in _filled(lines):
             if len(rows) == MAX_ROWS:
                 raise InputError(table, f"has more than {MAX_ROWS} rows")
-            row = _row(columns, lines.line_num, [cell.strip() for cell in cells], still=len(rows))
+            row = _row(columns, lines.line_num, [as_text(cell.strip()) for cell in cells], still=len(rows))
             if row.stroke.stroke_id in seen:
                 raise InputError(table, f"line {lines.line_num}: stroke {row.stroke.stroke_id} appears twice")
             seen.add(row.stroke.stroke_id)
@@ -144,6 +151,10 @@ def _row(columns: _Columns, line: int, cells: list[str], still: int) -> Row:
             parsed = math.nan
         if not math.isfinite(parsed):
             raise InputError(table, f"line {line}, column `{name}`: {fields[name][:80]!r} is not a finite number")
+        least, most = _range(name)
+        if not least <= parsed <= most:
+            told = f"{fields[name][:80]!r}, allowed: {least / factor:g} to {most / factor:g}"
+            raise InputError(table, f"line {line}, column `{name}`: {told}")
         return parsed
 
     def pair(first: str, second: str) -> tuple[float, float] | None:
@@ -168,6 +179,15 @@ def _row(columns: _Columns, line: int, cells: list[str], still: int) -> Row:
         commanded={stored: value(name, factor) for name, (stored, factor) in columns.commanded.items()},
     )
     return Row(image, stroke)
+
+
+def _range(column: str) -> tuple[float, float]:
+    """What a column may hold, in the unit that is stored."""
+    if column.startswith(DEPTHS) and column.rpartition("_")[2] in LENGTH_UNITS:
+        return 0.0, DEEPEST_MM
+    if column == "tilt_deg":
+        return 0.0, STEEPEST_DEG
+    return -MOST, MOST
 
 
 def _name(columns: _Columns, line: int, name: str) -> str:

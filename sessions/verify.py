@@ -12,7 +12,7 @@ from sessions.evidence import Evidence, gather
 from sessions.journal import JOURNAL_NAME
 from sessions.merge import verify as verify_digest
 from sessions.reader import Recording
-from sessions.renamed import check_name
+from sessions.renamed import check_name, not_a_session
 from sessions.schemas import Topic
 from sessions.show import details
 from sessions.soundness import file_problems
@@ -53,17 +53,17 @@ def verify_session(path: Path) -> Verdict:
 
     Raises `InputError` where it is neither, was renamed, or holds links.
     """
+    check_name(path)
     if path.is_file():
         return _verify_file(path, path.name)
     if not path.is_dir():
         raise InputError(path, "no such session: give a session's folder or its .mcap file")
-    check_name(path)
     name = path.resolve().name
     collected = (path / JOURNAL_NAME).is_file() or any(SEGMENT_NAME.fullmatch(p.name) for p in path.glob("*.mcap*"))
     if not collected:
         final = path / f"{name}.mcap"
         if not final.is_file():
-            raise InputError(path, f"holds neither {JOURNAL_NAME} nor {final.name}: not a session")
+            raise not_a_session(path)
         return _verify_file(final, name)
     return _verify_folder(path.resolve())
 

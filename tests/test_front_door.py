@@ -62,6 +62,19 @@ def test_nobody_imports_the_front_door_and_nobody_outside_it_the_loopback_rig(pa
         (("sessions", "import", "nowhere", "--csv", "no.csv"), "nowhere: is not a folder"),
         (("sessions", "list", "nowhere"), "nowhere: is not a folder"),
         (("sim", "--write-rig", "no/rig.toml"), "brushloop: no/rig.toml: there is no folder no\n"),
+        (("sim", "--rate", "nan"), "brushloop: --rate is 'nan', allowed: a number from 0.01 to 1000\n"),
+        (("sim", "--rate", "fast"), "brushloop: --rate is 'fast', allowed: a number from 0.01 to 1000\n"),
+        (
+            (
+                "sim",
+                "--idle-exit=-1",
+            ),
+            "brushloop: --idle-exit is '-1', allowed: a number from 0\n",
+        ),
+        (
+            ("write", "plan", "字", "--cell-mm", "1e300"),
+            "brushloop: --cell-mm is '1e300', allowed: a number from 10 to 500\n",
+        ),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:

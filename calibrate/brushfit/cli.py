@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calibrate.scales import DRAG_MM_PER_PX, MM_PER_PX
+from sessions.terminal import say
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -35,8 +36,6 @@ def fit(
             raise typer.BadParameter("--correction and --reference are for presses, not for --drags")
         _fit_drags(session, mm_per_px or DRAG_MM_PER_PX, calibration)
         return
-    import rich
-    from rich.markup import escape
 
     from calibrate.artefact import load_artefact
     from calibrate.brushfit.artefact import BrushFit
@@ -51,15 +50,13 @@ def fit(
     captures = read_presses(session, view, calibration)
     fitted = fit_session(captures, view)
     path = save(fitted, Recording(session).path.parent)
-    rich.print(*_tables(captures, fitted), sep="\n")
+    say(*_tables(captures, fitted))
     if correction:
-        rich.print("\n".join(_correction(corrected(captures, fitted.artefact, before))))
-    rich.print(f"Fit: {escape(str(path))}")
+        say(*_correction(corrected(captures, fitted.artefact, before)))
+    say(f"Fit: {path}")
 
 
 def _fit_drags(session: Path, mm_per_px: float, calibration: Path | None) -> None:
-    import rich
-    from rich.markup import escape
     from rich.table import Table
 
     from calibrate.brushfit.drag_captures import read_drags
@@ -70,28 +67,27 @@ def _fit_drags(session: Path, mm_per_px: float, calibration: Path | None) -> Non
     drawn = read_drags(session, mm_per_px, calibration)
     fitted = fit_drawn(drawn)
     artefact = fitted.artefact
-    rich.print(
-        f"{escape(source_note(drawn.header.source))}; {artefact.strokes} dragged strokes in {artefact.images} images; "
+    say(
+        f"{source_note(drawn.header.source)}; {artefact.strokes} dragged strokes in {artefact.images} images; "
         f"condition number {artefact.condition:.3g}"
     )
     for name, why in drawn.refused:
-        rich.print(f"left out: {escape(name)}: {escape(why)}")
+        say(f"left out: {name}: {why}")
     out = Table("parameter", "fitted", "95 %", title="drag model, mm")
     for name, found in artefact.parameters.items():
         out.add_row(name, f"{found.value:.3f}", f"{found.low:.3f} to {found.high:.3f}")
-    rich.print(out)
+    say(out)
     if artefact.held_out:
         out = Table("model", "n", "CSIM", "IoU", title="a fifth left out in turn, where the command put it, percent")
         for name, score in artefact.held_out.items():
             out.add_row(name, str(score.images), f"{score.csim_percent:.2f}", f"{score.iou_percent:.2f}")
-        rich.print(out)
+        say(out)
     else:
-        rich.print("Fewer than five images: none can be left out.")
-    rich.print(f"Fit: {escape(str(save(fitted, Recording(session).path.parent)))}")
+        say("Fewer than five images: none can be left out.")
+    say(f"Fit: {save(fitted, Recording(session).path.parent)}")
 
 
 def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
-    from rich.markup import escape
     from rich.table import Table
 
     from calibrate.brushfit.fit import WORST_CONDITION
@@ -100,9 +96,9 @@ def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
     from model.fitted import PARAMETERS
 
     artefact = fitted.artefact
-    yield f"{escape(source_note(captures.header.source))}; {len(captures.strokes)} presses fitted"
+    yield f"{source_note(captures.header.source)}; {len(captures.strokes)} presses fitted"
     for name, why in captures.refused:
-        yield f"left out: {escape(name)}: {escape(why)}"
+        yield f"left out: {name}: {why}"
     out = Table("parameter", "unit", "published", "fitted", "95 %", title="brush")
     for name, parameter in zip(NAMES, PARAMETERS, strict=True):
         found = artefact.parameters[name]

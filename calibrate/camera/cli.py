@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sessions.terminal import say
+
 if TYPE_CHECKING:
     from calibrate.camera.boards import Board
 
@@ -44,7 +46,7 @@ def board(
     from calibrate.camera.pdf import describe, write_pdf
 
     made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
-    typer.echo(f"{write_pdf(made, out, page)}: {describe(made)}")
+    say(f"{write_pdf(made, out, page)}: {describe(made)}")
 
 
 @app.command()
@@ -85,22 +87,22 @@ def intrinsics(
     fitted = fit_lens(seen, limit_px, unusable, one_camera=one_camera)
     file = lens_file(fitted, describe(made), digests, limit_px, f"brushloop {version('brushloop')}")
     for name, residual in file.residuals_px.items():
-        typer.echo(f"{name}: {residual:.3f} px, slanted by {fitted.slants_deg[name]:.0f} deg")
+        say(f"{name}: {residual:.3f} px, slanted by {fitted.slants_deg[name]:.0f} deg")
     for name, residual in file.dropped.items():
-        typer.echo(f"{name}: {residual:.3f} px, dropped: it does not fit the others")
+        say(f"{name}: {residual:.3f} px, dropped: it does not fit the others")
     for name, why in file.unusable.items():
-        typer.echo(f"{name}: {why}")
+        say(f"{name}: {why}")
     fx, fy, cx, cy = file.matrix
     reach = fitted.focal_reach_px
     across, along = ("", "") if reach is None else (f" +- {reach[0]:.2f}", f" +- {reach[1]:.2f}")
-    typer.echo(
+    say(
         f"fx {fx:.2f}{across} px, fy {fy:.2f}{along} px{'' if reach is None else ' (95 %)'}, "
-        f"centre {cx:.1f}, {cy:.1f} px, k1 {file.distortion[0]:+.4f}\n"
-        f"residual {file.rms_px:.3f} px over {len(file.residuals_px)} views, the board held in {fitted.ways} ways"
+        f"centre {cx:.1f}, {cy:.1f} px, k1 {file.distortion[0]:+.4f}",
+        f"residual {file.rms_px:.3f} px over {len(file.residuals_px)} views, the board held in {fitted.ways} ways",
     )
     for line in (*(f"warning: {w}" for w in file.warnings), *(f"to do: {g}" for g in file.guidance)):
-        typer.echo(line)
-    typer.echo(str(file.save(out)))
+        say(line)
+    say(str(file.save(out)))
 
 
 @app.command()
@@ -124,12 +126,12 @@ def check(
     assert isinstance(spec, BoardSpec)
     plane, warnings = preflight(read_gray(photograph), spec, load_artefact(lens, LensFile) if lens else None, limit_px)
     low, high = plane.interval_mm_per_px
-    typer.echo(
+    say(
         f"pix2len {plane.mm_per_px:.5f} mm/px (95 %: {low:.5f} to {high:.5f}), residual {plane.rms_px:.3f} px over "
         f"{plane.corners} corners, k1 {float(plane.lens.distortion[0]):+.4f}"
     )
     for warning in warnings:
-        typer.echo(f"warning: {warning}")
+        say(f"warning: {warning}")
     if warnings:
         raise typer.Exit(5)
 
@@ -150,15 +152,15 @@ def drift(
     for seen in found.seen:
         low, high = (seen.mm_per_px * (1.0 + side * seen.reach) for side in (-1.0, 1.0))
         after_s = (seen.t_ns - found.seen[0].t_ns) / 1e9
-        typer.echo(
+        say(
             f"{after_s:8.0f} s: {seen.mm_per_px:.5f} mm/px (95 %: {low:.5f} to {high:.5f}), "
             f"residual {seen.plane.rms_px:.3f} px, board moved {seen.moved_px:.2f} px"
         )
     if found.trend is not None:
         low, high = found.trend.interval
-        typer.echo(f"trend {100 * found.trend.slope:+.4f} % per hour (95 %: {100 * low:+.4f} to {100 * high:+.4f})")
+        say(f"trend {100 * found.trend.slope:+.4f} % per hour (95 %: {100 * low:+.4f} to {100 * high:+.4f})")
     for warning in found.warnings:
-        typer.echo(f"warning: {warning}")
+        say(f"warning: {warning}")
     if found.warnings:
         raise typer.Exit(5)
 
@@ -219,26 +221,27 @@ def register(
     fitted = fit(points.names, points.robot_mm, plane.to_paper(points.image_px), model.value)
     for name, (dx, dy) in zip(fitted.names, fitted.residuals_mm.tolist(), strict=True):
         out_of_it = ", dropped: it does not fit the others" if name in fitted.dropped else ""
-        typer.echo(f"{name}: {dx:+.3f}, {dy:+.3f} mm{out_of_it}")
+        say(f"{name}: {dx:+.3f}, {dy:+.3f} mm{out_of_it}")
     seen = hashlib.sha256(read_bounded(photograph, MAX_PHOTOGRAPH_BYTES)).hexdigest()
     through = known.source if known else "no lens"
     source = f"{table.name}, sha256 {points.sha256}; {photograph.name}, sha256 {seen}; {through}"
     file = registration_file(fitted, spec.origin_mm, source, f"brushloop {version('brushloop')}")
     for flag in flags:
-        typer.echo(f"warning: {flag}")
-    typer.echo(
+        say(f"warning: {flag}")
+    say(
         f"scale {file.scale:.5f}, residual {file.rms_mm:.3f} mm, "
-        f"{file.left_out_rms_mm:.3f} mm for a point that was left out\n{file.save(out)}"
+        f"{file.left_out_rms_mm:.3f} mm for a point that was left out",
+        str(file.save(out)),
     )
     if model is not Kind.RIGID:
-        typer.echo("no lines for rig.toml, which knows a place and a turn, and no scale: use --model rigid")
+        say("no lines for rig.toml, which knows a place and a turn, and no scale: use --model rigid")
         return
     lines = PaperLines(fitted.origin_mm, fitted.yaw_deg)
     if target is not None:
-        typer.echo(f"{target.path}: written; as it was before: {target.write(lines)}")
+        say(f"{target.path}: written; as it was before: {target.write(lines)}")
     else:
-        typer.echo("for [paper] of rig.toml:")
-    typer.echo(lines.toml)
+        say("for [paper] of rig.toml:")
+    say(*lines.toml.splitlines())
 
 
 def _board(checkerboard: str, charuco: str, square_mm: float, marker_mm: float, dictionary: str) -> Board:

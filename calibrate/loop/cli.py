@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from calibrate.scales import MM_PER_PX
+from sessions.terminal import say
 
 
 def compare(
@@ -22,15 +23,14 @@ def compare(
     """Compare re-pressed strokes with their originals, beside the brush's own repeatability."""
     import sys
 
-    import rich
-    from rich.markup import escape
-
     from calibrate.field import Field
+    from calibrate.files import check_folder
     from calibrate.loop.compare import compare_sessions
     from calibrate.loop.report import PICTURE, summary, write_loop
 
+    check_folder(out)
     closed = compare_sessions(original, again, fit, Field(mm_per_px=mm_per_px))
     report = write_loop(closed, out, " ".join(["brushloop", *sys.argv[1:]]))
     for line in summary(closed):
-        rich.print(escape(line))
-    rich.print(escape(f"Picture: {out / PICTURE}\nReport:  {report}"))
+        say(line)
+    say(f"Picture: {out / PICTURE}", f"Report:  {report}")

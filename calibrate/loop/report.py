@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import csv
 import io
 import platform
 from collections.abc import Iterator
@@ -22,6 +21,7 @@ from calibrate.pages import render
 from calibrate.pictures import difference, ink
 from calibrate.similarity import SSIM_SETTINGS
 from calibrate.wording import source_note
+from sessions.cells import CsvWriter
 
 HEADLINE = (Alignment.MM, Tone.BINARY)
 PICTURE, PAGE, TABLE = "loop.png", "loop.html", "loop.csv"
@@ -94,7 +94,7 @@ def summary(closed: Closed) -> Iterator[str]:
 def loop_csv(scores: list[PairScore], source: str) -> str:
     """A row for every contestant against every original."""
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
+    writer = CsvWriter(out)
     columns = ["original", "again", "height_mm", "tilt_deg", "what", "alignment", "tone", "csim", "ssim", "source"]
     writer.writerow(columns)
     for s in scores:

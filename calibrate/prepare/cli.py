@@ -9,6 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from calibrate.cli import calibrate
+from sessions.terminal import say
 
 SESSION = "session"
 
@@ -38,7 +39,7 @@ def show(
     from calibrate.compare import described, read_any
 
     path, made = read_any(artefact)
-    typer.echo("\n".join([str(path), *described(made)]))
+    say(str(path), *described(made))
 
 
 @app.command()
@@ -50,7 +51,7 @@ def diff(
     from calibrate.compare import differences, read_any
 
     lines = differences(read_any(one)[1], read_any(other)[1])
-    typer.echo("\n".join(lines) if lines else "they are equal")
+    say(*(lines or ["they are equal"]))
 
 
 @app.command("apply")
@@ -65,8 +66,8 @@ def apply_to(
 
     path = apply_calibration(calibration, session, force=force)
     if label := load_artefact(path, Calibration).label:
-        typer.echo(f"warning: {label}")
-    typer.echo(str(path))
+        say(f"warning: {label}")
+    say(str(path))
 
 
 @app.command()
@@ -88,7 +89,7 @@ def preprocess(
     else:
         trace = show_stroke(capture, stroke, out, lens=lens)
     for name, value in trace.log.items():
-        typer.echo(f"{name} {value:.6g}")
+        say(f"{name} {value:.6g}")
     for flag in trace.flags:
-        typer.echo(f"flag: {flag}")
-    typer.echo(str(out))
+        say(f"flag: {flag}")
+    say(str(out))

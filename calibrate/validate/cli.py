@@ -9,6 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from calibrate.scales import MM_PER_PX
+from sessions.terminal import say
 
 if TYPE_CHECKING:
     from calibrate.validate.diff import Difference
@@ -64,9 +65,6 @@ def validate(
     """Compare every model with every captured stroke; the same command goes on where it was stopped."""
     import sys
 
-    import rich
-    from rich.markup import escape
-
     from calibrate.field import Field
     from calibrate.terminal import summary as drag_summary
     from calibrate.validate.beside import Given
@@ -96,15 +94,15 @@ def validate(
     with _shown() as progress:
         made = run(request, progress)
     if json and made.report is not None:
-        typer.echo(made.report.to_json(), nl=False)
+        say(*made.report.to_json().rstrip("\n").split("\n"))
     else:
         for drags in made.drags:
-            rich.print(*drag_summary(drags), sep="\n")
+            say(*drag_summary(drags))
         if made.report is not None:
-            rich.print(*summary(made.report), sep="\n")
+            say(*summary(made.report))
         for note in made.notes:
-            rich.print(escape(note))
-        rich.print(f"Report: {escape(str(made.folder / 'report.html'))}")
+            say(note)
+        say(f"Report: {made.folder / 'report.html'}")
     check(made, request)
 
 
@@ -124,7 +122,7 @@ def diff(
 
         changes = [asdict(change) | {"verdict": change.verdict} for change in found.changes]
         said = {"paired_by": found.paired_by, "source": found.before.label, "changes": changes}
-        typer.echo(dumps(said, indent=1, ensure_ascii=False))
+        say(*dumps(said, indent=1, ensure_ascii=False).split("\n"))
         return
     _print_difference(found)
 
@@ -138,8 +136,6 @@ def captures(
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
 ) -> None:
     """Write captured presses as `brushloop train tune` reads them."""
-    import rich
-    from rich.markup import escape
 
     from calibrate.errors import CalibrationError
     from calibrate.files import check_target
@@ -158,27 +154,25 @@ def captures(
     laid = lay_captures(opened, generator)
     count = write_captures(laid, out, cells)
     for name, why in laid.left_out:
-        rich.print(f"left out: {escape(name)}: {escape(why)}")
+        say(f"left out: {name}: {why}")
     if cells:
-        rich.print(f"left out, as asked: {len(laid.cells) - count} presses of {len(cells)} cells")
-    rich.print(f"{count} presses ({escape(laid.source)}): {escape(str(out))}")
+        say(f"left out, as asked: {len(laid.cells) - count} presses of {len(cells)} cells")
+    say(f"{count} presses ({laid.source}): {out}")
 
 
 def _print_difference(found: Difference) -> None:
-    import rich
-    from rich.markup import escape
     from rich.table import Table
 
     from calibrate.validate.diff import sentences
 
-    rich.print(*(escape(sentence) for sentence in sentences(found)), sep="\n")
+    say(*sentences(found))
     title = f"after minus before, points of percent ({found.before.label})"
-    out = Table("model", "images", "", "before", "after", "change", "95 %", "p", "", title=escape(title))
+    out = Table("model", "images", "", "before", "after", "change", "95 %", "p", "", title=title)
     for change in found.changes:
         name, alignment, tone, measure = change.series
         span = change.test.interval
         out.add_row(
-            escape(name),
+            name,
             f"{alignment}, {tone}",
             measure.upper(),
             f"{change.before:.2f}",
@@ -188,18 +182,22 @@ def _print_difference(found: Difference) -> None:
             f"{change.p_holm:.3f}",
             change.verdict,
         )
-    rich.print(out)
+    say(out)
 
 
 class _shown:  # noqa: N801 - used as a function
     """Progress on stderr: a bar on a terminal, a line a tenth elsewhere."""
 
     def __enter__(self) -> Progress:
-        from rich.console import Console
+        from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
         from rich.progress import Progress as Bar
 
-        self._console = Console(stderr=True)
-        self._bar = Bar(console=self._console, transient=True) if self._console.is_terminal else None
+        from sessions.console import PlainConsole
+
+        self._console = PlainConsole(stderr=True)
+        words = TextColumn("{task.description}", markup=False)
+        columns = (words, BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+        self._bar = Bar(*columns, console=self._console, transient=True) if self._console.is_terminal else None
         self._tasks: dict[str, Any] = {}
         if self._bar is not None:
             self._bar.start()
@@ -218,4 +216,4 @@ class _shown:  # noqa: N801 - used as a function
         tenth = done * MUCH // max(total, 1)
         if tenth > self._tasks.get(what, 0):
             self._tasks[what] = tenth
-            typer.echo(f"{what}: {done} of {total}", err=True)
+            say(f"{what}: {done} of {total}", err=True)

@@ -18,6 +18,7 @@ import numpy as np
 from calibrate.errors import CalibrationError
 from calibrate.validate.report import Report, load_report
 from calibrate.validate.stats import Paired, holm, paired
+from sessions.cells import as_text
 
 SIGNIFICANT = 0.05
 MEASURES = ("csim", "ssim")
@@ -119,9 +120,8 @@ def read_scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, 
     sums: dict[Series, dict[tuple[str, ...], tuple[float, int]]] = {}
     with table.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
-            key = (
-                (recordings[row["session_id"]], row["stroke_id"]) if by_stroke else (row["height_mm"], row["tilt_deg"])
-            )
+            stroke = (recordings[row["session_id"]], as_text(row["stroke_id"]))
+            key = stroke if by_stroke else (row["height_mm"], row["tilt_deg"])
             for measure in MEASURES:
                 series = sums.setdefault((row["model"], row["alignment"], row["tone"], measure), {})
                 total, count = series.get(key, (0.0, 0))

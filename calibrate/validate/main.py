@@ -13,7 +13,7 @@ from filelock import FileLock, Timeout
 from calibrate.drags import validate_drags
 from calibrate.errors import CalibrationError
 from calibrate.field import Field
-from calibrate.files import write_whole
+from calibrate.files import check_folder, write_whole
 from calibrate.preprocess import Params
 from calibrate.validate import beside as extra
 from calibrate.validate.ablation import similarity_by_strokes
@@ -81,6 +81,7 @@ def validate(request: Request, progress: Progress) -> Made:
         raise CalibrationError("--tune", "needs a --generator to tune")
     curves = [read_curve(text) for text in request.curves]
     folder = _folder(request)
+    check_folder(folder)
     made_before = folder.exists()
     try:
         sessions = [open_session(p, folder / WORK, request.calibration, request.fit) for p in request.places]

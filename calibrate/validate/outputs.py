@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import importlib
 import io
@@ -17,6 +16,7 @@ from calibrate.field import KEYS
 from calibrate.loop.scores import AGAIN
 from calibrate.validate.report import Report, Stat
 from calibrate.validate.run import REPEATED, Outcome
+from sessions.cells import CsvWriter
 
 COLUMNS = ("session_id", "stroke_id", "height_mm", "tilt_deg", "model", "alignment", "tone", "csim", "ssim", "source")
 GROUP = 2000
@@ -65,7 +65,7 @@ def write_csv(outcome: Outcome, path: Path) -> str:
 
 def _lines(outcome: Outcome) -> Iterator[str]:
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
+    writer = CsvWriter(out)
     writer.writerow(COLUMNS)
     for row in score_rows(outcome):
         writer.writerow([f"{v:.8f}" if k in (7, 8) else v for k, v in enumerate(row)])
@@ -146,7 +146,7 @@ def table_3_csv(report: Report) -> str:
 def csv_of(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """A small table as text."""
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
+    writer = CsvWriter(out)
     writer.writerow(head)
     writer.writerows(rows)
     return out.getvalue()

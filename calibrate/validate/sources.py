@@ -11,6 +11,7 @@ import importlib
 import os
 import re
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -29,6 +30,7 @@ from sessions.writer import file_sha256
 
 PIECE = 1024 * 1024
 MAX_DOWNLOAD_BYTES = 64 * 1024**3
+MAX_SUM_BYTES = 64 * 1024
 MAX_ARTEFACTS = 64
 MAX_ARTEFACT_BYTES = 4 * 1024 * 1024
 FORBIDDEN = 403
@@ -144,8 +146,7 @@ def _backend_errors() -> tuple[type[Exception], ...]:
 def _expected(system: Any, where: str, address: str, fragment: str) -> str:
     told = fragment
     if not told and system.exists(f"{where}.sha256"):
-        with system.open(f"{where}.sha256", "rb") as file:
-            told = file.read(4096).decode("utf-8", "replace")
+        told = b"".join(_pieces(system, f"{where}.sha256", MAX_SUM_BYTES, address)).decode("utf-8", "replace")
     found = SHA256.search(told)
     if found is None:
         what = "tells no checksum: add #sha256=... to the URL, or put it into a file beside, <recording>.mcap.sha256"
@@ -156,13 +157,10 @@ def _expected(system: Any, where: str, address: str, fragment: str) -> str:
 def _copy(system: Any, where: str, target: Path, expected: str, address: str) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     part = target.with_name(target.name + ".part")
-    digest, size = hashlib.sha256(), 0
+    digest = hashlib.sha256()
     try:
-        with system.open(where, "rb") as source, part.open("wb") as out:
-            while piece := source.read(PIECE):
-                size += len(piece)
-                if size > MAX_DOWNLOAD_BYTES:
-                    raise CalibrationError(address, f"is larger than {MAX_DOWNLOAD_BYTES} bytes")
+        with part.open("wb") as out:
+            for piece in _pieces(system, where, MAX_DOWNLOAD_BYTES, address):
                 digest.update(piece)
                 out.write(piece)
         if digest.hexdigest() != expected:
@@ -170,6 +168,19 @@ def _copy(system: Any, where: str, target: Path, expected: str, address: str) ->
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
+
+
+def _pieces(system: Any, where: str, most_bytes: int, address: str) -> Iterator[bytes]:
+    """A remote file from its beginning to its end. Raises `CalibrationError` beyond so many bytes."""
+    # By blocks, fsspec asks a web server for ranges, and there are servers that have none.
+    options = {"block_size": 0} if "http" in system.protocol else {}
+    size = 0
+    with system.open(where, "rb", **options) as file:
+        while piece := file.read(PIECE):
+            size += len(piece)
+            if size > most_bytes:
+                raise CalibrationError(address, f"is larger than {most_bytes} bytes")
+            yield piece
 
 
 def _copy_artefacts(system: Any, there: str, here: Path) -> None:
@@ -200,10 +211,9 @@ def _copy_artefacts(system: Any, there: str, here: Path) -> None:
 
 
 def _read(system: Any, name: str, most_bytes: int) -> bytes | None:
-    """The beginning of a remote file; None where there is none."""
+    """A remote file; None where there is none. Raises `CalibrationError` beyond so many bytes."""
     try:
-        with system.open(name, "rb") as file:
-            return bytes(file.read(most_bytes))
+        return b"".join(_pieces(system, name, most_bytes, name))
     except (FileNotFoundError, PermissionError):
         return None
     except _backend_errors() as error:

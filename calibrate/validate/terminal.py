@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 
-from rich.markup import escape
 from rich.table import Column, Table
 
 from calibrate.field import Alignment, Tone
@@ -20,17 +19,17 @@ SHORT = {"fitted, held-out cells": ", held out", "fitted, in sample": ", in samp
 def summary(report: Report) -> Iterator[Table | str]:
     """Renderables for the terminal."""
     names = ", ".join(session.session_id for session in report.sessions[:4])
-    yield escape(f"{names}: {source_note(report.source)}")
-    yield escape(words.measured(report))
+    yield f"{names}: {source_note(report.source)}"
+    yield words.measured(report)
     for alignment in (Alignment.SIZE_NORMALISED, Alignment.MM):
         yield _scores(report, alignment)
     for one in tables.table_3(report):
         yield from _character(report, one)
-    yield from (escape(sentence) for sentence in words.findings(report))
+    yield from words.findings(report)
     for point in words.trust(report):
-        yield escape(f"{'•' if point.good is None else '✓' if point.good else '✗'} {point.text}")
+        yield f"{'•' if point.good is None else '✓' if point.good else '✗'} {point.text}"
     for one in report.refused[:MOST_REFUSED]:
-        yield escape(f"not used: {one.session_id} {one.stroke_id}: {one.why}")
+        yield f"not used: {one.session_id} {one.stroke_id}: {one.why}"
     if len(report.refused) > MOST_REFUSED:
         yield f"and {len(report.refused) - MOST_REFUSED} more, in the report"
 
@@ -40,13 +39,13 @@ def _scores(report: Report, alignment: Alignment) -> Table:
     beside = alignment is Alignment.SIZE_NORMALISED
     columns = ["model", "n", "CSIM max", "min", "avg", "SSIM max", "min", "avg", *(["paper's avg"] if beside else [])]
     title = f"{alignment}, binary, ink = 1, percent ({report.label})"
-    out = Table(*columns, title=escape(title))
+    out = Table(*columns, title=title)
     others = tables.robot_writing(report, alignment, Tone.BINARY)
     for row in (*tables.table_2(report, alignment, Tone.BINARY), *others):
         if row.ours is None:
             continue
         told = f"{row.paper[2]:.2f} / {row.paper[5]:.2f}" if row.paper is not None else ""
-        cells = [escape(row.label + SHORT.get(row.basis, "")), str(row.n), *(f"{v:.2f}" for v in row.ours)]
+        cells = [row.label + SHORT.get(row.basis, ""), str(row.n), *(f"{v:.2f}" for v in row.ours)]
         out.add_row(*cells, *([told] if beside else []))
     return out
 
@@ -58,10 +57,10 @@ def _character(report: Report, one: tables.Written) -> Iterator[Table]:
             beside = alignment is Alignment.SIZE_NORMALISED
             columns = ["n", "CSIM\nmax", "min", "avg", "SSIM\nmax", "min", "avg", *(["paper's avg"] if beside else [])]
             title = f"Table 3: {one.character}, {alignment}, binary, {polarity}, percent ({report.label})"
-            out = Table(Column("", min_width=len("simulated")), *columns, title=escape(title))
+            out = Table(Column("", min_width=len("simulated")), *columns, title=title)
             for row in group:
                 assert row.ours is not None, "rows of Table 3 are rows of ours"
                 told = f"{row.paper[2]:.2f} / {row.paper[5]:.2f}" if row.paper is not None else ""
-                cells = [escape(row.label), str(row.n), *(f"{value:.2f}" for value in row.ours)]
+                cells = [row.label, str(row.n), *(f"{value:.2f}" for value in row.ours)]
                 out.add_row(*cells, *([told] if beside else []))
             yield out

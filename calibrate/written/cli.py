@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from sessions.terminal import say
+
 
 def compare(
     session: Annotated[Path, typer.Argument(help="The session in which a plan was written.")],
@@ -21,16 +23,15 @@ def compare(
     """Compare written characters with the simulated image and with the reference, in both polarities (Table 3)."""
     import sys
 
-    import rich
-    from rich.markup import escape
-
     from calibrate.errors import CalibrationError
     from calibrate.field import Image
+    from calibrate.files import check_folder
     from calibrate.written.compare import compare_written
     from calibrate.written.images import read_reference
     from calibrate.written.record import load_plan
     from calibrate.written.report import PICTURE, summary, write_written
 
+    check_folder(out)
     references: dict[str, tuple[str, Image]] = {}
     for given in reference or []:
         name, equals, path = given.partition("=")
@@ -40,8 +41,8 @@ def compare(
     written = compare_written(session, load_plan(plan), references)
     report = write_written(written, out, " ".join(["brushloop", *sys.argv[1:]]))
     for line in summary(written):
-        rich.print(escape(line))
-    rich.print(escape(f"Picture: {out / PICTURE}\nReport:  {report}"))
+        say(line)
+    say(f"Picture: {out / PICTURE}", f"Report:  {report}")
 
 
 def learn(
@@ -52,17 +53,16 @@ def learn(
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written next.")] = 1,
 ) -> None:
     """Move a plan's trajectories by what their ink was off, for the next writing."""
-    import rich
-    from rich.markup import escape
-
+    from calibrate.files import check_folder
     from calibrate.write_plan_files import write_record
     from calibrate.written.compare import compare_written
     from calibrate.written.learn import learned
     from calibrate.written.record import load_plan
 
+    check_folder(out)
     made, lessons = learned(compare_written(session, load_plan(plan), {}), gain)
     out.mkdir(parents=True, exist_ok=True)
     protocol = write_record(made, repeats, out)
     for one in lessons:
-        rich.print(escape(f"{one.name}: was off by {one.sideways_mm:.2f} mm in place, {one.depth_mm:.2f} mm in depth"))
-    rich.print(escape(str(protocol)))
+        say(f"{one.name}: was off by {one.sideways_mm:.2f} mm in place, {one.depth_mm:.2f} mm in depth")
+    say(str(protocol))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import csv
 import hashlib
 import io
 import platform
@@ -23,6 +22,7 @@ from calibrate.written.picture import draw, ranked
 from calibrate.written.scores import PAIRS, WrittenScore
 from calibrate.written.table import FILE as NUMBERS
 from calibrate.written.table import PICTURE, Table3Row, WrittenRecord
+from sessions.cells import CsvWriter
 
 PAGE, TABLE = "written.html", "written.csv"
 
@@ -67,7 +67,7 @@ def summary(written: Written) -> Iterator[str]:
 def written_csv(scores: list[WrittenScore], source: str) -> str:
     """A row a comparison."""
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
+    writer = CsvWriter(out)
     writer.writerow(["character", "stroke_id", "pair", "alignment", "tone", "polarity", "csim", "ssim", "source"])
     for s in scores:
         numbers = (f"{s.csim:.6f}", f"{s.ssim:.6f}", source)

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from sessions.terminal import say
+
 
 def loop(
     session: Annotated[Path, typer.Argument(help="The session whose presses are recovered and made again.")],
@@ -29,6 +31,6 @@ def loop(
     options += [] if tui is None else ["--tui" if tui else "--no-tui"]
     folder = out if out is not None else Recording(session).path.parent / "loop"
     try:
-        run_loop(Wanted(session, config, folder, fit, repeats, seed, tuple(options)), lambda line: typer.echo(line))
+        run_loop(Wanted(session, config, folder, fit, repeats, seed, tuple(options)), say)
     except CommandFailed as error:
         raise typer.Exit(error.exit_code) from None  # the command has said why

@@ -95,7 +95,8 @@ def _check_cells(rig_path: Path, path: Path, rig: RigConfig, protocol: ProtocolC
         try:
             triangle_in(sheet.cell(0), rig.self_check)
         except StepError as error:
-            raise ConfigError(rig_path, "self_check.legs_mm", str(error)) from None
+            told = f"{error}; `enabled = false` switches the self-check off, which --arm switches on"
+            raise ConfigError(rig_path, "self_check.legs_mm", told) from None
     x_mm, y_mm = rig.paper.touch_point_mm
     for cell in map(sheet.cell, range(sheet.capacity)):
         for mark_x, mark_y in _marks(protocol, cell):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 
 from rich.console import Group
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -19,7 +18,7 @@ MOST_ROWS = 40
 def plan_table(plan: Plan) -> Group:
     """What it takes, what is pressed where, and what should be looked at."""
     totals = Table(title=f"plan of {plan.kind}", show_header=False)
-    changes = f", a fresh one before {escape(', '.join(plan.sheet_changes))}" if plan.sheet_changes else ""
+    changes = f", a fresh one before {', '.join(plan.sheet_changes)}" if plan.sheet_changes else ""
     totals.add_row("strokes", str(len(plan.placed)))
     totals.add_row("sheets", f"{plan.sheets} of {plan.cells_per_sheet} cells{changes}" if plan.placed else "no marks")
     totals.add_row("dips", str(plan.dips))

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from collect.config import RigConfig
+from collect.errors import StepError
 from collect.planning.ink import InkNeed, ink_need
 from collect.planning.marks import reach_of
 from collect.planning.moves import StepMoves
@@ -16,7 +17,8 @@ from collect.procedures import park_moves
 from collect.protocols.config import AdaptiveConfig, ProtocolConfig, ReplayConfig, WriteConfig
 from collect.protocols.plans import planned
 from collect.sheet import Cell, Sheet
-from collect.steps import StepKind
+from collect.steps import MARKING, StepKind
+from collect.touch.selfcheck import triangle_in
 from drivers.samples import Pose
 
 STROKES = frozenset({StepKind.PRESS, StepKind.DRAW})
@@ -134,6 +136,8 @@ def _warnings(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list
             f"the presses are chosen while they are made: this is the worst case, {protocol.most} presses; it stops "
             f"after {protocol.least_presses} at the earliest"
         )
+    if (told := _armed(config, protocol)) is not None:
+        warnings.append(told)
     over_mm, worst = max(_overhangs(config, protocol, sheet), default=(0.0, ""))
     if over_mm > 0.0:
         warnings.append(
@@ -141,6 +145,33 @@ def _warnings(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list
             "by the closed-form stroke model: marks may run into each other"
         )
     return warnings
+
+
+def _armed(config: RigConfig, protocol: ProtocolConfig) -> str | None:
+    """What the self-check, which `--arm` switches on, takes beyond this plan."""
+    if config.self_check.enabled is not None or not planned(protocol):
+        return None
+    armed = config.checking_itself(True)
+    try:
+        triangle_in(sheet_of(armed, protocol).cell(0), armed.self_check)
+    except StepError as error:
+        return f"with --arm the self-check comes first, and {error}: change [self_check] legs_mm, or enabled = false"
+    (before, _), (sheets, taken) = (_sheets(one, protocol) for one in (config, armed))
+    if sheets == before:
+        return None
+    cells = f"{taken} cells" if taken > 1 else "one cell"
+    return f"with --arm the self-check first takes {cells}: {sheets} sheets instead of {before} (`collect plan --arm`)"
+
+
+def _sheets(config: RigConfig, protocol: ProtocolConfig) -> tuple[int, int]:
+    """(sheets that are marked, cells of the first that the self-check takes)."""
+    sheets, taken = 1, 0
+    for walked in walk(config, protocol):
+        if walked.cell is not None and walked.step.kind in MARKING:
+            sheets = walked.sheet
+        if walked.step.kind is StepKind.SELF_CHECK:
+            taken = 1 + len(walked.more_cells)
+    return sheets, taken
 
 
 def _overhangs(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list[tuple[float, str]]:

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from collect.errors import ConfigError
 from collect.reading import read_text
+from sessions.cells import as_text
 
 MAX_TABLE_BYTES = 4 * 1024 * 1024
 MAX_COLUMNS = 100
@@ -40,7 +41,7 @@ def read_rows(
             if len(cells) != len(header):
                 raise ConfigError(path, f"line {lines.line_num}", f"{len(cells)} cells under {len(header)} columns")
             values = {
-                column: cell.strip()
+                column: as_text(cell.strip())
                 for column, cell in zip(header, cells, strict=True)
                 if column in row.model_fields and cell.strip()
             }

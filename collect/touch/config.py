@@ -121,7 +121,9 @@ class TouchConfig(Config):
 class SelfCheckConfig(Config):
     """Three marks at the corners of an uneven triangle, found by the camera, before a session."""
 
-    enabled: bool = False
+    enabled: bool | None = None
+    """Left out, it is on where real hardware may move (with `--arm`, or an arm that is not on this machine); a session
+    goes on as it was begun."""
     depth_mm: Annotated[float, Field(ge=0.5, le=10.0)] = 2.0
     legs_mm: tuple[Annotated[float, Field(ge=8.0, le=200.0)], Annotated[float, Field(ge=8.0, le=200.0)]] = (24.0, 15.0)
     """Along paper x and y from the corner of the triangle, on sheets without room for one over three cells; uneven, so

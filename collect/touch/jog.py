@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from collect.asking import Asker, Choice, Prompt
-from collect.errors import StepError
+from collect.errors import JogGivenUp, StepError
 from collect.touch.arm import TouchArm
 from collect.touch.config import JogTouchConfig
 from collect.touch.reach import Reach
@@ -58,14 +58,17 @@ async def touch_by_jog(
         z_mm = min(max(z_mm + step_mm, reach.lowest_z_mm), reach.start_z_mm)
 
 
-def asked(asker: Asker, config: JogTouchConfig) -> NextJog:
-    """Jogs that are asked for on the screen, one prompt a step. An asker that nobody watches raises `NeedsOperator`."""
+def asked(asker: Asker, config: JogTouchConfig, height: str = "the height") -> NextJog:
+    """Jogs that are asked for on the screen, one prompt a step. `height` names what is known without a jog.
+
+    An asker that nobody watches raises `NeedsOperator`; giving up raises `JogGivenUp`.
+    """
     small, middle, large = config.steps_mm
     keys = {"1": -large, "2": -middle, "3": -small, "8": small, "9": middle, "0": large}
     choices = (
         *(Choice(key, f"{'down' if step < 0 else 'up'} {abs(step):g} mm") for key, step in keys.items()),
         Choice("t", "the tip just touches"),
-        Choice("x", "give up: the height stays as it was"),
+        Choice("x", f"give up: {height} stays as it was"),
     )
 
     async def next_jog(at: Jogged) -> float | None:
@@ -77,7 +80,7 @@ def asked(asker: Asker, config: JogTouchConfig) -> NextJog:
             question += " This is the end of the travel: if nothing touches, give up, and mend touch_z_mm in rig.toml."
         key = await asker.ask(Prompt(question, choices, "x"))
         if key == "x":
-            raise StepError(f"the operator gave up at touch {at.number} of {at.of}")
+            raise JogGivenUp(at.number, at.of, height)
         return keys.get(key)
 
     return next_jog

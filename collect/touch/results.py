@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from dataclasses import dataclass
+from typing import Literal
 
 from collect.errors import StepError
 from collect.plane import PaperPlane, fit_plane
@@ -43,7 +44,8 @@ class PlaneResult:
     """The plane from which H is counted, and everything that it was made of."""
 
     plane: PaperPlane
-    method: Method
+    method: Method | Literal["kept"]
+    """`kept`: nothing was touched, the plane is the one that was known before."""
     points: tuple[PointTouches, ...]
     residuals_mm: tuple[float, ...]
     """Point less plane, in the order of the points; zeros where three points leave no freedom."""
@@ -86,6 +88,12 @@ def at_one_point(touches: list[Touch], config: TouchConfig, guide: PaperPlane | 
             f"span {span_mm:.3f} mm, limit {config.repeatability_mm:g} mm. Is the paper flat and the brush firm?"
         )
     return PointTouches(tuple(touches), span_mm)
+
+
+def kept(plane: PaperPlane, at_mm: tuple[float, float]) -> PlaneResult:
+    """The plane that was known before, for whoever gave up touching; told by its height at one point."""
+    point = PointTouches((Touch(*at_mm, plane.touch_z_mm(*at_mm)),), 0.0)
+    return PlaneResult(plane, "kept", (point,), (0.0,))
 
 
 def through(points: list[PointTouches], config: TouchConfig) -> PlaneResult:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from textual import events, work
-from textual.app import App, SystemCommand
+from textual.app import SystemCommand
 from textual.binding import Binding, BindingType
 from textual.screen import Screen
 
@@ -22,11 +22,12 @@ from collect.states import FINAL, State
 from collect.tui.ask import AskScreen
 from collect.tui.confirm import AT_WORK, AT_WORK_KEYS, NOT_AT_REST, NOT_PARKED, NOT_PARKED_KEYS, Confirm
 from collect.tui.help import HelpScreen
+from collect.tui.keys import CAN_PAUSE, CAN_RESUME
 from collect.tui.pictures import Pictures
-from collect.tui.run import CAN_PAUSE, CAN_RESUME, RunScreen
+from collect.tui.run import RunScreen
 from collect.tui.set_up import SetUpScreen
 from collect.tui.start import StartScreen
-from collect.tui.terminal import TerminalDriver
+from collect.tui.terminal import PlainApp, TerminalDriver
 from collect.tui.text import plain
 from collect.wishes import Wish
 from sessions.errors import SessionError
@@ -48,7 +49,7 @@ COMMANDS = (
 )
 
 
-class OperatorApp(App[None]):
+class OperatorApp(PlainApp):
     """One app for a whole day, or, handed an engine, for one run."""
 
     TITLE = "brushloop"

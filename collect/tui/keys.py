@@ -9,6 +9,8 @@ from textual.app import RenderResult
 from textual.content import Content
 from textual.widget import Widget
 
+from collect.states import FINAL, State
+
 Key = tuple[str, str]
 """The key and what it does."""
 GAP = 2
@@ -27,6 +29,19 @@ RUN_KEYS: tuple[Key, ...] = (
     ("b", "bad"),
     ("ctrl-p", "commands"),
 )
+
+
+CAN_PAUSE = frozenset({State.IDLE, State.RECOVERING, State.RUNNING})
+CAN_RESUME = frozenset({State.PAUSING, State.PAUSED})
+OVER_KEYS: tuple[Key, ...] = (("q", "leave"), ("v", "review"), ("?", "help"), ("tab", "pane"), ("ctrl-p", "commands"))
+
+
+def keys_in(state: State, keys: Sequence[Key]) -> tuple[Key, ...]:
+    """Those keys of a run that do something in this state, called by what they do."""
+    if state in FINAL:
+        return OVER_KEYS
+    space = "resume" if state in CAN_RESUME else "pause" if state in CAN_PAUSE else ""
+    return tuple((key, space if key == "space" else what) for key, what in keys if key != "space" or space)
 
 
 class KeyBar(Widget):

@@ -9,14 +9,9 @@ from textual.binding import Binding, BindingType
 from textual.screen import Screen
 
 from collect.snapshot import Snapshot
-from collect.states import FINAL, State
-from collect.tui.keys import RUN_KEYS, KeyBar
+from collect.tui.keys import RUN_KEYS, KeyBar, keys_in
 from collect.tui.pictures import Pictures
 from collect.tui.view import RunView
-
-CAN_PAUSE = frozenset({State.IDLE, State.RECOVERING, State.RUNNING})
-CAN_RESUME = frozenset({State.PAUSING, State.PAUSED})
-OVER_KEYS = (("q", "leave"), ("v", "review"), ("?", "help"), ("tab", "pane"), ("ctrl-p", "commands"))
 
 
 class RunScreen(Screen[None]):
@@ -46,11 +41,4 @@ class RunScreen(Screen[None]):
     def show(self, now: Snapshot) -> None:
         """Draw what differs."""
         self._view.show(now)
-        if now.state in FINAL:
-            self._keys.show(OVER_KEYS)
-        elif now.state in CAN_RESUME:
-            self._keys.show(tuple(("space", "resume") if key == "space" else (key, what) for key, what in RUN_KEYS))
-        elif now.state in CAN_PAUSE:
-            self._keys.show(RUN_KEYS)
-        else:
-            self._keys.show(tuple(key for key in RUN_KEYS if key[0] != "space"))
+        self._keys.show(keys_in(now.state, RUN_KEYS))

@@ -18,7 +18,7 @@ from collect.snapshot import EngineView, Snapshot
 from collect.steps import StepKind
 from collect.tui.ask import choices_content
 from collect.tui.facts import target_text
-from collect.tui.keys import STOP_KEY, KeyBar
+from collect.tui.keys import STOP_KEY, KeyBar, keys_in
 from collect.tui.line import Line
 from collect.tui.pictures import Pictures
 from collect.tui.text import SOFTWARE_STOP, one_line, plain, tip_text
@@ -36,7 +36,7 @@ SHARP_PX = 2.0
 FORCE_SCALE_N = 0.1
 """Full bar: a soft brush pushes with a few tens of mN."""
 BAR = 30
-KEYS = (STOP_KEY, ("space", "pause"), ("q", "leave"), ("?", "help"), ("ctrl-p", "commands"))
+KEYS = (STOP_KEY, ("space", "pause"), ("q", "leave"), ("?", "help"), ("ctrl-p", "commands"), ("tab", "camera"))
 
 
 class SetUpScreen(Screen[None]):
@@ -65,6 +65,7 @@ class SetUpScreen(Screen[None]):
         self._prompt: Prompt | None = None
         self._title, self._steps, self._found = Line("set-up-title"), Line("steps"), Line("found-text")
         self._live, self._question, self._note = Line("live"), Line("question-text"), Line("set-up-note")
+        self._keys = KeyBar(KEYS)
         self._camera = pictures.make("set-up-camera")
         self._with_camera = pictures.kind != "off"
 
@@ -82,7 +83,7 @@ class SetUpScreen(Screen[None]):
             box.can_focus = False
             yield self._question
         yield self._note
-        yield KeyBar((*KEYS, ("tab", "camera")))
+        yield self._keys
 
     def on_resize(self, event: events.Resize) -> None:
         """The camera beside the findings where there is room."""
@@ -113,6 +114,7 @@ class SetUpScreen(Screen[None]):
             question = Content.styled(plain(now.prompt.question), "bold")
             self._question.show(Content("\n").join((question, choices_content(now.prompt))))
         self._note.show(SOFTWARE_STOP)
+        self._keys.show(keys_in(now.state, KEYS))
 
     def on_key(self, event: events.Key) -> None:
         """An answer's key answers."""

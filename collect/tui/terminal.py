@@ -8,9 +8,16 @@ from __future__ import annotations
 
 import contextlib
 import io
+from collections.abc import Sequence
 from typing import TextIO
 
+from rich.segment import Segment
+from textual.app import App
+from textual.color import Color
 from textual.drivers.linux_driver import LinuxDriver
+from textual.filter import LineFilter
+
+from sessions.terminal import inert
 
 
 class TerminalDriver(LinuxDriver):
@@ -33,6 +40,25 @@ class TerminalDriver(LinuxDriver):
         if self._suspended:
             self._suspended = False
             super().resume_application_mode()
+
+
+class PlainApp(App[None]):
+    """An app on which no text acts on the terminal, whoever wrote it."""
+
+    def get_line_filters(self) -> Sequence[LineFilter]:
+        """Textual's, and one behind them."""
+        return [*super().get_line_filters(), PLAIN_LINES]
+
+
+class PlainLines(LineFilter):
+    """Takes out what a terminal acts on; textual's own controls stay."""
+
+    def apply(self, segments: list[Segment], background: Color) -> list[Segment]:
+        """See `LineFilter`."""
+        return [part if part.control else Segment(inert(part.text), part.style) for part in segments]
+
+
+PLAIN_LINES = PlainLines()
 
 
 class _Forgiving(io.StringIO):

@@ -20,6 +20,7 @@ from collect.tui.text import SHORT_STOP, SOFTWARE_STOP, one_line, plain
 from collect.tui.trace import plot
 
 OVER = "Over: q leaves"
+GOES_ON = "The same command goes on from here; this screen does not."
 STOP_SENT = "STOP SENT"
 WARNING = "warning: "
 NARROW_COLUMNS, TALL_ROWS = 110, 36
@@ -200,7 +201,8 @@ def _message_content(line: str) -> Content:
 def note_content(now: Snapshot) -> Content:
     """What was asked for by key and waits, and what the stop key is."""
     if now.state in FINAL:
-        return Content.assemble((f" {OVER} ", "bold reverse"), f"  {SOFTWARE_STOP}")
+        told = SOFTWARE_STOP if now.state is State.DONE or now.rest_unknown else GOES_ON
+        return Content.assemble((f" {OVER} ", "bold reverse"), f"  {told}")
     if now.state is State.STOPPING:
         return Content.styled(" not seen at rest yet: the red button, if it moves on ", "bold reverse")
     if now.wishes:

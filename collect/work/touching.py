@@ -16,7 +16,7 @@ from collect.touch.config import TouchConfig
 from collect.touch.jog import asked
 from collect.touch.measure import measure_plane
 from collect.touch.moves import visit_moves
-from collect.touch.results import PlaneResult
+from collect.touch.results import PlaneResult, kept
 from collect.touch.selfcheck import self_check, triangle_on
 from collect.touch.tap import ForceTap
 from collect.work.context import Bench, Job
@@ -32,12 +32,17 @@ async def zero_touch(job: Job) -> Result:
     await bench.inking.begin()
     if rig.force is not None and rig.config.force is not None:
         await rig.force.bias(rig.config.force.bias_s)
-    if "method" in job.step.params:
-        await _check(check_step, "", rig.config, bench.procedures.plane, job.step)
-    found = await _measured(job, touch_of(rig.config, job.step))
+    if job.step.params.get("method") == "kept":
+        found = kept(bench.procedures.plane, rig.config.paper.touch_point_mm)
+    else:
+        if "method" in job.step.params:
+            await _check(check_step, "", rig.config, bench.procedures.plane, job.step)
+        found = await _measured(job, touch_of(rig.config, job.step))
     await _check(check_poses, "over the paper as it was touched, ", rig.config, bench.protocol, found.plane)
     moved_mm = _moved_mm(found, bench.procedures.plane)
-    if found.method != "taught":
+    if found.method == "kept":
+        bench.progress.log(f"zero touch was given up: {_height(bench)} is kept", warning=True)
+    elif found.method != "taught":
         bench.progress.log(f"zero touch by {found.method}: the paper lies {moved_mm:+.2f} mm from where it was before")
     if job.step.params.get("between_strokes"):
         await _accepted(job, moved_mm)
@@ -121,13 +126,20 @@ async def _measured(job: Job, config: TouchConfig) -> PlaneResult:
     bench = job.bench
     tap = ForceTap()
     with job.guard.also(tap.take):
-        jog = asked(bench.asker, config.jog)
+        jog = asked(bench.asker, config.jog, _height(bench))
 
         def tell(words: str) -> None:
             bench.progress.doing(f"zero touch by {config.method}: {words}")
 
         measured = measure_plane(bench.rig, _Hands(job), config, tap=tap, next_jog=jog, tell=tell)
         return await job.guard.guarded(measured)
+
+
+def _height(bench: Bench) -> str:
+    """The height that is known without a measurement, in words."""
+    paper, plane = bench.rig.config.paper, bench.procedures.plane
+    how = "taught height" if plane == PaperPlane(paper.touch_z_mm) else "height that was measured before"
+    return f"the {how}, {plane.touch_z_mm(*paper.touch_point_mm):.2f} mm,"
 
 
 async def _check(check: Callable[..., None], where: str, *checked: object) -> None:

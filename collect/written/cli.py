@@ -8,6 +8,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from sessions.terminal import say
+
 CHARACTERS = "characters"
 
 
@@ -59,6 +61,6 @@ def write(
         tuple(options),
     )
     try:
-        Writing(wanted, lambda line: typer.echo(line)).run()
+        Writing(wanted, say).run()
     except CommandFailed as error:
         raise typer.Exit(error.exit_code) from None  # the command has said why

@@ -34,6 +34,13 @@ class Fault(StrEnum):
     LATE = "late"
 
 
+LIKELY = {
+    Fault.BLACK: "The picture is black: lens covered or light off? ",
+    Fault.SATURATED: "The picture is white: too much light, or exposed too long? ",
+}
+"""The cause of a fault that a person can see at the camera."""
+
+
 class FrameHealth:
     """Judges the frames of one camera in the order in which they arrive."""
 
@@ -73,6 +80,10 @@ class FrameHealth:
     def summary(self) -> str:
         """`3 black, 1 torn`, or empty."""
         return ", ".join(f"{count} {fault}" for fault, count in sorted(self.counts.items()))
+
+    def told(self, fault: Fault) -> str:
+        """What to look for now, where that is known, and how many frames of each kind were passed over."""
+        return f"{LIKELY.get(fault, '')}frames passed over: {self.summary()}"
 
     def _look(self, image: NDArray[np.uint8]) -> Fault | None:
         import numpy as np

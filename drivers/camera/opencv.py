@@ -154,7 +154,7 @@ class OpenCvCamera:
             fault = health.judge(image, arrival_ns)
             if fault is not None:
                 # Single ones happen; a second without a sound frame is worth a word.
-                self._tell_trouble(f"frames passed over: {health.summary()}", aloud=arrival_ns - sound_ns > LASTING_NS)
+                self._tell_trouble(health.told(fault), aloud=arrival_ns - sound_ns > LASTING_NS)
                 continue
             sound_ns = arrival_ns
             if health.repeated:

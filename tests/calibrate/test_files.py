@@ -28,6 +28,31 @@ def test_a_target_has_the_ending_of_what_is_written_and_is_not_what_is_read(tmp_
 @pytest.mark.parametrize(
     "words",
     [
+        ("write", "plan", "字", "--out", "taken/plan"),
+        ("write", "plan", "字", "--out", "taken"),
+        ("write", "compare", "s.mcap", "--plan", "p", "--out", "taken"),
+        ("write", "learn", "s.mcap", "--plan", "p", "--out", "taken"),
+        ("loop", "compare", "s.mcap", "s.mcap", "--out", "taken/loop"),
+        ("invert", "s.mcap", "--out", "taken/recovered.csv"),
+        ("validate", "s.mcap", "--out", "taken/report"),
+    ],
+)
+def test_where_it_is_to_be_written_is_looked_at_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken").write_text("a file")
+    with monkeypatch.context() as patch:
+        patch.setattr("calibrate.write_plan.plan", None)  # not called: it takes minutes
+        ran = CliRunner().invoke(app, [*words])
+    assert isinstance(ran.exception, CalibrationError)
+    assert str(ran.exception) == f"{tmp_path / 'taken'}: is a file; a folder is needed"
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
         ("invert", "{s}", "--out", "{s}"),
         ("validate", "captures", "{s}", "--generator", "g.safetensors", "--out", "{s}"),
         ("calibrate", "preprocess", "{s}", "--out", "{s}"),

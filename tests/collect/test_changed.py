@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 
 from collect.errors import ConfigError
 from collect.opening import Opening, find_resumable
+from collect.planning.limits import distinct_steps
+from collect.steps import StepKind
 from drivers.clock import HostClock
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml
@@ -29,13 +32,18 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def begin() -> None:
+def begin(*, armed: bool = False) -> None:
     header = Header(session_id="grid-01", source=Source.LOOPBACK, software="brushloop 0")
-    SessionStore.create(Path("sessions/grid-01"), header, opening().snapshots, HostClock().now_ns).release()
+    snapshots = opening(armed=armed).snapshots
+    SessionStore.create(Path("sessions/grid-01"), header, snapshots, HostClock().now_ns).release()
 
 
-def opening() -> Opening:
-    return Opening.load(Path("sessions"), Path("rig.toml"), Path("protocol.toml"))
+def opening(*, armed: bool = False) -> Opening:
+    return Opening.load(Path("sessions"), Path("rig.toml"), Path("protocol.toml"), armed=armed)
+
+
+def kinds(opened: Opening) -> list[StepKind]:
+    return [step.kind for step in distinct_steps(opened.rig, opened.protocol)]
 
 
 def edit(name: str, old: str, new: str) -> None:
@@ -134,3 +142,25 @@ def test_values_of_any_length_and_kind_have_short_words() -> None:
 def test_a_session_whose_old_values_cannot_be_read_is_not_gone_on_with(lab: Path) -> None:
     Path("sessions/grid-01/rig.effective.json").write_text("{")
     assert refused()[1] == "rig.toml: how it was then is missing or damaged"
+
+
+def test_where_hardware_may_move_the_rig_is_checked_first_unless_it_is_switched_off(lab: Path) -> None:
+    assert StepKind.SELF_CHECK in kinds(opening(armed=True))
+    assert StepKind.SELF_CHECK not in kinds(opening())
+    edit("rig.toml", 'host = "127.0.0.1"', 'host = "192.168.1.7"')  # to be armed on the screen
+    assert StepKind.SELF_CHECK in kinds(opening())
+    edit("rig.toml", "[motion]", "[self_check]\nenabled = false\n\n[motion]")
+    assert StepKind.SELF_CHECK not in kinds(opening(armed=True))
+
+
+@pytest.mark.parametrize("begun_armed", [False, True])
+def test_a_session_goes_on_with_or_without_its_check_as_it_was_begun(lab: Path, *, begun_armed: bool) -> None:
+    shutil.rmtree("sessions")
+    begin(armed=begun_armed)
+    session = Path("sessions/grid-01")
+    for armed in (False, True):
+        assert find_resumable(opening(armed=armed)) == session
+        going_on = opening(armed=armed).as_begun(session)
+        assert kinds(going_on) == kinds(opening(armed=begun_armed))
+    edit("rig.toml", "[motion]", f"[self_check]\nenabled = {str(not begun_armed).lower()}\n\n[motion]")
+    assert "self_check.enabled" in "".join(refused())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.engine import Engine
+from collect.engine import UNCHECKED, Engine
 from collect.errors import CollectAborted, ConfigError
 from collect.snapshot import Snapshot
 from collect.states import State
@@ -214,6 +214,14 @@ def test_real_hardware_is_not_moved_unless_armed(lab: Lab, monkeypatch: pytest.M
         run(lab.engine())
     assert not lab.sessions.exists()
     assert lab.rig.arcs.mode == "PowerOff"
+
+
+def test_an_armed_run_without_its_self_check_says_so(lab: Lab) -> None:
+    lab.write_protocol("[11.0]", "[0.0]")
+    engine = lab.engine(armed=True)
+    run(engine)
+    assert any(UNCHECKED in line for line in engine.snapshot().messages)
+    assert "self_check" not in {line["kind"] for line in replay(next(lab.sessions.glob("*/journal.jsonl"))).segments}
 
 
 def test_a_session_is_not_resumed_on_another_robot(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -162,5 +162,7 @@ async def test_a_camera_that_only_shows_black_times_out_and_says_so(monkeypatch:
             return True, page(5.0, 1.0)
 
     monkeypatch.setattr(cv2, "VideoCapture", Dark)
-    with pytest.raises(DeviceTimeout, match=r"frames passed over: \d+ black"):
+    with pytest.raises(
+        DeviceTimeout, match=r"The picture is black: lens covered or light off\? frames passed over: \d+ black"
+    ):
         await OpenCvCamera(CameraOptions("0", timeout_s=0.5), CLOCK).connect()

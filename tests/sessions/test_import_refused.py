@@ -2,12 +2,17 @@
 
 import math
 import os
+import struct
+import zlib
 
+import cv2
+import numpy as np
 import pytest
 
 from sessions import importer, messages, table
 from sessions.errors import InputError
 from sessions.importer import ImportOptions, import_photographs
+from sessions.reader import Recording
 
 ROWS = [
     {"file": "a.png", "px_per_mm": "12.5", "height_mm": "13", "tilt_deg": "5"},
@@ -146,14 +151,14 @@ def test_a_name_that_is_no_session_id_is_refused(make, tmp_path, photos):
 def test_a_photograph_that_changes_under_the_import_is_refused(make, photos, refusal, monkeypatch):
     make.photographs(photos, *ROWS)
     (photos.parent / "sessions").mkdir()
-    read = importer._read_bytes
+    read = importer.read_bounded
     seen = []
 
     def change(path):
         seen.append(path)
         return read(path) + b"x" * (len(seen) > 2)
 
-    monkeypatch.setattr(importer, "_read_bytes", change)
+    monkeypatch.setattr(importer, "read_bounded", change)
     assert refusal() == "photos/a.png: changed while it was imported"
 
 
@@ -174,3 +179,59 @@ def test_a_damaged_photograph_is_told_by_us_and_not_by_a_library_on_stderr(make,
     (photos / "a.png").write_bytes(data)
     assert refusal() == "photos/a.png: is no whole PNG or JPEG image"
     assert capfd.readouterr().err == ""
+
+
+def progressive(side, scans):
+    """A JPEG of one gray level, its last scan repeated: ten bytes of file for another pass over every pixel."""
+    image = np.full((side, side), 200, np.uint8)
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    last, have = data[data.rindex(b"\xff\xda") : -2], data.count(b"\xff\xda")
+    return data[:-2] + last * (scans - have) + data[-2:]
+
+
+def comment(data, text):
+    """The same JPEG with a comment before its first scan."""
+    at = data.index(b"\xff\xda")
+    return data[:at] + b"\xff\xfe" + (len(text) + 2).to_bytes(2, "big") + text + data[at:]
+
+
+def test_a_jpeg_that_goes_over_its_pixels_for_minutes_is_refused_by_its_header(make, photos, refusal, monkeypatch):
+    make.photographs(photos, *ROWS)
+    monkeypatch.setattr(cv2, "imdecode", None)  # nothing is decoded
+    (photos / "a.png").write_bytes(comment(progressive(64, 60_000), b"a comment that names an end \xff\xd9"))
+    assert refusal() == "photos/a.png: JPEG of 64 x 64 pixels in more than 100 scans"
+    monkeypatch.setattr(messages, "MAX_SCANNED_PIXELS", 64 * 64 * 20)
+    (photos / "a.png").write_bytes(progressive(64, 21))
+    assert refusal() == "photos/a.png: JPEG of 64 x 64 pixels in more than 20 scans"
+
+
+def test_a_jpeg_with_a_film_behind_it_and_a_look_alike_of_scans_in_a_comment_is_imported(make, photos, run):
+    make.photographs(photos, *ROWS)
+    (photos / "a.png").write_bytes(comment(progressive(64, 12), b"\xff\xda" * 200) + b"\xff\xda film " * 2000)
+    assert Recording(run()).strokes() == 2
+
+
+def test_a_png_that_would_unpack_to_gigabytes_is_refused_by_its_header(make, photos, refusal, monkeypatch):
+    make.photographs(photos, *ROWS)
+    monkeypatch.setattr(cv2, "imdecode", None)
+    header = struct.pack(">II5B", 60_000, 60_000, 8, 0, 0, 0, 0)
+    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(bytes(1000))), (b"IEND", b"")]
+    data = [struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks]
+    (photos / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(data))
+    assert refusal() == "photos/a.png: image of 60000 x 60000 pixels exceeds 200000000"
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "told"),
+    [
+        ("height_mm", "-13", "line 3, column `height_mm`: '-13', allowed: 0 to 500"),
+        ("height_mm", "1e300", "line 3, column `height_mm`: '1e300', allowed: 0 to 500"),
+        ("tilt_deg", "-5", "line 3, column `tilt_deg`: '-5', allowed: 0 to 90"),
+        ("depth_mid_cm", "-1.5", "line 3, column `depth_mid_cm`: '-1.5', allowed: 0 to 50"),
+        ("bend_mm", "1e300", "line 3, column `bend_mm`: '1e300', allowed: -1e+06 to 1e+06"),
+    ],
+)
+def test_a_depth_above_the_paper_or_out_of_this_world_is_refused(make, photos, refusal, column, value, told):
+    first, second = ({**row, "depth_mid_cm": "1.5", "bend_mm": "0"} for row in ROWS)
+    make.photographs(photos, first, {**second, column: value})
+    assert refusal() == f"photos/table.csv: {told}"

@@ -90,3 +90,41 @@ def test_the_command_says_it_in_the_front_doors_way(copy):
     ran = CliRunner().invoke(app, ["verify", str(copy)])
     assert isinstance(ran.exception, InputError)
     assert ran.output == ""
+
+
+LOOKS = [Recording, details, verify_session, lambda path: repair_session(path, lambda: 0)]
+
+
+@pytest.mark.parametrize("look", LOOKS)
+def test_an_unfinished_file_is_told_as_one(make, store, look):
+    store.begin("k", "press", cell=0, notes={"params": {}}).writer.abandon()
+    (part,) = store.folder.glob("*.part")
+    before = make.tree(store.folder)
+    with pytest.raises(InputError) as refused:
+        look(part)
+    assert str(refused.value) == (
+        f"{part}: was never finished, a step or a merge was cut: it is kept as evidence and is no recording. "
+        f"Give the session's folder, {store.folder}"
+    )
+    assert refused.value.exit_code == 2
+    assert make.tree(store.folder) == before
+
+
+@pytest.mark.parametrize("look", LOOKS)
+def test_a_folder_that_is_no_session_is_told_what_it_is(make, store, tmp_path, look):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"is no session: neither journal\.jsonl nor a recording empty\.mcap is in it"):
+        look(tmp_path / "empty")
+    with pytest.raises(InputError, match=rf"is no session, but holds 1 of them: give one, as {store.folder}"):
+        look(tmp_path)
+
+
+def test_a_session_that_lost_its_merged_file_is_sent_to_repair(make, store):
+    make.collect(store)
+    store.close()
+    store.release()
+    (store.folder / f"{store.folder.name}.mcap").unlink()
+    with pytest.raises(InputError, match=f"has lost its recording .*`brushloop sessions repair {store.folder}` makes"):
+        Recording(store.folder)
+    repair_session(store.folder, make.clock())
+    assert Recording(store.folder).strokes() == 2

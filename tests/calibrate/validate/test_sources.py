@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
+import os
 import shutil
 import sys
 from collections.abc import Iterator
@@ -22,7 +23,7 @@ from calibrate.artefact import Calibration
 from calibrate.current import current, put_to_use
 from calibrate.errors import CalibrationError
 from calibrate.validate import sources
-from calibrate.validate.sources import open_session
+from calibrate.validate.sources import fetched, open_session
 from sessions.errors import SessionDamaged
 from tests.calibrate.given import CALIBRATION
 
@@ -172,6 +173,20 @@ def test_a_web_server_is_a_place_like_any_other(web: str, session: Path, tmp_pat
         open_session(f"{web}/presses.mcap", tmp_path, None, None)
     with pytest.raises(CalibrationError, match="cannot be read"):
         open_session(f"{web}/nothing.mcap#sha256={digest(session)}", tmp_path, None, None)
+
+
+def test_a_recording_longer_than_a_block_comes_from_a_server_that_serves_no_ranges(
+    web: str, session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = os.urandom(1024) * 8 * 1024  # fsspec asks for blocks of 5 MiB, and one read more
+    (session.parent / "long.mcap").write_bytes(data)
+    (session.parent / "long.mcap.sha256").write_text(" " * 3000 + hashlib.sha256(data).hexdigest())
+    url = f"{web.rpartition('/')[0]}/long.mcap"
+    assert fetched(url, tmp_path).read_bytes() == data
+    monkeypatch.setattr(sources, "MAX_DOWNLOAD_BYTES", 10**6)
+    with pytest.raises(CalibrationError, match=r"long.mcap: is larger than 1000000 bytes"):
+        fetched(url, tmp_path / "again")
+    assert not [path for path in (tmp_path / "again").rglob("*") if path.is_file()]
 
 
 def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: Path, tmp_path: Path) -> None:

@@ -284,6 +284,18 @@ def test_a_self_check_takes_a_cell_before_the_first_stroke(tmp_path: Path) -> No
         check_protocol(tmp_path / "rig.toml", EXAMPLES / "protocol.toml", small, example("protocol.toml"))
 
 
+def test_a_plan_says_beforehand_what_the_self_check_of_an_armed_run_adds(tmp_path: Path) -> None:
+    full = 'kind = "grid"\nheights_mm = [11.0, 13.0]\ntilts_deg = [0.0]\nrepeats = {}\n'
+    tight, roomy = (protocol(tmp_path, full.format(repeats)) for repeats in (21, 19))
+    told = "with --arm the self-check first takes 3 cells: 2 sheets instead of 1 (`collect plan --arm`)"
+    assert make_plan(rig(tmp_path), tight).warnings == (told,)
+    assert make_plan(rig(tmp_path), roomy).warnings == ()
+    assert make_plan(rig(tmp_path).checking_itself(False), tight).warnings == ()
+    narrow = rig(tmp_path, "[motion]", "[self_check]\nlegs_mm = [50.0, 15.0]\n\n[motion]")
+    [warning] = make_plan(narrow, roomy).warnings
+    assert warning.startswith("with --arm the self-check comes first, and a triangle of 50 by 15 mm does not fit")
+
+
 def test_moves_of_a_touch_end_above_where_they_began(tmp_path: Path) -> None:
     config = rig(tmp_path)
     walked = next(w for w in walk(config, example("protocol-calibration.toml")) if w.step.kind == StepKind.TOUCH)

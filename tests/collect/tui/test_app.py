@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import pytest
 from textual.pilot import Pilot
+from textual.widgets import Static
 
 from collect.states import FINAL, State
 from collect.tui.app import OperatorApp
@@ -15,7 +16,7 @@ from collect.tui.confirm import Confirm
 from collect.tui.help import HelpScreen
 from collect.tui.line import Line
 from collect.tui.text import SOFTWARE_STOP
-from collect.tui.view import OVER, STOP_SENT
+from collect.tui.view import GOES_ON, OVER, STOP_SENT
 from tests.collect.tui.fake import (
     DONE,
     ERROR,
@@ -288,6 +289,40 @@ async def test_what_comes_from_outside_is_shown_as_it_is() -> None:
         assert "\x1b" not in text
 
 
+@pytest.mark.parametrize("state", [State.STOPPED, State.FAILED])
+async def test_what_is_over_offers_no_resume_and_says_what_goes_on(state: State) -> None:
+    engine = FakeEngine(PAUSED)
+    app = OperatorApp(engine)
+    async with app.run_test(size=(80, 24)) as pilot:
+        assert "space resume" in await look(app, pilot)
+        engine.now = replace(PAUSED, state=state, error="stopped by the operator")
+        text = await look(app, pilot)
+        assert GOES_ON in text
+        assert not [word for word in ("space", "s STOP", "r retake", SOFTWARE_STOP) if word in text]
+        await pilot.press("space", "p", "r", "n", "j")
+        assert engine.calls == []
+
+
+async def test_the_keys_of_the_set_up_are_those_that_work_now() -> None:
+    engine = FakeEngine(picture(set_up=SET_UP, state=State.PAUSED))
+    app = OperatorApp(engine)
+    async with app.run_test(size=(109, 40)) as pilot:
+        assert "space resume" in await look(app, pilot)
+        engine.now = picture(set_up=SET_UP, state=State.STOPPING)
+        text = await look(app, pilot)
+        assert not [word for word in ("space resume", "space pause") if word in text]
+
+
+async def test_no_widget_can_hand_a_control_character_to_the_terminal() -> None:
+    app = OperatorApp(FakeEngine(picture()))
+    async with app.run_test(size=(80, 24)) as pilot:
+        await app.screen.mount(Static("a\x1b]0;owned\x07b \x9b31m \u202eltr", markup=False, id="hostile"))
+        await pilot.pause()
+        text = shown(app)
+        assert "a]0;ownedb 31m ltr" in text
+        assert not set(text) & set("\x1b\x07\x9b\u202e")
+
+
 async def test_chinese_takes_its_two_columns() -> None:
     engine = FakeEngine(picture(session_id="永字八法", messages=("墨分五色 capture 1",), step="写 永"))
     app = OperatorApp(engine)
@@ -317,7 +352,7 @@ async def test_80_columns_by_24_rows_show_all_that_matters() -> None:
         text = await look(app, pilot)
     for part in ("2026-11-21-grid-01", "source: loopback rig", "FAILED", "13/30", "elapsed 3:05", "voids 1", "20 mm"):
         assert part in text
-    for part in ("123.40", "10°", OVER, SOFTWARE_STOP, "q leave"):
+    for part in ("123.40", "10°", OVER, GOES_ON, "q leave"):
         assert part in text
     words = " ".join(text.replace("┃", " ").split())
     assert " ".join(ERROR.split()) in words

@@ -196,6 +196,31 @@ def test_a_height_that_is_not_taken_and_a_jog_that_is_given_up_leave_the_paper_w
     ]
 
 
+@pytest.mark.parametrize("guided", [False, True])
+def test_who_gives_the_jog_of_the_set_up_up_keeps_the_taught_height_and_the_run_goes_on(lab: Lab, guided: bool) -> None:
+    lab.write_protocol("[11.0]", "[0.0]")
+    rig = lab.folder / "rig.toml"
+    rig.write_text(rig.read_text().replace("[paper]", '[touch]\nmethod = "jog"\n\n[paper]'))
+    engine = engine_of(lab, guided=guided)
+    engine.start()
+    if guided:
+        answer(engine, "Camera, board, scale", "g")
+    now = until(engine, lambda now: now.prompt is not None and "Touch 1 of 3." in now.prompt.question)
+    assert now.prompt is not None
+    assert now.prompt.choices[-1].label == "give up: the taught height, 120.03 mm, stays as it was"
+    answer(engine, "Touch 1 of 3.", "x")
+    answer(engine, "The taught height, 120.03 mm, can be kept", "a")
+    answer(engine, "Touch 1 of 3.", "x")
+    answer(engine, "The taught height, 120.03 mm, can be kept", "k")
+    if guided:
+        answer(engine, "Zero touch and plane", "g")
+    engine.join()
+    assert engine.snapshot().strokes_done == 1
+    assert any("given up: the taught height, 120.03 mm, is kept" in line for line in engine.snapshot().messages)
+    [result] = [line["result"] for line in lines(lab, "done") if line["kind"] == "zero_touch"]
+    assert (result["method"], result["touch_z_mm"], result["moved_mm"]) == ("kept", pytest.approx(120.03), 0.0)  # type: ignore[index]
+
+
 def test_park_ends_the_run_after_the_step_with_the_arm_at_its_place(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0, 10.0]")
     engine = engine_of(lab)

@@ -50,7 +50,7 @@ async def seen_after(camera: OpenCvCamera, after_ns: int) -> int:
 @pytest.mark.parametrize(
     ("kind", "words"),
     [
-        ("black", r"frames passed over: \d+ black"),
+        ("black", r"\(The picture is black: lens covered or light off\? frames passed over: \d+ black"),
         ("frozen", r"frames passed over: .*\d+ frozen"),
         ("torn", r"frames passed over: .*\d+ torn"),
     ],

@@ -1,0 +1,51 @@
+"""Cells of CSV files: a text that a spreadsheet would run as a formula is written with an apostrophe before it."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+MARK = "'"
+FORMULA_STARTS = frozenset("=+-@\t\r\n＝＋－＠")
+
+
+def as_cell(value: object) -> object:
+    """What is written for a value: numbers as they are, also as text (`-0.5`), everything else never as a formula."""
+    if isinstance(value, str) and value and (value[0] in FORMULA_STARTS or _marked(value)) and not _is_number(value):
+        return MARK + value
+    return value
+
+
+def as_text(cell: str) -> str:
+    """The text that `as_cell` was given."""
+    return cell[1:] if _marked(cell) else cell
+
+
+class CsvWriter:
+    """A CSV file, row by row, whose cells hold what others named."""
+
+    def __init__(self, file: Any, lineterminator: str = "\n") -> None:
+        self._out = csv.writer(file, lineterminator=lineterminator)  # noqa: TID251 - the one place
+
+    def writerow(self, row: Iterable[object]) -> None:
+        """Write one row."""
+        self._out.writerow([as_cell(value) for value in row])
+
+    def writerows(self, rows: Iterable[Sequence[object]]) -> None:
+        """Write many."""
+        for row in rows:
+            self.writerow(row)
+
+
+def _marked(text: str) -> bool:
+    rest = text.lstrip(MARK)
+    return rest != text and rest[:1] in FORMULA_STARTS
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,41 @@
+"""Cells that a spreadsheet would run are written as text, numbers stay numbers, and names come back as they were."""
+
+import csv
+import io
+
+import pytest
+
+from sessions.cells import CsvWriter, as_cell, as_text
+from sessions.export import export
+from sessions.importer import ImportOptions
+from sessions.reader import Recording
+
+FORMULAS = ['=cmd|"/c calc"!A1', "+1+2", "-1+2", "@SUM(A1)", "\tx", "\r=1", "'=1", "''=1", "＝1"]
+
+
+@pytest.mark.parametrize("text", FORMULAS)
+def test_a_formula_is_written_as_text_and_read_as_it_was(text):
+    out = io.StringIO()
+    CsvWriter(out, "\r\n").writerow([text, "plain"])
+    cell, other = next(csv.reader(io.StringIO(out.getvalue(), newline="")))
+    assert cell == f"'{text}"
+    assert (as_text(cell), other) == (text, "plain")
+
+
+@pytest.mark.parametrize("value", [-1.5, 3, None, "-0.5", "+1e3", "-inf", "", "H13-a05", "it's", "'quoted'", "字"])
+def test_numbers_stay_numbers_and_other_text_stays_itself(value):
+    assert as_cell(value) == value
+
+
+def test_names_go_out_and_in_again_by_our_own_importer(make, tmp_path, photos, run):
+    names = ["=1+1", "@home", "-2-3", "-5", "'=x", "a"]
+    rows = [{"file": f"{k}.png", "name": str(as_cell(name)), "px_per_mm": "5"} for k, name in enumerate(names)]
+    make.photographs(photos, *rows)
+    recorded = run(ImportOptions())
+    assert [stroke.stroke_id for stroke in Recording(recorded).stroke_records()] == names
+
+    export(recorded, tmp_path / "exported", "png")
+    with (tmp_path / "exported" / "strokes.csv").open(newline="", encoding="utf-8") as file:
+        cells = [row["stroke_id"] for row in csv.DictReader(file)]
+    assert cells == ["'=1+1", "'@home", "'-2-3", "-5", "''=x", "a"]
+    assert [as_text(cell) for cell in cells] == names

@@ -1,0 +1,109 @@
+"""What a file or a folder from elsewhere says is printed and never obeyed, whichever command prints it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+import brushloop
+from sessions.store import SessionStore
+from sessions.terminal import plain
+from tests.sessions.conftest import Make
+
+HOSTILE = "\x1b]0;owned\x07\x1b]52;c;cm0gLXJm\x07\x1b[2J\x9b31m\u202eltr\r[bold][/x][link=http://a]"
+NAME = HOSTILE.replace("/", "")
+"""The same, as a file may be called."""
+ACTED_ON = [*map(chr, [*range(9), *range(11, 32), *range(127, 160)]), "\u202e", "\u2028"]
+HEADER = Make.header.model_copy(
+    update=dict.fromkeys(("software", "brush", "lens", "ink", "paper", "robot", "robot_firmware", "licence"), HOSTILE)
+)
+
+
+@pytest.fixture(scope="module")
+def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a session that says such things wherever a text is free: one closed, one open, one damaged."""
+    make, folder = Make(), tmp_path_factory.mktemp("foreign")
+    for name in ("closed", "open", "damaged"):
+        header = HEADER.model_copy(update={"session_id": name, "protocol": HOSTILE})
+        store = SessionStore.create(folder / name, header, make.snapshots, make.clock())
+        make.perform(store, f"key{NAME}", cell=1)
+        store.void(store.begin("cut", f"press{NAME}", cell=2, notes={"params": {"stroke_id": HOSTILE}}), HOSTILE)
+        store.begin("begun", f"press{NAME}", cell=3, notes={"params": {"stroke_id": HOSTILE}}).writer.abandon()
+        if name == "closed":
+            store.close()
+        store.release()
+    for file in (folder / "damaged").glob("0000-*.mcap"):
+        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    shutil.copytree(folder / "open", folder / f"name{NAME}")
+    table = f'"file{HOSTILE.replace(chr(13), "")}",px_per_mm\na.png,1\n'
+    (folder / "table.csv").write_text(table, encoding="utf-8")
+    (folder / "rig.toml").write_text(f"[robot]\n{json.dumps(HOSTILE)} = {json.dumps(HOSTILE)}\n", encoding="utf-8")
+    (folder / "fit.json").write_text(json.dumps({"kind": HOSTILE, HOSTILE: HOSTILE}), encoding="utf-8")
+    return folder
+
+
+COMMANDS = [
+    "sessions list .",
+    "sessions show closed",
+    "sessions show open --files",
+    "sessions show closed --json",
+    "sessions show damaged",
+    "sessions verify closed",
+    "sessions verify open",
+    "sessions verify damaged",
+    "sessions repair open",
+    "sessions repair damaged",
+    "sessions merge merged.mcap closed open",
+    "sessions export closed exported",
+    "sessions import . --csv table.csv",
+    "validate closed",
+    "validate closed --json --no-held-out",
+    "validate diff fit.json fit.json",
+    "calibrate closed",
+    "calibrate show fit.json",
+    "calibrate apply fit.json closed",
+    "calibrate preprocess closed",
+    "fit closed",
+    "fit closed --drags",
+    "invert closed",
+    "loop compare closed closed",
+    "write compare closed --plan fit.json",
+    "write plan fit.json",
+    "camera drift closed",
+    "doctor --config rig.toml",
+    "collect plan --config rig.toml --protocol rig.toml",
+    "collect --config rig.toml --protocol rig.toml --no-tui",
+    "train --config rig.toml",
+]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_command_lets_what_it_read_act_on_the_terminal(
+    command: str, hostile: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "elsewhere"
+    shutil.copytree(hostile, folder)
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "argv", ["brushloop", *command.split()])
+    with pytest.raises(SystemExit) as ended:
+        brushloop.main()
+    told = capfd.readouterr()
+    assert told.out + told.err
+    assert not [char for char in ACTED_ON if char in told.out + told.err]
+    assert ended.value.code != 1, told.err
+    assert "Traceback" not in told.err
+
+
+def test_a_line_end_in_a_name_does_not_make_a_line_of_its_own() -> None:
+    assert plain("a\nsession is sound") == "a\\u000asession is sound"
+
+
+def test_json_keeps_its_values_and_chinese_its_characters() -> None:
+    told = {"brush": f"羊毫 \U000e0041{HOSTILE}"}
+    printed = plain(json.dumps(told, ensure_ascii=False))
+    assert json.loads(printed) == told
+    assert "羊毫" in printed
