@@ -151,7 +151,7 @@ def _row(columns: _Columns, line: int, cells: list[str], still: int) -> Row:
             parsed = math.nan
         if not math.isfinite(parsed):
             raise InputError(table, f"line {line}, column `{name}`: {fields[name][:80]!r} is not a finite number")
-        least, most = _range(name)
+        least, most = _range(name, columns.kind)
         if not least <= parsed <= most:
             told = f"{fields[name][:80]!r}, allowed: {least / factor:g} to {most / factor:g}"
             raise InputError(table, f"line {line}, column `{name}`: {told}")
@@ -181,12 +181,12 @@ def _row(columns: _Columns, line: int, cells: list[str], still: int) -> Row:
     return Row(image, stroke)
 
 
-def _range(column: str) -> tuple[float, float]:
-    """What a column may hold, in the unit that is stored."""
+def _range(column: str, kind: str) -> tuple[float, float]:
+    """What a column may hold, in the unit that is stored; a drag may lean to either side of its way."""
     if column.startswith(DEPTHS) and column.rpartition("_")[2] in LENGTH_UNITS:
         return 0.0, DEEPEST_MM
     if column == "tilt_deg":
-        return 0.0, STEEPEST_DEG
+        return (0.0 if kind == "press" else -STEEPEST_DEG), STEEPEST_DEG
     return -MOST, MOST
 
 

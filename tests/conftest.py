@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 
 import pytest
 from hypothesis import settings
+
+for _library in ("OPENBLAS", "OMP", "MKL"):
+    # Two workers have the machine's cores already: threads that wait for each other there only take them away.
+    os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
 # The same examples every time, so that a failure is that of the change; `make soak` looks for new ones.
 settings.register_profile("same", derandomize=True)

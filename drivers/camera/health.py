@@ -55,7 +55,8 @@ class FrameHealth:
         self._equal = 0
         self._last_ns: int | None = None
         self._periods: deque[int] = deque(maxlen=PERIODS_KEPT)
-        self._backlog = False
+        self._backlog = 0
+        """How many frames may still have waited while nobody read."""
         self.counts: Counter[Fault] = Counter()
         self.repeated = False
         """The frame judged last is the one before it again: nothing new, though as yet no fault."""
@@ -123,12 +124,18 @@ class FrameHealth:
         if len(self._periods) < 3:
             self._periods.append(gap_ns)
             return False
-        usual_ns = sorted(self._periods)[len(self._periods) // 2]
-        if gap_ns > max(3 * usual_ns, self._latency_ns):
-            self._backlog = True
+        usual_ns = max(sorted(self._periods)[len(self._periods) // 2], 1)
+        stalled = gap_ns > max(3 * usual_ns, self._latency_ns)
+        if stalled:
+            # No more can have waited than came in the gap: a camera whose period was misjudged is not late for ever.
+            self._backlog = 1 + gap_ns // usual_ns
+        if self._backlog == 0:
+            self._periods.append(gap_ns)
+            return False
+        if stalled or gap_ns < BURST_SHARE * usual_ns:
+            self._backlog -= 1
+            if self._backlog == 0:
+                self._periods.clear()
             return True
-        if self._backlog:
-            self._backlog = gap_ns < BURST_SHARE * usual_ns
-            return self._backlog
-        self._periods.append(gap_ns)
+        self._backlog = 0
         return False

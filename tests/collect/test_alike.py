@@ -78,7 +78,7 @@ def targets(request: pytest.FixtureRequest) -> list[str]:
             sent.append("park")
         elif target.z_mm == pytest.approx(config.ink.dip_z_mm, abs=1e-3):
             sent.append("ink")
-        elif target.z_mm < config.paper.touch_z_mm - 1.0:
+        elif target.z_mm < config.paper.touch_z_mm - 1.0 and sent[-1:] != ["paper"]:
             sent.append("paper")
 
     noting(lab.rig.world.motion, note)

@@ -135,7 +135,10 @@ def test_what_is_wrong_in_the_file_is_not_blamed_on_the_environment(
         (PROTOCOL.replace("[11.0, 20.0]", "[11.0, 11.0]"), r"heights_mm has the same value twice"),
         (PROTOCOL.replace("[0.0, 10.0]", "[-5.0]"), r"tilts_deg.0: .*greater than or equal to 0"),
         (PROTOCOL + "speed = 3\n", r"speed: unknown field; did you mean seed\?$"),
-        (PROTOCOL + "hurry = 3\n", r"hurry: unknown field; known are board_every, kind, heights_mm, .*dwell_s$"),
+        (
+            PROTOCOL + "hurry = 3\n",
+            r"hurry: unknown field; known are board_every, wait_after_dip_s, kind, heights_mm, .*dwell_s$",
+        ),
     ],
 )
 def test_a_bad_protocol_is_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from collect import headless
 from collect.config import load_rig
@@ -87,7 +85,9 @@ async def test_the_set_up_says_it_in_its_title_and_beside_the_tip() -> None:
         assert "Tip     no pose for 1.4 s" in str(app.screen.query_one("#live").render())
 
 
-def test_without_a_screen_it_is_one_line_when_it_begins_and_one_when_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_screen_it_is_one_line_when_it_begins_and_one_when_it_ends(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     class Scripted(FakeEngine):
         def __init__(self, shots: Iterator[Snapshot]) -> None:
             super().__init__(next(shots))
@@ -102,8 +102,7 @@ def test_without_a_screen_it_is_one_line_when_it_begins_and_one_when_it_ends(mon
             return self.now.state is State.DONE
 
     shots = [picture(messages=(), no_pose_s=s) for s in (None, None, 1.04, 1.1, 2.0, None)]
-    out = io.StringIO()
     monkeypatch.setattr(headless, "REFRESH_S", 0.0)
-    headless._show(Scripted(iter([*shots, picture(state=State.DONE, messages=())])), Console(file=out))
-    told = [line for line in out.getvalue().splitlines() if "pose" in line]
+    headless._show(Scripted(iter([*shots, picture(state=State.DONE, messages=())])))
+    told = [line for line in capsys.readouterr().err.splitlines() if "pose" in line]
     assert told == ["warning: no pose for 1.0 s", "the arm tells its pose again"]

@@ -63,6 +63,15 @@ def test_a_recording_may_show_equal_frames() -> None:
     assert [judged.judge(image, k * PERIOD) for k in range(8)] == [None] * 8
 
 
+def test_a_camera_that_was_slow_at_first_is_not_late_for_ever_after_a_pause() -> None:
+    """Its frames then come faster than half the period that was known, as those of a backlog do."""
+    judged = health()
+    slow = [k * 500_000_000 for k in range(4)]
+    resumed = [slow[-1] + 2_000_000_000 + k * 100_000_000 for k in range(12)]
+    assert [judged.judge(page(), t) for t in slow] == [None] * 4
+    assert [judged.judge(page(), t) for t in resumed] == [Fault.LATE] * 5 + [None] * 7
+
+
 def test_a_backlog_after_a_pause_is_late_until_frames_come_at_their_own_pace() -> None:
     judged = health()
     arrivals = [k * PERIOD for k in range(6)]
