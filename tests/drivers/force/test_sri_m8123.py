@@ -340,13 +340,19 @@ async def test_a_bias_while_something_moves_is_refused(channel: str, axis: int, 
         await sensor.close()
 
 
-async def test_a_bias_from_too_few_rounds_is_refused(sensor: SriM8123):
+async def test_where_too_few_rounds_came_a_bias_averages_longer(sensor: SriM8123):
+    await sensor.bias(0.02)
+    assert sensor.bias_wrench != (0.0,) * 6
+
+
+async def test_a_bias_from_too_few_rounds_is_refused(sensor: SriM8123, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("drivers.force.sri_m8123.MORE_BIAS_S", 0.0)
     with pytest.raises(DeviceTimeout, match="10 are needed"):
         await sensor.bias(0.02)
 
 
 async def test_a_bias_over_silence_is_refused(board: SimForceSensor, sensor: SriM8123):
-    board.fail(*[Fault.SILENCE] * 60)
+    board.fail(*[Fault.SILENCE] * 600)
     with pytest.raises(Stale):
         await sensor.bias(0.4)
 
