@@ -351,8 +351,9 @@ async def test_a_bias_from_too_few_rounds_is_refused(sensor: SriM8123, monkeypat
         await sensor.bias(0.02)
 
 
-async def test_a_bias_over_silence_is_refused(board: SimForceSensor, sensor: SriM8123):
-    board.fail(*[Fault.SILENCE] * 600)
+async def test_a_bias_over_silence_is_refused(board: SimForceSensor, sensor: SriM8123, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("drivers.force.sri_m8123.MORE_BIAS_S", 0.0)
+    board.fail(*[Fault.SILENCE] * 60)
     with pytest.raises(Stale):
         await sensor.bias(0.4)
 
