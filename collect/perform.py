@@ -70,15 +70,19 @@ class Performer:
 
     def answered(self, error: StepError | DeviceError) -> None:
         """A person has put right what `error` said: a full sheet was changed, or something at the camera."""
-        self._bench.procedures.photographer.forget()
+        self.forget_camera()
         if isinstance(error, SheetFull):
             self.fresh_sheet()
+
+    def forget_camera(self) -> None:
+        """A person may have changed something at the camera or in its view: measure its delay again."""
+        self._bench.procedures.photographer.forget()
 
     def fresh_sheet(self) -> None:
         """A person has put a fresh sheet in."""
         self._bench.store.fresh_sheet()
         self._bench.known.sound_frame = None
-        self._bench.procedures.photographer.forget()
+        self.forget_camera()
         self._bench.progress.sheet_in(self._bench.store.state.sheet)
 
     @property

@@ -117,6 +117,7 @@ class Run:
                 answer = await self._ask_about(step, result)
                 if answer == GO_ON:
                     return result
+                self.performer.forget_camera()
                 step = again(step, answer)
             except (StepError, DeviceError) as error:
                 failures += 1
