@@ -47,6 +47,8 @@ VIEW = View(width_px=1024, height_px=768, px_per_mm=3.12, fps=20.0, stamp_strip=
 RATE = 20.0
 OLD_RULE_S = 0.25
 STOP_S = 2.0
+MOST_REFUSALS = 3
+"""A run would have ended with the first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +99,10 @@ async def photograph(path: Path, seed: int) -> None:
         await rig.robot.enable()
         procedures = Procedures(rig)
         await procedures.retreat()
+        refused = 0
         for _ in range(EACH):
+            if refused == MOST_REFUSALS:
+                break
             try:
                 if procedures.photographer.delay is not None:
                     cell = cells.cell(rng.randrange(cells.capacity))
@@ -109,6 +114,7 @@ async def photograph(path: Path, seed: int) -> None:
                 frame = await procedures.capture()
                 tell(json.dumps(_row(frame, left_s, time.perf_counter() - began, seen, procedures)))
             except (StepError, DeviceError) as error:
+                refused += isinstance(error, StepError)  # not where the rig did not answer while it was stopped
                 tell(json.dumps({"error": type(error).__name__, "what": str(error), "true_s": _true_s(seen)}))
                 procedures.photographer.forget()
                 with contextlib.suppress(DeviceError):
