@@ -17,18 +17,10 @@ from drivers.errors import RobotNotSafe
 from drivers.samples import Identity
 from sessions.journal import read_lines, replay
 from sessions.reader import Recording
+from tests.collect.until import until
 
 if TYPE_CHECKING:
     from conftest import Lab
-
-
-def until(engine: Engine, condition: Callable[[Snapshot], bool], timeout_s: float = 30.0) -> Snapshot:
-    deadline = time.monotonic() + timeout_s
-    while not condition(now := engine.snapshot()):
-        assert time.monotonic() < deadline, f"waited in vain: {now}"
-        assert not engine.finished, f"over too early: {now}"
-        time.sleep(0.005)
-    return now
 
 
 def run(engine: Engine) -> None:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import time
-from collections.abc import Callable
+import functools
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from collect.snapshot import Snapshot
 from collect.states import State
 from drivers.arcs.controller import Controller
 from drivers.arcs.rpc import RpcConnection
@@ -17,6 +15,7 @@ from drivers.arcs.waiting import Tolerance, until_settled
 from drivers.errors import MotionFailed, SettingsChanged
 from drivers.geometry import brush_pose, from_wire, lean
 from sessions.journal import read_lines
+from tests.collect.until import until as waited_until
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -36,13 +35,7 @@ def lab(lab: Lab) -> Lab:
     return lab
 
 
-def until(engine: Engine, condition: Callable[[Snapshot], bool], timeout_s: float = 60.0) -> Snapshot:
-    deadline = time.monotonic() + timeout_s
-    while not condition(now := engine.snapshot()):
-        assert time.monotonic() < deadline, f"waited in vain: {now}"
-        assert not engine.finished, f"over too early: {now}"
-        time.sleep(0.005)
-    return now
+until = functools.partial(waited_until, timeout_s=60.0)
 
 
 def start_and_pause(engine: Engine) -> None:
