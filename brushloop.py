@@ -10,19 +10,19 @@ from typing import Annotated, Any, cast
 import typer
 from typer.core import TyperGroup
 
-import calibrate.brushfit.cli
-import calibrate.camera.cli
-import calibrate.invert_cli
+import calibrate.board.cli
+import calibrate.cli
+import calibrate.fit.cli
+import calibrate.invert.cli
 import calibrate.loop.cli
-import calibrate.prepare.cli
 import calibrate.validate.cli
-import calibrate.write_plan_cli
-import calibrate.written.cli
+import calibrate.writing.cli
+import calibrate.writing.plan_cli
+import collect.chains.loop_cli
+import collect.chains.writing_cli
 import collect.cli
-import collect.loop.cli
-import collect.written.cli
 import model.train.cli
-import sessions.cli
+import sessions.cli.app
 from sessions.terminal import plain, say
 
 
@@ -57,27 +57,27 @@ app = typer.Typer(
 )
 app.add_typer(collect.cli.app, name="collect")
 app.command("doctor")(collect.cli.doctor)
-app.add_typer(calibrate.prepare.cli.app, name="calibrate")
-app.add_typer(calibrate.camera.cli.app, name="camera")
+app.add_typer(calibrate.cli.app, name="calibrate")
+app.add_typer(calibrate.board.cli.app, name="camera")
 app.add_typer(calibrate.validate.cli.app, name="validate")
-app.command("fit")(calibrate.brushfit.cli.fit)
-app.command("invert")(calibrate.invert_cli.invert)
+app.command("fit")(calibrate.fit.cli.fit)
+app.command("invert")(calibrate.invert.cli.invert)
 loop = typer.Typer(
-    cls=calibrate.prepare.cli.SessionOrCommand,
+    cls=calibrate.cli.SessionOrCommand,
     help="Recover the presses of a SESSION, press them again and compare (`brushloop loop SESSION`), or only compare.",
 )
-loop.command(calibrate.prepare.cli.SESSION)(collect.loop.cli.loop)
+loop.command(calibrate.cli.SESSION)(collect.chains.loop_cli.loop)
 loop.command("compare")(calibrate.loop.cli.compare)
 app.add_typer(loop, name="loop")
-app.add_typer(sessions.cli.app, name="sessions")
+app.add_typer(sessions.cli.app.app, name="sessions")
 write = typer.Typer(
-    cls=collect.written.cli.CharactersOrCommand,
+    cls=collect.chains.writing_cli.CharactersOrCommand,
     help="Write characters on the rig and compare them (`brushloop write 字 --config ...`), or only plan or compare.",
 )
-write.command(collect.written.cli.CHARACTERS)(collect.written.cli.write)
-write.command("plan")(calibrate.write_plan_cli.plan)
-write.command("compare")(calibrate.written.cli.compare)
-write.command("learn")(calibrate.written.cli.learn)
+write.command(collect.chains.writing_cli.CHARACTERS)(collect.chains.writing_cli.write)
+write.command("plan")(calibrate.writing.plan_cli.plan)
+write.command("compare")(calibrate.writing.cli.compare)
+write.command("learn")(calibrate.writing.cli.learn)
 app.add_typer(write, name="write")
 app.add_typer(model.train.cli.app, name="train")
 
@@ -97,7 +97,7 @@ def sim(
 
     Ctrl-C ends it; SIGUSR1 puts a fresh sheet in.
     """
-    from drivers.sim.brush import BrushSpec
+    from drivers.sim.brush.brush import BrushSpec
     from drivers.sim.config import SimConfig
     from drivers.sim.rig import serve
 
@@ -123,7 +123,7 @@ def fault(
     """Break a device of a loopback rig that runs, look at what hangs, or be the person at its pendant."""
     from json import dumps
 
-    from drivers.sim.fault_cli import ask, request_of
+    from drivers.sim.faults.cli import ask, request_of
 
     options = {"after_s": after_s, "on": on, "nth": nth, "phase": phase, "press": press, "count": count}
     request = request_of(what, kind, options | {"for_s": for_s, "late_s": late_s, "id": ident})
@@ -138,7 +138,7 @@ def demo(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the rig and of the order of presses.")] = 1,
 ) -> None:
     """Collect, calibrate and validate a short session on the loopback rig; run again, it goes on where it stopped."""
-    from collect.demo import run_demo
+    from collect.chains.demo import run_demo
 
     if code := run_demo(out, repeats, rate, seed):
         raise typer.Exit(code)
@@ -148,7 +148,7 @@ def main() -> None:
     """Run the app; an error of ours is one line on stderr and its exit code, anything else a traceback."""
     try:
         if len(sys.argv) == 1 and sys.stdin.isatty() and sys.stdout.isatty():
-            from collect.desk import Paths
+            from collect.tui.browser import Paths
             from collect.tui.running import run_desk
 
             run_desk(Paths())

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from bench.brushfit_brushes import DEVELOPMENT, FROZEN
 from bench.harness import Result, machine
-from calibrate.brushfit.adaptive import next_press
-from calibrate.brushfit.bezier import RefittedBezier, refit_bezier
-from calibrate.brushfit.fit import Grid, Pressed, fit_presses
-from calibrate.brushfit.heldout import predictor
-from drivers.sim.brush import Brush, BrushSpec, Footprint
+from calibrate.fit.adaptive import next_press
+from calibrate.fit.bezier import RefittedBezier, refit_bezier
+from calibrate.fit.fit import Grid, Pressed, fit_presses
+from calibrate.fit.heldout import predictor
+from drivers.sim.brush.brush import Brush, BrushSpec, Footprint
 from model.fitted import FittedPress
 
 PX_MM, SIZE_PX = 0.3, 128

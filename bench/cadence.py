@@ -6,8 +6,8 @@ import asyncio
 import itertools
 
 from bench.harness import Result, percentile
-from collect.config import RigConfig
-from collect.rig import make_robot
+from collect.rig.config import RigConfig
+from collect.rig.devices import make_robot
 from drivers.clock import HostClock
 from drivers.samples import PoseSample
 

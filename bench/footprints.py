@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from drivers.sim.brush import Brush, BrushSpec, Footprint
+from drivers.sim.brush.brush import Brush, BrushSpec, Footprint
 from model.ccdbsm import Brush as ModelBrush
 from model.ccdbsm import ccdbsm
 

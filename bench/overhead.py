@@ -103,7 +103,7 @@ def _results(watch: Watch, strokes: int, seed: int) -> list[Result]:
 
 def share_out(spans: Spans, begin_s: float, end_s: float) -> dict[str, float]:
     """Seconds of [begin, end] by part; an instant that no part covers is `the rest`."""
-    from drivers.sim.motion import STEADY_LAG_S
+    from drivers.sim.arm.motion import STEADY_LAG_S
 
     moves = [_around(move, spans["motion"]) for move in spans["move"]]
     parts = dict(spans) | {
@@ -131,8 +131,8 @@ def _around(move: Span, motion: list[Span]) -> tuple[Span, Span]:
 
 
 def _collect(folder: Path) -> None:
-    from collect.engine import Engine
-    from collect.opening import Opening, find_resumable, open_store
+    from collect.engine.engine import Engine
+    from collect.engine.opening import Opening, find_resumable, open_store
     from drivers.clock import HostClock
 
     opening = Opening.load(folder / "sessions", folder / "rig.toml", folder / "protocol.toml")
@@ -150,10 +150,11 @@ def _collect(folder: Path) -> None:
 @contextlib.contextmanager
 def _watching(watch: Watch) -> Iterator[None]:
     """Note when each part begins and ends."""
-    from collect.inking import Inking
-    from collect.perform import Performer
-    from collect.recorder import Recorder
-    from collect.work import capturing, looking
+    from collect.engine.inking import Inking
+    from collect.engine.perform import Performer
+    from collect.engine.recorder import Recorder
+    from collect.engine.steps import capture as capturing
+    from collect.engine.steps import look as looking
     from drivers.arcs.robot import AuboArcs
     from drivers.camera import OpenCvCamera
     from sessions.store import SessionStore

@@ -28,19 +28,19 @@ import numpy as np
 
 from bench.harness import machine, percentile
 from bench.processes import ROOT, lines_of_input, started, tell
-from collect.config import RigConfig
 from collect.errors import StepError
+from collect.motion.procedures import Procedures, press_moves
 from collect.photograph import frames as frames_of
-from collect.procedures import Procedures, press_moves
-from collect.rig import connected
-from collect.sheet import Sheet
+from collect.rig.config import RigConfig
+from collect.rig.devices import connected
+from collect.rig.sheet import Sheet
 from drivers.camera.opencv import OpenCvCamera
 from drivers.clock import HostClock
 from drivers.errors import DeviceError
 from drivers.samples import Frame, Stamp
+from drivers.sim.camera.scene import STRIP_PX, read_strip
 from drivers.sim.config import SimConfig, View
 from drivers.sim.rig import LoopbackRig
-from drivers.sim.scene import STRIP_PX, read_strip
 
 EACH = 30
 VIEW = View(width_px=1024, height_px=768, px_per_mm=3.12, fps=20.0, stamp_strip=True)

@@ -13,8 +13,8 @@ import skimage.transform
 from numpy.typing import NDArray
 
 from bench.harness import Result, interleave, machine
-from calibrate.prepare.params import PX_PER_MM, Params
-from calibrate.preprocess import prepare, rectify
+from calibrate.stroke.params import PX_PER_MM, Params
+from calibrate.stroke.preprocess import prepare, rectify
 
 SIDE_MM = 25.6
 SIZE_PX = 128

@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.scale import BoardSpec
+from calibrate.board.scale import BoardSpec
 from drivers.geometry import brush_pose
-from drivers.sim.brush import BrushSpec
+from drivers.sim.brush.brush import BrushSpec
+from drivers.sim.brush.paper import PX_PER_MM as SHEET_PX_PER_MM
+from drivers.sim.camera.optics import Optics
+from drivers.sim.camera.scene import Scene
 from drivers.sim.config import SimConfig, Table, View
-from drivers.sim.optics import Optics
-from drivers.sim.paper import PX_PER_MM as SHEET_PX_PER_MM
-from drivers.sim.scene import Scene
 from drivers.sim.world import World
 
 Gray = NDArray[np.uint8]

@@ -8,14 +8,14 @@ import time
 
 from bench.harness import BenchError, Result
 from bench.processes import Process
-from collect.config import RigConfig
-from collect.rig import make_robot
-from collect.sheet import to_base
+from collect.rig.config import RigConfig
+from collect.rig.devices import make_robot
+from collect.rig.sheet import to_base
 from drivers.arcs.robot import AuboArcs
 from drivers.clock import HostClock
 from drivers.geometry import brush_pose
 from drivers.samples import Pose
-from drivers.sim.brush import Brush, BrushSpec
+from drivers.sim.brush.brush import Brush, BrushSpec
 
 HEIGHTS_MM = tuple(range(11, 21))
 TILTS_DEG = (0.0, 5.0, 10.0)

@@ -15,15 +15,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.scale import BoardSpec, PlaneFit, see_board
-from collect.config import PaperConfig
+from calibrate.board.scale import BoardSpec, PlaneFit, see_board
 from collect.quality.verdict import Failure
-from collect.sheet import Cell, Sheet
+from collect.rig.config import PaperConfig
+from collect.rig.sheet import Cell, Sheet
 from drivers.geometry import brush_pose
-from drivers.sim.brush import BrushSpec, Flaw, Footprint
+from drivers.sim.brush.brush import BrushSpec, Flaw, Footprint
+from drivers.sim.brush.paper import PX_PER_MM
+from drivers.sim.camera.scene import Scene
 from drivers.sim.config import SimConfig, Table, View
-from drivers.sim.paper import PX_PER_MM
-from drivers.sim.scene import Scene
 from drivers.sim.world import World
 
 Gray = NDArray[np.uint8]

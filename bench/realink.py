@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from bench.harness import BenchError, Result, machine
 from bench.realink_network import train_and_predict
 from bench.realink_strokes import Strokes, captured_distance, load
-from calibrate.brushfit.drags import INK_ABOVE, Residual, chance, fit_drags
+from calibrate.drags.fit import INK_ABOVE, Residual, chance, fit_drags
 
 SPLIT_SEED = 0
 TEST = 40

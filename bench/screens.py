@@ -19,17 +19,17 @@ from pathlib import Path
 
 from textual.pilot import Pilot
 
-from collect.desk import Desk, Paths
+from collect.engine.states import State
 from collect.errors import CollectAborted
-from collect.states import State
 from collect.tui.app import OperatorApp
 from collect.tui.ask import AskScreen
+from collect.tui.browser import Desk, Paths
 from collect.tui.finish import FinishScreen
 from collect.tui.review import ReviewScreen
 from collect.tui.set_up import SetUpScreen
 from collect.tui.start import StartScreen
+from drivers.sim.brush.flaws import Flaw
 from drivers.sim.config import SimConfig, View
-from drivers.sim.flaws import Flaw
 from drivers.sim.rig import LoopbackRig
 
 SIZE = (120, 40)

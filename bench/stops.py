@@ -15,8 +15,8 @@ from contextlib import asynccontextmanager
 
 from bench.harness import BenchError, Result, percentile
 from bench.processes import HOST, ROOT
-from collect.config import RigConfig
-from collect.rig import make_robot
+from collect.rig.config import RigConfig
+from collect.rig.devices import make_robot
 from drivers.arcs.frames import encode
 from drivers.arcs.rpc import encode_request, request_id
 from drivers.clock import HostClock

@@ -15,9 +15,9 @@ from bench.brushfit_brushes import FROZEN
 from bench.harness import BenchError, Result, machine
 from bench.processes import brushloop
 from bench.validate import CELLS, session
-from calibrate.field import Alignment, Tone
-from calibrate.validate.contenders import BEZIER_REFITTED, FITTED_HELD_OUT, GENERATOR_HELD_OUT
-from calibrate.validate.report import Report, load_report
+from calibrate.compare.field import Alignment, Tone
+from calibrate.validate.candidates import BEZIER_REFITTED, FITTED_HELD_OUT, GENERATOR_HELD_OUT
+from calibrate.validate.report.data import Report, load_report
 from calibrate.validate.run import CEILING
 
 REPEATS, TRAIN_STEPS, TUNE_STEPS = 3, 3000, 300

@@ -27,16 +27,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.harness import BenchError, Result, interleave, machine
-from calibrate.field import BEST_SHIFT_PX, KEYS, SIZE_PX, Alignment, Field
-from calibrate.similarity import csim, ssim
-from calibrate.simulate import simulated_pixels
+from calibrate.compare.field import BEST_SHIFT_PX, KEYS, SIZE_PX, Alignment, Field
+from calibrate.compare.images import Pixels, pack, unpack
+from calibrate.compare.similarity import csim, ssim
+from calibrate.compare.simulate import simulated_pixels
 from calibrate.validate.jobs import ABSENT, PrepareJob, Press, ScoreJob, prepare_job, score_job
-from calibrate.validate.pixels import Pixels, pack, unpack
 from calibrate.validate.pool import Dask, Threads
-from drivers.sim.brush import Brush, BrushSpec
+from drivers.sim.brush.brush import Brush, BrushSpec
 from model.ccdbsm import Brush as Bundle
 from model.registry import stroke_models
-from sessions.importer import ImportOptions, import_photographs
+from sessions.imports.photographs import ImportOptions, import_photographs
 from sessions.reader import Recording
 
 CELLS = tuple((height, tilt) for height in (11.0, 13.0, 15.0, 17.0, 20.0) for tilt in (0.0, 5.0, 10.0))

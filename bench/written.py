@@ -16,10 +16,10 @@ from pathlib import Path
 from bench.brushfit_brushes import FROZEN
 from bench.harness import BenchError, Result, machine
 from bench.processes import ROOT, Process, started
-from calibrate.field import Alignment, Tone
-from calibrate.written.images import Polarity
-from calibrate.written.scores import ANOTHER, REFERENCE, SIMULATED
-from calibrate.written.table import Table3Row, read_table_3
+from calibrate.compare.field import Alignment, Tone
+from calibrate.writing.images import Polarity
+from calibrate.writing.scores import ANOTHER, REFERENCE, SIMULATED
+from calibrate.writing.table import Table3Row, read_table_3
 
 CHARACTER, WRITINGS, ROUNDS = "字", 10, 3
 RATE = 20.0

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from calibrate.artefact import Calibration, Foreign, load_artefact
-from calibrate.camera.boards import see
-from calibrate.camera.session import board_of, board_stills
-from calibrate.camera.view import paper_mm
+from calibrate.board.detect import see
+from calibrate.board.session import board_of, board_stills
+from calibrate.board.view import paper_mm
 from calibrate.current import put_to_use
 from calibrate.errors import CalibrationError
 from sessions.reader import Recording
-from sessions.schemas import Source
+from sessions.recording.schemas import Source
 
 
 def apply_calibration(path: Path, session: Path, *, force: bool = False) -> Path:

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from calibrate.camera.lens import Lens, lens_of
+from calibrate.board.lens import Lens, lens_of
+from calibrate.board.scale import BoardSpec, apply
 from calibrate.errors import CalibrationError, invalid
 from calibrate.files import read_bounded, write_whole
-from calibrate.scale import BoardSpec, apply
 
 SCHEMA_VERSION = 2
 """Of a calibration: 2 names the lens, the board and the still, and tells where it was made for another session."""

@@ -1,33 +1,95 @@
-"""`brushloop calibrate`. Heavy imports wait until a command runs."""
+"""`brushloop calibrate SESSION` as ever, and `brushloop calibrate preprocess ...` beside it."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
+from calibrate.calibrate_cli import calibrate
 from sessions.terminal import say
 
+SESSION = "session"
 
-def calibrate(
-    session: Annotated[Path, typer.Argument(help="A session's folder or its .mcap file.")],
-    lens: Annotated[
-        Path | None, typer.Option(help="Lens file of `camera intrinsics`; the session's own by default.")
-    ] = None,
+
+class SessionOrCommand(TyperGroup):
+    """A group whose first argument may be a session's path: whatever is no command's name is one."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the command's name before a path; `./preprocess` names a session of that name."""
+        if not args or (args[0] not in self.commands and not args[0].startswith("-")):
+            args = [SESSION, *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(
+    cls=SessionOrCommand,
+    help="Fit scale and paper plane of a SESSION (`brushloop calibrate SESSION`), or look at what comes before.",
+)
+app.command(SESSION)(calibrate)
+
+
+@app.command()
+def show(
+    artefact: Annotated[Path, typer.Argument(help="A calibration, lens, registration or brush fit, or a session.")],
 ) -> None:
-    """Fit scale and paper plane from the board in view; writes an immutable calibration/<hash>.json."""
+    """What an artefact holds, or the calibration that a session uses."""
+    from calibrate.artefact_words import described, read_any
 
+    path, made = read_any(artefact)
+    say(str(path), *described(made))
+
+
+@app.command()
+def diff(
+    one: Annotated[Path, typer.Argument(help="An artefact, or a session: the calibration that it uses.")],
+    other: Annotated[Path, typer.Argument(help="Another of the same kind.")],
+) -> None:
+    """What is different in another artefact, and for calibrations what that means on the paper."""
+    from calibrate.artefact_words import differences, read_any
+
+    lines = differences(read_any(one)[1], read_any(other)[1])
+    say(*(lines or ["they are equal"]))
+
+
+@app.command("apply")
+def apply_to(
+    calibration: Annotated[Path, typer.Argument(help="A calibration/<hash>.json.")],
+    session: Annotated[Path, typer.Argument(help="The session that it is to be used for.")],
+    force: Annotated[bool, typer.Option(help="Also another session's; every result is then labelled.")] = False,
+) -> None:
+    """Use a calibration for a session from now on; another session's only by force."""
+    from calibrate.apply import apply_calibration
     from calibrate.artefact import Calibration, load_artefact
-    from calibrate.calibration import calibrate_session
 
-    path = calibrate_session(session, lens)
-    made = load_artefact(path, Calibration)
-    for flag in made.flags:
-        say(f"warning: {flag}")
-    say(
-        f"pix2len {made.mm_per_px:.5f} mm/px (95 %: {made.mm_per_px_low:.5f} to {made.mm_per_px_high:.5f}), "
-        f"board residual {made.rms_px:.3f} px over {made.corners} corners, {made.source}",
-        f"lens: {made.lens.source if made.lens else 'none'}",
-        str(path),
-    )
+    path = apply_calibration(calibration, session, force=force)
+    if label := load_artefact(path, Calibration).label:
+        say(f"warning: {label}")
+    say(str(path))
+
+
+@app.command()
+def preprocess(
+    capture: Annotated[Path, typer.Argument(help="A session (folder or .mcap), or a photograph.")],
+    stroke: Annotated[str, typer.Option(help="Stroke of the session, the first by default.")] = "",
+    px_per_mm: Annotated[float | None, typer.Option(help="Scale of a photograph.")] = None,
+    before: Annotated[Path | None, typer.Option(help="Photograph of the page before the stroke came.")] = None,
+    lens: Annotated[Path | None, typer.Option(help="Lens file; the session's own by default.")] = None,
+    out: Annotated[Path, typer.Option(help="The picture; the numbers go beside it as .json.")] = Path("stages.png"),
+) -> None:
+    """Show every stage of one capture as one picture, and write down each number that was fitted on the way."""
+    from calibrate.files import check_target
+    from calibrate.stroke.show import show_photograph, show_stroke
+
+    check_target(out, ".png", capture, before)
+    if capture.suffix.lower() in (".png", ".jpg", ".jpeg"):
+        trace = show_photograph(capture, px_per_mm, before, out)
+    else:
+        trace = show_stroke(capture, stroke, out, lens=lens)
+    for name, value in trace.log.items():
+        say(f"{name} {value:.6g}")
+    for flag in trace.flags:
+        say(f"flag: {flag}")
+    say(str(out))

@@ -74,7 +74,7 @@ def read_bounded(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
 def read_gray(path: Path) -> NDArray[np.uint8]:
     """(h, w) gray of a photograph, PNG or JPEG. Raises `CalibrationError` where it is none, or absurdly large."""
     from sessions.errors import SessionDamaged
-    from sessions.messages import decode_gray
+    from sessions.recording.messages import decode_gray
 
     try:
         return decode_gray(read_bounded(path, MAX_PHOTOGRAPH_BYTES), str(path))

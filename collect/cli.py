@@ -58,8 +58,8 @@ def collect(
     import sys
 
     from collect import start
-    from collect.live import LiveView
-    from collect.opening import Opening
+    from collect.engine.live import LiveView
+    from collect.engine.opening import Opening
 
     on_screen = tui if tui is not None else sys.stdin.isatty() and sys.stdout.isatty()
     if dry_run is not None:
@@ -97,12 +97,12 @@ def plan(
     import asyncio
     import json
 
-    from collect.config import load_rig
-    from collect.plane import PaperPlane
     from collect.planning.limits import all_poses, check_protocol
     from collect.planning.plan_table import plan_table
     from collect.planning.summary import make_plan
     from collect.protocols.loading import load_protocol
+    from collect.rig.config import load_rig
+    from collect.rig.plane import PaperPlane
 
     if picture is not None:
         from collect.planning.picture import check_picture
@@ -139,15 +139,15 @@ def doctor(
     import asyncio
     import json
 
-    from collect.config import load_rig
-    from collect.doctor import examine
+    from collect.rig.config import load_rig
+    from collect.rig.doctor import examine
     from drivers.clock import HostClock
 
     findings = asyncio.run(examine(load_rig(config), HostClock()))
     if as_json:
         say(*(json.dumps(finding.as_json()) for finding in findings))
     else:
-        from collect.doctor_table import doctor_table
+        from collect.rig.doctor_table import doctor_table
 
         say(doctor_table(findings))
     if not all(finding.well for finding in findings):

@@ -13,7 +13,7 @@ from typing import Protocol
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from collect.snapshot import EngineView, Snapshot
+from collect.engine.snapshot import EngineView, Snapshot
 from sessions.console import PlainConsole
 
 REFRESH_S = 0.1

@@ -8,13 +8,13 @@ import tempfile
 from pathlib import Path
 from typing import Literal
 
-from collect.engine import Engine
-from collect.finished import ending
+from collect.chains.finished import ending
+from collect.engine.engine import Engine
+from collect.engine.live import LiveView
+from collect.engine.opening import Opening, check_writable, find_resumable, open_store
+from collect.engine.rehearsal import Rehearsal
 from collect.headless import run_headless
-from collect.live import LiveView
-from collect.opening import Opening, check_writable, find_resumable, open_store
 from collect.planning.limits import check_protocol
-from collect.rehearsal import Rehearsal
 from drivers.clock import HostClock
 from sessions.terminal import plain
 

@@ -17,16 +17,16 @@ from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
 from pydantic import ValidationError
 
-from sessions import container
-from sessions.codec import Line
 from sessions.disk import check_room, publish
 from sessions.errors import InputError, SessionDamaged, disk_error
-from sessions.journal import fsync_folder
+from sessions.journal.codec import Line
+from sessions.journal.journal import fsync_folder
 from sessions.merge import Copier, count_messages
 from sessions.reader import Recording
-from sessions.schemas import Header, Quality, Stroke, Topic
+from sessions.recording import container
+from sessions.recording.schemas import Header, Quality, Stroke, Topic
+from sessions.recording.writer import CHUNK_BYTES, HEADER_METADATA, header_metadata, media_type, note, read_note
 from sessions.store import SESSION_ID, SNAPSHOT_NAMES
-from sessions.writer import CHUNK_BYTES, HEADER_METADATA, header_metadata, media_type, note, read_note
 
 PARTS_NOTE = "brushloop.parts"
 JOINED = ("software", "robot_firmware", "camera", "origin", "licence")

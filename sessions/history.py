@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from sessions.codec import Line
 from sessions.errors import SessionDamaged, in_one_line
-from sessions.events import NONSENSE
-from sessions.journal import JOURNAL_NAME, replay
+from sessions.journal.codec import Line
+from sessions.journal.events import NONSENSE
+from sessions.journal.journal import JOURNAL_NAME, replay
 
 CAPTURE, DIP, ZERO_TOUCH = "capture", "dip", "zero_touch"
 

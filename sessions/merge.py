@@ -10,12 +10,12 @@ from pathlib import Path
 from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
 
-from sessions.codec import Line
-from sessions.container import messages
 from sessions.errors import SessionDamaged, disk_error, in_one_line
-from sessions.journal import fsync_folder
-from sessions.schemas import Header, Topic
-from sessions.writer import CHUNK_BYTES, HEADER_METADATA, file_sha256, header_metadata, media_type, note
+from sessions.journal.codec import Line
+from sessions.journal.journal import fsync_folder
+from sessions.recording.container import messages
+from sessions.recording.schemas import Header, Topic
+from sessions.recording.writer import CHUNK_BYTES, HEADER_METADATA, file_sha256, header_metadata, media_type, note
 
 REPAIRS_NOTE = "brushloop.repairs"
 """Metadata of a merged file whose session was repaired: what was rewritten, with what missing, and what was lost."""

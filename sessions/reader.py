@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
-from sessions import container
 from sessions.errors import InputError, SessionDamaged, in_one_line
-from sessions.journal import JOURNAL_NAME, is_open, replay
-from sessions.messages import decode_gray, decode_still
+from sessions.journal.journal import JOURNAL_NAME, is_open, replay
 from sessions.names import check_companions
+from sessions.recording import container
+from sessions.recording.messages import decode_gray, decode_still
+from sessions.recording.schemas import Event, Header, StepEvent, Stroke, Topic
+from sessions.recording.writer import HEADER_METADATA, file_sha256, header_crc
 from sessions.remarks import remarks_of
 from sessions.renamed import check_name, not_a_session
-from sessions.schemas import Event, Header, StepEvent, Stroke, Topic
-from sessions.writer import HEADER_METADATA, file_sha256, header_crc
 
 if TYPE_CHECKING:
     import numpy as np

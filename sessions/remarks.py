@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sessions.errors import SessionDamaged
-from sessions.journal import Journal, read_lines
+from sessions.journal.journal import Journal, read_lines
 
 REMARKS_NAME = "remarks.jsonl"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sessions.errors import InputError, SessionDamaged
-from sessions.journal import JOURNAL_NAME, is_open, replay
+from sessions.journal.journal import JOURNAL_NAME, is_open, replay
 from sessions.names import check_folder
 from sessions.store import SEGMENT_NAME
 

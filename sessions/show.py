@@ -10,15 +10,15 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from sessions import container
-from sessions.codec import Line
 from sessions.errors import InputError, SessionDamaged, in_one_line
-from sessions.events import NONSENSE
-from sessions.journal import JOURNAL_NAME, Replay, replay_lines
+from sessions.journal.codec import Line
+from sessions.journal.events import NONSENSE
+from sessions.journal.journal import JOURNAL_NAME, Replay, replay_lines
 from sessions.reader import Recording
+from sessions.recording import container
+from sessions.recording.schemas import Header, Stroke, Topic
 from sessions.remarks import remarks_of
 from sessions.renamed import check_name
-from sessions.schemas import Header, Stroke, Topic
 from sessions.store import counts_of, read_header
 
 DEVICES = ("robot", "robot_firmware", "camera", "lens", "brush", "ink", "paper")

@@ -14,14 +14,14 @@ from typing import Any
 from filelock import FileLock, Timeout
 from pydantic import ValidationError
 
-from sessions.codec import Line
 from sessions.disk import check_room, free_bytes, set_aside
 from sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked, disk_error, in_one_line
-from sessions.journal import JOURNAL_NAME, Journal, Replay, fsync_folder, is_open, replay
+from sessions.journal.codec import Line
+from sessions.journal.journal import JOURNAL_NAME, Journal, Replay, fsync_folder, is_open, replay
 from sessions.merge import merge, verify
 from sessions.names import check_folder
-from sessions.schemas import Header, Recorded
-from sessions.writer import QUEUE_LIMIT, SegmentWriter, file_sha256
+from sessions.recording.schemas import Header, Recorded
+from sessions.recording.writer import QUEUE_LIMIT, SegmentWriter, file_sha256
 
 STEP_BYTES = 64 * 1024 * 1024
 """Room that the disk must have before a step begins: more than the photographs and poses of any one step."""

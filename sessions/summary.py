@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sessions.errors import InputError, SessionError
-from sessions.journal import JOURNAL_NAME, is_open, replay
+from sessions.journal.journal import JOURNAL_NAME, is_open, replay
 from sessions.names import check_folder
 from sessions.reader import Recording
+from sessions.recording.schemas import Source, Topic
 from sessions.renamed import recording_of_renamed
-from sessions.schemas import Source, Topic
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,16 +6,16 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sessions.codec import Line
 from sessions.errors import InputError, SessionDamaged, SessionError
-from sessions.evidence import Evidence, gather
-from sessions.journal import JOURNAL_NAME
+from sessions.journal.codec import Line
+from sessions.journal.journal import JOURNAL_NAME
 from sessions.merge import verify as verify_digest
 from sessions.reader import Recording
+from sessions.recording.schemas import Topic
 from sessions.renamed import check_name, not_a_session
-from sessions.schemas import Topic
+from sessions.repair.evidence import Evidence, gather
+from sessions.repair.soundness import file_problems
 from sessions.show import details
-from sessions.soundness import file_problems
 from sessions.store import SEGMENT_NAME, counts_of
 
 

@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Iterable, Mapping
 from typing import TypeVar
 
-from sessions.lines import Line
+from sessions.journal.lines import Line
 
 LEAST_S = 2.0
 """A difference that no ink shows."""

@@ -34,8 +34,10 @@ def test_help_loads_nothing_heavy() -> None:
 
 
 def test_a_rig_pc_collects_without_torch_and_a_validator_without_devices() -> None:
-    assert "torch" not in loaded("import collect.engine, collect.headless, collect.opening, collect.tui.app")
-    validating = loaded("import calibrate.validation, calibrate.write")
+    assert "torch" not in loaded(
+        "import collect.engine.engine, collect.headless, collect.engine.opening, collect.tui.app"
+    )
+    validating = loaded("import calibrate.current_calibration, calibrate.drags.report")
     assert not {"serial", "can", "textual", "drivers"} & set(validating)
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calibrate.scales import MM_PER_PX
+from calibrate.compare.scales import MM_PER_PX
 from sessions.terminal import say
 
 
@@ -23,7 +23,7 @@ def compare(
     """Compare re-pressed strokes with their originals, beside the brush's own repeatability."""
     import sys
 
-    from calibrate.field import Field
+    from calibrate.compare.field import Field
     from calibrate.files import check_folder
     from calibrate.loop.compare import compare_sessions
     from calibrate.loop.report import PICTURE, summary, write_loop

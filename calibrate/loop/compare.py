@@ -9,18 +9,18 @@ from pathlib import Path
 from typing import Any
 
 from calibrate.artefact import Calibration, load_artefact
-from calibrate.brushfit.artefact import BrushFit
+from calibrate.compare.field import Field
+from calibrate.current_calibration import brush_of, calibration_of
 from calibrate.errors import CalibrationError
-from calibrate.field import Field
+from calibrate.fit.artefact import BrushFit
 from calibrate.loop.pairs import Paired, Side, pair_up
 from calibrate.loop.scores import PairScore, Verdict, score_pairs, verdicts
 from calibrate.loop.table import Table1Row, table_1
-from calibrate.validation import brush_of, calibration_of
 from model.fitted_shape import fitted_model
 from model.protocol import StrokeModel
 from model.registry import stroke_model
 from sessions.reader import Recording
-from sessions.schemas import Header, Source
+from sessions.recording.schemas import Header, Source
 
 
 @dataclass(frozen=True, slots=True)

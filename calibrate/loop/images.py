@@ -5,11 +5,11 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 
+from calibrate.compare.field import Alignment, Image, Tone, best_shift, captured_mm, captured_normalised
+from calibrate.compare.similarity import csim, ssim
 from calibrate.errors import CaptureRefused
-from calibrate.field import Alignment, Image, Tone, best_shift, captured_mm, captured_normalised
-from calibrate.measure import Measured, measure
-from calibrate.preprocess import Prepared
-from calibrate.similarity import csim, ssim
+from calibrate.stroke.measure import Measured, measure
+from calibrate.stroke.preprocess import Prepared
 
 Key = tuple[Alignment, Tone]
 KEYS: tuple[Key, ...] = tuple(itertools.product(Alignment, Tone))

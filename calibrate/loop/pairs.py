@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from calibrate.artefact import Calibration
+from calibrate.compare.field import Field, Image
+from calibrate.compare.simulate import simulated
 from calibrate.errors import CaptureRefused
-from calibrate.field import Field, Image
 from calibrate.loop.images import KEYS, Key, Seen, seen
-from calibrate.preprocess import Params
-from calibrate.presses import prepare_press
-from calibrate.simulate import simulated
+from calibrate.stroke.preprocess import Params
+from calibrate.stroke.presses import prepare_press
 from model.ccdbsm import DomainError
 from model.protocol import StrokeModel
 from sessions.errors import SessionDamaged

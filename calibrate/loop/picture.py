@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.field import Alignment, Image, Tone
+from calibrate.compare.field import Alignment, Image, Tone
 from calibrate.loop.compare import Closed
 from calibrate.loop.pairs import Pair
 from calibrate.loop.scores import AGAIN

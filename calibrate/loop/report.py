@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from calibrate.field import Alignment, Tone
+from calibrate.compare.field import Alignment, Tone
+from calibrate.compare.similarity import SSIM_SETTINGS
 from calibrate.files import write_whole
 from calibrate.loop.compare import Closed, Half
 from calibrate.loop.images import KEYS
@@ -17,10 +18,9 @@ from calibrate.loop.picture import draw
 from calibrate.loop.scores import AGAIN, GOAL_POINTS, PairScore
 from calibrate.loop.table import FILE as NUMBERS
 from calibrate.loop.table import PAPER_ROBOT, LoopRecord, Table1Row
-from calibrate.pages import render
-from calibrate.pictures import difference, ink
-from calibrate.similarity import SSIM_SETTINGS
-from calibrate.wording import source_note
+from calibrate.report.pages import render
+from calibrate.report.pictures import difference, ink
+from calibrate.report.wording import source_note
 from sessions.cells import CsvWriter
 
 HEADLINE = (Alignment.MM, Tone.BINARY)

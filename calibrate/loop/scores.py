@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.field import Alignment, Image, Tone
+from calibrate.compare.field import Alignment, Image, Tone
 from calibrate.loop.images import KEYS, Seen, similarity
 from calibrate.loop.pairs import Pair, Paired
 

@@ -8,11 +8,11 @@ from typing import Annotated, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from calibrate.field import Alignment, Tone
+from calibrate.compare.field import Alignment, Tone
 from calibrate.loop.images import KEYS
 from calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, Verdict, statistics
-from calibrate.sealed import Sealed, load_sealed
-from sessions.schemas import Source
+from calibrate.report.sealed import Sealed, load_sealed
+from sessions.recording.schemas import Source
 
 FILE = "loop.json"
 FORMAT = "brushloop-loop-1"

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.brushfit.fit import fit_presses
-from calibrate.field import KEYS, Alignment, Tone
-from calibrate.simulate import simulated_pixels
+from calibrate.compare.field import KEYS, Alignment, Tone
+from calibrate.compare.images import pack
+from calibrate.compare.simulate import simulated_pixels
+from calibrate.current_calibration import brush_of
+from calibrate.fit.fit import fit_presses
 from calibrate.validate.heldout import RefitJob, bezier_body, bezier_pixels, cropped, fitted_press, press_body
 from calibrate.validate.jobs import ABSENT, VERSION, ScoreJob, score_job
-from calibrate.validate.pixels import pack
 from calibrate.validate.pool import Scheduler
-from calibrate.validate.report import Step
+from calibrate.validate.report.data import Step
 from calibrate.validate.run import CHUNK, Outcome
 from calibrate.validate.steps import Progress
-from calibrate.validation import brush_of
 from model.fitted_shape import fitted_model
 
 COUNTS = (1, 2, 3, 5, 9, 15, 30, 60)

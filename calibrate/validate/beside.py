@@ -18,8 +18,8 @@ from calibrate.files import read_bounded
 from calibrate.loop.table import FILE as LOOP_FILE
 from calibrate.loop.table import LoopRecord, read_loop
 from calibrate.validate.sources import Opened, one_source
-from calibrate.written.table import FILE as WRITTEN_FILE
-from calibrate.written.table import PICTURE, WrittenRecord, read_written
+from calibrate.writing.table import FILE as WRITTEN_FILE
+from calibrate.writing.table import PICTURE, WrittenRecord, read_written
 
 LOOP_FOLDER, WRITTEN_FOLDER = "loop", "written"
 """Where `brushloop loop` and `brushloop write` put theirs: in the session, and beside the folder of sessions."""

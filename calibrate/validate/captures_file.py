@@ -12,14 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.compare.field import FINE, Field, Image
+from calibrate.compare.simulate import axis_mm
+from calibrate.current_calibration import brush_of
 from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.field import FINE, Field, Image
-from calibrate.preprocess import PX_PER_MM, Params, Prepared
-from calibrate.presses import prepare_press
-from calibrate.simulate import axis_mm
+from calibrate.stroke.preprocess import PX_PER_MM, Params, Prepared
+from calibrate.stroke.presses import prepare_press
 from calibrate.validate.heldout import Cell
 from calibrate.validate.sources import Opened, one_source
-from calibrate.validation import brush_of
 from model.ccdbsm import DomainError
 from sessions.errors import SessionDamaged
 

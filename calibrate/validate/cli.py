@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from calibrate.scales import MM_PER_PX
+from calibrate.compare.scales import MM_PER_PX
 from sessions.terminal import say
 
 if TYPE_CHECKING:
@@ -65,12 +65,12 @@ def validate(
     """Compare every model with every captured stroke; the same command goes on where it was stopped."""
     import sys
 
-    from calibrate.field import Field
-    from calibrate.terminal import summary as drag_summary
+    from calibrate.compare.field import Field
+    from calibrate.drags.terminal import summary as drag_summary
     from calibrate.validate.beside import Given
     from calibrate.validate.main import Request, check
     from calibrate.validate.main import validate as run
-    from calibrate.validate.terminal import summary
+    from calibrate.validate.report.terminal import summary
 
     request = Request(
         places=tuple(session),

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from calibrate.compare.stats import Paired, holm, paired
 from calibrate.errors import CalibrationError
-from calibrate.validate.report import Report, load_report
-from calibrate.validate.stats import Paired, holm, paired
+from calibrate.validate.report.data import Report, load_report
 from sessions.cells import as_text
 
 SIGNIFICANT = 0.05

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
+from calibrate.compare.field import Alignment, Tone
 from calibrate.errors import CalibrationError
-from calibrate.field import Alignment, Tone
-from calibrate.validate.report import Report
+from calibrate.validate.report.data import Report
 
 OPERATORS: dict[str, Callable[[float, float], bool]] = {
     ">=": operator.ge,

@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.brushfit.artefact import BrushFit
-from calibrate.brushfit.bezier import RefittedBezier, refit_bezier
-from calibrate.brushfit.captures import MARGIN_MM, grid_of
-from calibrate.brushfit.fit import Fit, Grid, Pressed, refit
-from calibrate.field import SIZE_PX, Field
-from calibrate.simulate import shape_pixels
+from calibrate.compare.field import SIZE_PX, Field
+from calibrate.compare.images import Pixels, unpack
+from calibrate.compare.simulate import shape_pixels
+from calibrate.fit.artefact import BrushFit
+from calibrate.fit.bezier import RefittedBezier, refit_bezier
+from calibrate.fit.captures import MARGIN_MM, grid_of
+from calibrate.fit.fit import Fit, Grid, Pressed, refit
 from calibrate.validate.jobs import VERSION
-from calibrate.validate.pixels import Pixels, unpack
 from model.fitted import MODES, NAMES, TERMS, FittedPress
 
 Cell = tuple[float, float]

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.artefact import Calibration
+from calibrate.compare.field import BEST_SHIFT_PX, KEYS, Alignment, Field
+from calibrate.compare.images import pack, press_images, unpack
 from calibrate.errors import CaptureRefused
-from calibrate.field import BEST_SHIFT_PX, KEYS, Alignment, Field
-from calibrate.measure import Measured
-from calibrate.preprocess import Params
-from calibrate.presses import prepare_press
-from calibrate.validate.pixels import pack, press_images, unpack
+from calibrate.stroke.measure import Measured
+from calibrate.stroke.preprocess import Params
+from calibrate.stroke.presses import prepare_press
 from sessions.errors import SessionDamaged
 from sessions.reader import Capture
 
@@ -135,7 +135,7 @@ def scores(captured: NDArray[np.uint8], predicted: Sequence[NDArray[np.uint8]]) 
 
     In the size-normalised alignment each prediction first takes its best shift. NaN where an image is blank.
     """
-    from calibrate.validate.kernel import compare  # numba takes a fifth of a second to import
+    from calibrate.compare.compiled import compare  # numba takes a fifth of a second to import
 
     out = np.empty((len(predicted), len(KEYS), 2))
     for k, (alignment, _tone) in enumerate(KEYS):

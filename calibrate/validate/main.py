@@ -10,25 +10,25 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from calibrate.drags import validate_drags
+from calibrate.compare.field import Field
+from calibrate.drags.measure import validate_drags
+from calibrate.drags.report import DragValidation, write_drags
 from calibrate.errors import CalibrationError
-from calibrate.field import Field
 from calibrate.files import check_folder, write_whole
-from calibrate.preprocess import Params
+from calibrate.stroke.preprocess import Params
 from calibrate.validate import beside as extra
 from calibrate.validate.ablation import similarity_by_strokes
-from calibrate.validate.contenders import generator_file
-from calibrate.validate.figures import read_curve
+from calibrate.validate.candidates import generator_file
 from calibrate.validate.gates import check_gates, parse_gate
-from calibrate.validate.outputs import csv_of, summary_csv, table_3_csv, write_csv, write_parquet
-from calibrate.validate.page import page_of
 from calibrate.validate.pool import Dask, Threads
-from calibrate.validate.report import Report
+from calibrate.validate.report.data import Report
+from calibrate.validate.report.figures import read_curve
+from calibrate.validate.report.outputs import csv_of, summary_csv, table_3_csv, write_csv, write_parquet
+from calibrate.validate.report.page import page_of
+from calibrate.validate.report.summary import report_of
 from calibrate.validate.run import Options, Outcome, validate_presses
 from calibrate.validate.sources import URL, Opened, one_source, open_session
 from calibrate.validate.steps import Progress
-from calibrate.validate.summary import report_of
-from calibrate.write import DragValidation, write_drags
 
 FOLDER = "validation"
 WORK = "work"

@@ -14,10 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.compare.field import KEYS, Field
+from calibrate.compare.images import pack
+from calibrate.current_calibration import brush_of
 from calibrate.errors import CalibrationError
-from calibrate.field import KEYS, Field
-from calibrate.validate import contenders as who
-from calibrate.validate.contenders import Contender, Generator
+from calibrate.validate import candidates as who
+from calibrate.validate.candidates import Contender, Generator
 from calibrate.validate.heldout import Cell
 from calibrate.validate.jobs import (
     ABSENT,
@@ -26,13 +28,11 @@ from calibrate.validate.jobs import (
     press_of,
     score_job,
 )
-from calibrate.validate.pixels import pack
 from calibrate.validate.pool import Scheduler
 from calibrate.validate.sources import Opened
 from calibrate.validate.steps import Progress, Row, pixels_of, prepared_rows, refits_by_cell
 from calibrate.validate.store import Store
 from calibrate.validate.tuned import FOLDS, tuned_by_cell
-from calibrate.validation import brush_of
 from model.ccdbsm import DomainError
 
 CEILING = "another press"

@@ -17,16 +17,16 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from calibrate.artefact import FOLDER, Calibration, load_artefact
-from calibrate.brushfit.artefact import FOLDER as FITS
-from calibrate.brushfit.artefact import BrushFit
 from calibrate.current import MAX_POINTER_BYTES, POINTER, current, pointed
+from calibrate.current_calibration import calibration_of
 from calibrate.errors import CalibrationError
-from calibrate.validation import calibration_of
+from calibrate.fit.artefact import FOLDER as FITS
+from calibrate.fit.artefact import BrushFit
 from sessions.errors import SessionDamaged
-from sessions.journal import JOURNAL_NAME, replay
+from sessions.journal.journal import JOURNAL_NAME, replay
 from sessions.reader import Recording
-from sessions.schemas import Header, Source
-from sessions.writer import file_sha256
+from sessions.recording.schemas import Header, Source
+from sessions.recording.writer import file_sha256
 
 PIECE = 1024 * 1024
 MAX_DOWNLOAD_BYTES = 64 * 1024**3

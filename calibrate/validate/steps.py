@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from calibrate.field import Field
+from calibrate.compare.field import Field
+from calibrate.current_calibration import brush_of
 from calibrate.validate.heldout import MOST_FOLDS, MOST_STROKES, PER_CELL, Cell, RefitJob, folds, refit_job, start_of
 from calibrate.validate.jobs import VERSION, PrepareJob, Press, prepare_job, press_of
 from calibrate.validate.pool import Scheduler
 from calibrate.validate.sources import Opened
 from calibrate.validate.store import Store
-from calibrate.validation import brush_of
 
 Progress = Callable[[str, int, int], None]
 """What is being done, how much of it is done, of how much."""

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calibrate.current_calibration import brush_of
+from calibrate.validate.candidates import Generator
 from calibrate.validate.captures_file import Laid, lay_captures, write_captures
-from calibrate.validate.contenders import Generator
 from calibrate.validate.heldout import Cell, fitted_press, folds
 from calibrate.validate.jobs import VERSION
 from calibrate.validate.sources import Opened
-from calibrate.validation import brush_of
 
 if TYPE_CHECKING:
     from calibrate.validate.steps import Progress

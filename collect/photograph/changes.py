@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from collect.touch.ink import gray
+from collect.photograph.ink import gray
 
 Thumbnail = NDArray[np.float32]
 WIDTH_PX = 160

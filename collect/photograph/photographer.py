@@ -13,11 +13,11 @@ import math
 from collections.abc import AsyncGenerator, Awaitable, Callable
 from dataclasses import dataclass, replace
 
-from collect.config_devices import CameraConfig
 from collect.errors import ArmInPicture, CameraLate
 from collect.photograph.changes import Thumbnail
 from collect.photograph.delay import CameraDelay, Look, Placed, look
 from collect.photograph.frames import ARM_SHARE, Frames, View, watching
+from collect.rig.config_devices import CameraConfig
 from drivers.clock import Clock
 from drivers.errors import DeviceError
 from drivers.protocols import Camera, Robot

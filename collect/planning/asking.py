@@ -8,8 +8,8 @@ from typing import Any
 
 from scipy.spatial.transform import Rotation
 
-from collect.config import RigConfig
 from collect.errors import ConfigError
+from collect.rig.config import RigConfig
 from drivers.arcs.controller import Controller
 from drivers.arcs.generation import open_arcs
 from drivers.arcs.joints import joint_positions

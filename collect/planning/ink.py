@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from collect.config import BrushConfig, RigConfig
-from collect.config_devices import ModbusPumpConfig
+from collect.rig.config import BrushConfig, RigConfig
+from collect.rig.config_devices import ModbusPumpConfig
 
 HELD_SHARE = 0.3
 """Share of a wet bundle's volume that is ink between the hairs. An assumption: weigh a dipped brush to do better."""

@@ -6,17 +6,17 @@ import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from collect.config import RigConfig
 from collect.errors import ConfigError, StepError
-from collect.plane import PaperPlane
+from collect.motion.procedures import park_moves
 from collect.planning.moves import moves_of
 from collect.planning.walk import sheet_of, steps_on
-from collect.procedures import park_moves
 from collect.protocols.config import CalibrationConfig, GridConfig, ProtocolConfig, WriteConfig
 from collect.protocols.plans import planned
-from collect.rig import limits_of
-from collect.sheet import Cell, Sheet
-from collect.steps import MARKING, Result, Step, StepKind
+from collect.protocols.steps import MARKING, Result, Step, StepKind
+from collect.rig.config import RigConfig
+from collect.rig.devices import limits_of
+from collect.rig.plane import PaperPlane
+from collect.rig.sheet import Cell, Sheet
 from collect.touch.selfcheck import triangle_in
 from drivers.errors import LimitExceeded
 from drivers.samples import Pose

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from collect.config import BrushConfig
+from collect.rig.config import BrushConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from collect.config import RigConfig
-from collect.drawing import Drawn, stroke_moves
-from collect.plane import PaperPlane
-from collect.procedures import Move, inking_moves, photograph_moves, press_moves, zero_touch_moves
-from collect.sheet import Cell
-from collect.steps import Step, StepKind
-from collect.touch.config import TouchConfig
-from collect.touch.moves import Room, mark_moves, over, visit_moves
+from collect.motion.drawing import Drawn, stroke_moves
+from collect.motion.procedures import Move, inking_moves, photograph_moves, press_moves, zero_touch_moves
+from collect.motion.touches import Room, mark_moves, over, visit_moves
+from collect.protocols.steps import Step, StepKind
+from collect.rig.config import RigConfig
+from collect.rig.config_touch import TouchConfig
+from collect.rig.plane import PaperPlane
+from collect.rig.sheet import Cell
 from collect.touch.places import patch_spots, touch_rects
 from collect.touch.reach import lowest_z_mm
 from collect.touch.selfcheck import triangle_on

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from collect.config import RigConfig
 from collect.errors import ConfigError
-from collect.plane import to_paper
 from collect.planning.summary import Placed, Plan
 from collect.planning.walk import sheet_of
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.plans import planned
-from collect.sheet import Sheet
+from collect.rig.config import RigConfig
+from collect.rig.plane import to_paper
+from collect.rig.sheet import Sheet
 from collect.touch.selfcheck import partners
 
 Axes = Any

@@ -6,18 +6,18 @@ from collections import Counter
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from collect.config import RigConfig
 from collect.errors import StepError
+from collect.motion.procedures import park_moves
 from collect.planning.ink import InkNeed, ink_need
 from collect.planning.marks import reach_of
 from collect.planning.moves import StepMoves
 from collect.planning.timing import OMITTED, step_s
 from collect.planning.walk import Walked, sheet_of, walk
-from collect.procedures import park_moves
 from collect.protocols.config import AdaptiveConfig, ProtocolConfig, ReplayConfig, WriteConfig
 from collect.protocols.plans import planned
-from collect.sheet import Cell, Sheet
-from collect.steps import MARKING, StepKind
+from collect.protocols.steps import MARKING, StepKind
+from collect.rig.config import RigConfig
+from collect.rig.sheet import Cell, Sheet
 from collect.touch.selfcheck import triangle_in
 from drivers.samples import Pose
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-from collect.config import RigConfig
+from collect.motion.procedures import Move
+from collect.motion.touches import Room
 from collect.planning.moves import StepMoves, Way
-from collect.procedures import Move
-from collect.rig import limits_of
-from collect.touch.moves import Room
+from collect.rig.config import RigConfig
+from collect.rig.devices import limits_of
 from drivers.limits import Limits
 from drivers.samples import Pose
 

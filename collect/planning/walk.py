@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
-from collect.config import RigConfig
-from collect.plane import PaperPlane
 from collect.planning.moves import StepMoves, moves_of
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.planned import Layout
 from collect.protocols.plans import cell_mm, steps
 from collect.protocols.self_check import with_self_check
-from collect.sheet import Cell, Sheet
-from collect.steps import MARKING, Protocol, Result, Step, StepKind
+from collect.protocols.steps import MARKING, Protocol, Result, Step, StepKind
+from collect.rig.config import RigConfig
+from collect.rig.plane import PaperPlane
+from collect.rig.sheet import Cell, Sheet
 from collect.touch.selfcheck import partners
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from collect.protocols.config import AdaptiveConfig
 from collect.protocols.planned import Planned
+from collect.protocols.steps import Protocol, Result, Step, StepKind
 from collect.protocols.strokes import takes
-from collect.steps import Protocol, Result, Step, StepKind
 
 
 def cells(config: AdaptiveConfig) -> list[tuple[float, float]]:

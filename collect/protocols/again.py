@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from collect.protocols.planned import Planned
-from collect.steps import Result
+from collect.protocols.steps import Result
 
 AGAIN = "-again"
 

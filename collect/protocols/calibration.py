@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collect.protocols.config import CalibrationConfig
-from collect.steps import Protocol, Step, StepKind
+from collect.protocols.steps import Protocol, Step, StepKind
 
 
 def steps(config: CalibrationConfig) -> Protocol:

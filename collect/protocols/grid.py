@@ -7,8 +7,8 @@ import random
 from collect.protocols.config import GridConfig
 from collect.protocols.order import numbered
 from collect.protocols.planned import Layout, Planned
+from collect.protocols.steps import Protocol
 from collect.protocols.strokes import stroke_steps
-from collect.steps import Protocol
 
 
 def planned(config: GridConfig, layout: Layout | None = None) -> list[Planned]:

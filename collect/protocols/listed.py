@@ -5,8 +5,8 @@ from __future__ import annotations
 from collect.protocols.config import ListConfig
 from collect.protocols.order import numbered, shuffled
 from collect.protocols.planned import Layout, Planned
+from collect.protocols.steps import Protocol
 from collect.protocols.strokes import stroke_steps
-from collect.steps import Protocol
 
 
 def planned(config: ListConfig, layout: Layout | None = None) -> list[Planned]:

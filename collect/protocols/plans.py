@@ -13,7 +13,7 @@ from collect.protocols.config import (
     WriteConfig,
 )
 from collect.protocols.planned import Layout, Planned
-from collect.steps import Protocol
+from collect.protocols.steps import Protocol
 
 
 def planned(config: ProtocolConfig, layout: Layout | None = None) -> list[Planned]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 
-from collect.steps import Protocol, Step, StepKind
+from collect.protocols.steps import Protocol, Step, StepKind
 
 KNOWING = frozenset({StepKind.ZERO_TOUCH, StepKind.TOUCH, StepKind.BOARD})
 """Paper and board must be known before it."""

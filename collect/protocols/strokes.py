@@ -9,7 +9,7 @@ from collections.abc import Generator, Iterable
 from collect.protocols.config import WriteConfig
 from collect.protocols.planned import Planned
 from collect.protocols.rows import TrajectoryPoint
-from collect.steps import Params, Protocol, Result, Step, StepKind
+from collect.protocols.steps import Params, Protocol, Result, Step, StepKind
 
 
 def stroke_steps(plan: Iterable[Planned], *, board_every: int | None, write: WriteConfig | None = None) -> Protocol:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collect.protocols.config import WriteConfig
 from collect.protocols.order import shuffled
 from collect.protocols.planned import Layout, Planned
+from collect.protocols.steps import Protocol
 from collect.protocols.strokes import stroke_steps
-from collect.steps import Protocol
 
 
 def planned(config: WriteConfig, layout: Layout | None = None) -> list[Planned]:

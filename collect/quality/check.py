@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibrate.preprocess import PX_PER_MM, Gray, Params
-from calibrate.scale import PlaneFit
+from calibrate.board.scale import PlaneFit
+from calibrate.stroke.preprocess import PX_PER_MM, Gray, Params
 from collect.quality import ink_checks, picture_checks, shape_checks
-from collect.quality.config import QualityConfig
 from collect.quality.ink import Ink, mm2, tell_apart
 from collect.quality.mark import measure_mark
 from collect.quality.patch import Point, Rect, around, take
 from collect.quality.verdict import Check, Failure, Verdict
-from collect.sheet import Cell
+from collect.rig.config_quality import QualityConfig
+from collect.rig.sheet import Cell
 
 MARGIN_MM = 4.0
 """Around the cell, where a stroke that leaves it may be found."""

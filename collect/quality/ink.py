@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from calibrate.preprocess import PX_PER_MM, Mask
+from calibrate.stroke.preprocess import PX_PER_MM, Mask
 from collect.quality.patch import Patch, Point, Rect
 
 COARSE = 4

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from collect.quality.config import QualityConfig
 from collect.quality.ink import Ink
 from collect.quality.mark import Mark
 from collect.quality.verdict import Check, Failure
+from collect.rig.config_quality import QualityConfig
 
 CROSSING_MM = 4.0
 """Ink across the edge of a cell: more than the end of one stroke that went too far."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from calibrate.preprocess import PX_PER_MM, Gray, Mask, Params, Soft, flatten, rectify
-from calibrate.scale import Floats, apply
+from calibrate.board.scale import Floats, apply
+from calibrate.stroke.preprocess import PX_PER_MM, Gray, Mask, Params, Soft, flatten, rectify
 
 Rect = tuple[float, float, float, float]
 """x, y, width, height in the paper frame, mm."""

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.preprocess import PX_PER_MM, Gray, Mask
-from calibrate.scale import Floats, PlaneFit, apply
+from calibrate.board.scale import Floats, PlaneFit, apply
+from calibrate.stroke.preprocess import PX_PER_MM, Gray, Mask
 
 FINE_PX, WIDE_PX = 1.0, 2.0
 """Two blurs put on top; how much the second weakens an edge more than the first tells the edge's own blur."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibrate.preprocess import Gray, rectify
-from calibrate.scale import PlaneFit
+from calibrate.board.scale import PlaneFit
+from calibrate.stroke.preprocess import Gray, rectify
 from collect.quality import picture
-from collect.quality.config import QualityConfig
 from collect.quality.ink import Ink
 from collect.quality.patch import Point, Rect
 from collect.quality.verdict import Check, Failure
+from collect.rig.config_quality import QualityConfig
 
 
 def exposure(image: Gray, limits: QualityConfig) -> Check:

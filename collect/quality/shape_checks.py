@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collect.quality.config import QualityConfig
 from collect.quality.mark import Mark
 from collect.quality.verdict import Check, Failure
+from collect.rig.config_quality import QualityConfig
 
 
 def split(mark: Mark, limits: QualityConfig) -> Check:

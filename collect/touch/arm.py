@@ -7,9 +7,9 @@ import contextlib
 from collections.abc import AsyncGenerator, Sequence
 
 from collect.errors import ForceTooHigh
-from collect.procedures import Move
-from collect.rig import Rig
-from collect.touch import moves
+from collect.motion import touches as moves
+from collect.motion.procedures import Move
+from collect.rig.devices import Rig
 from drivers.samples import QueuedLine
 
 

@@ -9,16 +9,16 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.board.scale import see_board
 from calibrate.errors import CalibrationError
-from calibrate.scale import see_board
 from collect.errors import StepError
-from collect.optics import straightened
-from collect.plane import PaperPlane, fit_plane
-from collect.rig import Rig
+from collect.photograph.ink import gray, ink_at
+from collect.rig.config_touch import CameraTouchConfig, TouchConfig
+from collect.rig.devices import Rig
+from collect.rig.optics import straightened
+from collect.rig.plane import PaperPlane, fit_plane
 from collect.touch.arm import TouchArm
-from collect.touch.config import CameraTouchConfig, TouchConfig
 from collect.touch.contact import first_ink
-from collect.touch.ink import gray, ink_at
 from collect.touch.reach import Known, Reach, lowest_z_mm
 from collect.touch.results import PointTouches, Touch, at_one_point
 from drivers.samples import Frame

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from collect.errors import StepError
-from collect.touch.config import ForceTouchConfig
+from collect.rig.config_touch import ForceTouchConfig
 from collect.touch.contact import Contact, find_contact
 from collect.touch.reach import Reach
 

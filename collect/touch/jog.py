@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from collect.asking import Asker, Choice, Prompt
 from collect.errors import JogGivenUp, StepError
+from collect.operator.questions import Asker, Choice, Prompt
+from collect.rig.config_touch import JogTouchConfig
 from collect.touch.arm import TouchArm
-from collect.touch.config import JogTouchConfig
 from collect.touch.reach import Reach
 from collect.touch.results import Touch
 

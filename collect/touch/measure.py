@@ -6,11 +6,11 @@ from collections.abc import Callable
 from typing import Protocol
 
 from collect.errors import StepError
-from collect.plane import PaperPlane
-from collect.rig import Rig
+from collect.rig.config_touch import TouchConfig
+from collect.rig.devices import Rig
+from collect.rig.plane import PaperPlane
 from collect.touch.arm import TouchArm
 from collect.touch.camera import FirstInkTouch, Hands
-from collect.touch.config import TouchConfig
 from collect.touch.force import touch_by_force
 from collect.touch.jog import NextJog, touch_by_jog
 from collect.touch.reach import Known

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from collect.config import PaperConfig
-from collect.sheet import Sheet
+from collect.rig.config import PaperConfig
+from collect.rig.config_touch import TouchConfig
+from collect.rig.sheet import Sheet
 from collect.touch.camera import coarse_count, fine_count
-from collect.touch.config import TouchConfig
 from collect.touch.reach import Known
 from collect.touch.selfcheck import Triangle
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from collect.config import PaperConfig
-from collect.touch.config import TouchConfig
+from collect.rig.config import PaperConfig
+from collect.rig.config_touch import TouchConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from collect.errors import StepError
-from collect.plane import PaperPlane, fit_plane
-from collect.touch.config import Method, TouchConfig
+from collect.rig.config_touch import Method, TouchConfig
+from collect.rig.plane import PaperPlane, fit_plane
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,19 +14,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.board.scale import see_board
 from calibrate.errors import CalibrationError
-from calibrate.scale import see_board
 from collect.errors import StepError
-from collect.optics import straightened
-from collect.plane import PaperPlane
-from collect.rig import Rig
-from collect.sheet import Cell, Sheet
+from collect.motion.touches import CHECK_SPEED_MM_S, mark_moves
+from collect.photograph.ink import gray
+from collect.photograph.marks import new_marks
+from collect.rig.config_touch import SelfCheckConfig
+from collect.rig.devices import Rig
+from collect.rig.optics import straightened
+from collect.rig.plane import PaperPlane
+from collect.rig.sheet import Cell, Sheet
 from collect.touch.arm import TouchArm
 from collect.touch.camera import Hands
-from collect.touch.config import SelfCheckConfig
-from collect.touch.ink import gray
-from collect.touch.marks import new_marks
-from collect.touch.moves import CHECK_SPEED_MM_S, mark_moves
 from drivers.samples import Frame
 
 Floats = NDArray[np.float64]

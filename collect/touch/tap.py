@@ -7,8 +7,8 @@ import math
 import statistics
 
 from collect.errors import StepError
+from collect.rig.config_touch import ForceTouchConfig
 from collect.touch.arm import TouchArm
-from collect.touch.config import ForceTouchConfig
 from collect.touch.force import Reading
 from drivers.clock import Clock
 from drivers.force.samples import ForceSample

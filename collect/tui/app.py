@@ -14,12 +14,13 @@ from textual.app import SystemCommand
 from textual.binding import Binding, BindingType
 from textual.screen import Screen
 
-from collect.desk import Desk
+from collect.engine.snapshot import Snapshot
+from collect.engine.states import FINAL, State
 from collect.errors import ConfigError
 from collect.headless import REFRESH_S, RunnableEngine
-from collect.snapshot import Snapshot
-from collect.states import FINAL, State
+from collect.operator.requests import Wish
 from collect.tui.ask import AskScreen
+from collect.tui.browser import Desk
 from collect.tui.confirm import AT_WORK, AT_WORK_KEYS, NOT_AT_REST, NOT_PARKED, NOT_PARKED_KEYS, Confirm
 from collect.tui.help import HelpScreen
 from collect.tui.keys import CAN_PAUSE, CAN_RESUME
@@ -29,7 +30,6 @@ from collect.tui.set_up import SetUpScreen
 from collect.tui.start import StartScreen
 from collect.tui.terminal import PlainApp, TerminalDriver
 from collect.tui.text import plain
-from collect.wishes import Wish
 from sessions.errors import SessionError
 from sessions.remarks import mark_bad_or_good
 
@@ -248,7 +248,7 @@ class OperatorApp(PlainApp):
         self._review(self._desk.paths.root / session_id)
 
     def _review(self, folder: Path) -> None:
-        from collect.reviewing import Review
+        from collect.tui.captures import Review
         from collect.tui.review import ReviewScreen
 
         try:

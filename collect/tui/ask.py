@@ -15,8 +15,8 @@ from textual.content import Content
 from textual.screen import ModalScreen
 from textual.widgets import Static
 
-from collect.asking import Prompt
-from collect.snapshot import EngineView
+from collect.engine.snapshot import EngineView
+from collect.operator.questions import Prompt
 from collect.tui.line import Line
 from collect.tui.pictures import Pictures
 from collect.tui.text import plain

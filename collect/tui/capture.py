@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from collect.last_capture import LastCapture
+    from collect.engine.last_capture import LastCapture
 
 A_LINE, CHECK_WIDTH = 3, 16
 """Checks in a line: as many as the pane of 120 columns has room for."""

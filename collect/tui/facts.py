@@ -7,9 +7,9 @@ import math
 from rich.cells import cell_len
 from textual.content import Content
 
+from collect.engine.snapshot import Snapshot
+from collect.engine.states import FINAL
 from collect.headless import eta_text, no_pose_text
-from collect.snapshot import Snapshot
-from collect.states import FINAL
 from collect.tui.text import bar_text, minutes_text, one_line, tip_text
 from collect.tui.trace import spark
 

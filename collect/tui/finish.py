@@ -13,7 +13,7 @@ from textual.containers import VerticalScroll
 from textual.content import Content
 from textual.screen import ModalScreen
 
-from collect.desk import run_command, verified
+from collect.tui.browser import run_command, verified
 from collect.tui.line import Line
 from collect.tui.text import plain
 from sessions.errors import SessionError

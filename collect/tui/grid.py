@@ -6,7 +6,7 @@ from textual.app import RenderResult
 from textual.content import Content
 from textual.widget import Widget
 
-from collect.snapshot import CellCount
+from collect.engine.snapshot import CellCount
 
 COMPLETE, NOW, NEXT, BAD, LEFT_OUT = "✓", "▶", "›", "!", "×"
 LEGEND = f"{COMPLETE} done {NOW} now {NEXT} next {BAD} bad takes {LEFT_OUT} left out"

@@ -9,7 +9,7 @@ from textual.app import RenderResult
 from textual.content import Content
 from textual.widget import Widget
 
-from collect.states import FINAL, State
+from collect.engine.states import FINAL, State
 
 Key = tuple[str, str]
 """The key and what it does."""

@@ -16,7 +16,7 @@ from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Input, OptionList
 
-from collect.reviewing import Looked, Review, Seen, counts
+from collect.tui.captures import Looked, Review, Seen, counts
 from collect.tui.finish import FinishScreen
 from collect.tui.host import host
 from collect.tui.keys import STOP_KEY, KeyBar

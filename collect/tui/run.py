@@ -8,7 +8,7 @@ from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.screen import Screen
 
-from collect.snapshot import Snapshot
+from collect.engine.snapshot import Snapshot
 from collect.tui.keys import RUN_KEYS, KeyBar, keys_in
 from collect.tui.pictures import Pictures
 from collect.tui.view import RunView

@@ -6,10 +6,10 @@ import contextlib
 import signal
 from contextlib import AbstractContextManager
 
-from collect.desk import Desk, Paths
 from collect.errors import CollectAborted
 from collect.headless import RunnableEngine, stop_signals
 from collect.tui.app import OperatorApp
+from collect.tui.browser import Desk, Paths
 from collect.tui.pictures import Kind, Pictures
 
 

@@ -11,11 +11,11 @@ from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
 from textual.screen import Screen
 
-from collect.asking import Prompt
+from collect.engine.set_up_steps import Fact, SetUpStep, Standing
+from collect.engine.snapshot import EngineView, Snapshot
 from collect.headless import no_pose_text
-from collect.set_up_steps import Fact, SetUpStep, Standing
-from collect.snapshot import EngineView, Snapshot
-from collect.steps import StepKind
+from collect.operator.questions import Prompt
+from collect.protocols.steps import StepKind
 from collect.tui.ask import choices_content
 from collect.tui.facts import target_text
 from collect.tui.keys import STOP_KEY, KeyBar, keys_in

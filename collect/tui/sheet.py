@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from textual.content import Content
 
-from collect.tally import Mark, SheetMap
+from collect.engine.tally import Mark, SheetMap
 
 SIGNS: dict[Mark | None, tuple[str, str]] = {
     None: ("·", "dim"),

@@ -14,8 +14,8 @@ from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Input, OptionList
 
-from collect.desk import Desk
 from collect.errors import ConfigError
+from collect.tui.browser import Desk
 from collect.tui.confirm import Confirm
 from collect.tui.host import host
 from collect.tui.keys import KeyBar
@@ -25,7 +25,7 @@ from collect.tui.text import one_line, plain
 from sessions.errors import SessionError
 
 if TYPE_CHECKING:
-    from collect.doctor import Finding
+    from collect.rig.doctor import Finding
     from sessions.show import Details
     from sessions.summary import Summary
 

@@ -7,9 +7,9 @@ from textual.app import ComposeResult
 from textual.containers import Horizontal, ScrollableContainer, Vertical, VerticalScroll
 from textual.content import Content
 
+from collect.engine.snapshot import Snapshot
+from collect.engine.states import FINAL, State
 from collect.headless import no_pose_text
-from collect.snapshot import Snapshot
-from collect.states import FINAL, State
 from collect.tui.capture import CapturePane
 from collect.tui.facts import facts_content
 from collect.tui.grid import LEGEND, Grid

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from drivers.sim.brush import BrushSpec
+from drivers.sim.brush.brush import BrushSpec
 
 
 @dataclass(frozen=True, slots=True)

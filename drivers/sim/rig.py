@@ -8,19 +8,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.rtde_server import RtdeServer
+from drivers.sim.arcs.server import ArcsServer
+from drivers.sim.camera.mjpeg_server import MjpegServer
+from drivers.sim.camera.scene import Scene
 from drivers.sim.config import SimConfig
 from drivers.sim.faults.control import live_control
 from drivers.sim.faults.rig_faults import Faults
 from drivers.sim.faults.script import hang_script, load_faults
-from drivers.sim.force_board import ForceBoard
-from drivers.sim.ink_station import Instrument, PtyLine, StationFirmware
-from drivers.sim.mjpeg_server import MjpegServer
-from drivers.sim.modbus_pump import PumpFirmware
+from drivers.sim.instruments.force_board import ForceBoard
+from drivers.sim.instruments.ink_station import Instrument, PtyLine, StationFirmware
+from drivers.sim.instruments.modbus_pump import PumpFirmware
+from drivers.sim.instruments.socketcand_server import SocketcandServer
 from drivers.sim.rig_toml import LOOPBACK_HEAD, PUMP_ML, Addresses, rig_toml
-from drivers.sim.rtde_server import RtdeServer
-from drivers.sim.scene import Scene
-from drivers.sim.socketcand_server import SocketcandServer
 from drivers.sim.world import World
 
 HOST = "127.0.0.1"

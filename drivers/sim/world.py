@@ -12,17 +12,17 @@ import numpy as np
 from drivers.force.samples import Wrench
 from drivers.geometry import brush_pose, lean
 from drivers.samples import Pose
-from drivers.sim.arcs_stream import StreamedQueue
-from drivers.sim.brush import MAX_TILT_DEG, Brush
+from drivers.sim.arcs.stream import StreamedQueue
+from drivers.sim.brush.brush import MAX_TILT_DEG, Brush
+from drivers.sim.brush.contact import Contact, ContactWatch
+from drivers.sim.brush.drag import ink_left
+from drivers.sim.brush.flaws import Flaw, flaw_of_load, natural_split
+from drivers.sim.brush.leash import Waypoint
+from drivers.sim.brush.paper import Paper
+from drivers.sim.brush.reaction import Reaction, leaning_with
 from drivers.sim.clock import SimClock
 from drivers.sim.config import SimConfig
-from drivers.sim.contact import Contact, ContactWatch
-from drivers.sim.drag import ink_left
-from drivers.sim.flaws import Flaw, flaw_of_load, natural_split
-from drivers.sim.leash import Waypoint
-from drivers.sim.paper import Paper
-from drivers.sim.reaction import Reaction, leaning_with
-from drivers.sim.well import Well
+from drivers.sim.instruments.well import Well
 
 INK_PER_PRESS = 0.12
 """Share of a full brush that one press takes, and the landing of a drag."""

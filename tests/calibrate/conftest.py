@@ -14,11 +14,11 @@ import pytest
 from numpy.typing import NDArray
 
 from calibrate.artefact import LensUsed
-from calibrate.scale import BoardSpec
-from sessions.messages import encode_png, image_message
-from sessions.schemas import Header, Source, StepEvent, Stroke, Topic
+from calibrate.board.scale import BoardSpec
+from sessions.recording.messages import encode_png, image_message
+from sessions.recording.schemas import Header, Source, StepEvent, Stroke, Topic
+from sessions.recording.writer import Outgoing
 from sessions.store import SessionStore
-from sessions.writer import Outgoing
 
 T0_NS = 1_700_000_000_000_000_000
 MINUTE_NS = 60_000_000_000

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from calibrate.artefact import Calibration
-from calibrate.written.record import PlannedBy
+from calibrate.writing.record import PlannedBy
 
 CALIBRATION = Calibration(
     session_id="test",

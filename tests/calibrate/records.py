@@ -8,10 +8,10 @@ from typing import Any
 from calibrate.loop.images import KEYS
 from calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, verdicts
 from calibrate.loop.table import LoopRecord, table_1
-from calibrate.written.images import KEYS as WRITTEN_KEYS
-from calibrate.written.scores import PAIRS, PLANNED, WrittenScore
-from calibrate.written.table import Table3Row, WrittenRecord, table_3
-from sessions.schemas import Source
+from calibrate.writing.images import KEYS as WRITTEN_KEYS
+from calibrate.writing.scores import PAIRS, PLANNED, WrittenScore
+from calibrate.writing.table import Table3Row, WrittenRecord, table_3
+from sessions.recording.schemas import Source
 
 LEVELS = {AGAIN: 0.94, ANOTHER: 0.95, SIMULATED: 0.9}
 

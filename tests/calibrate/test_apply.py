@@ -15,16 +15,16 @@ from typer.testing import CliRunner, Result
 from bench.preprocess_rigs import board_of
 from brushloop import app
 from calibrate.artefact import HASH_CHARS, Calibration, load_artefact
-from calibrate.calibration import calibrate_session
 from calibrate.current import current, put_to_use
+from calibrate.current_calibration import calibration_of
 from calibrate.errors import CalibrationError
-from calibrate.validation import calibration_of
+from calibrate.session import calibrate_session
 from drivers.geometry import brush_pose
+from drivers.sim.camera.scene import Scene
 from drivers.sim.config import SimConfig, Table, View
-from drivers.sim.scene import Scene
 from drivers.sim.world import World
 from sessions.reader import Recording
-from sessions.schemas import Stroke
+from sessions.recording.schemas import Stroke
 
 if TYPE_CHECKING:
     from conftest import Photographed

@@ -12,12 +12,12 @@ from typer.testing import CliRunner
 from bench.preprocess_rigs import board_of
 from brushloop import app
 from calibrate.artefact import Calibration, load_artefact
+from calibrate.board.scale import BoardSpec
 from calibrate.current import current
 from calibrate.errors import CalibrationError
-from calibrate.scale import BoardSpec
 from drivers.geometry import brush_pose
+from drivers.sim.camera.scene import Scene
 from drivers.sim.config import SimConfig, Table, View
-from drivers.sim.scene import Scene
 from drivers.sim.world import World
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.camera.register import register
+from calibrate.board.register import register
 from calibrate.errors import CaptureRefused
-from calibrate.prepare.difference import new_stroke
+from calibrate.stroke.difference import new_stroke
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "frida_page_sequence"
 PAGE_MM = (203.2, 279.4)

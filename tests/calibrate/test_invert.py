@@ -12,19 +12,19 @@ import cv2
 import numpy as np
 import pytest
 
+from calibrate.compare.field import Field
 from calibrate.errors import CalibrationError
-from calibrate.field import Field
-from calibrate.invert import Row, Settings, invert_recording, lay, off_command
-from calibrate.invert_write import PROTOCOL, write_inversion
+from calibrate.invert.files import PROTOCOL, write_inversion
+from calibrate.invert.invert import Row, Settings, invert_recording, lay, off_command
 from collect.protocols.config import ReplayConfig
 from collect.protocols.loading import load_protocol
 from model.ccdbsm import Brush, ccdbsm
 from model.coverage import coverage
 from model.inversion.press import Range
-from sessions.importer import ImportOptions, import_photographs
-from sessions.messages import encode_png
+from sessions.imports.photographs import ImportOptions, import_photographs
 from sessions.reader import Capture
-from sessions.schemas import Stroke
+from sessions.recording.messages import encode_png
+from sessions.recording.schemas import Stroke
 
 PRESSES = [(12.0, 3.0), (15.0, 6.0), (18.5, 9.0)]
 PX = 12.0  # of the pretended scan, per mm

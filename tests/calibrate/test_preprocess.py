@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from calibrate.errors import CaptureRefused
-from calibrate.measure import fit_line, measure
-from calibrate.preprocess import PX_PER_MM, Params, prepare, rectify, rescale
+from calibrate.stroke.measure import fit_line, measure
+from calibrate.stroke.preprocess import PX_PER_MM, Params, prepare, rectify, rescale
 
 PAGE = (800, 800)
 PARAMS = Params()

@@ -9,16 +9,16 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.field import KEYS, Alignment, Field, Tone, best_shift
-from calibrate.simulate import simulated, simulated_pixels
+from calibrate.compare.field import KEYS, Alignment, Field, Tone, best_shift
+from calibrate.compare.images import pack
+from calibrate.compare.simulate import simulated, simulated_pixels
 from calibrate.validate.jobs import ABSENT, PrepareJob, Press, ScoreJob, prepare_job, score_job
-from calibrate.validate.pixels import pack
 from model.ccdbsm import Brush
 from model.coverage import coverage
 from model.registry import stroke_models
-from sessions.messages import encode_png
 from sessions.reader import Capture
-from sessions.schemas import Stroke
+from sessions.recording.messages import encode_png
+from sessions.recording.schemas import Stroke
 from tests.calibrate.given import CALIBRATION
 
 MODELS = stroke_models(Brush())

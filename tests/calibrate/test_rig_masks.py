@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from bench.preprocess_rigs import BRUSHES, Shot, heading_free_window, sheet, true_mask
-from calibrate.camera.plane import Plane
-from calibrate.camera.view import see_plane
-from calibrate.prepare.params import PX_PER_MM, Params
-from calibrate.prepare.rectify import rectify_bent
-from calibrate.prepare.stages import trace_seen
-from calibrate.preprocess import prepare
-from calibrate.scales import MM_PER_PX
+from calibrate.board.plane import Plane
+from calibrate.board.view import see_plane
+from calibrate.compare.scales import MM_PER_PX
+from calibrate.stroke.params import PX_PER_MM, Params
+from calibrate.stroke.preprocess import prepare
+from calibrate.stroke.rectify import rectify_bent
+from calibrate.stroke.stages import trace_seen
 
 
 def overlaps(shot: Shot, plane: Plane) -> list[float]:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from calibrate.board.scale import BENT_SHARE, BoardSpec, apply, bent_share, find_corners, fit_plane, local_scale
 from calibrate.errors import CalibrationError
-from calibrate.scale import BENT_SHARE, BoardSpec, apply, bent_share, find_corners, fit_plane, local_scale
 
 SPEC = BoardSpec(squares=(7, 5), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_50", origin_mm=(-10.0, 5.0))
 

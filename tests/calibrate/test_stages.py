@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from calibrate.cli import app
+from calibrate.compare.field import Field
+from calibrate.compare.scales import MM_PER_PX
 from calibrate.errors import CaptureRefused
-from calibrate.field import Field
-from calibrate.prepare.cli import app
-from calibrate.prepare.params import Params
-from calibrate.prepare.stages import trace_scaled
-from calibrate.scales import MM_PER_PX
+from calibrate.stroke.params import Params
+from calibrate.stroke.stages import trace_scaled
 
 
 def photograph(*strokes: tuple[int, int], glare: tuple[int, int] | None = None, paper: int = 225) -> np.ndarray:

@@ -13,12 +13,12 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop import app
-from calibrate.brushfit.artefact import FittedValue
-from calibrate.brushfit.drag_run import DragArtefact
+from calibrate.drags.run import DragArtefact
 from calibrate.errors import CalibrationError
-from calibrate.write_plan import Settings, plan, wanted_of
-from calibrate.write_plan_files import PICTURE, PROTOCOL, write_plan
-from calibrate.written.record import load_plan
+from calibrate.fit.artefact import FittedValue
+from calibrate.writing.plan import Settings, plan, wanted_of
+from calibrate.writing.plan_files import PICTURE, PROTOCOL, write_plan
+from calibrate.writing.record import load_plan
 from collect.protocols.config import WriteConfig
 from collect.protocols.loading import load_protocol
 from model.ccdbsm import Brush

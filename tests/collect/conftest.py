@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from collect.engine import Engine
-from collect.opening import Opening, find_resumable, open_store
+from collect.engine.engine import Engine
+from collect.engine.opening import Opening, find_resumable, open_store
 from drivers.clock import HostClock
+from drivers.sim.brush.flaws import Flaw
 from drivers.sim.config import SimConfig, View
-from drivers.sim.flaws import Flaw
 from drivers.sim.rig import LoopbackRig
 
 SMALL_VIEW = View(width_px=512, height_px=384, px_per_mm=1.56, fps=50.0)

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from collect.config import RigConfig
-from collect.plane import to_paper
+from collect.motion.procedures import Move, over_sheet_move, photograph_moves
+from collect.motion.touches import Room
 from collect.planning.moves import StepMoves, Way
-from collect.procedures import Move, over_sheet_move, photograph_moves
-from collect.touch.moves import Room
+from collect.rig.config import RigConfig
+from collect.rig.plane import to_paper
 from drivers.geometry import distance
 from drivers.samples import Pose
-from drivers.sim.motion import MotionQueue
+from drivers.sim.arm.motion import MotionQueue
 
 SAME_MM, SAME_DEG = 1e-6, 1e-4
 

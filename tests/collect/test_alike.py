@@ -7,20 +7,21 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from collect.config import load_rig
+from collect.engine.progress import Progress
+from collect.engine.steps import touch as touching
+from collect.engine.steps import waited
+from collect.engine.steps.context import Known
 from collect.planning.summary import make_plan
-from collect.progress import Progress
 from collect.protocols.loading import load_protocol
 from collect.protocols.plans import steps
-from collect.reviewing import Review
-from collect.steps import StepKind
-from collect.work import touching, waited
-from collect.work.context import Known
+from collect.protocols.steps import StepKind
+from collect.rig.config import load_rig
+from collect.tui.captures import Review
 from drivers.samples import Pose
-from sessions import container
-from sessions.journal import read_lines
+from sessions.journal.journal import read_lines
 from sessions.reader import Recording
-from sessions.schemas import Quality, Topic
+from sessions.recording import container
+from sessions.recording.schemas import Quality, Topic
 from tests.collect.sent import noting
 
 if TYPE_CHECKING:

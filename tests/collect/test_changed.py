@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
+from collect.engine.opening import Opening, find_resumable
 from collect.errors import ConfigError
-from collect.opening import Opening, find_resumable
 from collect.planning.limits import distinct_steps
-from collect.steps import StepKind
+from collect.protocols.steps import StepKind
 from drivers.clock import HostClock
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml
 from sessions.difference import Difference
-from sessions.schemas import Header, Source
+from sessions.recording.schemas import Header, Source
 from sessions.store import SessionStore
 
 RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.config import load_rig
-from collect.doctor import examine
+from collect.rig.config import load_rig
+from collect.rig.doctor import examine
 from drivers.arcs.codes import SafetyMode
 from drivers.clock import HostClock
-from drivers.sim.force_board import Fault
-from drivers.sim.ink_station import Fault as InkFault
+from drivers.sim.instruments.force_board import Fault
+from drivers.sim.instruments.ink_station import Fault as InkFault
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -42,7 +42,7 @@ async def test_a_rig_in_order_is_told_as_it_is_and_left_as_it_was(lab: Lab) -> N
 async def test_an_instrument_that_was_unplugged_is_told_and_the_others_are_still_asked(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("collect.rig.FORCE_CONNECT_S", 2.0)
+    monkeypatch.setattr("collect.rig.devices.FORCE_CONNECT_S", 2.0)
     assert lab.rig.ink is not None
     assert lab.rig.force is not None
     lab.rig.ink.fail(*[InkFault.DEAF] * 100)

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.engine import UNCHECKED, Engine
+from collect.engine.engine import UNCHECKED, Engine
+from collect.engine.snapshot import Snapshot
+from collect.engine.states import State
 from collect.errors import CollectAborted, ConfigError
-from collect.snapshot import Snapshot
-from collect.states import State
 from drivers.arcs.codes import SafetyMode
 from drivers.errors import RobotNotSafe
 from drivers.samples import Identity
-from sessions.journal import read_lines, replay
+from sessions.journal.journal import read_lines, replay
 from sessions.reader import Recording
 from tests.collect.until import until
 

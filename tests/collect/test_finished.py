@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.finished import ending
-from collect.opening import Opening
+from collect.chains.finished import ending
+from collect.engine.opening import Opening
 from collect.start import start
 
 if TYPE_CHECKING:

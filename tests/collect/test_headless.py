@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from collect.engine.snapshot import Snapshot
+from collect.engine.states import State
 from collect.headless import eta_text
-from collect.snapshot import Snapshot
-from collect.states import State
 from sessions.reader import Recording
 
 if TYPE_CHECKING:

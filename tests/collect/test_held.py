@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from collect.engine.opening import Opening
+from collect.engine.states import State
 from collect.errors import ConfigError
-from collect.opening import Opening
-from collect.states import State
 from drivers.arcs.codes import SafetyMode
 from drivers.errors import RobotNotSafe
 
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
     from conftest import Lab
 
-    from collect.asking import Prompt
-    from collect.engine import Engine
+    from collect.engine.engine import Engine
+    from collect.operator.questions import Prompt
 
 
 def slowly(lab: Lab) -> None:

@@ -9,20 +9,20 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from mcap.reader import make_reader
 
+from collect.engine.states import State
 from collect.errors import ForceTooHigh, NeedsOperator
-from collect.states import State
 from drivers.errors import ConnectionLost, Stuck
 from drivers.ink.errors import InkRefused
-from drivers.sim.force_board import Fault
-from sessions.journal import replay
-from sessions.schemas import Topic
+from drivers.sim.instruments.force_board import Fault
+from sessions.journal.journal import replay
+from sessions.recording.schemas import Topic
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from conftest import Lab
 
-    from collect.engine import Engine
+    from collect.engine.engine import Engine
 
 
 def run(engine: Engine) -> None:

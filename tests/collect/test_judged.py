@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from collect.engine.states import State
+from collect.engine.steps import capture as capturing
 from collect.errors import CollectAborted, NeedsOperator
 from collect.quality.check import check_drawing
 from collect.quality.verdict import Verdict
-from collect.states import State
-from collect.work import capturing
-from drivers.sim.flaws import Flaw
-from sessions.journal import replay
+from drivers.sim.brush.flaws import Flaw
+from sessions.journal.journal import replay
 from sessions.reader import Recording
 
 if TYPE_CHECKING:
     from conftest import Lab
 
-    from calibrate.preprocess import Gray
-    from collect.engine import Engine
-    from collect.snapshot import Snapshot
+    from calibrate.stroke.preprocess import Gray
+    from collect.engine.engine import Engine
+    from collect.engine.snapshot import Snapshot
 
 
 def run(engine: Engine) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibrate.field import Alignment, Field, Tone
-from calibrate.simulate import simulated
-from collect.last_capture import LastCapture, published_mark
+from calibrate.compare.field import Alignment, Field, Tone
+from calibrate.compare.simulate import simulated
+from collect.engine.last_capture import LastCapture, published_mark
 from model.registry import stroke_model
 
 BRUSH = {"radius_mm": 6.0, "length_mm": 48.0}

@@ -9,16 +9,16 @@ import pytest
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 
 from calibrate.artefact import Calibration, load_artefact
-from calibrate.calibration import calibrate_session
-from calibrate.camera.artefact import LensFile
-from collect.config import load_rig
+from calibrate.board.artefact import LensFile
+from calibrate.session import calibrate_session
+from collect.engine.states import State
 from collect.errors import ConfigError, StepError
-from collect.reviewing import Review, counts
-from collect.states import State
-from sessions import container
-from sessions.journal import read_lines, replay
+from collect.rig.config import load_rig
+from collect.tui.captures import Review, counts
+from sessions.journal.journal import read_lines, replay
 from sessions.reader import Recording
-from sessions.schemas import Topic
+from sessions.recording import container
+from sessions.recording.schemas import Topic
 
 if TYPE_CHECKING:
     from conftest import Lab

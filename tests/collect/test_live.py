@@ -24,16 +24,16 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from mcap_protobuf.schema import build_file_descriptor_set
 
+from collect.engine.live import HOST, PREVIEW_S, QUEUE_LIMIT, LiveView
+from collect.engine.opening import Opening
 from collect.errors import ConfigError
-from collect.live import HOST, PREVIEW_S, QUEUE_LIMIT, LiveView
-from collect.opening import Opening
 from collect.start import start
 from drivers.samples import Frame, Stamp
-from sessions import container
-from sessions.messages import encode_png, image_message, pose_message
-from sessions.schemas import Topic, Wrench
+from sessions.recording import container
+from sessions.recording.messages import encode_png, image_message, pose_message
+from sessions.recording.schemas import Topic, Wrench
+from sessions.recording.writer import Outgoing
 from sessions.verify import verify_session
-from sessions.writer import Outgoing
 
 if TYPE_CHECKING:
     from conftest import Lab

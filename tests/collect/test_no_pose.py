@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 
 from collect import headless
-from collect.config import load_rig
-from collect.engine import Engine
+from collect.engine.engine import Engine
+from collect.engine.snapshot import Snapshot
+from collect.engine.states import State
 from collect.protocols.config import GridConfig
-from collect.rig import Rig, make_robot
-from collect.snapshot import Snapshot
-from collect.states import State
+from collect.rig.config import load_rig
+from collect.rig.devices import Rig, make_robot
 from collect.tui.app import OperatorApp
 from drivers.geometry import brush_pose
 from drivers.samples import Identity

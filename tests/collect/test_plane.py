@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from collect.config import PaperConfig
 from collect.errors import StepError
-from collect.plane import PaperPlane, fit_plane, to_paper
-from collect.sheet import to_base
+from collect.rig.config import PaperConfig
+from collect.rig.plane import PaperPlane, fit_plane, to_paper
+from collect.rig.sheet import to_base
 from drivers.geometry import brush_pose, distance, lean
 from drivers.samples import Pose
 

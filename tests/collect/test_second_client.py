@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from collect.states import State
+from collect.engine.states import State
 from drivers.arcs.controller import Controller
 from drivers.arcs.rpc import RpcConnection
 from drivers.arcs.waiting import Tolerance, until_settled
 from drivers.errors import MotionFailed, SettingsChanged
 from drivers.geometry import brush_pose, from_wire, lean
-from sessions.journal import read_lines
+from sessions.journal.journal import read_lines
 from tests.collect.until import until as waited_until
 
 if TYPE_CHECKING:
     from conftest import Lab
 
-    from collect.engine import Engine
+    from collect.engine.engine import Engine
     from drivers.samples import Pose
 
 

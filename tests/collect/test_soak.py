@@ -22,11 +22,11 @@ import pytest
 
 from collect.protocols.loading import load_protocol
 from collect.protocols.plans import planned
-from sessions.journal import JOURNAL_NAME, is_open, read_lines, replay
+from sessions.journal.journal import JOURNAL_NAME, is_open, read_lines, replay
 from sessions.reader import Recording
-from sessions.schemas import Stroke
+from sessions.recording.schemas import Stroke
+from sessions.recording.writer import file_sha256
 from sessions.verify import verify_session
-from sessions.writer import file_sha256
 
 if TYPE_CHECKING:
     from conftest import Lab

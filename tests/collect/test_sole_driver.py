@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from collect.config import RigConfig, load_rig
 from collect.errors import ConfigError
-from collect.rig import sole_driver
+from collect.rig.config import RigConfig, load_rig
+from collect.rig.devices import sole_driver
 from drivers import sole
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml
@@ -21,8 +21,8 @@ from drivers.sim.rig_toml import Addresses, rig_toml
 HOLD = """
 import encodings.idna, os, sys, time
 from pathlib import Path
-from collect.config import load_rig
-from collect.rig import sole_driver
+from collect.rig.config import load_rig
+from collect.rig.devices import sole_driver
 rig = load_rig(Path(sys.argv[1]))
 if len(sys.argv) > 2:
     os.setuid(int(sys.argv[2]))

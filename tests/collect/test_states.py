@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from collect.engine.policy import MAX_FAILURES, Action, decide
+from collect.engine.states import FINAL, TRANSITIONS, IllegalTransition, State, check_transition
 from collect.errors import SheetFull, StepVoid
-from collect.policy import MAX_FAILURES, Action, decide
-from collect.states import FINAL, TRANSITIONS, IllegalTransition, State, check_transition
-from collect.steps import Step, StepKind
+from collect.protocols.steps import Step, StepKind
 from drivers.errors import DeviceError, DeviceTimeout, MotionFailed, RobotNotSafe, Stuck
 
 

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.config import RigConfig, load_rig
 from collect.errors import ConfigError
-from collect.procedures import dip_moves, wash_moves
+from collect.motion.procedures import dip_moves, wash_moves
+from collect.rig.config import RigConfig, load_rig
 
 if TYPE_CHECKING:
     from conftest import Lab

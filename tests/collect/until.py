@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from collect.engine import Engine
-from collect.snapshot import Snapshot
+from collect.engine.engine import Engine
+from collect.engine.snapshot import Snapshot
 
 
 def until(engine: Engine, condition: Callable[[Snapshot], bool], timeout_s: float = 30.0) -> Snapshot:

@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from collect.config import RigConfig
-from collect.rig import make_robot, sole_driver
+from collect.rig.config import RigConfig
+from collect.rig.devices import make_robot, sole_driver
 from drivers.arcs.robot import Condition
 from drivers.clock import HostClock
 from drivers.samples import Identity, Pose

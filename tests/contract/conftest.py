@@ -11,19 +11,19 @@ from pathlib import Path
 
 import pytest
 
-from collect.config import RigConfig, load_rig
 from collect.errors import ConfigError
-from collect.rig import limits_of, make_robot, sole_driver
+from collect.rig.config import RigConfig, load_rig
+from collect.rig.devices import limits_of, make_robot, sole_driver
 from drivers.arcs.robot import AuboArcs
 from drivers.clock import HostClock
 from drivers.errors import DeviceError, LimitExceeded
 from drivers.geometry import distance
 from drivers.samples import Pose
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.rtde_server import RtdeServer
+from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.config import SimConfig
 from drivers.sim.rig import HOST
 from drivers.sim.rig_toml import Addresses, rig_toml
-from drivers.sim.rtde_server import RtdeServer
 from drivers.sim.world import World
 from tests.contract.asking import permission_refused
 from tests.contract.motion import ACC_MM_S2, LIFT_MM, SAME_PLACE_MM, SPEED_MM_S, Enabled, raised

@@ -14,8 +14,8 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from collect.config import RigConfig
-from collect.rig import limits_of, make_robot
+from collect.rig.config import RigConfig
+from collect.rig.devices import limits_of, make_robot
 from drivers.arcs.robot import AuboArcs
 from drivers.arcs.rpc import RpcConnection
 from drivers.clock import HostClock

@@ -9,7 +9,7 @@ import pytest
 from drivers.arcs.robot import ArcsOptions, AuboArcs
 from drivers.clock import HostClock
 from drivers.limits import Limits
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.config import SimConfig, View
 from drivers.sim.rig import HOST
 from drivers.sim.world import World

@@ -13,10 +13,10 @@ from drivers.clock import HostClock
 from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected
 from drivers.protocols import Camera
 from drivers.samples import Frame, Stamp
+from drivers.sim.camera.mjpeg_server import MjpegServer
+from drivers.sim.camera.scene import Scene, read_strip
 from drivers.sim.config import SimConfig, View
-from drivers.sim.mjpeg_server import MjpegServer
 from drivers.sim.rig import HOST
-from drivers.sim.scene import Scene, read_strip
 from drivers.sim.world import World
 
 CLOCK = HostClock()

@@ -18,12 +18,12 @@ import pytest
 from mcap.reader import make_reader
 
 from sessions.errors import InputError
-from sessions.importer import ImportOptions, import_photographs
-from sessions.journal import JOURNAL_NAME, read_lines
-from sessions.messages import encode_png, image_message, pose_message
-from sessions.schemas import Header, Source, StepEvent, Stroke, Topic
+from sessions.imports.photographs import ImportOptions, import_photographs
+from sessions.journal.journal import JOURNAL_NAME, read_lines
+from sessions.recording.messages import encode_png, image_message, pose_message
+from sessions.recording.schemas import Header, Source, StepEvent, Stroke, Topic
+from sessions.recording.writer import Outgoing, SegmentWriter
 from sessions.store import SessionStore
-from sessions.writer import Outgoing, SegmentWriter
 
 
 class Make:

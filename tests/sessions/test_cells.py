@@ -6,8 +6,8 @@ import io
 import pytest
 
 from sessions.cells import CsvWriter, as_cell, as_text
-from sessions.export import export
-from sessions.importer import ImportOptions
+from sessions.export.export import export
+from sessions.imports.photographs import ImportOptions
 from sessions.reader import Recording
 
 FORMULAS = ['=cmd|"/c calc"!A1', "+1+2", "-1+2", "@SUM(A1)", "\tx", "\r=1", "'=1", "''=1", "＝1"]

@@ -5,11 +5,11 @@ import json
 
 import pytest
 
-from sessions.codec import encode_line
 from sessions.errors import SessionDamaged
-from sessions.journal import JOURNAL_NAME, read_lines, replay
-from sessions.lines import read
-from sessions.repair import repair_session
+from sessions.journal.codec import encode_line
+from sessions.journal.journal import JOURNAL_NAME, read_lines, replay
+from sessions.journal.lines import read
+from sessions.repair.repair import repair_session
 from sessions.store import SessionStore
 from sessions.verify import verify_session
 

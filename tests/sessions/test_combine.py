@@ -7,14 +7,14 @@ from mcap.reader import make_reader
 from typer.testing import CliRunner
 
 from sessions import combine as module
-from sessions.cli import app
+from sessions.cli.app import app
 from sessions.combine import PARTS_NOTE, combine
 from sessions.errors import InputError, SessionError
 from sessions.reader import Recording
-from sessions.schemas import Source
+from sessions.recording.schemas import Source
+from sessions.recording.writer import read_note
 from sessions.store import SessionStore
 from sessions.verify import verify_session
-from sessions.writer import read_note
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
 from mcap.records import Chunk
 
-from sessions import container
 from sessions.errors import InputError, SessionDamaged
 from sessions.reader import Recording
+from sessions.recording import container
 
 CUTS = 120
 FLIPS = 400

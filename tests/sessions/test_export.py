@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sessions import export as module
-from sessions.cli import app
+from sessions.cli.app import app
 from sessions.errors import InputError, SessionError
-from sessions.export import export
-from sessions.messages import decode_gray
+from sessions.export import export as module
+from sessions.export.export import export
 from sessions.reader import Recording
+from sessions.recording.messages import decode_gray
 
 
 @pytest.fixture

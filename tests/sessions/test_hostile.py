@@ -12,9 +12,9 @@ from click.testing import CliRunner
 from typer.main import get_command
 
 from brushloop import app
-from sessions.codec import encode_line
 from sessions.errors import InputError
-from sessions.journal import JOURNAL_NAME
+from sessions.journal.codec import encode_line
+from sessions.journal.journal import JOURNAL_NAME
 from sessions.names import bare_name
 from sessions.store import SessionStore, open_sessions
 
@@ -89,7 +89,7 @@ def place(make, tmp_path):
 
 def rewritten(folder, change):
     """The journal again, unchained as a stranger may write it, with `change` made to each of its lines."""
-    from sessions.lines import read_lines
+    from sessions.journal.lines import read_lines
 
     lines = [change(dict(line)) for line in read_lines(folder / JOURNAL_NAME)]
     data = b"".join(encode_line(line.pop("t_ns"), line) for line in lines)

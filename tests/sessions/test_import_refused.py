@@ -9,10 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from sessions import importer, messages, table
 from sessions.errors import InputError
-from sessions.importer import ImportOptions, import_photographs
+from sessions.imports import photographs as importer
+from sessions.imports import table
+from sessions.imports.photographs import ImportOptions, import_photographs
 from sessions.reader import Recording
+from sessions.recording import messages
 
 ROWS = [
     {"file": "a.png", "px_per_mm": "12.5", "height_mm": "13", "tilt_deg": "5"},

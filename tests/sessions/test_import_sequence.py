@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sessions.cli import app
+from sessions.cli.app import app
 from sessions.errors import InputError
-from sessions.importer import ImportOptions
+from sessions.imports.photographs import ImportOptions
+from sessions.imports.scan import dpi_of, import_scans
+from sessions.imports.sequence import SEQUENCE, import_sequence
 from sessions.reader import Recording
-from sessions.scan import dpi_of, import_scans
-from sessions.schemas import Topic
-from sessions.sequence import SEQUENCE, import_sequence
+from sessions.recording.schemas import Topic
 
 
 @pytest.fixture

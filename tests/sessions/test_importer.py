@@ -9,10 +9,10 @@ import cv2
 import pytest
 from typer.testing import CliRunner
 
-from sessions.cli import app
-from sessions.importer import ImportOptions
+from sessions.cli.app import app
+from sessions.imports.photographs import ImportOptions
 from sessions.reader import Recording
-from sessions.schemas import Source
+from sessions.recording.schemas import Source
 
 ROWS = [
     {"file": "a.png", "px_per_mm": "12.5", "height_mm": "13", "tilt_deg": "5"},

@@ -15,10 +15,10 @@ KILLS = 10
 COLLECT = """
 import random, sys, time
 from pathlib import Path
-from sessions.messages import image_message
-from sessions.schemas import Header, Stroke, Topic
+from sessions.recording.messages import image_message
+from sessions.recording.schemas import Header, Stroke, Topic
 from sessions.store import SessionStore
-from sessions.writer import Outgoing
+from sessions.recording.writer import Outgoing
 
 folder, keys = Path(sys.argv[1]), sys.argv[2:]
 header = Header(session_id=folder.name, source="loopback rig", software="test")

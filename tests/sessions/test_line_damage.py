@@ -19,10 +19,10 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Message
 from mcap.stream_reader import breakup_chunk
 
-from sessions.codec import with_crc
-from sessions.journal import JOURNAL_NAME
-from sessions.repair import repair_session
-from sessions.schemas import Topic
+from sessions.journal.codec import with_crc
+from sessions.journal.journal import JOURNAL_NAME
+from sessions.recording.schemas import Topic
+from sessions.repair.repair import repair_session
 from sessions.store import SessionStore
 from sessions.verify import verify_session
 

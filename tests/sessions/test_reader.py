@@ -10,9 +10,9 @@ import pytest
 from mcap.writer import Writer
 
 from sessions.errors import InputError, SessionDamaged
-from sessions.messages import decode_gray
 from sessions.reader import Recording
-from sessions.writer import HEADER_METADATA, header_metadata
+from sessions.recording.messages import decode_gray
+from sessions.recording.writer import HEADER_METADATA, header_metadata
 
 
 @pytest.fixture
@@ -193,7 +193,7 @@ def test_an_image_bomb_is_refused_before_it_is_decoded(make, path, bomb, monkeyp
 
 
 def test_too_many_bytes_are_refused(make, monkeypatch):
-    monkeypatch.setattr("sessions.messages.MAX_IMAGE_BYTES", 10)
+    monkeypatch.setattr("sessions.recording.messages.MAX_IMAGE_BYTES", 10)
     with pytest.raises(SessionDamaged, match="exceeds 10"):
         decode_gray(make.png(), "a still")
 

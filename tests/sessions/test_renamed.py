@@ -7,12 +7,12 @@ import shutil
 import pytest
 from typer.testing import CliRunner
 
-from sessions.cli import app
+from sessions.cli.app import app
 from sessions.errors import InputError
-from sessions.export import export
-from sessions.journal import JOURNAL_NAME
+from sessions.export.export import export
+from sessions.journal.journal import JOURNAL_NAME
 from sessions.reader import Recording
-from sessions.repair import repair_session
+from sessions.repair.repair import repair_session
 from sessions.show import details
 from sessions.store import SessionStore
 from sessions.summary import Summary, summaries

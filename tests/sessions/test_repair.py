@@ -7,14 +7,16 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from sessions import merge, rewrite, writer
-from sessions.cli import app
-from sessions.codec import encode_line
+from sessions import merge
+from sessions.cli.app import app
 from sessions.errors import DiskFull, InputError, SessionDamaged, SessionError, SessionLocked
-from sessions.journal import JOURNAL_NAME
-from sessions.lines import read_lines
+from sessions.journal.codec import encode_line
+from sessions.journal.journal import JOURNAL_NAME
+from sessions.journal.lines import read_lines
 from sessions.reader import Recording
-from sessions.repair import repair_session
+from sessions.recording import writer
+from sessions.repair import rewrite
+from sessions.repair.repair import repair_session
 from sessions.show import details
 from sessions.store import SessionStore
 from sessions.verify import verify_session

@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 from mcap.opcode import Opcode
 
-from sessions.journal import JOURNAL_NAME
-from sessions.repair import repair_session
-from sessions.schemas import Topic
+from sessions.journal.journal import JOURNAL_NAME
+from sessions.recording.schemas import Topic
+from sessions.repair.repair import repair_session
 from sessions.store import SessionStore
 from sessions.verify import verify_session
 

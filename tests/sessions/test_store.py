@@ -11,12 +11,12 @@ import pytest
 from mcap.reader import make_reader
 
 from sessions.combine import combine
-from sessions.container import attachments
 from sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked
-from sessions.journal import JOURNAL_NAME, Journal
-from sessions.lines import with_crc
+from sessions.journal.journal import JOURNAL_NAME, Journal
+from sessions.journal.lines import with_crc
 from sessions.merge import count_messages
 from sessions.reader import Recording
+from sessions.recording.container import attachments
 from sessions.store import SessionStore, next_session_id, open_sessions
 
 CRC = re.compile(rb',"crc":"[0-9a-f]{8}"\}$')

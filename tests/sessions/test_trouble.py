@@ -16,8 +16,8 @@ import pytest
 
 from sessions import disk
 from sessions.errors import DiskFull, SessionError
-from sessions.journal import JOURNAL_NAME
-from sessions.lines import read_lines
+from sessions.journal.journal import JOURNAL_NAME
+from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 from sessions.store import STEP_BYTES, SessionStore
 from sessions.verify import verify_session
@@ -163,7 +163,7 @@ store.release()
 TOUCH = """
 import sys, time
 from pathlib import Path
-from sessions.repair import repair_session
+from sessions.repair.repair import repair_session
 from sessions.store import SessionStore
 folder = Path(sys.argv[1])
 for take in (lambda: SessionStore(folder, None, time.time_ns), lambda: repair_session(folder, time.time_ns)):

@@ -4,9 +4,9 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from sessions.cli import app
+from sessions.cli.app import app
 from sessions.errors import InputError
-from sessions.journal import JOURNAL_NAME
+from sessions.journal.journal import JOURNAL_NAME
 from sessions.verify import verify_session
 
 

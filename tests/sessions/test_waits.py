@@ -6,8 +6,8 @@ import csv
 
 import pytest
 
-from sessions.export import export
-from sessions.schemas import Stroke
+from sessions.export.export import export
+from sessions.recording.schemas import Stroke
 from sessions.waits import unlike, waits_of
 
 

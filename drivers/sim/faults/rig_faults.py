@@ -6,13 +6,13 @@ import asyncio
 from typing import Any, Protocol
 
 from drivers.arcs.codes import SafetyMode
-from drivers.sim.arcs_power import EMERGENCY_STOPS
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.power import EMERGENCY_STOPS
+from drivers.sim.arcs.rtde_server import RtdeServer
+from drivers.sim.arcs.server import ArcsServer
+from drivers.sim.camera.mjpeg_server import MjpegServer
 from drivers.sim.faults.board import FaultBoard
 from drivers.sim.faults.truth import Truth
 from drivers.sim.faults.vocabulary import Device, Fault
-from drivers.sim.mjpeg_server import MjpegServer
-from drivers.sim.rtde_server import RtdeServer
 from drivers.sim.world import World
 
 TICK_S = 0.002
@@ -124,7 +124,7 @@ def _name_of(fault: Fault) -> Any:
     """The member of the instrument's own enumeration."""
     # Here, because python-can takes a while to import, and a rig without a force sensor does not need it.
     if fault.device is Device.INK:
-        from drivers.sim.ink_station import Fault as Names
+        from drivers.sim.instruments.ink_station import Fault as Names
     else:
-        from drivers.sim.force_board import Fault as Names
+        from drivers.sim.instruments.force_board import Fault as Names
     return Names[fault.kind.upper().replace("-", "_")]

@@ -38,10 +38,10 @@ KINDS: dict[Device, frozenset[str]] = {
     Device.CAMERA: frozenset({"stale", "black", "frozen", "torn", "drop"}),
     Device.INK: frozenset(
         {"deaf", "mute", "garbage", "late", "split", "damaged", "mistaken", "echo", "unplug"}
-    ),  # the names of drivers.sim.ink_station.Fault
+    ),  # the names of drivers.sim.instruments.ink_station.Fault
     Device.FORCE: frozenset(
         {"silence", "no-first", "no-second", "no-third", "short", "nan", "inf", "bus-error", "bus-off", "stuck"}
-    ),  # the names of drivers.sim.force_board.Fault
+    ),  # the names of drivers.sim.instruments.force_board.Fault
 }
 HANDED_OVER = frozenset({Device.INK, Device.FORCE})
 """Their simulators keep their own list of faults, one for each of the next requests or rounds."""

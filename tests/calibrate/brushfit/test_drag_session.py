@@ -12,15 +12,15 @@ from typer.testing import CliRunner
 
 from brushloop import app
 from calibrate.artefact import load_artefact
-from calibrate.brushfit.drag_captures import commanded_path, figures_of, read_drags
-from calibrate.brushfit.drag_run import FOLDER, LAGGING, STAMPS, DragArtefact
-from calibrate.brushfit.drags import chance, fit_drags
 from calibrate.current import current
+from calibrate.drags.captures import commanded_path, figures_of, read_drags
+from calibrate.drags.fit import chance, fit_drags
+from calibrate.drags.run import FOLDER, LAGGING, STAMPS, DragArtefact
 from calibrate.errors import CalibrationError
-from drivers.sim.brush import Brush, BrushSpec, Waypoint
+from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from model.drag import DragModel
-from sessions.importer import ImportOptions, import_photographs
-from sessions.schemas import Header, Source
+from sessions.imports.photographs import ImportOptions, import_photographs
+from sessions.recording.schemas import Header, Source
 
 STROKES = [
     (30.0, 0.0, 4.0),

@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.brushfit.drags import INK_ABOVE, Residual, chance, fit_drags
-from drivers.sim.brush import Brush, BrushSpec, Waypoint
+from calibrate.drags.fit import INK_ABOVE, Residual, chance, fit_drags
+from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from model.drag import DragModel
 
 X_MM, Y_MM = np.arange(-10.0, 50.0, 1.0), np.arange(-18.0, 18.0, 1.0)

@@ -4,8 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.brushfit.fit import STAGES, Grid, Pressed, bootstrap, condition_number, fit_presses, refit, zero_touch
-from calibrate.brushfit.heldout import CEILING, FITTED, leave_cell_out, predictor
+from calibrate.fit.fit import STAGES, Grid, Pressed, bootstrap, condition_number, fit_presses, refit, zero_touch
+from calibrate.fit.heldout import CEILING, FITTED, leave_cell_out, predictor
 from model.fitted import NAMES, FittedPress, published
 
 PX_MM = 0.4

@@ -11,16 +11,16 @@ from typer.testing import CliRunner
 
 from brushloop import app
 from calibrate.artefact import load_artefact
-from calibrate.brushfit.artefact import FOLDER, BrushFit
-from calibrate.brushfit.captures import read_presses
-from calibrate.brushfit.run import correction, fit_session
+from calibrate.compare.field import Alignment, Field, Tone
 from calibrate.current import current
 from calibrate.errors import CalibrationError
-from calibrate.field import Alignment, Field, Tone
-from calibrate.validate.report import load_report
-from drivers.sim.brush import Brush, BrushSpec
+from calibrate.fit.artefact import FOLDER, BrushFit
+from calibrate.fit.captures import read_presses
+from calibrate.fit.run import correction, fit_session
+from calibrate.validate.report.data import load_report
+from drivers.sim.brush.brush import Brush, BrushSpec
 from model.fitted_shape import NAME
-from sessions.importer import ImportOptions, import_photographs
+from sessions.imports.photographs import ImportOptions, import_photographs
 
 CELLS = [(11.0, 0.0), (11.0, 10.0), (15.0, 5.0), (20.0, 0.0), (20.0, 10.0)]
 VIEW = Field(mm_per_px=0.4)

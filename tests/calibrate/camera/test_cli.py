@@ -14,10 +14,10 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from brushloop import app
-from calibrate.camera.artefact import LensFile
-from calibrate.camera.lens import Gray
+from calibrate.board.artefact import LensFile
+from calibrate.board.lens import Gray
+from calibrate.board.scale import BoardSpec, apply, charuco_board
 from calibrate.errors import CalibrationError
-from calibrate.scale import BoardSpec, apply, charuco_board
 
 if TYPE_CHECKING:
     from conftest import Photographed

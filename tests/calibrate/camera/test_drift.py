@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.camera.check import preflight
-from calibrate.camera.drift import drift
-from calibrate.camera.view import see_plane
+from calibrate.board.check import preflight
+from calibrate.board.drift import drift
+from calibrate.board.scale import BoardSpec, charuco_board
+from calibrate.board.view import see_plane
 from calibrate.errors import CalibrationError
-from calibrate.scale import BoardSpec, charuco_board
 
 SPEC = BoardSpec(squares=(9, 7), square_mm=20.0, marker_mm=14.0, dictionary="DICT_5X5_100", origin_mm=(-10.0, 5.0))
 HOUR_NS = 3_600_000_000_000

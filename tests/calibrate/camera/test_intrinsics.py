@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from calibrate.artefact import HASH_CHARS, load_artefact
-from calibrate.camera.artefact import LensFile, lens_file
-from calibrate.camera.boards import Checkerboard, View, see
-from calibrate.camera.cameras import two_cameras
-from calibrate.camera.intrinsics import fit_lens, guidance
-from calibrate.camera.lens import Lens, lens_of
-from calibrate.camera.zhang import solve
+from calibrate.board.artefact import LensFile, lens_file
+from calibrate.board.cameras import two_cameras
+from calibrate.board.detect import Checkerboard, View, see
+from calibrate.board.intrinsics import fit_lens, guidance
+from calibrate.board.lens import Lens, lens_of
+from calibrate.board.scale import BoardSpec, charuco_board
+from calibrate.board.zhang import solve
 from calibrate.errors import CalibrationError
-from calibrate.scale import BoardSpec, charuco_board
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "opencv_calib"
 real = pytest.mark.skipif(not DATA.is_dir(), reason="OpenCV's real photographs of boards are not here")

@@ -16,20 +16,20 @@ from typer.testing import CliRunner
 from bench.preprocess_rigs import CAMERAS, Shot, lens_views, sheet, true_mask, true_scale
 from brushloop import app
 from calibrate.artefact import Calibration, LensUsed, load_artefact
-from calibrate.calibration import FITTED, calibrate_session
-from calibrate.camera.artefact import LensFile, lens_file
-from calibrate.camera.boards import see
-from calibrate.camera.intrinsics import fit_lens
-from calibrate.camera.session import read_lens
+from calibrate.board.artefact import LensFile, lens_file
+from calibrate.board.detect import see
+from calibrate.board.intrinsics import fit_lens
+from calibrate.board.scale import see_board
+from calibrate.board.session import read_lens
+from calibrate.compare.field import Field, Tone, captured_mm
 from calibrate.current import current
 from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.field import Field, Tone, captured_mm
-from calibrate.prepare.params import PX_PER_MM, Params
-from calibrate.presses import prepare_press
-from calibrate.scale import see_board
-from collect.reviewing import Review
+from calibrate.session import FITTED, calibrate_session
+from calibrate.stroke.params import PX_PER_MM, Params
+from calibrate.stroke.presses import prepare_press
+from collect.tui.captures import Review
 from sessions.reader import Recording
-from sessions.schemas import Stroke
+from sessions.recording.schemas import Stroke
 
 if TYPE_CHECKING:
     from conftest import Photographed

@@ -13,14 +13,14 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from brushloop import app
-from calibrate.camera.rig_file import PaperLines, read_rig
+from calibrate.board.rig_file import PaperLines, read_rig
 from calibrate.errors import CalibrationError
-from collect.config import PaperConfig, RigConfig, load_rig
-from collect.sheet import to_base
+from collect.rig.config import PaperConfig, RigConfig, load_rig
+from collect.rig.sheet import to_base
 from drivers.geometry import brush_pose
+from drivers.sim.camera.scene import Scene
 from drivers.sim.config import SimConfig, Table, View
 from drivers.sim.rig_toml import Addresses, rig_toml
-from drivers.sim.scene import Scene
 from drivers.sim.world import World
 
 VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from bench.preprocess_rigs import CAMERAS, board_of, boards, lens_views, true_scale
-from calibrate.camera.boards import see
-from calibrate.camera.intrinsics import fit_lens
-from calibrate.camera.lens import Lens
-from calibrate.camera.view import see_plane
+from calibrate.board.detect import see
+from calibrate.board.intrinsics import fit_lens
+from calibrate.board.lens import Lens
+from calibrate.board.view import see_plane
+from drivers.sim.camera.optics import Optics
 from drivers.sim.config import Table
-from drivers.sim.optics import Optics
 
 WORST = 2e-4
 BOARD = board_of(Table())

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.camera.ruler import bars, check_scale
+from calibrate.board.ruler import bars, check_scale
 from calibrate.errors import CalibrationError
-from sessions.scan import dpi_of
+from sessions.imports.scan import dpi_of
 
 SCAN = Path(__file__).parents[4] / "shared" / "data" / "ardibid_scan_400dpi" / "01.jpg"
 

@@ -8,15 +8,15 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from calibrate.field import Alignment, Field, Tone
+from calibrate.compare.field import Alignment, Field, Tone
 from calibrate.loop.pairs import Paired, Side, pair_up
 from calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, bootstrap, score_pairs, statistics, verdicts
 from model.ccdbsm import Brush
 from model.coverage import coverage
 from model.registry import stroke_model
-from sessions.messages import encode_png
 from sessions.reader import Capture
-from sessions.schemas import Stroke
+from sessions.recording.messages import encode_png
+from sessions.recording.schemas import Stroke
 from tests.calibrate.given import CALIBRATION
 
 MODEL = stroke_model("ccd-bsm", Brush())

@@ -17,15 +17,15 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop import app
+from calibrate.compare.field import Alignment, Tone
 from calibrate.errors import CalibrationError
-from calibrate.field import Alignment, Tone
 from calibrate.loop.table import LoopRecord
-from calibrate.validate import tables
-from calibrate.validate.report import load_report
+from calibrate.validate.report import tables
+from calibrate.validate.report.data import load_report
 from calibrate.validate.run import REPEATED
-from sessions.importer import ImportOptions, import_photographs
+from sessions.imports.photographs import ImportOptions, import_photographs
 from sessions.reader import Recording
-from sessions.schemas import Source
+from sessions.recording.schemas import Source
 from tests.calibrate.records import loop_record, table_of, written_record
 
 FAST = ("--model", "line", "--no-held-out", "--no-parquet")

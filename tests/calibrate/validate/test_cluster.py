@@ -66,7 +66,7 @@ def test_jobs_come_back_whole_and_alike_though_a_worker_dies(cluster: Cluster, s
     program = f"""
 import os, signal
 from pathlib import Path
-from calibrate.field import Field
+from calibrate.compare.field import Field
 from calibrate.validate.jobs import PrepareJob, prepare_job
 from calibrate.validate.pool import Dask, Threads
 from sessions.reader import Recording

@@ -10,8 +10,8 @@ import torch
 from typer.testing import CliRunner
 
 from brushloop import app
-from calibrate.field import Alignment, Tone
-from calibrate.validate.report import load_report
+from calibrate.compare.field import Alignment, Tone
+from calibrate.validate.report.data import load_report
 from model.ccdbsm import Brush
 from model.train.captures import load_captures
 from model.train.checkpoint import load_weights

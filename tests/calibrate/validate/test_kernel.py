@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibrate.field import BEST_SHIFT_PX
-from calibrate.similarity import csim, ssim
-from calibrate.validate.kernel import compare
-from calibrate.validate.pixels import pack, unpack
+from calibrate.compare.compiled import compare
+from calibrate.compare.field import BEST_SHIFT_PX
+from calibrate.compare.images import pack, unpack
+from calibrate.compare.similarity import csim, ssim
 
 
 def marks(rng: np.random.Generator, count: int, tones: int) -> np.ndarray:

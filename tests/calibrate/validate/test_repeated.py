@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bench.validate import scoring
-from calibrate.field import Field
+from calibrate.compare.field import Field
 from calibrate.validate import run as running
 from calibrate.validate import steps
 from calibrate.validate.jobs import PrepareJob, Press, prepare_job

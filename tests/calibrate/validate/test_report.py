@@ -13,12 +13,12 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop import app
+from calibrate.compare.field import Alignment, Tone
 from calibrate.errors import CalibrationError
-from calibrate.field import Alignment, Tone
 from calibrate.validate.gates import GateMissed, parse_gate
-from calibrate.validate.page import _of_session
-from calibrate.validate.report import Collected, Report, load_report
-from calibrate.validate.words import trust
+from calibrate.validate.report.data import Collected, Report, load_report
+from calibrate.validate.report.findings import trust
+from calibrate.validate.report.page import _of_session
 from sessions.reader import Recording
 from sessions.remarks import Remark, add_remark
 

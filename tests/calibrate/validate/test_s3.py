@@ -14,10 +14,10 @@ from typer.testing import CliRunner
 
 from bench.preprocess_rigs import sheet
 from brushloop import app, main
-from calibrate.calibration import calibrate_session
-from calibrate.validate.report import load_report
+from calibrate.session import calibrate_session
+from calibrate.validate.report.data import load_report
 from calibrate.validate.sources import open_session
-from sessions.schemas import Stroke
+from sessions.recording.schemas import Stroke
 
 if TYPE_CHECKING:
     from conftest import Photographed

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from calibrate.artefact import Calibration
+from calibrate.compare.field import Tone
 from calibrate.errors import CalibrationError
-from calibrate.field import Tone
-from calibrate.written.compare import Written
-from calibrate.written.images import drawn
-from calibrate.written.learn import MOST_MM, learned, model_of, reach_of, smoothed
-from calibrate.written.record import PlanRecord, arrays, figure_record
-from calibrate.written.scores import Character
+from calibrate.writing.compare import Written
+from calibrate.writing.images import drawn
+from calibrate.writing.learn import MOST_MM, learned, model_of, reach_of, smoothed
+from calibrate.writing.record import PlanRecord, arrays, figure_record
+from calibrate.writing.scores import Character
 from model.characters.ink import written as ink_of
-from sessions.schemas import Header, Source
+from sessions.recording.schemas import Header, Source
 from tests.calibrate.given import BY
 
 SIDE_MM = 48.0

@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
+from calibrate.compare.field import Alignment, Tone
 from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.field import Alignment, Tone
-from calibrate.written.images import KEYS, Polarity, captured, drawn, laid, read_reference, similarity
-from calibrate.written.record import PlanRecord, figure_record, load_plan, points_digest
-from calibrate.written.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED, Character, score_character
-from calibrate.written.table import read_table_3, table_3
-from sessions.messages import encode_png
+from calibrate.writing.images import KEYS, Polarity, captured, drawn, laid, read_reference, similarity
+from calibrate.writing.record import PlanRecord, figure_record, load_plan, points_digest
+from calibrate.writing.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED, Character, score_character
+from calibrate.writing.table import read_table_3, table_3
 from sessions.reader import Capture
-from sessions.schemas import Source, Stroke
+from sessions.recording.messages import encode_png
+from sessions.recording.schemas import Source, Stroke
 from tests.calibrate.given import BY, CALIBRATION
 from tests.calibrate.records import written_record
 

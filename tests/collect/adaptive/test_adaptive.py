@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from calibrate.brushfit.stepwise import Design, Seen, field_grid, next_cell, packed, unpacked
-from collect.config import load_rig
+from calibrate.fit.stepwise import Design, Seen, field_grid, next_cell, packed, unpacked
 from collect.planning.limits import check_protocol
 from collect.planning.summary import make_plan
 from collect.protocols.adaptive import planned, steps
 from collect.protocols.config import AdaptiveConfig
 from collect.protocols.loading import load_protocol
-from collect.steps import Result, Step, StepKind
+from collect.protocols.steps import Result, Step, StepKind
+from collect.rig.config import load_rig
 from model.fitted import FittedPress
-from sessions.journal import JOURNAL_NAME, read_lines, replay
+from sessions.journal.journal import JOURNAL_NAME, read_lines, replay
 from sessions.reader import Recording
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def walked(made: AdaptiveConfig, choices: dict[int, Result]) -> list[Step]:
 
 def ink_of(brush: FittedPress, height_mm: float, tilt_deg: float) -> str:
     """A press of that brush as a capture would tell it."""
-    from calibrate.brushfit.stepwise import FIELD
+    from calibrate.fit.stepwise import FIELD
 
     centres = (np.arange(768) + 0.5) * 0.05
     left, top = FIELD.anchor_mm
@@ -131,7 +131,7 @@ def test_a_cell_that_shows_no_stroke_twice_is_not_chosen_again() -> None:
 
 
 def test_a_rig_pc_chooses_without_torch() -> None:
-    code = "import sys, collect.work.choosing, calibrate.brushfit.stepwise; sys.exit('torch' in sys.modules)"
+    code = "import sys, collect.engine.steps.choose, calibrate.fit.stepwise; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from collect import demo
-from collect.commands import GIVEN_UP, CommandFailed
+from collect.chains import demo
+from collect.chains.commands import GIVEN_UP, CommandFailed
 from collect.protocols.loading import load_protocol
 from sessions.store import SessionStore
 from tests.sessions.conftest import Make

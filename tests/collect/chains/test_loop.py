@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from calibrate.loop.table import read_table_1
-from sessions.journal import JOURNAL_NAME
+from sessions.journal.journal import JOURNAL_NAME
 from sessions.reader import Recording
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from calibrate.written.scores import ANOTHER, REFERENCE, SIMULATED
-from calibrate.written.table import Table3Row, read_table_3
+from calibrate.writing.scores import ANOTHER, REFERENCE, SIMULATED
+from calibrate.writing.table import Table3Row, read_table_3
 
 if TYPE_CHECKING:
     from tests.collect.chains.conftest import Bench

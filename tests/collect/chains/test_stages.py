@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from collect.commands import CommandFailed, run_command
+from collect.chains.commands import CommandFailed, run_command
+from collect.chains.loop import check_recovered
+from collect.chains.loop_settings import FILE, Settings, begun_with, keep
 from collect.errors import ConfigError
-from collect.loop.run import check_recovered
-from collect.loop.settings import FILE, Settings, begun_with, keep
 
 SETTINGS = Settings(
     original="grid-01",

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from calibrate.written.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED
-from calibrate.written.table import Table3Row, read_table_3
+from calibrate.writing.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED
+from calibrate.writing.table import Table3Row, read_table_3
 from sessions.reader import Recording
 
 if TYPE_CHECKING:

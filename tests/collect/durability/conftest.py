@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from drivers.sim.faults.phases import Phase
-from sessions.journal import JOURNAL_NAME
+from sessions.journal.journal import JOURNAL_NAME
 
 if TYPE_CHECKING:
     from tests.collect.conftest import Lab

@@ -9,10 +9,10 @@ import sys
 from pathlib import Path
 from typing import Any, cast
 
-from collect.config import load_rig
-from collect.procedures import Procedures
-from collect.rig import Rig, make_robot
-from collect.sheet import Sheet
+from collect.motion.procedures import Procedures
+from collect.rig.config import load_rig
+from collect.rig.devices import Rig, make_robot
+from collect.rig.sheet import Sheet
 from drivers.clock import HostClock
 
 

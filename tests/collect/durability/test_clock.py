@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.engine import Engine
+from collect.engine.engine import Engine
+from collect.engine.snapshot import Snapshot
 from collect.errors import CollectAborted
-from collect.snapshot import Snapshot
-from sessions import container
-from sessions.journal import JOURNAL_NAME, read_lines
+from sessions.journal.journal import JOURNAL_NAME, read_lines
 from sessions.reader import Recording
+from sessions.recording import container
 from sessions.verify import verify_session
 from tests.collect.durability.conftest import the_session
 

@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from collect.engine import Engine
-from collect.states import State
+from collect.engine.engine import Engine
+from collect.engine.states import State
 from drivers.arcs.codes import SafetyMode
 from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, MotionFailed, ProtocolViolation, RobotNotSafe
 from drivers.geometry import distance
 from drivers.samples import Pose
 from drivers.sim.faults.phases import Phase
 from drivers.sim.faults.vocabulary import ALWAYS, Fault
-from sessions.journal import read_lines, replay
+from sessions.journal.journal import read_lines, replay
 from sessions.store import SessionStore
 
 if TYPE_CHECKING:

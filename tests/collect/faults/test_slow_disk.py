@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from collect.states import State
+from collect.engine.states import State
 from drivers.sim.faults.phases import Phase
 from sessions.errors import SessionError
-from sessions.journal import read_lines, replay
+from sessions.journal.journal import read_lines, replay
 from sessions.reader import Recording
-from sessions.writer import ChannelTable
+from sessions.recording.writer import ChannelTable
 
 if TYPE_CHECKING:
     from conftest import Stage

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from collect.config_devices import CameraConfig
 from collect.photograph.photographer import Photographer, Ways
+from collect.rig.config_devices import CameraConfig
 from drivers.clock import HostClock
 from drivers.samples import Frame, Pose, PoseSample, Stamp
 

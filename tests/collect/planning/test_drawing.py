@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from collect.config import RigConfig, load_rig
-from collect.drawing import Drawn, check_drawn, draw_stroke, stroke_moves
-from collect.plane import PaperPlane
+from collect.motion.drawing import Drawn, check_drawn, draw_stroke, stroke_moves
 from collect.planning.walk import sheet_of, walk
 from collect.protocols.loading import load_protocol
-from collect.rig import limits_of, make_robot
-from collect.steps import StepKind
+from collect.protocols.steps import StepKind
+from collect.rig.config import RigConfig, load_rig
+from collect.rig.devices import limits_of, make_robot
+from collect.rig.plane import PaperPlane
 from drivers.arcs.robot import AuboArcs
 from drivers.clock import HostClock
 from drivers.errors import LimitExceeded
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml
 from drivers.sim.world import World

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from collect.config import RigConfig, load_rig
-from collect.drawing import Drawn
 from collect.errors import ConfigError
-from collect.plane import PaperPlane
+from collect.motion.drawing import Drawn
+from collect.motion.procedures import Move
 from collect.planning.ink import bundle_ml, ink_need
 from collect.planning.limits import all_poses, check_poses, check_protocol
 from collect.planning.marks import reach_of
@@ -19,11 +18,12 @@ from collect.planning.moves import Way, moves_of
 from collect.planning.summary import Plan, make_plan
 from collect.planning.timing import _apart, move_s, trapezoid_s, way_s
 from collect.planning.walk import sheet_of, walk
-from collect.procedures import Move
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.loading import load_protocol
-from collect.rig import limits_of
-from collect.steps import MARKING, StepKind
+from collect.protocols.steps import MARKING, StepKind
+from collect.rig.config import RigConfig, load_rig
+from collect.rig.devices import limits_of
+from collect.rig.plane import PaperPlane
 from drivers.geometry import brush_pose, distance
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml

@@ -13,17 +13,17 @@ import pytest
 from typer.testing import CliRunner
 
 import collect.cli
-from collect.config import RigConfig, load_rig
 from collect.errors import ConfigError
-from collect.plane import PaperPlane
 from collect.planning.asking import ask_reach
 from collect.planning.limits import all_poses
 from collect.planning.picture import draw_plan
 from collect.planning.summary import make_plan
 from collect.protocols.loading import load_protocol
+from collect.rig.config import RigConfig, load_rig
+from collect.rig.plane import PaperPlane
 from drivers.arcs.codes import RobotMode
 from drivers.errors import ConnectionLost
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml
 from drivers.sim.world import World

@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from collect.config import load_rig
-from collect.perform import Performer
-from collect.plane import PaperPlane
+from collect.engine.perform import Performer
+from collect.engine.steps import choose as choosing
+from collect.engine.steps.context import Job
+from collect.motion.procedures import inking_moves
 from collect.planning.limits import all_poses, check_protocol
 from collect.planning.moves import moves_of
-from collect.procedures import inking_moves
 from collect.protocols.loading import load_protocol
-from collect.steps import MARKING, Result, Step, StepKind
-from collect.work import choosing
-from collect.work.context import Job
+from collect.protocols.steps import MARKING, Result, Step, StepKind
+from collect.rig.config import load_rig
+from collect.rig.plane import PaperPlane
 from drivers.samples import Pose
 from tests.collect.conftest import Lab
 from tests.collect.sent import not_checked, not_sent, noting

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from calibrate.scale import PlaneFit
+from calibrate.board.scale import PlaneFit
 from collect.quality.check import cell_is_blank, check_capture, check_drawing, check_frame
-from collect.quality.config import QualityConfig
 from collect.quality.picture import blur_px, glare, paper_level
 from collect.quality.verdict import Failure, Family
-from collect.sheet import Cell
+from collect.rig.config_quality import QualityConfig
+from collect.rig.sheet import Cell
 
 LIMITS = QualityConfig()
 PX = 8.0

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from collect.errors import StepError
-from collect.touch.config import ForceTouchConfig
+from collect.rig.config_touch import ForceTouchConfig
 from collect.touch.contact import Contact
 from collect.touch.force import Reading, touch_by_force
 from collect.touch.reach import Reach
-from drivers.sim.brush import Brush, BrushSpec
+from drivers.sim.brush.brush import Brush, BrushSpec
+from drivers.sim.brush.reaction import Reaction
 from drivers.sim.config import SimConfig
-from drivers.sim.reaction import Reaction
 
 NOISE_N = SimConfig().force_noise_n
 REACH = Reach(122.0, 120.0, 118.0)

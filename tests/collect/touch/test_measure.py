@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from collect.asking import Asker
 from collect.errors import NeedsOperator, StepError
-from collect.touch.config import TouchConfig
+from collect.operator.questions import Asker
+from collect.rig.config_touch import TouchConfig
 from collect.touch.jog import Jogged, asked
 from collect.touch.measure import measure_plane
 from collect.touch.results import PlaneResult

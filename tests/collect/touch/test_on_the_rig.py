@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from collect.config import load_rig
-from collect.plane import PaperPlane
+from collect.motion.procedures import Procedures
 from collect.planning.moves import moves_of
-from collect.procedures import Procedures
-from collect.rig import connected
-from collect.steps import Step, StepKind
-from collect.touch.config import TouchConfig
+from collect.protocols.steps import Step, StepKind
+from collect.rig.config import load_rig
+from collect.rig.config_touch import TouchConfig
+from collect.rig.devices import connected
+from collect.rig.plane import PaperPlane
 from collect.touch.measure import measure_plane
 from drivers.clock import HostClock
 from drivers.samples import Pose

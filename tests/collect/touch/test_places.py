@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from collect.config import PaperConfig
-from collect.sheet import Sheet
-from collect.touch.config import TouchConfig
+from collect.rig.config import PaperConfig
+from collect.rig.config_touch import TouchConfig
+from collect.rig.sheet import Sheet
 from collect.touch.places import used_cells
 from collect.touch.selfcheck import triangle_of
 

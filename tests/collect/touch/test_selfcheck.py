@@ -15,11 +15,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from collect.config import PaperConfig
 from collect.errors import StepError
-from collect.plane import PaperPlane
-from collect.sheet import Sheet, to_base
-from collect.touch.config import SelfCheckConfig
+from collect.rig.config import PaperConfig
+from collect.rig.config_touch import SelfCheckConfig
+from collect.rig.plane import PaperPlane
+from collect.rig.sheet import Sheet, to_base
 from collect.touch.selfcheck import (
     SelfCheck,
     Triangle,

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from collect.config import RigConfig
 from collect.errors import ConfigError
-from collect.plane import PaperPlane
 from collect.planning.limits import check_step
 from collect.planning.moves import moves_of
-from collect.sheet import Sheet
-from collect.steps import Step, StepKind
-from collect.touch.config import TouchConfig
+from collect.protocols.steps import Step, StepKind
+from collect.rig.config import RigConfig
+from collect.rig.config_touch import TouchConfig
+from collect.rig.plane import PaperPlane
+from collect.rig.sheet import Sheet
 from collect.touch.jog import Jogged
 from collect.touch.measure import measure_plane
 from collect.touch.selfcheck import partners, self_check, triangle_on

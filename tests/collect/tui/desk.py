@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from collect.desk import Desk, Paths
-from collect.doctor import Finding
-from collect.reviewing import Looked, Review, Seen
+from collect.rig.doctor import Finding
+from collect.tui.browser import Desk, Paths
+from collect.tui.captures import Looked, Review, Seen
 from collect.tui.pictures import Pictures
 from collect.tui.review import ReviewScreen
 from sessions.remarks import Remark

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from collect.asking import Choice, Prompt
+from collect.engine.last_capture import LastCapture, published_mark
+from collect.engine.set_up_steps import Fact, SetUpStep, Standing
+from collect.engine.snapshot import CellCount, Snapshot
+from collect.engine.states import State
+from collect.engine.tally import Mark, SheetMap
+from collect.engine.telemetry import Picture
 from collect.errors import CollectAborted
-from collect.last_capture import LastCapture, published_mark
+from collect.operator.questions import Choice, Prompt
+from collect.operator.requests import Wish
+from collect.protocols.steps import StepKind
 from collect.quality.verdict import Check, Failure, Verdict
-from collect.set_up_steps import Fact, SetUpStep, Standing
-from collect.snapshot import CellCount, Snapshot
-from collect.states import State
-from collect.steps import StepKind
-from collect.tally import Mark, SheetMap
-from collect.telemetry import Picture
-from collect.wishes import Wish
 
 HEIGHTS_MM = (11.0, 13.0, 15.0, 17.0, 20.0)
 TILTS_DEG = (0.0, 5.0, 10.0)

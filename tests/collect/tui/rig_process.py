@@ -12,8 +12,8 @@ from pathlib import Path
 
 from bench.processes import lines_of_input, tell
 from drivers.arcs.codes import SafetyMode
+from drivers.sim.brush.flaws import Flaw
 from drivers.sim.config import SimConfig, View
-from drivers.sim.flaws import Flaw
 from drivers.sim.rig import LoopbackRig
 
 MOST_PRESSES = 100

@@ -10,7 +10,7 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import Static
 
-from collect.states import FINAL, State
+from collect.engine.states import FINAL, State
 from collect.tui.app import OperatorApp
 from collect.tui.confirm import Confirm
 from collect.tui.help import HelpScreen

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from collect.asking import Choice, Prompt
-from collect.states import State
+from collect.engine.states import State
+from collect.operator.questions import Choice, Prompt
 from collect.tui.app import OperatorApp
 from collect.tui.ask import AskScreen
 from collect.tui.confirm import Confirm

@@ -7,15 +7,15 @@ from collections.abc import Callable
 
 import pytest
 
-from collect.engine import Engine
+from collect.engine.engine import Engine
+from collect.engine.opening import Opening, find_resumable, open_store
+from collect.engine.snapshot import Snapshot
+from collect.engine.states import State
+from collect.engine.tally import Mark
 from collect.errors import CollectAborted, NeedsOperator, Parked
-from collect.opening import Opening, find_resumable, open_store
-from collect.snapshot import Snapshot
-from collect.states import State
-from collect.tally import Mark
-from collect.wishes import Wish, Wishes
+from collect.operator.requests import Wish, Wishes
 from drivers.clock import HostClock
-from sessions.journal import read_lines
+from sessions.journal.journal import read_lines
 from sessions.reader import Recording
 from sessions.remarks import mark_bad_or_good
 from tests.collect.conftest import Lab

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from textual.pilot import Pilot
 
-from collect.states import State
+from collect.engine.states import State
 from collect.tui.app import OperatorApp
 from collect.tui.finish import FinishScreen
 from sessions.verify import Verdict

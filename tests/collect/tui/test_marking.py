@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from collect.snapshot import Snapshot
-from collect.states import State
+from collect.engine.snapshot import Snapshot
+from collect.engine.states import State
 from collect.tui.app import OperatorApp
 from sessions.remarks import remarks_of
 from tests.collect.tui.fake import FakeEngine, full_picture

@@ -12,11 +12,11 @@ import pytest
 from textual.pilot import Pilot
 
 from bench.processes import Process, started
-from collect.desk import Desk, Paths
-from collect.snapshot import Snapshot
-from collect.states import State
+from collect.engine.snapshot import Snapshot
+from collect.engine.states import State
 from collect.tui.app import OperatorApp
 from collect.tui.ask import AskScreen
+from collect.tui.browser import Desk, Paths
 from collect.tui.finish import FinishScreen
 from collect.tui.review import ReviewScreen
 from collect.tui.run import RunScreen

@@ -17,7 +17,7 @@ from drivers.arcs.rpc import Framing
 from drivers.clock import HostClock
 from drivers.errors import ConnectionLost, MotionRefused, RobotNotSafe, RpcError
 from drivers.geometry import brush_pose, distance
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.server import ArcsServer
 
 NEAR = brush_pose(260.0, -220.0, 250.0)
 FAR = brush_pose(250.0, -30.0, 260.0)

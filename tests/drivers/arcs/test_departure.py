@@ -14,7 +14,7 @@ from drivers.arcs.waiting import Tolerance, until_settled
 from drivers.errors import ArmMoved, LimitExceeded, RobotNotSafe, SettingsChanged
 from drivers.geometry import brush_pose, distance
 from drivers.samples import Pose
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.rig import HOST
 
 QUICK = {"speed_mm_s": 200.0, "acc_mm_s2": 800.0}

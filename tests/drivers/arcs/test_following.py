@@ -17,7 +17,7 @@ from drivers.errors import ConnectionLost, LimitExceeded, MotionFailed, MotionRe
 from drivers.geometry import brush_pose, distance
 from drivers.limits import Limits
 from drivers.samples import Pose
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.server import ArcsServer
 
 WAY = {"speed_mm_s": 40.0, "acc_mm_s2": 800.0, "blend_mm": 1.0}
 SLOW = {**WAY, "speed_mm_s": 3.0}

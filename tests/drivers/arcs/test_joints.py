@@ -12,7 +12,7 @@ from drivers.arcs.robot import AuboArcs
 from drivers.errors import DeviceError, LimitExceeded, MotionFailed, NotConnected, ProtocolViolation
 from drivers.geometry import brush_pose, distance, to_wire
 from drivers.samples import Pose
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.server import ArcsServer
 
 GENTLE = {"speed_rad_s": 0.2, "acc_rad_s2": 0.8}
 NEAR = brush_pose(300.0, -200.0, 240.0)

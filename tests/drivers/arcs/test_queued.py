@@ -12,7 +12,7 @@ from drivers.arcs.robot import AuboArcs
 from drivers.errors import ConnectionLost, LimitExceeded, MotionFailed, MotionRefused
 from drivers.geometry import brush_pose, distance
 from drivers.samples import Pose, QueuedLine
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.server import ArcsServer
 
 HOME = brush_pose(250.0, -230.0, 260.0)
 TOP, DEEP = brush_pose(250.0, -230.0, 300.0), brush_pose(250.0, -230.0, 200.0)

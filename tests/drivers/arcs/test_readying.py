@@ -16,7 +16,7 @@ from drivers.clock import HostClock
 from drivers.errors import MotionFailed, MotionRefused, RpcError
 from drivers.geometry import brush_pose
 from drivers.limits import Limits
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.rig import HOST
 
 NEAR = brush_pose(260.0, -220.0, 250.0)

@@ -28,7 +28,7 @@ from drivers.geometry import brush_pose, distance
 from drivers.limits import Limits
 from drivers.protocols import Robot
 from drivers.samples import Pose, PoseSample
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.server import ArcsServer
 
 NEAR = brush_pose(260.0, -220.0, 250.0)
 QUICK = {"speed_mm_s": 200.0, "acc_mm_s2": 800.0}

@@ -25,9 +25,9 @@ from drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, Protocol
 from drivers.geometry import brush_pose, distance
 from drivers.limits import Limits
 from drivers.samples import PoseSample
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.rtde_server import RtdeServer
+from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.rig import HOST
-from drivers.sim.rtde_server import RtdeServer
 from drivers.sim.server import LoopbackServer
 
 GREETING = b'{"protocol":"rtde","version":1,"input":{"set_recipe":100},"output":{"R1_actual_TCP_pose":1021}}\n\n'

@@ -11,7 +11,7 @@ from drivers.arcs import stopping
 from drivers.arcs.robot import AuboArcs
 from drivers.errors import ConnectionLost, DeviceTimeout, MotionError
 from drivers.geometry import brush_pose, distance
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.server import ArcsServer
 
 FAR = brush_pose(250.0, -30.0, 260.0)  # 200 mm from home: two seconds of the fast clock
 SLOW = {"speed_mm_s": 5.0, "acc_mm_s2": 800.0}

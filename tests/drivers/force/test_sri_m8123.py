@@ -19,7 +19,7 @@ from drivers.force.rounds import encode_round
 from drivers.force.samples import ForceSample, Wrench
 from drivers.force.sri_m8123 import SriM8123, SriOptions
 from drivers.protocols import ForceSensor
-from drivers.sim.force_sensor import Fault, SimForceSensor
+from drivers.sim.instruments.force_sensor import Fault, SimForceSensor
 
 WRENCH: Wrench = (1.0, -2.0, 3.5, 0.25, -0.5, 0.125)
 NUMBERS = count()

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, contextmanager
 
 import pytest
 
-from drivers.sim.ink_station import PtyLine
+from drivers.sim.instruments.ink_station import PtyLine
 
 Transcript = Callable[[Sequence[tuple[bytes, bytes]]], AbstractContextManager[str]]
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from drivers.errors import ProtocolViolation
 from drivers.ink.crc import crc16
 from drivers.ink.line import MAX_LINE_BYTES, Line, Reply, find_reply, number_of, seal, unseal
-from drivers.sim.ink_station import StationFirmware
+from drivers.sim.instruments.ink_station import StationFirmware
 
 DOC = Path(__file__).parents[3] / "docs" / "ink-station.md"
 THOROUGH = settings(max_examples=2000, deadline=None)

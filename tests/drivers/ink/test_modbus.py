@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from drivers.errors import ProtocolViolation
 from drivers.ink.modbus import exception, find_reply, read_write, seal, unseal, write_register
-from drivers.sim.modbus_pump import PumpFirmware
+from drivers.sim.instruments.modbus_pump import PumpFirmware
 
 THOROUGH = settings(max_examples=2000, deadline=None)
 SOME = settings(max_examples=100, deadline=None)

@@ -21,8 +21,8 @@ from drivers.errors import (
 from drivers.ink.errors import InkRefused
 from drivers.ink.pump import ModbusPump, PumpOptions
 from drivers.protocols import Ink
-from drivers.sim.ink_station import Fault, PtyLine
-from drivers.sim.modbus_pump import PumpFirmware
+from drivers.sim.instruments.ink_station import Fault, PtyLine
+from drivers.sim.instruments.modbus_pump import PumpFirmware
 
 TIMEOUT_S = 0.08
 ML_PER_REV = 0.12  # at 50 rpm: 0.1 ml/s

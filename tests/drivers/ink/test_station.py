@@ -21,7 +21,7 @@ from drivers.errors import (
 from drivers.ink.errors import InkRefused
 from drivers.ink.station import InkStation, StationOptions
 from drivers.protocols import Ink
-from drivers.sim.ink_station import Fault, PtyLine, StationFirmware
+from drivers.sim.instruments.ink_station import Fault, PtyLine, StationFirmware
 
 TIMEOUT_S = 0.07
 HELLO = (b"000 identify*6A60\n", b"000 ok ink-station 1 1.0.0 real*8310\n")

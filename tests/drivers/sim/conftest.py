@@ -8,8 +8,8 @@ import pytest
 
 from drivers.geometry import distance, to_wire
 from drivers.samples import Pose
-from drivers.sim.arcs_cabinet import Cabinet
-from drivers.sim.arcs_methods import methods
+from drivers.sim.arcs.cabinet import Cabinet
+from drivers.sim.arcs.methods import methods
 from drivers.sim.config import SimConfig
 from drivers.sim.world import World
 

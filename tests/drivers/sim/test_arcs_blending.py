@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from drivers.geometry import brush_pose, distance
 from drivers.samples import Pose
-from drivers.sim.arcs_motion import ArmQueue, Pace
+from drivers.sim.arcs.motion import ArmQueue, Pace
+from drivers.sim.arm.kinematics import HOME, Joints
+from drivers.sim.arm.motion import MotionQueue
 from drivers.sim.config import SimConfig
-from drivers.sim.kinematics import HOME, Joints
-from drivers.sim.motion import MotionQueue
 from drivers.sim.world import World
 
 V, A = 100.0, 1000.0

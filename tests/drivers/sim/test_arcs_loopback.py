@@ -6,13 +6,13 @@ import asyncio
 
 import pytest
 
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.rtde_server import RtdeServer
+from drivers.sim.arcs.server import ArcsServer
+from drivers.sim.camera.mjpeg_server import MjpegServer
 from drivers.sim.config import SimConfig
 from drivers.sim.faults.control import ControlServer
-from drivers.sim.mjpeg_server import MjpegServer
-from drivers.sim.rtde_server import RtdeServer
+from drivers.sim.instruments.socketcand_server import SocketcandServer
 from drivers.sim.server import LoopbackServer, NotLoopback
-from drivers.sim.socketcand_server import SocketcandServer
 from drivers.sim.world import World
 
 ELSEWHERE = ["0.0.0.0", "::", "", "192.168.1.10", "10.0.0.1", "8.8.8.8", "example.org", "localhost", "fe80::1"]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drivers.geometry import brush_pose, distance, to_wire
-from drivers.sim.kinematics import HOME, LIMITS_DEG
+from drivers.sim.arm.kinematics import HOME, LIMITS_DEG
 
 CENTRE = (300.0, -230.0)
 START = brush_pose(250.0, -230.0, 260.0)

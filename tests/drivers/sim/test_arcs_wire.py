@@ -11,7 +11,7 @@ import pytest
 
 from drivers.arcs.bare import BareDecoder
 from drivers.arcs.frames import FrameDecoder, encode
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.rig import HOST
 
 Ask = Callable[[bytes, int], Awaitable[list[Any]]]

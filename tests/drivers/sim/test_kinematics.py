@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.geometry import brush_pose, distance, from_wire, to_wire
-from drivers.sim.kinematics import HOME, LIMITS_DEG, forward, inverse, matrix_of, pose_of
+from drivers.sim.arm.kinematics import HOME, LIMITS_DEG, forward, inverse, matrix_of, pose_of
 
 TOOL = np.eye(4)
 TOOL[2, 3] = 0.18

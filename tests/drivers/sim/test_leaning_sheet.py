@@ -10,8 +10,8 @@ import pytest
 
 from drivers.geometry import brush_pose
 from drivers.samples import Pose
+from drivers.sim.brush.reaction import leaning_with
 from drivers.sim.config import SimConfig, Table
-from drivers.sim.reaction import leaning_with
 from drivers.sim.world import World
 
 LEANING = replace(Table(), slope_deg=(0.6, -0.8))

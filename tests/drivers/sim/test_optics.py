@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from drivers.sim.camera.optics import Optics
+from drivers.sim.camera.scene import Scene, board
 from drivers.sim.config import SimConfig, View
-from drivers.sim.optics import Optics
-from drivers.sim.scene import Scene, board
 from drivers.sim.world import World
 
 BENT = View(k1=-0.08)

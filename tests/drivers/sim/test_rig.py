@@ -14,7 +14,7 @@ from drivers.camera import CameraOptions, OpenCvCamera
 from drivers.clock import HostClock
 from drivers.samples import Stamp
 from drivers.sim import rig as rig_module
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.config import SimConfig, View
 from drivers.sim.rig import HOST, LoopbackRig, serve
 

@@ -13,9 +13,9 @@ import pytest
 from drivers.arcs.frames import FrameDecoder, encode, encode_short
 from drivers.arcs.rtde_wire import PING, encode_topic
 from drivers.geometry import brush_pose
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.rtde_server import RtdeServer
+from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.rig import HOST
-from drivers.sim.rtde_server import RtdeServer
 
 EVERYTHING = [
     "timestamp",

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
+from drivers.sim.camera.optics import homography
+from drivers.sim.camera.scene import PAPER_GRAY, Scene, board, read_strip
 from drivers.sim.config import SimConfig, View
-from drivers.sim.optics import homography
-from drivers.sim.scene import PAPER_GRAY, Scene, board, read_strip
 from drivers.sim.world import World
 
 CONFIG = SimConfig(view=View(width_px=1024, height_px=768, px_per_mm=3.125))

@@ -10,9 +10,9 @@ import pytest
 
 from drivers.geometry import brush_pose
 from drivers.samples import Pose
+from drivers.sim.brush.drag import INK_PER_MM
+from drivers.sim.brush.flaws import Flaw
 from drivers.sim.config import SimConfig, Table
-from drivers.sim.drag import INK_PER_MM
-from drivers.sim.flaws import Flaw
 from drivers.sim.world import INK_PER_PRESS, Press, World
 
 TABLE = Table()

@@ -9,8 +9,8 @@ import pytest
 from drivers.sim.faults.board import MOST, FaultBoard
 from drivers.sim.faults.phases import Phase
 from drivers.sim.faults.vocabulary import HANDED_OVER, KINDS, REPLIES, STOPS, Device, Fault
-from drivers.sim.force_board import Fault as ForceFault
-from drivers.sim.ink_station import Fault as InkFault
+from drivers.sim.instruments.force_board import Fault as ForceFault
+from drivers.sim.instruments.ink_station import Fault as InkFault
 
 
 @dataclass

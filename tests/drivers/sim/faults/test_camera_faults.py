@@ -17,9 +17,9 @@ from drivers.camera.health import FrameHealth
 from drivers.clock import HostClock
 from drivers.errors import DeviceTimeout
 from drivers.samples import Stamp
+from drivers.sim.camera.scene import read_strip
 from drivers.sim.faults.vocabulary import ALWAYS, Device, Fault
 from drivers.sim.rig import HOST, LoopbackRig
-from drivers.sim.scene import read_strip
 
 CLOCK = HostClock()
 

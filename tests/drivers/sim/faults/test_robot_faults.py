@@ -22,7 +22,7 @@ from drivers.errors import (
 )
 from drivers.geometry import brush_pose, distance
 from drivers.limits import Limits
-from drivers.sim.arcs_server import ArcsServer
+from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.faults.vocabulary import ALWAYS, Device, Fault
 from drivers.sim.rig import HOST, LoopbackRig
 

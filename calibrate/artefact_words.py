@@ -1,0 +1,101 @@
+"""Artefacts in words: what one holds, and what is different in another."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from calibrate.artefact import Artefact, Calibration, load_artefact
+from calibrate.board.artefact import LensFile, RegistrationFile
+from calibrate.current import current
+from calibrate.errors import CalibrationError
+from calibrate.files import read_bounded
+from calibrate.fit.artefact import BrushFit
+
+KINDS: dict[str, type[Artefact]] = {
+    "image_to_paper": Calibration,
+    "focal_se_px": LensFile,
+    "robot_to_paper": RegistrationFile,
+    "edges_mm": BrushFit,
+}
+"""A field that only this kind has."""
+
+
+def read_any(path: Path) -> tuple[Path, Artefact]:
+    """An artefact of any kind, or the calibration that a session uses, and where it lies. Raises `CalibrationError`."""
+    if path.is_dir():
+        found = current(path)
+        if found is None:
+            raise CalibrationError(str(path), f"is not calibrated: run `brushloop calibrate {path}`")
+        path = found
+    try:
+        values: Any = json.loads(read_bounded(path))
+    except (ValueError, RecursionError):
+        raise CalibrationError(str(path), "is no artefact: not JSON") from None
+    kind = next((kind for name, kind in KINDS.items() if isinstance(values, dict) and name in values), None)
+    if kind is None:
+        raise CalibrationError(str(path), "is no artefact of this software")
+    return path, load_artefact(path, kind)
+
+
+def described(artefact: Artefact) -> list[str]:
+    """One line a field, dotted names; what a calibration is labelled with comes first."""
+    label = [artefact.label] if isinstance(artefact, Calibration) and artefact.label else []
+    return label + [f"{name} = {_short(value)}" for name, value in fields(artefact).items()]
+
+
+def differences(one: Artefact, other: Artefact) -> list[str]:
+    """One line for each field that differs, and for calibrations what that means in mm; empty where they are equal.
+
+    Raises `CalibrationError` where they are of two kinds.
+    """
+    if type(one) is not type(other):
+        told = f"{type(one).__name__} and {type(other).__name__} are not compared"
+        raise CalibrationError(f"{one.digest}, {other.digest}", told)
+    left, right = fields(one), fields(other)
+    names = [*left, *(name for name in right if name not in left)]
+    lines = [f"{n}: {_told(left, n)} -> {_told(right, n)}" for n in names if left.get(n) != right.get(n)]
+    if lines and isinstance(one, Calibration) and isinstance(other, Calibration):
+        lines += _meaning(one, other)
+    return lines
+
+
+def fields(artefact: Artefact) -> dict[str, object]:
+    """Every value that is no table, by dotted name."""
+    return dict(_flat("", artefact.model_dump(mode="json")))
+
+
+def _flat(name: str, value: object) -> Iterator[tuple[str, object]]:
+    if isinstance(value, dict) and value:
+        for key, inner in cast("dict[str, object]", value).items():
+            yield from _flat(f"{name}.{key}" if name else key, inner)
+    else:
+        yield name, value
+
+
+def _meaning(one: Calibration, other: Calibration) -> Iterator[str]:
+    apart = other.mm_per_px_low > one.mm_per_px_high or one.mm_per_px_low > other.mm_per_px_high
+    words = "their intervals lie apart" if apart else "their intervals overlap"
+    yield f"pix2len differs by {100.0 * (other.mm_per_px / one.mm_per_px - 1.0):+.4f} %, {words}"
+    board = one.board
+    if board is None:
+        return
+    x, y = board.origin_mm
+    width, height = (n * board.square_mm for n in board.squares)
+    across, along = np.meshgrid(np.linspace(x, x + width, 9), np.linspace(y, y + height, 9))
+    paper_mm = np.column_stack([across.ravel(), along.ravel()])
+    off_mm = np.linalg.norm(other.to_paper(one.to_image(paper_mm)) - paper_mm, axis=1)
+    yield f"the same pixel lies {off_mm.mean():.3f} mm apart on average over the board, {off_mm.max():.3f} mm at most"
+
+
+def _told(values: dict[str, object], name: str) -> str:
+    return _short(values[name]) if name in values else "none"
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 200 else text[:197] + "..."

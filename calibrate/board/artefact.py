@@ -1,0 +1,100 @@
+"""What was measured of a camera, as immutable files named after the hash of their contents."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from calibrate.artefact import Artefact
+from calibrate.board.intrinsics import Fitted
+from calibrate.board.lens import Lens, lens_of
+
+
+class LensFile(Artefact):
+    """Intrinsics with everything that is needed to judge them."""
+
+    versions: ClassVar[tuple[int, ...]] = (1, 2)
+
+    kind: Literal["lens"] = "lens"
+    schema_version: int = 2
+    """Version 1 took the standard errors from corners alone, as if no two views were alike."""
+    software: str
+    photographs: dict[str, str]
+    """Name of every photograph that was given, and the sha256 of its bytes."""
+    board: str
+    """In words: kind, size in squares or corners, mm."""
+    size_px: tuple[int, int]
+    matrix: tuple[float, float, float, float]
+    """fx, fy, cx, cy in pixels, pixel centres on integers."""
+    distortion: tuple[float, float, float, float, float]
+    """k1, k2, p1, p2, k3 of OpenCV's model."""
+    focal_se_px: tuple[float, float] | None
+    """By leaving out each way in which the board was held; None where there were too few to tell."""
+    rms_px: float
+    rms_limit_px: float
+    residuals_px: dict[str, float]
+    dropped: dict[str, float]
+    """Outlier views and their residuals."""
+    unusable: dict[str, str]
+    """Photographs without a usable board, or that show nothing new, and why."""
+    guidance: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    def lens(self) -> Lens:
+        """To look through."""
+        return lens_of(self.matrix, self.distortion, self.size_px)
+
+
+def lens_file(
+    fitted: Fitted,
+    board: str,
+    photographs: dict[str, str],
+    rms_limit_px: float,
+    software: str,
+) -> LensFile:
+    """The file of a fitted lens."""
+    matrix, d = fitted.lens.matrix, fitted.lens.distortion
+    return LensFile(
+        software=software,
+        photographs=photographs,
+        board=board,
+        size_px=fitted.lens.size_px,
+        matrix=(float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])),
+        distortion=(float(d[0]), float(d[1]), float(d[2]), float(d[3]), float(d[4])),
+        focal_se_px=fitted.focal_se_px,
+        rms_px=fitted.rms_px,
+        rms_limit_px=rms_limit_px,
+        residuals_px=fitted.residuals_px,
+        dropped=fitted.dropped,
+        unusable=fitted.unusable,
+        guidance=fitted.guidance,
+        warnings=fitted.warnings,
+    )
+
+
+class RegistrationFile(Artefact):
+    """Where the robot's points lie on the paper, with what each of them says."""
+
+    versions: ClassVar[tuple[int, ...]] = (1, 2)
+
+    kind: Literal["registration"] = "registration"
+    schema_version: int = 2
+    """Version 1 told `turn_deg`, and took the board's corner for the origin of the paper frame."""
+    software: str
+    source: str
+    """The table of points, or the session, and its sha256."""
+    model: Literal["rigid", "similarity", "affine"]
+    robot_to_paper: tuple[float, float, float, float, float, float]
+    """(2, 3) row by row: mm in the robot's base frame to mm in the paper frame."""
+    turn_deg: float | None = None
+    """How far points turn on their way to the paper frame; in files of version 1 only."""
+    board_origin_mm: tuple[float, float] | None = None
+    """Lower left corner of the board in the paper frame, as it was taken."""
+    origin_mm: tuple[float, float] | None = None
+    yaw_deg: float | None = None
+    """Of the paper frame in the base frame, as in `[paper]` of rig.toml."""
+    scale: float
+    rms_mm: float
+    left_out_rms_mm: float
+    """Of every point, predicted by the others."""
+    residuals_mm: dict[str, tuple[float, float]]
+    dropped: dict[str, tuple[float, float]]

@@ -1,0 +1,276 @@
+"""`brushloop camera ...`: board, lens, plane, drift, registration. Heavy imports wait until a command runs."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sessions.terminal import say
+
+if TYPE_CHECKING:
+    from calibrate.board.detect import Board
+
+
+class Kind(StrEnum):
+    """What a registration may fit."""
+
+    RIGID = "rigid"
+    SIMILARITY = "similarity"
+    AFFINE = "affine"
+
+
+app = typer.Typer(help="The camera: print a board, calibrate lens and plane, register the robot.", no_args_is_help=True)
+
+Corners = Annotated[str, typer.Option("--checkerboard", help="Inner corners of a checkerboard, as 9x6.")]
+Squares = Annotated[str, typer.Option("--charuco", help="Squares of a ChArUco board, as 26x20.")]
+Square = Annotated[float, typer.Option(min=0.5, max=1000.0, help="Side of a square, measured on the print.")]
+Marker = Annotated[float, typer.Option(min=0.0, max=1000.0, help="Side of a marker; 0: three quarters of a square.")]
+Dictionary = Annotated[str, typer.Option(help="Markers of the ChArUco board.")]
+LensOption = Annotated[Path | None, typer.Option("--lens", help="Lens file of `camera intrinsics`.")]
+
+
+@app.command()
+def board(
+    out: Annotated[Path, typer.Argument(help="The new PDF.")],
+    checkerboard: Corners = "",
+    charuco: Squares = "",
+    square_mm: Square = 12.0,
+    marker_mm: Marker = 0.0,
+    dictionary: Dictionary = "DICT_5X5_1000",
+    page: Annotated[str, typer.Option(help="a4, a3, a2 or letter.")] = "a4",
+) -> None:
+    """Write a printable board as a PDF at true scale, with a ruler to check the print."""
+    from calibrate.board.pdf import describe, write_pdf
+
+    made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
+    say(f"{write_pdf(made, out, page)}: {describe(made)}")
+
+
+@app.command()
+def intrinsics(
+    photographs: Annotated[list[Path], typer.Argument(help="Photographs of one board, held in many ways.")],
+    checkerboard: Corners = "",
+    charuco: Squares = "",
+    square_mm: Square = 12.0,
+    marker_mm: Marker = 0.0,
+    dictionary: Dictionary = "DICT_5X5_1000",
+    limit_px: Annotated[float, typer.Option(min=0.01, max=10.0, help="Residual above which it warns.")] = 0.5,
+    one_camera: Annotated[
+        bool, typer.Option("--one-camera", help="Go on though the photographs look like two cameras'.")
+    ] = False,
+    out: Annotated[Path, typer.Option(help="Folder for the lens file.")] = Path("camera"),
+) -> None:
+    """Fit the lens; says what each photograph contributes, which were dropped, and what to photograph besides."""
+    import hashlib
+    from importlib.metadata import version
+
+    from calibrate.board.artefact import lens_file
+    from calibrate.board.detect import View, see
+    from calibrate.board.intrinsics import fit_lens
+    from calibrate.board.pdf import describe
+    from calibrate.board.views import named
+    from calibrate.errors import CalibrationError
+    from calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
+
+    made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
+    seen, unusable, digests = list[View](), dict[str, str](), dict[str, str]()
+    for name, path in named(photographs).items():
+        image = read_gray(path)
+        digests[name] = hashlib.sha256(read_bounded(path, MAX_PHOTOGRAPH_BYTES)).hexdigest()
+        try:
+            seen.append(see(image, made, name))
+        except CalibrationError as error:
+            unusable[name] = error.what
+    fitted = fit_lens(seen, limit_px, unusable, one_camera=one_camera)
+    file = lens_file(fitted, describe(made), digests, limit_px, f"brushloop {version('brushloop')}")
+    for name, residual in file.residuals_px.items():
+        say(f"{name}: {residual:.3f} px, slanted by {fitted.slants_deg[name]:.0f} deg")
+    for name, residual in file.dropped.items():
+        say(f"{name}: {residual:.3f} px, dropped: it does not fit the others")
+    for name, why in file.unusable.items():
+        say(f"{name}: {why}")
+    fx, fy, cx, cy = file.matrix
+    reach = fitted.focal_reach_px
+    across, along = ("", "") if reach is None else (f" +- {reach[0]:.2f}", f" +- {reach[1]:.2f}")
+    say(
+        f"fx {fx:.2f}{across} px, fy {fy:.2f}{along} px{'' if reach is None else ' (95 %)'}, "
+        f"centre {cx:.1f}, {cy:.1f} px, k1 {file.distortion[0]:+.4f}",
+        f"residual {file.rms_px:.3f} px over {len(file.residuals_px)} views, the board held in {fitted.ways} ways",
+    )
+    for line in (*(f"warning: {w}" for w in file.warnings), *(f"to do: {g}" for g in file.guidance)):
+        say(line)
+    say(str(file.save(out)))
+
+
+@app.command()
+def check(
+    photograph: Annotated[Path, typer.Argument(help="A photograph of the board as it will lie, no sheet on it.")],
+    charuco: Squares = "26x20",
+    square_mm: Square = 12.0,
+    marker_mm: Marker = 0.0,
+    dictionary: Dictionary = "DICT_5X5_1000",
+    lens: LensOption = None,
+    limit_px: Annotated[float, typer.Option(min=0.01, max=10.0, help="Residual above which it warns.")] = 0.5,
+) -> None:
+    """Pre-flight: pix2len with its interval from one photograph of the board, and warnings. Exit code 5 with any."""
+    from calibrate.artefact import load_artefact
+    from calibrate.board.artefact import LensFile
+    from calibrate.board.check import preflight
+    from calibrate.board.scale import BoardSpec
+    from calibrate.files import read_gray
+
+    spec = _board("", charuco, square_mm, marker_mm, dictionary)
+    assert isinstance(spec, BoardSpec)
+    plane, warnings = preflight(read_gray(photograph), spec, load_artefact(lens, LensFile) if lens else None, limit_px)
+    low, high = plane.interval_mm_per_px
+    say(
+        f"pix2len {plane.mm_per_px:.5f} mm/px (95 %: {low:.5f} to {high:.5f}), residual {plane.rms_px:.3f} px over "
+        f"{plane.corners} corners, k1 {float(plane.lens.distortion[0]):+.4f}"
+    )
+    for warning in warnings:
+        say(f"warning: {warning}")
+    if warnings:
+        raise typer.Exit(5)
+
+
+@app.command()
+def drift(
+    session: Annotated[Path, typer.Argument(help="A session's folder or its .mcap file.")],
+    lens: LensOption = None,
+) -> None:
+    """pix2len each time that the board was seen in a session, its trend, and warnings. Exit code 5 with any."""
+    from calibrate.board.drift import board_over_session
+    from calibrate.board.session import board_of, known_lens
+    from sessions.reader import Recording
+
+    recording = Recording(session)
+    known = known_lens(recording, lens)
+    found = board_over_session(recording, board_of(recording), known.lens() if known else None)
+    for seen in found.seen:
+        low, high = (seen.mm_per_px * (1.0 + side * seen.reach) for side in (-1.0, 1.0))
+        after_s = (seen.t_ns - found.seen[0].t_ns) / 1e9
+        say(
+            f"{after_s:8.0f} s: {seen.mm_per_px:.5f} mm/px (95 %: {low:.5f} to {high:.5f}), "
+            f"residual {seen.plane.rms_px:.3f} px, board moved {seen.moved_px:.2f} px"
+        )
+    if found.trend is not None:
+        low, high = found.trend.interval
+        say(f"trend {100 * found.trend.slope:+.4f} % per hour (95 %: {100 * low:+.4f} to {100 * high:+.4f})")
+    for warning in found.warnings:
+        say(f"warning: {warning}")
+    if found.warnings:
+        raise typer.Exit(5)
+
+
+@app.command()
+def register(
+    table: Annotated[Path, typer.Argument(help="CSV with name, robot_x_mm, robot_y_mm, image_x_px, image_y_px.")],
+    photograph: Annotated[Path, typer.Option(help="Photograph of the board, taken as the marks were.")],
+    config: Annotated[Path | None, typer.Option(help="The rig.toml whose board and lens the photograph shows.")] = None,
+    write: Annotated[
+        Path | None, typer.Option(help="The rig.toml to write origin_mm and yaw_deg into; read as --config is.")
+    ] = None,
+    charuco: Squares = "26x20",
+    square_mm: Square = 12.0,
+    marker_mm: Marker = 0.0,
+    dictionary: Dictionary = "DICT_5X5_1000",
+    origin_mm: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Without a rig.toml: lower left corner of the board, seen from that of the sheet."),
+    ] = None,
+    lens: LensOption = None,
+    model: Annotated[
+        Kind, typer.Option(help="rigid; similarity: scale too; affine: x and y on their own.")
+    ] = Kind.RIGID,
+    out: Annotated[Path, typer.Option(help="Folder for the registration file.")] = Path("camera"),
+) -> None:
+    """Where the paper lies before the robot, from marks that it touched or pressed: the lines for rig.toml."""
+    import hashlib
+    from importlib.metadata import version
+
+    from calibrate.board.points import read_points, registration_file
+    from calibrate.board.register import register as fit
+    from calibrate.board.rig_file import PaperLines, read_rig
+    from calibrate.board.scale import BoardSpec
+    from calibrate.board.session import read_lens
+    from calibrate.board.view import see_straight
+    from calibrate.errors import CalibrationError
+    from calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
+
+    if write is not None and model is not Kind.RIGID:
+        raise CalibrationError("--write", "needs --model rigid: rig.toml knows a place and a turn, and no scale")
+    rig_path = config or write
+    rig = read_rig(rig_path) if rig_path else None
+    target = read_rig(write) if write else None
+    if rig is not None:
+        spec = rig.board
+    elif origin_mm is not None:
+        flat = _board("", charuco, square_mm, marker_mm, dictionary)
+        assert isinstance(flat, BoardSpec)
+        spec = flat.model_copy(update={"origin_mm": origin_mm})
+    else:
+        told = "is not known: give --config rig.toml, or the board by its options and --origin-mm X Y"
+        raise CalibrationError("where the sheet lies on the board", told)
+    points = read_points(table)
+    lens = lens or (rig.lens_file if rig else None)
+    known = read_lens(lens) if lens else None
+    plane, flags = see_straight(read_gray(photograph), spec, known.lens() if known else None, str(photograph))
+    fitted = fit(points.names, points.robot_mm, plane.to_paper(points.image_px), model.value)
+    for name, (dx, dy) in zip(fitted.names, fitted.residuals_mm.tolist(), strict=True):
+        out_of_it = ", dropped: it does not fit the others" if name in fitted.dropped else ""
+        say(f"{name}: {dx:+.3f}, {dy:+.3f} mm{out_of_it}")
+    seen = hashlib.sha256(read_bounded(photograph, MAX_PHOTOGRAPH_BYTES)).hexdigest()
+    through = known.source if known else "no lens"
+    source = f"{table.name}, sha256 {points.sha256}; {photograph.name}, sha256 {seen}; {through}"
+    file = registration_file(fitted, spec.origin_mm, source, f"brushloop {version('brushloop')}")
+    for flag in flags:
+        say(f"warning: {flag}")
+    say(
+        f"scale {file.scale:.5f}, residual {file.rms_mm:.3f} mm, "
+        f"{file.left_out_rms_mm:.3f} mm for a point that was left out",
+        str(file.save(out)),
+    )
+    if model is not Kind.RIGID:
+        say("no lines for rig.toml, which knows a place and a turn, and no scale: use --model rigid")
+        return
+    lines = PaperLines(fitted.origin_mm, fitted.yaw_deg)
+    if target is not None:
+        say(f"{target.path}: written; as it was before: {target.write(lines)}")
+    else:
+        say("for [paper] of rig.toml:")
+    say(*lines.toml.splitlines())
+
+
+def _board(checkerboard: str, charuco: str, square_mm: float, marker_mm: float, dictionary: str) -> Board:
+    from pydantic import ValidationError
+
+    from calibrate.board.detect import Checkerboard
+    from calibrate.board.scale import BoardSpec
+    from calibrate.errors import CalibrationError, invalid
+
+    if bool(checkerboard) == bool(charuco):
+        raise CalibrationError("board", "give one of --checkerboard (inner corners) and --charuco (squares), as 9x6")
+    try:
+        if checkerboard:
+            return Checkerboard(inner_corners=_pair(checkerboard), square_mm=square_mm)
+        return BoardSpec(
+            squares=_pair(charuco),
+            square_mm=square_mm,
+            marker_mm=marker_mm or 0.75 * square_mm,
+            dictionary=dictionary,
+            origin_mm=(0.0, 0.0),
+        )
+    except ValidationError as error:
+        raise invalid("board", error) from None
+
+
+def _pair(text: str) -> tuple[int, int]:
+    from calibrate.errors import CalibrationError
+
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdigit() and len(part) < 4 for part in parts):
+        raise CalibrationError("board", f"{text!r} is no size like 9x6")
+    return int(parts[0]), int(parts[1])

@@ -1,0 +1,253 @@
+"""Boards in photographs: which corners are seen, and what is wrong where none are."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Annotated
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from calibrate.board.edges import on_edges
+from calibrate.board.lens import Floats, Gray
+from calibrate.board.scale import MIN_CORNERS, BoardSpec, apply, charuco_board
+from calibrate.errors import CalibrationError
+
+WINDOW_SHARE = 0.3
+"""Half the window of corner refinement as a share of the way to the next edge: a wider one would see that too."""
+MOST_WINDOW_PX = 8
+SATURATED = 254
+MOST_SATURATED = 0.4
+"""Share of saturated pixels above which edges have moved: light bleeds over them."""
+PARTLY_HIDDEN = 0.7
+"""Share of corners below which a board is said to be partly hidden."""
+CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+
+LEAST_CONTRAST = 30.0
+BLANK = "is blank: nothing in it is darker than the rest"
+GOES_ON = 0.75
+"""Of the contrast of its own corners: at its outer edge a board has half."""
+GRID_ERROR = 0.25
+"""In squares: a strong lens bends a board by less."""
+
+Corners = Annotated[int, Field(ge=3, le=60)]
+
+
+class Checkerboard(BaseModel):
+    """A plain checkerboard, named by its inner corners as OpenCV does."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    inner_corners: tuple[Corners, Corners]
+    """Columns and rows."""
+    square_mm: Annotated[float, Field(gt=0.0, le=1000.0)]
+
+
+Board = Checkerboard | BoardSpec
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One photograph of a board."""
+
+    name: str
+    size_px: tuple[int, int]
+    """Width and height of the photograph."""
+    pixels: Floats
+    """(n, 2) corners in it."""
+    board_mm: Floats
+    """(n, 2) the same on the board: x right, y down, from its upper left corner."""
+    ids: NDArray[np.int64]
+    """(n,) number of each corner, row by row."""
+    flags: tuple[str, ...] = ()
+    """What is not as it should be, though corners were found."""
+
+
+def see(image: Gray, board: Board, name: str, expected: int | None = None) -> View:
+    """The corners of the board in a gray photograph. Raises `CalibrationError` that says what is wrong.
+
+    `expected` is how many corners can be seen where a sheet lies on the board; all of them by default.
+    """
+    flags = _exposure(image)
+    found = _checkerboard(image, board, name) if isinstance(board, Checkerboard) else _charuco(image, board, name)
+    pixels, ids, board_mm, total = found
+    wanted = total if expected is None else expected
+    if len(ids) < PARTLY_HIDDEN * wanted:
+        flags = (*flags, f"only {len(ids)} of {wanted} corners are seen: the board is partly hidden or out of view")
+    return View(name, (image.shape[1], image.shape[0]), pixels, board_mm, ids, flags)
+
+
+def _blank(image: Gray) -> bool:
+    return float(np.percentile(image, 99) - np.percentile(image, 1)) < LEAST_CONTRAST
+
+
+def _exposure(image: Gray) -> tuple[str, ...]:
+    share = float(np.count_nonzero(image >= SATURATED)) / image.size
+    return (f"{100 * share:.0f} % of the pixels are saturated: expose less",) if share > MOST_SATURATED else ()
+
+
+def _charuco(image: Gray, spec: BoardSpec, name: str) -> tuple[Floats, NDArray[np.int64], Floats, int]:
+    board = charuco_board(spec, name)
+    markers, numbers = _markers(image, board)
+    twice = sorted(number for number, times in Counter(int(n) for n in numbers).items() if times > 1)
+    if len(twice) > 1:
+        raise CalibrationError(name, f"shows two boards: markers {twice[0]} and {twice[1]} are there twice")
+    own = np.asarray(board.getIds()).ravel()
+    foreign = np.setdiff1d(numbers, own)
+    if len(foreign) > max(1, 0.1 * len(numbers)):
+        raise CalibrationError(
+            name,
+            f"shows markers up to number {numbers.max()}, a board of {spec.squares[0]} x {spec.squares[1]} squares has "
+            f"0 to {own.max()}: it is another board",
+        )
+    total = (spec.squares[0] - 1) * (spec.squares[1] - 1)
+    pixels, ids = _charuco_corners(image, board)
+    if len(ids) < MIN_CORNERS:
+        why = f"{len(ids)} of {total} board corners found, at least {MIN_CORNERS} are needed"
+        if _blank(image):
+            raise CalibrationError(name, BLANK)
+        if len(markers) > MIN_CORNERS:
+            why += f", though {len(markers)} markers are seen: they do not lie as this board has them"
+        mirrored, _ = _markers(np.ascontiguousarray(image[:, ::-1]), board)
+        if len(mirrored) >= max(4, 2 * len(markers)):
+            why = "is mirrored: its markers can only be read the other way round"
+        raise CalibrationError(name, why)
+    board_mm = np.asarray(board.getChessboardCorners(), np.float64)[ids, :2]
+    gap_mm = 0.5 * (spec.square_mm - spec.marker_mm)
+    fine = _refined(image, pixels, board_mm, spec.square_mm, gap_mm)
+    return fine, ids, board_mm, total
+
+
+def _markers(image: Gray, board: cv2.aruco.CharucoBoard) -> tuple[list[Floats], NDArray[np.int64]]:
+    detector = cv2.aruco.ArucoDetector(board.getDictionary())
+    corners, ids, _ = detector.detectMarkers(image)
+    empty = ids is None  # pyright: ignore[reportUnnecessaryComparison]
+    return [np.asarray(c, np.float64) for c in corners], np.zeros(0, np.int64) if empty else np.ravel(ids).astype(
+        np.int64
+    )
+
+
+def _charuco_corners(image: Gray, board: cv2.aruco.CharucoBoard) -> tuple[Floats, NDArray[np.int64]]:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    detector = cv2.aruco.CharucoDetector(board)
+    detector.setDetectorParameters(parameters)
+    pixels, ids, _, _ = detector.detectBoard(image)
+    if ids is None:  # pyright: ignore[reportUnnecessaryComparison]
+        return np.zeros((0, 2)), np.zeros(0, np.int64)
+    return np.asarray(pixels, np.float64).reshape(-1, 2), np.ravel(ids).astype(np.int64)
+
+
+def _checkerboard(image: Gray, board: Checkerboard, name: str) -> tuple[Floats, NDArray[np.int64], Floats, int]:
+    columns, rows = board.inner_corners
+    pixels = _squares(image, board.inner_corners)
+    if pixels is None:
+        raise CalibrationError(name, _why_no_board(image, board.inner_corners))
+    if (more := _goes_on(image, pixels, board.inner_corners)) is not None:
+        raise CalibrationError(
+            name, f"shows more than {columns} x {rows} inner corners: at least {more[0]} x {more[1]}"
+        )
+    rest = image.copy()
+    hull = cv2.convexHull(pixels.astype(np.float32))
+    centre = pixels.mean(axis=0)
+    # A square more all round, so that nothing of this board is found again.
+    wider = centre + (hull.reshape(-1, 2) - centre) * (max(columns, rows) + 3) / (max(columns, rows) - 1)
+    cv2.fillConvexPoly(rest, np.rint(wider).astype(np.int32), int(np.median(image)))
+    if _squares(rest, board.inner_corners, quick=True) is not None:
+        raise CalibrationError(name, "shows two boards")
+    ids = np.arange(columns * rows, dtype=np.int64)
+    places = np.column_stack([ids % columns, ids // columns]).astype(np.float64)
+    board_mm: Floats = (places + 1.0) * board.square_mm
+    return _refined(image, pixels, board_mm, board.square_mm, board.square_mm), ids, board_mm, columns * rows
+
+
+def _goes_on(image: Gray, pixels: Floats, inner: tuple[int, int]) -> tuple[int, int] | None:
+    """The larger size, where squares go on beyond the outermost corners; None where the board ends."""
+    columns, rows = inner
+    grid = np.array([(k % columns, k // columns) for k in range(columns * rows)], np.float64)
+    to_image, _ = cv2.findHomography(grid, pixels, 0)
+    matrix = np.asarray(to_image, np.float64)
+
+    def response(places: Floats) -> Floats:
+        # Light minus dark across both diagonals: large only where four squares meet.
+        around = places[:, None] + 0.3 * np.array([[-1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [1.0, -1.0]])
+        at = apply(matrix, around.reshape(-1, 2)).astype(np.float32).reshape(-1, 4, 2)
+        levels = np.asarray(cv2.remap(image, at, np.empty(0), cv2.INTER_LINEAR, borderValue=128), np.float64)
+        return np.abs(levels[:, 0] + levels[:, 1] - levels[:, 2] - levels[:, 3])
+
+    own = float(np.median(response(grid)))
+    beyond = {
+        (columns + 1, rows): [np.array([(c, r) for r in range(rows)], np.float64) for c in (-1, columns)],
+        (columns, rows + 1): [np.array([(c, r) for c in range(columns)], np.float64) for r in (-1, rows)],
+    }
+    for size, sides in beyond.items():
+        if any(float(np.median(response(side))) > GOES_ON * own for side in sides):
+            return size
+    return None
+
+
+def _squares(image: Gray, inner: tuple[int, int], *, quick: bool = False) -> Floats | None:
+    if min(inner) < 3:
+        return None
+    flags = CLASSIC | cv2.CALIB_CB_FAST_CHECK if quick else CLASSIC
+    found, corners = cv2.findChessboardCorners(image, inner, None, flags)
+    if not found and not quick:
+        found, corners = cv2.findChessboardCornersSB(image, inner, None, cv2.CALIB_CB_NORMALIZE_IMAGE)
+    if not found:
+        return None
+    pixels = np.asarray(corners, np.float64).reshape(-1, 2)
+    return pixels if _is_grid(pixels, inner) else None
+
+
+def _is_grid(pixels: Floats, inner: tuple[int, int]) -> bool:
+    """Whether the corners lie as a flat board's would: OpenCV now and then takes a shadow's edge for a row."""
+    places = np.array([(k % inner[0], k // inner[0]) for k in range(inner[0] * inner[1])], np.float64)
+    to_grid, _ = cv2.findHomography(pixels, places, 0)
+    if to_grid is None:  # pyright: ignore[reportUnnecessaryComparison]
+        return False
+    return bool(np.linalg.norm(apply(np.asarray(to_grid, np.float64), pixels) - places, axis=1).max() < GRID_ERROR)
+
+
+def _why_no_board(image: Gray, inner: tuple[int, int]) -> str:
+    columns, rows = inner
+    if _blank(image):
+        return BLANK
+    more = ((columns + 1, rows), (columns, rows + 1), (columns + 1, rows + 1))
+    fewer = ((columns - 1, rows), (columns, rows - 1), (columns - 1, rows - 1))
+    for other in (*more, *fewer):
+        if _squares(image, other, quick=True) is not None:
+            return f"shows a board of {other[0]} x {other[1]} inner corners, not {columns} x {rows}"
+    return f"shows no whole board of {columns} x {rows} inner corners; a plain checkerboard must not be hidden anywhere"
+
+
+def _gap_px(pixels: Floats, board_mm: Floats, gap_mm: float) -> float:
+    """How many pixels `gap_mm` of the board are where the board is smallest in the photograph."""
+    apart_mm = np.linalg.norm(board_mm[:, None] - board_mm[None], axis=2)
+    apart_px = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
+    apart_mm[np.diag_indices(len(pixels))] = np.inf
+    nearest = np.argmin(apart_mm, axis=1)
+    rows = np.arange(len(pixels))
+    return float((apart_px[rows, nearest] / apart_mm[rows, nearest]).min()) * gap_mm
+
+
+def _refined(image: Gray, pixels: Floats, board_mm: Floats, square_mm: float, gap_mm: float) -> Floats:
+    gap_px = _gap_px(pixels, board_mm, gap_mm)
+    window = int(np.clip(round(WINDOW_SHARE * gap_px), 2, MOST_WINDOW_PX))
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-4)
+    start = pixels.astype(np.float32).reshape(-1, 1, 2).copy()
+    fine = np.asarray(cv2.cornerSubPix(image, start, (window, window), (-1, -1), criteria), np.float64).reshape(-1, 2)
+    # Where it walked away it found something else.
+    walked = np.linalg.norm(fine - pixels, axis=1) > window
+    fine = np.where(walked[:, None], pixels, fine)
+    to_image, _ = cv2.findHomography(board_mm, fine, cv2.LMEDS)
+    if to_image is None:  # pyright: ignore[reportUnnecessaryComparison]
+        return fine
+    there = apply(np.asarray(to_image, np.float64), board_mm)
+    right, down = (
+        apply(np.asarray(to_image, np.float64), board_mm + step) - there
+        for step in (np.array([square_mm, 0.0]), np.array([0.0, square_mm]))
+    )
+    return on_edges(image, fine, right, down, gap_px)

@@ -1,0 +1,113 @@
+"""pix2len over a session: the board seen again at intervals, and whether the camera or the paper moved in between."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrate.board.lens import Gray, Lens
+from calibrate.board.plane import Plane
+from calibrate.board.scale import BoardSpec
+from calibrate.board.session import NO_BOARD, board_stills, sheet_of
+from calibrate.board.view import see_flagged
+from calibrate.errors import CalibrationError
+from calibrate.stroke.measure import Line, fit_line
+from sessions.reader import Recording
+
+MOVED_PX = 1.0
+"""The board's middle moved by more between two views: someone touched the camera, or the board."""
+CHANGED = 5e-4
+"""Relative change of pix2len that is worth a warning: 0.01 mm over a stroke of 20 mm."""
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """The board at one moment."""
+
+    t_ns: int
+    plane: Plane
+    mm_per_px: float
+    """pix2len in the board's own middle: a view that shows other corners would else tell another place's."""
+    moved_px: float
+    """How far the board's middle lies from where it was first seen."""
+    flags: tuple[str, ...]
+    """What is not as it should be with the photograph."""
+
+    @property
+    def reach(self) -> float:
+        """Half of pix2len's 95 % interval, relative."""
+        low, high = self.plane.interval_mm_per_px
+        return (high - low) / 2.0 / self.plane.mm_per_px
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """The board through a session."""
+
+    seen: tuple[Seen, ...]
+    unseen: tuple[tuple[int, str], ...]
+    """(t_ns, why) of stills of the board that cannot be used."""
+    trend: Line | None
+    """Relative change of pix2len per hour; None with fewer than three views."""
+    warnings: tuple[str, ...]
+
+
+def board_over_session(recording: Recording, spec: BoardSpec, lens: Lens | None = None) -> Drift:
+    """Every still taken in a `board` step. Raises `CalibrationError` where there is none."""
+    stills = list(board_stills(recording))
+    if not stills:
+        raise CalibrationError(str(recording.path), NO_BOARD)
+    return drift(stills, spec, lens, sheet_of(recording))
+
+
+def drift(
+    stills: Sequence[tuple[int, Gray]],
+    spec: BoardSpec,
+    lens: Lens | None = None,
+    sheet_mm: tuple[float, float] | None = None,
+) -> Drift:
+    """pix2len of each (t_ns, gray photograph) in order. Photographs without a board are listed, not raised.
+
+    Raises `CalibrationError` where it is seen in none.
+    """
+    seen: list[Seen] = []
+    unseen: list[tuple[int, str]] = []
+    for t_ns, image in stills:
+        try:
+            plane, flags = see_flagged(image, spec, lens, f"the board at {t_ns} ns", sheet_mm)
+        except CalibrationError as error:
+            unseen.append((t_ns, error.what))
+            continue
+        middle = np.array([spec.squares]) * spec.square_mm / 2.0 + np.array([spec.origin_mm])
+        first = seen[0].plane if seen else plane
+        here, then = plane.to_image(middle)[0], first.to_image(middle)[0]
+        seen.append(Seen(t_ns, plane, plane.scale_at(here), float(np.linalg.norm(here - then)), flags))
+    if not seen:
+        told = (
+            f"is not seen in any of {len(unseen)} photographs: {unseen[0][1]}" if unseen else "was never photographed"
+        )
+        raise CalibrationError("the board", told)
+    return Drift(tuple(seen), tuple(unseen), _trend(seen), _warnings(seen, unseen))
+
+
+def _trend(seen: Sequence[Seen]) -> Line | None:
+    if len(seen) < 3:
+        return None
+    first = seen[0]
+    hours = [(s.t_ns - first.t_ns) / 3.6e12 for s in seen]
+    return fit_line(hours, [s.mm_per_px / first.mm_per_px - 1.0 for s in seen])
+
+
+def _warnings(seen: Sequence[Seen], unseen: Sequence[tuple[int, str]]) -> tuple[str, ...]:
+    told = [f"the board is not seen at {t_ns} ns: {why}" for t_ns, why in unseen]
+    told += [f"at {s.t_ns} ns: {flag}" for s in seen for flag in s.flags]
+    first = seen[0]
+    for s in seen[1:]:
+        change = s.mm_per_px / first.mm_per_px - 1.0
+        if abs(change) > max(CHANGED, float(np.hypot(first.reach, s.reach))):
+            told.append(f"pix2len changed by {100 * change:+.3f} % until {s.t_ns} ns: calibrate the parts on their own")
+        if s.moved_px > MOVED_PX:
+            told.append(f"the board moved by {s.moved_px:.1f} px until {s.t_ns} ns: camera or board was touched")
+    return tuple(told)

@@ -1,0 +1,181 @@
+"""Intrinsics of a camera from photographs of a board: what each photograph contributes, and which do not fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from calibrate.board.cameras import TwoCameras, two_cameras
+from calibrate.board.detect import View
+from calibrate.board.lens import Lens
+from calibrate.board.views import Ways, held, nominal_normals, reasons, told_apart
+from calibrate.board.zhang import solve
+from calibrate.errors import CalibrationError
+
+LEAST_VIEWS = 4
+GOOD_VIEWS = 10
+EARNED_WAYS = 6
+"""Ways of holding the board from which an interval is told: below, leaving one out shakes the lens too much."""
+MOST_LEFT_OUT = 12
+"""So many are left out at most, some together: more tell no more of the spread."""
+OUTLIER_MEDIANS = 3.0
+"""A view whose residual is so many times the median's is dropped and named."""
+LEAST_OUTLIER_PX = 0.4
+RMS_LIMIT_PX = 0.5
+"""Above this a pre-flight check warns: a flat, sharp, still board gives 0.1 to 0.3 px."""
+GRID = (3, 3)
+"""Coverage is judged on so many columns and rows of the image."""
+GRID_WORDS = (
+    ("upper left", "upper middle", "upper right"),
+    ("left", "middle", "right"),
+    ("lower left", "lower middle", "lower right"),
+)
+LEAST_SLANT_DEG = 15.0
+"""Boards face on tell focal length and distance together only."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """A lens, how sure it is, and view by view how well it explains the photographs."""
+
+    lens: Lens
+    focal_se_px: tuple[float, float] | None
+    """Standard errors of fx and fy, by leaving out each way in which the board was held; None with too few of them."""
+    ways: int
+    """In how many ways the board was held."""
+    rms_px: float
+    """Over all corners of the views that were kept."""
+    residuals_px: dict[str, float]
+    """Of each kept view by name."""
+    dropped: dict[str, float]
+    """Views left out as outliers, with the residual that told so."""
+    unusable: dict[str, str]
+    """Photographs that tell nothing, or nothing new, and why."""
+    slants_deg: dict[str, float]
+    """How far each kept board is turned from face on."""
+    guidance: tuple[str, ...]
+    """What to photograph besides; empty where the coverage is good."""
+    warnings: tuple[str, ...]
+    """What a pre-flight check must show."""
+
+    @property
+    def focal_reach_px(self) -> tuple[float, float] | None:
+        """Half of the 95 % intervals of fx and fy: of the noise in these views, not of a board that is not flat."""
+        if self.focal_se_px is None:
+            return None
+        reach = float(student.ppf(0.975, min(self.ways, MOST_LEFT_OUT) - 1))
+        return reach * self.focal_se_px[0], reach * self.focal_se_px[1]
+
+
+def fit_lens(
+    views: Sequence[View],
+    rms_limit_px: float = RMS_LIMIT_PX,
+    unusable: Mapping[str, str] | None = None,
+    *,
+    one_camera: bool = False,
+) -> Fitted:
+    """Zhang's method over the views that fit together; `unusable` names the photographs without one, and why.
+
+    Raises `CalibrationError` for fewer than `LEAST_VIEWS` views that differ, and for photographs of two cameras, by
+    their size or (unless they are said to be of `one_camera`) by what they tell of the lens.
+    """
+    seen, left_out = told_apart(views)
+    left_out = {**(unusable or {}), **left_out}
+    where = f"{len(views) + len(unusable or {})} photographs"
+    _one_size(seen, where)
+    kept, dropped = list(seen), dict[str, float]()
+    while True:
+        if len(kept) < LEAST_VIEWS:
+            out = f", dropped: {', '.join(sorted(dropped))}" if dropped else ""
+            told = f"{len(kept)} usable views of the board, at least {LEAST_VIEWS} needed{out}"
+            raise CalibrationError(where, "; ".join([told, *reasons(left_out)]))
+        solved = solve(kept, where)
+        if not dropped and not one_camera and (two := two_cameras(kept, solved)) is not None:
+            raise CalibrationError(where, _two_cameras(two))
+        residuals = solved.residuals_px
+        worst = int(np.argmax(residuals))
+        # The median of the others: with four views one bad one would hide behind itself.
+        others = float(np.median(np.delete(residuals, worst)))
+        if residuals[worst] <= max(LEAST_OUTLIER_PX, OUTLIER_MEDIANS * others):
+            break
+        dropped[kept[worst].name] = float(residuals[worst])
+        del kept[worst]
+    ways = held(solved.normals)
+    fewest = min(int(ways.max()), int(held(nominal_normals(kept)).max())) + 1
+    if fewest < LEAST_VIEWS:
+        told = f"{len(kept)} usable views, but the board is held in {fewest} ways, at least {LEAST_VIEWS} needed"
+        raise CalibrationError(where, "; ".join([f"{told}: slant it to other sides", *reasons(left_out)]))
+    slants = {v.name: float(s) for v, s in zip(kept, np.degrees(np.arccos(solved.normals[:, 2])), strict=True)}
+    warnings = [f"{view.name}: {flag}" for view in kept for flag in view.flags]
+    if solved.rms_px > rms_limit_px:
+        told = f"residual {solved.rms_px:.2f} px exceeds {rms_limit_px:g} px: is the board flat, sharp and still?"
+        warnings.insert(0, told)
+    return Fitted(
+        solved.lens,
+        _focal(kept, ways, where),
+        int(ways.max()) + 1,
+        solved.rms_px,
+        {view.name: float(r) for view, r in zip(kept, residuals, strict=True)},
+        dropped,
+        left_out,
+        slants,
+        guidance(kept, list(slants.values()), int(ways.max()) + 1),
+        tuple(warnings),
+    )
+
+
+def _one_size(views: Sequence[View], where: str) -> None:
+    sizes: dict[tuple[int, int], list[str]] = {}
+    for view in views:
+        sizes.setdefault(view.size_px, []).append(view.name)
+    if len(sizes) > 1:
+        told = "; ".join(f"{w} x {h} px: {', '.join(names)}" for (w, h), names in sorted(sizes.items()))
+        raise CalibrationError(where, f"have several sizes, so they are of two cameras or settings ({told})")
+
+
+def _two_cameras(two: TwoCameras) -> str:
+    one, other = (", ".join(part) for part in two.parts)
+    return (
+        f"are of two cameras: {one} leave {two.apart_px:.2f} px with a lens of their own, and so do {other}; "
+        f"all together leave {two.together_px:.2f} px. Give each camera's alone, or --one-camera if they are of one"
+    )
+
+
+def _focal(views: Sequence[View], ways: Ways, where: str) -> tuple[float, float] | None:
+    """Standard errors of fx and fy, by leaving out each way in which the board was held (jackknife).
+
+    Views that are held alike err alike, and so go together. None where too few ways do not earn an error.
+    """
+    if ways.max() + 1 < EARNED_WAYS:
+        return None
+    count = min(int(ways.max()) + 1, MOST_LEFT_OUT)
+    left_out = (ways % count).tolist()
+    without = [solve([v for v, out in zip(views, left_out, strict=True) if out != k], where) for k in range(count)]
+    focal = np.array([[one.lens.matrix[0, 0], one.lens.matrix[1, 1]] for one in without])
+    spread = np.sqrt((count - 1) / count * ((focal - focal.mean(axis=0)) ** 2).sum(axis=0))
+    return float(spread[0]), float(spread[1])
+
+
+def guidance(views: Sequence[View], slants_deg: Sequence[float], ways: int = EARNED_WAYS) -> tuple[str, ...]:
+    """What is missing in these views, held in so many ways, as instructions."""
+    wanted: list[str] = []
+    if len(views) < GOOD_VIEWS:
+        wanted.append(f"take {GOOD_VIEWS - len(views)} more photographs ({len(views)} used, {GOOD_VIEWS} are good)")
+    width, height = views[0].size_px
+    places = np.concatenate([view.pixels for view in views])
+    counts, _, _ = np.histogram2d(places[:, 1], places[:, 0], bins=(GRID[1], GRID[0]), range=((0, height), (0, width)))
+    empty = [GRID_WORDS[r][c] for r in range(GRID[1]) for c in range(GRID[0]) if counts[r, c] == 0]
+    if ways < EARNED_WAYS:
+        more = f"{EARNED_WAYS - ways} more ways ({ways} so far)"
+        wanted.append(f"hold the board in {more}: fewer than {EARNED_WAYS} earn no interval")
+    if empty:
+        wanted.append(f"bring the board into the {', '.join(empty)} of the image: no corner was seen there")
+    slanted = sum(slant >= LEAST_SLANT_DEG for slant in slants_deg)
+    if slanted < min(4, LEAST_VIEWS):
+        wanted.append(
+            f"slant the board by {LEAST_SLANT_DEG:.0f} to 45 deg in at least 4 photographs ({slanted} so far)"
+        )
+    return tuple(wanted)

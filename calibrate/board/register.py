@@ -1,0 +1,153 @@
+"""Where the robot's points lie on the paper: from marks that it touched or pressed, and where the camera saw them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.board.lens import Floats
+from calibrate.errors import CalibrationError
+
+Model = Literal["rigid", "similarity", "affine"]
+LEAST_POINTS = {"rigid": 3, "similarity": 3, "affine": 4}
+WORST_RMS_MM = 5.0
+TRIALS = 500
+OUTLIER_MEDIANS = 5.0
+LEAST_OUTLIER_MM = 0.3
+"""Marks that lie closer to where they should be are never outliers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """From the robot's base frame to the paper frame, both in mm, in the plane."""
+
+    model: Model
+    matrix: Floats
+    """(2, 3)."""
+    names: tuple[str, ...]
+    residuals_mm: Floats
+    """(n, 2) seen minus predicted, of every point; also of those dropped."""
+    dropped: tuple[str, ...]
+    rms_mm: float
+    left_out_mm: Floats
+    """(n, 2) seen minus what the other kept points predict."""
+
+    @property
+    def left_out_rms_mm(self) -> float:
+        """Of the kept points, each predicted by the others: what a new point may expect."""
+        kept = np.array([name not in self.dropped for name in self.names])
+        return _rms(self.left_out_mm[kept])
+
+    @property
+    def yaw_deg(self) -> float:
+        """Of the paper frame in the base frame, counter-clockwise from base x to paper x, as `paper.yaw_deg` has it.
+
+        Points are turned the other way round on their way from the base frame to the paper frame.
+        """
+        return float(np.degrees(np.arctan2(-self.matrix[1, 0], self.matrix[0, 0])))
+
+    @property
+    def origin_mm(self) -> tuple[float, float]:
+        """Of the paper frame in the base frame, as `paper.origin_mm` has it."""
+        x, y = self.to_robot(np.zeros((1, 2)))[0]
+        return float(x), float(y)
+
+    @property
+    def scale(self) -> float:
+        """Paper mm per robot mm, the root of how areas grow; 1 for a rigid one."""
+        return float(np.sqrt(abs(np.linalg.det(self.matrix[:, :2]))))
+
+    def to_paper(self, robot_mm: Floats) -> Floats:
+        """(n, 2) of the base frame -> (n, 2) of the paper frame."""
+        return robot_mm @ self.matrix[:, :2].T + self.matrix[:, 2]
+
+    def to_robot(self, paper_mm: Floats) -> Floats:
+        """(n, 2) of the paper frame -> (n, 2) of the base frame."""
+        return (paper_mm - self.matrix[:, 2]) @ np.linalg.inv(self.matrix[:, :2]).T
+
+
+def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats, model: Model = "rigid") -> Registration:
+    """Least squares over (n, 2) points of both frames, outliers dropped and named (Umeyama 1991, eq. 40-43).
+
+    Outliers are told by the few points (two, or three for an affine fit) that explain the others best. A similarity
+    also lets the scale go, where the board was not printed at true scale; an affine fit lets x and y go their own ways,
+    where a page was rectified to wrong proportions. Raises `CalibrationError` for
+    fewer than three points, points that are all in one place, or where most do not fit together.
+    """
+    where = f"{len(names)} points"
+    if not len(names) == len(robot_mm) == len(seen_mm):
+        raise ValueError(f"{len(names)} names, {len(robot_mm)} and {len(seen_mm)} points")
+    least = LEAST_POINTS[model]
+    if len(names) < least:
+        raise CalibrationError(where, f"at least {least} are needed")
+    if np.ptp(robot_mm, axis=0).max() < 1.0:
+        raise CalibrationError(where, "lie within 1 mm: touch the paper at places far apart")
+    kept = _agreeing(robot_mm, seen_mm, model)
+    if kept.sum() < max(least, (len(names) + 1) // 2):
+        raise CalibrationError(where, f"only {kept.sum()} agree: are their names mixed up?")
+    matrix = _fit(robot_mm[kept], seen_mm[kept], model)
+    residuals = seen_mm - _apply(matrix, robot_mm)
+    if _rms(residuals[kept]) > WORST_RMS_MM:
+        told = f"{_rms(residuals[kept]):.1f} mm off on average, at most {WORST_RMS_MM:g}: are their names mixed up?"
+        raise CalibrationError(where, told)
+    left_out = residuals.copy()
+    for index in np.flatnonzero(kept):
+        others = kept.copy()
+        others[index] = False
+        left_out[index] = seen_mm[index] - _apply(_fit(robot_mm[others], seen_mm[others], model), robot_mm[[index]])[0]
+    return Registration(
+        model,
+        matrix,
+        tuple(names),
+        residuals,
+        tuple(name for name, keep in zip(names, kept, strict=True) if not keep),
+        _rms(residuals[kept]),
+        left_out,
+    )
+
+
+def _agreeing(robot_mm: Floats, seen_mm: Floats, model: Model) -> NDArray[np.bool_]:
+    best = np.full(len(robot_mm), np.inf)
+    few = list(itertools.combinations(range(len(robot_mm)), 3 if model == "affine" else 2))
+    for chosen in few[:: max(1, len(few) // TRIALS)]:
+        points = robot_mm[list(chosen)]
+        # Points on a line fix no affine map, points in one place nothing at all.
+        if np.linalg.svd(points - points.mean(axis=0))[1][1 if model == "affine" else 0] < 1.0:
+            continue
+        away = np.linalg.norm(seen_mm - _apply(_fit(points, seen_mm[list(chosen)], model), robot_mm), axis=1)
+        if np.median(away) < np.median(best):
+            best = away
+    if not np.isfinite(best).all():
+        return np.zeros(len(robot_mm), np.bool_)
+    rough = best <= max(LEAST_OUTLIER_MM, OUTLIER_MEDIANS * float(np.median(best)))
+    # Once more around the fit of all that agree: a few points are a poor ruler.
+    away = np.linalg.norm(seen_mm - _apply(_fit(robot_mm[rough], seen_mm[rough], model), robot_mm), axis=1)
+    return away <= max(LEAST_OUTLIER_MM, OUTLIER_MEDIANS * float(np.median(away)))
+
+
+def _fit(robot_mm: Floats, seen_mm: Floats, model: Model) -> Floats:
+    from_middle, to_middle = robot_mm.mean(axis=0), seen_mm.mean(axis=0)
+    a, b = robot_mm - from_middle, seen_mm - to_middle
+    if model == "affine":
+        linear = np.asarray(np.linalg.pinv(a) @ b, np.float64).T
+    else:
+        u, s, vt = np.linalg.svd(b.T @ a)
+        # Both frames are right-handed: a mirrored fit is never wanted.
+        sign = np.array([1.0, np.sign(np.linalg.det(u @ vt)) or 1.0])
+        linear = u @ np.diag(sign) @ vt
+        if model == "similarity":
+            linear = linear * float((s * sign).sum()) / max(float((a**2).sum()), 1e-12)
+    return np.column_stack([linear, to_middle - linear @ from_middle])
+
+
+def _apply(matrix: Floats, points: Floats) -> Floats:
+    return points @ matrix[:, :2].T + matrix[:, 2]
+
+
+def _rms(residuals: Floats) -> float:
+    return float(np.sqrt((residuals**2).sum(axis=1).mean()))

@@ -1,0 +1,125 @@
+"""`rig.toml` as a registration needs it: board and lens read from it, and where the paper lies written into it.
+
+Only two values change in the text. Comments, order and everything else stay, and the file as it was is kept beside it.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+from pydantic import ValidationError
+
+from calibrate.board.scale import BoardSpec
+from calibrate.errors import CalibrationError, invalid
+from calibrate.files import read_bounded, write_whole
+
+TABLE = re.compile(r"\s*\[{1,2}\s*[A-Za-z0-9_\"'-]")
+PAPER = re.compile(r"\s*\[\s*paper\s*\]\s*(#.*)?$")
+VALUE = r"^(?P<name>\s*{}\s*=\s*)(?P<value>\[[^\[\]#]*\]|[^\s\[#]+)(?P<rest>\s*(#.*)?)$"
+
+
+@dataclass(frozen=True, slots=True)
+class PaperLines:
+    """Where the sheet lies, as two lines of `[paper]`."""
+
+    origin_mm: tuple[float, float]
+    """Lower left corner of the sheet in the base frame."""
+    yaw_deg: float
+    """From base x to paper x, counter-clockwise."""
+
+    @property
+    def values(self) -> dict[str, str]:
+        """Each field and its value as TOML, to the micrometre and to the width of a hair on a sheet."""
+        x, y = (round(v, 3) + 0.0 for v in self.origin_mm)  # no -0.0
+        return {"origin_mm": f"[{x}, {y}]", "yaw_deg": f"{round(self.yaw_deg, 4) + 0.0}"}
+
+    @property
+    def toml(self) -> str:
+        """To paste into rig.toml."""
+        return "\n".join(f"{name} = {value}" for name, value in self.values.items())
+
+
+@dataclass(frozen=True, slots=True)
+class RigFile:
+    """A rig's configuration as text, and what it says of the camera."""
+
+    path: Path
+    text: str
+    board: BoardSpec
+    lens_file: Path | None
+
+    def with_paper(self, lines: PaperLines) -> str:
+        """The text with these two values. Raises `CalibrationError` where they are not found, each on a line."""
+        rows, found = self.text.splitlines(keepends=True), dict[str, int]()
+        start = next((k for k, row in enumerate(rows) if PAPER.match(row.rstrip("\r\n"))), None)
+        if start is None:
+            raise self._refused("paper", "is not a table of its own ([paper])", lines)
+        for k, row in enumerate(rows[start + 1 :], start + 1):
+            if TABLE.match(row):
+                break
+            bare = row.rstrip("\r\n")
+            for name, value in lines.values.items():
+                if (at := re.match(VALUE.format(name), bare)) is not None:
+                    rows[k] = f"{at['name']}{value}{at['rest']}{row[len(bare) :]}"
+                    found[name] = k
+        for name in lines.values:
+            if name not in found:
+                raise self._refused(f"paper.{name}", "is not found on a line of its own under [paper]", lines)
+        made = "".join(rows)
+        if _tables(made, self.path) != _changed(_tables(self.text, self.path), lines):
+            raise self._refused("paper", "cannot be changed without changing something else", lines)
+        return made
+
+    def write(self, lines: PaperLines) -> Path:
+        """Write these two values; returns where the file as it was is kept. Raises `CalibrationError` and OSError."""
+        made = self.with_paper(lines)
+        kept = _free(self.path)
+        with kept.open("xb") as file:
+            file.write(self.text.encode())
+        write_whole(self.path.resolve(), made)
+        return kept
+
+    def _refused(self, field: str, what: str, lines: PaperLines) -> CalibrationError:
+        put = ", ".join(lines.toml.splitlines())
+        return CalibrationError(str(self.path), f"{field}: {what}; nothing is written. Put in by hand: {put}")
+
+
+def read_rig(path: Path) -> RigFile:
+    """A rig's configuration. Raises `CalibrationError` that names file and field."""
+    try:
+        text = read_bounded(path).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise CalibrationError(str(path), f"is not UTF-8 at byte {error.start}") from None
+    tables = _tables(text, path)
+    try:
+        board = BoardSpec.model_validate(tables.get("board"))
+    except ValidationError as error:
+        told = invalid("board", error)
+        raise CalibrationError(str(path), f"board.{told.what}" if "board" in tables else "[board] is missing") from None
+    camera = tables.get("camera")
+    lens = cast("dict[str, Any]", camera).get("lens_file") if isinstance(camera, dict) else None
+    return RigFile(path, text, board, path.parent / lens if isinstance(lens, str) else None)
+
+
+def _tables(text: str, path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise CalibrationError(str(path), f"is not TOML: {error}") from None
+
+
+def _changed(tables: dict[str, Any], lines: PaperLines) -> dict[str, Any]:
+    return tables | {"paper": cast("dict[str, Any]", tables["paper"]) | tomllib.loads(lines.toml)}
+
+
+def _free(path: Path) -> Path:
+    """A name beside the file that nothing has yet."""
+    number, kept = 1, path.with_name(f"{path.name}.bak")
+    while kept.exists() or kept.is_symlink():
+        number += 1
+        kept = path.with_name(f"{path.name}.bak-{number}")
+    return kept

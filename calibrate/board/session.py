@@ -1,0 +1,117 @@
+"""What a session tells of its camera: the board, the lens, and the photographs of the board."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+from pydantic import BaseModel, ValidationError
+
+from calibrate.artefact import Calibration, LensUsed, load_artefact
+from calibrate.board.artefact import LensFile
+from calibrate.board.lens import Gray
+from calibrate.board.scale import BoardSpec
+from calibrate.current import current
+from calibrate.errors import CalibrationError
+from calibrate.files import read_bounded
+from sessions.reader import Recording
+from sessions.recording import container
+from sessions.recording.messages import decode_gray, decode_still
+from sessions.recording.schemas import StepEvent, Topic
+
+EFFECTIVE = "rig.effective.json"
+"""The configuration with what the environment changed on top of rig.toml."""
+NO_BOARD = "holds no view of the board (a `board` step)"
+
+
+Told = Recording | Path
+"""A recording, or the folder of a session that may still be open."""
+
+
+class _Paper(BaseModel):
+    size_mm: tuple[float, float]
+
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def board_of(session: Told) -> BoardSpec:
+    """The board of a session's rig. Raises `CalibrationError` where the session names none."""
+    try:
+        board = _rig(session)["board"]
+    except KeyError:
+        raise CalibrationError(_where(session), "holds no board") from None
+    return _parsed(session, "board", BoardSpec, board)
+
+
+def sheet_of(recording: Recording) -> tuple[float, float] | None:
+    """Width and height in mm of the sheet that lies on the board; None where the rig's configuration tells none."""
+    paper = _rig(recording).get("paper")
+    size = cast("dict[str, Any]", paper).get("size_mm") if isinstance(paper, dict) else None
+    return None if size is None else _parsed(recording, "paper", _Paper, {"size_mm": size}).size_mm
+
+
+def lens_of_session(session: Told) -> LensUsed | None:
+    """The lens that the session was collected with; None where its rig named none. Raises `CalibrationError`."""
+    camera = _rig(session).get("camera")
+    optics = cast("dict[str, Any]", camera).get("optics") if isinstance(camera, dict) else None
+    return None if optics is None else _parsed(session, "camera.optics", LensUsed, optics)
+
+
+def lens_in_use(folder: Path) -> LensUsed | None:
+    """The lens of the calibration that a session uses, else the one that it was collected with.
+
+    Raises `CalibrationError`.
+    """
+    path = current(folder)
+    lens = None if path is None else load_artefact(path, Calibration).lens
+    return lens if lens is not None else lens_of_session(folder)
+
+
+def read_lens(path: Path) -> LensUsed:
+    """A lens file of `camera intrinsics`. Raises `CalibrationError`."""
+    file = load_artefact(path, LensFile)
+    source = f"lens file {file.digest}"
+    return LensUsed(source=source, size_px=file.size_px, matrix=file.matrix, distortion=file.distortion)
+
+
+def known_lens(recording: Recording, given: Path | None) -> LensUsed | None:
+    """The lens file that was given, else the session's own. Raises `CalibrationError`."""
+    return read_lens(given) if given is not None else lens_of_session(recording)
+
+
+def board_stills(recording: Recording) -> Iterator[tuple[int, Gray]]:
+    """(t_ns, gray photograph) of every `board` step in order. Raises `SessionDamaged` for one that cannot be read."""
+    kind = ""
+    for _schema, channel, message in container.messages(recording.path, [str(Topic.STEP), str(Topic.STILL)]):
+        if channel.topic == Topic.STEP:
+            event = StepEvent.model_validate_json(message.data)
+            kind = event.kind if event.phase == "begin" else ""
+        elif kind == "board":
+            yield message.log_time, decode_gray(decode_still(message.data), str(recording.path))
+
+
+def _rig(session: Told) -> dict[str, Any]:
+    data = read_bounded(session / EFFECTIVE) if isinstance(session, Path) else session.attachment(EFFECTIVE)
+    try:
+        rig: Any = json.loads(data)
+    except (ValueError, RecursionError):
+        rig = None
+    if not isinstance(rig, dict):
+        raise CalibrationError(_where(session), "holds no board")
+    return cast("dict[str, Any]", rig)
+
+
+def _parsed(session: Told, name: str, kind: type[M], values: object) -> M:
+    try:
+        return kind.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join([name, *map(str, first["loc"])])
+        raise CalibrationError(_where(session), f"{field}: {first['msg']}") from None
+
+
+def _where(session: Told) -> str:
+    return str(session / EFFECTIVE) if isinstance(session, Path) else f"{session.path} {EFFECTIVE}"

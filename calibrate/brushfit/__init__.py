@@ -1,1 +1,0 @@
-"""Fits a stroke model to a brush's own strokes: presses and drags, with intervals and held-out scores."""

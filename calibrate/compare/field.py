@@ -1,0 +1,134 @@
+"""The 128 x 128 images that are compared, and how a captured stroke gets onto them.
+
+Two alignment protocols: `mm` keeps millimetres and the zero-touch anchor; `size-normalised` scales each image to one
+length and then takes the best shift. The second is how the paper's spread comes about; the first is the honest one.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.compare.scales import MM_PER_PX
+from calibrate.errors import CaptureRefused
+from calibrate.stroke.preprocess import PX_PER_MM, Prepared
+
+Image = NDArray[np.float32]
+SIZE_PX = 128
+NORMAL_LENGTH_PX = 100
+BEST_SHIFT_PX = 6
+FINE = 4
+"""A stroke is moved on a raster so many times finer, near its own 20 px/mm, then averaged over areas."""
+
+
+class Alignment(StrEnum):
+    """How captured and simulated images are laid over each other."""
+
+    MM = "mm"
+    SIZE_NORMALISED = "size-normalised"
+
+
+class Tone(StrEnum):
+    """What a pixel holds."""
+
+    BINARY = "binary"
+    GRAY = "gray"
+
+
+Key = tuple[Alignment, Tone]
+KEYS: tuple[Key, ...] = tuple(itertools.product(Alignment, Tone))
+"""Every way in which two images are compared."""
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """The millimetre field: 128 x 128 px around the zero-touch point."""
+
+    mm_per_px: float = MM_PER_PX
+    anchor_share: tuple[float, float] = (0.76, 0.5)
+    """Where the zero-touch point lies, as a share of the field from the left and from the top."""
+
+    @property
+    def side_mm(self) -> float:
+        """Width and height."""
+        return SIZE_PX * self.mm_per_px
+
+    @property
+    def anchor_mm(self) -> tuple[float, float]:
+        """The zero-touch point from the left and from the top."""
+        return self.anchor_share[0] * self.side_mm, self.anchor_share[1] * self.side_mm
+
+    def window_mm(self, anchor: tuple[float, float]) -> tuple[float, float, float, float]:
+        """(x, y, width, height) in the paper frame of the field around an anchor there (y upward)."""
+        left, top = self.anchor_mm
+        return anchor[0] - left, anchor[1] - (self.side_mm - top), self.side_mm, self.side_mm
+
+    def corner_px(self, anchor_px: tuple[float, float]) -> tuple[int, int]:
+        """Column and row on the 20 px/mm raster at which the field around an anchor there begins."""
+        left, top = self.anchor_mm
+        return round(anchor_px[0] - left * PX_PER_MM), round(anchor_px[1] - top * PX_PER_MM)
+
+
+def crop(prepared: Prepared, corner_px: tuple[int, int], view: Field) -> Prepared:
+    """As much of a raster as the field shows from that corner on; `cut` where ink is left out."""
+    side, (height, width) = round(view.side_mm * PX_PER_MM), prepared.mask.shape
+    left, top = min(max(corner_px[0], -side), width), min(max(corner_px[1], -side), height)
+    window = slice(top + side, top + 2 * side), slice(left + side, left + 2 * side)
+    mask, soft = (np.pad(part, side)[window] for part in (prepared.mask, prepared.soft))
+    anchor = prepared.anchor_px
+    return replace(
+        prepared,
+        mask=mask,
+        soft=soft,
+        anchor_px=None if anchor is None else (anchor[0] - left, anchor[1] - top),
+        cut=prepared.cut or bool(np.count_nonzero(mask) < np.count_nonzero(prepared.mask)),
+    )
+
+
+def crop_at_anchor(prepared: Prepared, anchor_px: tuple[float, float], view: Field) -> Prepared:
+    """The field around an anchor. Raises `CaptureRefused` where the stroke lies outside it."""
+    cropped = crop(prepared, view.corner_px(anchor_px), view)
+    if not cropped.mask.any():
+        raise CaptureRefused("anchor", "lies so far from the stroke that none of it is in the field")
+    return cropped
+
+
+def captured_mm(prepared: Prepared, tone: Tone) -> Image:
+    """(128, 128) of a capture that was rectified to the field."""
+    side = (SIZE_PX, SIZE_PX)
+    source = prepared.soft if tone is Tone.GRAY else prepared.mask.astype(np.float32)
+    return to_tone(cast("Image", cv2.resize(source, side, interpolation=cv2.INTER_AREA)), tone)
+
+
+def captured_normalised(prepared: Prepared, tone: Tone) -> Image:
+    """(128, 128) with the stroke's length scaled to 100 px and its bounding box in the middle."""
+    rows, columns = np.flatnonzero(prepared.mask.any(axis=1)), np.flatnonzero(prepared.mask.any(axis=0))
+    source = prepared.soft if tone is Tone.GRAY else prepared.mask.astype(np.float32)
+    scale = FINE * NORMAL_LENGTH_PX / (columns[-1] + 1 - columns[0])
+    # To the middle without rounding: half a pixel off costs a perfect model several points of SSIM. cv2 puts pixel
+    # centres on integers, a pixel here covers [j, j + 1).
+    x, y = 0.5 * (columns[0] + columns[-1] + 1), 0.5 * (rows[0] + rows[-1] + 1)
+    middle = 0.5 * FINE * SIZE_PX
+    move = np.array([[scale, 0.0, middle - 0.5 - scale * (x - 0.5)], [0.0, scale, middle - 0.5 - scale * (y - 0.5)]])
+    fine = cv2.warpAffine(source, move, (FINE * SIZE_PX, FINE * SIZE_PX), flags=cv2.INTER_LINEAR)
+    return to_tone(cast("Image", cv2.resize(fine, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA)), tone)
+
+
+def to_tone(coverage: Image, tone: Tone) -> Image:
+    """Coverage as it is, or whether a pixel is mostly ink."""
+    return coverage if tone is Tone.GRAY else (coverage > 0.5).astype(np.float32)
+
+
+def best_shift(moving: Image, fixed: Image) -> Image:
+    """`moving` shifted by at most 6 px each way so that its overlap with `fixed` is largest."""
+    reach = BEST_SHIFT_PX
+    padded = np.pad(moving, reach)
+    overlap = cv2.matchTemplate(padded, fixed, cv2.TM_CCORR)
+    row, column = np.unravel_index(int(np.argmax(overlap)), overlap.shape)
+    return padded[row : row + SIZE_PX, column : column + SIZE_PX]

@@ -1,0 +1,1 @@
+"""Strokes that travel along the paper: their ink measured, and bristle lag fitted to it."""

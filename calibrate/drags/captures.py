@@ -1,0 +1,194 @@
+"""Dragged strokes of a session as commanded paths and the ink beside them, for `calibrate.drags.fit`.
+
+Drawn sessions tell their trajectories in the protocol that the recording holds. Imported photographs tell numbers:
+`length_mm` along x from the start, a depth (`depth_mm`, ...), and as one likes `bend_mm` (both inner control points of
+a cubic Bezier curve lie so far to the left of the line) and `depth_ends_mm` (the depth at both ends, reached from the
+middle over a third of the length).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.artefact import Calibration
+from calibrate.current_calibration import calibration_of
+from calibrate.drags.measure import DEPTH_NAMES, LENGTH_NAME
+from calibrate.errors import CalibrationError, CaptureRefused
+from calibrate.stroke.preprocess import PX_PER_MM, Params, on_raster, prepare, rescale
+from calibrate.stroke.rectify import rectify_by
+from sessions.errors import SessionDamaged
+from sessions.reader import Capture, Recording
+from sessions.recording.schemas import Header, Stroke
+
+Floats = NDArray[np.float64]
+MARGIN_MM = 16.0
+"""Around an imported stroke's path: wider than any mark."""
+NODES = 28
+SPECK_SHARE = 0.002
+"""A dot of a figure is smaller against its longest stroke than a drop against a press."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """Dragged strokes on one grid of pixel centres, mm, y upward."""
+
+    header: Header
+    recording_sha256: str
+    calibration: Calibration | None
+    x_mm: Floats
+    y_mm: Floats
+    paths: list[Floats]
+    """Of all images after each other, (n, 4): x, y, depth in mm, heading in deg."""
+    groups: NDArray[np.int64]
+    """(B + 1,): paths `groups[i]` to `groups[i + 1]` are the strokes of image i."""
+    ink: NDArray[np.float32]
+    """(B, len(y_mm), len(x_mm)) from 0 to 1."""
+    stroke_ids: list[str]
+    refused: list[tuple[str, str]]
+    """(stroke, why): captures that cannot be used, or that their photograph cuts."""
+
+    @property
+    def mm_per_px(self) -> float:
+        """The pixel's side."""
+        return float(self.x_mm[1] - self.x_mm[0])
+
+
+def read_drags(session: Path, mm_per_px: float, calibration_path: Path | None = None) -> Drawn:
+    """Every usable dragged stroke or drawn figure. Raises `CalibrationError` where a session holds none."""
+    recording = Recording(session)
+    digest, strokes = recording.sha256, list(recording.stroke_records())
+    where = str(recording.path)
+    if not strokes or {stroke.kind for stroke in strokes} != {"drag"}:
+        raise CalibrationError(where, "holds no strokes that travel: fit its presses without --drags")
+    calibration = calibration_of(recording, strokes[0], digest, calibration_path)
+    told = figures_of(recording.header) if calibration is not None else {}
+    x_mm, y_mm = _cell_grid(strokes, mm_per_px, where) if calibration is not None else _grid(strokes, mm_per_px, where)
+    paths: list[list[Floats]] = []
+    images: list[NDArray[np.float32]] = []
+    names: list[str] = []
+    refused: list[tuple[str, str]] = []
+    for capture in recording.captures():
+        name = capture.stroke.stroke_id
+        try:
+            if calibration is not None:
+                drawn, image = _figure(capture, calibration, told, x_mm, y_mm)
+            else:
+                drawn, image = [_path(capture.stroke)], _photograph(capture, x_mm, y_mm)
+        except (CaptureRefused, SessionDamaged) as error:
+            refused.append((name, error.what))
+            continue
+        paths.append(drawn)
+        images.append(image)
+        names.append(name)
+    if not images:
+        raise CalibrationError(where, f"holds no stroke that can be used: {refused[0][0]}: {refused[0][1]}")
+    groups = np.cumsum([0, *(len(one) for one in paths)])
+    flat = [path for one in paths for path in one]
+    return Drawn(recording.header, digest, calibration, x_mm, y_mm, flat, groups, np.array(images), names, refused)
+
+
+def figures_of(header: Header) -> dict[str, list[Floats]]:
+    """Figure -> its strokes, (n, 4) each on its cell, from the recorded protocol. Raises `CalibrationError`."""
+    try:
+        protocol: dict[str, Any] = json.loads(header.protocol)
+        return {
+            str(figure["name"]): [
+                np.array([[float(x), float(y), float(h), float(d)] for x, y, h, _, d in stroke["points"]])
+                for stroke in figure["strokes"]
+            ]
+            for figure in protocol["figures"]
+        }
+    except (ValueError, KeyError, TypeError) as error:
+        told = f"its recorded protocol tells no trajectories ({error})"
+        raise CalibrationError(header.session_id, told) from None
+
+
+def commanded_path(length_mm: float, bend_mm: float, depth_mm: float, depth_ends_mm: float) -> Floats:
+    """(28, 4) of an imported stroke, its start at (0, 0)."""
+    t = np.linspace(0.0, 1.0, NODES)
+    depth = np.interp(t, [0.0, 1 / 3, 2 / 3, 1.0], [depth_ends_mm, depth_mm, depth_mm, depth_ends_mm])
+    return np.column_stack([length_mm * t, 3.0 * bend_mm * t * (1.0 - t), depth, np.zeros(NODES)])
+
+
+def _path(stroke: Stroke) -> Floats:
+    told = dict(stroke.commanded)
+    depth = next((told[name] for name in DEPTH_NAMES if name in told), stroke.height_mm)
+    if LENGTH_NAME not in told or depth is None:
+        raise CaptureRefused(stroke.stroke_id, f"tells no {LENGTH_NAME} or no depth")
+    return commanded_path(told[LENGTH_NAME], told.get("bend_mm", 0.0), depth, told.get("depth_ends_mm", depth))
+
+
+def _figure(
+    capture: Capture, calibration: Calibration, told: dict[str, list[Floats]], x_mm: Floats, y_mm: Floats
+) -> tuple[list[Floats], NDArray[np.float32]]:
+    stroke = capture.stroke
+    paths = told.get(stroke.stroke_id.rpartition("-r")[0])
+    if paths is None or stroke.cell_mm is None:
+        raise CaptureRefused(stroke.stroke_id, "is no figure of the recorded protocol")
+    if any(len(path) < 2 for path in paths):
+        raise CaptureRefused(stroke.stroke_id, "has a stroke of one point")
+    raster = rectify_by(capture.image(), calibration, stroke.cell_mm, capture.where)
+    # All ink of the cell is the figure's, however far its strokes lie apart.
+    reach = {"join_mm": float(np.hypot(*stroke.cell_mm[2:])), "speck_share": SPECK_SHARE}
+    prepared = prepare(raster, None, capture.where, Params(**(calibration.preprocess | reach)))
+    if prepared.cut:
+        raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph or cell")
+    return paths, _shrunk(prepared.mask, x_mm, y_mm)
+
+
+def _photograph(capture: Capture, x_mm: Floats, y_mm: Floats) -> NDArray[np.float32]:
+    stroke = capture.stroke
+    if stroke.px_per_mm is None or stroke.anchor_px is None:
+        raise CaptureRefused(stroke.stroke_id, "has no scale or no start (start_x_px, start_y_px)")
+    anchor = on_raster(stroke.anchor_px, stroke.px_per_mm)
+    prepared = prepare(rescale(capture.image(), stroke.px_per_mm, capture.where), anchor, capture.where, Params())
+    if prepared.cut:
+        raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph")
+    half = 0.5 * float(x_mm[1] - x_mm[0])
+    left = round(anchor[0] + (x_mm[0] - half) * PX_PER_MM)
+    top = round(anchor[1] - (y_mm[0] + half) * PX_PER_MM)
+    height, width = (round(2 * half * len(axis) * PX_PER_MM) for axis in (y_mm, x_mm))
+    pad = max(height, width) + abs(left) + abs(top)
+    mask = np.pad(prepared.mask, pad)[top + pad : top + pad + height, left + pad : left + pad + width]
+    return _shrunk(mask, x_mm, y_mm)
+
+
+def _shrunk(mask: NDArray[np.bool_], x_mm: Floats, y_mm: Floats) -> NDArray[np.float32]:
+    size = (len(x_mm), len(y_mm))
+    return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _cell_grid(strokes: list[Stroke], mm_per_px: float, where: str) -> tuple[Floats, Floats]:
+    sizes = {stroke.cell_mm[2:] for stroke in strokes if stroke.cell_mm is not None}
+    if len(sizes) != 1:
+        raise CalibrationError(where, "its figures lie on no cells, or on cells of several sizes")
+    [(width_mm, height_mm)] = sizes
+    columns, rows = round(width_mm / mm_per_px), round(height_mm / mm_per_px)
+    x_mm = (np.arange(columns) + 0.5) * width_mm / columns
+    return x_mm, height_mm - (np.arange(rows) + 0.5) * height_mm / rows
+
+
+def _grid(strokes: list[Stroke], mm_per_px: float, where: str) -> tuple[Floats, Floats]:
+    paths = list(_paths(strokes))
+    if not paths:
+        raise CalibrationError(where, f"no stroke tells {LENGTH_NAME} and a depth: where it was drawn is not known")
+    places = np.concatenate(paths)
+    low, high = places[:, :2].min(axis=0) - MARGIN_MM, places[:, :2].max(axis=0) + MARGIN_MM
+    columns, rows = (int(n) for n in np.ceil((high - low) / mm_per_px))
+    return low[0] + (np.arange(columns) + 0.5) * mm_per_px, high[1] - (np.arange(rows) + 0.5) * mm_per_px
+
+
+def _paths(strokes: list[Stroke]) -> Iterator[Floats]:
+    for stroke in strokes:
+        try:
+            yield _path(stroke)
+        except CaptureRefused:
+            continue

@@ -1,0 +1,101 @@
+"""Validate imported strokes that travel along the paper: measure them, and say what may be compared.
+
+A press model does not predict a drag. What the two share is how wide the brush opens at a depth, so that is what is
+fitted: width against depth, beside the slope that CCD-BSM gives to a brush of known R and L.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.errors import CaptureRefused
+from calibrate.stroke.measure import Line, Measured, fit_line, measure
+from calibrate.stroke.preprocess import Params, on_raster, prepare, rescale
+from sessions.errors import SessionDamaged
+from sessions.reader import Capture
+
+THUMB_PX = 160
+DEPTH_NAMES = ("depth_mm", "depth_mid_mm", "depth_mid_mm_nominal", "height_mm")
+LENGTH_NAME = "length_mm"
+
+
+@dataclass(frozen=True, slots=True)
+class Drag:
+    """One stroke: what was commanded beside what was measured."""
+
+    stroke_id: str
+    commanded: dict[str, float]
+    measured: Measured
+    cut: bool
+    """True where the photograph cuts the stroke."""
+    thumbnail: NDArray[np.uint8]
+    """(160, 160) gray photograph with the stroke's outline drawn in."""
+
+    @property
+    def depth_mm(self) -> float | None:
+        """The commanded depth, under whichever name the source gives it."""
+        return next((self.commanded[name] for name in DEPTH_NAMES if name in self.commanded), None)
+
+
+@dataclass(slots=True)
+class DragResults:
+    """Everything that the report of an imported session needs."""
+
+    strokes: list[Drag] = field(default_factory=list[Drag])
+    refused: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    width_on_depth: Line | None = None
+    length_on_commanded: Line | None = None
+
+
+def validate_drags(captures: Iterator[Capture], params: Params) -> DragResults:
+    """Measure every stroke, then fit width on depth and length on commanded length over those that are whole."""
+    results = DragResults()
+    for capture in captures:
+        try:
+            results.strokes.append(_measure(capture, params))
+        except (CaptureRefused, SessionDamaged) as error:
+            results.refused.append((capture.stroke.stroke_id, error.what))
+    whole = [drag for drag in results.strokes if not drag.cut]
+    deep = [(drag.depth_mm, drag.measured.mid_width_mm) for drag in whole if drag.depth_mm is not None]
+    results.width_on_depth = fit_line([d for d, _ in deep], [w for _, w in deep])
+    long = [drag for drag in whole if LENGTH_NAME in drag.commanded]
+    results.length_on_commanded = fit_line(
+        [drag.commanded[LENGTH_NAME] for drag in long], [drag.measured.length_mm for drag in long]
+    )
+    return results
+
+
+def _measure(capture: Capture, params: Params) -> Drag:
+    stroke = capture.stroke
+    if stroke.px_per_mm is None:
+        raise CaptureRefused(stroke.stroke_id, "has no scale (px_per_mm)")
+    raster = rescale(capture.image(), stroke.px_per_mm, capture.where)
+    anchor = on_raster(stroke.anchor_px, stroke.px_per_mm) if stroke.anchor_px is not None else None
+    prepared = prepare(raster, anchor, capture.where, params)
+    commanded = dict(stroke.commanded)
+    if stroke.height_mm is not None:
+        commanded["height_mm"] = stroke.height_mm
+    if stroke.tilt_deg is not None:
+        commanded["tilt_deg"] = stroke.tilt_deg
+    return Drag(stroke.stroke_id, commanded, measure(prepared.mask), prepared.cut, _thumbnail(raster, prepared.mask))
+
+
+def _thumbnail(raster: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    side = round(1.15 * max(rows[-1] - rows[0], columns[-1] - columns[0])) + 8
+    centre = ((rows[0] + rows[-1]) // 2, (columns[0] + columns[-1]) // 2)
+    # Padded by `side`, so that a square of that size around the stroke always fits.
+    rows_shown, columns_shown = (slice(c + side // 2, c + side // 2 + side) for c in centre)
+    crop = np.pad(raster, side, mode="edge")[rows_shown, columns_shown]
+    inside = np.pad(mask.astype(np.uint8), side)[rows_shown, columns_shown]
+    small = cv2.resize(crop, (THUMB_PX, THUMB_PX), interpolation=cv2.INTER_AREA)
+    shape = cv2.resize(inside, (THUMB_PX, THUMB_PX), interpolation=cv2.INTER_AREA)
+    outline = cv2.morphologyEx((shape > 0).astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((2, 2), np.uint8)) > 0
+    small[outline & (small > 90)] = 150
+    small[outline & (small <= 90)] = 230
+    return small.astype(np.uint8)

@@ -1,0 +1,1 @@
+"""A stroke model fitted to the presses of one brush."""

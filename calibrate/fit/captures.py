@@ -1,0 +1,91 @@
+"""The presses of a recorded session as images around the point of touch, for the fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from calibrate.artefact import Calibration
+from calibrate.compare.field import SIZE_PX, Field
+from calibrate.current_calibration import brush_of, calibration_of
+from calibrate.errors import CalibrationError, CaptureRefused
+from calibrate.fit.fit import Grid, Pressed
+from calibrate.stroke.preprocess import Params
+from calibrate.stroke.presses import prepare_press
+from sessions.errors import SessionDamaged
+from sessions.reader import Recording
+from sessions.recording.schemas import Header
+
+MARGIN_MM = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Captures:
+    """What a fit is made of, and where it comes from."""
+
+    header: Header
+    recording_sha256: str
+    calibration: Calibration | None
+    radius_mm: float
+    length_mm: float
+    rows: slice
+    """Of the field: those that ink reaches, and 2 mm more; the grid and the strokes are cut to them."""
+    grid: Grid
+    strokes: list[Pressed]
+    stroke_ids: list[str]
+    refused: list[tuple[str, str]]
+    """(stroke, why): captures that cannot be used, or that their photograph cuts."""
+
+
+def grid_of(view: Field) -> Grid:
+    """The pixel centres of the millimetre field around the point of touch."""
+    left, top = view.anchor_mm
+    centres = np.asarray((np.arange(SIZE_PX) + 0.5) * view.mm_per_px, np.float64)
+    return Grid(np.asarray(centres - left), np.asarray(top - centres))
+
+
+def read_presses(session: Path, view: Field, calibration_path: Path | None = None) -> Captures:
+    """Every usable press of a session. Raises `CalibrationError` where it holds none, or was not calibrated."""
+    recording = Recording(session)
+    digest = recording.sha256
+    strokes = list(recording.stroke_records())
+    if not strokes or {stroke.kind for stroke in strokes} != {"press"}:
+        raise CalibrationError(str(recording.path), "holds no presses, or strokes that travel, which --drags fits")
+    calibration = calibration_of(recording, strokes[0], digest, calibration_path)
+    params = Params(**calibration.preprocess) if calibration else Params()
+    pressed: list[Pressed] = []
+    names: list[str] = []
+    refused: list[tuple[str, str]] = []
+    for capture in recording.captures():
+        stroke = capture.stroke
+        try:
+            prepared = prepare_press(capture, calibration, params, view)
+        except (CaptureRefused, SessionDamaged) as error:
+            refused.append((stroke.stroke_id, error.what))
+            continue
+        if stroke.height_mm is None or stroke.tilt_deg is None:
+            refused.append((stroke.stroke_id, "tells no depth or tilt"))
+        elif prepared.cut:
+            refused.append((stroke.stroke_id, "is cut by the edge of its photograph or cell"))
+        else:
+            mask = prepared.mask.astype(np.float32)
+            ink = cv2.resize(mask, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA)
+            pressed.append(Pressed(stroke.height_mm, stroke.tilt_deg, np.asarray(ink, np.float64)))
+            names.append(stroke.stroke_id)
+    if not pressed:
+        raise CalibrationError(str(recording.path), "holds no press that can be used for a fit")
+    brush = brush_of(recording.header)
+    radius, length = float(brush.radius_mm), float(brush.length_mm)
+    grid, rows = grid_of(view), _rows(pressed, view)
+    grid = Grid(grid.x_mm, grid.y_mm[rows])
+    pressed = [Pressed(one.height_mm, one.tilt_deg, one.ink[rows]) for one in pressed]
+    return Captures(recording.header, digest, calibration, radius, length, rows, grid, pressed, names, refused)
+
+
+def _rows(pressed: list[Pressed], view: Field) -> slice:
+    inked = np.flatnonzero(np.any([one.ink.any(axis=1) for one in pressed], axis=0))
+    margin = round(MARGIN_MM / view.mm_per_px)
+    return slice(max(0, int(inked[0]) - margin), min(SIZE_PX, int(inked[-1]) + 1 + margin))

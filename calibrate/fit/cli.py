@@ -1,0 +1,136 @@
+"""`brushloop fit`: a brush's own stroke model. Heavy imports wait until the command runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from calibrate.compare.scales import DRAG_MM_PER_PX, MM_PER_PX
+from sessions.terminal import say
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from calibrate.fit.captures import Captures
+    from calibrate.fit.run import Correction, Fitted
+
+
+def fit(
+    session: Annotated[Path, typer.Argument(help="A session of presses: its folder or its .mcap file.")],
+    mm_per_px: Annotated[
+        float | None,
+        typer.Option(min=0.1, max=1.0, help=f"Scale of the images; {MM_PER_PX:g}, with --drags {DRAG_MM_PER_PX:g}."),
+    ] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
+    correction: Annotated[bool, typer.Option("--correction", help="Print the zero-touch offset for rig.toml.")] = False,
+    reference: Annotated[Path | None, typer.Option(help="An earlier fit of this brush, for --correction.")] = None,
+    drags: Annotated[
+        bool, typer.Option("--drags", help="Fit bristle lag to strokes that travel; writes dragfit/<hash>.json.")
+    ] = False,
+) -> None:
+    """Fit the stroke model to a session's presses; writes an immutable brushfit/<hash>.json."""
+    if drags:
+        if correction or reference is not None:
+            raise typer.BadParameter("--correction and --reference are for presses, not for --drags")
+        _fit_drags(session, mm_per_px or DRAG_MM_PER_PX, calibration)
+        return
+
+    from calibrate.artefact import load_artefact
+    from calibrate.compare.field import Field
+    from calibrate.fit.artefact import BrushFit
+    from calibrate.fit.captures import read_presses
+    from calibrate.fit.run import correction as corrected
+    from calibrate.fit.run import fit_session, save
+    from sessions.reader import Recording
+
+    before = load_artefact(reference, BrushFit) if reference is not None else None
+    view = Field(mm_per_px=mm_per_px or MM_PER_PX)
+    captures = read_presses(session, view, calibration)
+    fitted = fit_session(captures, view)
+    path = save(fitted, Recording(session).path.parent)
+    say(*_tables(captures, fitted))
+    if correction:
+        say(*_correction(corrected(captures, fitted.artefact, before)))
+    say(f"Fit: {path}")
+
+
+def _fit_drags(session: Path, mm_per_px: float, calibration: Path | None) -> None:
+    from rich.table import Table
+
+    from calibrate.drags.captures import read_drags
+    from calibrate.drags.run import fit_drawn, save
+    from calibrate.report.wording import source_note
+    from sessions.reader import Recording
+
+    drawn = read_drags(session, mm_per_px, calibration)
+    fitted = fit_drawn(drawn)
+    artefact = fitted.artefact
+    say(
+        f"{source_note(drawn.header.source)}; {artefact.strokes} dragged strokes in {artefact.images} images; "
+        f"condition number {artefact.condition:.3g}"
+    )
+    for name, why in drawn.refused:
+        say(f"left out: {name}: {why}")
+    out = Table("parameter", "fitted", "95 %", title="drag model, mm")
+    for name, found in artefact.parameters.items():
+        out.add_row(name, f"{found.value:.3f}", f"{found.low:.3f} to {found.high:.3f}")
+    say(out)
+    if artefact.held_out:
+        out = Table("model", "n", "CSIM", "IoU", title="a fifth left out in turn, where the command put it, percent")
+        for name, score in artefact.held_out.items():
+            out.add_row(name, str(score.images), f"{score.csim_percent:.2f}", f"{score.iou_percent:.2f}")
+        say(out)
+    else:
+        say("Fewer than five images: none can be left out.")
+    say(f"Fit: {save(fitted, Recording(session).path.parent)}")
+
+
+def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
+    from rich.table import Table
+
+    from calibrate.fit.fit import WORST_CONDITION
+    from calibrate.fit.run import NAMES
+    from calibrate.report.wording import source_note
+    from model.fitted import PARAMETERS
+
+    artefact = fitted.artefact
+    yield f"{source_note(captures.header.source)}; {len(captures.strokes)} presses fitted"
+    for name, why in captures.refused:
+        yield f"left out: {name}: {why}"
+    out = Table("parameter", "unit", "published", "fitted", "95 %", title="brush")
+    for name, parameter in zip(NAMES, PARAMETERS, strict=True):
+        found = artefact.parameters[name]
+        interval = "not fitted" if found.low is None else f"{found.low:.3f} to {found.high:.3f}"
+        out.add_row(name, parameter.unit, f"{parameter.start:.3f}", f"{found.value:.3f}", interval)
+    yield out
+    out = Table("stage", "condition", "", title=f"stages, refused beyond {WORST_CONDITION:g}")
+    for stage in artefact.stages:
+        condition = "infinite" if stage.condition is None else f"{stage.condition:.1f}"
+        out.add_row(stage.name, condition, "refused: the strokes do not tell it" if stage.refused else "fitted")
+    yield out
+    if not fitted.held_out:
+        yield "One cell only: nothing can be held out."
+        return
+    out = Table("model", "n", "CSIM", "SSIM", title="leave one cell out, mm, binary, percent")
+    for row in fitted.held_out:
+        out.add_row(row.model, str(row.n), f"{row.csim:.2f}", f"{row.ssim:.2f}")
+    yield out
+
+
+def _correction(found: Correction) -> Iterator[str]:
+    low, high = found.lift_interval_mm
+    if found.reference:
+        yield f"Zero touch against the fit of {found.reference}, everything else of the brush held:"
+    else:
+        yield (
+            "Zero touch, absolutely: where the sizes of the marks, taken as proportional to depth, come to nothing. "
+            "Ink that spreads, or a brush that does not open evenly, is taken for an offset: with an earlier fit of "
+            "the same brush (--reference) it is not."
+        )
+    yield f"  paper.touch_z_mm: add {found.lift_mm:+.2f} mm (95 % {low:+.2f} to {high:+.2f})"
+    low, high = found.along_interval_mm
+    yield f"  along the heading: the ink lies off by {found.along_mm:+.2f} mm (95 % {low:+.2f} to {high:+.2f})"
+    if found.lift_interval_mm[0] <= 0.0 <= found.lift_interval_mm[1]:
+        yield "  The interval holds 0: leave rig.toml as it is."

@@ -1,0 +1,138 @@
+"""Fit the brush of a session: parameters with intervals, condition numbers, held-out scores, and the artefact."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.compare.field import Alignment, Field, Tone
+from calibrate.compare.simulate import simulated
+from calibrate.current import put_to_use
+from calibrate.errors import CalibrationError
+from calibrate.fit.artefact import FOLDER, BrushFit, FittedStage, FittedValue
+from calibrate.fit.captures import Captures
+from calibrate.fit.fit import STAGES, Fit, Grid, Pressed, bootstrap, fit_presses, zero_touch
+from calibrate.fit.heldout import HeldOut, by_cell, leave_cell_out
+from model.ccdbsm import Brush
+from model.fitted import NAMES, FittedPress
+from model.registry import stroke_models
+
+NORMAL_95 = 1.96
+PROPORTIONAL = 3
+"""Stages in which every size is proportional to depth: scale and place, heel, zero offset."""
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """Where the ink says that the tip touched, against where the rig said so; 95 % intervals."""
+
+    lift_mm: float
+    """Add to `paper.touch_z_mm`: positive where the paper is met higher than the rig believes."""
+    lift_interval_mm: tuple[float, float]
+    along_mm: float
+    """How far along the heading the ink lies from where it should."""
+    along_interval_mm: tuple[float, float]
+    reference: str
+    """The fit that it is measured against, or empty: against a brush whose sizes are proportional to depth."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """A fit of a session and all that is printed about it."""
+
+    fit: Fit
+    artefact: BrushFit
+    held_out: list[HeldOut]
+    """Empty with one cell only."""
+
+
+def fit_session(captures: Captures, view: Field) -> Fitted:
+    """Fit, leave each cell out in turn, and make the artefact. Raises `CalibrationError` where no stage can be told."""
+    grid, strokes = captures.grid, captures.strokes
+    fit = fit_presses(strokes, grid, captures.radius_mm, captures.length_mm)
+    if not fit.free:
+        first = fit.stages[0]
+        raise CalibrationError(
+            captures.header.session_id,
+            f"its strokes do not even tell scale and place (condition number {first.condition:.3g})",
+        )
+    brush = Brush(captures.radius_mm, captures.length_mm)
+    published = stroke_models(brush)["ccd-bsm"]
+
+    def uncalibrated(height_mm: float, tilt_deg: float) -> NDArray[np.floating]:
+        return simulated(published, height_mm, tilt_deg, Alignment.MM, Tone.BINARY, view)[captures.rows]
+
+    held_out = leave_cell_out(fit, strokes, grid, uncalibrated) if len(by_cell(strokes)) > 1 else []
+    draws = bootstrap(_bare(fit.press), fit.free, fit.squares, fit.gradients)
+    low, high = np.quantile(draws, [0.025, 0.975], axis=0)
+    parameters = {name: FittedValue(value=v, low=None, high=None) for name, v in zip(NAMES, _floats(fit), strict=True)}
+    for k, name in enumerate(fit.free):
+        parameters[name] = FittedValue(value=parameters[name].value, low=float(low[k]), high=float(high[k]))
+    h0_mm, h0_se_mm = proportional_zero(strokes, grid, captures.radius_mm, captures.length_mm)
+    artefact = BrushFit(
+        session_id=captures.header.session_id,
+        source=captures.header.source,
+        recording_sha256=captures.recording_sha256,
+        calibration=captures.calibration.digest if captures.calibration else "",
+        software=f"brushloop {version('brushloop')}",
+        radius_mm=captures.radius_mm,
+        length_mm=captures.length_mm,
+        strokes=len(strokes),
+        mm_per_px=view.mm_per_px,
+        parameters=parameters,
+        edges_mm=tuple(tuple(tuple(terms) for terms in side) for side in fit.press.edges.tolist()),
+        stages=tuple(
+            FittedStage(name=s.name, condition=s.condition if math.isfinite(s.condition) else None, refused=s.refused)
+            for s in fit.stages
+        ),
+        proportional_h0_mm=h0_mm,
+        proportional_h0_se_mm=h0_se_mm,
+        csim_percent={row.model: row.csim for row in held_out},
+    )
+    return Fitted(fit, artefact, held_out)
+
+
+def proportional_zero(strokes: list[Pressed], grid: Grid, radius_mm: float, length_mm: float) -> tuple[float, float]:
+    """(h0, its standard error) in mm where every size is proportional to depth; (0, inf) where one depth hides it."""
+    fit = fit_presses(strokes, grid, radius_mm, length_mm, edges=False, stages=STAGES[:PROPORTIONAL])
+    if "h0_mm" not in fit.free:
+        return 0.0, 1e9
+    at = fit.free.index("h0_mm")
+    draws = bootstrap(fit.press, fit.free, fit.squares, fit.gradients)[:, at]
+    return float(fit.press.values[NAMES.index("h0_mm")]), float(draws.std())
+
+
+def correction(captures: Captures, artefact: BrushFit, reference: BrushFit | None) -> Correction:
+    """What to correct of the rig's zero touch, against an earlier fit of the same brush, or absolutely."""
+    if reference is not None:
+        before = reference.press()
+        now, errors = zero_touch(before, captures.strokes, captures.grid)
+        lift, along = (float(v) for v in (now.values - before.values)[1:3])
+        lift_se, along_se = (float(v) for v in errors)
+        return Correction(lift, _interval(lift, lift_se), along, _interval(along, along_se), reference.session_id)
+    lift, error = artefact.proportional_h0_mm, artefact.proportional_h0_se_mm
+    along = artefact.parameters["origin_mm"]
+    ends = (along.low if along.low is not None else -1e9, along.high if along.high is not None else 1e9)
+    return Correction(lift, _interval(lift, error), along.value, ends, "")
+
+
+def save(fitted: Fitted, session: Path) -> Path:
+    """Write the artefact into the session's folder and use it from now on."""
+    return put_to_use(fitted.artefact, session, FOLDER)
+
+
+def _interval(value: float, error: float) -> tuple[float, float]:
+    return value - NORMAL_95 * error, value + NORMAL_95 * error
+
+
+def _floats(fit: Fit) -> list[float]:
+    return [float(v) for v in fit.press.values]
+
+
+def _bare(press: FittedPress) -> FittedPress:
+    return replace(press, edges=np.zeros_like(press.edges))

@@ -1,0 +1,1 @@
+"""Depth and tilt recovered from photographs of presses."""

@@ -1,0 +1,81 @@
+"""`brushloop invert`. Heavy imports wait until the command runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibrate.compare.scales import MM_PER_PX
+from sessions.terminal import say
+
+
+def invert(
+    session: Annotated[Path, typer.Argument(help="A session's folder or its .mcap file; imports count as sessions.")],
+    out: Annotated[Path, typer.Option(help="CSV to write; protocol-replay.toml goes beside it.")] = Path(
+        "recovered.csv"
+    ),
+    model: Annotated[str, typer.Option(help="The stroke model to invert.")] = "ccd-bsm",
+    fit: Annotated[Path | None, typer.Option(help="A brush fitted to captures, instead of --model.")] = None,
+    lam: Annotated[float | None, typer.Option(min=0.1, max=10, help="lambda of CCD-BSM; pi when left out.")] = None,
+    height_range: Annotated[tuple[float, float], typer.Option(help="Depths to look for, mm.")] = (2.0, 30.0),
+    tilt_range: Annotated[tuple[float, float], typer.Option(help="Tilts to look for, deg; at most 30.")] = (0.0, 30.0),
+    anchor_sd: Annotated[float, typer.Option(min=0, max=5, help="How well the touch point is known, mm.")] = 0.1,
+    assume_tilt: Annotated[float, typer.Option(min=0, max=30, help="alpha where there is no anchor, deg.")] = 0.0,
+    mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = MM_PER_PX,
+    calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often the protocol presses each again.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Of the order in which the protocol presses.")] = 1,
+) -> None:
+    """Recover depth and tilt of every captured press; writes a CSV and a protocol that presses them again."""
+
+    from calibrate.compare.field import Field
+    from calibrate.errors import CalibrationError
+    from calibrate.files import check_target
+    from calibrate.invert.files import write_inversion
+    from calibrate.invert.invert import Settings, invert_recording, off_command
+    from model.inversion.press import Range
+
+    check_target(out, ".csv")
+    try:
+        within = Range(height_range, tilt_range)
+        if tilt_range[1] > 30 or not tilt_range[0] <= assume_tilt <= tilt_range[1]:
+            raise ValueError(
+                f"tilt_deg = {tilt_range}, assumed {assume_tilt:g}: expected 0 to 30, the assumed one within"
+            )
+    except ValueError as error:
+        raise CalibrationError("--height-range, --tilt-range, --assume-tilt", str(error)) from None
+    fitted = None
+    if fit is not None:
+        from calibrate.artefact import load_artefact
+        from calibrate.fit.artefact import BrushFit
+        from model.fitted import NAMES
+        from model.fitted_shape import fitted_model
+
+        press = load_artefact(fit, BrushFit).press()
+        fitted = fitted_model(press)
+        model = fitted.name
+        # A fitted brush marks nothing above its zero offset.
+        least = max(within.height_mm[0], 0.5 - float(press.values[NAMES.index("h0_mm")]))
+        if least >= within.height_mm[1]:
+            raise CalibrationError("--height-range", f"ends before the fitted brush marks, at {least:.2f} mm")
+        within = Range((least, within.height_mm[1]), within.tilt_deg)
+    settings = Settings(model, fitted, lam, within, anchor_sd, assume_tilt, Field(mm_per_px=mm_per_px))
+    made = invert_recording(session, settings, calibration)
+    protocol = write_inversion(made, out, repeats, seed)
+    say(f"{made.header.session_id}: {len(made.rows)} presses recovered by {model} ({made.header.source})")
+    for name, mean, sd, inside, n in off_command(made.rows):
+        unit = "mm" if name == "H" else "deg"
+        say(f"{name}: recovered - commanded {mean:+.3f} {unit}, sd {sd:.3f}; {inside:.0%} of {n} in the interval")
+    unknown = sum("alpha_unknown" in row.flags for row in made.rows)
+    if unknown:
+        say(f"warning: {unknown} without a zero-touch anchor: their alpha is assumed, shape does not tell it")
+    bound = sum("at_bound" in row.flags for row in made.rows)
+    if 2 * bound > len(made.rows):
+        say(f"warning: {bound} at a bound: the model does not fit this brush; do not press these again")
+    elif bound:
+        say(f"warning: {bound} at a bound of the range: their interval holds for one side at most")
+    for stroke_id, why in made.refused:
+        say(f"not used: {stroke_id}: {why}")
+    say(str(out), str(protocol))

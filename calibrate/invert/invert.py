@@ -1,0 +1,229 @@
+"""Presses recovered from captures: each stroke on the millimetre field, inverted in batches, with its interval.
+
+What is fitted is the coverage of the stroke's mask: its share of each pixel of the 128 x 128 field. The recovered
+(H, alpha) is the press for which this model makes this mark. It is a measurement of the press only as far as the model
+is true to the brush.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import cast
+
+import cv2
+import numpy as np
+
+from calibrate.artefact import Calibration
+from calibrate.compare.field import SIZE_PX, Field, Image
+from calibrate.current_calibration import brush_of, calibration_of
+from calibrate.errors import CalibrationError, CaptureRefused
+from calibrate.stroke.preprocess import PX_PER_MM, Params, Prepared, prepare, rescale
+from calibrate.stroke.presses import prepare_press
+from model.ccdbsm import DomainError
+from model.inversion.noise import Noise
+from model.inversion.press import Flag, Inverter, Known, Range, Recovered
+from model.protocol import Basis, StrokeModel
+from model.registry import UnknownModelError, stroke_model
+from sessions.errors import SessionDamaged
+from sessions.reader import Capture, Recording
+from sessions.recording.schemas import Header, Stroke
+
+BATCH = 64
+USELESS = frozenset({Flag.BLANK, Flag.DID_NOT_CONVERGE, Flag.CUT})
+"""A stroke with one of these is listed with the reason and not pressed again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How captures are inverted."""
+
+    model: str = "ccd-bsm"
+    fitted: StrokeModel | None = None
+    """A calibrated brush, which then stands for `model`."""
+    lam: float | None = None
+    """lambda of CCD-BSM; None is pi, the default of the paper."""
+    within: Range = field(default_factory=Range)
+    anchor_sigma_mm: float = 0.1
+    """How well the zero-touch point is known; 0: exactly."""
+    assumed_tilt_deg: float = 0.0
+    """alpha where it cannot be known: for captures without an anchor that were commanded none."""
+    view: Field = field(default_factory=Field)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One recovered stroke. `tilt_sd_deg` is None where alpha was assumed, not recovered."""
+
+    stroke_id: str
+    height_mm: float
+    tilt_deg: float
+    height_sd_mm: float
+    tilt_sd_deg: float | None
+    rms: float
+    flags: tuple[str, ...]
+    commanded_height_mm: float | None
+    commanded_tilt_deg: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Inversion:
+    """What came out of a recording."""
+
+    header: Header
+    recording: Path
+    recording_sha256: str
+    settings: Settings
+    rows: list[Row]
+    refused: list[tuple[str, str]]
+    """(stroke, why), never dropped in silence."""
+
+
+@dataclass(frozen=True, slots=True)
+class Laid:
+    """A stroke on its field: coverage, and the anchor's place as mm from the left and top edge, where it is known."""
+
+    stroke: Stroke
+    image: Image
+    place_mm: tuple[float, float] | None
+
+
+def invert_recording(session: Path, settings: Settings, calibration_path: Path | None) -> Inversion:
+    """Recover every press of a session. Raises `CalibrationError` where it was not calibrated or holds no press."""
+    recording = Recording(session)
+    digest = recording.sha256
+    strokes = list(recording.stroke_records())
+    if not strokes:
+        raise CalibrationError(str(recording.path), "holds no strokes")
+    if any(stroke.kind != "press" for stroke in strokes):
+        raise CalibrationError(str(recording.path), "holds drags: only presses are inverted")
+    calibration = calibration_of(recording, strokes[0], digest, calibration_path)
+    made = Inversion(recording.header, recording.path, digest, settings, [], [])
+    anchored, loose = _inverters(recording.header, settings)
+    waiting: dict[bool, list[Laid]] = {True: [], False: []}
+    for capture in recording.captures():
+        try:
+            laid = lay(capture, calibration, settings.view)
+        except (CaptureRefused, SessionDamaged) as error:
+            made.refused.append((capture.stroke.stroke_id, error.what))
+            continue
+        known = laid.place_mm is not None
+        waiting[known].append(laid)
+        if len(waiting[known]) == BATCH:
+            _invert(made, anchored if known else loose, waiting[known])
+            waiting[known] = []
+    for known, rest in waiting.items():
+        _invert(made, anchored if known else loose, rest)
+    order = {stroke.stroke_id: number for number, stroke in enumerate(strokes)}
+    made.rows.sort(key=lambda row: order[row.stroke_id])
+    return made
+
+
+def lay(capture: Capture, calibration: Calibration | None, view: Field) -> Laid:
+    """A capture on the field, by the calibration or by the import's own scale. Raises `CaptureRefused`."""
+    stroke = capture.stroke
+    params = Params(**calibration.preprocess) if calibration else Params()
+    if stroke.px_per_mm is None or stroke.anchor_px is not None:
+        return _laid(stroke, prepare_press(capture, calibration, params, view), (0, 0), view)
+    # An import that tells no anchor: the field is laid around the stroke.
+    prepared = prepare(rescale(capture.image(), stroke.px_per_mm, capture.where), None, capture.where, params)
+    rows, columns = np.flatnonzero(prepared.mask.any(axis=1)), np.flatnonzero(prepared.mask.any(axis=0))
+    side = round(view.side_mm * PX_PER_MM)
+    corner = (int(columns[0] + columns[-1] + 1 - side) // 2, int(rows[0] + rows[-1] + 1 - side) // 2)
+    return _laid(stroke, prepared, corner, view)
+
+
+def _laid(stroke: Stroke, prepared: Prepared, corner: tuple[int, int], view: Field) -> Laid:
+    """The window of the field whose upper left corner is that pixel of the prepared raster."""
+    side = round(view.side_mm * PX_PER_MM)
+    whole = np.zeros((side, side), np.float32)
+    height, width = prepared.mask.shape
+    left, top = corner
+    columns, rows = slice(max(left, 0), min(left + side, width)), slice(max(top, 0), min(top + side, height))
+    part = prepared.mask[rows, columns]
+    if prepared.cut or np.count_nonzero(part) < np.count_nonzero(prepared.mask):
+        raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph, cell or field")
+    whole[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = part
+    image = cast("Image", cv2.resize(whole, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA))
+    anchor = prepared.anchor_px
+    place = None if anchor is None else ((anchor[0] - left) / PX_PER_MM, (anchor[1] - top) / PX_PER_MM)
+    return Laid(stroke, image, place)
+
+
+def _invert(made: Inversion, inverter: Inverter, batch: list[Laid]) -> None:
+    """Invert a batch of one kind, and file each stroke where it belongs."""
+    if not batch:
+        return
+    images = np.stack([laid.image for laid in batch])
+    if inverter.known is Known.ANCHOR:
+        heading = np.array([laid.stroke.heading_deg for laid in batch])
+        found = inverter(images, np.array([laid.place_mm for laid in batch]), heading)
+        _file(made, batch, found)
+        return
+    for laid in batch:
+        # What was commanded is the better guess: without an anchor alpha stays what is assumed.
+        tilt = laid.stroke.tilt_deg
+        low, high = made.settings.within.tilt_deg
+        assumed = made.settings.assumed_tilt_deg if tilt is None else min(max(tilt, low), high)
+        _file(made, [laid], inverter.assuming(assumed)(laid.image[None]))
+
+
+def _file(made: Inversion, batch: list[Laid], found: Recovered) -> None:
+    for k, laid in enumerate(batch):
+        stroke, flags = laid.stroke, found.flags[k]
+        ident = stroke.stroke_id
+        if useless := sorted(flags & USELESS):
+            made.refused.append((ident, ", ".join(useless)))
+            continue
+        if problem := _unnameable(ident, {row.stroke_id for row in made.rows}):
+            made.refused.append((ident, problem))
+            continue
+        tilt_sd = float(found.sigma[k, 1]) if "tilt_deg" in found.fitted else None
+        made.rows.append(
+            Row(
+                ident, float(found.values[k, 0]), float(found.values[k, 1]), float(found.sigma[k, 0]), tilt_sd,
+                float(found.rms[k]), tuple(sorted(flags)), stroke.height_mm, stroke.tilt_deg,
+            )
+        )  # fmt: skip
+
+
+def _unnameable(ident: str, taken: set[str]) -> str:
+    """Why a protocol could not press a stroke of that name again; empty where it can."""
+    if ident in taken:
+        return "its name stands for two strokes"
+    if not 1 <= len(ident) <= 100 or not ident.isprintable() or any(c in ' /\\<>:"|?*' for c in ident):
+        return "its name cannot stand in a protocol"
+    return "its name cannot stand in a protocol" if ident[0] in ".-~" else ""
+
+
+def _inverters(header: Header, settings: Settings) -> tuple[Inverter, Inverter]:
+    """With a known anchor, and without."""
+    brush = brush_of(header)
+    basis = Basis(brush) if settings.lam is None else Basis(brush, settings.lam)
+    options = {"within": settings.within, "noise": Noise.BLOCKS, "px_mm": settings.view.mm_per_px}
+    known = options | {"anchor_sigma_mm": settings.anchor_sigma_mm}
+    loose = options | {"known": Known.NOTHING, "tilt_deg": settings.within.tilt_deg[0]}
+    try:
+        if settings.fitted is None and settings.model == "ccd-bsm":
+            return Inverter.of_brush(basis, **known), Inverter.of_brush(basis, **loose)
+        model = settings.fitted or stroke_model(settings.model, brush, basis.lam)
+        return Inverter.of_model(model, **known), Inverter.of_model(model, **loose)
+    except UnknownModelError as error:
+        raise CalibrationError("--model", str(error)) from None
+    except DomainError as error:
+        raise CalibrationError("--height-range, --tilt-range", str(error)) from None
+
+
+def off_command(rows: list[Row]) -> Iterator[tuple[str, float, float, float, int]]:
+    """(what, mean difference, its standard deviation, share in the 95 % interval, n) of recovered against commanded."""
+    pairs = {
+        "H": [(r.height_mm, r.height_sd_mm, r.commanded_height_mm) for r in rows],
+        "alpha": [(r.tilt_deg, r.tilt_sd_deg, r.commanded_tilt_deg) for r in rows if r.tilt_sd_deg is not None],
+    }
+    for name, found in pairs.items():
+        known = [(value - asked, sd) for value, sd, asked in found if asked is not None]
+        if known:
+            off, sd = (np.array(part, np.float64) for part in zip(*known, strict=True))
+            inside = np.abs(off) <= 1.96 * sd
+            yield name, float(off.mean()), float(off.std()), float(inside.mean()), len(known)

@@ -1,0 +1,1 @@
+"""What every report page needs: templates, pictures as data, sealed JSON, shared sentences."""

@@ -1,0 +1,1 @@
+"""From a photograph to one stroke: light, rectification, components, binarisation, measurement."""

@@ -1,0 +1,222 @@
+"""The stroke that came between two photographs of one page: pages that already carry ink, frame after frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import cv2
+import numpy as np
+
+from calibrate.errors import CaptureRefused
+from calibrate.stroke.light import LIGHT_ROUNDS
+from calibrate.stroke.params import Floats, Gray, Mask, Soft
+
+DARK_SHARE = 0.6
+"""Darker than this share of the paper, a place held ink before: what came on top of it cannot be told."""
+SHRINK = 8
+MOST_SHIFT_PX = 8.0
+LEAST_RESPONSE = 0.05
+NOISE_SIGMAS = 6.0
+NEAR_MM = 10.0
+"""New ink so far from where the stroke should begin counts a third."""
+
+
+@dataclass(frozen=True, slots=True)
+class DifferenceParams:
+    """Named parameters of before and after; millimetres of the page."""
+
+    core: float = 0.35
+    """Darkening, as a share of the paper's brightness, that a stroke must reach somewhere."""
+    rim: float = 0.15
+    """Darkening down to which its neighbours belong to it."""
+    join_mm: float = 2.0
+    """Parts that lie closer to the main part are the same stroke: bristles part, bubbles shine."""
+    least_mm2: float = 2.0
+    """Less new ink than this is no stroke."""
+    sliver_mm: float = 0.6
+    """Thinner new ink along an old edge comes from a page that moved, or from ink that ran."""
+
+
+@dataclass(frozen=True, slots=True)
+class NewStroke:
+    """What came in between."""
+
+    mask: Mask
+    """(h, w), True where ink came."""
+    soft: Soft
+    """(h, w) ink from 0 to 1 where it came, 0 elsewhere."""
+    start_px: tuple[float, float]
+    """(x, y) of the end that lies against the heading: the middle of its outermost ink; pixel j covers [j, j + 1)."""
+    shift_px: tuple[float, float]
+    """How far the page lay from where it was, undone before comparing."""
+    noise: float
+    """Standard deviation of the difference on paper, as a share of its brightness."""
+    flags: tuple[str, ...]
+
+
+def new_stroke(
+    before: Gray,
+    after: Gray,
+    px_per_mm: float,
+    where: str,
+    params: DifferenceParams | None = None,
+    heading_deg: float = 0.0,
+    near_px: tuple[float, float] | None = None,
+) -> NewStroke:
+    """The stroke in `after` that is not in `before`, two gray photographs of one page and one size.
+
+    `near_px` is where it should begin; of several new components the one with the most ink near it is taken. Raises
+    `CaptureRefused` where nothing came, or the sizes differ.
+    """
+    params = params or DifferenceParams()
+    if before.shape != after.shape:
+        raise CaptureRefused(
+            where,
+            f"is {after.shape[1]} x {after.shape[0]} px, what is before it {before.shape[1]} x {before.shape[0]} px",
+        )
+    shift = _shift(before, after)
+    moved = cast("Gray", _moved(after, (-shift[0], -shift[1]))) if max(map(abs, shift)) > 0.02 else after
+    first, second = before.astype(np.float32), moved.astype(np.float32)
+    paper = _paper(first)
+    clean = first > DARK_SHARE * paper
+    light = _gain(first, second, clean)
+    darker = np.where(clean, (first - second / light) / paper, 0.0).astype(np.float32)
+    quiet = darker[clean & (darker < params.rim)]
+    noise = 1.4826 * float(np.median(np.abs(quiet - np.median(quiet)))) if quiet.size else 0.0
+    core = max(params.core, NOISE_SIGMAS * noise)
+    rim = max(params.rim, 0.5 * NOISE_SIGMAS * noise)
+    mask = _grown(darker, clean, core, rim, px_per_mm, params, near_px)
+    area_mm2 = float(np.count_nonzero(mask)) / px_per_mm**2
+    if area_mm2 < params.least_mm2:
+        raise CaptureRefused(where, f"shows no new stroke: {area_mm2:.1f} mm2 of new ink, {params.least_mm2:g} needed")
+    ink = float(np.quantile(darker[mask], 0.75))
+    # Half way between paper and ink, so that the blur of the edge neither widens nor narrows the stroke.
+    mask = mask & (darker >= max(rim, 0.5 * ink))
+    soft = np.where(mask, np.clip(darker / ink, 0.0, 1.0), 0.0).astype(np.float32)
+    return NewStroke(
+        mask, soft, end_of(mask, heading_deg, px_per_mm), shift, noise, _flags(mask, clean, shift, px_per_mm)
+    )
+
+
+def end_of(mask: Mask, heading_deg: float, px_per_mm: float, reach_mm: float = 1.0) -> tuple[float, float]:
+    """(x, y) px of the mask's end against the heading (deg, counter-clockwise, rows run down): where a stroke began.
+
+    Along the heading it is where ink begins, leaving out the outermost 0.5 % as stray bristles; across it, the middle
+    of the first `reach_mm`.
+    """
+    ys, xs = np.nonzero(mask)
+    turn = np.radians(heading_deg)
+    along = (xs + 0.5) * np.cos(turn) - (ys + 0.5) * np.sin(turn)
+    across = (xs + 0.5) * np.sin(turn) + (ys + 0.5) * np.cos(turn)
+    begin = float(np.quantile(along, 0.005)) - 0.5
+    middle = float(np.median(across[along <= begin + max(reach_mm * px_per_mm, 2.0)]))
+    return begin * float(np.cos(turn)) + middle * float(np.sin(turn)), middle * float(np.cos(turn)) - begin * float(
+        np.sin(turn)
+    )
+
+
+def _shift(before: Gray, after: Gray) -> tuple[float, float]:
+    """How far the page moved, (x, y) px, by phase correlation; 0 where the two photographs do not tell."""
+    a, b = (cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float64) for image in (before, after))
+    if float(a.std()) < 3.0:
+        return 0.0, 0.0
+    # What is new must not pull: it is filled with what was there.
+    same = np.abs(a - b) < 40.0
+    b = np.where(same, b, a)
+    window = cv2.createHanningWindow((before.shape[1], before.shape[0]), cv2.CV_64F)
+    (dx, dy), response = cv2.phaseCorrelate(a, b, window)
+    if response < LEAST_RESPONSE or max(abs(dx), abs(dy)) > MOST_SHIFT_PX:
+        return 0.0, 0.0
+    return float(dx), float(dy)
+
+
+def _moved(image: Gray, by: tuple[float, float]) -> cv2.typing.MatLike:
+    matrix = np.array([[1.0, 0.0, by[0]], [0.0, 1.0, by[1]]])
+    return cv2.warpAffine(image, matrix, (image.shape[1], image.shape[0]), borderMode=cv2.BORDER_REPLICATE)
+
+
+def _paper(first: Soft) -> Soft:
+    """Brightness of the paper everywhere: closing fills the ink, blurring takes the fibres out."""
+    small = cv2.resize(first, None, fx=1 / SHRINK, fy=1 / SHRINK, interpolation=cv2.INTER_AREA)
+    side = max(3, min(small.shape[:2]) // 4) | 1
+    closed = cv2.morphologyEx(small, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8), borderType=cv2.BORDER_REPLICATE)
+    smooth = cv2.GaussianBlur(closed, (0, 0), side / 6.0)
+    size = (first.shape[1], first.shape[0])
+    return np.maximum(np.asarray(cv2.resize(smooth, size, interpolation=cv2.INTER_LINEAR), np.float32), 1.0)
+
+
+def _gain(first: Soft, second: Soft, clean: Mask) -> Soft:
+    """How the light changed, a quadratic surface of second / first over paper that stayed paper."""
+    height, width = first.shape
+    y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
+    basis = np.asarray(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1), np.float64)
+    thin = (slice(None, None, 4), slice(None, None, 4))
+    terms, ratio = basis[thin].reshape(-1, 6), (second / np.maximum(first, 1.0))[thin].ravel().astype(np.float64)
+    use = clean[thin].ravel()
+    coefficients: Floats = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0], np.float64)
+    for _ in range(LIGHT_ROUNDS):
+        if np.count_nonzero(use) < 60:
+            break
+        kept = terms[use]
+        coefficients = np.asarray(np.linalg.pinv(kept.T @ kept) @ (kept.T @ ratio[use]), np.float64)
+        off = np.abs(ratio - terms @ coefficients)
+        use = clean[thin].ravel() & (off < max(0.05, 3.0 * float(np.median(off[use]))))
+    return np.maximum(basis @ coefficients, 0.05).astype(np.float32)
+
+
+def _grown(
+    darker: Soft,
+    clean: Mask,
+    core: float,
+    rim: float,
+    px_per_mm: float,
+    params: DifferenceParams,
+    near_px: tuple[float, float] | None,
+) -> Mask:
+    """The main component above `rim` that holds some of `core`, with the parts that lie close to it."""
+    candidate = (darker > rim).astype(np.uint8)
+    side = max(1, round(params.sliver_mm * px_per_mm))
+    if side > 1:
+        # Only along old ink: a thin tail on clean paper is a part of the stroke.
+        kernel = np.ones((side, side), np.uint8)
+        old = cv2.dilate((~clean).astype(np.uint8), np.ones((2 * side + 1, 2 * side + 1), np.uint8)) > 0
+        opened = cv2.morphologyEx(candidate, cv2.MORPH_OPEN, kernel)
+        candidate = np.where(old, opened, candidate).astype(np.uint8)
+    count, labels, _, _ = cv2.connectedComponentsWithStats(candidate, connectivity=8)
+    if count <= 1:
+        return np.zeros(darker.shape, np.bool_)
+    flat = np.asarray(labels, np.int64).ravel()
+    strong = np.bincount(flat, weights=(darker > core).ravel(), minlength=count)
+    ink = np.bincount(flat, weights=np.clip(darker, 0.0, 1.0).ravel(), minlength=count)
+    ink[0] = 0.0
+    ink[strong < 3] = 0.0
+    weight = ink.copy()
+    if near_px is not None:
+        for label in np.flatnonzero(ink > 0.0):
+            ys, xs = np.nonzero(labels == label)
+            away = float(np.hypot(xs + 0.5 - near_px[0], ys + 0.5 - near_px[1]).min())
+            weight[label] *= np.exp(-away / (NEAR_MM * px_per_mm))
+    main = int(np.argmax(weight))
+    if weight[main] <= 0.0:
+        return np.zeros(darker.shape, np.bool_)
+    stroke = labels == main
+    distance = np.asarray(cv2.distanceTransform((~stroke).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
+    for label in np.flatnonzero(ink > 0.0):
+        part = labels == label
+        if label != main and float(distance[part].min()) <= params.join_mm * px_per_mm:
+            stroke = stroke | part
+    return stroke
+
+
+def _flags(mask: Mask, clean: Mask, shift: tuple[float, float], px_per_mm: float) -> tuple[str, ...]:
+    told: list[str] = []
+    around = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    touching_mm = float(np.count_nonzero(around & ~clean)) / px_per_mm
+    if touching_mm > 1.0:
+        told.append(f"crosses: {touching_mm:.1f} mm of its edge lie on older ink, what is below cannot be told")
+    if max(map(abs, shift)) > 1.0:
+        told.append(f"moved: the page lay {np.hypot(*shift):.1f} px from where it was")
+    if mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any():
+        told.append("cut: the stroke reaches the edge of the photograph")
+    return tuple(told)

@@ -1,0 +1,96 @@
+"""Length, width and area of a stroke in mm, straight from its mask."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from calibrate.stroke.preprocess import PX_PER_MM, Mask
+
+GAP_MM = 1.5
+"""Bare streaks and glare narrower than this lie inside a stroke, not between two."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A stroke's size. `heading` is the image's x axis."""
+
+    length_mm: float
+    """Extent along the heading."""
+    width_mm: float
+    """Diameter of the largest circle that fits inside the outline: the width at its widest, bent or not."""
+    mid_width_mm: float
+    """The same over the middle third of the length: free of the blobs where a drag begins and ends."""
+    breadth_mm: float
+    """Greatest thickness across the heading; only for a straight stroke is this its width."""
+    area_mm2: float
+    """Ink, without the holes in it."""
+
+
+def measure(mask: Mask) -> Measured:
+    """Measure a non-empty mask at 20 px/mm."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    stroke = mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    filled = outline(stroke)
+    inside = cv2.distanceTransform(np.pad(filled, 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[:, 1:-1]
+    third = stroke.shape[1] // 3
+    middle = inside[:, third : stroke.shape[1] - third]
+    return Measured(
+        length_mm=stroke.shape[1] / PX_PER_MM,
+        width_mm=_diameter_mm(float(inside.max())),
+        mid_width_mm=_diameter_mm(float(middle.max())),
+        breadth_mm=float(filled.sum(axis=0).max()) / PX_PER_MM,
+        area_mm2=float(np.count_nonzero(stroke)) / PX_PER_MM**2,
+    )
+
+
+def outline(mask: Mask) -> NDArray[np.uint8]:
+    """The mask with gaps of up to `GAP_MM` closed and holes filled: glare and bare bristles do not narrow a stroke."""
+    side = round(GAP_MM * PX_PER_MM) | 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    # Padded, so that the border of the image counts as paper and closing has room.
+    padded = cv2.morphologyEx(np.pad(mask.astype(np.uint8), side), cv2.MORPH_CLOSE, kernel)
+    paper = padded.copy()
+    cv2.floodFill(paper, None, (0, 0), (1,))
+    filled = np.where(paper == 0, 1, padded).astype(np.uint8)
+    return filled[side:-side, side:-side]
+
+
+def _diameter_mm(reach_px: float) -> float:
+    # The transform measures from pixel centre to the nearest paper centre: half a pixel more than to the edge.
+    return 2.0 * (reach_px - 0.5) / PX_PER_MM
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A straight line fitted by least squares, with the standard error of its slope."""
+
+    slope: float
+    intercept: float
+    slope_se: float
+    r: float
+    n: int
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the slope (Student's t with n - 2 degrees of freedom)."""
+        reach = float(stats.t.ppf(0.975, self.n - 2)) * self.slope_se
+        return self.slope - reach, self.slope + reach
+
+
+def fit_line(x: list[float], y: list[float]) -> Line | None:
+    """y = slope x + intercept; None with fewer than 3 points or no spread in x or y."""
+    n = len(x)
+    if n < 3 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
+        return None
+    xs, ys = np.asarray(x), np.asarray(y)
+    sxx = float(((xs - xs.mean()) ** 2).sum())
+    slope = float(((xs - xs.mean()) * (ys - ys.mean())).sum()) / sxx
+    intercept = float(ys.mean()) - slope * float(xs.mean())
+    residual = ys - slope * xs - intercept
+    slope_se = float(np.sqrt((residual**2).sum() / max(n - 2, 1) / sxx))
+    return Line(slope, intercept, slope_se, float(np.corrcoef(xs, ys)[0, 1]), n)

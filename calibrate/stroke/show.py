@@ -1,0 +1,101 @@
+"""One capture of a session, or one photograph, through all stages into a picture and a file of numbers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from calibrate.board.lens import Gray, unknown_lens
+from calibrate.board.plane import Plane
+from calibrate.board.session import NO_BOARD, board_of, known_lens
+from calibrate.board.view import see_straight
+from calibrate.compare.field import Field
+from calibrate.current import current
+from calibrate.current_calibration import calibration_of
+from calibrate.errors import CalibrationError
+from calibrate.files import read_gray, write_whole
+from calibrate.stroke.difference import new_stroke
+from calibrate.stroke.params import Params
+from calibrate.stroke.picture import contact_sheet
+from calibrate.stroke.stages import Trace, trace_scaled, trace_seen
+from sessions.imports.sequence import SEQUENCE
+from sessions.reader import Capture, Recording
+from sessions.recording.messages import decode_gray
+from sessions.recording.schemas import Stroke
+
+PAPER = 255
+
+
+def show_stroke(session: Path, stroke: str, out: Path, params: Params | None = None, lens: Path | None = None) -> Trace:
+    """A stroke of a session by its name, the first where that is empty.
+
+    Seen by the calibration that the session uses, as a validation sees it; by a lens file, or where there is none by
+    the session's own lens, on its last photograph of the board. Raises `CalibrationError`.
+    """
+    recording = Recording(session)
+    before: Capture | None = None
+    for capture in recording.captures():
+        if stroke in ("", capture.stroke.stroke_id):
+            break
+        before = capture
+    else:
+        raise CalibrationError(str(recording.path), f"holds no stroke {stroke!r}")
+    one, image, where = capture.stroke, capture.image(), f"{recording.path.name} {capture.stroke.stroke_id}"
+    if one.anchor_mm is not None:
+        plane = _plane(recording, one, image, lens, where)
+        window_mm, chosen = Field().window_mm(one.anchor_mm), params or Params()
+        trace = trace_seen(image, plane, window_mm, one.anchor_mm, where, chosen, one.cell_mm)
+    elif one.px_per_mm is not None:
+        if recording.header.protocol.startswith(SEQUENCE) and before is not None:
+            image = only_new(before.image(), image, float(np.mean(one.px_per_mm)), where)
+        trace = trace_scaled(image, one.px_per_mm, one.anchor_px, where, params or Params())
+    else:
+        raise CalibrationError(where, "has neither an anchor on the sheet nor a scale of its own")
+    return _written(trace, params or Params(), out)
+
+
+def _plane(recording: Recording, one: Stroke, image: Gray, lens: Path | None, where: str) -> Plane:
+    path = current(recording.path.parent) if lens is None else None
+    used = None if path is None else calibration_of(recording, one, recording.sha256, path)
+    if used is not None:
+        through = used.lens.lens() if used.lens is not None else unknown_lens((image.shape[1], image.shape[0]))
+        through.check_size(image, where)
+        reach, middle = (used.mm_per_px_low, used.mm_per_px_high), used.middle_px or (0.0, 0.0)
+        return Plane(through, used.homography(), used.mm_per_px, reach, used.rms_px, 0.0, middle, used.corners, ())
+    boards = list(recording.stills_of("board"))
+    if not boards:
+        raise CalibrationError(str(recording.path), NO_BOARD)
+    known = known_lens(recording, lens)
+    photograph = decode_gray(boards[-1], where)
+    return see_straight(photograph, board_of(recording), known.lens() if known else None, where)[0]
+
+
+def show_photograph(
+    path: Path, px_per_mm: float | None, before: Path | None, out: Path, params: Params | None = None
+) -> Trace:
+    """A flat photograph of known scale. Raises `CalibrationError`."""
+    if px_per_mm is None:
+        raise CalibrationError(str(path), "is a photograph: give --px-per-mm")
+    image = read_gray(path)
+    if before is not None:
+        image = only_new(read_gray(before), image, px_per_mm, str(path))
+    trace = trace_scaled(image, (px_per_mm, px_per_mm), None, str(path), params or Params())
+    return _written(trace, params or Params(), out)
+
+
+def only_new(before: Gray, after: Gray, px_per_mm: float, where: str) -> Gray:
+    """A page with nothing on it but what came since `before`, black on white. Raises `CaptureRefused`."""
+    new = new_stroke(before, after, px_per_mm, where)
+    return np.rint(PAPER * (1.0 - new.soft)).astype(np.uint8)
+
+
+def _written(trace: Trace, params: Params, out: Path) -> Trace:
+    _, data = cv2.imencode(".png", contact_sheet(trace))
+    out.write_bytes(data.tobytes())
+    told = {"where": trace.where, "params": asdict(params), "fitted": trace.log, "flags": list(trace.flags)}
+    write_whole(out.with_suffix(".json"), json.dumps(told, indent=2) + "\n")
+    return trace

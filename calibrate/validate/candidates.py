@@ -1,0 +1,172 @@
+"""What is compared with the captures: every registered model, the fitted brush, refits to other cells, generators."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from calibrate.compare.field import Field
+from calibrate.compare.images import Pixels
+from calibrate.compare.simulate import simulated_pixels
+from calibrate.current_calibration import brush_of
+from calibrate.validate.heldout import Cell, bezier_pixels, fitted_press
+from calibrate.validate.sources import Opened
+from model.ccdbsm import Brush, DomainError
+from model.fitted_shape import NAME as FITTED
+from model.fitted_shape import fitted_model
+from model.registry import StrokeModel, stroke_model, stroke_models
+
+PUBLISHED = "as published"
+HELD_OUT = "fitted, held-out cells"
+FITTED_HELD_OUT, BEZIER_REFITTED = "ccd-bsm-heldout", "bezier-refitted"
+GENERATOR_HELD_OUT = "ccd-bsmg-heldout"
+LAMBDAS = {"ccd-bsm-lambda-1": 1.0, "ccd-bsm-lambda-pi/2": 0.5 * math.pi}
+"""Beside lambda = pi, which is CCD-BSM itself: the paper's figure 3."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contender:
+    """One row of the tables, for one session."""
+
+    name: str
+    label: str
+    definition: str
+    basis: str
+    """What it knows of these strokes: `as published`, `fitted, in sample`, `fitted, held-out cells`, ..."""
+    predict: Callable[[float, float], Pixels]
+    """(H, alpha) -> (len(KEYS), 128, 128); raises `DomainError` for a press that it does not predict."""
+    file: Path | None = None
+    """Where a generator comes from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Generator:
+    """A trained generator's file, and its content."""
+
+    path: Path
+    sha256: str
+
+
+def generator_file(path: Path) -> Generator:
+    """Raises OSError where there is no such file."""
+    with path.open("rb") as file:
+        return Generator(path, hashlib.file_digest(file, "sha256").hexdigest())
+
+
+def closed_forms(session: Opened, view: Field, *, ablations: bool) -> list[Contender]:
+    """The registered models of the session's brush, the fitted one, and CCD-BSM at other lambdas."""
+    brush = brush_of(session.header)
+    made = [_of_model(model, PUBLISHED, view) for model in stroke_models(brush).values()]
+    if session.fit is not None:
+        fit = session.fit
+        basis = "fitted, in sample" if fit.recording_sha256 == session.sha256 else f"fitted on {fit.session_id}"
+        made.insert(1, _of_model(fitted_model(fit.press(), "CCD-BSM fitted"), basis, view))
+    if ablations:
+        for name, lam in LAMBDAS.items():
+            label = f"CCD-BSM, λ = {name.rpartition('-')[2].replace('pi', 'π')}"
+            made.append(_of_model(stroke_model("ccd-bsm", brush, lam), PUBLISHED, view, name, label))
+    return made
+
+
+def generators(session: Opened, files: Sequence[Generator], view: Field) -> list[Contender]:
+    """Trained generators, drawn as their traced outlines. Raises what `load_generator` does."""
+    from model.train.load import load_generator
+
+    made: list[Contender] = []
+    for number, file in enumerate(files):
+        model = load_generator(file.path, brush_of(session.header))
+        name = (
+            model.name if number == 0 or model.name not in {one.name for one in made} else f"{model.name}-{number + 1}"
+        )
+        basis = "trained, then tuned on captures" if model.fitted else "trained on exact images"
+        made.append(replace(_of_model(model, basis, view, name, model.label), file=file.path))
+    return made
+
+
+def held_out(made: dict[Cell, dict[str, Any]], brush: Brush, view: Field, *, fitted: bool) -> list[Contender]:
+    """Fits that left out the very cell that they predict; `made` has a finished `refit_job` for each cell."""
+
+    def predict_fitted(height_mm: float, tilt_deg: float) -> Pixels:
+        found = _of_cell(made, height_mm, tilt_deg, "fitted")
+        press = fitted_press(found, float(brush.radius_mm), float(brush.length_mm))
+        return simulated_pixels(fitted_model(press), height_mm, tilt_deg, view)
+
+    def predict_bezier(height_mm: float, tilt_deg: float) -> Pixels:
+        return bezier_pixels(_of_cell(made, height_mm, tilt_deg, "bezier"), height_mm, tilt_deg, view)
+
+    bezier = Contender(
+        BEZIER_REFITTED,
+        "Bezier refitted",
+        "Two mirrored cubic Bezier curves; ends, belly and shoulder regressed on the captures of all other cells.",
+        HELD_OUT,
+        predict_bezier,
+    )
+    ours = Contender(
+        FITTED_HELD_OUT,
+        "CCD-BSM calibrated",
+        "CCD-BSM's lengths with gains, powers, profile and edges fitted to the captures of all other cells.",
+        HELD_OUT,
+        predict_fitted,
+    )
+    return [ours, bezier] if fitted else [bezier]
+
+
+def tuned(files: dict[Cell, Path], brush: Brush, view: Field, number: int) -> Contender:
+    """A generator tuned on all cells but the one that it predicts."""
+    from model.train.load import load_generator
+
+    loaded: dict[Path, StrokeModel] = {}
+
+    def predict(height_mm: float, tilt_deg: float) -> Pixels:
+        file = files[(height_mm, tilt_deg)]
+        if file not in loaded:
+            loaded[file] = load_generator(file, brush)
+        return simulated_pixels(loaded[file], height_mm, tilt_deg, view)
+
+    return Contender(
+        GENERATOR_HELD_OUT if number == 0 else f"{GENERATOR_HELD_OUT}-{number + 1}",
+        "CCD-BSMG calibrated",
+        "The generator, fine-tuned on captures of other cells (left out by fifths) and on images of the CCD-BSM that "
+        "was fitted to them, if there is a fit; its outline.",
+        HELD_OUT,
+        predict,
+    )
+
+
+def _of_model(model: StrokeModel, basis: str, view: Field, name: str = "", label: str = "") -> Contender:
+    return Contender(
+        name or model.name,
+        label or model.label,
+        model.definition,
+        basis,
+        lambda height_mm, tilt_deg: simulated_pixels(model, height_mm, tilt_deg, view),
+    )
+
+
+def _of_cell(made: dict[Cell, dict[str, Any]], height_mm: float, tilt_deg: float, what: str) -> Any:
+    found = made.get((height_mm, tilt_deg), {}).get(what)
+    if found is None:
+        raise DomainError("height_mm", height_mm, "other cells", "the other cells do not tell it")
+    return found
+
+
+__all__ = [
+    "BEZIER_REFITTED",
+    "FITTED",
+    "FITTED_HELD_OUT",
+    "GENERATOR_HELD_OUT",
+    "HELD_OUT",
+    "LAMBDAS",
+    "PUBLISHED",
+    "Contender",
+    "Generator",
+    "closed_forms",
+    "generator_file",
+    "generators",
+    "held_out",
+    "tuned",
+]

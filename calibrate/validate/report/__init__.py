@@ -1,0 +1,1 @@
+"""The report of a validation as data, tables, sentences, figures, page and files."""

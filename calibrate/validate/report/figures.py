@@ -1,0 +1,220 @@
+"""Pictures of a report of presses, as data URIs. Every plot carries its source in the picture itself."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibrate.compare.field import KEYS, Alignment, Tone
+from calibrate.compare.images import Pixels
+from calibrate.errors import CalibrationError
+from calibrate.files import read_bounded
+from calibrate.report import pictures
+from calibrate.validate.report.data import Report
+from calibrate.validate.run import Outcome
+from model.ccdbsm import DomainError
+
+ROWS = slice(32, 96)
+"""The middle half of a field: a press is at most half as thick as the field is high."""
+MOST_POINTS = 200
+MOST_SAMPLES, MOST_CELLS = 15, 5
+GRAY_MM = KEYS.index((Alignment.MM, Tone.GRAY))
+MOST_CURVE_BYTES = 64 * 1024 * 1024
+BLUE, RED = "#0072B2", "#D55E00"
+
+
+def distributions(outcome: Outcome, report: Report) -> str:
+    """CSIM of every stroke by model in both alignments, with the average and its interval."""
+    labels = {rival.name: rival.label for rival in report.rivals}
+    names = [name for name in outcome.names if name in labels]
+    figure, axes = _figure(1, 2, (11.0, 0.9 + 0.36 * len(names)))
+    for axis, alignment in zip(axes, (Alignment.MM, Alignment.SIZE_NORMALISED), strict=True):
+        key = KEYS.index((alignment, Tone.BINARY))
+        rng = np.random.default_rng(0)  # jitter only, so that points do not hide each other
+        for place, name in enumerate(reversed(names)):
+            values = 100.0 * outcome.values[:, outcome.names.index(name), key, 0]
+            values = values[np.isfinite(values)]
+            stat = report.stat(name, alignment, Tone.BINARY, "csim")
+            if stat is None:
+                continue
+            if len(values) > 3 and np.ptp(values) > 1e-6:
+                parts: Any = axis.violinplot([values], [place], orientation="horizontal", widths=0.8, showextrema=False)
+                for body in parts["bodies"]:
+                    body.set(facecolor=BLUE, alpha=0.18)
+            some = values[:: max(1, -(-len(values) // MOST_POINTS))]
+            axis.plot(some, place + 0.14 * rng.uniform(-1, 1, len(some)), ".", ms=3, alpha=0.5, color=BLUE)
+            if stat.avg_interval is not None:
+                span = stat.avg_interval
+                axis.plot([span.low, span.high], [place] * 2, color=RED, lw=2.5, solid_capstyle="butt")
+            axis.plot(stat.avg, place, "|", ms=15, mew=2.5, color=RED)
+        axis.set_yticks(range(len(names)), [labels[name] for name in reversed(names)])
+        axis.set_xlabel("CSIM, %")
+        axis.set_title(f"{alignment}, binary ({report.label})", fontsize=10)
+        axis.grid(axis="x", alpha=0.3)
+    axes[1].set_yticklabels([])
+    return _png(figure)
+
+
+def by_strokes(report: Report) -> str:
+    """CSIM on presses that were not fitted, against the number of presses that were."""
+    figure, axis = _figure(1, 1, (6.4, 3.2))
+    for name, colour in (("CCD-BSM", RED), ("Bézier", BLUE)):
+        counts = sorted({step.strokes for step in report.by_strokes if step.model == name})
+        means = [np.mean([s.csim for s in report.by_strokes if (s.model, s.strokes) == (name, n)]) for n in counts]
+        if counts:
+            axis.plot(counts, means, "o-", ms=4, color=colour, label=f"{name} fitted")
+    axis.set_xscale("log")
+    axis.set_xticks(sorted({s.strokes for s in report.by_strokes}))
+    axis.set_xticklabels([str(n) for n in sorted({s.strokes for s in report.by_strokes})])
+    axis.minorticks_off()
+    axis.set_xlabel("presses that were fitted")
+    axis.set_ylabel("CSIM on all others, %")
+    axis.set_title(f"mm, binary ({report.label})", fontsize=10)
+    axis.grid(alpha=0.3)
+    axis.legend()
+    return _png(figure)
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """A training as its folder tells it: validation loss by step."""
+
+    name: str
+    steps: tuple[int, ...]
+    losses: tuple[float, ...]
+
+
+def read_curve(text: str) -> Curve:
+    """`NAME=FOLDER`, a folder that `brushloop train` wrote. Raises `CalibrationError` where it holds no curve."""
+    name, _, folder = text.partition("=")
+    if not name or not folder:
+        raise CalibrationError(f"--curves {text}", "expected NAME=FOLDER")
+    path = Path(folder) / "validation.csv"
+    try:
+        rows = list(csv.DictReader(io.StringIO(read_bounded(path, MOST_CURVE_BYTES).decode())))
+        steps = tuple(int(row["step"]) for row in rows)
+        losses = tuple(float(row["mse"]) for row in rows)
+    except (KeyError, TypeError, ValueError):
+        raise CalibrationError(str(path), "is no table of validation losses (step, mse)") from None
+    if not steps:
+        raise CalibrationError(str(path), "holds no validation yet")
+    return Curve(name, steps, losses)
+
+
+def curves(given: Sequence[Curve]) -> str:
+    """Validation losses of trained generators: the paper's figures 9 and 12."""
+    figure, axis = _figure(1, 1, (6.4, 3.2))
+    for one in given:
+        axis.semilogy(one.steps, one.losses, ".-", ms=4, label=one.name)
+    axis.set_xlabel("step")
+    axis.set_ylabel("validation loss (MSE)")
+    axis.set_title("networks trained on exact images of stroke models", fontsize=10)
+    axis.grid(alpha=0.3)
+    axis.legend()
+    return _png(figure)
+
+
+def samples(outcome: Outcome, shown: str) -> list[dict[str, Any]]:
+    """The first capture of each cell above what one model predicts: the paper's figures 7 and 8."""
+    made: list[dict[str, Any]] = []
+    for k in _first_of_cells(outcome, MOST_SAMPLES):
+        row = outcome.rows[k]
+        image, measured = predicted(outcome, k, shown), row.press.measured
+        size = "" if measured is None else f"{measured.length_mm:.1f} × {measured.breadth_mm:.1f} mm"
+        drawn = "" if image is None else _ink(image)
+        made.append({"row": row, "size": size, "captured": _ink(captured_image(outcome, k)), "predicted": drawn})
+    return made
+
+
+def side_by_side(outcome: Outcome, leave_out: Sequence[str]) -> dict[str, Any]:
+    """Some captures beside what every contender predicts: the paper's figures 10 and 11."""
+    chosen = _first_of_cells(outcome, MOST_CELLS)
+    known = {one.name: one.label for made in outcome.contenders for one in made if one.name not in leave_out}
+    lines: list[dict[str, Any]] = []
+    for k in chosen:
+        images = [predicted(outcome, k, name) for name in known]
+        shown = ["" if image is None else _ink(image) for image in images]
+        lines.append({"row": outcome.rows[k], "captured": _ink(captured_image(outcome, k)), "models": shown})
+    return {"labels": list(known.values()), "lines": lines}
+
+
+def of_one_cell(outcome: Outcome, names: Sequence[str]) -> list[tuple[str, str]]:
+    """(label, image) of a capture in the middle of the cells, and of these contenders for it."""
+    chosen = _first_of_cells(outcome, MOST_SAMPLES)
+    if not chosen:
+        return []
+    k = chosen[len(chosen) // 2]
+    labels = {one.name: one.label for one in outcome.contenders[outcome.rows[k].session]}
+    made = [("captured", _ink(captured_image(outcome, k)))]
+    for name in names:
+        image = predicted(outcome, k, name)
+        if image is not None:
+            made.append((labels[name], _ink(image)))
+    return made
+
+
+def _first_of_cells(outcome: Outcome, most: int) -> list[int]:
+    """The first capture of each cell, of cells evenly chosen where there are more."""
+    first: dict[tuple[float, float], int] = {}
+    for k, row in enumerate(outcome.rows):
+        first.setdefault(row.cell, k)
+    cells = sorted(first)
+    count = min(len(cells), most)
+    return [first[cells[n * (len(cells) - 1) // max(count - 1, 1)]] for n in range(count)]
+
+
+def extreme(outcome: Outcome, session_id: str, stroke_id: str, model: str) -> dict[str, str]:
+    """Captured, predicted and difference of one stroke."""
+    k = next(
+        k
+        for k, row in enumerate(outcome.rows)
+        if row.press.stroke_id == stroke_id and outcome.sessions[row.session].header.session_id == session_id
+    )
+    captured, image = captured_image(outcome, k), predicted(outcome, k, model)
+    assert image is not None, "a stroke that was scored was predicted"
+    a, b = (np.asarray(one[ROWS] / 255.0, np.float32) for one in (captured, image))
+    return {"captured": pictures.ink(a), "predicted": pictures.ink(b), "difference": pictures.difference(a, b)}
+
+
+def predicted(outcome: Outcome, k: int, name: str) -> Pixels | None:
+    """(128, 128) gray on the millimetre field, or None where the model does not predict this press."""
+    row = outcome.rows[k]
+    found = next((one for one in outcome.contenders[row.session] if one.name == name), None)
+    if found is None:
+        return None
+    try:
+        return found.predict(*row.cell)[GRAY_MM]
+    except DomainError:
+        return None
+
+
+def captured_image(outcome: Outcome, k: int) -> Pixels:
+    """(128, 128) gray on the millimetre field."""
+    from calibrate.compare.images import unpack
+
+    return unpack(outcome.press(k).pixels)[GRAY_MM]
+
+
+def _ink(image: Pixels) -> str:
+    return pictures.ink(np.asarray(image[ROWS] / 255.0, np.float32))
+
+
+def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
+    # The object interface: pyplot would keep every figure alive and look for a display.
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns)
+
+
+def _png(figure: Any) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()

@@ -1,0 +1,259 @@
+"""What a report says in sentences: what was measured, on what, how well, and whether to trust it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from calibrate.compare.field import Alignment, Tone
+from calibrate.compare.paper import ORDER
+from calibrate.loop.scores import AGAIN, ANOTHER
+from calibrate.loop.table import LoopRecord
+from calibrate.validate import candidates as who
+from calibrate.validate.report.data import Report, Session, Stat
+from calibrate.validate.run import CEILING
+from calibrate.writing.images import Polarity
+from calibrate.writing.scores import REFERENCE
+from sessions.recording.schemas import Source
+
+CLOSE = 0.5
+"""Points below which two models are not told apart."""
+NEAR_CEILING = 1.5
+"""Points of average CSIM."""
+FEW_REPEATS = 3
+WIDE_SCALE = 0.005
+"""Relative width of the interval of pix2len from which it matters: half a percent of every length."""
+MUCH_REFUSED = 0.05
+MOVED_MM = 0.3
+"""Between two zero touches of one session: more than their repeatability together."""
+MOST_NAMED = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One thing to know before trusting a number; `good` None where it is neither good nor bad."""
+
+    good: bool | None
+    text: str
+
+
+def measured(report: Report) -> str:
+    """What was measured, on what."""
+    cells = {one.cell for one in report.stats if one.cell is not None}
+    compared, strokes = (sum(getattr(s, name) for s in report.sessions) for name in ("compared", "strokes"))
+    many = f"{len(report.sessions)} sessions" if len(report.sessions) > 1 else "one session"
+    where = f" at {len(cells)} combinations of press depth H and brush tilt α" if cells else ""
+    brush = next((one.brush for one in report.sessions if one.brush), "a brush that is not named")
+    left = "" if compared == strokes else f", {strokes - compared} more could not be used"
+    what = {
+        Source.LOOPBACK: "The brush, the ink and the photographs are simulated",
+        Source.REAL: "A robot arm pressed them on paper, a camera photographed them",
+        Source.IMPORT: "They are photographs from elsewhere",
+    }[report.source]
+    return (
+        f"{compared} brush presses{where}, from {many}, were compared with what {_count(report)} stroke models predict "
+        f"for them{left}. Each press is one vertical dab of {brush}. {what} ({report.label})."
+    )
+
+
+def findings(report: Report) -> Iterator[str]:
+    """How well: the ceiling, the best model that had not seen the strokes, the published one."""
+    top = _avg(report, CEILING)
+    if top is not None:
+        yield (
+            f"How repeatable the brush is: one press foretells another of the same H and α with a CSIM of "
+            f"{_told(top)}. No model can be expected to do much better; this is the ceiling."
+        )
+    held, bezier = _avg(report, who.FITTED_HELD_OUT), _avg(report, who.BEZIER_REFITTED)
+    if held is not None:
+        gap = "" if top is None else f", {top.avg - held.avg:.1f} points below the ceiling"
+        yield f"Calibrated to this brush, CCD-BSM reaches {_told(held)}{gap}, on cells that the fit had not seen."
+    tuned = _avg(report, who.GENERATOR_HELD_OUT)
+    if tuned is not None:
+        gap = "" if top is None else f", {top.avg - tuned.avg:.1f} points below the ceiling"
+        yield f"Tuned to this brush, CCD-BSMG reaches {_told(tuned)}{gap}, on cells that it had not seen."
+    if bezier is not None:
+        beside = "" if held is None else f": {abs(held.avg - bezier.avg):.1f} points {_less(bezier.avg, held.avg)}"
+        yield f"A Bézier stroke fitted to the same captures reaches {_told(bezier)}{beside}."
+    yield from _pressed_again(report)
+    yield from _characters(report)
+    published = [(name, stat) for name in ("ccd-bsmg", "ccd-bsm") if (stat := _avg(report, name)) is not None]
+    for name, stat in published:
+        label = _label(report, name)
+        yield f"{label} as published, told nothing but the brush's size, H and α, reaches {_told(stat)}."
+    if published:
+        yield from _sizes(report)
+    if held is None and report.source != Source.IMPORT:
+        yield "No model was calibrated to this brush: “brushloop fit” does that; then validate again."
+
+
+def _pressed_again(report: Report) -> Iterator[str]:
+    for loop in report.loops:
+        again, other = (loop.row(what, Alignment.MM, Tone.BINARY) for what in (AGAIN, ANOTHER))
+        if again is None:
+            continue
+        beside = "" if other is None else f", other presses of the same H and α {other.csim[2]:.1f} %"
+        yield (
+            f"Pressed again from what their photographs told ({loop.again}), {again.n} strokes are like their "
+            f"originals with a CSIM of {again.csim[2]:.1f} %{beside}."
+        )
+
+
+def _characters(report: Report) -> Iterator[str]:
+    for record in report.written:
+        for row in record.table_3:
+            key = (row.pair, row.alignment, row.tone, row.polarity)
+            if key == (REFERENCE, Alignment.MM, Tone.BINARY, Polarity.INK):
+                yield (
+                    f"{row.character}, written {row.n} times by the arm, is like its reference ({row.reference}) with "
+                    f"a CSIM of {row.csim[2]:.1f} %."
+                )
+
+
+def _sizes(report: Report) -> Iterator[str]:
+    known = [
+        (s.length_ratio, s.width_ratio)
+        for s in report.sessions
+        if s.length_ratio is not None and s.width_ratio is not None
+    ]
+    if not known:
+        return
+    length, width = (sum(ratio[k] for ratio in known) / len(known) for k in (0, 1))
+    yield f"The marks are {length:.2f} times as long and {width:.2f} times as wide as CCD-BSM says for such a brush."
+
+
+def order(report: Report) -> str:
+    """Whether the models stand in the paper's order, size-normalised and binary."""
+    found = {
+        name: stat.avg
+        for name in ORDER
+        if (stat := report.stat(name, Alignment.SIZE_NORMALISED, Tone.BINARY, "csim")) is not None
+    }
+    if len(found) < 3:
+        return ""
+    ours = sorted(found, key=lambda name: -found[name])
+    wanted = [name for name in ORDER if name in found]
+    words = " > ".join(f"{_label(report, name)} {found[name]:.1f}" for name in ours)
+    close = [
+        f"{_label(report, a)} and {_label(report, b)}"
+        for a, b in itertools.pairwise(ours)
+        if found[a] - found[b] < CLOSE
+    ]
+    near = f" Too close to tell apart: {'; '.join(close)}." if close else ""
+    if ours == wanted:
+        return f"By average CSIM in the size-normalised alignment the models stand in the paper's order: {words}.{near}"
+    swapped = [
+        f"{_label(report, b)} before {_label(report, a)}"
+        for k, a in enumerate(wanted)
+        for b in wanted[k + 1 :]
+        if found[b] > found[a]
+    ]
+    return (
+        f"By average CSIM in the size-normalised alignment: {words}. The paper's order differs: here "
+        f"{', '.join(swapped)}. Uncalibrated models carry the proportions of the paper's brush; where this brush's "
+        "marks have others, the closer outline wins by size alone, and the order says little about the models." + near
+    )
+
+
+def trust(report: Report) -> Iterator[Point]:
+    """What to look at before believing the numbers."""
+    match report.source:
+        case Source.LOOPBACK:
+            yield Point(None, "Loopback rig: the numbers test the software and the method. They say nothing about ink.")
+        case Source.REAL:
+            yield Point(True, "Real capture: the recording says so itself, and its hash is below.")
+        case Source.IMPORT:
+            yield Point(None, "Imported photographs: scale and commands are as their table tells them, not measured.")
+    strokes = sum(s.strokes for s in report.sessions)
+    lost = len({(r.session_id, r.stroke_id) for r in report.refused if "does not predict it" not in r.why})
+    if lost:
+        words = f"{lost} of {strokes} strokes could not be used; each is named below, with the reason."
+        yield Point(lost <= MUCH_REFUSED * strokes, words)
+    else:
+        yield Point(True, "Every stroke that counted was used.")
+    for one in report.sessions:
+        yield from _collection(one)
+    cut = sum(len(s.cut) for s in report.sessions)
+    if cut:
+        yield Point(False, f"{cut} strokes are cut by the edge of their photograph or cell: their scores are too low.")
+    for one in report.sessions:
+        if one.mm_per_px is None or one.mm_per_px_interval is None:
+            continue
+        width = (one.mm_per_px_interval.high - one.mm_per_px_interval.low) / one.mm_per_px
+        words = f"{one.session_id}: scale known to ±{50 * width:.3f} %, board seen to {one.board_rms_px:.2f} px."
+        yield Point(width <= WIDE_SCALE, words)
+    repeats = [s.n for s in report.stats if s.cell is not None and s.model == CEILING]
+    if not repeats:
+        yield Point(
+            False, "No cell was pressed twice: how repeatable the brush is cannot be told, there is no ceiling."
+        )
+    elif min(repeats) < FEW_REPEATS:
+        words = f"Some cells were pressed only {min(repeats)} times: the ceiling is rough. The paper has ten."
+        yield Point(None, words)
+    held, bezier, top = (_avg(report, name) for name in (who.FITTED_HELD_OUT, who.BEZIER_REFITTED, CEILING))
+    if held is not None and top is not None:
+        near = top.avg - held.avg <= NEAR_CEILING
+        how = "within" if near else "not within"
+        yield Point(near, f"The calibrated model is {how} {NEAR_CEILING} points of the ceiling (mm, binary, CSIM).")
+    if held is not None and bezier is not None and held.avg < bezier.avg:
+        yield Point(False, "The refitted Bézier predicts unseen cells better than the calibrated CCD-BSM.")
+    for loop in report.loops:
+        yield from _verdict(loop)
+    if any("in sample" in rival.basis for rival in report.rivals):
+        words = "Rows “in sample” were fitted to the very strokes that they predict: read the held-out rows instead."
+        yield Point(None, words)
+
+
+def _collection(one: Session) -> Iterator[Point]:
+    """What the recording alone does not show: what was planned and never counted, and paper that moved."""
+    told = one.collected
+    if told is None:
+        return
+    if told.left_out:
+        of = "" if told.planned is None else f" of {told.planned} planned"
+        some = ", ".join(told.left_out[:MOST_NAMED]) + (", ..." if len(told.left_out) > MOST_NAMED else "")
+        words = f"{one.session_id}: {len(told.left_out)}{of} strokes were left out while it was collected: {some}."
+        yield Point(False, words)
+    if told.pressed_again:
+        takes = f"{len(told.pressed_again)} of {told.photographed} takes"
+        yield Point(None, f"{one.session_id}: {takes} did not count and were pressed again: what is left was selected.")
+    if told.moved_mm > MOVED_MM:
+        words = f"the paper was found {told.moved_mm:.2f} mm apart ({', '.join(told.touches[:MOST_NAMED])})"
+        yield Point(False, f"{one.session_id}: {words}: presses of one H are not of one depth.")
+
+
+def _verdict(loop: LoopRecord) -> Iterator[Point]:
+    if not loop.verdicts:
+        yield Point(None, f"{loop.again}: no original cell was pressed twice, so nothing says how alike is alike.")
+        return
+    least = min(loop.verdicts, key=lambda verdict: verdict.difference)
+    failed = sum(not verdict.holds for verdict in loop.verdicts)
+    how = "at most" if not failed else f"in {failed} of {len(loop.verdicts)} comparisons more than"
+    sure = "" if all(verdict.certain for verdict in loop.verdicts) else ", not certain in all"
+    yield Point(
+        not failed,
+        f"Strokes pressed again ({loop.again}) are {how} {loop.goal_points:g} point less like their originals than "
+        f"other presses of the same cell (least: {least.difference:+.2f} points{sure}).",
+    )
+
+
+def _avg(report: Report, model: str) -> Stat | None:
+    return report.stat(model, Alignment.MM, Tone.BINARY, "csim")
+
+
+def _told(stat: Stat) -> str:
+    span = stat.avg_interval
+    return f"{stat.avg:.1f} %" + ("" if span is None else f" (95 % {span.low:.1f} to {span.high:.1f})")
+
+
+def _count(report: Report) -> int:
+    return sum(rival.basis != "captured presses" for rival in report.rivals)
+
+
+def _label(report: Report, name: str) -> str:
+    return next((rival.label for rival in report.rivals if rival.name == name), name)
+
+
+def _less(one: float, other: float) -> str:
+    return "less" if one < other else "more"

@@ -1,0 +1,164 @@
+"""Every score on disk, as CSV and as Parquet, written as it is read: never whole in memory. And the report's tables."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import io
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibrate.compare.field import KEYS
+from calibrate.errors import CalibrationError
+from calibrate.loop.scores import AGAIN
+from calibrate.validate.report.data import Report, Stat
+from calibrate.validate.run import REPEATED, Outcome
+from sessions.cells import CsvWriter
+
+COLUMNS = ("session_id", "stroke_id", "height_mm", "tilt_deg", "model", "alignment", "tone", "csim", "ssim", "source")
+GROUP = 2000
+"""Strokes of one row group of the Parquet file."""
+Cells = tuple[str, str, float, float, str, str, str, float, float, str]
+
+
+def score_rows(outcome: Outcome) -> Iterator[Cells]:
+    """One row a score, by session and order of capture; scores that are not there are left out."""
+    for k, row in enumerate(outcome.rows):
+        header = outcome.sessions[row.session].header
+        press = row.press
+        for m, model in enumerate(outcome.names):
+            for j, (alignment, tone) in enumerate(KEYS):
+                csim, ssim = (float(v) for v in outcome.values[k, m, j])
+                if np.isfinite(csim):
+                    yield (
+                        header.session_id,
+                        press.stroke_id,
+                        press.height_mm,
+                        press.tilt_deg,
+                        model,
+                        str(alignment),
+                        str(tone),
+                        csim,
+                        ssim,
+                        str(header.source),
+                    )
+
+
+def write_csv(outcome: Outcome, path: Path) -> str:
+    """Write every score and return the file's SHA-256. Raises OSError; what was half written is then gone."""
+    part = path.with_name(path.name + ".part")
+    digest = hashlib.sha256()
+    try:
+        with part.open("wb") as file:
+            for text in _lines(outcome):
+                data = text.encode()
+                digest.update(data)
+                file.write(data)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    return digest.hexdigest()
+
+
+def _lines(outcome: Outcome) -> Iterator[str]:
+    out = io.StringIO()
+    writer = CsvWriter(out)
+    writer.writerow(COLUMNS)
+    for row in score_rows(outcome):
+        writer.writerow([f"{v:.8f}" if k in (7, 8) else v for k, v in enumerate(row)])
+        if out.tell() > 2**16:
+            yield out.getvalue()
+            out.seek(0)
+            out.truncate()
+    yield out.getvalue()
+
+
+def write_parquet(outcome: Outcome, path: Path) -> None:
+    """The same rows. Raises `CalibrationError` where pyarrow is not installed."""
+    try:
+        pa: Any = importlib.import_module("pyarrow")  # without type stubs
+        pq: Any = importlib.import_module("pyarrow.parquet")
+    except ImportError:
+        raise CalibrationError("--parquet", "needs pyarrow: pip install 'brushloop[parquet]'") from None
+    kinds = [pa.float64() if name in ("height_mm", "tilt_deg", "csim", "ssim") else pa.string() for name in COLUMNS]
+    schema: Any = pa.schema(
+        list(zip(COLUMNS, kinds, strict=True)), metadata={"source": str(outcome.sessions[0].header.source)}
+    )
+    part = path.with_name(path.name + ".part")
+    try:
+        with pq.ParquetWriter(part, schema) as writer:
+            for group in _groups(outcome):
+                columns = [list(column) for column in zip(*group, strict=True)]
+                writer.write_table(pa.table(columns, schema=schema))
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def summary_csv(report: Report) -> str:
+    """Every statistic, per cell and overall; strokes that `brushloop loop` pressed again as “robot writing”."""
+    head = ("model", "alignment", "tone", "measure", "height_mm", "tilt_deg", "n", "max", "min", "avg")
+    ends = ("avg_low", "avg_high", "median", "median_low", "median_high", "source")
+    rows = [(*_stat_row(stat), report.label) for stat in report.stats]
+    return csv_of((*head, *ends), [*rows, *_loop_rows(report)])
+
+
+def _stat_row(stat: Stat) -> tuple[object, ...]:
+    cell = stat.cell if stat.cell is not None else ("", "")
+    low, high = (stat.avg_interval.low, stat.avg_interval.high) if stat.avg_interval is not None else ("", "")
+    middle = (stat.median_interval.low, stat.median_interval.high) if stat.median_interval is not None else ("", "")
+    known = (stat.model, stat.alignment, stat.tone, stat.measure, *cell, stat.n, stat.max, stat.min, stat.avg)
+    return (*known, low, high, stat.median, *middle)
+
+
+def _loop_rows(report: Report) -> Iterator[tuple[object, ...]]:
+    for loop in report.loops:
+        for row in loop.table_1:
+            if row.what != AGAIN:
+                continue
+            name = f"{REPEATED} ({loop.again})"
+            for measure, three, median in (("csim", row.csim, row.csim_median), ("ssim", row.ssim, row.ssim_median)):
+                known = (name, row.alignment, row.tone, measure, "", "", row.n, *three)
+                yield (*known, "", "", median, "", "", str(row.source))
+
+
+def table_3_csv(report: Report) -> str:
+    """Every row of Table 3, the paper's numbers in the rows that stand beside them."""
+    head = ["session_id", "character", "reference", "model", "compared", "alignment", "tone", "polarity", "n"]
+    head += [f"{of}_{what}" for of in ("csim", "ssim") for what in ("max", "min", "avg", "median")]
+    head += ["paper_row", *(f"paper_{of}_{what}" for of in ("csim", "ssim") for what in ("max", "min", "avg"))]
+    none = ("", "", "")
+    rows = [
+        (
+            *(row.session_id, row.character, row.reference, row.model, row.pair, row.alignment, row.tone, row.polarity),
+            *(row.n, *row.csim, row.csim_median, *row.ssim, row.ssim_median),
+            *(row.paper_row or "", *(row.paper_csim or none), *(row.paper_ssim or none), str(row.source)),
+        )
+        for record in report.written
+        for row in record.table_3
+    ]
+    return csv_of((*head, "source"), rows)
+
+
+def csv_of(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A small table as text."""
+    out = io.StringIO()
+    writer = CsvWriter(out)
+    writer.writerow(head)
+    writer.writerows(rows)
+    return out.getvalue()
+
+
+def _groups(outcome: Outcome) -> Iterator[list[Cells]]:
+    group: list[Cells] = []
+    most = GROUP * len(outcome.names)
+    for row in score_rows(outcome):
+        group.append(row)
+        if len(group) == most:
+            yield group
+            group = []
+    if group:
+        yield group

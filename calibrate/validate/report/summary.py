@@ -1,0 +1,249 @@
+"""From scores to a report: statistics per cell and overall, the best and worst strokes, and where it all comes from."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibrate.compare.field import KEYS, Alignment, Key, Tone
+from calibrate.compare.similarity import SSIM_SETTINGS
+from calibrate.compare.stats import summarise
+from calibrate.current_calibration import brush_of
+from calibrate.validate import candidates as who
+from calibrate.validate.beside import Beside
+from calibrate.validate.report.data import (
+    Collected,
+    Extreme,
+    Interval,
+    Refused,
+    Report,
+    Rival,
+    Session,
+    Stat,
+    Step,
+    software,
+)
+from calibrate.validate.run import CEILING, REPEATED, Outcome
+from calibrate.validate.sources import Opened, one_source
+from calibrate.validate.steps import Row
+from model.ccdbsm import DomainError, ccdbsm
+from sessions.history import history_of
+from sessions.show import details
+
+MEASURES = ("csim", "ssim")
+MOST_CELLS = 60
+EXTREMES = 6
+JUDGED: Key = (Alignment.MM, Tone.BINARY)
+"""Best and worst are told in millimetres: where and how large a stroke is counts."""
+PRESSES = {
+    CEILING: (
+        "another press",
+        "A capture foretold by other captures of its cell, averaged: what a perfect model of this brush could reach, "
+        "about.",
+    ),
+    REPEATED: ("robot writing", "A stroke pressed again with what was recovered from it, against the original."),
+}
+
+
+def report_of(
+    outcome: Outcome, command: str, scores_sha256: str, by_strokes: tuple[Step, ...], beside: Beside
+) -> Report:
+    """Everything of a run as one frozen report."""
+    cells = sorted({row.cell for row in outcome.rows})
+    told = len(cells) <= MOST_CELLS
+    shown = _shown(outcome)
+    best, worst = _extremes(outcome, shown)
+    return Report(
+        source=one_source(outcome.sessions),
+        software=software(),
+        command=command,
+        mm_per_px=outcome.options.view.mm_per_px,
+        ssim_settings=SSIM_SETTINGS,
+        sessions=tuple(_session(outcome, k, one) for k, one in enumerate(outcome.sessions)),
+        rivals=_rivals(outcome),
+        shown=shown,
+        stats=tuple(_stats(outcome, cells if told else [])),
+        cells_told=told,
+        best=best,
+        worst=worst,
+        refused=tuple(Refused(session_id=s, stroke_id=n, why=why) for s, n, why in outcome.refused),
+        by_strokes=by_strokes,
+        scores_sha256=scores_sha256,
+        loops=beside.loops,
+        written=beside.written,
+    ).sealed()
+
+
+def _stats(outcome: Outcome, cells: list[tuple[float, float]]) -> list[Stat]:
+    rows = outcome.rows
+    strata = {key: k for k, key in enumerate(sorted({(row.session, row.cell) for row in rows}))}
+    stratum = np.array([strata[(row.session, row.cell)] for row in rows], np.int64)
+    groups: list[tuple[tuple[float, float] | None, np.ndarray]] = [(None, np.arange(len(rows)))]
+    by_cell: dict[tuple[float, float], list[int]] = {}
+    for k, row in enumerate(rows):
+        by_cell.setdefault(row.cell, []).append(k)
+    groups += [(cell, np.array(by_cell[cell])) for cell in cells]
+    made: list[Stat] = []
+    for cell, at in groups:
+        for m, model in enumerate(outcome.names):
+            for k, (alignment, tone) in enumerate(KEYS):
+                for j, measure in enumerate(MEASURES):
+                    found = summarise(100.0 * outcome.values[at, m, k, j], stratum[at])
+                    if found is None:
+                        continue
+                    made.append(
+                        Stat(
+                            model=model,
+                            alignment=alignment,
+                            tone=tone,
+                            measure=measure,
+                            cell=cell,
+                            n=found.n,
+                            max=_round(found.max),
+                            min=_round(found.min),
+                            avg=_round(found.avg),
+                            avg_interval=_interval(found.avg_interval),
+                            median=_round(found.median),
+                            median_interval=_interval(found.median_interval),
+                        )
+                    )
+    return made
+
+
+def _shown(outcome: Outcome) -> str:
+    present = [name for name in outcome.names if np.isfinite(outcome.values[:, outcome.names.index(name)]).any()]
+    order = (who.FITTED_HELD_OUT, who.FITTED, "ccd-bsmg", "ccd-bsm", *present)
+    return next((name for name in order if name in present), "")
+
+
+def _extremes(outcome: Outcome, model: str) -> tuple[tuple[Extreme, ...], tuple[Extreme, ...]]:
+    if not model:
+        return (), ()
+    scores = outcome.values[:, outcome.names.index(model), KEYS.index(JUDGED)]
+    known = np.flatnonzero(np.isfinite(scores[:, 0]))
+    order = known[np.argsort(scores[known, 0], kind="stable")]
+
+    def extreme(k: int) -> Extreme:
+        row: Row = outcome.rows[k]
+        return Extreme(
+            session_id=outcome.sessions[row.session].header.session_id,
+            stroke_id=row.press.stroke_id,
+            height_mm=row.press.height_mm,
+            tilt_deg=row.press.tilt_deg,
+            model=model,
+            csim=_round(100.0 * float(scores[k, 0])),
+            ssim=_round(100.0 * float(scores[k, 1])),
+        )
+
+    count = min(EXTREMES, max(1, len(order) // 2))
+    return tuple(extreme(int(k)) for k in order[::-1][:count]), tuple(extreme(int(k)) for k in order[:count])
+
+
+def _rivals(outcome: Outcome) -> tuple[Rival, ...]:
+    files = {one.path: one.sha256 for one in outcome.options.generators}
+    by_name = {one.name: one for made in outcome.contenders for one in made}
+    bases: dict[str, list[str]] = {}
+    for made in outcome.contenders:
+        for one in made:
+            bases.setdefault(one.name, [])
+            if one.basis not in bases[one.name]:
+                bases[one.name].append(one.basis)
+    rivals = [
+        Rival(
+            name=name,
+            label=by_name[name].label,
+            definition=by_name[name].definition,
+            basis="; ".join(bases[name]),
+            sha256=files[file] if (file := by_name[name].file) is not None else "",
+        )
+        for name in outcome.names
+        if name in by_name
+    ]
+    for name, (label, definition) in PRESSES.items():
+        if np.isfinite(outcome.values[:, outcome.names.index(name)]).any():
+            rivals.append(Rival(name=name, label=label, definition=definition, basis="captured presses", sha256=""))
+    return tuple(rivals)
+
+
+def _session(outcome: Outcome, number: int, one: Opened) -> Session:
+    header, calibration = one.header, one.calibration
+    mine = [row for row in outcome.rows if row.session == number]
+    length, width = _ratios(one, mine)
+    scale = None
+    if calibration is not None:
+        scale = Interval(low=calibration.mm_per_px_low, high=calibration.mm_per_px_high)
+    size = ""
+    if header.brush_radius_mm is not None and header.brush_length_mm is not None:
+        size = f"R = {header.brush_radius_mm:g} mm, L = {header.brush_length_mm:g} mm"
+    return Session(
+        session_id=header.session_id,
+        source=header.source,
+        recording=one.recording.path.name,
+        recording_sha256=one.sha256,
+        recorded_with=header.software,
+        robot=f"{header.robot} {header.robot_firmware}".strip(),
+        camera=f"{header.camera} {header.lens}".strip(),
+        brush=", ".join(part for part in (header.brush, size) if part),
+        ink=header.ink,
+        paper=header.paper,
+        protocol=header.protocol,
+        origin=header.origin,
+        licence=header.licence,
+        strokes=one.count,
+        compared=len(mine),
+        cut=tuple(row.press.stroke_id for row in mine if row.press.cut),
+        calibration=calibration.named if calibration is not None else "",
+        mm_per_px=calibration.mm_per_px if calibration is not None else None,
+        mm_per_px_interval=scale,
+        board_rms_px=calibration.rms_px if calibration is not None else None,
+        fit=one.fit.digest if one.fit is not None else "",
+        length_ratio=length,
+        width_ratio=width,
+        collected=_collected(one),
+    )
+
+
+def _collected(one: Opened) -> Collected | None:
+    folder = one.recording.path.parent
+    history = history_of(folder)
+    if history is None:
+        return None
+    return Collected(
+        planned=details(folder).planned,
+        photographed=history.photographed,
+        pressed_again=history.pressed_again,
+        left_out=history.left_out,
+        touches=tuple(f"{found.method} {found.touch_z_mm:.2f} mm" for found in history.found),
+        moved_mm=_round(history.moved_mm),
+    )
+
+
+def _ratios(one: Opened, mine: list[Row]) -> tuple[float | None, float | None]:
+    """How much longer and wider whole marks are than CCD-BSM draws them for a brush of this size."""
+    brush = brush_of(one.header)
+    drawn: dict[tuple[float, float], tuple[float, float]] = {}
+    found: list[tuple[float, float]] = []
+    for row in mine:
+        measured = row.press.measured
+        if measured is None or row.press.cut:
+            continue
+        if row.cell not in drawn:
+            try:
+                mark = ccdbsm(brush, *row.cell)
+            except DomainError:
+                continue
+            drawn[row.cell] = float(mark.length_mm[0]), float(mark.width_mm[0])
+        length, width = drawn[row.cell]
+        found.append((measured.length_mm / length, measured.breadth_mm / width))
+    if not found:
+        return None, None
+    mean = np.mean(found, axis=0)
+    return _round(float(mean[0])), _round(float(mean[1]))
+
+
+def _interval(ends: tuple[float, float] | None) -> Interval | None:
+    return None if ends is None else Interval(low=_round(ends[0]), high=_round(ends[1]))
+
+
+def _round(value: float) -> float:
+    """Six digits behind the point: more would be another machine's rounding."""
+    return round(value, 6)

@@ -1,0 +1,1 @@
+"""Characters: planned, compared with what was written, learned from."""

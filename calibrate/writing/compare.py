@@ -1,0 +1,118 @@
+"""A session of written characters and the plan that it was drawn from, from the recording to the scores."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from calibrate.artefact import Calibration
+from calibrate.compare.field import Image
+from calibrate.current_calibration import calibration_of
+from calibrate.errors import CalibrationError, CaptureRefused
+from calibrate.writing.images import Ink, captured, drawn
+from calibrate.writing.record import FigureRecord, PlanRecord, points_digest
+from calibrate.writing.scores import Character, WrittenScore, score_character
+from calibrate.writing.table import Table3Row, table_3
+from sessions.errors import SessionDamaged
+from sessions.reader import Recording
+from sessions.recording.schemas import Header
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """What came out."""
+
+    header: Header
+    recording: Path
+    recording_sha256: str
+    calibration: Calibration
+    plan: PlanRecord
+    characters: list[Character]
+    scores: list[WrittenScore]
+    table: list[Table3Row]
+    refused: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    """(stroke, why), never dropped in silence."""
+    software: str = ""
+
+
+def compare_written(session: Path, plan: PlanRecord, references: dict[str, tuple[str, Image]]) -> Written:
+    """Compare a session with its plan. `references` (character -> name, image) stand for the plan's own.
+
+    Raises `CalibrationError` where the two do not belong together or nothing can be compared.
+    """
+    recording = Recording(session)
+    digest = recording.sha256
+    first = next(recording.stroke_records(), None)
+    calibration = None if first is None else calibration_of(recording, first, digest, None)
+    if first is None or calibration is None:
+        raise CalibrationError(str(recording.path), "holds no characters that the arm wrote")
+    _check_points(recording, plan)
+    if unknown := sorted(set(references) - {figure.name for figure in plan.figures}):
+        raise CalibrationError("--reference", f"{unknown[0]!r} is not in the plan")
+    found, cut, refused = _captured(recording, plan, calibration)
+    characters = [_character(figure, found, cut, references) for figure in plan.figures if figure.name in found]
+    if not characters:
+        why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
+        raise CalibrationError(str(recording.path), f"not one character can be compared{why}")
+    scores = [score for one in characters for score in score_character(one)]
+    header = recording.header
+    table = table_3(
+        scores,
+        source=header.source,
+        session_id=header.session_id,
+        model=plan.model,
+        references={one.name: one.reference_name for one in characters},
+    )
+    software = f"brushloop {version('brushloop')}"
+    return Written(header, recording.path, digest, calibration, plan, characters, scores, table, refused, software)
+
+
+def _captured(
+    recording: Recording, plan: PlanRecord, calibration: Calibration
+) -> tuple[dict[str, dict[str, Ink]], set[str], list[tuple[str, str]]]:
+    """(character -> stroke -> ink, strokes that are cut, refused)."""
+    found: dict[str, dict[str, Ink]] = {}
+    cut: set[str] = set()
+    refused: list[tuple[str, str]] = []
+    for capture in recording.captures():
+        stroke_id = capture.stroke.stroke_id
+        name = stroke_id.rsplit("-r", 1)[0]
+        if capture.stroke.kind != "drag" or plan.figure(name) is None:
+            refused.append((stroke_id, "is no character of this plan"))
+            continue
+        try:
+            ink, is_cut = captured(capture, calibration)
+        except (CaptureRefused, SessionDamaged) as error:
+            refused.append((stroke_id, error.what))
+            continue
+        found.setdefault(name, {})[stroke_id] = ink
+        cut |= {stroke_id} if is_cut else set()
+    return found, cut, refused
+
+
+def _character(
+    figure: FigureRecord, found: dict[str, dict[str, Ink]], cut: set[str], references: dict[str, tuple[str, Image]]
+) -> Character:
+    name, image = references.get(figure.name) or (figure.source, figure.wanted())
+    writings = found[figure.name]
+    edge = tuple(stroke_id for stroke_id in writings if stroke_id in cut)
+    return Character(figure.name, name, drawn(image), drawn(figure.simulated()), writings, edge)
+
+
+def _check_points(recording: Recording, plan: PlanRecord) -> None:
+    """The session's protocol must have drawn what the plan has planned."""
+    try:
+        told: Any = json.loads(recording.header.protocol)
+        points = {f["name"]: points_digest([s["points"] for s in f["strokes"]]) for f in told["figures"]}
+        cell_mm = [float(side) for side in told["cell_mm"]]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise CalibrationError(str(recording.path), "was not collected by a `write` protocol") from None
+    if cell_mm != [plan.cell_mm, plan.cell_mm]:
+        raise CalibrationError(str(recording.path), f"has cells of {cell_mm} mm, the plan {plan.cell_mm:g} mm")
+    for name, digest in points.items():
+        figure = plan.figure(name)
+        if figure is None or figure.points_sha256 != digest:
+            raise CalibrationError(str(recording.path), f"{name!r} was not drawn from this plan")

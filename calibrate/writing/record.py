@@ -1,0 +1,155 @@
+"""`plan.json`: what a plan of characters wants and what the model makes of it, for whoever compares with ink later."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from calibrate.compare.field import SIZE_PX, Image
+from calibrate.errors import CalibrationError, invalid
+from calibrate.files import read_bounded
+from sessions.errors import SessionDamaged
+from sessions.recording.messages import decode_gray, encode_png
+
+FILE = "plan.json"
+MAX_PLAN_BYTES = 4 * 1024 * 1024
+Text = Annotated[str, Field(max_length=64 * 1024)]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Points = tuple[tuple[tuple[Number, Number, Number, Number, Number], ...], ...]
+"""[stroke][point] of x, y, height, tilt, heading, as in the protocol."""
+Floats = NDArray[np.float64]
+
+
+class PlannedBy(BaseModel):
+    """The model and the brush's reach that a plan was made with."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    model: str
+    """Name of the stroke model."""
+    radius_mm: Number
+    length_mm: Number
+    lam: Number | None
+    """None is pi."""
+    height_range_mm: tuple[Number, Number]
+    tilt_range_deg: tuple[Number, Number]
+    turn_deg_mm: Number
+    speed_mm_s: Number
+    drag_fit: Annotated[str, Field(max_length=64)] = ""
+    """Digest of the drag fit that images were drawn with; empty: presses laid over each other."""
+
+
+class FigureRecord(BaseModel):
+    """One planned figure."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: Annotated[str, Field(min_length=1, max_length=60)]
+    source: Text
+    """Font or file that the wanted image comes from."""
+    commanded: Points
+    """What the arm is told."""
+    intended: Points
+    """What the ink is meant to look like the press marks of; differs from `commanded` once a plan has learned from ink,
+    point by point."""
+    wanted_png: Text
+    """128 x 128 gray in base64, ink black, row 0 at the cell's far edge."""
+    simulated_png: Text
+
+    @property
+    def points_sha256(self) -> str:
+        """Of the commanded points: a session drawn from others is another plan's."""
+        return points_digest(self.commanded)
+
+    def wanted(self) -> Image:
+        """(128, 128) ink from 0 to 1. Raises `CalibrationError`."""
+        return _decoded(self.wanted_png, f"{self.name}: wanted_png")
+
+    def simulated(self) -> Image:
+        """(128, 128) ink from 0 to 1 as the planning model draws it. Raises `CalibrationError`."""
+        return _decoded(self.simulated_png, f"{self.name}: simulated_png")
+
+
+class PlanRecord(BaseModel):
+    """A plan."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    model: str
+    """Label of the stroke model that planned and drew."""
+    planned_by: PlannedBy
+    cell_mm: float
+    software: str
+    figures: Annotated[tuple[FigureRecord, ...], Field(min_length=1, max_length=1000)]
+
+    def figure(self, name: str) -> FigureRecord | None:
+        """The figure of that name."""
+        return next((figure for figure in self.figures if figure.name == name), None)
+
+
+def figure_record(
+    name: str,
+    source: str,
+    commanded: Sequence[Floats],
+    intended: Sequence[Floats],
+    *,
+    wanted: Image,
+    simulated: Image,
+) -> FigureRecord:
+    """Of a planned figure: trajectories (N, 5), images (128, 128)."""
+    return FigureRecord(
+        name=name,
+        source=source,
+        commanded=_points(commanded),
+        intended=_points(intended),
+        wanted_png=_encoded(wanted),
+        simulated_png=_encoded(simulated),
+    )
+
+
+def arrays(points: Points) -> list[Floats]:
+    """Trajectories (N, 5)."""
+    return [np.array(stroke, np.float64) for stroke in points]
+
+
+def load_plan(path: Path) -> PlanRecord:
+    """Read plan.json, or the one in a plan's folder. Raises `CalibrationError`."""
+    path = path / FILE if path.is_dir() else path
+    try:
+        return PlanRecord.model_validate_json(read_bounded(path, MAX_PLAN_BYTES))
+    except ValidationError as error:
+        raise invalid(str(path), error) from None
+
+
+def points_digest(strokes: Sequence[Any]) -> str:
+    """sha256 of trajectories [stroke][point][x, y, height, tilt, heading], to the micrometre of the protocol."""
+    rounded = [[[round(float(value), 3) + 0.0 for value in point] for point in stroke] for stroke in strokes]
+    return hashlib.sha256(json.dumps(rounded, separators=(",", ":")).encode()).hexdigest()
+
+
+def _points(strokes: Sequence[Floats]) -> Points:
+    rounded = (np.round(stroke, 3).tolist() for stroke in strokes)
+    return tuple(tuple((x, y, height, tilt, heading) for x, y, height, tilt, heading in stroke) for stroke in rounded)
+
+
+def _encoded(ink: Image) -> str:
+    return base64.b64encode(encode_png(np.rint(255.0 * (1.0 - ink)).astype(np.uint8))).decode()
+
+
+def _decoded(text: str, where: str) -> Image:
+    try:
+        gray = decode_gray(base64.b64decode(text, validate=True), where)
+    except (binascii.Error, ValueError, SessionDamaged):
+        raise CalibrationError(FILE, f"{where} is no picture") from None
+    if gray.shape != (SIZE_PX, SIZE_PX):
+        raise CalibrationError(FILE, f"{where} is {gray.shape[1]} x {gray.shape[0]} px, not {SIZE_PX} x {SIZE_PX}")
+    return (1.0 - gray.astype(np.float32) / 255.0).astype(np.float32)

@@ -1,1 +1,0 @@
-"""Characters that the arm has written, beside what they should look like."""

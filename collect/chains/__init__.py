@@ -1,0 +1,1 @@
+"""Commands that run other brushloop commands: the demo, the loop, and writing."""

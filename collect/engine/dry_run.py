@@ -1,0 +1,41 @@
+"""A dry run: the same moves, lifted so high that the brush meets neither paper nor ink."""
+
+from __future__ import annotations
+
+from collect.errors import ConfigError
+from collect.protocols.config import ProtocolConfig
+from collect.protocols.plans import planned
+from collect.rig.config import TRAVEL_CLEARANCE_MM, InkConfig, RigConfig
+
+CLEAR_MM = 5.0
+"""Least distance of the tip from the paper at the deepest point."""
+
+
+def lifted(rig: RigConfig, protocol: ProtocolConfig, by_mm: float) -> RigConfig:
+    """The rig with paper and well `by_mm` higher, and without anything that would touch, dose or judge.
+
+    Raises `ConfigError`, with the allowed range, where the brush would still meet the paper or travel would not clear.
+    """
+    deepest_mm = max((stroke.height_mm for stroke in planned(protocol)), default=0.0)
+    low_mm = deepest_mm + CLEAR_MM
+    high_mm = rig.motion.safe_z_mm - rig.paper.touch_z_mm - TRAVEL_CLEARANCE_MM
+    if not low_mm <= by_mm <= high_mm:
+        raise ConfigError(
+            "--dry-run",
+            "",
+            f"{by_mm:g} mm is outside [{low_mm:g}, {high_mm:g}] mm: above the deepest press, below travel",
+        )
+    return rig.checking_itself(False).model_copy(
+        update={
+            "paper": rig.paper.model_copy(update={"touch_z_mm": rig.paper.touch_z_mm + by_mm}),
+            "ink": _lifted_ink(rig.ink, by_mm),
+            "touch": rig.touch.model_copy(update={"method": "taught", "points_mm": []}),
+            "quality": rig.quality.model_copy(update={"enabled": False}),
+        }
+    )
+
+
+def _lifted_ink(ink: InkConfig, by_mm: float) -> InkConfig:
+    wipe = None if ink.wipe is None else ink.wipe.model_copy(update={"z_mm": ink.wipe.z_mm + by_mm})
+    wash = None if ink.wash is None else ink.wash.model_copy(update={"dip_z_mm": ink.wash.dip_z_mm + by_mm})
+    return ink.model_copy(update={"dip_z_mm": ink.dip_z_mm + by_mm, "wipe": wipe, "wash": wash, "device": None})

@@ -1,0 +1,270 @@
+"""The engine: interprets a protocol on a rig, one step at a time, so that a stroke is pressed exactly once.
+
+Resume is memoised replay: the generator runs from the top, and a step that the journal says is done gets its stored
+result while nothing moves. The engine runs in its own thread with its own event loop; screens see `Snapshot`s.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import contextlib
+import math
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from typing import ClassVar
+
+from collect.engine.arming import arm
+from collect.engine.control import RunControl
+from collect.engine.live import LiveView, watching
+from collect.engine.perform import Performer
+from collect.engine.preview import previewing
+from collect.engine.progress import Progress
+from collect.engine.run import Run
+from collect.engine.set_up import board_first, listed
+from collect.engine.set_up_steps import SetUpStep
+from collect.engine.snapshot import Snapshot
+from collect.engine.states import FINAL, State
+from collect.engine.steps.waiting import uninterrupted
+from collect.engine.telemetry import NotedRobot, Telemetry
+from collect.errors import CollectAborted, Parked, rest_is_unknown, told
+from collect.operator.questions import Asker
+from collect.operator.requests import Wish, Wishes
+from collect.planning.walk import layout_of, sheet_of, steps_on
+from collect.protocols.config import ProtocolConfig
+from collect.rig.config import RigConfig
+from collect.rig.devices import Rig, connected
+from drivers.clock import Clock
+from drivers.errors import DeviceError, NotConnected, Stale
+from sessions.store import SessionStore
+
+PARKED_MM = 2.0
+"""How near to the park position counts as parked."""
+
+SILENT_S = 1.0
+"""So long without a pose is told: the arm, or the way to it, is dead."""
+UNCHECKED = (
+    "no self-check: it is switched off in rig.toml, or this session was begun without it. Nothing tells whether arm, "
+    "camera and configuration agree"
+)
+
+OpenStore = Callable[[Rig], SessionStore]
+"""Makes or resumes the session, once the devices have said who they are and before anything is powered."""
+
+
+class Engine:
+    """Runs one session. `start`, then look at `snapshot` until `finished`, then `join`."""
+
+    presses: ClassVar[bool] = True
+    """Whether this is a real run: one without its self-check says so."""
+
+    def __init__(
+        self,
+        rig: RigConfig,
+        protocol: ProtocolConfig,
+        open_store: OpenStore,
+        clock: Clock,
+        *,
+        watched: bool = False,
+        armed: bool = False,
+        live: LiveView | None = None,
+        guided: bool = False,
+        preview: bool = False,
+    ) -> None:
+        """`watched`: a screen can answer. `armed`: the operator has let real hardware move. `live` has been started.
+        `guided`: a person accepts each set-up step. `preview`: snapshots carry what the camera sees."""
+        self._rig_config = rig
+        self._protocol_config = protocol
+        self._open_store = open_store
+        self._progress = Progress(protocol, clock, layout_of(rig, protocol))
+        self._clock = clock
+        self._asker = Asker(watched=watched)
+        self._armed = armed
+        self._live = live
+        self._guided = guided
+        self._preview = preview
+        self._telemetry = Telemetry()
+        self._wishes = Wishes()
+        self._control = RunControl(self._progress.doing)
+        self._task: asyncio.Task[None] | None = None
+        self._stopper: asyncio.Task[None] | None = None
+        self._rig: Rig | None = None
+        self._stop_failure: DeviceError | None = None
+        self._rest_unknown = False
+        self._thread = threading.Thread(target=self._run_thread, name="engine", daemon=True)
+        self._outcome: concurrent.futures.Future[None] = concurrent.futures.Future()
+
+    def start(self) -> None:
+        """Begin in the engine's own thread."""
+        self._thread.start()
+
+    @property
+    def finished(self) -> bool:
+        """True once the run is over, in whatever way."""
+        return self._outcome.done()
+
+    def join(self) -> None:
+        """Wait for the end; raises what ended the run: `CollectAborted`, or a device, step or session error."""
+        try:
+            self._outcome.result()
+        finally:
+            self._thread.join()
+
+    def snapshot(self) -> Snapshot:
+        """The engine now; from any thread."""
+        tip_mm = force_n = None
+        no_pose_s, state = 0.0, self._control.state
+        if (rig := self._rig) is not None:
+            try:
+                tip_mm = self._telemetry.tip_mm = rig.robot.latest().pose.position_mm
+            except Stale as stale:
+                no_pose_s = stale.age_ms / 1e3
+            except DeviceError:
+                pass
+            with contextlib.suppress(DeviceError):
+                force_n = math.hypot(*rig.force.latest_n()) if rig.force is not None else None
+        if force_n is not None:
+            self._telemetry.note_force(force_n, self._clock.now_ns())
+        return replace(
+            self._progress.snapshot(state, tip_mm, force_n, self._asker.prompt),
+            target_mm=self._telemetry.target_mm,
+            parked=self._parked(),
+            rest_unknown=self._rest_unknown,
+            trace_n=self._telemetry.trace_n(),
+            picture=self._telemetry.picture,
+            wishes=self._wishes.open,
+            set_up=self._set_up(),
+            no_pose_s=no_pose_s if no_pose_s >= SILENT_S and state not in FINAL else None,
+        )
+
+    def _parked(self) -> bool:
+        tip_mm, motion = self._telemetry.tip_mm, self._rig_config.motion
+        return not self._rest_unknown and tip_mm is not None and math.dist(tip_mm, motion.park_mm) < PARKED_MM
+
+    def _set_up(self) -> tuple[SetUpStep, ...]:
+        if not self._guided or self._progress.strokes_begun:
+            return ()
+        return listed(self._rig_config, self._progress.found, self._progress.set_up)
+
+    def wish(self, wish: Wish) -> None:
+        """Ask for something, or take it back; granted at the next moment that allows it. From any thread."""
+        self._wishes.toggle(wish)
+
+    def park(self) -> None:
+        """End the run after this step, the arm lifted and parked; nobody is asked any more. From any thread."""
+        self._control.park()
+        self._asker.abandon()
+
+    def answer(self, number: int, key: str) -> bool:
+        """Answer the prompt of that number; False where it is over. From any thread."""
+        return self._asker.answer(number, key)
+
+    def pause(self) -> None:
+        """Pause before the next step."""
+        self._control.pause()
+
+    def resume(self) -> None:
+        """Go on after a pause, or forget one that has not begun."""
+        self._control.resume()
+
+    def stop(self) -> None:
+        """Stop the arm now and end the run; from any thread, in any state, any number of times."""
+        self._control.stop(self._stop_now)
+
+    def _stop_now(self) -> None:
+        if self._stopper is None or self._stopper.done():
+            self._stopper = asyncio.create_task(self._stop_arm(), name="stop")
+        # Once all is collected the arm is parked; the merge ends by itself and loses nothing.
+        if self._task is not None and not self._control.closing and not self._task.cancelling():
+            self._task.cancel()
+
+    async def _stop_arm(self) -> None:
+        # Its own socket: it neither waits for the session's task nor for what that waits for.
+        if self._rig is not None:
+            try:
+                await self._rig.robot.stop()
+            except DeviceError as error:
+                self._stop_failure = error
+                self._progress.log(told(error), warning=True)
+
+    def _run_thread(self) -> None:
+        try:
+            asyncio.run(self._main())
+        except BaseException as error:
+            self._outcome.set_exception(error)
+        else:
+            self._outcome.set_result(None)
+
+    async def _main(self) -> None:
+        self._task = asyncio.create_task(self._session(), name="session")
+        self._control.entered(self._task)
+        try:
+            await self._task
+        except asyncio.CancelledError:
+            await self._stopped()
+        except Parked as error:
+            self._end(State.STOPPED, told(error))
+            raise
+        except Exception as error:
+            self._rest_unknown = rest_is_unknown(error)
+            self._end(State.FAILED, told(error))
+            raise
+        finally:
+            if self._stopper is not None:
+                await self._stopper
+            self._control.left()
+
+    async def _stopped(self) -> None:
+        if self._stopper is not None:
+            await self._stopper
+        if self._stop_failure is not None and not isinstance(self._stop_failure, NotConnected):
+            # Never told as stopped: the arm was not seen at rest.
+            self._rest_unknown = True
+            self._end(State.FAILED, told(self._stop_failure))
+            raise self._stop_failure
+        self._end(State.STOPPED, "stopped by the operator")
+        raise CollectAborted("stopped; the same command goes on from here")
+
+    async def _session(self) -> None:
+        self._progress.doing("connect")
+        async with connected(self._rig_config, self._clock, self._progress.log) as rig:
+            rig = replace(rig, robot=NotedRobot(rig.robot, self._telemetry))
+            self._rig = rig
+            await arm(rig, self._asker, armed=self._armed)
+            store = self._open_store(rig)
+            try:
+                self._progress.opened(store, sheet_of(self._rig_config, self._protocol_config))
+                if (self._armed or not rig.simulated) and self.presses and not self._rig_config.self_check.enabled:
+                    self._progress.log(UNCHECKED, warning=True)
+                async with (
+                    watching(self._live, rig.camera, self._progress.log),
+                    previewing(self._telemetry, rig.camera, wanted=self._preview),
+                ):
+                    await self._protocol(rig, store)
+                self._control.begin_closing()
+                self._progress.doing("merge and verify")
+                final = await uninterrupted(store.close)
+                self._progress.closed(f"closed: {final}")
+            finally:
+                store.release()
+        self._control.end(State.DONE)
+
+    async def _protocol(self, rig: Rig, store: SessionStore) -> None:
+        performer = Performer(
+            rig,
+            store,
+            self._protocol_config,
+            self._progress,
+            self._asker,
+            self._live,
+            telemetry=self._telemetry,
+            wishes=self._wishes,
+        )
+        run = Run(rig, store, performer, self._progress, self._asker, self._control, self._wishes, self._guided)
+        steps = steps_on(self._rig_config, self._protocol_config)
+        await run.protocol(board_first(steps) if self._guided else steps)
+
+    def _end(self, state: State, why: str) -> None:
+        self._control.end(state)
+        self._progress.ended(why)

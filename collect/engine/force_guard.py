@@ -1,0 +1,93 @@
+"""Watches the force while the brush is down, and stops the arm above the ceiling."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable, Coroutine, Generator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+from collect.errors import ForceTooHigh
+from collect.rig.devices import Rig
+from drivers.force.samples import ForceSample
+
+CHECK_S = 0.02
+"""How often a silent sensor is looked for: silence must not pass for no force."""
+
+_R = TypeVar("_R")
+
+
+class ForceGuard:
+    """One force sensor, one ceiling; without a sensor it lets everything pass."""
+
+    def __init__(self, rig: Rig, on_sample: Callable[[ForceSample], None] | None = None) -> None:
+        self._rig = rig
+        self._listeners = [] if on_sample is None else [on_sample]
+        self._over: asyncio.Event = asyncio.Event()
+        self._guarding = False
+        self.peak_n = 0.0
+        """The largest force since `guarded` began."""
+
+    def listen(self) -> None:
+        """Take every sample from now on."""
+        if self._rig.force is not None:
+            self._rig.force.listen(self._sample)
+
+    @contextmanager
+    def also(self, on_sample: Callable[[ForceSample], None]) -> Generator[None]:
+        """Hand every sample to one more listener, within the block."""
+        self._listeners.append(on_sample)
+        try:
+            yield
+        finally:
+            self._listeners.remove(on_sample)
+
+    def deafen(self) -> None:
+        """Take none any more."""
+        if self._rig.force is not None:
+            self._rig.force.listen(None)
+
+    async def guarded(self, procedure: Coroutine[Any, Any, _R]) -> _R:
+        """Do the procedure under the ceiling.
+
+        Raises `ForceTooHigh` once the arm was stopped, and `Stale` or `ConnectionLost` where the sensor went silent:
+        the arm is stopped then too.
+        """
+        if self._rig.force is None or self._guarding:
+            return await procedure
+        self._over.clear()
+        self.peak_n, self._guarding = 0.0, True
+        work, watch = asyncio.ensure_future(procedure), asyncio.create_task(self._watch(), name="force guard")
+        try:
+            await asyncio.wait((work, watch), return_when=asyncio.FIRST_COMPLETED)
+            if watch.done():
+                # The arm first; what the procedure makes of being stopped does not matter any more.
+                await self._rig.robot.stop()
+                watch.result()
+            return await work
+        finally:
+            self._guarding = False
+            for task in (work, watch):
+                task.cancel()
+            await asyncio.gather(work, watch, return_exceptions=True)
+
+    async def _watch(self) -> None:
+        assert self._rig.force is not None
+        assert self._rig.config.force is not None
+        while True:
+            self._rig.force.latest_n()
+            try:
+                async with asyncio.timeout(CHECK_S):
+                    await self._over.wait()
+            except TimeoutError:
+                continue
+            raise ForceTooHigh(self.peak_n, self._rig.config.force.max_n)
+
+    def _sample(self, sample: ForceSample) -> None:
+        if self._guarding and self._rig.config.force is not None:
+            self.peak_n = max(self.peak_n, math.hypot(*sample.force_n))
+            if self.peak_n > self._rig.config.force.max_n:
+                self._over.set()
+        for listener in self._listeners:
+            listener(sample)

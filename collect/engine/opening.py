@@ -1,0 +1,213 @@
+"""Which session a command works on: resume the open one that it was started with, or make a new one."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+
+from collect.engine.changed import changed
+from collect.engine.dry_run import lifted
+from collect.errors import ConfigError
+from collect.protocols.config import ProtocolConfig
+from collect.protocols.loading import load_protocol
+from collect.protocols.steps import StepKind
+from collect.rig.config import RigConfig, load_rig
+from collect.rig.devices import Rig
+from drivers.clock import Clock
+from drivers.samples import Identity
+from sessions.difference import differences
+from sessions.disk import unwritable
+from sessions.errors import SessionError
+from sessions.journal.journal import JOURNAL_NAME, replay
+from sessions.recording.schemas import Header, Source
+from sessions.store import SessionStore, Snapshots, next_session_id, open_sessions
+
+RIG_EFFECTIVE = "rig.effective.json"
+COMPARED = (RIG_EFFECTIVE, "protocol.effective.json")
+MACHINE_NAMES = {
+    "robot": {"host", "port", "rtde_port"},
+    "camera": {"source"},
+    "force": {"interface", "channel", "host", "port"},
+    "ink": {"device": {"port"}},
+}
+"""What may differ between two runs of one session: where the devices are, not what they do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """What the command line said about the session, with its configuration as it was read once."""
+
+    root: Path
+    rig_path: Path
+    protocol_path: Path
+    rig: RigConfig
+    protocol: ProtocolConfig
+    snapshots: Snapshots
+    new: bool = False
+    """Start a new session although another one is open."""
+    sheet: int | None = None
+    """The number of the sheet that is in, counted from 1: the operator's word for it."""
+    armed: bool = False
+    """The operator has looked at the cell: real hardware may move."""
+    self_check_left_out: bool = False
+    """rig.toml does not say whether there is a self-check: `armed` does, and for an open session how it was begun."""
+
+    @classmethod
+    def load(
+        cls,
+        root: Path,
+        rig_path: Path,
+        protocol_path: Path,
+        *,
+        new: bool = False,
+        sheet: int | None = None,
+        armed: bool = False,
+        dry_run_mm: float | None = None,
+    ) -> Opening:
+        """Read both files once; a dry run is lifted by so much. Raises `ConfigError`."""
+        rig, protocol = load_rig(rig_path), load_protocol(protocol_path)
+        left_out, rig = rig.self_check.enabled is None, rig.settled(armed)
+        if dry_run_mm is not None:
+            rig = lifted(rig, protocol, dry_run_mm)
+        snapshots = {
+            "rig.toml": rig_path.read_text(encoding="utf-8"),
+            "protocol.toml": protocol_path.read_text(encoding="utf-8"),
+            # What really holds, the environment included: a touch height from there is part of the record.
+            RIG_EFFECTIVE: _effective(rig),
+            # With the rows of the files that it names.
+            "protocol.effective.json": protocol.model_dump_json(indent=2) + "\n",
+        }
+        return cls(root, rig_path, protocol_path, rig, protocol, snapshots, new, sheet, armed, left_out)
+
+    def as_begun(self, folder: Path) -> Opening:
+        """The same for going on with that session: where rig.toml leaves the self-check out, as it was begun."""
+        if not self.self_check_left_out:
+            return self
+        try:
+            begun = json.loads((folder / RIG_EFFECTIVE).read_text(encoding="utf-8"))["self_check"]["enabled"]
+        except (OSError, ValueError, LookupError, TypeError, RecursionError):
+            return self
+        rig = self.rig.checking_itself(begun is True)
+        return replace(self, rig=rig, snapshots={**self.snapshots, RIG_EFFECTIVE: _effective(rig)})
+
+
+def _effective(rig: RigConfig) -> str:
+    return rig.model_dump_json(indent=2, exclude=MACHINE_NAMES) + "\n"
+
+
+def find_resumable(opening: Opening) -> Path | None:
+    """The open session to go on with, None for a new one.
+
+    Raises `ConfigError` where the configuration changed, or where a new session might press on a used sheet.
+    """
+    if not opening.root.is_dir():
+        return None
+    refusals: list[ConfigError] = []
+    for folder in reversed(open_sessions(opening.root)) if not opening.new else ():
+        found = differences(folder, {name: opening.as_begun(folder).snapshots[name] for name in COMPARED})
+        if not found:
+            return folder
+        given = {"rig.toml": opening.rig_path, "protocol.toml": opening.protocol_path}
+        refusals.append(changed(folder, found, given, {name: opening.snapshots[name] for name in given}))
+    if refusals:
+        raise refusals[0]
+    if opening.sheet is None and any(map(_has_pressed, opening.root.glob(f"*/{JOURNAL_NAME}"))):
+        raise ConfigError(
+            opening.root,
+            "",
+            "holds earlier sessions, and a new one would press on whatever sheet is in. "
+            "Put a fresh sheet in, then confirm it with --sheet 1",
+        )
+    if opening.sheet not in (None, 1):
+        raise ConfigError("--sheet", "", f"{opening.sheet}: a new session begins with sheet 1")
+    return None
+
+
+def check_writable(folder: Path) -> None:
+    """Raise `ConfigError` unless sessions can be written there, or made; before anything is connected."""
+    if (found := unwritable(folder)) is not None:
+        raise ConfigError(found[0], "", found[1])
+
+
+def _has_pressed(journal: Path) -> bool:
+    try:
+        return bool(replay(journal).used_cells)
+    except SessionError:
+        return True  # nobody knows; ask
+
+
+def put_in_sheet(store: SessionStore, sheet: int | None) -> None:
+    """Take the operator's word for the sheet that is in. The same word twice changes nothing.
+
+    Raises `ConfigError` for a number that cannot be, or while a press still has to be photographed.
+    """
+    now = store.state.sheet + 1
+    if sheet is None or sheet == now:
+        return
+    if sheet != now + 1:
+        raise ConfigError("--sheet", "", f"{sheet}: sheet {now} is in use, so only {now} or {now + 1} can be in")
+    results = [(line["kind"], line["result"]) for line in store.state.segments]
+    pressed = {r["stroke_id"] for kind, r in results if kind == StepKind.PRESS}
+    waiting = sorted(pressed - {r["stroke_id"] for kind, r in results if kind == StepKind.CAPTURE})
+    if waiting:
+        raise ConfigError(
+            "--sheet",
+            "",
+            f"{sheet}: {', '.join(waiting)} is pressed on sheet {now} but not photographed. "
+            f"Put sheet {now} back and run the same command without --sheet",
+        )
+    store.fresh_sheet()
+
+
+def open_store(opening: Opening, resume: Path | None, rig: Rig, clock: Clock) -> SessionStore:
+    """Make or resume the session. Raises `ConfigError` for another robot than before."""
+    header = _header(opening, rig)
+    if resume is None:
+        session_id = next_session_id(opening.root, opening.protocol.kind, dt.date.today())
+        header = header.model_copy(update={"session_id": session_id})
+        return SessionStore.create(opening.root / session_id, header, opening.snapshots, clock.now_ns)
+    store = SessionStore(resume, None, clock.now_ns)
+    try:
+        # Before anything moves: a damaged step would otherwise show only when all is collected.
+        store.verify()
+        if (store.header.source, store.header.robot) != (header.source, header.robot):
+            raise ConfigError(
+                opening.rig_path,
+                "robot",
+                f"session {resume.name} was begun on {store.header.robot} ({store.header.source}), "
+                f"but {header.robot} ({header.source}) answers",
+            )
+        put_in_sheet(store, opening.sheet)
+    except BaseException:
+        store.release()
+        raise
+    return store
+
+
+def _header(opening: Opening, rig: Rig) -> Header:
+    config, protocol = opening.rig, opening.protocol
+    return Header(
+        session_id="",
+        source=Source.LOOPBACK if rig.simulated else Source.REAL,
+        software=f"brushloop {version('brushloop')}",
+        robot=rig.robot_identity.model,
+        robot_firmware=rig.robot_identity.firmware,
+        camera=rig.camera_identity.model,
+        lens=config.camera.lens,
+        brush=config.brush.name,
+        brush_radius_mm=config.brush.radius_mm,
+        brush_length_mm=config.brush.length_mm,
+        ink=config.ink.name,
+        ink_device=_who(rig.ink_identity),
+        force_sensor=_who(rig.force_identity),
+        paper=config.paper.name,
+        protocol=protocol.model_dump_json(),
+        origin=f"{config.name}, {opening.rig_path.name}",
+    )
+
+
+def _who(identity: Identity | None) -> str:
+    return "" if identity is None else " ".join(part for part in (identity.model, identity.firmware) if part)

@@ -1,1 +1,0 @@
-"""The loop closed: recover presses from their images, press them again, compare."""

@@ -1,0 +1,1 @@
+"""Questions to the operator, and what the operator asks of a run."""

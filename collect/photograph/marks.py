@@ -1,0 +1,62 @@
+"""Marks that came between two photographs, anywhere in view, as places of the paper frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.board.scale import Floats, apply, local_scale
+from collect.photograph.ink import DARK_SHARE, Gray
+
+DARKER = 0.2
+"""Share of the paper's brightness that a pixel must have lost to belong to a mark."""
+JOIN_MM = 1.5
+"""Parts of a mark that lie closer are one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """New ink: its centre of darkness in the paper frame, and mm2 of black."""
+
+    x_mm: float
+    y_mm: float
+    ink_mm2: float
+
+
+def new_marks(before: Gray, after: Gray, image_to_paper: Floats, least_ink_mm2: float) -> list[Mark]:
+    """Every new mark of at least so much ink, the largest first. The camera must not have moved in between."""
+    first, second = before.astype(np.float32), after.astype(np.float32)
+    paper = float(np.quantile(first, 0.9))
+    clean = first > DARK_SHARE * paper
+    if paper < 1.0 or not clean.any():
+        return []
+    light = float(np.median(second[clean] / first[clean]))
+    darker = np.asarray((first - second / max(light, 1e-3)) / np.maximum(first, DARK_SHARE * paper), np.float32)
+    height, width = darker.shape
+    middle = np.array([0.5 * width, 0.5 * height])
+    reach_px = max(1, round(0.5 * JOIN_MM / local_scale(image_to_paper, middle)))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach_px + 1, 2 * reach_px + 1))
+    joined = cv2.dilate((darker > DARKER).astype(np.uint8), kernel)
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(joined, connectivity=8)
+    parts = np.asarray(labels, np.int32)
+    marks = [_mark(darker, parts, label, boxes[label], image_to_paper) for label in range(1, count)]
+    return sorted((m for m in marks if m.ink_mm2 >= least_ink_mm2), key=lambda m: -m.ink_mm2)
+
+
+def _mark(
+    darker: NDArray[np.float32], labels: NDArray[np.int32], label: int, box: cv2.typing.MatLike, image_to_paper: Floats
+) -> Mark:
+    x, y, width, height = (int(v) for v in box[:4])
+    part = (slice(y, y + height), slice(x, x + width))
+    # noise is as often brighter: without clipping, the halo that joining added weighs nothing
+    weights = np.where(labels[part] == label, darker[part], 0.0).astype(np.float64)
+    total = float(weights.sum())
+    if total <= 0.0:
+        return Mark(0.0, 0.0, 0.0)
+    rows, columns = np.mgrid[y : y + height, x : x + width]
+    pixel = np.array([float((columns * weights).sum()), float((rows * weights).sum())]) / total
+    [[x_mm, y_mm]] = apply(image_to_paper, pixel[None])
+    return Mark(float(x_mm), float(y_mm), total * local_scale(image_to_paper, pixel) ** 2)

@@ -1,0 +1,189 @@
+"""`rig.toml`: frozen, complete, refused with one line that names file, field and range.
+
+Any value can be overridden from the environment: `BRUSHLOOP_ROBOT__HOST=192.0.2.7` sets `[robot] host`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, ValidationError, model_validator
+from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, SettingsError
+
+from calibrate.board.scale import BoardSpec
+from collect.errors import ConfigError
+from collect.rig.config_base import Config, Finite, Positive
+from collect.rig.config_devices import CameraConfig, ForceConfig, InkDeviceConfig, RobotConfig
+from collect.rig.config_environment import DELIMITER, PREFIX, overrides, unreadable
+from collect.rig.config_quality import QualityConfig
+from collect.rig.config_touch import SelfCheckConfig, TouchConfig
+from collect.rig.optics import with_optics
+from collect.rig.reading import read_toml, refusal
+
+MAX_CONFIG_BYTES = 1024 * 1024
+TRAVEL_CLEARANCE_MM = 15.0
+"""Least height of travel above the paper: more than a drop at the tip."""
+
+
+class BrushConfig(Config):
+    """The brush that is mounted."""
+
+    name: str
+    radius_mm: Annotated[float, Field(gt=0.0, le=50.0)] = 6.0
+    length_mm: Annotated[float, Field(gt=0.0, le=200.0)] = 48.0
+    max_depth_mm: Annotated[float, Field(gt=0.0, le=100.0)] = 22.0
+    """Deepest press that this brush survives."""
+
+
+class PaperConfig(Config):
+    """The sheet and where it lies. The paper frame is right-handed, z up, origin at the lower left corner."""
+
+    name: str = "Xuan paper"
+    origin_mm: tuple[Finite, Finite]
+    """Lower left corner in the base frame."""
+    yaw_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
+    """From base x to paper x."""
+    touch_z_mm: Finite
+    """Height in the base frame at which the tip of the vertical brush just touches: taught by the operator."""
+    size_mm: tuple[Positive, Positive]
+    cell_mm: tuple[Positive, Positive] = (40.0, 24.0)
+    """Width and height of the patch for one press."""
+    touch_point_mm: tuple[Finite, Finite] = (4.0, 4.0)
+    """Where the taught height is visited at the start of each run, in the paper frame; off every cell's ink."""
+
+
+class WipeConfig(Config):
+    """Wiping off a drop at the rim of the well, after each dip."""
+
+    rim_mm: tuple[Finite, Finite]
+    """Where the tip goes from the middle of the well: past the rim, in the paper frame; off the sheet."""
+    z_mm: Finite
+    """Height of the tip on the way, in the base frame: a little below the rim."""
+
+
+class WashConfig(Config):
+    """A pot of water, for a brush that dries in a long session."""
+
+    pot_mm: tuple[Finite, Finite]
+    """Its centre, in the paper frame; off the sheet."""
+    dip_z_mm: Finite
+    """Height of the tip at the bottom, in the base frame."""
+    every_dips: Annotated[int, Field(ge=1, le=1000)] = 30
+    """Washed before every so many dips into the ink."""
+    strokes: Annotated[int, Field(ge=1, le=20)] = 3
+    """How often down and up."""
+
+
+class InkConfig(Config):
+    """The ink well."""
+
+    name: str = "ink"
+    well_mm: tuple[Finite, Finite]
+    """Centre, in the paper frame."""
+    dip_z_mm: Finite
+    """Height of the tip at the bottom of a dip, in the base frame."""
+    wipe: WipeConfig | None = None
+    wash: WashConfig | None = None
+    device: InkDeviceConfig | None = None
+    """What keeps the well filled; left out, the operator does."""
+
+
+class MotionConfig(Config):
+    """Heights and speeds."""
+
+    safe_z_mm: Finite
+    """Travel height in the base frame."""
+    park_mm: tuple[Finite, Finite, Finite]
+    """Where the arm waits, out of the camera's view, in the base frame."""
+    travel_speed_mm_s: Annotated[float, Field(gt=0.0, le=500.0)] = 150.0
+    press_speed_mm_s: Annotated[float, Field(gt=0.0, le=100.0)] = 20.0
+    acc_mm_s2: Annotated[float, Field(gt=0.0, le=5000.0)] = 500.0
+    least_dwell_s: Annotated[float, Field(ge=0.05, le=60.0)] = 0.1
+    """Time at depth, however short a dwell is asked for: the depth must be seen."""
+
+
+class RigConfig(BaseSettings):
+    """Everything about the rig: `rig.toml`, with the environment on top."""
+
+    model_config = SettingsConfigDict(frozen=True, extra="forbid", env_prefix=PREFIX, env_nested_delimiter=DELIMITER)
+
+    name: str
+    robot: RobotConfig
+    camera: CameraConfig
+    force: ForceConfig | None = None
+    brush: BrushConfig
+    paper: PaperConfig
+    ink: InkConfig
+    board: BoardSpec
+    motion: MotionConfig
+    touch: TouchConfig = TouchConfig()
+    self_check: SelfCheckConfig = SelfCheckConfig()
+    quality: QualityConfig = QualityConfig()
+
+    def settled(self, armed: bool) -> RigConfig:
+        """The same with the self-check decided, where it was left out: on wherever real hardware may come to move."""
+        if self.self_check.enabled is not None:
+            return self
+        return self.checking_itself(armed or not self.robot.on_this_machine)
+
+    def checking_itself(self, enabled: bool) -> RigConfig:
+        """The same with the self-check on or off."""
+        return self.model_copy(update={"self_check": self.self_check.model_copy(update={"enabled": enabled})})
+
+    @model_validator(mode="after")
+    def _clear_of_the_paper(self) -> RigConfig:
+        lowest_mm = self.paper.touch_z_mm + TRAVEL_CLEARANCE_MM
+        if self.motion.safe_z_mm < lowest_mm:
+            raise ValueError(
+                f"motion.safe_z_mm = {self.motion.safe_z_mm:g} is below {lowest_mm:g} mm: "
+                f"travel must clear the paper (paper.touch_z_mm) by {TRAVEL_CLEARANCE_MM:g} mm"
+            )
+        if self.motion.park_mm[2] < self.motion.safe_z_mm:
+            raise ValueError(f"motion.park_mm[2] = {self.motion.park_mm[2]:g} is below motion.safe_z_mm")
+        width, height = self.paper.size_mm
+        wipe, wash = self.ink.wipe, self.ink.wash
+        places = {"ink.well_mm": self.ink.well_mm}
+        places |= {"ink.wipe.rim_mm": wipe.rim_mm} if wipe is not None else {}
+        places |= {"ink.wash.pot_mm": wash.pot_mm} if wash is not None else {}
+        for name, (x, y) in places.items():
+            if 0.0 <= x <= width and 0.0 <= y <= height:
+                raise ValueError(f"{name} = [{x:g}, {y:g}] lies on the sheet: dips would press on it")
+        if wipe is not None and not self.ink.dip_z_mm <= wipe.z_mm < self.motion.safe_z_mm:
+            raise ValueError(
+                f"ink.wipe.z_mm = {wipe.z_mm:g} is outside [{self.ink.dip_z_mm:g}, {self.motion.safe_z_mm:g}): "
+                "between the dip and travel"
+            )
+        self.touch.check_points(self.paper.size_mm)
+        x, y = self.paper.touch_point_mm
+        if not (0.0 <= x <= width and 0.0 <= y <= height):
+            raise ValueError(f"paper.touch_point_mm = [{x:g}, {y:g}] does not lie on the sheet")
+        return self
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """The environment wins over the file; nothing else is read."""
+        return env_settings, init_settings
+
+
+def load_rig(path: Path) -> RigConfig:
+    """Read `rig.toml` and its lens file, with overrides from the environment. Raises `ConfigError`."""
+    values = read_toml(path, MAX_CONFIG_BYTES)
+    for name in values:
+        if name.startswith("_"):
+            raise ConfigError(path, name, "is not a table of this file")
+    environment = overrides(RigConfig)
+    try:
+        rig = RigConfig(**values)
+    except SettingsError as error:
+        raise unreadable(RigConfig, error) from None
+    except ValidationError as error:
+        raise refusal(path, error, RigConfig, environment=environment) from None
+    return rig.model_copy(update={"camera": with_optics(path, rig.camera)})

@@ -1,0 +1,175 @@
+"""The devices' tables of `rig.toml`: where each one is, and what it may do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from calibrate.artefact import LensUsed
+from collect.rig.config_base import Config, Finite, Positive, Range
+from drivers.force.samples import LOOPBACK_CHANNEL
+
+MOST_STALE_MS = 100.0
+"""At 20 mm/s a brush goes down 2 mm meanwhile, unfelt."""
+MOST_STALE_LOOPBACK_MS = 2000.0
+"""On the loopback rig's bus, where simulated time may run faster than the sensor's rounds come."""
+
+
+class LimitsConfig(Config):
+    """Where the brush tip may ever be, in the robot's base frame."""
+
+    x_mm: Range
+    y_mm: Range
+    z_mm: Range
+    """The lower end is the floor: paper height less the deepest press."""
+    tilt_deg: Annotated[float, Field(gt=0.0, le=30.0)] = 15.0
+    speed_mm_s: Annotated[float, Field(gt=0.0, le=500.0)] = 250.0
+    acc_mm_s2: Annotated[float, Field(gt=0.0, le=5000.0)] = 1000.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> LimitsConfig:
+        for name in ("x_mm", "y_mm", "z_mm"):
+            low, high = getattr(self, name)
+            if low >= high:
+                raise ValueError(f"{name} = [{low}, {high}]: the first must be less than the second")
+        return self
+
+
+class RobotConfig(Config):
+    """The arm."""
+
+    kind: Literal["aubo-arcs"]
+    host: str = Field(min_length=1)
+    port: int = Field(30004, ge=1, le=65535)
+    tcp_offset_mm: tuple[Finite, Finite, Finite]
+    """Flange to brush tip."""
+    framing: Literal["sof", "bare"] = "sof"
+    """`sof` as the maker's client speaks, `bare` as the maker documents."""
+    rtde_port: int | None = Field(None, ge=1, le=65535)
+    """Where poses are pushed from (30010); left out, they are polled for."""
+    watchdog_s: Annotated[float, Field(ge=0.5, le=60.0)] | None = None
+    """Dead-man on the controller: without a sign of life for so long it goes into a protective stop, which only a
+    person releases, and which leaves the brush where it is. Left out, none is armed, and a press lifts by itself."""
+    speed_fraction: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
+    collision_level: Annotated[int, Field(ge=1, le=9)] | None = None
+    """1 to 9, most sensitive; left out, what the pendant has stays."""
+    payload_kg: Annotated[float, Field(ge=0.0, le=5.0)] | None = None
+    """Mass of sensor, holder and brush; an i5 carries 5 kg. Left out, what the pendant has stays."""
+    payload_cog_mm: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    """Its centre, from the flange."""
+    limits: LimitsConfig
+
+    @property
+    def on_this_machine(self) -> bool:
+        """Whether its controller is reached over loopback, as that of the loopback rig is."""
+        return self.host in ("localhost", "::1") or self.host.startswith("127.")
+
+
+class LockedConfig(Config):
+    """Settings of a camera device that must not drift; left out means left as it is. The device's own units."""
+
+    width: Annotated[int, Field(ge=16, le=65535)] | None = None
+    height: Annotated[int, Field(ge=16, le=65535)] | None = None
+    exposure: Finite | None = None
+    """Turns automatic exposure off."""
+    gain: Finite | None = None
+    white_balance_k: Finite | None = None
+    """Turns automatic white balance off."""
+    focus: Finite | None = None
+    """Turns autofocus off."""
+
+
+class CameraConfig(Config):
+    """The camera that looks at the sheet."""
+
+    kind: Literal["opencv"]
+    source: str = Field(min_length=1)
+    """Stream URL, file, folder of images, or device number as text."""
+    latency_ms: Annotated[float, Field(ge=0.0, le=10_000.0)] = 250.0
+    """From exposure to arrival, roughly: used by `doctor` and the live picture. A run measures it."""
+    max_delay_ms: Annotated[float, Field(ge=50.0, le=10_000.0)] = 1500.0
+    """A camera whose pictures are measured to come later is refused."""
+    max_jitter_ms: Annotated[float, Field(ge=10.0, le=10_000.0)] = 500.0
+    """A camera whose measured delay varies by more is refused."""
+    timeout_s: Annotated[float, Field(gt=0.0, le=120.0)] = 10.0
+    lens: str = ""
+    """Its name, for the record."""
+    lens_file: Path | None = None
+    """Of `brushloop camera intrinsics`, beside rig.toml: what the lens bends is undone before anything is measured."""
+    optics: LensUsed | None = None
+    """What stands in that file; filled in when rig.toml is read, so that the session holds it."""
+    locked: LockedConfig = LockedConfig()
+
+
+class InkStationConfig(Config):
+    """A station that doses, lights and knows the level (docs/ink-station.md)."""
+
+    kind: Literal["ink-station"]
+    port: str = Field(min_length=1)
+    """Device file or COM port."""
+    baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115200
+    keep_level: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
+    """Before a dip the well is filled up to this share of its capacity."""
+    dose_ml: Annotated[float, Field(gt=0.0, le=2.0)] = 0.5
+    """Given at once, and again until the level holds."""
+    max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
+    light: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
+    """Set at the start of a run; left out, the light stays as it is."""
+
+
+class ModbusPumpConfig(Config):
+    """A peristaltic pump without a gauge: what dips take is given back unseen."""
+
+    kind: Literal["modbus-pump"]
+    port: str = Field(min_length=1)
+    """Device file or COM port."""
+    ml_per_revolution: Annotated[float, Field(gt=0.0, lt=100.0)]
+    """Calibrated by weighing."""
+    rpm: Annotated[float, Field(gt=0.0, le=600.0)] = 50.0
+    unit: Annotated[int, Field(ge=1, le=247)] = 1
+    baud: Annotated[int, Field(ge=1200, le=115200)] = 9600
+    dose_ml: Annotated[float, Field(gt=0.0, le=2.0)] = 0.3
+    """Given before every `every_dips`-th dip."""
+    every_dips: Annotated[int, Field(ge=1, le=1000)] = 5
+    max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
+
+
+InkDeviceConfig = Annotated[InkStationConfig | ModbusPumpConfig, Field(discriminator="kind")]
+
+
+class ForceConfig(Config):
+    """A force sensor between flange and brush, on a CAN bus of its own (docs/force-sensor.md)."""
+
+    kind: Literal["sri-m8123"]
+    interface: str = Field("socketcan", min_length=1)
+    """As python-can names it: socketcan, slcan, pcan, socketcand and so on."""
+    channel: str = Field("can0", min_length=1)
+    bitrate: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
+    host: str | None = None
+    """Of a CAN gateway, for the interface socketcand."""
+    port: Annotated[int, Field(ge=1, le=65535)] | None = None
+    rate_hz: Annotated[float, Field(gt=0.0, le=2000.0)] = 200.0
+    """What the board is set to; gaps are counted against it."""
+    max_n: Positive = 5.0
+    """Ceiling while the brush is down: above it the arm is stopped and the press is void."""
+    stale_ms: Annotated[float, Field(ge=20.0)] = 100.0
+    """While the brush goes down, silence of this length stops the arm: 100 at most, save on the loopback rig's bus."""
+    bias_s: Annotated[float, Field(ge=0.05, le=60.0)] = 0.5
+    """How long to average with nothing touching, before each zero touch."""
+
+    @model_validator(mode="after")
+    def _gateway(self) -> ForceConfig:
+        if (self.interface == "socketcand") != (self.host is not None and self.port is not None):
+            raise ValueError("host and port belong to the interface socketcand, and to no other")
+        return self
+
+    @model_validator(mode="after")
+    def _fresh(self) -> ForceConfig:
+        most_ms = MOST_STALE_LOOPBACK_MS if self.channel == LOOPBACK_CHANNEL else MOST_STALE_MS
+        if self.stale_ms > most_ms:
+            raise ValueError(
+                f"stale_ms = {self.stale_ms:g}: must be from 20 to {most_ms:g}; the brush is blind so long"
+            )
+        return self

@@ -1,0 +1,146 @@
+"""The tables `[touch]` and `[self_check]` of `rig.toml`: how zero touch is found, and when a rig is refused."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from collect.rig.config_base import Config, Finite, Positive
+
+Method = Literal["taught", "force", "camera", "jog"]
+Step = Annotated[float, Field(ge=0.01, le=5.0)]
+
+
+class ForceTouchConfig(Config):
+    """Zero touch by force: fast steps until something is felt, then slow ones around where it was."""
+
+    threshold_n: Positive = 0.0012
+    """Force that ends the fast approach. A soft brush pushes with a few mN in its first millimetre."""
+    fast_step_mm: Step = 0.5
+    fast_samples: Annotated[int, Field(ge=4, le=10_000)] = 60
+    """Averaged at each rest of the fast approach."""
+    medium_step_mm: Step = 0.1
+    medium_samples: Annotated[int, Field(ge=4, le=10_000)] = 150
+    slow_samples: Annotated[int, Field(ge=10, le=100_000)] = 1000
+    """Averaged over the three rests of one slow descent."""
+    sigma_mm: Annotated[float, Field(ge=0.001, le=0.5)] = 0.0135
+    """Slow descents are repeated until the contact is known to this standard error."""
+    max_samples: Annotated[int, Field(ge=100, le=1_000_000)] = 60_000
+    """No touch takes more: where they do not suffice, the sensor is too noisy for the brush."""
+    linear_mm: Annotated[float, Field(ge=0.05, le=5.0)] = 0.45
+    """Depth to which the brush counts as a straight spring; below it nothing is averaged."""
+    push_axis: tuple[Finite, Finite, Finite] = (0.0, 0.0, -1.0)
+    """Where the paper pushes, in the sensor's frame: against its z axis, if that points along the tool to the tip."""
+    clear_mm: Annotated[float, Field(ge=0.0, le=20.0)] = 1.0
+    """A rest above the one before is reached from so much higher still: every rest is met on the way down."""
+    settle_s: Annotated[float, Field(ge=0.0, le=10.0)] = 0.05
+    """From the arm at rest to the first sample that counts."""
+
+    @model_validator(mode="after")
+    def _axis(self) -> ForceTouchConfig:
+        if sum(v * v for v in self.push_axis) < 1e-6:
+            raise ValueError("push_axis must not be zero")
+        return self
+
+
+class CameraTouchConfig(Config):
+    """Zero touch by first ink: rows of shallow touches, each a little lower, and a photograph of each row."""
+
+    coarse_step_mm: Step = 0.5
+    fine_step_mm: Step = 0.08
+    """Half of it, about, is the error of a touch."""
+    pitch_mm: Annotated[float, Field(ge=2.0, le=20.0)] = 4.0
+    """Between spots; a shallow touch leaves a mark of one to three millimetres. Camera and arm must agree on the place
+    within a quarter of it."""
+    columns: Annotated[int, Field(ge=2, le=50)] = 9
+    """Spots in a row of a point's patch."""
+    spots_per_dip: Annotated[int, Field(ge=1, le=20)] = 2
+    """Touches after which the brush is dipped again: a dry tip leaves nothing at first."""
+    spots_per_photo: Annotated[int, Field(ge=1, le=20)] = 2
+    """Of the coarse row, which ends at the photograph that shows ink: few, so that no spot gets deep and large."""
+    least_ink_mm2: Annotated[float, Field(gt=0.0, le=10.0)] = 0.25
+    """Darkening that counts as ink: area times how much darker it became, 1 being black."""
+
+    @property
+    def extent_mm(self) -> float:
+        """Length of a row."""
+        return (self.columns - 1) * self.pitch_mm
+
+
+class JogTouchConfig(Config):
+    """Zero touch by the operator's jog."""
+
+    steps_mm: tuple[Step, Step, Step] = (0.02, 0.1, 1.0)
+
+
+class TouchConfig(Config):
+    """How the height is found from which H is counted (docs/zero-touch.md)."""
+
+    method: Method = "taught"
+    """`taught` visits the height of `[paper]` and confirms it; the others measure."""
+    touches: Annotated[int, Field(ge=1, le=50)] = 3
+    """At each point."""
+    repeatability_mm: Positive = 0.15
+    """The touches of one point may span so much; more, and the run stops with the heights."""
+    residual_mm: Positive = 0.2
+    """A point may lie so far from the plane through all of them; three points have no residuals."""
+    above_mm: Annotated[float, Field(gt=0.0, le=20.0)] = 2.0
+    """The approach begins so far above the expected height: more than its error."""
+    travel_mm: Annotated[float, Field(gt=0.0, le=20.0)] = 2.0
+    """The approach ends so far below it: nothing was touched."""
+    moved_mm: Positive = 0.5
+    """A height that is measured so far from the one before is doubtful: whoever sets up is told."""
+    lean_deg: Annotated[float, Field(ge=0.0, le=3.0)] = 1.0
+    """The sheet may lean so much: what is not known of a height far from the last touch widens the approach."""
+    points_mm: Annotated[list[tuple[Finite, Finite]], Field(max_length=25)] = Field(
+        default_factory=list[tuple[float, float]]
+    )
+    """Where to touch, in the paper frame; empty means `[paper] touch_point_mm`. Three or more give a plane, fewer a
+    level sheet. By camera each point is the lower left of a patch that gets inked, and three are needed."""
+    speed_mm_s: Annotated[float, Field(ge=0.5, le=50.0)] = 5.0
+    """Of every move at or below the start of the approach."""
+    force: ForceTouchConfig = ForceTouchConfig()
+    camera: CameraTouchConfig = CameraTouchConfig()
+    jog: JogTouchConfig = JogTouchConfig()
+
+    def check_points(self, size_mm: tuple[float, float]) -> None:
+        """Raise ValueError where a point does not lie on a sheet of that size; for the validator of `rig.toml`."""
+        for x, y in self.points_mm:
+            if not (0.0 <= x <= size_mm[0] and 0.0 <= y <= size_mm[1]):
+                raise ValueError(f"touch.points_mm: [{x:g}, {y:g}] does not lie on the sheet")
+
+    @model_validator(mode="after")
+    def _points(self) -> TouchConfig:
+        if self.method == "camera" and len(self.points_mm) < 3:
+            # over the length of a row, a sheet that leans by 1 deg changes its height by more than a fine step
+            raise ValueError(f"points_mm has {len(self.points_mm)} points: by camera three are needed")
+        return self
+
+
+class SelfCheckConfig(Config):
+    """Three marks at the corners of an uneven triangle, found by the camera, before a session."""
+
+    enabled: bool | None = None
+    """Left out, it is on where real hardware may move (with `--arm`, or an arm that is not on this machine); a session
+    goes on as it was begun."""
+    depth_mm: Annotated[float, Field(ge=0.5, le=10.0)] = 2.0
+    legs_mm: tuple[Annotated[float, Field(ge=8.0, le=200.0)], Annotated[float, Field(ge=8.0, le=200.0)]] = (24.0, 15.0)
+    """Along paper x and y from the corner of the triangle, on sheets without room for one over three cells; uneven, so
+    that it tells which is which."""
+    offset_mm: Positive = 3.0
+    """The marks may lie so far from where they were commanded, all together; a soft tip lands beside its axis."""
+    turn_deg: Positive = 1.0
+    scale: Annotated[float, Field(gt=0.0, le=0.2)] = 0.01
+    """Relative error of a length that is refused, once `mark_mm` is taken off the triangle's extent."""
+    mark_mm: Positive = 0.3
+    """How far one mark's centre may lie from where the others put it: no two presses bend the hairs alike. A triangle
+    that is to tell 2 % from 1 % must extend over more than 50 mm along both axes."""
+    least_ink_mm2: Annotated[float, Field(gt=0.0, le=100.0)] = 1.0
+
+    @model_validator(mode="after")
+    def _uneven(self) -> SelfCheckConfig:
+        x_mm, y_mm = self.legs_mm
+        if not 1.3 * y_mm <= x_mm:
+            raise ValueError(f"legs_mm = [{x_mm:g}, {y_mm:g}]: the first must be 1.3 times the second or more")
+        return self

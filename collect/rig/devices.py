@@ -1,0 +1,169 @@
+"""The devices of a rig, made from its configuration, connected observers first and closed in reverse."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import socket
+from collections.abc import AsyncGenerator, Callable, Generator
+from dataclasses import dataclass
+
+from collect.errors import ConfigError
+from collect.rig.config import RigConfig
+from collect.rig.config_devices import ForceConfig, InkDeviceConfig, InkStationConfig
+from drivers.arcs.robot import ArcsOptions, AuboArcs
+from drivers.camera import CameraOptions, Locked, OpenCvCamera
+from drivers.clock import Clock
+from drivers.force.sri_m8123 import SriM8123, SriOptions
+from drivers.ink.pump import ModbusPump, PumpOptions
+from drivers.ink.station import InkStation, StationOptions
+from drivers.limits import Limits
+from drivers.protocols import Camera, ForceSensor, Ink, Robot
+from drivers.samples import Identity
+from drivers.sole import Claimed, claimed
+
+FORCE_CONNECT_S = 10.0
+"""To open the bus, through a gateway as well, and get a first round."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """Connected devices and who they say they are."""
+
+    config: RigConfig
+    clock: Clock
+    robot: Robot
+    camera: Camera
+    robot_identity: Identity
+    camera_identity: Identity
+    force: ForceSensor | None = None
+    ink: Ink | None = None
+    force_identity: Identity | None = None
+    ink_identity: Identity | None = None
+
+    @property
+    def simulated(self) -> bool:
+        """True where any device says that it is the loopback rig, or shows a recording."""
+        known = (self.robot_identity, self.camera_identity, self.force_identity, self.ink_identity)
+        return any(identity.simulated for identity in known if identity is not None)
+
+
+def limits_of(config: RigConfig) -> Limits:
+    """The limits of `rig.toml`; the floor is never below what the brush survives."""
+    box = config.robot.limits
+    floor = max(box.z_mm[0], config.paper.touch_z_mm - config.brush.max_depth_mm)
+    return Limits(box.x_mm, box.y_mm, (floor, box.z_mm[1]), box.tilt_deg, box.speed_mm_s, box.acc_mm_s2)
+
+
+def make_robot(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> AuboArcs:
+    """The arm's driver, not yet connected."""
+    robot = config.robot
+    options = ArcsOptions(
+        robot.host,
+        robot.port,
+        robot.tcp_offset_mm,
+        framing=robot.framing,
+        rtde_port=robot.rtde_port,
+        watchdog_s=robot.watchdog_s,
+        speed_fraction=robot.speed_fraction,
+        collision_level=robot.collision_level,
+        payload_kg=robot.payload_kg,
+        payload_cog_mm=robot.payload_cog_mm,
+    )
+    return AuboArcs(options, limits_of(config), clock, on_notice)
+
+
+def make_camera(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> OpenCvCamera:
+    """The camera's driver, not yet connected."""
+    camera = config.camera
+    options = CameraOptions(
+        camera.source, camera.latency_ms, camera.timeout_s, locked=Locked(**camera.locked.model_dump())
+    )
+    return OpenCvCamera(options, clock, on_notice)
+
+
+def make_force(config: ForceConfig, clock: Clock) -> SriM8123:
+    """The force sensor's driver, not yet connected."""
+    options = SriOptions(
+        config.interface,
+        config.channel,
+        config.bitrate,
+        host=config.host,
+        port=config.port,
+        stale_after_ms=config.stale_ms,
+        connect_timeout_s=FORCE_CONNECT_S,
+    )
+    return SriM8123(options, clock)
+
+
+def make_ink(config: InkDeviceConfig, clock: Clock) -> InkStation | ModbusPump:
+    """The ink device's driver, not yet connected."""
+    if isinstance(config, InkStationConfig):
+        return InkStation(
+            StationOptions(
+                config.port, config.baud, max_dose_ml=config.dose_ml, max_per_minute_ml=config.max_per_minute_ml
+            ),
+            clock,
+        )
+    return ModbusPump(
+        PumpOptions(
+            config.port,
+            config.ml_per_revolution,
+            rpm=config.rpm,
+            unit=config.unit,
+            baud=config.baud,
+            max_dose_ml=config.dose_ml,
+            max_per_minute_ml=config.max_per_minute_ml,
+        ),
+        clock,
+    )
+
+
+def _resolved(host: str) -> str:
+    """One arm under two names is one arm."""
+    try:
+        return socket.gethostbyname(host)
+    except OSError:
+        return host
+
+
+@contextlib.contextmanager
+def sole_driver(config: RigConfig) -> Generator[None]:
+    """Hold the arm at this address against other processes of this machine, of any user. Raises `ConfigError`."""
+    address = f"{_resolved(config.robot.host)}:{config.robot.port}"
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(claimed(f"brushloop-arm-{hashlib.sha256(address.encode()).hexdigest()[:16]}"))
+        except Claimed as who:
+            what = f"another brushloop is driving the arm at {address}: {who}"
+            raise ConfigError("rig.toml", "robot", what) from None
+        yield
+
+
+@contextlib.asynccontextmanager
+async def connected(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> AsyncGenerator[Rig]:
+    """Connect camera, force sensor, ink device, then the robot; on the way out stop the arm first, come what may.
+
+    `on_notice` is told what a device says unasked, from any thread. Raises `ConfigError` where another brushloop on
+    this machine has the arm: closing would stop its motion.
+    """
+    async with contextlib.AsyncExitStack() as stack:
+        stack.enter_context(sole_driver(config))
+        camera = make_camera(config, clock, on_notice)
+        stack.push_async_callback(camera.close)
+        camera_identity = await camera.connect()
+        force = force_identity = ink = ink_identity = None
+        if config.force is not None:
+            force = make_force(config.force, clock)
+            stack.push_async_callback(force.close)
+            force_identity = await force.connect()
+        if config.ink.device is not None:
+            ink = make_ink(config.ink.device, clock)
+            stack.push_async_callback(ink.close)
+            ink_identity = await ink.connect()
+        robot = make_robot(config, clock, on_notice)
+        stack.push_async_callback(robot.close)
+        robot_identity = await robot.connect()
+        yield Rig(
+            config, clock, robot, camera, robot_identity, camera_identity, force, ink, force_identity, ink_identity
+        )

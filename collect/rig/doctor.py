@@ -1,0 +1,194 @@
+"""Asks every configured device who it is, and says in one table what answers and what is wrong. Powers nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import statistics
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from calibrate.board.scale import see_board
+from calibrate.errors import CalibrationError
+from collect.rig.config import RigConfig
+from collect.rig.config_devices import ForceConfig, InkDeviceConfig
+from collect.rig.devices import make_camera, make_force, make_ink, make_robot
+from collect.rig.optics import lens_of
+from drivers.arcs.codes import MOVING_ALLOWED, RobotMode
+from drivers.clock import Clock
+from drivers.errors import DeviceError
+from drivers.samples import Identity, Stamp
+
+CALLS = 20
+FRAMES = 5
+LISTEN_S = 0.5
+"""To a force sensor: a hundred rounds tell the rate."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What one device answered."""
+
+    device: str
+    address: str
+    answers: bool
+    identity: str = ""
+    firmware: str = ""
+    latency_ms: float | None = None
+    """Median of several calls; for a camera, the time to a frame exposed after asking."""
+    notes: str = ""
+    problem: str = ""
+    remedy: str = ""
+
+    @property
+    def well(self) -> bool:
+        """True where nothing needs mending."""
+        return self.answers and not self.problem
+
+    def as_json(self) -> dict[str, Any]:
+        """Every field, and the verdict."""
+        return {**asdict(self), "well": self.well}
+
+
+async def examine(config: RigConfig, clock: Clock) -> list[Finding]:
+    """One finding for each configured device, in the order in which a session connects them."""
+    findings = [await _asked("camera", config.camera.source, lambda: _camera(config, clock))]
+    if (force := config.force) is not None:
+        findings.append(await _asked("force", _bus(force), lambda: _force(force, clock)))
+    if (ink := config.ink.device) is not None:
+        findings.append(await _asked("ink", ink.port, lambda: _ink(ink, clock)))
+    robot_address = f"{config.robot.host}:{config.robot.port}"
+    findings.append(await _asked("robot", robot_address, lambda: _robot(config, clock, robot_address)))
+    return findings
+
+
+async def _asked(device: str, address: str, ask: Callable[[], Awaitable[Finding]]) -> Finding:
+    try:
+        return await ask()
+    except DeviceError as error:
+        remedy = error.remedy or "Check power, cable and address."
+        return Finding(device, address, answers=False, problem=f"{error.op}: {error.what}", remedy=remedy)
+
+
+async def _camera(config: RigConfig, clock: Clock) -> Finding:
+    notices: list[str] = []
+    camera = make_camera(config, clock, notices.append)
+    try:
+        identity = await camera.connect()
+        frame = await camera.fresh(Stamp(clock.now_ns()))
+        waits_ms: list[float] = []
+        for _ in range(FRAMES):
+            asked = time.perf_counter()
+            frame = await camera.fresh(Stamp(clock.now_ns()))
+            waits_ms.append((time.perf_counter() - asked) * 1e3)
+    finally:
+        await camera.close()
+    board, problem, remedy = await asyncio.to_thread(_board, config, frame.image)
+    return Finding(
+        "camera",
+        config.camera.source,
+        answers=True,
+        identity=identity.model,
+        latency_ms=statistics.median(waits_ms),
+        notes="; ".join([board, *notices]),
+        problem=problem,
+        remedy=remedy,
+    )
+
+
+def _board(config: RigConfig, image: Any) -> tuple[str, str, str]:
+    try:
+        plane = see_board(image, config.board, lens=lens_of(config.camera))
+    except CalibrationError as error:
+        return "", f"board: {error.what}", "Put the configured board into view, in focus and evenly lit."
+    return f"board: {plane.corners} corners, residual {plane.rms_px:.2f} px, {plane.mm_per_px:.4f} mm/px", "", ""
+
+
+def _bus(config: ForceConfig) -> str:
+    gateway = "" if config.host is None else f" at {config.host}:{config.port}"
+    return f"{config.interface} {config.channel}{gateway}"
+
+
+async def _force(config: ForceConfig, clock: Clock) -> Finding:
+    sensor = make_force(config, clock)
+    try:
+        identity = await sensor.connect()
+        await asyncio.sleep(LISTEN_S)
+        age_ms = (clock.now_ns() - sensor.latest().stamp.host_ns) / 1e6
+        force_n, health = math.hypot(*sensor.latest_n()), sensor.health()
+    finally:
+        await sensor.close()
+    problem = remedy = ""
+    if health.torn or health.refused or health.bus_errors:
+        problem = f"{health.torn} torn, {health.refused} refused rounds, {health.bus_errors} bus errors"
+        remedy = "Check wiring, shielding and termination."
+    elif force_n > config.max_n:
+        problem = f"{force_n:.2f} N with nothing pressing, above the ceiling force.max_n = {config.max_n:g} N"
+        remedy = "Take off what touches the brush; the weight of the holder is taken off by the bias at each start."
+    return Finding(
+        "force",
+        _bus(config),
+        answers=True,
+        identity=identity.model,
+        firmware=identity.firmware or "not told",
+        latency_ms=age_ms,
+        notes=f"{health.rate_hz:.0f} rounds/s, {force_n:.3f} N before bias" + _simulated(identity),
+        problem=problem,
+        remedy=remedy,
+    )
+
+
+async def _ink(config: InkDeviceConfig, clock: Clock) -> Finding:
+    device = make_ink(config, clock)
+    try:
+        identity = await device.connect()
+        waits_ms: list[float] = []
+        level: float | None = None
+        for _ in range(CALLS):
+            asked = time.perf_counter()
+            level = await device.level()
+            waits_ms.append((time.perf_counter() - asked) * 1e3)
+    finally:
+        await device.close()
+    return Finding(
+        "ink",
+        config.port,
+        answers=True,
+        identity=identity.model,
+        firmware=identity.firmware or "not told",
+        latency_ms=None if level is None else statistics.median(waits_ms),
+        notes=("no gauge" if level is None else f"well {level:.0%} full") + _simulated(identity),
+    )
+
+
+def _simulated(identity: Identity) -> str:
+    return ", simulated" if identity.simulated else ""
+
+
+async def _robot(config: RigConfig, clock: Clock, address: str) -> Finding:
+    notices: list[str] = []
+    robot = make_robot(config, clock, notices.append)
+    try:
+        identity = await robot.connect()
+        state = await robot.condition(CALLS)
+    finally:
+        await robot.close()
+    condition = f"{state.mode}, safety {state.safety}" + _simulated(identity)
+    problem = remedy = ""
+    if state.safety not in MOVING_ALLOWED:
+        problem, remedy = f"safety mode is {state.safety}", "Look at the pendant; nothing is cleared from here."
+    elif state.mode not in (RobotMode.POWER_OFF, RobotMode.IDLE, RobotMode.RUNNING):
+        problem, remedy = f"robot mode is {state.mode}", "Look at the pendant."
+    return Finding(
+        "robot",
+        address,
+        answers=True,
+        identity=identity.model,
+        firmware=identity.firmware,
+        latency_ms=state.latency_ms,
+        notes="; ".join([condition, *notices]),
+        problem=problem,
+        remedy=remedy,
+    )

@@ -1,0 +1,135 @@
+"""Where the paper really lies: a plane through touched points, and poses above and below it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from collect.errors import StepError
+from collect.rig.config import PaperConfig
+from collect.rig.sheet import to_base
+from drivers.geometry import brush_pose
+from drivers.samples import Pose
+
+MAX_SLOPE_DEG = 3.0
+"""A sheet that leans more is not lying: something else was touched."""
+LEAST_SPREAD_MM = 20.0
+"""Touched points must span at least this much in their narrowest direction to tell a slope."""
+
+
+@dataclass(frozen=True, slots=True)
+class PaperPlane:
+    """The height at which the vertical brush's tip just touches, over the sheet: z = z0 + a x + b y, in mm.
+
+    x and y are in the paper frame, z in the base frame.
+    """
+
+    z0_mm: float
+    slope_x: float = 0.0
+    slope_y: float = 0.0
+
+    def touch_z_mm(self, x_mm: float, y_mm: float) -> float:
+        """Height of the surface at a point of the sheet, in the base frame."""
+        return self.z0_mm + self.slope_x * x_mm + self.slope_y * y_mm
+
+    @property
+    def normal(self) -> tuple[float, float, float]:
+        """Unit vector out of the paper, in the paper frame."""
+        length = math.sqrt(1.0 + self.slope_x**2 + self.slope_y**2)
+        return -self.slope_x / length, -self.slope_y / length, 1.0 / length
+
+    @property
+    def slope_deg(self) -> float:
+        """How far the sheet leans from level."""
+        return math.degrees(math.atan(math.hypot(self.slope_x, self.slope_y)))
+
+    def above_mm(self, paper: PaperConfig, tip: Pose) -> float:
+        """Distance of the tip from the surface along its normal; negative below."""
+        x_mm, y_mm = to_paper(paper, tip.x_mm, tip.y_mm)
+        return (tip.z_mm - self.touch_z_mm(x_mm, y_mm)) * self.normal[2]
+
+    def pose(
+        self,
+        paper: PaperConfig,
+        x_mm: float,
+        y_mm: float,
+        above_mm: float,
+        *,
+        tilt_deg: float = 0.0,
+        turn_deg: float = 0.0,
+    ) -> Pose:
+        """The tip `above_mm` from the point (x, y) of the surface, along the normal (H = -above_mm).
+
+        The ferrule leans by `tilt_deg` from the normal toward `turn_deg`, counter-clockwise from paper x.
+        """
+        nx, ny, nz = self.normal
+        base_x, base_y = to_base(paper, x_mm + above_mm * nx, y_mm + above_mm * ny)
+        z_mm = self.touch_z_mm(x_mm, y_mm) + above_mm * nz
+        level = brush_pose(base_x, base_y, z_mm, heading_deg=paper.yaw_deg + turn_deg, tilt_deg=tilt_deg)
+        if self.slope_x == self.slope_y == 0.0:
+            return level
+        qx, qy, qz, qw = (float(v) for v in (self._lean(paper) * Rotation.from_quat(level.quaternion)).as_quat())
+        return Pose(base_x, base_y, z_mm, qx, qy, qz, qw)
+
+    def frame(self, paper: PaperConfig) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
+        """Origin in mm and quaternion (x, y, z, w) of the paper frame in the base frame: yaw, then the lean."""
+        yaw = Rotation.from_euler("z", paper.yaw_deg, degrees=True)
+        qx, qy, qz, qw = (float(v) for v in (self._lean(paper) * yaw).as_quat())
+        return (*paper.origin_mm, self.z0_mm), (qx, qy, qz, qw)
+
+    def _lean(self, paper: PaperConfig) -> Rotation:
+        """The shortest turn that brings the base's z to the paper's normal."""
+        normal = Rotation.from_euler("z", paper.yaw_deg, degrees=True).apply(self.normal)
+        lean, _ = Rotation.align_vectors([normal], [[0.0, 0.0, 1.0]])
+        return lean
+
+
+@dataclass(frozen=True, slots=True)
+class PlaneFit:
+    """A plane through touched points, and how well they lie in it."""
+
+    plane: PaperPlane
+    residuals_mm: tuple[float, ...]
+    """Touched less fitted height, in the order of the points; zeros where three points leave no freedom."""
+
+    @property
+    def worst_mm(self) -> float:
+        """The largest residual."""
+        return max((abs(r) for r in self.residuals_mm), default=0.0)
+
+
+def fit_plane(points_mm: list[tuple[float, float, float]]) -> PlaneFit:
+    """Least squares through touched points (x, y in the paper frame, z in the base frame).
+
+    One or two points give a level plane at their mean height. Raises `StepError` where three or more lie nearly on a
+    line, or the plane leans more than a sheet can.
+    """
+    at: NDArray[np.float64] = np.asarray(points_mm, np.float64)
+    if len(points_mm) < 3:
+        level = PaperPlane(float(at[:, 2].mean()))
+        return PlaneFit(level, tuple(float(v) for v in at[:, 2] - level.z0_mm))
+    centred = at[:, :2] - at[:, :2].mean(axis=0)
+    spread_mm = float(np.linalg.svd(centred, compute_uv=False)[1]) / math.sqrt(len(points_mm)) * 2.0
+    if spread_mm < LEAST_SPREAD_MM:
+        raise StepError(
+            f"the touched points lie within {spread_mm:.1f} mm of a line: they cannot tell how the sheet leans"
+        )
+    ones = np.column_stack((np.ones(len(points_mm)), at[:, :2]))
+    z0, slope_x, slope_y = (float(v) for v in np.linalg.lstsq(ones, at[:, 2], rcond=None)[0])
+    plane = PaperPlane(z0, slope_x, slope_y)
+    if plane.slope_deg > MAX_SLOPE_DEG:
+        raise StepError(
+            f"the sheet would lean by {plane.slope_deg:.1f} deg, limit {MAX_SLOPE_DEG:g}: look what was touched"
+        )
+    return PlaneFit(plane, tuple(float(z - plane.touch_z_mm(x, y)) for x, y, z in points_mm))
+
+
+def to_paper(paper: PaperConfig, x_mm: float, y_mm: float) -> tuple[float, float]:
+    """A point of the base frame in the paper frame, seen from above."""
+    yaw = math.radians(paper.yaw_deg)
+    dx, dy = x_mm - paper.origin_mm[0], y_mm - paper.origin_mm[1]
+    return math.cos(yaw) * dx + math.sin(yaw) * dy, -math.sin(yaw) * dx + math.cos(yaw) * dy

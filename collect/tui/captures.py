@@ -1,0 +1,178 @@
+"""A session as it is looked through: its captures by cell, their pictures, and how alike the presses of a cell are."""
+
+from __future__ import annotations
+
+import itertools
+import statistics
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calibrate.board.scale import BoardSpec, PlaneFit, see_board
+from calibrate.board.session import board_of, lens_in_use
+from calibrate.compare.similarity import csim
+from calibrate.errors import CalibrationError
+from collect.engine.last_capture import pictures_of
+from collect.rig.sheet import Cell
+from sessions.errors import InputError, SessionDamaged
+from sessions.journal.journal import JOURNAL_NAME, is_open, replay
+from sessions.journal.lines import Line
+from sessions.names import check_folder
+from sessions.recording import container
+from sessions.recording.messages import decode_gray, decode_still
+from sessions.recording.schemas import Stroke, Topic
+from sessions.remarks import Remark, remarks_of
+from sessions.waits import unlike, waits_of
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from calibrate.board.lens import Lens
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One capture of a session."""
+
+    stroke_id: str
+    height_mm: float
+    tilt_deg: float
+    still: int
+    kept: bool
+    """False for a take that was pressed again, or left out."""
+    verdict: str
+    """Name of the check that it failed; empty where it passed."""
+    file: str
+    remark: Remark | None
+    waited_s: float | None = None
+    """From dip to touch; None where the session does not tell."""
+    unlike: str = ""
+    """Why that is far from the other strokes of the session; empty where it is not."""
+
+
+@dataclass(frozen=True, slots=True)
+class Looked:
+    """What one capture shows, and where it is in the recording."""
+
+    photo: NDArray[np.uint8]
+    """(h, w) gray: the field around its zero-touch point, or the whole photograph where the board is not seen."""
+    binary: NDArray[np.bool_] | None
+    log_ns: int
+    """When the still came to the host: where to jump to in a viewer."""
+
+
+class Review:
+    """One session's folder, open or closed; reads, and writes nothing."""
+
+    untold: str = ""
+    """Why photographs are shown whole and presses are not compared; empty where the session tells board and lens."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises `InputError` where it was not collected here or holds links, `SessionDamaged`."""
+        self.folder = folder
+        if not (folder / JOURNAL_NAME).is_file():
+            raise InputError(folder, f"holds no {JOURNAL_NAME}: imported photographs are looked at with `validate`")
+        check_folder(folder)
+        self._plane: PlaneFit | None = None
+        self._looked: dict[int, Looked] = {}
+        self._board: BoardSpec | None = None
+        self._lens: Lens | None = None
+        try:
+            # As the session recorded them: lens files lie beside the rig's own rig.toml, not beside its snapshot here.
+            lens = lens_in_use(folder)
+            self._lens = None if lens is None else lens.lens()
+            self._board = board_of(folder)
+        except CalibrationError as error:
+            self.untold = str(error)
+        self.read()
+
+    def read(self) -> None:
+        """Read the journal and the remarks again."""
+        state, remarks = replay(self.folder / JOURNAL_NAME), remarks_of(self.folder)
+        self.open = is_open(state)
+        waits = waits_of(state.segments)
+        odd = unlike(waits)
+        try:
+            captures = [_seen(line, remarks) for line in state.segments if line["kind"] == "capture"]
+        except (KeyError, TypeError, ValueError) as error:
+            raise SessionDamaged(self.folder / JOURNAL_NAME, f"a capture's {error} is missing or not valid") from None
+        self.captures = tuple(replace(c, waited_s=waits.get(c.still), unlike=odd.get(c.still, "")) for c in captures)
+
+    def look(self, seen: Seen) -> Looked:
+        """The pictures of one capture; kept once made. Takes a tenth of a second: call it off a screen's loop.
+
+        Raises `SessionDamaged` where the still is not there.
+        """
+        if seen.still not in self._looked:
+            self._looked[seen.still] = self._look(seen)
+        return self._looked[seen.still]
+
+    def repeatability(self, height_mm: float, tilt_deg: float) -> tuple[float, int] | None:
+        """(mean CSIM of every pair, captures) of the counted presses of one cell; None for fewer than two.
+
+        CSIM is that of the validation, on the binarised 128 x 128 images in the millimetre alignment.
+        """
+        binaries = [
+            looked.binary.astype("float32")
+            for seen in self.captures
+            if (seen.height_mm, seen.tilt_deg) == (height_mm, tilt_deg) and counts(seen)
+            if (looked := self.look(seen)).binary is not None
+        ]
+        if len(binaries) < 2:
+            return None
+        return statistics.fmean(csim(a, b) for a, b in itertools.combinations(binaries, 2)), len(binaries)
+
+    def _look(self, seen: Seen) -> Looked:
+        path = self.folder / seen.file
+        path = path if path.is_file() else self.folder / f"{self.folder.name}.mcap"
+        image, log_ns, stroke = None, 0, None
+        for _schema, channel, message in container.messages(path, [Topic.STILL, Topic.STROKE]):
+            if message.sequence != seen.still:
+                continue
+            if channel.topic == Topic.STILL:
+                image, log_ns = decode_gray(decode_still(message.data), f"still {seen.still}"), message.log_time
+            else:
+                stroke = Stroke.model_validate_json(message.data)
+        if image is None:
+            raise SessionDamaged(path, f"holds no still {seen.still}")
+        cell = self._cell(stroke)
+        if cell is None or self._board is None:
+            return Looked(image, None, log_ns)
+        if self._lens is not None:
+            if image.shape[::-1] != self._lens.size_px:
+                return Looked(image, None, log_ns)  # the lens says nothing of a photograph of another size
+            image = self._lens.straighten(image)
+        try:
+            self._plane = see_board(image, self._board)
+        except CalibrationError:
+            if self._plane is None:
+                return Looked(image, None, log_ns)
+        photo, binary = pictures_of(image, self._plane, cell)
+        return Looked(photo, binary, log_ns)
+
+    def _cell(self, stroke: Stroke | None) -> Cell | None:
+        """Where it lies, from its stroke record; a take that does not count has none, and is shown whole."""
+        if stroke is None or stroke.cell_mm is None:
+            return None
+        return Cell(0, *stroke.cell_mm)
+
+
+def counts(seen: Seen) -> bool:
+    """Whether it counts: kept by the run, and not marked bad since."""
+    return seen.kept and not (seen.remark is not None and seen.remark.bad)
+
+
+def _seen(line: Line, remarks: dict[int, Remark]) -> Seen:
+    result = line["result"]
+    still = int(result["still"])
+    return Seen(
+        str(result["stroke_id"]),
+        float(result["height_mm"]),
+        float(result["tilt_deg"]),
+        still,
+        bool(result.get("kept", True)),
+        str(result.get("verdict", "")),
+        str(line["file"]),
+        remarks.get(still),
+    )

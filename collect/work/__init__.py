@@ -1,1 +1,0 @@
-"""What each kind of step does on the rig; one module a kind."""

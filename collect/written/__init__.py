@@ -1,1 +1,0 @@
-"""Characters written by the arm, from the plan to the report."""

@@ -1,0 +1,1 @@
+"""The loopback rig's controller: ARCS JSON-RPC and RTDE, over a simulated cabinet."""

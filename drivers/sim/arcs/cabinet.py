@@ -1,0 +1,194 @@
+"""The loopback cabinet: an arm's motion, tool, safety and watchdogs, whoever asks for them and however.
+
+It keeps the parts that a driver can get wrong: refusals by return code, poses that are accepted first and fail in
+planning, a path that a protective stop keeps. It fakes no accuracy and no safety function.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import numpy as np
+
+from drivers.arcs.codes import MOVING_ALLOWED, ReturnCode, RobotMode, SafetyMode
+from drivers.geometry import from_wire, to_wire
+from drivers.samples import Pose
+from drivers.sim.arcs.io import Io
+from drivers.sim.arcs.power import EMERGENCY_STOPS, Power
+from drivers.sim.arm.kinematics import Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
+from drivers.sim.world import World
+
+ROBOT = "rob1"
+IK_NO_CONVERGE = -23
+HARD_STOP_M_S2 = 10.0
+SOFT_STOP_M_S2 = 2.0
+
+Params = dict[str, Any]
+
+
+class Cabinet:
+    """What the methods of the controller act on. The tip is where the world says; the joints follow from it."""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.motion = world.motion
+        self.power = Power(self.now_s)
+        self.io = Io(self.now_s)
+        self.tcp_offset = [0.0] * 6
+        self.payload: list[Any] = [0.0, [0.0] * 3, [0.0] * 3, [0.0] * 6]
+        self.collision_level = 6
+        self.operational_mode = "Automatic"
+        self.servo_mode = 0
+        """0 off; the others as `setServoModeSelect` numbers them."""
+        self.messages: list[dict[str, Any]] = []
+        self.watchdogs: dict[str, tuple[float, int]] = {}
+        """(timeout in real seconds, action) by key."""
+        self._timers: dict[str, asyncio.TimerHandle] = {}
+
+    def now_s(self) -> float:
+        """Simulated time."""
+        return self.world.clock.now_s()
+
+    def tell(self, code: int, *args: str) -> None:
+        """Put a message where `Trace.peek` finds it."""
+        stamp = max(int(self.now_s() * 1e9), self.messages[-1]["timestamp"] + 1 if self.messages else 1)
+        self.messages.append({"code": code, "level": "ERROR", "source": ROBOT, "args": list(args), "timestamp": stamp})
+
+    def safety_stop(self, mode: SafetyMode) -> None:
+        """Enter a safety stop where the arm is. A protective stop keeps the path; only a person clears any of them."""
+        if mode in EMERGENCY_STOPS:
+            self.emergency_stop(mode)
+            return
+        if self.power.safety in EMERGENCY_STOPS:
+            return  # nothing less takes its place
+        self.power.safety, self.servo_mode = mode, 0
+        if mode == SafetyMode.PROTECTIVE_STOP:
+            self.hold(HARD_STOP_M_S2)
+        else:
+            self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
+
+    def collide(self) -> None:
+        """The arm hits something: a protective stop that says so."""
+        self.power.collision = True
+        self.safety_stop(SafetyMode.PROTECTIVE_STOP)
+
+    def emergency_stop(self, mode: SafetyMode = SafetyMode.ROBOT_EMERGENCY_STOP) -> None:
+        """A person pushes the button."""
+        self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
+        self.servo_mode = 0
+        self.power.press_emergency_stop(mode)
+
+    def power_off(self) -> int:
+        """Stop, then take the power away."""
+        self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
+        return self.power.power_off()
+
+    @property
+    def tcp_offset(self) -> list[float]:
+        """Flange to tool centre point as configured: [x, y, z m, rx, ry, rz rad]. It moves no real tip."""
+        return self._tcp_offset
+
+    @tcp_offset.setter
+    def tcp_offset(self, offset: list[float]) -> None:
+        self._tcp_offset = list(offset)
+        tool = matrix_of(from_wire(offset))
+        fix = inverted(tool) @ self.motion.tool
+        self.fix = None if np.allclose(fix, np.eye(4), rtol=0.0, atol=1e-9) else fix
+        """From the configured tool centre point to the true tip; None where they are one."""
+        self._tool = tool
+
+    def tool(self) -> Matrix:
+        """Flange to tool centre point, as configured."""
+        return self._tool
+
+    def tcp(self) -> Pose:
+        """Where the configured tool centre point is: what the controller takes for the tip."""
+        return self.configured(self.world.tool())
+
+    def configured(self, tip: Pose) -> Pose:
+        """Where the configured tool centre point is when the true tip is there."""
+        return tip if self.fix is None else pose_of(matrix_of(tip) @ inverted(self.fix))
+
+    def tcp_speed(self) -> list[float]:
+        """[vx, vy, vz m/s, wx, wy, wz rad/s] of the true tip, in the base frame."""
+        velocity = self.motion.velocity(self.now_s())
+        return [*(v / 1e3 for v in velocity[:3]), *velocity[3:]]
+
+    def joints(self) -> Joints:
+        """The joints that put the tip where it is."""
+        return self.motion.joints(self.now_s())
+
+    def flange(self) -> Pose:
+        """Where the flange is."""
+        return pose_of(matrix_of(self.world.tool()) @ inverted(self.motion.tool))
+
+    def force(self) -> list[float]:
+        """[Fx, Fy, Fz N, Mx, My, Mz Nm] in the base frame: the bristles' push while the tip is below the paper."""
+        return [*self.world.push_n(), 0.0, 0.0, 0.0]
+
+    def fk(self, q: list[float], *, tip: bool) -> list[Any]:
+        """[pose, return code]."""
+        flange = forward([float(v) for v in q])
+        return [to_wire(pose_of(flange @ self.tool() if tip else flange)), 0]
+
+    def ik(self, near: list[float], pose: list[float], *, tip: bool = True) -> list[Any]:
+        """[joints, return code]; the joints are `near` where there is no solution."""
+        target = matrix_of(from_wire([float(v) for v in pose]))
+        found = inverse(target @ inverted(self.tool()) if tip else target, near)
+        return [list(near), IK_NO_CONVERGE] if found is None else [list(found), 0]
+
+    def stop(self, acc_m_s2: float, acc_rad_s2: float) -> int:
+        """Decelerate and forget the path."""
+        if not (acc_m_s2 > 0.0 and acc_rad_s2 > 0.0):
+            return -ReturnCode.INVALID_ARGUMENT
+        self.motion.stop(acc_m_s2 * 1e3, acc_rad_s2, self.now_s())
+        return ReturnCode.OK
+
+    def hold(self, acc_m_s2: float = SOFT_STOP_M_S2) -> int:
+        """Decelerate and keep the path."""
+        self.motion.hold(acc_m_s2 * 1e3, acc_m_s2, self.now_s())
+        return ReturnCode.OK
+
+    def resume(self) -> int:
+        """Go on with a path that was held. Refused while a safety stop lasts."""
+        if self.power.mode != RobotMode.RUNNING:
+            return -1
+        if self.power.safety not in MOVING_ALLOWED:
+            return ReturnCode.BAD_STATE
+        self.motion.resume(self.now_s())
+        return ReturnCode.OK
+
+    def set_speed_fraction(self, fraction: float) -> int:
+        """For every move that has not begun."""
+        if not 0.0 < fraction <= 1.0:
+            return -ReturnCode.INVALID_ARGUMENT
+        self.motion.set_fraction(fraction, self.now_s())
+        return ReturnCode.OK
+
+    def set_watchdog(self, key: str, timeout_s: float, action: int) -> int:
+        """Start it again from now; action 0 ends it. Its time is real time, as its client's is."""
+        if action not in (0, 1, 2, 3) or not timeout_s >= 0.1:
+            return -ReturnCode.INVALID_ARGUMENT
+        if (timer := self._timers.pop(key, None)) is not None:
+            timer.cancel()
+        self.watchdogs[key] = (timeout_s, action)
+        if action:
+            self._timers[key] = asyncio.get_running_loop().call_later(timeout_s, self._bite, key, action)
+        return ReturnCode.OK
+
+    def close(self) -> None:
+        """End the watchdogs' timers."""
+        for timer in self._timers.values():
+            timer.cancel()
+        self._timers.clear()
+
+    def _bite(self, key: str, action: int) -> None:
+        self._timers.pop(key, None)
+        match action:
+            case 1:
+                self.hold()
+            case 2:
+                self.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2)
+            case _:
+                self.safety_stop(SafetyMode.PROTECTIVE_STOP)

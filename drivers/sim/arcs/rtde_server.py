@@ -1,0 +1,151 @@
+"""The loopback controller's RTDE port: it greets, and pushes what clients subscribe to at the frequency they ask."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from drivers.arcs.frames import FrameDecoder, encode_short
+from drivers.arcs.rtde_wire import MAX_MESSAGE_BYTES, PING, SET_RECIPE, decode_message, encode_sample
+from drivers.errors import ProtocolViolation
+from drivers.geometry import to_wire
+from drivers.sim.arcs.cabinet import Cabinet
+from drivers.sim.arcs.io import mask
+from drivers.sim.arcs.methods import runtime_state
+from drivers.sim.arm.motion import Rest
+from drivers.sim.faults.board import FaultBoard
+from drivers.sim.faults.truth import Truth
+from drivers.sim.faults.vocabulary import ALWAYS, KINDS, Device, Fault
+from drivers.sim.server import LoopbackServer
+
+MAX_HZ = 500.0
+BACKLOG_BYTES = 32 * 1024
+"""A client that does not read is sent nothing more until it has caught up."""
+MALFORMED = b"\xff\x81"
+"""A break where a value should be: neither CBOR nor JSON."""
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """What one client wants on one channel."""
+
+    chanel: int
+    period_s: float
+    segments: tuple[str, ...]
+
+
+class RtdeServer(LoopbackServer):
+    """One RTDE port for any number of clients."""
+
+    def __init__(self, cabinet: Cabinet) -> None:
+        super().__init__()
+        self.faults = FaultBoard(Truth(cabinet.world))
+        """What goes wrong here; a rig puts one board in all its servers."""
+        self._cabinet = cabinet
+        self._muted: int | None = None
+        self.pings = 0
+        """Keep-alives seen, for tests."""
+        self._outputs: dict[str, tuple[int, Callable[[], Any]]] = {
+            "timestamp": (100, cabinet.now_s),
+            "runtime_state": (102, lambda: runtime_state(cabinet)),
+            "R1_target_q": (1001, lambda: list(cabinet.joints())),
+            "R1_actual_q": (1006, lambda: list(cabinet.joints())),
+            "R1_robot_mode": (1014, lambda: cabinet.power.mode.value),
+            "R1_safety_mode": (1015, lambda: cabinet.power.safety.value),
+            "R1_speed_scaling": (1019, lambda: cabinet.motion.fraction),
+            "R1_actual_TCP_pose": (1021, lambda: to_wire(cabinet.tcp())),
+            "R1_actual_TCP_force": (1023, cabinet.force),
+            "R1_tool_digital_output_bits": (1049, lambda: mask(cabinet.io.outputs["Tool"])),
+        }
+
+    @property
+    def mute(self) -> bool:
+        """While True, nothing is pushed (a fault that tests script)."""
+        return self._muted is not None
+
+    @mute.setter
+    def mute(self, mute: bool) -> None:
+        if mute and self._muted is None:
+            self._muted = self.faults.hang(Fault(device=Device.TELEMETRY, kind="mute", count=ALWAYS))
+        elif not mute and self._muted is not None:
+            self.faults.take(self._muted)
+            self._muted = None
+
+    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Greet, then follow the client's topics until it goes."""
+        outputs = {name: ident for name, (ident, _) in self._outputs.items()}
+        hello = {"protocol": "rtde", "version": 1, "input": {"set_recipe": SET_RECIPE}, "output": outputs}
+        writer.write(json.dumps(hello, separators=(",", ":")).encode() + b"\n\n")
+        decoder = FrameDecoder(skip=PING, max_bytes=MAX_MESSAGE_BYTES)
+        pushes: dict[int, asyncio.Task[None]] = {}
+        try:
+            while data := await reader.read(65536):
+                self.pings += data.count(PING)
+                for payload in decoder.feed(data):
+                    topic = topic_of(payload)
+                    if (old := pushes.pop(topic.chanel, None)) is not None:
+                        old.cancel()
+                    if topic.period_s > 0.0 and all(name in self._outputs for name in topic.segments):
+                        pushes[topic.chanel] = asyncio.create_task(self._push(topic, writer), name="rtde push")
+        finally:
+            for task in pushes.values():
+                task.cancel()
+            await asyncio.gather(*pushes.values(), return_exceptions=True)
+
+    async def _push(self, topic: Topic, writer: asyncio.StreamWriter) -> None:
+        loop = asyncio.get_running_loop()
+        due, before_s = loop.time(), self._cabinet.now_s()
+        while not writer.is_closing():
+            now_s = self._cabinet.now_s()
+            if writer.transport.get_write_buffer_size() < BACKLOG_BYTES:
+                for rest in self._rests(before_s, now_s):
+                    self._push_once(topic, writer, rest)
+                self._push_once(topic, writer)
+            before_s = now_s
+            due = max(due + topic.period_s, loop.time())
+            await asyncio.sleep(due - loop.time())
+
+    def _rests(self, after_s: float, until_s: float) -> list[Rest]:
+        """Where the arm rested between two pushes. A clock that runs faster than life leaves so much between them that
+        a whole press might pass unseen."""
+        world = self._cabinet.world
+        world.motion.advance(until_s)
+        return [rest for rest in world.motion.rests if after_s < rest.at_s <= until_s] if world.clock.rate > 1.0 else []
+
+    def _value(self, name: str, rest: Rest | None) -> Any:
+        if rest is not None:
+            match name:
+                case "timestamp":
+                    return rest.at_s
+                case "R1_actual_TCP_pose":
+                    return to_wire(self._cabinet.configured(rest.pose))
+                case "R1_actual_q" | "R1_target_q":
+                    return list(self._cabinet.motion.near_joints(rest.pose))
+                case _:
+                    pass
+        return self._outputs[name][1]()
+
+    def _push_once(self, topic: Topic, writer: asyncio.StreamWriter, rest: Rest | None = None) -> None:
+        fault = self.faults.meet(Device.TELEMETRY, "push", KINDS[Device.TELEMETRY])
+        match fault.kind if fault is not None else "":
+            case "mute":
+                pass
+            case "malformed":
+                writer.write(encode_short(MALFORMED))
+            case "drop":
+                writer.close()
+            case _:
+                writer.write(encode_sample(topic.chanel, [self._value(name, rest) for name in topic.segments]))
+
+
+def topic_of(payload: bytes) -> Topic:
+    """What a client asks for; a period of 0 where it unsubscribes. Raises `ProtocolViolation`."""
+    match decode_message(payload, "rtde"):
+        case (100, [{"chanel": int(chanel), "frequency": float() | int() as hz, "segments": list(names)}]):  # pyright: ignore[reportUnknownVariableType]
+            wanted = tuple(str(name) for name in names)  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+            return Topic(chanel, 1.0 / min(hz, MAX_HZ) if hz > 0 and wanted else 0.0, wanted)
+        case other:
+            raise ProtocolViolation("rtde", "topic", f"not a topic: {other!r}")

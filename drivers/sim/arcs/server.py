@@ -1,0 +1,191 @@
+"""The loopback controller on the wire: ARCS JSON-RPC over TCP, written from what the vendor's client was seen to do.
+
+One port takes SOF frames and bare JSON, named and positional params, ids of any kind; a connection's first byte tells.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Any
+
+from drivers.arcs.bare import BareDecoder
+from drivers.arcs.codes import RobotMode, SafetyMode
+from drivers.arcs.frames import FrameDecoder, encode
+from drivers.arcs.signatures import named
+from drivers.errors import ProtocolViolation
+from drivers.sim.arcs.cabinet import Cabinet
+from drivers.sim.arcs.methods import methods
+from drivers.sim.faults.board import FaultBoard
+from drivers.sim.faults.replies import Replies
+from drivers.sim.faults.truth import Truth
+from drivers.sim.faults.vocabulary import ALWAYS, LOST, REPLIES, STOPS, Device, Fault
+from drivers.sim.server import LoopbackServer
+from drivers.sim.world import World
+
+PARSE_ERROR, METHOD_NOT_FOUND, INVALID_PARAMS = -32700, -32601, -32602
+
+
+class ArcsServer(LoopbackServer):
+    """One controller for any number of clients."""
+
+    def __init__(self, world: World) -> None:
+        super().__init__()
+        self._world = world
+        self.cabinet = Cabinet(world)
+        self.faults = FaultBoard(Truth(world))
+        """What goes wrong here; a rig puts one board in all its servers."""
+        self._mutes: dict[str, int] = {}
+        """Faults that `mute` and `mute_to` have hung, by method; "" is any."""
+        self._methods = methods(self.cabinet)
+
+    async def stop(self) -> None:
+        """Close the listener, every client, and the cabinet's watchdogs."""
+        self.cabinet.close()
+        await super().stop()
+
+    def protective_stop(self, mode: SafetyMode = SafetyMode.PROTECTIVE_STOP) -> None:
+        """Enter a safety stop where the arm is (a fault that tests script); only a person clears it."""
+        self.cabinet.safety_stop(mode)
+
+    def stop_as(self, kind: str) -> None:
+        """Enter the safety stop that a fault of this kind asks for; `emergency-stop` takes the power too."""
+        match kind:
+            case "protective-stop":
+                self.cabinet.safety_stop(SafetyMode.PROTECTIVE_STOP)
+            case "safeguard-stop":
+                self.cabinet.safety_stop(SafetyMode.SAFEGUARD_STOP)
+            case _:
+                self.cabinet.emergency_stop()
+
+    @property
+    def mute(self) -> bool:
+        """While True, requests are lost: neither carried out nor answered (a fault that tests script)."""
+        return "" in self._mutes
+
+    @mute.setter
+    def mute(self, mute: bool) -> None:
+        if mute and not self.mute:
+            self._mutes[""] = self.faults.hang(Fault(device=Device.ROBOT, kind="deaf", count=ALWAYS))
+        elif not mute and self.mute:
+            self.faults.take(self._mutes.pop(""))
+
+    @property
+    def mute_to(self) -> set[str]:
+        """Methods that are carried out but never answered (a fault that tests script); set it as a whole."""
+        return set(self._mutes) - {""}
+
+    @mute_to.setter
+    def mute_to(self, methods: set[str]) -> None:
+        for method in self.mute_to - methods:
+            self.faults.take(self._mutes.pop(method))
+        for method in methods - self.mute_to:
+            fault = Fault(device=Device.ROBOT, kind="mute", on=method, count=ALWAYS)
+            self._mutes[method] = self.faults.hang(fault)
+
+    @property
+    def mode(self) -> RobotMode:
+        """The robot mode now."""
+        return self.cabinet.power.mode
+
+    @property
+    def safety(self) -> SafetyMode:
+        """The safety mode now; tests set it as a person at the pendant would."""
+        return self.cabinet.power.safety
+
+    @safety.setter
+    def safety(self, mode: SafetyMode) -> None:
+        self.cabinet.power.safety = mode
+
+    @property
+    def tcp_offset(self) -> list[float]:
+        """Flange to tip: [x, y, z m, rx, ry, rz rad]."""
+        return self.cabinet.tcp_offset
+
+    @property
+    def messages(self) -> list[dict[str, Any]]:
+        """What `Trace.peek` answers from."""
+        return self.cabinet.messages
+
+    @property
+    def _now_s(self) -> float:
+        return self.cabinet.now_s()
+
+    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer requests in order. The motion queue goes on when the client has gone, as a cabinet's would."""
+        data = await reader.read(65536)
+        bare = data[:1] in (b"{", b"[", b" ", b"\t", b"\r", b"\n")
+        decoder = BareDecoder() if bare else FrameDecoder()
+        replies = Replies(writer, bytes if bare else encode)
+        try:
+            while data:
+                try:
+                    payloads = decoder.feed(data)
+                except ProtocolViolation as error:
+                    if bare:  # a peer that speaks JSON is told before it is hung up on
+                        writer.write(_error(None, PARSE_ERROR, f"parse error: {error.what}"))
+                    raise
+                for payload in payloads:
+                    await self._serve_one(payload, replies)
+                data = await reader.read(65536)
+        finally:
+            replies.close()
+
+    async def _serve_one(self, payload: bytes, replies: Replies) -> None:
+        request = _parsed(payload)
+        op = _op(request)
+        if self.faults.meet(Device.ROBOT, op, LOST) is not None:
+            return
+        answer = self._answer(request)
+        stop = self.faults.meet(Device.ROBOT, op, STOPS)
+        if stop is not None:
+            self.stop_as(stop.kind)
+        await replies.send(answer, self.faults.meet(Device.ROBOT, op, REPLIES))
+
+    def _answer(self, request: Any) -> bytes:
+        match request:
+            case bytes() as reply:
+                return reply
+            case {"method": str(name)}:
+                return self._call(request.get("id"), name, request.get("params"))  # pyright: ignore[reportUnknownMemberType, reportUnknownArgumentType]
+            case _:
+                return _error(None, INVALID_PARAMS, "a request is an object with a method")
+
+    def _call(self, ident: object, name: str, params: Any) -> bytes:
+        method = self._methods.get(name)
+        if method is None:
+            return _error(ident, METHOD_NOT_FOUND, f"method not found: {name}")
+        try:
+            result = method(named(name, params) if isinstance(params, list) else params or {})  # pyright: ignore[reportUnknownArgumentType]
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            return _error(ident, INVALID_PARAMS, f"invalid params: {error!r}")
+        return _reply(ident, result=result)
+
+
+def _parsed(payload: bytes) -> Any:
+    """The request; where it is none that has a method, the reply as bytes."""
+    if payload.startswith(b"__login__"):
+        return b"SUCCEED"
+    try:
+        return json.loads(payload)
+    except (ValueError, RecursionError) as error:
+        return _error(None, PARSE_ERROR, f"parse error: {error}")
+
+
+def _op(request: Any) -> str:
+    """The method's name, as faults know it."""
+    match request:
+        case b"SUCCEED":
+            return "login"
+        case {"method": str(name)}:
+            return name
+        case _:
+            return ""
+
+
+def _reply(ident: object, **body: object) -> bytes:
+    return json.dumps({"id": ident, "jsonrpc": "2.0", **body}, separators=(",", ":")).encode()
+
+
+def _error(ident: object, code: int, message: str) -> bytes:
+    return _reply(ident, error={"code": code, "message": message})

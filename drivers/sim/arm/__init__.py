@@ -1,0 +1,1 @@
+"""The loopback rig's arm: kinematics, paths, and moves with trapezoidal speed."""

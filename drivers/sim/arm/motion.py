@@ -1,0 +1,267 @@
+"""The loopback arm's motion: a queue of moves with trapezoidal timing and rounded corners, evaluated when asked.
+
+Nothing depends on when it is asked. A move that comes later may change how an earlier one ends, but only where that
+agrees with all that was done by then; otherwise the arm comes to rest between the two.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from drivers.geometry import distance
+from drivers.samples import Pose
+from drivers.sim.arm.kinematics import HOME, Joints, Matrix, inverted
+from drivers.sim.arm.paths import Line, Path, fixed
+from drivers.sim.arm.plan import Corners, Move, pieces_of, ramps_of
+from drivers.sim.arm.ramp import Ramp
+
+__all__ = ["STEADY_LAG_S", "MotionQueue", "Move", "Ramp", "Segment"]
+
+STEADY_LAG_S = 0.08
+"""The controller reports steady a little after its queue is empty."""
+SAME_POSE_MM = 1e-4
+SAME_POSE_DEG = 1e-4
+RESTS_KEPT = 64
+AGREES = 1e-6
+"""mm, rad or those per second: two timings that differ by less are one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A piece of a move, with its time. `stop_s` cuts it: from then on it decelerates instead."""
+
+    ident: int
+    path: Path
+    enter: float
+    ramp: Ramp
+    begin_s: float
+    corner: bool = False
+    stop_s: float | None = None
+    stop_acc: float = 0.0
+    stops: bool = False
+    """True where it is on the way to a rest that was asked for."""
+
+    @property
+    def end_s(self) -> float:
+        """When it is over."""
+        if self.stop_s is None:
+            return self.begin_s + self.ramp.duration_s
+        done, speed = self.ramp.at(self.stop_s - self.begin_s)
+        left = speed * speed - 2.0 * self.stop_acc * max(self.ramp.length - done, 0.0)
+        return self.stop_s + (speed - math.sqrt(max(left, 0.0))) / self.stop_acc
+
+    def at(self, now_s: float) -> tuple[float, float]:
+        """(distance, speed) within the piece at `now_s`."""
+        if self.stop_s is None or now_s <= self.stop_s:
+            return self.ramp.at(now_s - self.begin_s)
+        done, speed = self.ramp.at(self.stop_s - self.begin_s)
+        dt = min(now_s, self.end_s) - self.stop_s
+        return min(done + speed * dt - 0.5 * self.stop_acc * dt * dt, self.ramp.length), speed - self.stop_acc * dt
+
+    def pose(self, now_s: float) -> Pose:
+        """Where the tip is at `now_s`."""
+        return self.path.pose(self.enter + self.at(now_s)[0])
+
+    def joints(self, now_s: float) -> Joints | None:
+        """The joints at `now_s`, where the path is given in joints."""
+        return self.path.joints(self.enter + self.at(now_s)[0])
+
+    def way(self) -> list[Pose]:
+        """The straight stretches that it was, as their ends."""
+        total = self.at(self.end_s)[0]
+        pieces = self.path.stretches
+        return [self.path.pose(self.enter + total * k / pieces) for k in range(pieces + 1)]
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """The tip came to rest here, be it for a moment."""
+
+    at_s: float
+    pose: Pose
+
+
+class MotionQueue:
+    """First in, first out. `on_path(start, end)` is told of every stretch once it has been travelled."""
+
+    def __init__(self, home: Pose, on_path: Callable[[Pose, Pose], None], capacity: int = 64) -> None:
+        self.fraction = 1.0
+        """Share of its speed at which every move runs that has not begun."""
+        self.near: Joints = HOME
+        """The joints where the arm was last seen: where inverse kinematics begins."""
+        self._rest = home
+        self._rest_since_s = -1.0
+        self._on_path = on_path
+        self._capacity = capacity
+        self._queue: deque[Segment] = deque()
+        self._moves: list[Move] = []
+        """Every move that is not over, in order."""
+        self._corners: Corners = {}
+        self._next_id: int = 0
+        self.rests: deque[Rest] = deque(maxlen=RESTS_KEPT)
+        """Where and when the arm came to rest, the newest ones."""
+
+    @property
+    def full(self) -> bool:
+        """True when another move would be refused."""
+        return self.size >= self._capacity
+
+    @property
+    def size(self) -> int:
+        """Moves that are queued or running; one that decelerates to a stop counts."""
+        return len({segment.ident for segment in self._queue})
+
+    @property
+    def running(self) -> Segment | None:
+        """The piece of the path that runs now; None at rest."""
+        return self._queue[0] if self._queue else None
+
+    def add(
+        self,
+        target: Pose,
+        speed_mm_s: float,
+        acc_mm_s2: float,
+        now_s: float,
+        duration_s: float = 0.0,
+        *,
+        blend_mm: float = 0.0,
+        fix: Matrix | None = None,
+    ) -> bool:
+        """Append a line; False where the target is where the last move ends.
+
+        `target` is for the tool centre point that was configured, and `fix` leads from there to the true tip.
+        """
+        self.advance(now_s)
+        start = self._last() if fix is None else fixed(self._last(), inverted(fix))
+        travel_mm, turn_deg = distance(start, target)
+        if travel_mm <= SAME_POSE_MM and turn_deg <= SAME_POSE_DEG:
+            return False
+        line = Line(start, target, fix)
+        unit = 1e-3 if line.angular else 1.0
+        self._append(
+            Move(
+                self._next_id, line, speed_mm_s * unit, acc_mm_s2 * unit, duration_s, 0.0 if line.angular else blend_mm
+            ),
+            now_s,
+        )
+        return True
+
+    def advance(self, now_s: float) -> None:
+        """Retire every piece that is over by `now_s`."""
+        while self._queue and self._queue[0].end_s <= now_s:
+            segment = self._queue.popleft()
+            if segment.corner:
+                self._moves = [replace(m, lead=None) if m.ident == segment.ident else m for m in self._moves]
+            elif not segment.stops:
+                self._moves = [m for m in self._moves if m.ident != segment.ident]
+            self._finish(segment)
+
+    def stop(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
+        """Decelerate along the path and forget the rest; a second stop changes nothing."""
+        self.advance(now_s)
+        self._brake(acc_mm_s2, acc_rad_s2, now_s)
+
+    def pose(self, now_s: float) -> Pose:
+        """Where the tip is."""
+        self.advance(now_s)
+        return self._queue[0].pose(now_s) if self._queue else self._rest
+
+    def exec_id(self, now_s: float) -> int:
+        """Id of the running move, -1 when the queue is empty. A corner belongs to the move that it leads into."""
+        self.advance(now_s)
+        return self._queue[0].ident if self._queue else -1
+
+    def steady(self, now_s: float) -> bool:
+        """True once the queue has been empty for `STEADY_LAG_S`."""
+        self.advance(now_s)
+        return not self._queue and now_s - self._rest_since_s >= STEADY_LAG_S
+
+    def _finish(self, segment: Segment) -> None:
+        way = segment.way()
+        self._rest, self._rest_since_s = way[-1], segment.end_s
+        self.near = segment.joints(segment.end_s) or self.near
+        if segment.ramp.v_out == 0.0:
+            self.rests.append(Rest(segment.end_s, way[-1]))
+        if segment.ramp.length:
+            for start, end in itertools.pairwise(way):
+                self._on_path(start, end)
+
+    def _last(self) -> Pose:
+        """Where the last accepted move ends."""
+        if self._moves:
+            path = self._moves[-1].path
+            return path.pose(path.length)
+        return self._queue[-1].pose(self._queue[-1].end_s) if self._queue else self._rest
+
+    def _append(self, move: Move, now_s: float) -> None:
+        self._next_id += 1
+        self._moves.append(move)
+        first = self._moves[0].ident
+        self._corners = {key: corner for key, corner in self._corners.items() if key[0] >= first}
+        self._replan(0, now_s)
+
+    def _replan(self, first: int, now_s: float) -> None:
+        """Time anew what can still be changed, from the move at index `first` on or a later one."""
+        queue = list(self._queue)
+        for k in range(first, len(self._moves)):
+            chain = self._moves[k:]
+            mine = [i for i, s in enumerate(queue) if s.ident == chain[0].ident and not s.stops]
+            # a corner that was planned stays with the move before it; one that was held begins the chain
+            at = next((i for i in mine if chain[0].lead or not queue[i].corner), len(queue))
+            planned = queue[at] if at < len(queue) else None
+            if planned is not None:
+                begin_s, v_in = planned.begin_s, planned.ramp.v_in
+            else:
+                begin_s, v_in = (queue[-1].end_s if queue else now_s), 0.0
+            if planned is not None and not chain[0].lead:
+                chain = [replace(chain[0], enter=planned.enter), *chain[1:]]
+            begun = planned if planned is not None and planned.begin_s < now_s else None
+            pieces = pieces_of(
+                chain, self.fraction, self._corners, None if begun is None or begun.corner else begun.ramp.speed
+            )
+            ramps = ramps_of(pieces, v_in)
+            if ramps is None or (begun is not None and not _agree(begun.ramp, ramps[0], now_s - begun.begin_s)):
+                continue
+            del queue[at:]
+            for piece, ramp in zip(pieces, ramps, strict=True):
+                queue.append(Segment(piece.ident, piece.path, piece.begin, ramp, begin_s, piece.corner))
+                begin_s += ramp.duration_s
+            break
+        self._queue = deque(queue)
+
+    def _brake(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> tuple[Segment, float] | None:
+        """Come to rest on the path; (piece, distance within it) where that is, None where nothing was under way."""
+        queue, self._moves = list(self._queue), []
+        if not queue or queue[0].stops:
+            self._queue = deque(s for s in queue if s.stops)
+            return None
+        front, now_done = queue[0], queue[0].at(now_s)
+        done, speed = now_done
+        left, last = front.ramp.length - done, 0
+        while queue[last].ramp.v_out > 0.0 and last + 1 < len(queue):
+            last += 1
+            left += queue[last].ramp.length
+        # never farther than the path would have gone
+        acc = max(acc_rad_s2 if front.ramp.angular else acc_mm_s2, speed * speed / (2.0 * left) if left > 0.0 else 0.0)
+        braking = [replace(front, stop_s=now_s, stop_acc=acc, stops=True)]
+        speed = math.sqrt(max(speed * speed - 2.0 * acc * (front.ramp.length - done), 0.0))
+        at, rest = front, braking[0].at(braking[0].end_s)[0]
+        for segment in queue[1 : last + 1]:
+            if speed <= AGREES:
+                break
+            way = min(speed * speed / (2.0 * acc), segment.ramp.length)
+            after = math.sqrt(max(speed * speed - 2.0 * acc * way, 0.0))
+            ramp = Ramp(way, speed, acc, segment.ramp.angular, speed, after if after > AGREES else 0.0)
+            braking.append(replace(segment, ramp=ramp, begin_s=braking[-1].end_s, stops=True))
+            at, rest, speed = segment, way, after
+        self._queue = deque(braking)
+        return at, rest
+
+
+def _agree(old: Ramp, new: Ramp, t: float) -> bool:
+    """Whether the two timings have done the same by `t`."""
+    return all(abs(a - b) <= AGREES for a, b in zip(old.at(t), new.at(t), strict=True))

@@ -1,0 +1,239 @@
+"""The ways of the loopback arm's tip: lines in space and in joints, and the corners that join two of them."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from drivers.geometry import distance, interpolate
+from drivers.samples import Pose
+from drivers.sim.arm.kinematics import Joints, Matrix, forward, matrix_of, pose_of
+
+ROTATION_AS_LINEAR_MM = 1.0
+"""Below this travel, ARCS reads speed and acceleration as rad/s and rad/s2."""
+TURN_RAD = 1e-4
+STRETCHES = 16
+"""Straight pieces that a curved way is told to the world in."""
+
+
+class Path(Protocol):
+    """A way of `length` mm, or rad where `angular`."""
+
+    @property
+    def length(self) -> float:
+        """From end to end."""
+        ...
+
+    @property
+    def angular(self) -> bool:
+        """True where lengths are in rad."""
+        ...
+
+    @property
+    def stretches(self) -> int:
+        """Straight pieces that stand for it; 1 for a straight line."""
+        ...
+
+    def pose(self, done: float) -> Pose:
+        """Where the true tip is after `done`."""
+        ...
+
+    def joints(self, done: float) -> Joints | None:
+        """The joints there, where the way is given in joints."""
+        ...
+
+
+class InSpace:
+    """A way that is given in space alone."""
+
+    def joints(self, done: float) -> Joints | None:
+        """None: not given in joints."""
+        return None
+
+
+class InJoints(ABC):
+    """A way that is given in joints: the tip follows from them and the tool."""
+
+    tool: Matrix
+
+    @abstractmethod
+    def joints(self, done: float) -> Joints:
+        """The joints after `done`."""
+
+    def pose(self, done: float) -> Pose:
+        """Where the tip is."""
+        return pose_of(forward(self.joints(done)) @ self.tool)
+
+
+@dataclass(frozen=True)
+class Line(InSpace):
+    """Straight for the tool centre point that was configured; `fix` leads from there to the true tip (None: same)."""
+
+    start: Pose
+    end: Pose
+    fix: Matrix | None = None
+
+    @cached_property
+    def _measure(self) -> tuple[float, float]:
+        travel_mm, turn_deg = distance(self.start, self.end)
+        return travel_mm, math.radians(turn_deg)
+
+    @property
+    def angular(self) -> bool:
+        """True for a turn on the spot."""
+        travel_mm, turn_rad = self._measure
+        return travel_mm < ROTATION_AS_LINEAR_MM and turn_rad > TURN_RAD
+
+    @property
+    def length(self) -> float:
+        """Of the way, or of the turn."""
+        return self._measure[1] if self.angular else self._measure[0]
+
+    @property
+    def stretches(self) -> int:
+        """1 unless the tip goes round a wrong tool centre point."""
+        return 1 if self.fix is None or self._measure[1] < TURN_RAD else STRETCHES
+
+    def along(self, done: float) -> Pose:
+        """The configured tool centre point after `done`; the ends are exact."""
+        if done >= self.length:
+            return self.end
+        return self.start if done <= 0.0 else interpolate(self.start, self.end, done / self.length)
+
+    def pose(self, done: float) -> Pose:
+        """Where the true tip is."""
+        return fixed(self.along(done), self.fix)
+
+
+@dataclass(frozen=True)
+class Corner(InSpace):
+    """The parabola that leaves `a` at `cut` before its end and meets `b` at `cut` after its start; turns go along."""
+
+    a: Line
+    b: Line
+    cut: float
+    angular: bool = False
+    stretches: int = STRETCHES
+
+    @property
+    def length(self) -> float:
+        """What is cut off; the curve itself is shorter."""
+        return 2.0 * self.cut
+
+    @cached_property
+    def bend(self) -> float:
+        """Length of the difference of the two directions: 0 straight on, 2 back again."""
+        ways = [np.subtract(w.end.position_mm, w.start.position_mm) / w.length for w in (self.a, self.b)]
+        return float(np.linalg.norm(ways[1] - ways[0]))
+
+    def pose(self, done: float) -> Pose:
+        """By de Casteljau: lines between lines."""
+        u = done / self.length
+        start, end = self.a.along(self.a.length - self.cut), self.b.along(self.cut)
+        there = interpolate(interpolate(start, self.a.end, u), interpolate(self.b.start, end, u), u)
+        return fixed(there, self.a.fix)
+
+
+@dataclass(frozen=True)
+class JointLine(InJoints):
+    """Straight in joints; its length is that of the joint that turns farthest."""
+
+    start: Joints
+    end: Joints
+    tool: Matrix
+    angular: bool = True
+    stretches: int = STRETCHES
+
+    @cached_property
+    def _length(self) -> float:
+        return max(abs(a - b) for a, b in zip(self.start, self.end, strict=True))
+
+    @property
+    def length(self) -> float:
+        """In rad."""
+        return self._length
+
+    def joints(self, done: float) -> Joints:
+        """The joints after `done`."""
+        if done >= self.length:
+            return self.end
+        return mixed(self.start, self.end, max(done, 0.0) / self.length)
+
+
+@dataclass(frozen=True)
+class JointCorner:
+    """A `Corner` in joints."""
+
+    a: JointLine
+    b: JointLine
+    cut: float
+    angular: bool = True
+    stretches: int = STRETCHES
+
+    @property
+    def length(self) -> float:
+        """What is cut off."""
+        return 2.0 * self.cut
+
+    @cached_property
+    def bend(self) -> float:
+        """The largest difference of the two directions in any joint."""
+        ways = [np.subtract(w.end, w.start) / w.length for w in (self.a, self.b)]
+        return float(np.abs(ways[1] - ways[0]).max())
+
+    def joints(self, done: float) -> Joints:
+        """By de Casteljau."""
+        u = done / self.length
+        start, end = self.a.joints(self.a.length - self.cut), self.b.joints(self.cut)
+        return mixed(mixed(start, self.a.end, u), mixed(self.b.start, end, u), u)
+
+    def pose(self, done: float) -> Pose:
+        """Where the tip is."""
+        return pose_of(forward(self.joints(done)) @ self.a.tool)
+
+
+@dataclass(frozen=True)
+class Part:
+    """What is left of a path after `begin`."""
+
+    whole: Path
+    begin: float
+
+    @property
+    def length(self) -> float:
+        """Of the rest."""
+        return max(self.whole.length - self.begin, 0.0)
+
+    @property
+    def angular(self) -> bool:
+        """As the whole."""
+        return self.whole.angular
+
+    @property
+    def stretches(self) -> int:
+        """As the whole."""
+        return self.whole.stretches
+
+    def pose(self, done: float) -> Pose:
+        """Where the tip is."""
+        return self.whole.pose(self.begin + done)
+
+    def joints(self, done: float) -> Joints | None:
+        """As the whole."""
+        return self.whole.joints(self.begin + done)
+
+
+def fixed(pose: Pose, fix: Matrix | None) -> Pose:
+    """The true tip, from the tool centre point that was configured."""
+    return pose if fix is None else pose_of(matrix_of(pose) @ fix)
+
+
+def mixed(a: Joints, b: Joints, share: float) -> Joints:
+    """Between two joint positions."""
+    q = [p + share * (r - p) for p, r in zip(a, b, strict=True)]
+    return (q[0], q[1], q[2], q[3], q[4], q[5])

@@ -1,0 +1,160 @@
+"""Look-ahead over queued moves: which corners are rounded, and how fast each piece of the way begins and ends."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from drivers.geometry import distance
+from drivers.sim.arm.paths import Corner, JointCorner, JointLine, Line, Path
+from drivers.sim.arm.ramp import Ramp, paced
+
+SHORTEST_CUT = 1e-6
+SLACK = 1e-9
+"""Rounding of speeds; a plan that needs more is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """One accepted move. Speeds in mm and s, or rad and s where the path is angular."""
+
+    ident: int
+    path: Path
+    speed: float
+    acc: float
+    duration_s: float = 0.0
+    blend_mm: float = 0.0
+    """How near to its end the tip may leave it for the next one; 0 ends at rest."""
+    enter: float = 0.0
+    """Where on its path it begins: after the corner that leads into it."""
+    lead: tuple[Path, float] | None = None
+    """What is left of that corner, and its speed, where the path was held in the middle of it."""
+    held: bool = False
+    """Begins at rest at `enter`: the path was held there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A stretch of one move between two joints at which speeds are matched."""
+
+    ident: int
+    path: Path
+    begin: float
+    """Where on the path it begins."""
+    length: float
+    cap: float
+    acc: float
+    corner: bool = False
+    even: bool = False
+    """A whole corner is taken at one speed: its acceleration is all needed for the bend."""
+    from_rest: bool = False
+
+
+Corners = dict[tuple[int, int, float], Corner | JointCorner | None]
+"""By the two moves, and by where the first was held."""
+
+
+def corner_of(a: Move, b: Move) -> Corner | JointCorner | None:
+    """The corner between two moves, or None where the arm comes to rest between them."""
+    if a.blend_mm <= 0.0:
+        return None
+    match a.path, b.path:
+        case Line() as one, Line() as two if not one.angular and not two.angular and one.fix is two.fix:
+            cut = min(a.blend_mm, 0.5 * one.length, 0.5 * two.length, one.length - a.enter)
+            return Corner(one, two, cut) if cut > SHORTEST_CUT else None
+        case JointLine() as one, JointLine() as two:
+            cut = min(_near(one, a.blend_mm, end=True), _near(two, a.blend_mm, end=False), one.length - a.enter)
+            return JointCorner(one, two, cut) if cut > SHORTEST_CUT else None
+        case _:
+            return None
+
+
+def pieces_of(
+    moves: Sequence[Move], fraction: float, corners_known: Corners, first_cap: float | None = None
+) -> list[Piece]:
+    """The moves with their corners, in order. `first_cap` is the speed of a first move that has begun already.
+
+    `corners_known` is looked into and added to.
+    """
+    corners: list[Corner | JointCorner | None] = []
+    for a, b in itertools.pairwise(moves):
+        key = (a.ident, b.ident, a.enter if a.held else 0.0)
+        if key not in corners_known:
+            corners_known[key] = corner_of(a, b)
+        corners.append(corners_known[key])
+    before, behind = [None, *corners], [*corners, None]
+    enters = [corner.cut if corner else move.enter for move, corner in zip(moves, before, strict=True)]
+    caps = [
+        paced(m.path.length, m.speed * fraction, m.acc, m.duration_s, _rests(m, enter))
+        for m, enter in zip(moves, enters, strict=True)
+    ]
+    caps[0] = caps[0] if first_cap is None else first_cap
+    pieces: list[Piece] = []
+    for i, (move, cap, enter) in enumerate(zip(moves, caps, enters, strict=True)):
+        if move.lead is not None:
+            rest, speed = move.lead
+            pieces.append(Piece(move.ident, rest, 0.0, rest.length, min(speed, cap), move.acc, corner=True))
+        rounded = behind[i]
+        length = max(move.path.length - enter - (rounded.cut if rounded else 0.0), 0.0)
+        from_rest = before[i] is None and move.lead is None
+        pieces.append(Piece(move.ident, move.path, enter, length, cap, move.acc, from_rest=from_rest))
+        if rounded is not None:
+            acc = min(move.acc, moves[i + 1].acc)
+            # the speed bends by `bend` v within 2 cut / v: an acceleration of v^2 bend / (2 cut)
+            limit = math.sqrt(2.0 * rounded.cut * acc / max(rounded.bend, 1e-12))
+            limit = min(cap, caps[i + 1], limit)
+            ident = moves[i + 1].ident
+            # from a rest just before the corner the arm speeds up within it
+            pieces.append(Piece(ident, rounded, 0.0, rounded.length, limit, acc, corner=True, even=not move.held))
+    return pieces
+
+
+def speeds_of(pieces: Sequence[Piece], v_in: float) -> list[float] | None:
+    """Speeds at the joints, ends included, each as high as caps and accelerations allow; it ends at rest.
+
+    None where the arm, arriving with `v_in`, could not slow down in time.
+    """
+    speeds = [0.0] * (len(pieces) + 1)
+    for i in range(len(pieces) - 1, -1, -1):
+        piece = pieces[i]
+        reach = speeds[i + 1] if piece.even else math.sqrt(speeds[i + 1] ** 2 + 2.0 * piece.acc * piece.length)
+        if i == 0:
+            if v_in > reach * (1.0 + SLACK) + SLACK:
+                return None
+            speeds[0] = v_in
+        else:
+            limit = 0.0 if piece.from_rest else min(pieces[i - 1].cap, piece.cap)
+            speeds[i] = min(limit, reach)
+    for i, piece in enumerate(pieces):
+        reach = speeds[i] if piece.even else math.sqrt(speeds[i] ** 2 + 2.0 * piece.acc * piece.length)
+        speeds[i + 1] = min(speeds[i + 1], reach)
+    return speeds
+
+
+def ramps_of(pieces: Sequence[Piece], v_in: float) -> list[Ramp] | None:
+    """The timing of every piece, or None where there is none."""
+    speeds = speeds_of(pieces, v_in)
+    if speeds is None:
+        return None
+    return [
+        Ramp(p.length, min(p.cap, speeds[i]) if p.even else p.cap, p.acc, p.path.angular, speeds[i], speeds[i + 1])
+        for i, p in enumerate(pieces)
+    ]
+
+
+def _rests(move: Move, enter: float) -> int:
+    """At how many of its ends the move is meant to be at rest."""
+    return 2 - (enter > 0.0 and not move.held) - (move.blend_mm > 0.0)
+
+
+def _near(path: JointLine, radius_mm: float, *, end: bool) -> float:
+    """How far along the joints the tip stays within `radius_mm` of one end, half the way at most."""
+    corner = path.pose(path.length if end else 0.0)
+    low, high = 0.0, 0.5 * path.length
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        there = path.pose(path.length - middle if end else middle)
+        low, high = (middle, high) if distance(there, corner)[0] <= radius_mm else (low, middle)
+    return low

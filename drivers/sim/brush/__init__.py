@@ -1,0 +1,1 @@
+"""The loopback rig's brush and paper: bristles, contact, ink."""

@@ -1,0 +1,210 @@
+"""The simulated brush: one individual brush, pressed on paper by mechanics and not by a stroke model.
+
+`docs/loopback-brush.md` gives the equations and their sources, and says what this brush is not.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.sim.brush.bristles import draw_wander, grow_bristles
+from drivers.sim.brush.drag import Stances, Waypoint, draw_drag
+from drivers.sim.brush.flaws import Flaw, Trouble, draw_trouble
+from drivers.sim.brush.footprint import Footprint, Tuft, blank_footprint, print_footprint
+from drivers.sim.brush.spine import Bundle, SpineShape, Vector, press_spine, pull_spine, rest_spine
+
+__all__ = ["Brush", "BrushSpec", "Flaw", "Footprint", "Waypoint"]
+
+LINKS = 48
+LEAST_DEPTH_MM = 1e-6
+"""A drag less deep leaves nothing."""
+MAX_TILT_DEG = 30.0
+MAX_DEPTH = 0.9
+"""Deepest press as a fraction of the ferrule's height at zero touch; beyond it the ferrule hits the paper."""
+
+REMEMBERED_SPINES = 64
+REMEMBERED_STANCES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class BrushSpec:
+    """What one individual brush is made of; raises ValueError, naming value and range, if it is no brush."""
+
+    radius_mm: float = 6.0
+    """Largest radius of the bundle."""
+    length_mm: float = 48.0
+    """Free length of the bundle, ferrule to tip."""
+    stiffness_n_mm2: float = 200.0
+    """Flexural rigidity of the wet bundle where it is thickest, N times mm^2."""
+    stiffness_power: float = 3.5
+    """Rigidity falls with this power of the local radius: 4 = a solid rod, 2 = hairs that slide freely."""
+    squash_n_per_mm2: float = 0.008
+    """Sideways stiffness of the bundle: force per mm of length and mm of squash."""
+    suction_n_per_mm2: float = 0.003
+    """Peak capillary stress that draws the wet bundle down: 2 x 0.072 N/m over pores of 0.05 mm radius."""
+    friction: float = 0.22
+    """Coulomb coefficient of wet hair on paper. From about 0.35 an upright tip sticks where it touched."""
+    set_deg: float = 8.0
+    """Set of the tip half toward -x, from the last wipe; never 0, or an upright brush stands on its tip."""
+    bristles: int = 400
+    """Hairs that are followed one by one; each stands for several real ones."""
+    seed: int = 1
+    """The individual: its bristles and how they clump."""
+
+    def __post_init__(self) -> None:
+        _within("radius_mm", self.radius_mm, 1.0, 20.0)
+        _within("length_mm", self.length_mm, 3.0 * self.radius_mm, 120.0)
+        _within("stiffness_n_mm2", self.stiffness_n_mm2, 10.0, 1000.0)
+        _within("stiffness_power", self.stiffness_power, 2.0, 4.0)
+        _within("squash_n_per_mm2", self.squash_n_per_mm2, 0.001, 0.5)
+        _within("suction_n_per_mm2", self.suction_n_per_mm2, 0.0, 0.01)
+        _within("friction", self.friction, 0.0, 0.8)
+        _within("set_deg", self.set_deg, 1.0, 30.0)
+        _within("bristles", self.bristles, 50, 5000)
+        _within("seed", self.seed, 0, 2**63 - 1)
+
+
+class Brush:
+    """One brush. Pressing has no memory: each press starts from the same wiped bundle."""
+
+    def __init__(self, spec: BrushSpec) -> None:
+        self.spec = spec
+        self._bundle = _bundle(spec)
+        self._bristles = grow_bristles(spec.bristles, np.random.default_rng(spec.seed))
+        # spines depend on (depth, tilt) only, and a protocol repeats its cells
+        self._spine = lru_cache(maxsize=REMEMBERED_SPINES)(self._solve)
+        self._stances = lru_cache(maxsize=REMEMBERED_STANCES)(self._solve_stances)
+
+    def press(
+        self,
+        depth_mm: float,
+        tilt_deg: float,
+        *,
+        ink_load: float,
+        press_seed: int,
+        px_per_mm: float = 10.0,
+        flaw: Flaw | None = None,
+        severity: float = 1.0,
+    ) -> Footprint:
+        """Press once on fresh paper; equal arguments give equal bytes, another `press_seed` another natural
+        repeat.
+
+        The frame's origin is where the tip touched; the brush tilts about it until the ferrule leans toward
+        +x by `tilt_deg` and then descends. Columns grow with +x, rows with -y. The upright bundle bends
+        toward -x, its set. A depth of 0 or less leaves the paper blank; a flaw of severity 0 is none. Raises
+        ValueError, naming value and range, if `depth_mm` exceeds 0.9 length cos(tilt), or tilt is outside
+        0 .. 30 deg, `ink_load` or `severity` outside 0 .. 1 (1 = freshly dipped), `px_per_mm` outside 2 .. 40,
+        or `press_seed` is negative.
+        """
+        self._check(depth_mm, tilt_deg, ink_load, press_seed, px_per_mm)
+        _within("severity", severity, 0.0, 1.0)
+        if depth_mm <= 0.0:
+            return blank_footprint(px_per_mm)
+        trouble: Trouble | None = None
+        if flaw is not None and severity > 0.0:
+            rng = np.random.default_rng([self.spec.seed, press_seed, 2])
+            trouble = draw_trouble(flaw, severity, self.spec.bristles, self.spec.length_mm, rng)
+        spine = self._spine(float(depth_mm), float(tilt_deg))
+        return print_footprint(spine, self._tuft(press_seed, trouble), ink_load, px_per_mm, self._paper(press_seed))
+
+    def deepest_mm(self, tilt_deg: float) -> float:
+        """Where the ferrule is about to hit the paper."""
+        return MAX_DEPTH * self.spec.length_mm * math.cos(math.radians(min(tilt_deg, MAX_TILT_DEG)))
+
+    def push_n(self, depth_mm: float, tilt_deg: float) -> Vector:
+        """Normal force in N at equally spaced depths from 0 to `depth_mm`, on the way down."""
+        path = press_spine(self._bundle, depth_mm, math.radians(tilt_deg))
+        return np.array([0.0, *(float(shape.normal_n.sum()) for shape in path)])
+
+    def drag(
+        self,
+        path: Sequence[Waypoint],
+        tilt_deg: float,
+        heading_deg: float,
+        *,
+        ink_load: float,
+        press_seed: int,
+        px_per_mm: float = 10.0,
+    ) -> Footprint:
+        """Draw the brush along straight lines between waypoints; equal arguments give equal bytes.
+
+        The mark's frame lies along the paper's: its origin is the first waypoint, columns grow with +x, rows with -y.
+        `heading_deg` is where the ferrule leans, or would lean, when the tip lands; from there on the bundle trails.
+        Raises ValueError as `press` does, and where there is no waypoint. No depth above 0 leaves the paper blank.
+        """
+        if not path:
+            raise ValueError("a drag needs at least one waypoint")
+        deepest = max(w.depth_mm for w in path)
+        self._check(deepest, tilt_deg, ink_load, press_seed, px_per_mm)
+        if deepest <= LEAST_DEPTH_MM:
+            return blank_footprint(px_per_mm)
+        return draw_drag(
+            path,
+            self._stances(math.ceil(deepest), float(tilt_deg)),
+            math.radians(heading_deg),
+            self._tuft(press_seed, None),
+            ink_load,
+            px_per_mm,
+            self._paper(press_seed),
+        )
+
+    def _check(self, depth_mm: float, tilt_deg: float, ink_load: float, press_seed: int, px_per_mm: float) -> None:
+        _within("tilt_deg", tilt_deg, 0.0, MAX_TILT_DEG)
+        _within("ink_load", ink_load, 0.0, 1.0)
+        _within("px_per_mm", px_per_mm, 2.0, 40.0)
+        _within("press_seed", press_seed, 0, 2**63 - 1)
+        _within("depth_mm", depth_mm, -math.inf, self.deepest_mm(tilt_deg))
+
+    # two streams, so that the paper does not shift when the number of bristles changes
+    def _tuft(self, press_seed: int, trouble: Trouble | None) -> Tuft:
+        lie_rng = np.random.default_rng([self.spec.seed, press_seed, 0])
+        return Tuft(self._bundle, self._bristles, draw_wander(self.spec.bristles, lie_rng), trouble)
+
+    def _paper(self, press_seed: int) -> np.random.Generator:
+        return np.random.default_rng([self.spec.seed, press_seed, 1])
+
+    def _solve(self, depth_mm: float, tilt_deg: float) -> tuple[SpineShape, ...]:
+        return press_spine(self._bundle, depth_mm, math.radians(tilt_deg))
+
+    def _solve_stances(self, depth_mm: int, tilt_deg: float) -> Stances:
+        tilt_rad = math.radians(tilt_deg)
+        return Stances(
+            (rest_spine(self._bundle, tilt_rad), *press_spine(self._bundle, depth_mm, tilt_rad)),
+            (rest_spine(self._bundle, tilt_rad), *pull_spine(self._bundle, depth_mm, tilt_rad)),
+            float(depth_mm),
+        )
+
+
+def _bundle(spec: BrushSpec) -> Bundle:
+    """Cut the free bundle into `LINKS` links and give each joint its share of rigidity and set."""
+    link = spec.length_mm / LINKS
+    joint_mm = link * np.arange(LINKS)
+    rigidity = spec.stiffness_n_mm2 * (_profile(spec, joint_mm) / spec.radius_mm) ** spec.stiffness_power
+    share = np.clip(joint_mm / spec.length_mm - 0.5, 0.0, None)
+    return Bundle(
+        link_mm=link,
+        radius_mm=_profile(spec, joint_mm + link),
+        joint_n_mm=rigidity / link,
+        rest_bend_rad=math.radians(spec.set_deg) * share / share.sum(),
+        squash_n_per_mm2=spec.squash_n_per_mm2,
+        suction_n_per_mm2=spec.suction_n_per_mm2,
+        friction=spec.friction,
+    )
+
+
+def _profile(spec: BrushSpec, from_ferrule_mm: NDArray[np.floating]) -> Vector:
+    """Free radius along the bundle: a slight belly at 0.3 of the length, then a hollow taper to a fine
+    tip."""
+    u = np.asarray(from_ferrule_mm / spec.length_mm, np.float64)
+    root = 0.95 + 0.05 * np.sin(0.5 * np.pi * np.minimum(u / 0.3, 1.0))
+    taper = 1.0 - np.clip((u - 0.3) / 0.7, 0.0, 1.0) ** 0.85
+    return spec.radius_mm * np.maximum(np.where(u < 0.3, root, taper), 0.04)
+
+
+def _within(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise ValueError(f"{name} = {value:g} is outside {low:g} .. {high:g}")

@@ -1,0 +1,167 @@
+"""From a dragged brush to ink on paper: the patch of each moment, laid where the leash has drawn it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from drivers.sim.brush.footprint import MARGIN_MM, Footprint, Tuft, frame_around
+from drivers.sim.brush.leash import Moment, Reach, Waypoint, follow
+from drivers.sim.brush.soak import Dots, Image, scatter, soak
+from drivers.sim.brush.spine import SpineShape, Vector
+
+INK_PER_MM = 0.005
+"""Share of a full brush that one mm of a drag takes, on top of what landing takes."""
+
+DEPTH_STEP_MM = 0.2
+LOAD_STEP = 0.02
+"""Patches of nearly equal depth and load are drawn once."""
+
+WET_MM = 0.3
+"""Hairs this near the paper are part of the patch."""
+
+STAMP_MARGIN_MM = 1.5
+
+
+@dataclass(frozen=True)
+class Stances:
+    """How one brush stands on the paper by depth: pressed straight down, and drawn along. Both start unloaded."""
+
+    pressed: tuple[SpineShape, ...]
+    pulled: tuple[SpineShape, ...]
+    deepest_mm: float
+
+    def at(self, depth_mm: float, pulled: bool) -> SpineShape:
+        """The spine at a depth, between the two nearest that were solved."""
+        shapes = self.pulled if pulled else self.pressed
+        place = min(depth_mm / self.deepest_mm, 1.0) * (len(shapes) - 1)
+        below = min(int(place), len(shapes) - 2)
+        return _between(shapes[below], shapes[below + 1], place - below)
+
+    @cached_property
+    def reach(self) -> Reach:
+        """The leash that belongs to these stances."""
+        depth = np.linspace(0.0, self.deepest_mm, len(self.pulled))
+        pressed, pulled = ([self.at(float(d), p) for d in depth] for p in (False, True))
+        return Reach(
+            depth_mm=depth,
+            pressed_mm=np.array([-middle_mm(s) for s in pressed]),
+            pulled_mm=np.array([-middle_mm(s) for s in pulled]),
+            half_mm=np.array([_half_mm(s) for s in pulled]),
+        )
+
+
+def _between(a: SpineShape, b: SpineShape, share: float) -> SpineShape:
+    """The spine a share of the way from one to the other."""
+    return SpineShape(
+        x_mm=a.x_mm + share * (b.x_mm - a.x_mm),
+        z_mm=a.z_mm + share * (b.z_mm - a.z_mm),
+        phi_rad=a.phi_rad + share * (b.phi_rad - a.phi_rad),
+        squash_mm=a.squash_mm + share * (b.squash_mm - a.squash_mm),
+        normal_n=a.normal_n + share * (b.normal_n - a.normal_n),
+    )
+
+
+def middle_mm(shape: SpineShape) -> float:
+    """Where along x a spine rests on the paper on average; its tip where it does not rest."""
+    force = float(shape.normal_n.sum())
+    return float(shape.x_mm @ shape.normal_n) / force if force > 1e-6 else float(shape.x_mm[-1])
+
+
+def _half_mm(shape: SpineShape) -> float:
+    """Half the length of what is near enough to the paper to wet it."""
+    near = shape.x_mm[shape.squash_mm > -WET_MM]
+    return 0.5 * float(near.max() - near.min()) if near.size else 0.0
+
+
+def ink_left(ink_load: float, travel_mm: float) -> float:
+    """Load after so many mm of a drag."""
+    return max(0.0, ink_load - INK_PER_MM * travel_mm)
+
+
+def draw_drag(
+    path: Sequence[Waypoint],
+    stances: Stances,
+    heading_rad: float,
+    tuft: Tuft,
+    ink_load: float,
+    px_per_mm: float,
+    paper_rng: np.random.Generator,
+) -> Footprint:
+    """Lay the patch along the path in a frame along the paper's, its origin at the first waypoint."""
+    start = path[0]
+    local = tuple(Waypoint(w.x_mm - start.x_mm, w.y_mm - start.y_mm, w.depth_mm) for w in path)
+    track = follow(local, stances.reach, heading_rad)
+    stamps: dict[tuple[float, float, bool], _Stamp] = {}
+    laid: list[tuple[_Stamp, Moment]] = []
+    for moment in track:
+        if moment.depth_mm <= 0.0:
+            continue
+        load = round(ink_left(ink_load, moment.travel_mm) / LOAD_STEP) * LOAD_STEP
+        key = (max(1, round(moment.depth_mm / DEPTH_STEP_MM)) * DEPTH_STEP_MM, min(load, 1.0), moment.pulled)
+        if key not in stamps:
+            stamps[key] = _stamp(stances.at(key[0], key[2]), tuft, key[1], px_per_mm)
+        laid.append((stamps[key], moment))
+    corners = np.concatenate([_corners_mm(*item, px_per_mm) for item in laid])
+    frame = Dots(corners[:, 0], corners[:, 1], np.zeros(0))
+    shape_px, origin = frame_around([frame], px_per_mm, MARGIN_MM)
+    wet = np.zeros(shape_px, np.float32)
+    load_map = np.zeros(shape_px, np.float32)
+    for stamp, moment in laid:
+        column, row = origin[0] + moment.x_mm * px_per_mm, origin[1] - moment.y_mm * px_per_mm
+        _lay(wet, load_map, stamp, column, row, moment.heading_rad, moment.length)
+    density = soak(wet, load_map, px_per_mm, paper_rng)
+    force = float(stances.at(max(w.depth_mm for w in path), True).normal_n.sum())
+    return Footprint(density, px_per_mm, origin, force)
+
+
+@dataclass(frozen=True, slots=True)
+class _Stamp:
+    """Ink offered by the patch of one moment, in the brush's frame, around the middle of the patch."""
+
+    wet: Image
+    origin_px: tuple[float, float]
+    load: float
+
+
+def _stamp(shape: SpineShape, tuft: Tuft, load: float, px_per_mm: float) -> _Stamp:
+    dots = tuft.touch(shape, load)
+    dots = Dots(dots.x_mm - middle_mm(shape), dots.y_mm, dots.ink)
+    shape_px, origin = frame_around([dots], px_per_mm, STAMP_MARGIN_MM)
+    return _Stamp(scatter(dots, shape_px, origin, px_per_mm, load), origin, load)
+
+
+def _corners_mm(stamp: _Stamp, moment: Moment, px_per_mm: float) -> Vector:
+    """(4, 2) corners of a laid stamp at its full length."""
+    h, w = stamp.wet.shape
+    u = (np.array([0.0, w, 0.0, w]) - stamp.origin_px[0]) / px_per_mm
+    v = (stamp.origin_px[1] - np.array([0.0, 0.0, h, h])) / px_per_mm
+    cos, sin = math.cos(moment.heading_rad), math.sin(moment.heading_rad)
+    return np.column_stack([moment.x_mm + cos * u - sin * v, moment.y_mm + sin * u + cos * v])
+
+
+def _lay(
+    wet: Image, load_map: Image, stamp: _Stamp, column: float, row: float, heading_rad: float, length: float
+) -> None:
+    """Shorten a stamp to `length`, turn it about its middle, put that at (column, row), and keep the wetter."""
+    h, w = stamp.wet.shape
+    ox, oy = stamp.origin_px
+    far = math.ceil(math.hypot(max(ox, w - ox), max(oy, h - oy))) + 1
+    left, top = max(0, int(column) - far), max(0, int(row) - far)
+    right, bottom = min(wet.shape[1], int(column) + far + 1), min(wet.shape[0], int(row) + far + 1)
+    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
+    # rows run against y; pixel centres lie on halves here and on integers in OpenCV
+    linear = np.array([[length * cos, sin], [-length * sin, cos]])
+    offset = np.array([column - left - 0.5, row - top - 0.5]) - linear @ np.array([ox - 0.5, oy - 0.5])
+    size = (right - left, bottom - top)
+    turned = np.asarray(cv2.warpAffine(stamp.wet, np.column_stack([linear, offset]), size), np.float32)
+    patch = wet[top:bottom, left:right]
+    passed = load_map[top:bottom, left:right]
+    # paper that a fuller brush has wetted stays so when a drier one passes again
+    np.maximum(passed, stamp.load, out=passed, where=turned > 0.0)
+    np.maximum(patch, turned, out=patch)

@@ -1,0 +1,136 @@
+"""From a pressed spine to ink on paper: which hairs come within the ink film, and where they lie.
+
+Local frame of a cross-section: `across` runs sideways (+y of the paper), `outward` runs away from the paper
+in the plane of bending; both are fractions of the free radius, so a bristle is one point of the unit disc.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.sim.brush.bristles import STATION_MM, Bristles, Wander, clump_flow
+from drivers.sim.brush.flaws import Trouble
+from drivers.sim.brush.soak import Dots, Image, scatter, soak
+from drivers.sim.brush.spine import Bundle, SpineShape, Vector
+
+MARGIN_MM = 3.0
+"""Blank border around the mark."""
+
+TRAIL_STEPS = 2
+"""Load steps between the moments at which the sliding bundle is printed: about 1 mm of descent."""
+
+SPREAD_POWER = 1.7
+"""Half width of a flattened section as a power of its mean flattening: 1 would keep its area, more lets
+the hairs part."""
+
+
+@dataclass(frozen=True, slots=True)
+class Footprint:
+    """One press on an unbounded sheet; columns grow with +x (where the ferrule leans), rows with -y."""
+
+    density: Image
+    """(h, w) ink per area, 0 = none, 1 = saturated."""
+    px_per_mm: float
+    origin_px: tuple[float, float]
+    """(x, y) of the zero-touch point; pixel (i, j) covers [j, j + 1) x [i, i + 1)."""
+    contact_force_n: float
+
+
+@dataclass(frozen=True, slots=True)
+class Tuft:
+    """A wet brush as it comes to the paper: its mechanics, its hairs, how they lie this time, and what is wrong."""
+
+    bundle: Bundle
+    bristles: Bristles
+    wander: Wander
+    trouble: Trouble | None = None
+
+    def load(self, ink_load: float) -> float:
+        """The load that the hairs carry to the paper."""
+        return ink_load if self.trouble is None else self.trouble.load(ink_load)
+
+    def touch(self, shape: SpineShape, load: float) -> Dots:
+        """Where the bristles of one spine shape come within the ink film of the paper.
+
+        A section that would reach below the paper is cut off flat by it, which lowers its mean half thickness
+        from r to r - squash / 2; the half width rises to r (r / (r - squash / 2))^SPREAD_POWER.
+        """
+        bundle, bristles, wander = self.bundle, self.bristles, self.wander
+        flow = clump_flow(wander.clump_ink, load)[bristles.clump]
+        if self.trouble is not None:
+            flow = self.trouble.flow(flow)
+        film_mm = 0.12 + 0.38 * load
+        link_mm = bundle.link_mm
+        node = np.arange(bundle.radius_mm.size, dtype=np.float64)
+        near = np.flatnonzero(shape.squash_mm > -film_mm)
+        if near.size == 0:
+            empty = np.zeros(0)
+            return Dots(empty, empty, empty)
+        first = max(0.0, float(near[0]) - 1.0)
+        at = np.arange(first, node[-1], STATION_MM / link_mm)
+        x, z, phi, radius = (np.interp(at, node, v) for v in (shape.x_mm, shape.z_mm, shape.phi_rad, bundle.radius_mm))
+        squash = np.interp(at, node, np.maximum(_smooth(shape.squash_mm, 3.0 / link_mm), 0.0))
+        flatter = radius / (radius - 0.5 * np.minimum(squash, 0.9 * radius))
+        half_width = wander.spread * radius * flatter**SPREAD_POWER
+
+        # (m, stations): rows are bristles
+        outward, across = bristles.outward[:, None], bristles.across[:, None]
+        dot_z = z + outward * radius * np.sin(phi)
+        dot_x = x - outward * radius * np.cos(phi)
+        along = (at - first) / max(node[-1] - first, 1.0)
+        bow = (bristles.bow_mm + wander.bow_mm) * along**2
+        dot_y = across * half_width + bow + wander.strand_mm[:, None]
+        dot_x += bristles.phase_mm[:, None] - wander.reach_mm * along
+        if self.trouble is not None:
+            dot_x, dot_y = self.trouble.displace(dot_x, dot_y, across, (node[-1] - at) * link_mm, squash, half_width)
+        ends = (node[-1] - at) * link_mm >= bristles.short_mm[:, None]
+        ink = flow[:, None] * np.clip(1.5 * (1.0 - np.maximum(dot_z, 0.0) / film_mm), 0.0, 1.0) * ends
+        inked = ink > 0.0
+        return Dots(dot_x[inked], dot_y[inked], ink[inked])
+
+
+def print_footprint(
+    path: Sequence[SpineShape], tuft: Tuft, ink_load: float, px_per_mm: float, paper_rng: np.random.Generator
+) -> Footprint:
+    """Print the load path `path` of a tuft as ink on fresh paper."""
+    load = tuft.load(ink_load)
+    # newest first, so that the final shape is always among them
+    dots = [tuft.touch(shape, load) for shape in path[::-1][::TRAIL_STEPS]]
+    force = float(path[-1].normal_n.sum())
+    shape_px, origin = frame_around(dots, px_per_mm, MARGIN_MM)
+
+    # hairs slide over their own wet trail: the sheet keeps the wettest moment, not the sum
+    wet = np.zeros(shape_px, np.float32)
+    for d in dots:
+        np.maximum(wet, scatter(d, shape_px, origin, px_per_mm, load), out=wet)
+    density = soak(wet, load, px_per_mm, paper_rng)
+    if tuft.trouble is not None:
+        density = density * np.float32(tuft.trouble.tone)
+    return Footprint(density, px_per_mm, origin, force)
+
+
+def frame_around(
+    dots: Sequence[Dots], px_per_mm: float, margin_mm: float
+) -> tuple[tuple[int, int], tuple[float, float]]:
+    """(rows, columns) of a raster that holds the dots and the frame's origin with a margin, and where that lies."""
+    x = np.concatenate([d.x_mm for d in dots])
+    y = np.concatenate([d.y_mm for d in dots])
+    left, right = min(0.0, x.min(initial=0.0)) - margin_mm, max(0.0, x.max(initial=0.0)) + margin_mm
+    down, up = min(0.0, y.min(initial=0.0)) - margin_mm, max(0.0, y.max(initial=0.0)) + margin_mm
+    shape_px = (int(np.ceil((up - down) * px_per_mm)), int(np.ceil((right - left) * px_per_mm)))
+    return shape_px, (float(round(-left * px_per_mm)), float(round(up * px_per_mm)))
+
+
+def blank_footprint(px_per_mm: float) -> Footprint:
+    """An untouched patch of paper around the zero-touch point."""
+    half = int(np.ceil(MARGIN_MM * px_per_mm))
+    return Footprint(np.zeros((2 * half, 2 * half), np.float32), px_per_mm, (float(half), float(half)), 0.0)
+
+
+def _smooth(values: Vector, sigma: float) -> Vector:
+    """Gaussian smoothing along the spine, ends held."""
+    reach = int(np.ceil(3.0 * sigma))
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(sigma, 1e-6)) ** 2)
+    held = np.pad(values, reach, mode="edge")
+    return np.lib.stride_tricks.sliding_window_view(held, kernel.size) @ (kernel / kernel.sum())

@@ -1,0 +1,1 @@
+"""The loopback rig's camera: scene, optics, MJPEG stream."""

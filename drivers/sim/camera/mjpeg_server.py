@@ -1,0 +1,130 @@
+"""The loopback camera: an MJPEG stream over HTTP, one new image per period to every client that keeps up."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import time
+from collections import deque
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.camera.options import LOOPBACK_SERVER
+from drivers.samples import Pose
+from drivers.sim.camera.scene import Scene
+from drivers.sim.config import View
+from drivers.sim.faults.board import FaultBoard
+from drivers.sim.faults.pictures import dark, retold, torn
+from drivers.sim.faults.vocabulary import KINDS, Device
+from drivers.sim.server import LoopbackServer
+
+BOUNDARY = "brushloop"
+BACKLOG = 64
+"""Images that a stalled stream keeps, as the buffers of a real one do."""
+
+
+class _Line:
+    """One client's connection, over which pictures come as late as the view says; none overtakes another."""
+
+    def __init__(self, view: View, writer: asyncio.StreamWriter) -> None:
+        self._view = view
+        self._writer = writer
+        self._loop = asyncio.get_running_loop()
+        self._began_s = self._last_s = self._loop.time()
+        self._random = random.Random(0)
+
+    async def send(self, data: bytes) -> None:
+        """Send now, or as soon as it is due."""
+        view, now_s = self._view, self._loop.time()
+        late_s = view.delay_s + view.delay_jitter_s * self._random.random() + view.delay_drift * (now_s - self._began_s)
+        if late_s <= 0.0:
+            self._writer.write(data)
+            await self._writer.drain()
+            return
+        self._last_s = max(self._last_s, now_s + late_s)
+        self._loop.call_at(self._last_s, self._write, data)
+
+    def _write(self, data: bytes) -> None:
+        if not self._writer.is_closing():
+            self._writer.write(data)
+
+
+class MjpegServer(LoopbackServer):
+    """Serves `/stream.mjpg`. A client that does not drain is sent the newest image next, never a backlog."""
+
+    def __init__(self, scene: Scene, *, fps: float, jpeg_quality: int, view: View | None = None) -> None:
+        """`view` tells how late pictures are sent; left out, at once."""
+        super().__init__()
+        self._scene = scene
+        self._view = view or View()
+        self._period_s = 1.0 / fps
+        self._quality = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
+        self._rendering = asyncio.Lock()
+        self.faults: FaultBoard | None = None
+        """What goes wrong here; a rig puts one board in all its servers."""
+
+    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer any request with the stream."""
+        async with asyncio.timeout(5.0):
+            request = await reader.readuntil(b"\r\n\r\n")
+        writer.write(
+            b"HTTP/1.0 200 OK\r\nCache-Control: no-store\r\nServer: " + LOOPBACK_SERVER.encode() + b"\r\n"
+            b"Content-Type: multipart/x-mixed-replace; boundary=" + BOUNDARY.encode() + b"\r\n\r\n"
+        )
+        if request.startswith(b"HEAD"):
+            return
+        await self._stream(writer)
+
+    async def _stream(self, writer: asyncio.StreamWriter) -> None:
+        loop = asyncio.get_running_loop()
+        due = loop.time()
+        line = _Line(self._view, writer)
+        held: deque[bytes] = deque(maxlen=BACKLOG)
+        shown = b""
+        while True:
+            match self._fault():
+                case "drop":
+                    return
+                case "stale":
+                    held.append(await self._jpeg())
+                case "black":
+                    held.append(await self._jpeg(black=True))
+                    shown = await self._send(held, line)
+                case "frozen":
+                    held.append(retold(shown or await self._jpeg(), time.time_ns()))
+                    shown = await self._send(held, line)
+                case "torn":
+                    held.append(torn(await self._jpeg()))
+                    await self._send(held, line)
+                case _:
+                    held.append(await self._jpeg())
+                    shown = await self._send(held, line)
+            due = max(due + self._period_s, loop.time())
+            await asyncio.sleep(due - loop.time())
+
+    def _fault(self) -> str:
+        fault = self.faults.meet(Device.CAMERA, "frame", KINDS[Device.CAMERA]) if self.faults is not None else None
+        return fault.kind if fault is not None else ""
+
+    async def _send(self, held: deque[bytes], line: _Line) -> bytes:
+        """Everything that is held, oldest first; returns the last."""
+        image = b""
+        while held:
+            image = held.popleft()
+            head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(image)}\r\n\r\n"
+            await line.send(head.encode() + image + b"\r\n")
+        return image
+
+    async def _jpeg(self, *, black: bool = False) -> bytes:
+        async with self._rendering:  # the scene keeps a cache: one thread at a time
+            # The stamp first, so that no frame shows anything older than it says; the tool here, because the
+            # motion queue belongs to the event loop's thread.
+            host_ns, tool = time.time_ns(), self._scene.tool()
+            return await asyncio.to_thread(self._encode, host_ns, tool, black)
+
+    def _encode(self, host_ns: int, tool: Pose, black: bool) -> bytes:
+        image: NDArray[np.uint8] = self._scene.render(host_ns, tool)
+        _, encoded = cv2.imencode(".jpg", dark(image.shape, host_ns) if black else image, self._quality)
+        return encoded.tobytes()

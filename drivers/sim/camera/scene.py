@@ -1,0 +1,143 @@
+"""What the camera sees: sheet, board, ink and tool under uneven light with its glare, in perspective, with noise."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.samples import Pose
+from drivers.sim.brush.paper import PX_PER_MM
+from drivers.sim.camera.optics import Optics
+from drivers.sim.config import Table
+from drivers.sim.world import World
+
+TABLE_GRAY = 120
+PAPER_GRAY = 228
+INK_REFLECTANCE = 0.06
+TOOL_CLEAR_MM = 60.0
+"""Half the width of what the arm hides when it is over the sheet."""
+NOISE_FIELDS = 4
+MARGIN_MM = 15.0
+"""Table around the board."""
+
+
+def board(table: Table) -> cv2.aruco.CharucoBoard:
+    """The ChArUco board that the sheet lies on."""
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, table.board_dictionary))
+    return cv2.aruco.CharucoBoard(table.board_squares, table.board_square_mm, table.board_marker_mm, dictionary)
+
+
+class Scene:
+    """Renders the world. The sheet is warped only when it has changed; noise is new in every frame."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._rng = np.random.default_rng([world.config.seed, 7])
+        table, view = world.config.table, world.config.view
+        left, bottom = (v - MARGIN_MM for v in table.board_origin_mm)
+        self._origin_mm = (left, bottom)
+        board_mm = [n * table.board_square_mm for n in table.board_squares]
+        self._size_mm = (board_mm[0] + 2 * MARGIN_MM, board_mm[1] + 2 * MARGIN_MM)
+        self._blank = self._draw_blank(table)
+        self.optics = Optics(view, world.config.seed)
+        self.paper_to_image = self.optics.homography
+        self._plane_to_image = self._raster_to_image()
+        self._noise = [
+            self._rng.normal(0.0, view.noise, (view.height_px, view.width_px)).astype(np.float32)
+            for _ in range(NOISE_FIELDS)
+        ]
+        self._lit: NDArray[np.float32] | None = None
+        self._lit_version = -1
+        self._count = 0
+
+    def tool(self) -> Pose:
+        """Where the tool is now. Moves the world on, so only the thread that owns the world may ask."""
+        return self._world.tool()
+
+    def render(self, host_ns: int = 0, tool: Pose | None = None) -> NDArray[np.uint8]:
+        """A (height, width) gray image of the world now; `host_ns` goes into the strip where the view has one.
+
+        With `tool` given it only reads, and may run in another thread.
+        """
+        tool = tool or self.tool()
+        if self._lit is None or self._lit_version != self._world.version:
+            self._lit_version = self._world.version
+            self._lit = self._light_sheet()
+        image = self._lit + self._noise[self._count % NOISE_FIELDS]
+        self._count += 1
+        self._hide_behind_tool(image, tool)
+        frame = np.clip(image, 0.0, 255.0).astype(np.uint8)
+        if self._world.config.view.stamp_strip:
+            draw_strip(frame, host_ns)
+        return frame
+
+    def _draw_blank(self, table: Table) -> NDArray[np.uint8]:
+        width, height = (round(v * PX_PER_MM) for v in self._size_mm)
+        raster = np.full((height, width), TABLE_GRAY, np.uint8)
+        fibre = cv2.GaussianBlur(self._rng.normal(0.0, 6.0, (height, width)).astype(np.float32), (0, 0), 3.0)
+        board_px = tuple(round(n * table.board_square_mm * PX_PER_MM) for n in table.board_squares)
+        x, y = table.board_origin_mm
+        top = round((self._size_mm[1] - (y - self._origin_mm[1])) * PX_PER_MM) - board_px[1]
+        column = round((x - self._origin_mm[0]) * PX_PER_MM)
+        margin = round(3.0 * PX_PER_MM)
+        raster[top - margin : top + board_px[1] + margin, column - margin : column + board_px[0] + margin] = 245
+        picture = board(table).generateImage((board_px[0], board_px[1]))
+        raster[top : top + board_px[1], column : column + board_px[0]] = np.where(picture > 127, 245, 20)
+        rows, columns = self._sheet_slices(table)
+        raster[rows, columns] = np.clip(PAPER_GRAY + fibre[rows, columns], 0, 255).astype(np.uint8)
+        return raster
+
+    def _sheet_slices(self, table: Table) -> tuple[slice, slice]:
+        top = round((self._size_mm[1] - (table.sheet_mm[1] - self._origin_mm[1])) * PX_PER_MM)
+        left = round(-self._origin_mm[0] * PX_PER_MM)
+        rows, columns = self._world.paper.density.shape
+        return slice(top, top + rows), slice(left, left + columns)
+
+    def _raster_to_image(self) -> NDArray[np.float64]:
+        # raster pixel centres (cv2 convention) -> mm in the paper frame -> image
+        s = 1.0 / PX_PER_MM
+        top_mm = self._origin_mm[1] + self._size_mm[1]
+        to_mm = np.array([[s, 0, self._origin_mm[0] + 0.5 * s], [0, -s, top_mm - 0.5 * s], [0, 0, 1]])
+        return self.paper_to_image @ to_mm
+
+    def _light_sheet(self) -> NDArray[np.float32]:
+        table, view = self._world.config.table, self._world.config.view
+        raster = self._blank.copy()
+        rows, columns = self._sheet_slices(table)
+        kept = 1.0 - (1.0 - INK_REFLECTANCE) * self._world.paper.density
+        raster[rows, columns] = (raster[rows, columns] * kept).astype(np.uint8)
+        warped = cv2.warpPerspective(
+            raster,
+            self._plane_to_image,
+            (view.width_px, view.height_px),
+            flags=cv2.INTER_LINEAR,
+            borderValue=TABLE_GRAY,
+        )
+        blurred = cv2.GaussianBlur(self.optics.distort(warped.astype(np.uint8)), (0, 0), view.blur_px)
+        lit = blurred.astype(np.float32) * self.optics.light
+        return lit if self.optics.glare is None else lit + self.optics.glare
+
+    def _hide_behind_tool(self, image: NDArray[np.float32], tool: Pose) -> None:
+        x_mm, y_mm = self._world.to_paper(tool.x_mm, tool.y_mm)
+        [[u, v]] = self.optics.image_of(np.array([[x_mm, y_mm]]))
+        radius_px = round(TOOL_CLEAR_MM * self._world.config.view.px_per_mm)
+        cv2.circle(image, (round(float(u)), round(float(v))), radius_px, (70.0,), -1)
+
+
+STRIP_BITS = 64
+STRIP_PX = 8
+
+
+def draw_strip(frame: NDArray[np.uint8], host_ns: int) -> None:
+    """Write `host_ns` as 64 black or white blocks into the top rows, in place."""
+    bits = (host_ns >> np.arange(STRIP_BITS, dtype=np.uint64).astype(object)) & 1
+    row = np.repeat(np.where(bits.astype(bool), 255, 0).astype(np.uint8), STRIP_PX)
+    frame[: 2 * STRIP_PX, : row.size] = row
+
+
+def read_strip(frame: NDArray[np.uint8]) -> int:
+    """The inverse of `draw_strip`, through JPEG."""
+    row = frame[STRIP_PX // 2 : STRIP_PX * 3 // 2, : STRIP_BITS * STRIP_PX].mean(axis=0)
+    blocks = row.reshape(STRIP_BITS, STRIP_PX)[:, 2:-2].mean(axis=1) > 127
+    return sum(1 << i for i, bit in enumerate(blocks) if bit)

@@ -1,0 +1,1 @@
+"""The loopback rig's instruments: force sensor, ink station, pump."""

@@ -1,0 +1,1 @@
+"""`brushloop sessions`: what a scientist does with recordings."""

@@ -1,0 +1,1 @@
+"""Recordings for other tools: images with tables, NumPy, Parquet."""

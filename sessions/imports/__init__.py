@@ -1,0 +1,1 @@
+"""Photographs from elsewhere made into sessions."""

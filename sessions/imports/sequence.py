@@ -1,0 +1,120 @@
+"""A page photographed again after every stroke becomes a session: frame k + 1 shows one stroke more than frame k.
+
+Every frame is a still; stroke k names the still after it, and the still before it has the sequence number one less.
+What the stroke is follows from the two by differencing, which is left to whoever reads the session.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+from sessions.errors import InputError, SessionDamaged, in_one_line
+from sessions.imports.photographs import ImportOptions, check_target, read_bounded, store_rows
+from sessions.imports.table import Row, parse_table, read_text
+from sessions.recording.messages import decode_gray
+
+SEQUENCE = "page sequence"
+"""Begins the header's `protocol`: whoever reads it knows that each still shows what the one before it shows."""
+PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
+
+
+def import_sequence(
+    folder: Path,
+    table: Path | None,
+    out: Path,
+    options: ImportOptions,
+    software: str,
+    now_ns: Callable[[], int],
+    page_mm: tuple[float, float] | None = None,
+) -> Path:
+    """Import frames into the new session folder `out`; returns its MCAP file. Raises `InputError`, leaving nothing.
+
+    The table has `before` and `after` columns, each frame `after` being the next one's `before`, and whatever was
+    commanded. Without a table the frames are taken in the order of their names, and nothing is known of the strokes.
+    `page_mm` (width, height of what a photograph shows) gives the scale where the table does not.
+    """
+    named = table or folder
+    check_target(folder, named, out, options)
+    if table is None:
+        frames, text = _by_name(folder)
+    else:
+        frames, text = _by_table(table)
+    opening = _frame(folder, named, frames[0])
+    size = _size(opening)
+    if page_mm is not None:
+        text = _with_scale(text, (size[0] / page_mm[0], size[1] / page_mm[1]))
+    rows = parse_table(folder, named, text, "drag", options.px_per_mm)
+    for row in rows:
+        if (other := _size(row.image)) != size:
+            raise InputError(row.image, f"is {other[0]} x {other[1]} px, the first frame {size[0]} x {size[1]}")
+    numbered = [Row(row.image, row.stroke.model_copy(update={"still": k})) for k, row in enumerate(rows, start=1)]
+    protocol = f"{SEQUENCE}: {len(rows)} strokes on one page, one new stroke a frame"
+    return store_rows(numbered, folder, named, out, options, protocol, software, now_ns, opening=opening)
+
+
+def _by_table(table: Path) -> tuple[list[str], str]:
+    """(frames in order, the table with `file` for `after`), the chain checked."""
+    try:
+        lines = [[cell.strip() for cell in line] for line in csv.reader(io.StringIO(read_text(table)), strict=True)]
+    except csv.Error as error:
+        raise InputError(table, f"is no table: {error}") from None
+    head = lines[0] if lines else []
+    for column in ("before", "after"):
+        if head.count(column) != 1:
+            raise InputError(table, f"column `{column}` is missing; found: {', '.join(head)[:200] or 'none'}")
+    before, after = head.index("before"), head.index("after")
+    frames: list[str] = []
+    for number, cells in enumerate(lines[1:], start=2):
+        if not any(cells):
+            continue
+        if len(cells) != len(head):
+            raise InputError(table, f"line {number} has {len(cells)} fields, expected {len(head)}")
+        if frames and cells[before] != frames[-1]:
+            told = f"line {number}: `before` is {cells[before][:80]!r}, the frame before it is {frames[-1][:80]!r}"
+            raise InputError(table, told)
+        frames += [cells[after]] if frames else [cells[before], cells[after]]
+    if not frames:
+        raise InputError(table, "has no rows")
+    head = ["file" if name == "after" else name for name in head]
+    kept = [k for k in range(len(head)) if k != before]
+    return frames, _text([[line[k] for k in kept] if any(line) else line for line in [head, *lines[1:]]])
+
+
+def _by_name(folder: Path) -> tuple[list[str], str]:
+    try:
+        frames = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in PHOTOGRAPHS)
+    except OSError as error:
+        raise InputError(folder, f"cannot read: {in_one_line(error)}") from None
+    if len(frames) < 2:
+        raise InputError(folder, f"holds {len(frames)} photographs, a sequence needs at least 2")
+    return frames, _text([["file"], *([name] for name in frames[1:])])
+
+
+def _with_scale(text: str, px_per_mm: tuple[float, float]) -> str:
+    lines = list(csv.reader(io.StringIO(text)))
+    added = [["px_per_mm_x", "px_per_mm_y"], *([repr(px_per_mm[0]), repr(px_per_mm[1])] for _ in lines[1:])]
+    return _text([line + more if any(line) else line for line, more in zip(lines, added, strict=True)])
+
+
+def _text(lines: list[list[str]]) -> str:
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows(lines)  # noqa: TID251 - read again at once
+    return out.getvalue()
+
+
+def _frame(folder: Path, named: Path, name: str) -> Path:
+    path = (folder / name).resolve()
+    if not path.is_relative_to(folder.resolve()) or not path.is_file():
+        raise InputError(named, f"frame {name[:80]!r} is not in {folder.name}/")
+    return path
+
+
+def _size(path: Path) -> tuple[int, int]:
+    try:
+        height, width = decode_gray(read_bounded(path), str(path)).shape
+    except SessionDamaged as error:
+        raise InputError(path, error.what) from None
+    return width, height

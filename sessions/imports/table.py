@@ -1,0 +1,214 @@
+"""The parameter table of an import: one line per photograph, columns named `quantity_unit`."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from sessions.cells import as_text
+from sessions.errors import InputError, in_one_line
+from sessions.recording.schemas import MAX_PX_PER_MM, MIN_PX_PER_MM, Stroke
+
+MAX_TABLE_BYTES = 16 * 1024 * 1024
+MAX_ROWS = 100_000
+LENGTH_UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
+ANGLE_UNITS = {"deg": 1.0, "rad": 180.0 / math.pi}
+FRACTIONS = ("frac", "px", "nominal", "ratio")
+"""Suffixes that are kept as they are: shares, pixels, and values that the source itself calls nominal."""
+PAIRS = (("px_per_mm_x", "px_per_mm_y"), ("start_x_px", "start_y_px"))
+SPECIAL = {"file", "name", "px_per_mm", "height_mm", "tilt_deg", *PAIRS[0], *PAIRS[1]}
+"""Columns that become fields of a stroke; all others are kept in `commanded`."""
+DEPTHS = ("height", "depth")
+"""How the names of columns begin that hold a depth: it counts from the touch of the paper down."""
+DEEPEST_MM = 500.0
+STEEPEST_DEG = 90.0
+MOST = 1e6
+"""Of any other number; a length of a kilometre is a slip of the pen."""
+MAX_NAME_CHARS = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A photograph, and what was commanded for it."""
+
+    image: Path
+    stroke: Stroke
+
+
+@dataclass(frozen=True, slots=True)
+class _Columns:
+    """What the header line says, and what holds for every line."""
+
+    table: Path
+    folder: Path
+    kind: Literal["press", "drag"]
+    px_per_mm: float | None
+    names: list[str]
+    commanded: dict[str, tuple[str, float]]
+    """Column -> stored name and factor."""
+
+
+def read_table(folder: Path, table: Path, kind: Literal["press", "drag"], px_per_mm: float | None) -> list[Row]:
+    """Every line, checked. Raises `InputError` naming line and column; the photographs are not looked into."""
+    return parse_table(folder, table, read_text(table), kind, px_per_mm)
+
+
+def parse_table(
+    folder: Path, table: Path, text: str, kind: Literal["press", "drag"], px_per_mm: float | None
+) -> list[Row]:
+    """The same for a table whose text is `text`; `table` is what errors name."""
+    lines = csv.reader(io.StringIO(text, newline=""), strict=True)
+    rows: list[Row] = []
+    seen: set[str] = set()
+    no_names: list[str] = []
+    try:
+        columns = _columns(folder, table, kind, px_per_mm, [name.strip() for name in next(lines, no_names)])
+        for cells in _filled(lines):
+            if len(rows) == MAX_ROWS:
+                raise InputError(table, f"has more than {MAX_ROWS} rows")
+            row = _row(columns, lines.line_num, [as_text(cell.strip()) for cell in cells], still=len(rows))
+            if row.stroke.stroke_id in seen:
+                raise InputError(table, f"line {lines.line_num}: stroke {row.stroke.stroke_id} appears twice")
+            seen.add(row.stroke.stroke_id)
+            rows.append(row)
+    except csv.Error as error:
+        raise InputError(table, f"line {lines.line_num}: {error}") from None
+    if not rows:
+        raise InputError(table, "has no rows")
+    return rows
+
+
+def read_text(table: Path) -> str:
+    """A table's text. Raises `InputError` where it is not there, too large or not UTF-8."""
+    if not table.is_file():
+        raise InputError(table, "no such table")
+    try:
+        if table.stat().st_size > MAX_TABLE_BYTES:
+            raise InputError(table, f"table of {table.stat().st_size} bytes exceeds {MAX_TABLE_BYTES}")
+        with table.open(encoding="utf-8-sig", newline="") as file:
+            return file.read()
+    except UnicodeDecodeError:
+        raise InputError(table, "is not UTF-8 text") from None
+    except OSError as error:
+        raise InputError(table, f"cannot read: {in_one_line(error)}") from None
+
+
+def _filled(lines: Iterator[list[str]]) -> Iterator[list[str]]:
+    return (cells for cells in lines if any(cells))
+
+
+def _columns(
+    folder: Path, table: Path, kind: Literal["press", "drag"], px_per_mm: float | None, names: list[str]
+) -> _Columns:
+    if not all(name.isprintable() for name in names):
+        raise InputError(table, "line 1 holds control characters: the names of the columns are expected there")
+    if "file" not in names:
+        raise InputError(table, f"column `file` is missing; found: {', '.join(names)[:200] or 'none'}")
+    if "px_per_mm" not in names and "px_per_mm_x" not in names and px_per_mm is None:
+        raise InputError(table, "column `px_per_mm` (or px_per_mm_x and px_per_mm_y) is missing; or give --px-per-mm")
+    required = [(name, "presses need it") for name in ("height_mm", "tilt_deg") if kind == "press"]
+    for first, second in PAIRS:
+        required += [(b, f"`{a}` needs it") for a, b in ((first, second), (second, first)) if a in names]
+    for name, why in required:
+        if name not in names:
+            raise InputError(table, f"column `{name}` is missing; {why}")
+    commanded = {name: _unit(table, name) for name in names if name not in SPECIAL}
+    stored = [name for name in names if name in SPECIAL] + [commanded[name][0] for name in names if name in commanded]
+    for name in stored:
+        if stored.count(name) > 1:
+            raise InputError(table, f"column `{name}` is there twice, perhaps in two units")
+    return _Columns(table, folder.resolve(), kind, px_per_mm, names, commanded)
+
+
+def _unit(table: Path, column: str) -> tuple[str, float]:
+    """(stored name, factor) of a column `quantity_unit`; mm and deg are what is stored."""
+    stem, _, suffix = column.rpartition("_")
+    if suffix in LENGTH_UNITS and stem:
+        return f"{stem}_mm", LENGTH_UNITS[suffix]
+    if suffix in ANGLE_UNITS and stem:
+        return f"{stem}_deg", ANGLE_UNITS[suffix]
+    if any(part in FRACTIONS for part in column.split("_")):
+        return column, 1.0
+    allowed = ", ".join([*LENGTH_UNITS, *ANGLE_UNITS, *FRACTIONS])
+    raise InputError(table, f"column `{column}` has no known unit; its name must end in one of: {allowed}")
+
+
+def _row(columns: _Columns, line: int, cells: list[str], still: int) -> Row:
+    table = columns.table
+    if len(cells) != len(columns.names):
+        raise InputError(table, f"line {line} has {len(cells)} fields, expected {len(columns.names)}")
+    fields = dict(zip(columns.names, cells, strict=True))
+
+    def value(name: str, factor: float = 1.0) -> float:
+        try:
+            parsed = float(fields[name]) * factor
+        except ValueError:
+            parsed = math.nan
+        if not math.isfinite(parsed):
+            raise InputError(table, f"line {line}, column `{name}`: {fields[name][:80]!r} is not a finite number")
+        least, most = _range(name, columns.kind)
+        if not least <= parsed <= most:
+            told = f"{fields[name][:80]!r}, allowed: {least / factor:g} to {most / factor:g}"
+            raise InputError(table, f"line {line}, column `{name}`: {told}")
+        return parsed
+
+    def pair(first: str, second: str) -> tuple[float, float] | None:
+        return (value(first), value(second)) if first in fields else None
+
+    image = _image(columns, line, fields["file"])
+    scale = pair("px_per_mm", "px_per_mm") or pair(*PAIRS[0])
+    if scale is None and columns.px_per_mm is not None:
+        scale = (columns.px_per_mm, columns.px_per_mm)
+    if scale is None or not all(MIN_PX_PER_MM <= s <= MAX_PX_PER_MM for s in scale):
+        raise InputError(table, f"line {line}: px_per_mm = {scale}, allowed: {MIN_PX_PER_MM} to {MAX_PX_PER_MM}")
+    stroke = Stroke(
+        stroke_id=_name(columns, line, fields["name"])
+        if "name" in fields
+        else image.relative_to(columns.folder).with_suffix("").as_posix(),
+        kind=columns.kind,
+        still=still,
+        height_mm=value("height_mm") if "height_mm" in fields else None,
+        tilt_deg=value("tilt_deg") if "tilt_deg" in fields else None,
+        anchor_px=pair(*PAIRS[1]),
+        px_per_mm=scale,
+        commanded={stored: value(name, factor) for name, (stored, factor) in columns.commanded.items()},
+    )
+    return Row(image, stroke)
+
+
+def _range(column: str, kind: str) -> tuple[float, float]:
+    """What a column may hold, in the unit that is stored; a drag may lean to either side of its way."""
+    if column.startswith(DEPTHS) and column.rpartition("_")[2] in LENGTH_UNITS:
+        return 0.0, DEEPEST_MM
+    if column == "tilt_deg":
+        return (0.0 if kind == "press" else -STEEPEST_DEG), STEEPEST_DEG
+    return -MOST, MOST
+
+
+def _name(columns: _Columns, line: int, name: str) -> str:
+    if not name or not name.isprintable() or len(name) > MAX_NAME_CHARS:
+        allowed = f"allowed are 1 to {MAX_NAME_CHARS} printable characters"
+        raise InputError(columns.table, f"line {line}, column `name`: {name[:80]!r} is no name; {allowed}")
+    return name
+
+
+def _image(columns: _Columns, line: int, name: str) -> Path:
+    """The photograph, links followed; it lies in the folder, or `InputError`."""
+    if not name.isprintable():
+        raise InputError(columns.table, f"line {line}, column `file`: {name[:80]!r} holds control characters")
+    image = columns.folder / name
+    try:
+        image = image.resolve()
+        inside, there = image.is_relative_to(columns.folder), image.is_file()
+    except (OSError, RuntimeError):
+        inside = there = False  # longer than any name, or links in a circle
+    if not inside:
+        raise InputError(columns.table, f"line {line}: file {name[:80]!r} lies outside {columns.folder.name}/")
+    if not there:
+        raise InputError(columns.table, f"line {line}: file {name[:80]!r} is not in {columns.folder.name}/")
+    return image

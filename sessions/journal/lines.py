@@ -1,0 +1,231 @@
+"""The lines of a journal: which can be trusted, and what is wrong with the others, line by line.
+
+Chained lines are trusted where the next one vouches for them. Older journals have lines without a chain, and the
+oldest have no CRC either; they are read as well, and the first chained line vouches for all of them at once.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from sessions.errors import SessionDamaged, SessionError, in_one_line
+from sessions.journal.codec import BadLine, Entry, Line, decode_line, digest, has_crc, lines_within
+from sessions.journal.codec import encode_line as encode_line
+from sessions.journal.codec import with_crc as with_crc
+from sessions.names import check_file
+
+MAX_STRANGE_BYTES = 30
+"""A rebuilt line may differ from the damaged one in its time (19 digits), its CRC (8) and the damage itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What is wrong with one line."""
+
+    number: int
+    """Of the line in the file as it is, from 1."""
+    what: str
+
+    def __str__(self) -> str:
+        """`line 5 does not match its CRC`."""
+        return f"line {self.number} {self.what}"
+
+
+@dataclass(slots=True)
+class Reading:
+    """What a journal says, and what in it says nothing."""
+
+    entries: list[Entry] = field(default_factory=list[Entry])
+    """Lines that can be trusted, in the order in which they were written."""
+    faults: list[Fault] = field(default_factory=list[Fault])
+    """In the order of the file; empty for a journal that is as it was written."""
+    spoilt: list[tuple[int, bytes]] = field(default_factory=list[tuple[int, bytes]])
+    """Number and bytes of lines that are there and cannot be trusted any more."""
+    gaps: int = 0
+    """Lines that are missing altogether."""
+    torn: bytes = b""
+    """A last line that a crash cut off: harmless, the next process sets it aside."""
+
+    @property
+    def unchained(self) -> int:
+        """How many lines, at the beginning, were written without a chain."""
+        return sum(entry.chain is None for entry in self.entries)
+
+    def fault(self, number: int, what: str) -> None:
+        """Note what is wrong."""
+        self.faults.append(Fault(number, what))
+
+
+def read_lines(path: Path) -> Iterator[Line]:
+    """Every complete line. A torn last line is left out; any other damage raises `SessionDamaged`."""
+    reading = read(read_journal(path))
+    if reading.faults:
+        raise SessionDamaged(path, str(reading.faults[0]))
+    return iter([entry.line for entry in reading.entries])
+
+
+def read_journal(path: Path) -> bytes:
+    """The bytes of a journal. Raises `SessionError`, and `InputError` where it is a link."""
+    check_file(path)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise SessionError(path, f"cannot read: {in_one_line(error)}") from None
+
+
+def read(data: bytes) -> Reading:
+    """All that the bytes of a journal still say."""
+    *pieces, tail = data.split(b"\n")
+    reading = Reading()
+    entries = _decoded(reading, pieces, tail)
+    first = next((entry for entry in entries if entry.chain is not None), None)
+    if first is None or _is_perfect(entries, first, data):
+        reading.entries = entries
+    else:
+        _link(reading, entries, data)
+        reading.faults.sort(key=lambda fault: fault.number)
+    return reading
+
+
+def accounts_for(spoilt: bytes, rebuilt: bytes) -> bool:
+    """Whether a damaged line, cut short or with wrong bytes, was this one; `rebuilt` is without a chain."""
+    body = rebuilt[: rebuilt.rindex(b',"crc":"')]
+    if len(spoilt) < len(body) // 2:
+        return False
+    strange = sum(a != b for a, b in zip(spoilt, body, strict=False))
+    return strange <= min(MAX_STRANGE_BYTES, len(spoilt) // 2)
+
+
+def _decoded(reading: Reading, pieces: list[bytes], tail: bytes) -> list[Entry]:
+    """Every line that its own CRC vouches for, also where the newline between two of them is damaged."""
+    chained_at = next((at for at, raw in enumerate(pieces) if _is_chained(raw)), len(pieces))
+    protected = any(has_crc(raw) for raw in pieces[:chained_at])
+    entries: list[Entry] = []
+    for number, raw in enumerate(pieces, start=1):
+        crc = protected or number > chained_at
+        try:
+            entries.append(decode_line(raw, number, protected=crc))
+        except BadLine as error:
+            found, left = lines_within(raw, number) if crc else ([], [raw])
+            reading.fault(number, "has a damaged end" if found and not left else str(error))
+            entries += found
+            reading.spoilt += [(number, span) for span in left]
+    if tail:
+        found, left = lines_within(tail, len(pieces) + 1)
+        entries += found
+        if not found:
+            reading.torn = tail
+        elif left or tail != found[-1].raw:
+            reading.fault(len(pieces) + 1, "has a damaged end")
+            reading.spoilt += [(len(pieces) + 1, span) for span in left]
+    return entries
+
+
+def _is_chained(raw: bytes) -> bool:
+    try:
+        return decode_line(raw, 0, protected=True).chain is not None
+    except BadLine:
+        return False
+
+
+def _is_perfect(entries: list[Entry], first: Entry, data: bytes) -> bool:
+    start = entries.index(first)
+    prev = digest(_before(first, data))
+    for number, entry in enumerate(entries[start:], start=start + 1):
+        chain = entry.chain
+        if chain is None or first.chain is None or entry.number != number:
+            return False
+        if (chain.seq, chain.session, chain.prev) != (number, first.chain.session, prev):
+            return False
+        prev = digest(entry.raw)
+    return True
+
+
+def _before(entry: Entry, data: bytes) -> bytes:
+    """Everything in front of a line."""
+    at = 0
+    for _ in range(entry.number - 1):
+        at = data.index(b"\n", at) + 1
+    return data[:at]
+
+
+def _link(reading: Reading, entries: list[Entry], data: bytes) -> None:
+    """Find what does not hang together: foreign, doubled, displaced, changed and missing lines."""
+    sessions = Counter(entry.chain.session for entry in entries if entry.chain is not None)
+    session = sessions.most_common(1)[0][0]
+    before: list[Entry] = []
+    by_seq: dict[int, list[Entry]] = {}
+    for entry in entries:
+        if entry.chain is None:
+            if not by_seq:
+                before.append(entry)
+            else:
+                reading.fault(entry.number, "has no chain: it was put in by something else")
+        elif entry.chain.session != session:
+            reading.fault(entry.number, f"is of another session, {entry.chain.session[:100]!r}")
+        else:
+            by_seq.setdefault(entry.chain.seq, []).append(entry)
+    held = _vouched(reading, by_seq)
+    _misplaced(reading, held)
+    first = held[0]
+    assert first.chain is not None
+    if first.chain.seq == len(before) + 1 and first.chain.prev != digest(_before(first, data)) and before:
+        reading.fault(first.number, "does not follow from the lines before it: one of them was changed")
+    _missing(reading, held, len(before))
+    reading.entries = before + held
+
+
+def _vouched(reading: Reading, by_seq: dict[int, list[Entry]]) -> list[Entry]:
+    """One entry for each number, by its successor's word where there is one; in the order of the numbers."""
+    held: list[Entry] = []
+    for seq in sorted(by_seq, reverse=True):
+        after = held[-1] if held else None
+        chain = after.chain if after is not None else None
+        prev = chain.prev if chain is not None and chain.seq == seq + 1 else None
+        one, *others = sorted(by_seq[seq], key=lambda entry: digest(entry.raw) != prev)
+        for other in others:
+            same = other.raw == one.raw
+            reading.fault(other.number, f"{'stands twice: it is' if same else 'stands in the place of'} line {seq}")
+        if after is not None and prev is not None and digest(one.raw) != prev:
+            reading.fault(one.number, f"was changed after it was written: line {after.number} does not follow from it")
+            reading.spoilt.append((one.number, one.raw))
+        else:
+            held.append(one)
+    return held[::-1]
+
+
+def _misplaced(reading: Reading, held: list[Entry]) -> None:
+    """Lines outside the longest run that is in order."""
+    ends: list[int] = []
+    """Of the best run of each length: the index of its last entry."""
+    before: list[int | None] = []
+    for index, entry in enumerate(held):
+        at = bisect_right(ends, entry.number, key=lambda end: held[end].number)
+        before.append(ends[at - 1] if at else None)
+        ends[at : at + 1] = [index]
+    in_order: set[int] = set()
+    index = ends[-1] if ends else None
+    while index is not None:
+        in_order.add(index)
+        index = before[index]
+    for index, entry in enumerate(held):
+        if index not in in_order and entry.chain is not None:
+            reading.fault(entry.number, f"is out of its place: it was written as line {entry.chain.seq}")
+
+
+def _missing(reading: Reading, held: list[Entry], before: int) -> None:
+    """Numbers that nothing in the file has, less the lines that are there and cannot be trusted."""
+    spoilt = {number for number, _ in reading.spoilt}
+    known, at = before, 0
+    for entry in held:
+        seq = known + 1 if entry.chain is None else entry.chain.seq
+        gone = seq - known - 1 - sum(at < number < entry.number for number in spoilt)
+        if gone > 0:
+            lines = "a line that is" if gone == 1 else f"{gone} lines that are"
+            reading.fault(entry.number, f"comes after {lines} missing")
+            reading.gaps += gone
+        known, at = seq, max(at, entry.number)

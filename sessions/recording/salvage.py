@@ -1,0 +1,277 @@
+"""What can still be read of a damaged MCAP file: every chunk that its CRC vouches for, and nothing else.
+
+The file is walked record by record; where a wrong length leads astray, the index at the end, if it is sound, tells
+where the other chunks lie. A torn tail never yields a wrong record.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import MCAP0_MAGIC
+
+from sessions.errors import InputError, in_one_line
+from sessions.recording.container import MAX_RECORD_BYTES, UNREADABLE, BoundedFile, check_chunk_at, indexed
+from sessions.recording.writer import HEADER_METADATA, header_crc, read_note
+
+Record = tuple[Schema | None, Channel, Message]
+_STROKE_NAME = re.compile(rb'"stroke_id":"([^"\\]{1,100})","kind"')
+"""As a stroke's message begins."""
+_START = struct.Struct("<BQ")
+_PIECE_BYTES = 256
+_MESSAGE_INDEX = struct.Struct("<HI")
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One chunk of a file, readable or not."""
+
+    offset: int
+    counts: Counter[str] | None
+    """Messages by topic; None where nothing tells them."""
+    sound: bool
+    """Whether it reads back with its CRC."""
+
+
+@dataclass(slots=True)
+class Scan:
+    """Where the sound parts of a file lie, and what is wrong with the rest."""
+
+    path: Path
+    parts: list[Part] = field(default_factory=list[Part])
+    """Every chunk that is known of, in order."""
+    complete: bool = False
+    """Whether no other chunk can be there: the walk came to the end, or the index is sound."""
+    indexed: dict[int, dict[int, int]] = field(default_factory=dict[int, dict[int, int]])
+    """Offset of a chunk -> number of a channel -> messages, as the records behind it tell."""
+    schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
+    channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
+    notes: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
+    """Our own notes (`brushloop.begin`, ...) whose CRC holds."""
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
+    """All metadata, which the format gives no CRC."""
+    attachments: list[Attachment] = field(default_factory=list[Attachment])
+    counts: Counter[str] = field(default_factory=Counter[str])
+    stated: dict[str, int] | None = None
+    """Messages by topic that the index, where it is sound, says there are."""
+    stated_attachments: int = 0
+    stated_notes: int = 0
+    """Metadata records of ours that the index knows of, the header left out."""
+    damage: list[str] = field(default_factory=list[str])
+    """In words; empty for a file that is whole."""
+
+
+def scan(path: Path) -> Scan:
+    """Look at every record. Raises `InputError` where the file cannot be opened; damage is told, never raised."""
+    found = Scan(path)
+    try:
+        file = BoundedFile(path)
+    except OSError as error:
+        raise InputError(path, f"cannot open: {in_one_line(error)}") from None
+    with file:
+        try:
+            offsets = _walk(file, found)
+            offsets += _from_index(file, found, set(offsets))
+        except OSError as error:
+            found.damage.append(f"cannot be read: {in_one_line(error)}")
+            return found
+        for offset in sorted(offsets):
+            try:
+                counts = Counter(channel.topic for _schema, channel, _message in _chunk(file, offset, found))
+            except UNREADABLE as error:
+                found.damage.append(f"a chunk at byte {offset} cannot be read ({in_one_line(error)})")
+                found.parts.append(Part(offset, None, sound=False))
+            else:
+                found.counts += counts
+                found.parts.append(Part(offset, counts, sound=True))
+    found.parts = [part if part.sound else Part(part.offset, _told(found, part.offset), False) for part in found.parts]
+    return found
+
+
+def _told(found: Scan, offset: int) -> Counter[str] | None:
+    """What the index of a chunk says of the messages in it."""
+    by_channel = found.indexed.get(offset)
+    if not by_channel or not by_channel.keys() <= found.channels.keys():
+        return None
+    return Counter({found.channels[number].topic: count for number, count in by_channel.items()})
+
+
+def salvaged(found: Scan) -> Iterator[Record]:
+    """The messages of the sound chunks, in the order in which they were written. Raises `OSError`."""
+    for part in found.parts:
+        if part.sound:
+            yield from read_part(found, part)
+
+
+def read_part(found: Scan, part: Part) -> Iterator[Record]:
+    """The messages of one sound chunk. Raises `OSError`."""
+    with BoundedFile(found.path) as file:
+        yield from _chunk(file, part.offset, found)
+
+
+def glimpsed(found: Scan) -> list[str]:
+    """Names of strokes that chunks without a CRC that holds still show, up to where they cannot be unpacked."""
+    names: dict[str, None] = {}
+    with BoundedFile(found.path) as file:
+        for part in found.parts:
+            if part.sound:
+                continue
+            try:
+                check_chunk_at(file, part.offset)
+                file.seek(part.offset)
+                _opcode, length = _START.unpack(file.read(_START.size))
+                chunk = Chunk.read(ReadDataStream(io.BytesIO(file.read(length))))
+                data = _unpacked(chunk.data) if chunk.compression else chunk.data
+            except UNREADABLE:
+                continue
+            names |= {name.decode("utf-8", "replace"): None for name in _STROKE_NAME.findall(data)}
+    return list(names)
+
+
+def _unpacked(data: bytes) -> bytes:
+    unpacked = bytearray()
+    stream = zstandard.ZstdDecompressor().decompressobj()
+    try:
+        for at in range(0, len(data), _PIECE_BYTES):
+            unpacked += stream.decompress(data[at : at + _PIECE_BYTES])
+    except zstandard.ZstdError:
+        pass  # what came before is worth showing
+    return bytes(unpacked)
+
+
+def _walk(file: BoundedFile, found: Scan) -> list[int]:
+    """Offsets of what look like chunks, up to the end or to where the walk loses its way."""
+    offsets: list[int] = []
+    if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+        found.damage.append("does not begin as an MCAP file does")
+    at = len(MCAP0_MAGIC)
+    while True:
+        file.seek(at)
+        start = file.read(_START.size)
+        if len(start) < _START.size:
+            found.damage.append(f"ends at byte {file.size} without an index")
+            return offsets
+        opcode, length = _START.unpack(start)
+        if not Opcode.HEADER <= opcode <= Opcode.DATA_END:
+            found.damage.append(f"no record can be read at byte {at}")
+            return offsets
+        if at + _START.size + length > file.size:
+            found.damage.append(f"is cut short in the record at byte {at}")
+            return offsets
+        if opcode == Opcode.CHUNK:
+            offsets.append(at)
+        elif opcode == Opcode.MESSAGE_INDEX and offsets:
+            _message_index(file, found, offsets[-1])
+        else:
+            _record(file, found, opcode, at, length)
+        at += _START.size + length
+        if opcode == Opcode.DATA_END:
+            found.complete = True
+            return offsets
+
+
+def _message_index(file: BoundedFile, found: Scan, chunk: int) -> None:
+    """The number of a channel, and the length of one entry of 16 bytes for each of its messages in the chunk."""
+    start = file.read(_MESSAGE_INDEX.size)
+    if len(start) == _MESSAGE_INDEX.size:
+        channel, length = _MESSAGE_INDEX.unpack(start)
+        found.indexed.setdefault(chunk, {})[channel] = length // 16
+
+
+def _record_at(file: BoundedFile, found: Scan, offset: int) -> None:
+    """A record that only the index knows of."""
+    file.seek(offset)
+    start = file.read(_START.size)
+    if len(start) == _START.size:
+        opcode, length = _START.unpack(start)
+        _record(file, found, opcode, offset, length)
+
+
+def _record(file: BoundedFile, found: Scan, opcode: int, at: int, length: int) -> None:
+    if opcode not in (Opcode.METADATA, Opcode.ATTACHMENT) or length > MAX_RECORD_BYTES:
+        return
+    data = file.read(length)
+    try:
+        if opcode == Opcode.METADATA:
+            _metadata(Metadata.read(ReadDataStream(io.BytesIO(data))), found)
+        elif struct.unpack("<I", data[-4:])[0] != zlib.crc32(data[:-4]):
+            found.damage.append(f"an attachment at byte {at} does not match its CRC")
+        else:
+            found.attachments.append(Attachment.read(ReadDataStream(io.BytesIO(data))))
+    except UNREADABLE as error:
+        found.damage.append(f"the record at byte {at} cannot be read ({in_one_line(error)})")
+
+
+def _metadata(record: Metadata, found: Scan) -> None:
+    found.metadata[record.name] = record.metadata
+    if record.name == HEADER_METADATA:
+        if record.metadata.get("crc", "") not in ("", header_crc(record.metadata)):
+            found.damage.append("its header does not match its CRC")
+    elif "crc" in record.metadata:
+        values = read_note(record.metadata)
+        if values is None:
+            found.damage.append(f"its note {record.name!r} does not match its CRC")
+        else:
+            found.notes[record.name] = values
+
+
+def _from_index(file: BoundedFile, found: Scan, known: set[int]) -> list[int]:
+    """Chunks that only the index knows of; its channels stand in for those of a chunk that is lost."""
+    try:
+        _reader, summary = indexed(file)
+    except UNREADABLE as error:
+        found.damage.append(f"its index cannot be read ({in_one_line(error)})")
+        return []
+    found.schemas.update(summary.schemas)
+    found.channels.update(summary.channels)
+    counts = summary.statistics.channel_message_counts if summary.statistics else {}
+    found.stated = {found.channels[key].topic: count for key, count in counts.items() if key in found.channels}
+    found.stated_attachments = len(summary.attachment_indexes)
+    found.stated_notes = len({index.name for index in summary.metadata_indexes} - {HEADER_METADATA})
+    found.complete = True
+    for index in summary.chunk_indexes:
+        if index.chunk_start_offset not in known:
+            for offset in index.message_index_offsets.values():
+                file.seek(offset + _START.size)
+                _message_index(file, found, index.chunk_start_offset)
+    missed = [index.chunk_start_offset for index in summary.chunk_indexes if index.chunk_start_offset not in known]
+    for index in summary.metadata_indexes:
+        if index.name not in found.metadata:
+            _record_at(file, found, index.offset)
+    if len(missed) + len(known) > len(summary.chunk_indexes):
+        found.damage.append("holds chunks that its index does not know of")
+    return missed
+
+
+def _chunk(file: BoundedFile, offset: int, found: Scan) -> Iterator[Record]:
+    """Messages of one chunk, all of them or an error."""
+    check_chunk_at(file, offset)
+    file.seek(offset)
+    opcode, length = _START.unpack(file.read(_START.size))
+    if opcode != Opcode.CHUNK or length > MAX_RECORD_BYTES:
+        raise ValueError("no chunk")
+    chunk = Chunk.read(ReadDataStream(io.BytesIO(file.read(length))))
+    if chunk.uncompressed_crc == 0:
+        raise ValueError("no CRC")
+    records = breakup_chunk(chunk, validate_crc=True)
+    for record in records:
+        if isinstance(record, Schema):
+            found.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            found.channels[record.id] = record
+    messages = [record for record in records if isinstance(record, Message)]
+    pairs = [(found.channels[message.channel_id], message) for message in messages]
+    return iter([(found.schemas[ch.schema_id] if ch.schema_id else None, ch, message) for ch, message in pairs])

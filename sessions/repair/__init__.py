@@ -1,0 +1,1 @@
+"""What a damaged session still holds, and its repair."""

@@ -1,0 +1,135 @@
+"""The messages of one finished step, put together from every file that still holds some of them.
+
+A message is known by its topic and its number within the step. In a step's own file that is its number in the file; in
+the merged file, the steps of which follow each other, the messages of the steps before it are counted off. Chunks that
+cannot be read are counted by their index; those behind one that cannot be counted either are counted from the end.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from mcap.records import Channel, Message, Schema
+from pydantic import ValidationError
+
+from sessions.journal.codec import Line
+from sessions.recording.salvage import Part, Scan, read_part, salvaged
+from sessions.recording.schemas import StepEvent, Topic
+from sessions.recording.writer import BEGIN_NOTE, DONE_NOTE
+
+Record = tuple[Schema | None, Channel, Message]
+Place = tuple[str, int]
+"""Topic, and number within the step."""
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A file that may hold messages of the step, and where in it they are."""
+
+    found: Scan
+    totals: Counter[str]
+    """Messages by topic of the whole file, as it was written."""
+    before: Counter[str]
+    """Of which these precede the step."""
+
+
+def identity_of(found: Scan) -> tuple[str, int] | None:
+    """Key and attempt of the step that a file is of, as it tells itself, whatever it is called."""
+    for values in (found.notes.get(BEGIN_NOTE, {}).get("line"), found.notes.get(DONE_NOTE)):
+        match values:
+            case {"key": str(key), "attempt": int(attempt)}:
+                return key, attempt
+            case _:
+                pass
+    for _schema, channel, message in salvaged(found):
+        if channel.topic == Topic.STEP:
+            event = _event(message)
+            return None if event is None else (event.key, event.attempt)
+    return None
+
+
+def united(line: Line, sources: Iterable[Source]) -> list[Record]:
+    """What is left of the finished step that this `done` line tells of, in the order in which it was written."""
+    counts = Counter[str](line["counts"])
+    records: dict[Place, Record] = {}
+    after: dict[Place | None, Place | None] = {None: None}
+    """Each place, and None for the beginning, with the place that follows it."""
+    for source in sources:
+        part = dict(_of_step(source, counts))
+        if not _agrees(part, records, line):
+            continue
+        last: Place | None = None
+        for place in part:
+            if place not in records:
+                after[place], after[last] = after[last], place
+            last = place
+        records = part | records
+        if len(records) == counts.total():
+            break
+    ordered: list[Record] = []
+    place = after[None]
+    while place is not None:
+        ordered.append(records[place])
+        place = after[place]
+    return ordered
+
+
+def _agrees(part: dict[Place, Record], records: dict[Place, Record], line: Line) -> bool:
+    """Whether what is placed in the step is of this step, and the same where another file has it too."""
+    for place, (_schema, channel, message) in part.items():
+        if place in records and records[place][2].data != message.data:
+            return False
+        if channel.topic == Topic.STEP:
+            event = _event(message)
+            if event is None or (event.key, event.attempt) != (line["key"], line.get("attempt", 1)):
+                return False
+    return True
+
+
+def _of_step(source: Source, counts: Counter[str]) -> Iterator[tuple[Place, Record]]:
+    """Messages of a file that lie in the step, each with its place."""
+    for part, first in placed(source.found, source.totals):
+        numbers = first.copy()
+        wanted = {topic: range(source.before[topic], source.before[topic] + count) for topic, count in counts.items()}
+        inside = part.counts or Counter[str]()
+        if not any(r.start < first[t] + inside[t] and first[t] < r.stop for t, r in wanted.items() if inside[t]):
+            continue
+        for record in read_part(source.found, part):
+            topic = record[1].topic
+            if numbers[topic] in wanted.get(topic, ()):
+                yield (topic, numbers[topic] - source.before[topic]), record
+            numbers[topic] += 1
+
+
+def placed(found: Scan, totals: Counter[str]) -> list[tuple[Part, Counter[str]]]:
+    """The sound chunks of a file, each with the number, by topic, of its first message; `totals` are the file's.
+
+    A chunk between two that nobody can count is left out.
+    """
+    lost = [at for at, part in enumerate(found.parts) if part.counts is None]
+    if not found.complete:
+        lost.append(len(found.parts))
+    known = sum((part.counts for part in found.parts if part.counts is not None), Counter[str]())
+    if known - totals or (not lost and totals - known):
+        return []  # not the file that was counted
+    first, last = (lost[0], lost[-1]) if lost else (len(found.parts), -1)
+    chunks: list[tuple[Part, Counter[str]]] = []
+    number = Counter[str]()
+    for part in found.parts[:first]:
+        chunks.append((part, number.copy()))
+        number.update(part.counts or {})
+    behind: list[tuple[Part, Counter[str]]] = []
+    number = totals.copy()
+    for part in reversed(found.parts[max(first, last + 1) :]):
+        number.subtract(part.counts or {})
+        behind.append((part, number.copy()))
+    return [(part, number) for part, number in [*chunks, *reversed(behind)] if part.sound]
+
+
+def _event(message: Message) -> StepEvent | None:
+    try:
+        return StepEvent.model_validate_json(message.data)
+    except ValidationError:
+        return None
