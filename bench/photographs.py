@@ -76,11 +76,9 @@ def cases() -> list[Case]:
     ]
 
 
-async def serve(path: Path, number: int) -> None:
+async def serve(path: Path, view: View) -> None:
     """The rig of one case, in a process of its own, until its input ends."""
-    async with LoopbackRig(
-        SimConfig(rate=RATE, force_sensor=False, ink_device="none", view=cases()[number].view)
-    ) as rig:
+    async with LoopbackRig(SimConfig(rate=RATE, force_sensor=False, ink_device="none", view=view)) as rig:
         path.write_text(rig.toml(), encoding="utf-8")
         asked = await lines_of_input()
         tell("ready")
@@ -156,7 +154,7 @@ def _blind_to_the_strip(seen: list[tuple[float, float]]) -> None:
 def measure(number: int, case: Case, seed: int) -> str:
     """One line of the table."""
     rows: list[dict[str, Any]] = []
-    with tempfile.TemporaryDirectory() as folder, _busy(case.loops):
+    with tempfile.TemporaryDirectory() as folder, busy(case.loops):
         path = Path(folder) / "rig.toml"
         with started("bench.photographs", "rig", str(path), str(number)) as rig:
             command = [sys.executable, "-m", "bench.photographs", "photograph", str(path), str(seed)]
@@ -167,11 +165,12 @@ def measure(number: int, case: Case, seed: int) -> str:
                     rows.append(json.loads(line))
                     if pid is not None and len(rows) % 3 == 0:
                         time.sleep(random.Random(seed + len(rows)).random())
-                        _stop(pid)
+                        stop(pid)
     return _line(case, rows)
 
 
-def _stop(pid: int) -> None:
+def stop(pid: int) -> None:
+    """Stop a process for `STOP_S`, as a loaded host does."""
     with contextlib.suppress(ProcessLookupError):
         os.kill(pid, signal.SIGSTOP)
         time.sleep(STOP_S)
@@ -179,7 +178,8 @@ def _stop(pid: int) -> None:
 
 
 @contextlib.contextmanager
-def _busy(count: int) -> Iterator[None]:
+def busy(count: int) -> Iterator[None]:
+    """So many loops beside, until the block ends."""
     loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
     try:
         yield
@@ -215,7 +215,7 @@ def main(seed: int) -> None:
 if __name__ == "__main__":
     match sys.argv[1:]:
         case ["rig", path, number]:
-            asyncio.run(serve(Path(path), int(number)))
+            asyncio.run(serve(Path(path), cases()[int(number)].view))
         case ["photograph", path, seed]:
             asyncio.run(photograph(Path(path), int(seed)))
         case [] | [_]:
