@@ -125,6 +125,6 @@ def rest_is_unknown(error: BaseException | None) -> bool:
     return isinstance(error, DeviceError) and error.device == "robot" and not isinstance(error, known)
 
 
-def told(error: BaseException) -> str:
+def describe(error: BaseException) -> str:
     """An error with the notes that were added on its way: one of them may say that the arm still moves."""
     return " ".join([str(error) or type(error).__name__, *getattr(error, "__notes__", [])])

@@ -12,7 +12,7 @@ from collect.chains.finished import ending
 from collect.engine.engine import Engine
 from collect.engine.live import LiveView
 from collect.engine.opening import Opening, check_writable, find_resumable, open_store
-from collect.engine.rehearsal import Rehearsal
+from collect.engine.rehearsal import DryRunEngine
 from collect.headless import run_headless
 from collect.planning.limits import check_protocol
 from drivers.clock import HostClock
@@ -73,7 +73,7 @@ def dry_run(config: Path, protocol: Path, height_mm: float, *, armed: bool, on_s
     """Walk through the protocol in the air; what is recorded is thrown away, so that no cell counts as used."""
     with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:
         opening = Opening.load(Path(folder), config, protocol, armed=armed, dry_run_mm=height_mm)
-        _run(engine_for(opening, watched=on_screen, preview=on_screen, make=Rehearsal), "cells", on_screen=on_screen)
+        _run(engine_for(opening, watched=on_screen, preview=on_screen, make=DryRunEngine), "cells", on_screen=on_screen)
     _say("dry run done; nothing was kept\n")
 
 

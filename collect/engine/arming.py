@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collect.errors import CollectAborted, ConfigError
-from collect.operator.questions import Asker, Choice, Prompt
+from collect.operator import Asker, Choice, Prompt
 from collect.rig.devices import Rig
 
 ARM, LEAVE = Choice("a", "arm it: I look at the cell, my hand is at the emergency stop"), Choice("x", "leave it")

@@ -10,7 +10,7 @@ from collect.engine.states import FINAL, State, check_transition
 
 
 class RunControl:
-    """One lock over the state and the wishes to stop, pause and park. Nothing here talks to a device."""
+    """One lock over the state and the requests to stop, pause and park. Nothing here talks to a device."""
 
     def __init__(self, doing: Callable[[str], None]) -> None:
         """`doing` is told what the run does, in words."""

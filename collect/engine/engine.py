@@ -28,9 +28,8 @@ from collect.engine.snapshot import Snapshot
 from collect.engine.states import FINAL, State
 from collect.engine.steps.waiting import uninterrupted
 from collect.engine.telemetry import NotedRobot, Telemetry
-from collect.errors import CollectAborted, Parked, rest_is_unknown, told
-from collect.operator.questions import Asker
-from collect.operator.requests import Wish, Wishes
+from collect.errors import CollectAborted, Parked, describe, rest_is_unknown
+from collect.operator import Asker, OperatorRequest, OperatorRequests
 from collect.planning.walk import layout_of, sheet_of, steps_on
 from collect.protocols.config import ProtocolConfig
 from collect.rig.config import RigConfig
@@ -85,7 +84,7 @@ class Engine:
         self._guided = guided
         self._preview = preview
         self._telemetry = Telemetry()
-        self._wishes = Wishes()
+        self._requests = OperatorRequests()
         self._control = RunControl(self._progress.doing)
         self._task: asyncio.Task[None] | None = None
         self._stopper: asyncio.Task[None] | None = None
@@ -133,7 +132,7 @@ class Engine:
             rest_unknown=self._rest_unknown,
             trace_n=self._telemetry.trace_n(),
             picture=self._telemetry.picture,
-            wishes=self._wishes.open,
+            requests=self._requests.open,
             set_up=self._set_up(),
             no_pose_s=no_pose_s if no_pose_s >= SILENT_S and state not in FINAL else None,
         )
@@ -147,9 +146,9 @@ class Engine:
             return ()
         return listed(self._rig_config, self._progress.found, self._progress.set_up)
 
-    def wish(self, wish: Wish) -> None:
+    def request(self, request: OperatorRequest) -> None:
         """Ask for something, or take it back; granted at the next moment that allows it. From any thread."""
-        self._wishes.toggle(wish)
+        self._requests.toggle(request)
 
     def park(self) -> None:
         """End the run after this step, the arm lifted and parked; nobody is asked any more. From any thread."""
@@ -186,7 +185,7 @@ class Engine:
                 await self._rig.robot.stop()
             except DeviceError as error:
                 self._stop_failure = error
-                self._progress.log(told(error), warning=True)
+                self._progress.log(describe(error), warning=True)
 
     def _run_thread(self) -> None:
         try:
@@ -204,11 +203,11 @@ class Engine:
         except asyncio.CancelledError:
             await self._stopped()
         except Parked as error:
-            self._end(State.STOPPED, told(error))
+            self._end(State.STOPPED, describe(error))
             raise
         except Exception as error:
             self._rest_unknown = rest_is_unknown(error)
-            self._end(State.FAILED, told(error))
+            self._end(State.FAILED, describe(error))
             raise
         finally:
             if self._stopper is not None:
@@ -221,7 +220,7 @@ class Engine:
         if self._stop_failure is not None and not isinstance(self._stop_failure, NotConnected):
             # Never told as stopped: the arm was not seen at rest.
             self._rest_unknown = True
-            self._end(State.FAILED, told(self._stop_failure))
+            self._end(State.FAILED, describe(self._stop_failure))
             raise self._stop_failure
         self._end(State.STOPPED, "stopped by the operator")
         raise CollectAborted("stopped; the same command goes on from here")
@@ -259,9 +258,9 @@ class Engine:
             self._asker,
             self._live,
             telemetry=self._telemetry,
-            wishes=self._wishes,
+            requests=self._requests,
         )
-        run = Run(rig, store, performer, self._progress, self._asker, self._control, self._wishes, self._guided)
+        run = Run(rig, store, performer, self._progress, self._asker, self._control, self._requests, self._guided)
         steps = steps_on(self._rig_config, self._protocol_config)
         await run.protocol(board_first(steps) if self._guided else steps)
 

@@ -18,13 +18,12 @@ from collect.engine.steps import look as looking
 from collect.engine.steps import press as marking
 from collect.engine.steps import review as reviewed
 from collect.engine.steps import touch as touching
-from collect.engine.steps.context import Bench, Job
+from collect.engine.steps.context import RunContext, StepContext
 from collect.engine.steps.waiting import uninterrupted
 from collect.engine.telemetry import Telemetry
-from collect.errors import SheetFull, StepError, told
+from collect.errors import SheetFull, StepError, describe
 from collect.motion.procedures import Procedures
-from collect.operator.questions import Asker
-from collect.operator.requests import Wish, Wishes
+from collect.operator import Asker, OperatorRequest, OperatorRequests
 from collect.protocols.config import ProtocolConfig, WriteConfig
 from collect.protocols.plans import cell_mm
 from collect.protocols.steps import MARKING, Result, Step, StepKind
@@ -52,11 +51,11 @@ class Performer:
         live: LiveView | None = None,
         *,
         telemetry: Telemetry | None = None,
-        wishes: Wishes | None = None,
+        requests: OperatorRequests | None = None,
     ) -> None:
-        """`telemetry` is handed every force; `wishes` are what an operator asks for by key."""
+        """`telemetry` is handed every force; `requests` are what an operator asks for by key."""
         self._show = None if live is None else live.offer
-        self._bench = Bench(
+        self._run_context = RunContext(
             rig,
             store,
             progress,
@@ -65,14 +64,14 @@ class Performer:
             Inking(rig),
             Sheet(rig.config.paper, cell_mm(protocol)),
             protocol,
-            wishes=wishes or Wishes(),
+            requests=requests or OperatorRequests(),
         )
         self._telemetry = telemetry
 
     async def retreat(self) -> None:
         """Bring the arm up and away from wherever it is; belongs to no step and is not recorded."""
-        self._bench.known.left_ink_ns = None
-        await self._bench.procedures.retreat()
+        self._run_context.known.left_ink_ns = None
+        await self._run_context.procedures.retreat()
 
     def answered(self, error: StepError | DeviceError) -> None:
         """A person has put right what `error` said: a full sheet was changed, or something at the camera."""
@@ -82,37 +81,37 @@ class Performer:
 
     def forget_camera(self) -> None:
         """A person may have changed something at the camera or in its view: measure its delay again."""
-        self._bench.procedures.photographer.forget()
+        self._run_context.procedures.photographer.forget()
 
     def fresh_sheet(self) -> None:
         """A person has put a fresh sheet in."""
-        self._bench.store.fresh_sheet()
-        self._bench.known.sound_frame = None
+        self._run_context.store.fresh_sheet()
+        self._run_context.known.sound_frame = None
         self.forget_camera()
-        self._bench.progress.sheet_in(self._bench.store.state.sheet)
+        self._run_context.progress.sheet_in(self._run_context.store.state.sheet)
 
     @property
     def write(self) -> WriteConfig | None:
         """How figures are drawn, where the protocol draws some."""
-        protocol = self._bench.protocol
+        protocol = self._run_context.protocol
         return protocol if isinstance(protocol, WriteConfig) else None
 
     @property
     def marked_bad(self) -> bool:
         """Whether a person has marked a capture bad that was not made again yet."""
-        return bool(reviewed.marked_bad(self._bench))
+        return bool(reviewed.marked_bad(self._run_context))
 
     async def perform(self, step: Step) -> Result:
         """Do the step once. If it is cut, the attempt is voided and its cell stays used. Raises `SheetFull` first."""
-        bench = self._bench
-        rig, store, progress = bench.rig, bench.store, bench.progress
+        run = self._run_context
+        rig, store, progress = run.rig, run.store, run.progress
         progress.doing(_in_words(step))
-        used = bench.used_cells()
+        used = run.used_cells()
         marks = step.kind in MARKING
         # Before the dip as well: a brush full of ink does not wait for a fresh sheet.
-        free = bench.sheet.free(used, store.state.sheet + 1) if marks or step.kind == StepKind.DIP else None
+        free = run.sheet.free(used, store.state.sheet + 1) if marks or step.kind == StepKind.DIP else None
         cell = free if marks else None
-        more = partners(bench.sheet, cell, used) if cell is not None and step.kind == StepKind.SELF_CHECK else ()
+        more = partners(run.sheet, cell, used) if cell is not None and step.kind == StepKind.SELF_CHECK else ()
         notes: dict[str, Any] = {"params": dict(step.params)}
         if more:
             notes["more_cells"] = [other.index for other in more]
@@ -136,7 +135,7 @@ class Performer:
             guard.listen()
             try:
                 with guard.also(self._telemetry.force) if self._telemetry is not None else contextlib.nullcontext():
-                    result = await self._do(Job(bench, step, cell, more, attempt, recorder, guard))
+                    result = await self._do(StepContext(run, step, cell, more, attempt, recorder, guard))
                 if step.kind in HEIGHTS:
                     with contextlib.suppress(ArmMoved):  # where it is now does not matter to what was done
                         await rig.robot.confirm()
@@ -146,12 +145,12 @@ class Performer:
             recorder.cadence()
             recorder.step(event.model_copy(update={"phase": "end"}))
         except BaseException as error:
-            bench.known.left_ink_ns = None
+            run.known.left_ink_ns = None
             progress.cut(place)
-            why = "stopped by the operator" if isinstance(error, asyncio.CancelledError) else told(error)
+            why = "stopped by the operator" if isinstance(error, asyncio.CancelledError) else describe(error)
             await uninterrupted(store.void, attempt, why)
             raise
-        if step.kind == StepKind.DIP and bench.wishes.take(Wish.SKIP):
+        if step.kind == StepKind.DIP and run.requests.take(OperatorRequest.SKIP):
             result = {**result, **progress.skipped(step)}
             progress.log(f"{result['stroke_id']}: is left out, as the operator asked")
         await uninterrupted(store.done, attempt, result)
@@ -160,28 +159,28 @@ class Performer:
             progress.captured(result)
         return result
 
-    async def _do(self, job: Job) -> Result:
-        match job.step.kind:
+    async def _do(self, context: StepContext) -> Result:
+        match context.step.kind:
             case StepKind.ZERO_TOUCH:
-                return await touching.zero_touch(job)
+                return await touching.zero_touch(context)
             case StepKind.TOUCH:
-                return await touching.touch(job)
+                return await touching.touch(context)
             case StepKind.SELF_CHECK:
-                return await touching.check_rig(job)
+                return await touching.check_rig(context)
             case StepKind.BOARD:
-                return await looking.board(job)
+                return await looking.board(context)
             case StepKind.DIP:
-                return await dipping.dip(job)
+                return await dipping.dip(context)
             case StepKind.PRESS:
-                return await marking.press(job)
+                return await marking.press(context)
             case StepKind.DRAW:
-                return await marking.draw(job)
+                return await marking.draw(context)
             case StepKind.CAPTURE:
-                return await capturing.capture(job)
+                return await capturing.capture(context)
             case StepKind.CHOOSE:
-                return await choosing.choose(job)
+                return await choosing.choose(context)
             case StepKind.REVIEW:
-                return await reviewed.review(job)
+                return await reviewed.review(context)
 
 
 def _in_words(step: Step) -> str:

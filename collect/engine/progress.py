@@ -12,7 +12,7 @@ from collect.engine.last_capture import LastCapture
 from collect.engine.snapshot import CellCount, Snapshot
 from collect.engine.states import State
 from collect.engine.tally import Place, Tally
-from collect.operator.questions import Prompt
+from collect.operator import Prompt
 from collect.protocols.adaptive import with_choice
 from collect.protocols.again import AGAIN, with_review
 from collect.protocols.planned import Layout, Planned

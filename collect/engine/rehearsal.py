@@ -11,7 +11,7 @@ BEGUN = "rehearsal: nothing is pressed, dipped or kept"
 OVER = "rehearsal: every move was made"
 
 
-class Rehearsal(Engine):
+class DryRunEngine(Engine):
     """Makes every move, lifted; its recording is discarded."""
 
     presses = False

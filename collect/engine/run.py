@@ -16,9 +16,8 @@ from collect.engine.set_up import again
 from collect.engine.set_up import question as set_up_question
 from collect.engine.set_up_steps import SET_UP
 from collect.engine.states import State
-from collect.errors import ForceTooHigh, Parked, StepError, told
-from collect.operator.questions import Asker, Choice, Prompt
-from collect.operator.requests import Wish, Wishes
+from collect.errors import ForceTooHigh, Parked, StepError, describe
+from collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
 from collect.protocols.steps import Protocol, Result, Step, StepKind
 from collect.protocols.strokes import takes
 from collect.rig.devices import Rig
@@ -63,7 +62,7 @@ class Run:
     progress: Progress
     asker: Asker
     control: Control
-    wishes: Wishes
+    requests: OperatorRequests
     guided: bool = False
     """A person looks at what each set-up step measured before it counts."""
 
@@ -146,9 +145,9 @@ class Run:
         if self.control.park_wanted:
             await self._park()
         await self._back_in_control()
-        if step.kind is StepKind.DIP and self.wishes.take(Wish.NEW_SHEET):
+        if step.kind is StepKind.DIP and self.requests.take(OperatorRequest.NEW_SHEET):
             await self._new_sheet()
-        if step.kind is StepKind.DIP and self.wishes.take(Wish.JOG):
+        if step.kind is StepKind.DIP and self.requests.take(OperatorRequest.JOG):
             await self._touch_again(step)
 
     async def _back_in_control(self) -> None:
@@ -215,7 +214,7 @@ class Run:
         self.progress.log(f"{asked.question} -> {meant}")
         if answer == STOP.key:
             if in_order:
-                raise Parked(f"stopped at a question, parked: {told(error)}") from error
+                raise Parked(f"stopped at a question, parked: {describe(error)}") from error
             raise error
         self.performer.answered(error)
         return answer
@@ -228,7 +227,7 @@ class Run:
         try:
             await self._recover()
         except (StepError, DeviceError) as failure:
-            error.add_note(f"The brush could not be lifted: {told(failure)}")
+            error.add_note(f"The brush could not be lifted: {describe(failure)}")
 
     async def _recover(self) -> None:
         self.control.move_to(State.RECOVERING)
@@ -236,6 +235,6 @@ class Run:
         try:
             await self.rig.robot.confirm()
         except ArmMoved as moved:
-            self.progress.log(told(moved), warning=True)  # told before it moves
+            self.progress.log(describe(moved), warning=True)  # told before it moves
         await self.performer.retreat()
         self.control.move_to(self.control.running())

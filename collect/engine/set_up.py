@@ -8,7 +8,7 @@ from dataclasses import replace
 from calibrate.board.scale import WORST_RMS_PX
 from collect.engine.questions import GO_ON, KEEP, STOP
 from collect.engine.set_up_steps import SET_UP, TITLES, Fact, SetUpStep, Standing
-from collect.operator.questions import Choice, Prompt
+from collect.operator import Choice, Prompt
 from collect.protocols.steps import Protocol, Result, Step, StepKind
 from collect.rig.config import RigConfig
 

@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     from collect.engine.states import State
     from collect.engine.tally import SheetMap
     from collect.engine.telemetry import Picture
-    from collect.operator.questions import Prompt
-    from collect.operator.requests import Wish
+    from collect.operator import OperatorRequest, Prompt
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +85,7 @@ class Snapshot:
     """The newest capture of this process."""
     stroke: str = ""
     """The stroke in hand."""
-    wishes: tuple[Wish, ...] = ()
+    requests: tuple[OperatorRequest, ...] = ()
     """What was asked for by key and still waits."""
     set_up: tuple[SetUpStep, ...] = ()
     """Of a guided set-up; empty once it is over, and where there is none."""
@@ -97,7 +96,7 @@ class Snapshot:
 
 
 class EngineView(Protocol):
-    """What a screen may do: look, pause, go on, wish, park, stop."""
+    """What a screen may do: look, pause, go on, request, park, stop."""
 
     def snapshot(self) -> Snapshot:
         """The engine now; never blocks."""
@@ -115,7 +114,7 @@ class EngineView(Protocol):
         """Answer the prompt of that number; False where it is over. From any thread."""
         ...
 
-    def wish(self, wish: Wish) -> None:
+    def request(self, request: OperatorRequest) -> None:
         """Ask for something, or take it back; from any thread."""
         ...
 

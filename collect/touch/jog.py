@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from collect.errors import JogGivenUp, StepError
-from collect.operator.questions import Asker, Choice, Prompt
+from collect.operator import Asker, Choice, Prompt
 from collect.rig.config_touch import JogTouchConfig
 from collect.touch.arm import TouchArm
 from collect.touch.reach import Reach

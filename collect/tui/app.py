@@ -18,7 +18,7 @@ from collect.engine.snapshot import Snapshot
 from collect.engine.states import FINAL, State
 from collect.errors import ConfigError
 from collect.headless import REFRESH_S, RunnableEngine
-from collect.operator.requests import Wish
+from collect.operator import OperatorRequest
 from collect.tui.ask import AskScreen
 from collect.tui.browser import Desk
 from collect.tui.confirm import AT_WORK, AT_WORK_KEYS, NOT_AT_REST, NOT_PARKED, NOT_PARKED_KEYS, Confirm
@@ -39,10 +39,10 @@ STOP_KEYS = frozenset({"s", "ctrl+c"})
 COMMANDS = (
     ("Stop the arm now", "A software stop; the red button is the emergency stop", "stop"),
     ("Pause or go on", "Before the next step", "pause"),
-    ("Retake", "Press the stroke in hand again", "wish('RETAKE')"),
-    ("Skip", "Leave the stroke in hand out", "wish('SKIP')"),
-    ("New sheet", "Put a new sheet in before the next stroke", "wish('NEW_SHEET')"),
-    ("Jog", "Find the paper again by jog before the next stroke", "wish('JOG')"),
+    ("Retake", "Press the stroke in hand again", "request('RETAKE')"),
+    ("Skip", "Leave the stroke in hand out", "request('SKIP')"),
+    ("New sheet", "Put a new sheet in before the next stroke", "request('NEW_SHEET')"),
+    ("Jog", "Find the paper again by jog before the next stroke", "request('JOG')"),
     ("Last capture bad", "It does not count, and is pressed again at the end", "mark_last"),
     ("Review", "Look through the captures", "review"),
     ("Leave", "Finish the step, park, leave", "quit"),
@@ -58,10 +58,10 @@ class OperatorApp(PlainApp):
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("ctrl+c", "quit", "Leave", show=False, priority=True),
         Binding("space,p", "pause", "Pause or go on"),
-        Binding("r", "wish('RETAKE')", "Retake"),
-        Binding("k", "wish('SKIP')", "Skip"),
-        Binding("n", "wish('NEW_SHEET')", "New sheet"),
-        Binding("j", "wish('JOG')", "Jog"),
+        Binding("r", "request('RETAKE')", "Retake"),
+        Binding("k", "request('SKIP')", "Skip"),
+        Binding("n", "request('NEW_SHEET')", "New sheet"),
+        Binding("j", "request('JOG')", "Jog"),
         Binding("b", "mark_last", "Last capture bad"),
         Binding("v", "review", "Review"),
         Binding("question_mark", "help", "Help"),
@@ -124,7 +124,7 @@ class OperatorApp(PlainApp):
             return self.at_work
         if action == "pause":
             return self._now is not None and self._now.state in CAN_PAUSE | CAN_RESUME
-        if action in ("wish", "mark_last"):
+        if action in ("request", "mark_last"):
             return self.at_work
         if action == "review":
             return self._now is not None and bool(self._now.folder)
@@ -156,10 +156,10 @@ class OperatorApp(PlainApp):
         if self.engine is not None and self._now is not None:
             (self.engine.resume if self._now.state in CAN_RESUME else self.engine.pause)()
 
-    def action_wish(self, name: str) -> None:
+    def action_request(self, name: str) -> None:
         """Ask the engine for something, or take it back."""
         if self.engine is not None and self._now_s() >= self._deaf_until_s:
-            self.engine.wish(Wish[name])
+            self.engine.request(OperatorRequest[name])
             self._look()
 
     def action_mark_last(self) -> None:

@@ -16,7 +16,7 @@ from textual.screen import ModalScreen
 from textual.widgets import Static
 
 from collect.engine.snapshot import EngineView
-from collect.operator.questions import Prompt
+from collect.operator import Prompt
 from collect.tui.line import Line
 from collect.tui.pictures import Pictures
 from collect.tui.text import plain

@@ -14,7 +14,7 @@ from textual.screen import Screen
 from collect.engine.set_up_steps import Fact, SetUpStep, Standing
 from collect.engine.snapshot import EngineView, Snapshot
 from collect.headless import no_pose_text
-from collect.operator.questions import Prompt
+from collect.operator import Prompt
 from collect.protocols.steps import StepKind
 from collect.tui.ask import choices_content
 from collect.tui.facts import target_text

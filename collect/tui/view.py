@@ -205,7 +205,7 @@ def note_content(now: Snapshot) -> Content:
         return Content.assemble((f" {OVER} ", "bold reverse"), f"  {told}")
     if now.state is State.STOPPING:
         return Content.styled(" not seen at rest yet: the red button, if it moves on ", "bold reverse")
-    if now.wishes:
-        asked = ", ".join(wish.short for wish in now.wishes)
+    if now.requests:
+        asked = ", ".join(request.short for request in now.requests)
         return Content.assemble((f" asked: {asked} ", "bold reverse"), f" {SHORT_STOP}")
     return Content(SOFTWARE_STOP)

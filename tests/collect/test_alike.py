@@ -116,11 +116,11 @@ def test_a_brush_that_waited_with_its_ink_dips_again(
 async def test_a_dip_of_zero_touch_or_the_self_check_is_none_for_a_press(monkeypatch: pytest.MonkeyPatch) -> None:
     known = Known()
 
-    async def dipped(_job: Any) -> None:
+    async def dipped(_context: Any) -> None:
         known.left_ink_ns = 1
 
     monkeypatch.setattr(touching, "fill_brush", dipped)
-    await touching._Hands(cast(Any, SimpleNamespace(bench=SimpleNamespace(known=known)))).dip()
+    await touching._Hands(cast(Any, SimpleNamespace(run=SimpleNamespace(known=known)))).dip()
     assert known.left_ink_ns is None
 
 

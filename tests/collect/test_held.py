@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from conftest import Lab
 
     from collect.engine.engine import Engine
-    from collect.operator.questions import Prompt
+    from collect.operator import Prompt
 
 
 def slowly(lab: Lab) -> None:

@@ -11,8 +11,7 @@ from collect.engine.inking import Inking
 from collect.engine.progress import Progress
 from collect.engine.recorder import Recorder
 from collect.motion.procedures import Procedures
-from collect.operator.questions import Asker
-from collect.operator.requests import Wishes
+from collect.operator import Asker, OperatorRequests
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.steps import Step
 from collect.rig.devices import Rig
@@ -39,7 +38,7 @@ class Known:
 
 
 @dataclass(frozen=True, slots=True)
-class Bench:
+class RunContext:
     """The rig for the length of a run."""
 
     rig: Rig
@@ -51,7 +50,7 @@ class Bench:
     sheet: Sheet
     protocol: ProtocolConfig
     known: Known = field(default_factory=Known)
-    wishes: Wishes = field(default_factory=Wishes)
+    requests: OperatorRequests = field(default_factory=OperatorRequests)
 
     def used_cells(self) -> set[int]:
         """Cells of the sheet that is in on which a mark was ever begun, or that zero touch may ink."""
@@ -61,10 +60,10 @@ class Bench:
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class StepContext:
     """One attempt at one step."""
 
-    bench: Bench
+    run: RunContext
     step: Step
     cell: Cell | None
     """That it marks."""

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collect.engine.steps.context import Bench, Job
+from collect.engine.steps.context import RunContext, StepContext
 from collect.protocols.steps import Result, StepKind
 from sessions.remarks import remarks_of
 
 
-def marked_bad(bench: Bench) -> list[str]:
+def marked_bad(run: RunContext) -> list[str]:
     """Strokes that count, are marked bad, and have not been given to a REVIEW step yet; in the order in which they were
     made. Raises `SessionDamaged`."""
-    remarks = remarks_of(bench.store.folder)
+    remarks = remarks_of(run.store.folder)
     if not remarks:
         return []
-    lines = bench.store.state.segments
+    lines = run.store.state.segments
     given = {str(name) for line in lines if line["kind"] == StepKind.REVIEW for name, _ in line["result"]["again"]}
     captures = [line["result"] for line in lines if line["kind"] == StepKind.CAPTURE]
     bad = {remark.still for remark in remarks.values() if remark.bad}
@@ -21,12 +21,12 @@ def marked_bad(bench: Bench) -> list[str]:
     return [name for name in counted if name not in given]
 
 
-async def review(job: Job) -> Result:
+async def review(context: StepContext) -> Result:
     """The REVIEW step: `again` holds [stroke_id, index of its steps] of what is to be made again."""
-    bench = job.bench
-    lines = [line["result"]["again"] for line in bench.store.state.segments if line["kind"] == StepKind.REVIEW]
-    first = bench.progress.first_free_index + sum(map(len, lines))
-    again = [[name, first + n] for n, name in enumerate(marked_bad(bench))]
+    run = context.run
+    lines = [line["result"]["again"] for line in run.store.state.segments if line["kind"] == StepKind.REVIEW]
+    first = run.progress.first_free_index + sum(map(len, lines))
+    again = [[name, first + n] for n, name in enumerate(marked_bad(run))]
     for name, _ in again:
-        bench.progress.log(f"{name}: was marked bad in review, is pressed again")
+        run.progress.log(f"{name}: was marked bad in review, is pressed again")
     return {"again": again}

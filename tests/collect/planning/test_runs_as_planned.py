@@ -9,7 +9,7 @@ import pytest
 
 from collect.engine.perform import Performer
 from collect.engine.steps import choose as choosing
-from collect.engine.steps.context import Job
+from collect.engine.steps.context import StepContext
 from collect.motion.procedures import inking_moves
 from collect.planning.limits import all_poses, check_protocol
 from collect.planning.moves import moves_of
@@ -51,7 +51,7 @@ class Made:
     """A step that was done, and the targets that reached the arm's queue meanwhile."""
 
     step: Step
-    job: Job
+    context: StepContext
     plane: PaperPlane
     dips: int
     sent: list[Pose] = field(default_factory=list)
@@ -63,11 +63,11 @@ def made(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> list[Made]:
     at_work: list[Made] = []
     do = Performer._do
 
-    async def noted(self: Performer, job: Job) -> Result:
-        procedures = job.bench.procedures
-        at_work.append(Made(job.step, job, procedures.plane, procedures._dips))
+    async def noted(self: Performer, context: StepContext) -> Result:
+        procedures = context.run.procedures
+        at_work.append(Made(context.step, context, procedures.plane, procedures._dips))
         try:
-            return await do(self, job)
+            return await do(self, context)
         finally:
             steps.append(at_work.pop())
 
@@ -101,7 +101,7 @@ def hold_against_the_plan(lab: Lab, made: list[Made]) -> None:
     config, protocol = load_rig(rig_path), load_protocol(path)
     check_protocol(rig_path, path, config, protocol)
     for one in made:
-        cell, more = one.job.cell, one.job.more_cells
+        cell, more = one.context.cell, one.context.more_cells
         planned = moves_of(config, one.plane, one.step, cell, more, dips=one.dips)
         # Where the ink had to wait, a press dips again.
         again = inking_moves(config, one.dips) if one.step.kind in MARKING else []
@@ -111,9 +111,9 @@ def hold_against_the_plan(lab: Lab, made: list[Made]) -> None:
         assert {rounded(pose) for pose, _ in planned.poses} <= checked, one.step
 
 
-async def chosen(job: Job) -> Result:
+async def chosen(context: StepContext) -> Result:
     """One press, without the seconds that a fit takes."""
-    return {"number": job.step.index, "stop": job.step.index > 0, "height_mm": 9.0, "tilt_deg": 5.0}
+    return {"number": context.step.index, "stop": context.step.index > 0, "height_mm": 9.0, "tilt_deg": 5.0}
 
 
 def rounded(pose: Pose) -> tuple[float, ...]:

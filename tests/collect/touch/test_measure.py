@@ -13,7 +13,7 @@ import pytest
 from pydantic import ValidationError
 
 from collect.errors import NeedsOperator, StepError
-from collect.operator.questions import Asker
+from collect.operator import Asker
 from collect.rig.config_touch import TouchConfig
 from collect.touch.jog import Jogged, asked
 from collect.touch.measure import measure_plane

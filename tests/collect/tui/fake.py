@@ -16,8 +16,7 @@ from collect.engine.states import State
 from collect.engine.tally import Mark, SheetMap
 from collect.engine.telemetry import Picture
 from collect.errors import CollectAborted
-from collect.operator.questions import Choice, Prompt
-from collect.operator.requests import Wish
+from collect.operator import Choice, OperatorRequest, Prompt
 from collect.protocols.steps import StepKind
 from collect.quality.verdict import Check, Failure, Verdict
 
@@ -208,9 +207,9 @@ class FakeEngine:
         self.calls.append(f"answer {number} {key}")
         return True
 
-    def wish(self, wish: Wish) -> None:
-        self.calls.append(f"wish {wish.name}")
-        self.now = replace(self.now, wishes=(*self.now.wishes, wish))
+    def request(self, request: OperatorRequest) -> None:
+        self.calls.append(f"request {request.name}")
+        self.now = replace(self.now, requests=(*self.now.requests, request))
 
     def park(self) -> None:
         self.calls.append("park")

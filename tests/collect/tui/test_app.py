@@ -122,18 +122,18 @@ async def test_a_stop_is_on_the_screen_in_less_than_a_tenth_of_a_second_whatever
         assert "STOPPED" in text
 
 
-async def test_wishes_are_passed_on_and_shown_until_they_are_granted() -> None:
+async def test_requests_are_passed_on_and_shown_until_they_are_carried_out() -> None:
     engine = FakeEngine(picture())
     app = OperatorApp(engine)
     async with app.run_test(size=(80, 24)) as pilot:
-        for key, wish in (("r", "RETAKE"), ("k", "SKIP"), ("n", "NEW_SHEET"), ("j", "JOG")):
+        for key, request in (("r", "RETAKE"), ("k", "SKIP"), ("n", "NEW_SHEET"), ("j", "JOG")):
             engine.calls.clear()
             engine.now = picture()
             assert "asked" not in await look(app, pilot)
             await pilot.press(key)
-            assert engine.calls == [f"wish {wish}"]
+            assert engine.calls == [f"request {request}"]
             text = await look(app, pilot)
-            assert f"asked: {engine.now.wishes[0].short}" in text
+            assert f"asked: {engine.now.requests[0].short}" in text
             assert "red button: emergency stop" in text
 
 
@@ -219,10 +219,10 @@ async def test_a_key_that_bounces_after_an_answer_asks_for_nothing() -> None:
         engine.now = picture()
         await look(app, pilot)
         await pilot.press("k")
-        assert [call for call in engine.calls if call.startswith("wish")] == []
+        assert [call for call in engine.calls if call.startswith("request")] == []
         now_s[0] += 1.0
         await pilot.press("k")
-        assert engine.calls[-1] == "wish SKIP"
+        assert engine.calls[-1] == "request SKIP"
 
 
 @pytest.mark.parametrize("state", sorted(FINAL))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from collect.engine.states import State
-from collect.operator.questions import Choice, Prompt
+from collect.operator import Choice, Prompt
 from collect.tui.app import OperatorApp
 from collect.tui.ask import AskScreen
 from collect.tui.confirm import Confirm

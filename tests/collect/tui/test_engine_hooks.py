@@ -1,4 +1,4 @@
-"""What the app asks of an engine besides pause and stop, on the loopback rig: wishes, park, guided set-up."""
+"""What the app asks of an engine besides pause and stop, on the loopback rig: requests, park, guided set-up."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from collect.engine.snapshot import Snapshot
 from collect.engine.states import State
 from collect.engine.tally import Mark
 from collect.errors import CollectAborted, NeedsOperator, Parked
-from collect.operator.requests import Wish, Wishes
+from collect.operator import OperatorRequest, OperatorRequests
 from drivers.clock import HostClock
 from sessions.journal.journal import read_lines
 from sessions.reader import Recording
@@ -60,28 +60,28 @@ def lines(lab: Lab, event: str) -> list[dict[str, object]]:
     return [line for line in read_lines(folder / "journal.jsonl") if line["event"] == event]
 
 
-def test_a_wish_asked_twice_is_taken_back_and_retake_and_skip_exclude_each_other() -> None:
-    wishes = Wishes()
-    assert wishes.toggle(Wish.RETAKE)
-    assert wishes.toggle(Wish.SKIP)
-    assert wishes.open == (Wish.SKIP,)
-    assert not wishes.toggle(Wish.SKIP)
-    assert not wishes.take(Wish.SKIP)
-    assert wishes.toggle(Wish.JOG)
-    assert wishes.take(Wish.JOG)
-    assert wishes.open == ()
+def test_a_request_made_twice_is_withdrawn_and_retake_and_skip_exclude_each_other() -> None:
+    requests = OperatorRequests()
+    assert requests.toggle(OperatorRequest.RETAKE)
+    assert requests.toggle(OperatorRequest.SKIP)
+    assert requests.open == (OperatorRequest.SKIP,)
+    assert not requests.toggle(OperatorRequest.SKIP)
+    assert not requests.take(OperatorRequest.SKIP)
+    assert requests.toggle(OperatorRequest.JOG)
+    assert requests.take(OperatorRequest.JOG)
+    assert requests.open == ()
 
 
 def test_a_stroke_is_pressed_again_on_a_new_cell_because_the_operator_asked(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
     engine = engine_of(lab)
-    engine.wish(Wish.RETAKE)
-    engine.wish(Wish.NEW_SHEET)
-    engine.wish(Wish.NEW_SHEET)
+    engine.request(OperatorRequest.RETAKE)
+    engine.request(OperatorRequest.NEW_SHEET)
+    engine.request(OperatorRequest.NEW_SHEET)
     engine.start()
     engine.join()
     now = engine.snapshot()
-    assert (now.state, now.strokes_done, now.given_up, now.wishes) == (State.DONE, 1, 0, ())
+    assert (now.state, now.strokes_done, now.given_up, now.requests) == (State.DONE, 1, 0, ())
     assert now.sheet is not None
     assert [mark for mark in now.sheet.marks if mark] == [Mark.BAD, Mark.KEPT]
     assert now.grid[0].bad == 1
@@ -92,7 +92,7 @@ def test_a_stroke_is_pressed_again_on_a_new_cell_because_the_operator_asked(lab:
 def test_a_stroke_is_left_out_before_it_is_pressed_and_stays_left_out_after_a_resume(lab: Lab) -> None:
     lab.write_protocol("[11.0, 15.0]", "[0.0]")
     first = engine_of(lab)
-    first.wish(Wish.SKIP)
+    first.request(OperatorRequest.SKIP)
     first.start()
     until(first, lambda now: now.given_up == 1)
     first.park()
@@ -149,7 +149,7 @@ def test_what_is_good_after_all_is_not_pressed_again(lab: Lab) -> None:
 def test_a_new_sheet_is_asked_for_and_the_next_stroke_lies_on_it(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
     engine = engine_of(lab)
-    engine.wish(Wish.NEW_SHEET)
+    engine.request(OperatorRequest.NEW_SHEET)
     engine.start()
     answer(engine, "Put a new sheet in for sheet 1", "g")
     engine.join()
@@ -162,7 +162,7 @@ def test_a_new_sheet_is_asked_for_and_the_next_stroke_lies_on_it(lab: Lab) -> No
 def test_the_paper_is_found_again_by_jog_between_two_strokes(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
     engine = engine_of(lab)
-    engine.wish(Wish.JOG)
+    engine.request(OperatorRequest.JOG)
     engine.start()
     for _ in range(3):  # touches at one point, which must agree
         answer(engine, "+2.00 mm", "1")
@@ -178,12 +178,12 @@ def test_the_paper_is_found_again_by_jog_between_two_strokes(lab: Lab) -> None:
 def test_a_height_that_is_not_taken_and_a_jog_that_is_given_up_leave_the_paper_where_it_was(lab: Lab) -> None:
     lab.write_protocol("[11.0, 15.0]", "[0.0]")
     engine = engine_of(lab)
-    engine.wish(Wish.JOG)
+    engine.request(OperatorRequest.JOG)
     engine.start()
     for number in range(1, 4):
         answer(engine, f"Touch {number} of 3.", "t")
     answer(engine, "found +2.", "k")
-    engine.wish(Wish.JOG)
+    engine.request(OperatorRequest.JOG)
     answer(engine, "Touch 1 of 3.", "x")
     engine.join()
     now = engine.snapshot()

@@ -1,1 +1,0 @@
-"""Questions to the operator, and what the operator asks of a run."""
