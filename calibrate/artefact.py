@@ -1,25 +1,32 @@
-"""Immutable files named after the hash of their contents, and the calibration of a session, which is one."""
+"""Immutable files named after the hash of their contents, and the pointer that says which of a session's is in use.
+
+`calibration/current` holds the name of one of `calibration/*.json`; every kind of artefact has a folder of its own.
+Sessions written before there were pointers have none: there the artefact that was written last is in use.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
+import re
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, cast
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from calibrate.board.lens import Lens, lens_of
-from calibrate.board.scale import BoardSpec, apply
 from calibrate.errors import CalibrationError, invalid
 from calibrate.files import read_bounded, write_whole
 
-SCHEMA_VERSION = 2
-"""Of a calibration: 2 names the lens, the board and the still, and tells where it was made for another session."""
 FOLDER = "calibration"
+"""Of a session: where its calibrations lie."""
 HASH_CHARS = 16
+POINTER = "current"
+NAME = re.compile(rb"([0-9a-f]{%d}\.json)\n?" % HASH_CHARS)
+"""Of an artefact: nothing else is followed, least of all a way out of the folder."""
+MAX_POINTER_BYTES = 256
+
+_log = logging.getLogger(__name__)
 
 
 class Artefact(BaseModel):
@@ -44,6 +51,17 @@ class Artefact(BaseModel):
         if not path.exists():
             write_whole(path, self._canonical().decode())
         return path
+
+
+class FittedValue(BaseModel):
+    """A fitted parameter; the interval is missing where the data do not determine the parameter."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    value: float
+    low: float | None
+    high: float | None
+    """95 % interval, by bootstrap over strokes."""
 
 
 A = TypeVar("A", bound=Artefact)
@@ -73,108 +91,47 @@ def _version(data: bytes) -> object:
     return cast("dict[str, Any]", parsed).get("schema_version") if isinstance(parsed, dict) else None
 
 
-class LensUsed(BaseModel):
-    """The lens by which photographs are straightened, and where it is known from."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    source: str
-    """`lens file <hash>`, or `k1 fitted on the board` where no lens was known and none was missed."""
-    size_px: tuple[int, int]
-    """Width and height of the photographs that it holds for."""
-    matrix: tuple[float, float, float, float]
-    """fx, fy, cx, cy in pixels, pixel centres on integers."""
-    distortion: tuple[float, float, float, float, float]
-    """k1, k2, p1, p2, k3 of OpenCV's model."""
-
-    def lens(self) -> Lens:
-        """To look through."""
-        return lens_of(self.matrix, self.distortion, self.size_px)
-
-    @classmethod
-    def of(cls, lens: Lens, source: str) -> LensUsed:
-        """What stands in a file of a lens."""
-        m, d = lens.matrix, [float(v) for v in lens.distortion]
-        return cls(
-            source=source,
-            size_px=lens.size_px,
-            matrix=(float(m[0, 0]), float(m[1, 1]), float(m[0, 2]), float(m[1, 2])),
-            distortion=(d[0], d[1], d[2], d[3], d[4]),
-        )
+def put_to_use(artefact: Artefact, session: Path, folder: str = FOLDER) -> Path:
+    """Save an artefact in that folder of a session and point there; returns where it lies. Raises OSError."""
+    path = artefact.save(session / folder)
+    write_whole(path.with_name(POINTER), path.name + "\n")
+    return path
 
 
-class Foreign(BaseModel):
-    """Another session's calibration, applied by force: where it comes from, and how far off it is here."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    digest: str
-    """Of the artefact that was applied."""
-    session_id: str
-    source: str
-    recording_sha256: str
-    board_off_mm: float | None
-    """Root mean square by which this session's own board lies off under it; missing where no board is seen."""
+def artefacts(session: Path, folder: str = FOLDER) -> list[Path]:
+    """Every artefact in that folder of a session, the one written first in front."""
+    found = (path for path in (session / folder).glob("*.json") if path.is_file())
+    return sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name))
 
 
-class Calibration(Artefact):
-    """What was measured, from which recording, with which software. Equal inputs give an equal file."""
+def current(session: Path, folder: str = FOLDER) -> Path | None:
+    """The artefact in use in that folder of a session; None where there is none.
 
-    versions: ClassVar[tuple[int, ...]] = (1, 2)
+    Raises `CalibrationError` for a pointer that leads nowhere. Where there are several and no pointer, a warning says
+    which was taken.
+    """
+    pointer, found = session / folder / POINTER, artefacts(session, folder)
+    if pointer.exists() or pointer.is_symlink():
+        name = pointed(read_bounded(pointer, MAX_POINTER_BYTES), str(pointer))
+        path = pointer.with_name(name)
+        if path not in found:
+            raise CalibrationError(str(pointer), f"names {name}, which is not there: {_choose(session, folder)}")
+        return path
+    if len(found) > 1:
+        taken = f"{len(found)} artefacts, and no file `{POINTER}` says which is in use: {found[-1].name} is taken"
+        _log.warning("%s: holds %s, as it was written last; %s", session / folder, taken, _choose(session, folder))
+    return found[-1] if found else None
 
-    schema_version: int = SCHEMA_VERSION
-    session_id: str
-    source: str
-    """`loopback rig` or `real capture`, as the recording says."""
-    recording_sha256: str
-    software: str
-    image_to_paper: tuple[float, float, float, float, float, float, float, float, float]
-    """Homography, row by row: pixels (centres on integers) of the straightened photograph to mm in the paper frame."""
-    mm_per_px: float
-    """pix2len in the middle of the corners that were seen."""
-    mm_per_px_low: float
-    mm_per_px_high: float
-    """95 % interval."""
-    rms_px: float
-    corners: int
-    corners_dropped: int
-    """Outliers: seen, but not on the plane of the others."""
-    preprocess: dict[str, float]
-    lens: LensUsed | None = None
-    """By which photographs are straightened first; none in files of version 1, which knew no lens."""
-    middle_px: tuple[float, float] | None = None
-    """Where `mm_per_px` holds, in the photograph as it was taken."""
-    board: BoardSpec | None = None
-    still_sha256: str = ""
-    """Of the encoded photograph of the board that this was measured on."""
-    flags: tuple[str, ...] = ()
-    """What was not as it should be with that photograph: partly hidden, saturated."""
-    foreign: Foreign | None = None
 
-    def homography(self) -> NDArray[np.float64]:
-        """`image_to_paper` as (3, 3)."""
-        return np.array(self.image_to_paper).reshape(3, 3)
+def pointed(data: bytes, where: str) -> str:
+    """The file name that a pointer holds. Raises `CalibrationError`."""
+    name = NAME.fullmatch(data)
+    if name is None:
+        raise CalibrationError(where, f"holds no name of an artefact ({HASH_CHARS} hexadecimal digits and .json)")
+    return name[1].decode()
 
-    def to_image(self, paper_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, 2) mm in the paper frame -> pixels of the photograph as it was taken."""
-        straight = apply(np.asarray(np.linalg.inv(self.homography()), np.float64), paper_mm)
-        return straight if self.lens is None else self.lens.lens().bent(straight)
 
-    def to_paper(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, 2) pixels of the photograph as it was taken -> mm in the paper frame."""
-        return apply(self.homography(), pixels if self.lens is None else self.lens.lens().straight(pixels))
-
-    @property
-    def named(self) -> str:
-        """For reports: the digest, and the label where there is one."""
-        return f"{self.digest}, {self.label}" if self.label else self.digest
-
-    @property
-    def label(self) -> str:
-        """What every result must say of it; empty for a session's own."""
-        if self.foreign is None:
-            return ""
-        off = (
-            "" if self.foreign.board_off_mm is None else f", its board lies {self.foreign.board_off_mm:.2f} mm off here"
-        )
-        return f"foreign calibration: {self.foreign.digest} of {self.foreign.session_id} ({self.foreign.source}){off}"
+def _choose(session: Path, folder: str) -> str:
+    if folder == FOLDER:
+        return f"choose with `brushloop calibrate apply {session / folder}/<hash>.json {session}`"
+    return f"choose with `--fit {session / folder}/<hash>.json`, or fit again"

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from calibrate.calibrate_cli import calibrate
 from sessions.terminal import say
 
 SESSION = "session"
@@ -24,6 +23,30 @@ class SessionOrCommand(TyperGroup):
         return super().parse_args(ctx, args)
 
 
+def calibrate(
+    session: Annotated[Path, typer.Argument(help="A session's folder or its .mcap file.")],
+    lens: Annotated[
+        Path | None, typer.Option(help="Lens file of `camera intrinsics`; the session's own by default.")
+    ] = None,
+) -> None:
+    """Fit scale and paper plane from the board in view; writes an immutable calibration/<hash>.json."""
+
+    from calibrate.artefact import load_artefact
+    from calibrate.calibration import Calibration
+    from calibrate.session import calibrate_session
+
+    path = calibrate_session(session, lens)
+    made = load_artefact(path, Calibration)
+    for flag in made.flags:
+        say(f"warning: {flag}")
+    say(
+        f"pix2len {made.mm_per_px:.5f} mm/px (95 %: {made.mm_per_px_low:.5f} to {made.mm_per_px_high:.5f}), "
+        f"board residual {made.rms_px:.3f} px over {made.corners} corners, {made.source}",
+        f"lens: {made.lens.source if made.lens else 'none'}",
+        str(path),
+    )
+
+
 app = typer.Typer(
     cls=SessionOrCommand,
     help="Fit scale and paper plane of a SESSION (`brushloop calibrate SESSION`), or look at what comes before.",
@@ -36,7 +59,7 @@ def show(
     artefact: Annotated[Path, typer.Argument(help="A calibration, lens, registration or brush fit, or a session.")],
 ) -> None:
     """What an artefact holds, or the calibration that a session uses."""
-    from calibrate.artefact_words import described, read_any
+    from calibrate.describe import described, read_any
 
     path, made = read_any(artefact)
     say(str(path), *described(made))
@@ -48,7 +71,7 @@ def diff(
     other: Annotated[Path, typer.Argument(help="Another of the same kind.")],
 ) -> None:
     """What is different in another artefact, and for calibrations what that means on the paper."""
-    from calibrate.artefact_words import differences, read_any
+    from calibrate.describe import differences, read_any
 
     lines = differences(read_any(one)[1], read_any(other)[1])
     say(*(lines or ["they are equal"]))
@@ -61,8 +84,9 @@ def apply_to(
     force: Annotated[bool, typer.Option(help="Also another session's; every result is then labelled.")] = False,
 ) -> None:
     """Use a calibration for a session from now on; another session's only by force."""
-    from calibrate.apply import apply_calibration
-    from calibrate.artefact import Calibration, load_artefact
+    from calibrate.artefact import load_artefact
+    from calibrate.calibration import Calibration
+    from calibrate.session import apply_calibration
 
     path = apply_calibration(calibration, session, force=force)
     if label := load_artefact(path, Calibration).label:
@@ -81,7 +105,7 @@ def preprocess(
 ) -> None:
     """Show every stage of one capture as one picture, and write down each number that was fitted on the way."""
     from calibrate.files import check_target
-    from calibrate.stroke.show import show_photograph, show_stroke
+    from calibrate.show_stages import show_photograph, show_stroke
 
     check_target(out, ".png", capture, before)
     if capture.suffix.lower() in (".png", ".jpg", ".jpeg"):

@@ -1,4 +1,4 @@
-"""Calibrate a session: undo its lens, find the board in its stills, fit the plane, write the artefact."""
+"""Calibrate a session, choose which calibration it uses, and find the one in use."""
 
 from __future__ import annotations
 
@@ -7,15 +7,19 @@ import hashlib
 from importlib.metadata import version
 from pathlib import Path
 
-from calibrate.artefact import Calibration, LensUsed
-from calibrate.board.session import NO_BOARD, board_of, known_lens, sheet_of
-from calibrate.board.view import see_straight
-from calibrate.current import put_to_use
+import numpy as np
+
+from calibrate.artefact import current, load_artefact, put_to_use
+from calibrate.board.detect import see
+from calibrate.board.lens import LensUsed
+from calibrate.board.session import NO_BOARD, board_of, board_stills, known_lens, lens_of_session, sheet_of
+from calibrate.board.view import paper_mm, see_straight
+from calibrate.calibration import Calibration, Foreign
 from calibrate.errors import CalibrationError
-from calibrate.stroke.preprocess import Params
+from calibrate.stroke.params import Params
 from sessions.reader import Recording
 from sessions.recording.messages import decode_gray
-from sessions.recording.schemas import Source
+from sessions.recording.schemas import Source, Stroke
 
 FITTED = "k1 fitted on the board"
 
@@ -57,3 +61,85 @@ def calibrate_session(session: Path, lens: Path | None = None) -> Path:
         still_sha256=hashlib.sha256(stills[-1]).hexdigest(),
     )
     return put_to_use(calibration, recording.path.parent)
+
+
+def apply_calibration(path: Path, session: Path, *, force: bool = False) -> Path:
+    """Put the calibration to use for the session; returns where it lies.
+
+    Another recording's is refused unless forced; it then becomes an artefact of its own that names where it comes from
+    and how far this session's board lies off under it. Raises `CalibrationError`.
+    """
+    recording, given = Recording(session), load_artefact(path, Calibration)
+    folder = recording.path.parent
+    if recording.header.source == Source.IMPORT:
+        raise CalibrationError(str(recording.path), "is an import and brings its own scale: nothing is applied to it")
+    if given.recording_sha256 == recording.sha256:
+        return put_to_use(given, folder)
+    if force:
+        return put_to_use(_labelled(given, recording), folder)
+    told = f"belongs to another recording ({given.session_id}); --force applies it, and labels every result"
+    raise CalibrationError(str(path), told)
+
+
+def calibration_of(recording: Recording, first: Stroke, digest: str, given: Path | None) -> Calibration | None:
+    """The artefact given, or the one that the session uses; None for an import, which brings its own scale.
+
+    Raises `CalibrationError` where there is none, or it belongs to another recording.
+    """
+    if first.px_per_mm is not None:
+        return None
+    path = given or current(recording.path.parent)
+    if path is None:
+        raise CalibrationError(
+            str(recording.path), f"is not calibrated: run `brushloop calibrate {recording.path.parent}`"
+        )
+    calibration = load_artefact(path, Calibration)
+    if calibration.recording_sha256 != digest:
+        told = f"belongs to another recording ({calibration.session_id}): `brushloop calibrate apply --force` labels it"
+        raise CalibrationError(str(path), told)
+    return calibration
+
+
+def lens_in_use(folder: Path) -> LensUsed | None:
+    """The lens of the calibration that a session uses, else the one that it was collected with.
+
+    Raises `CalibrationError`.
+    """
+    path = current(folder)
+    lens = None if path is None else load_artefact(path, Calibration).lens
+    return lens if lens is not None else lens_of_session(folder)
+
+
+def _labelled(given: Calibration, recording: Recording) -> Calibration:
+    origin = given.foreign or Foreign(
+        digest=given.digest,
+        session_id=given.session_id,
+        source=given.source,
+        recording_sha256=given.recording_sha256,
+        board_off_mm=None,
+    )
+    return given.model_copy(
+        update={
+            "schema_version": type(given).model_fields["schema_version"].default,
+            "session_id": recording.header.session_id,
+            "source": recording.header.source,
+            "recording_sha256": recording.sha256,
+            "foreign": origin.model_copy(update={"board_off_mm": _board_off_mm(given, recording)}),
+        }
+    )
+
+
+def _board_off_mm(given: Calibration, recording: Recording) -> float | None:
+    """How far off (rms) this session's last board lies under the calibration; None where none is seen."""
+    spec, where = board_of(recording), str(recording.path)
+    off_mm: float | None = None
+    for _, image in board_stills(recording):
+        if given.lens is not None:
+            given.lens.lens().check_size(image, where)
+        try:
+            view = see(image, spec, where)
+        except CalibrationError:
+            continue
+        there = given.to_paper(view.pixels) - paper_mm(view, spec)
+        off_mm = float(np.sqrt((there**2).sum(axis=1).mean()))
+    return off_mm

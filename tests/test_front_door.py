@@ -37,7 +37,7 @@ def test_a_rig_pc_collects_without_torch_and_a_validator_without_devices() -> No
     assert "torch" not in loaded(
         "import collect.engine.engine, collect.headless, collect.engine.opening, collect.tui.app"
     )
-    validating = loaded("import calibrate.current_calibration, calibrate.drags.report")
+    validating = loaded("import calibrate.session, calibrate.drags.report")
     assert not {"serial", "can", "textual", "drivers"} & set(validating)
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import ClassVar, Literal
 
-from calibrate.artefact import Artefact
+from calibrate.artefact import Artefact, load_artefact
 from calibrate.board.intrinsics import Fitted
-from calibrate.board.lens import Lens, lens_of
+from calibrate.board.lens import Lens, LensUsed, lens_of
 
 
 class LensFile(Artefact):
@@ -69,6 +70,13 @@ def lens_file(
         guidance=fitted.guidance,
         warnings=fitted.warnings,
     )
+
+
+def read_lens(path: Path) -> LensUsed:
+    """A lens file of `camera intrinsics`. Raises `CalibrationError`."""
+    file = load_artefact(path, LensFile)
+    source = f"lens file {file.digest}"
+    return LensUsed(source=source, size_px=file.size_px, matrix=file.matrix, distortion=file.distortion)
 
 
 class RegistrationFile(Artefact):

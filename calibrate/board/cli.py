@@ -191,11 +191,11 @@ def register(
     import hashlib
     from importlib.metadata import version
 
+    from calibrate.board.artefact import read_lens
     from calibrate.board.points import read_points, registration_file
     from calibrate.board.register import register as fit
     from calibrate.board.rig_file import PaperLines, read_rig
     from calibrate.board.scale import BoardSpec
-    from calibrate.board.session import read_lens
     from calibrate.board.view import see_straight
     from calibrate.errors import CalibrationError
     from calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray

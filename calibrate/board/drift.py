@@ -13,7 +13,7 @@ from calibrate.board.scale import BoardSpec
 from calibrate.board.session import NO_BOARD, board_stills, sheet_of
 from calibrate.board.view import see_flagged
 from calibrate.errors import CalibrationError
-from calibrate.stroke.measure import Line, fit_line
+from calibrate.line import Line, fit_line
 from sessions.reader import Recording
 
 MOVED_PX = 1.0

@@ -8,6 +8,7 @@ from typing import cast
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
 
 from calibrate.errors import CalibrationError
 
@@ -60,6 +61,36 @@ def lens_of(
     """A lens from what files hold: fx, fy, cx, cy in pixels; k1, k2, p1, p2, k3; width and height."""
     fx, fy, cx, cy = matrix
     return Lens(np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.array(distortion), size_px)
+
+
+class LensUsed(BaseModel):
+    """The lens by which photographs are straightened, and where it is known from."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    source: str
+    """`lens file <hash>`, or `k1 fitted on the board` where no lens was known and none was missed."""
+    size_px: tuple[int, int]
+    """Width and height of the photographs that it holds for."""
+    matrix: tuple[float, float, float, float]
+    """fx, fy, cx, cy in pixels, pixel centres on integers."""
+    distortion: tuple[float, float, float, float, float]
+    """k1, k2, p1, p2, k3 of OpenCV's model."""
+
+    def lens(self) -> Lens:
+        """To look through."""
+        return lens_of(self.matrix, self.distortion, self.size_px)
+
+    @classmethod
+    def of(cls, lens: Lens, source: str) -> LensUsed:
+        """What stands in a file of a lens."""
+        m, d = lens.matrix, [float(v) for v in lens.distortion]
+        return cls(
+            source=source,
+            size_px=lens.size_px,
+            matrix=(float(m[0, 0]), float(m[1, 1]), float(m[0, 2]), float(m[1, 2])),
+            distortion=(d[0], d[1], d[2], d[3], d[4]),
+        )
 
 
 def distort(rays: Floats, distortion: Floats) -> Floats:

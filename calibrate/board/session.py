@@ -9,11 +9,9 @@ from typing import Any, TypeVar, cast
 
 from pydantic import BaseModel, ValidationError
 
-from calibrate.artefact import Calibration, LensUsed, load_artefact
-from calibrate.board.artefact import LensFile
-from calibrate.board.lens import Gray
+from calibrate.board.artefact import read_lens
+from calibrate.board.lens import Gray, LensUsed
 from calibrate.board.scale import BoardSpec
-from calibrate.current import current
 from calibrate.errors import CalibrationError
 from calibrate.files import read_bounded
 from sessions.reader import Recording
@@ -58,23 +56,6 @@ def lens_of_session(session: Told) -> LensUsed | None:
     camera = _rig(session).get("camera")
     optics = cast("dict[str, Any]", camera).get("optics") if isinstance(camera, dict) else None
     return None if optics is None else _parsed(session, "camera.optics", LensUsed, optics)
-
-
-def lens_in_use(folder: Path) -> LensUsed | None:
-    """The lens of the calibration that a session uses, else the one that it was collected with.
-
-    Raises `CalibrationError`.
-    """
-    path = current(folder)
-    lens = None if path is None else load_artefact(path, Calibration).lens
-    return lens if lens is not None else lens_of_session(folder)
-
-
-def read_lens(path: Path) -> LensUsed:
-    """A lens file of `camera intrinsics`. Raises `CalibrationError`."""
-    file = load_artefact(path, LensFile)
-    source = f"lens file {file.digest}"
-    return LensUsed(source=source, size_px=file.size_px, matrix=file.matrix, distortion=file.distortion)
 
 
 def known_lens(recording: Recording, given: Path | None) -> LensUsed | None:

@@ -8,9 +8,19 @@ import numpy as np
 
 from calibrate.compare.field import KEYS, NORMAL_LENGTH_PX, SIZE_PX, Alignment, Field, Image, Tone, to_tone
 from calibrate.compare.images import Pixels, to_pixels
+from model.ccdbsm import Brush
 from model.coverage import centred_origin, coverage
 from model.profile import Shape
 from model.registry import StrokeModel
+from sessions.recording.schemas import Header
+
+
+def brush_of(header: Header) -> Brush:
+    """The brush that a recording names; sizes that it does not name are those of the published brush."""
+    nominal = Brush()
+    return Brush(
+        radius_mm=header.brush_radius_mm or nominal.radius_mm, length_mm=header.brush_length_mm or nominal.length_mm
+    )
 
 
 def simulated(

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.artefact import Calibration
-from calibrate.current_calibration import calibration_of
+from calibrate.calibration import Calibration
 from calibrate.drags.measure import DEPTH_NAMES, LENGTH_NAME
 from calibrate.errors import CalibrationError, CaptureRefused
+from calibrate.session import calibration_of
 from calibrate.stroke.preprocess import PX_PER_MM, Params, on_raster, prepare, rescale
 from calibrate.stroke.rectify import rectify_by
 from sessions.errors import SessionDamaged

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.errors import CaptureRefused
-from calibrate.stroke.measure import Line, Measured, fit_line, measure
+from calibrate.line import Line, fit_line
+from calibrate.stroke.measure import Measured, measure
 from calibrate.stroke.preprocess import Params, on_raster, prepare, rescale
 from sessions.errors import SessionDamaged
 from sessions.reader import Capture

@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, model_validator
 
-from calibrate.artefact import Artefact
-from calibrate.current import put_to_use
+from calibrate.artefact import Artefact, FittedValue, put_to_use
 from calibrate.drags.captures import Drawn
 from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, DragFit, bootstrap, chance, fit_drags
 from calibrate.errors import CalibrationError
-from calibrate.fit.artefact import FittedValue
 from model.drag import DragModel
 
 FOLDER = "dragfit"

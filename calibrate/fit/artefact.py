@@ -7,22 +7,11 @@ from typing import Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, model_validator
 
-from calibrate.artefact import Artefact
+from calibrate.artefact import Artefact, FittedValue
 from model.fitted import MODES, NAMES, TERMS, FittedPress
 
 SCHEMA_VERSION = 1
 FOLDER = "brushfit"
-
-
-class FittedValue(BaseModel):
-    """One parameter; the interval is missing where the stage that frees it was refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    value: float
-    low: float | None
-    high: float | None
-    """95 % interval, by bootstrap over strokes."""
 
 
 class FittedStage(BaseModel):

@@ -8,13 +8,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibrate.artefact import Calibration
+from calibrate.calibration import Calibration
 from calibrate.compare.field import SIZE_PX, Field
-from calibrate.current_calibration import brush_of, calibration_of
+from calibrate.compare.presses import prepare_press
+from calibrate.compare.simulate import brush_of
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.fit.fit import Grid, Pressed
+from calibrate.session import calibration_of
 from calibrate.stroke.preprocess import Params
-from calibrate.stroke.presses import prepare_press
 from sessions.errors import SessionDamaged
 from sessions.reader import Recording
 from sessions.recording.schemas import Header

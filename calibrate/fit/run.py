@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.artefact import FittedValue, put_to_use
 from calibrate.compare.field import Alignment, Field, Tone
 from calibrate.compare.simulate import simulated
-from calibrate.current import put_to_use
 from calibrate.errors import CalibrationError
-from calibrate.fit.artefact import FOLDER, BrushFit, FittedStage, FittedValue
+from calibrate.fit.artefact import FOLDER, BrushFit, FittedStage
 from calibrate.fit.captures import Captures
 from calibrate.fit.fit import STAGES, Fit, Grid, Pressed, bootstrap, fit_presses, zero_touch
 from calibrate.fit.heldout import HeldOut, by_cell, leave_cell_out

@@ -15,12 +15,13 @@ from typing import cast
 import cv2
 import numpy as np
 
-from calibrate.artefact import Calibration
+from calibrate.calibration import Calibration
 from calibrate.compare.field import SIZE_PX, Field, Image
-from calibrate.current_calibration import brush_of, calibration_of
+from calibrate.compare.presses import prepare_press
+from calibrate.compare.simulate import brush_of
 from calibrate.errors import CalibrationError, CaptureRefused
+from calibrate.session import calibration_of
 from calibrate.stroke.preprocess import PX_PER_MM, Params, Prepared, prepare, rescale
-from calibrate.stroke.presses import prepare_press
 from model.ccdbsm import DomainError
 from model.inversion.noise import Noise
 from model.inversion.press import Flag, Inverter, Known, Range, Recovered

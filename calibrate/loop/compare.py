@@ -8,14 +8,16 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from calibrate.artefact import Calibration, load_artefact
+from calibrate.artefact import load_artefact
+from calibrate.calibration import Calibration
 from calibrate.compare.field import Field
-from calibrate.current_calibration import brush_of, calibration_of
+from calibrate.compare.simulate import brush_of
 from calibrate.errors import CalibrationError
 from calibrate.fit.artefact import BrushFit
 from calibrate.loop.pairs import Paired, Side, pair_up
 from calibrate.loop.scores import PairScore, Verdict, score_pairs, verdicts
 from calibrate.loop.table import Table1Row, table_1
+from calibrate.session import calibration_of
 from model.fitted_shape import fitted_model
 from model.protocol import StrokeModel
 from model.registry import stroke_model

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from calibrate.artefact import Calibration
+from calibrate.calibration import Calibration
 from calibrate.compare.field import Field, Image
+from calibrate.compare.presses import prepare_press
 from calibrate.compare.simulate import simulated
 from calibrate.errors import CaptureRefused
 from calibrate.loop.images import KEYS, Key, Seen, seen
 from calibrate.stroke.preprocess import Params
-from calibrate.stroke.presses import prepare_press
 from model.ccdbsm import DomainError
 from model.protocol import StrokeModel
 from sessions.errors import SessionDamaged

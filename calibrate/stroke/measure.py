@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from calibrate.stroke.preprocess import PX_PER_MM, Mask
 
@@ -63,34 +62,3 @@ def outline(mask: Mask) -> NDArray[np.uint8]:
 def _diameter_mm(reach_px: float) -> float:
     # The transform measures from pixel centre to the nearest paper centre: half a pixel more than to the edge.
     return 2.0 * (reach_px - 0.5) / PX_PER_MM
-
-
-@dataclass(frozen=True, slots=True)
-class Line:
-    """A straight line fitted by least squares, with the standard error of its slope."""
-
-    slope: float
-    intercept: float
-    slope_se: float
-    r: float
-    n: int
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95 % interval of the slope (Student's t with n - 2 degrees of freedom)."""
-        reach = float(stats.t.ppf(0.975, self.n - 2)) * self.slope_se
-        return self.slope - reach, self.slope + reach
-
-
-def fit_line(x: list[float], y: list[float]) -> Line | None:
-    """y = slope x + intercept; None with fewer than 3 points or no spread in x or y."""
-    n = len(x)
-    if n < 3 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
-        return None
-    xs, ys = np.asarray(x), np.asarray(y)
-    sxx = float(((xs - xs.mean()) ** 2).sum())
-    slope = float(((xs - xs.mean()) * (ys - ys.mean())).sum()) / sxx
-    intercept = float(ys.mean()) - slope * float(xs.mean())
-    residual = ys - slope * xs - intercept
-    slope_se = float(np.sqrt((residual**2).sum() / max(n - 2, 1) / sxx))
-    return Line(slope, intercept, slope_se, float(np.corrcoef(xs, ys)[0, 1]), n)

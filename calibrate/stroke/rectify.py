@@ -7,8 +7,8 @@ from typing import Protocol, cast
 import cv2
 import numpy as np
 
-from calibrate.artefact import Calibration
 from calibrate.board.lens import Floats, Gray
+from calibrate.calibration import Calibration
 from calibrate.errors import CaptureRefused
 from calibrate.stroke.preprocess import PX_PER_MM, rectify
 

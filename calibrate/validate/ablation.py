@@ -11,8 +11,7 @@ import numpy as np
 
 from calibrate.compare.field import KEYS, Alignment, Tone
 from calibrate.compare.images import pack
-from calibrate.compare.simulate import simulated_pixels
-from calibrate.current_calibration import brush_of
+from calibrate.compare.simulate import brush_of, simulated_pixels
 from calibrate.fit.fit import fit_presses
 from calibrate.validate.heldout import RefitJob, bezier_body, bezier_pixels, cropped, fitted_press, press_body
 from calibrate.validate.jobs import ABSENT, VERSION, ScoreJob, score_job

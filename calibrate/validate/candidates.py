@@ -11,8 +11,7 @@ from typing import Any
 
 from calibrate.compare.field import Field
 from calibrate.compare.images import Pixels
-from calibrate.compare.simulate import simulated_pixels
-from calibrate.current_calibration import brush_of
+from calibrate.compare.simulate import brush_of, simulated_pixels
 from calibrate.validate.heldout import Cell, bezier_pixels, fitted_press
 from calibrate.validate.sources import Opened
 from model.ccdbsm import Brush, DomainError

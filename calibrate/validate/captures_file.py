@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.compare.field import FINE, Field, Image
-from calibrate.compare.simulate import axis_mm
-from calibrate.current_calibration import brush_of
+from calibrate.compare.presses import prepare_press
+from calibrate.compare.simulate import axis_mm, brush_of
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.stroke.preprocess import PX_PER_MM, Params, Prepared
-from calibrate.stroke.presses import prepare_press
 from calibrate.validate.heldout import Cell
 from calibrate.validate.sources import Opened, one_source
 from model.ccdbsm import DomainError

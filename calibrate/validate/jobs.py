@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.artefact import Calibration
+from calibrate.calibration import Calibration
 from calibrate.compare.field import BEST_SHIFT_PX, KEYS, Alignment, Field
 from calibrate.compare.images import pack, press_images, unpack
+from calibrate.compare.presses import prepare_press
 from calibrate.errors import CaptureRefused
 from calibrate.stroke.measure import Measured
 from calibrate.stroke.preprocess import Params
-from calibrate.stroke.presses import prepare_press
 from sessions.errors import SessionDamaged
 from sessions.reader import Capture
 

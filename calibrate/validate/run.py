@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from calibrate.compare.field import KEYS, Field
 from calibrate.compare.images import pack
-from calibrate.current_calibration import brush_of
+from calibrate.compare.simulate import brush_of
 from calibrate.errors import CalibrationError
 from calibrate.validate import candidates as who
 from calibrate.validate.candidates import Contender, Generator

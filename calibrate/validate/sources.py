@@ -16,12 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from calibrate.artefact import FOLDER, Calibration, load_artefact
-from calibrate.current import MAX_POINTER_BYTES, POINTER, current, pointed
-from calibrate.current_calibration import calibration_of
+from calibrate.artefact import FOLDER, MAX_POINTER_BYTES, POINTER, current, load_artefact, pointed
+from calibrate.calibration import Calibration
 from calibrate.errors import CalibrationError
 from calibrate.fit.artefact import FOLDER as FITS
 from calibrate.fit.artefact import BrushFit
+from calibrate.session import calibration_of
 from sessions.errors import SessionDamaged
 from sessions.journal.journal import JOURNAL_NAME, replay
 from sessions.reader import Recording

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from calibrate.compare.field import Field
-from calibrate.current_calibration import brush_of
+from calibrate.compare.simulate import brush_of
 from calibrate.validate.heldout import MOST_FOLDS, MOST_STROKES, PER_CELL, Cell, RefitJob, folds, refit_job, start_of
 from calibrate.validate.jobs import VERSION, PrepareJob, Press, prepare_job, press_of
 from calibrate.validate.pool import Scheduler

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibrate.current_calibration import brush_of
+from calibrate.compare.simulate import brush_of
 from calibrate.validate.candidates import Generator
 from calibrate.validate.captures_file import Laid, lay_captures, write_captures
 from calibrate.validate.heldout import Cell, fitted_press, folds

@@ -8,10 +8,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from calibrate.artefact import Calibration
+from calibrate.calibration import Calibration
 from calibrate.compare.field import Image
-from calibrate.current_calibration import calibration_of
 from calibrate.errors import CalibrationError, CaptureRefused
+from calibrate.session import calibration_of
 from calibrate.writing.images import Ink, captured, drawn
 from calibrate.writing.record import FigureRecord, PlanRecord, points_digest
 from calibrate.writing.scores import Character, WrittenScore, score_character

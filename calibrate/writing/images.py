@@ -11,7 +11,7 @@ from typing import cast
 import cv2
 import numpy as np
 
-from calibrate.artefact import Calibration
+from calibrate.calibration import Calibration
 from calibrate.compare.field import SIZE_PX, Alignment, Image, Tone, best_shift, to_tone
 from calibrate.compare.similarity import csim, ssim
 from calibrate.errors import CalibrationError, CaptureRefused

@@ -11,7 +11,7 @@ import io
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibrate.current import artefacts, current
+from calibrate.artefact import artefacts, current
 from calibrate.files import read_bounded
 from collect.chains.commands import GIVEN_UP, Say, run_command
 from collect.chains.finished import finished_session

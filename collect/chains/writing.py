@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibrate.current import artefacts
+from calibrate.artefact import artefacts
 from collect.chains.commands import GIVEN_UP, Say, run_command
 from collect.chains.finished import finished_session
 from collect.errors import ConfigError

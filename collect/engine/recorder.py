@@ -27,7 +27,7 @@ from sessions.recording.writer import Outgoing, SegmentWriter
 if TYPE_CHECKING:
     from google.protobuf.message import Message
 
-    from calibrate.artefact import LensUsed
+    from calibrate.board.lens import LensUsed
 
 POSE_HZ = 100.0
 """What the driver asks of the arm."""

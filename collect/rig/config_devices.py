@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from calibrate.artefact import LensUsed
+from calibrate.board.lens import LensUsed
 from collect.rig.config_base import Config, Finite, Positive, Range
 from drivers.force.samples import LOOPBACK_CHANNEL
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.board.artefact import read_lens
 from calibrate.board.lens import Lens
-from calibrate.board.session import read_lens
 from calibrate.errors import CalibrationError
 from collect.errors import ConfigError, StepError
 from collect.rig.config_devices import CameraConfig

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calibrate.board.scale import BoardSpec, PlaneFit, see_board
-from calibrate.board.session import board_of, lens_in_use
+from calibrate.board.session import board_of
 from calibrate.compare.similarity import csim
 from calibrate.errors import CalibrationError
+from calibrate.session import lens_in_use
 from collect.engine.last_capture import pictures_of
 from collect.rig.sheet import Cell
 from sessions.errors import InputError, SessionDamaged

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calibrate.artefact import LensUsed
+from calibrate.board.lens import LensUsed
 from calibrate.board.scale import BoardSpec
 from sessions.recording.messages import encode_png, image_message
 from sessions.recording.schemas import Header, Source, StepEvent, Stroke, Topic

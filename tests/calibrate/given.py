@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from calibrate.artefact import Calibration
+from calibrate.calibration import Calibration
 from calibrate.writing.record import PlannedBy
 
 CALIBRATION = Calibration(

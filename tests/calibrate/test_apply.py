@@ -14,11 +14,10 @@ from typer.testing import CliRunner, Result
 
 from bench.preprocess_rigs import board_of
 from brushloop import app
-from calibrate.artefact import HASH_CHARS, Calibration, load_artefact
-from calibrate.current import current, put_to_use
-from calibrate.current_calibration import calibration_of
+from calibrate.artefact import HASH_CHARS, current, load_artefact, put_to_use
+from calibrate.calibration import Calibration
 from calibrate.errors import CalibrationError
-from calibrate.session import calibrate_session
+from calibrate.session import calibrate_session, calibration_of
 from drivers.geometry import brush_pose
 from drivers.sim.camera.scene import Scene
 from drivers.sim.config import SimConfig, Table, View

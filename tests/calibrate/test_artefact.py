@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from calibrate.artefact import Calibration, load_artefact
-from calibrate.current import current, put_to_use
+from calibrate.artefact import current, load_artefact, put_to_use
+from calibrate.calibration import Calibration
 from calibrate.errors import CalibrationError
 
 MADE = Calibration(

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from bench.preprocess_rigs import board_of
 from brushloop import app
-from calibrate.artefact import Calibration, load_artefact
+from calibrate.artefact import current, load_artefact
 from calibrate.board.scale import BoardSpec
-from calibrate.current import current
+from calibrate.calibration import Calibration
 from calibrate.errors import CalibrationError
 from drivers.geometry import brush_pose
 from drivers.sim.camera.scene import Scene

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from calibrate.errors import CaptureRefused
-from calibrate.stroke.measure import fit_line, measure
+from calibrate.line import fit_line
+from calibrate.stroke.measure import measure
 from calibrate.stroke.preprocess import PX_PER_MM, Params, prepare, rectify, rescale
 
 PAGE = (800, 800)

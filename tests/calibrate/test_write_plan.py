@@ -13,9 +13,9 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop import app
+from calibrate.artefact import FittedValue
 from calibrate.drags.run import DragArtefact
 from calibrate.errors import CalibrationError
-from calibrate.fit.artefact import FittedValue
 from calibrate.writing.plan import Settings, plan, wanted_of
 from calibrate.writing.plan_files import PICTURE, PROTOCOL, write_plan
 from calibrate.writing.record import load_plan

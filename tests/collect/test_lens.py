@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import pytest
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 
-from calibrate.artefact import Calibration, load_artefact
+from calibrate.artefact import load_artefact
 from calibrate.board.artefact import LensFile
+from calibrate.calibration import Calibration
 from calibrate.session import calibrate_session
 from collect.engine.states import State
 from collect.errors import ConfigError, StepError

@@ -6,8 +6,8 @@ import numpy as np
 
 from calibrate.compare.field import KEYS, Alignment, Key, Tone
 from calibrate.compare.similarity import SSIM_SETTINGS
+from calibrate.compare.simulate import brush_of
 from calibrate.compare.stats import summarise
-from calibrate.current_calibration import brush_of
 from calibrate.validate import candidates as who
 from calibrate.validate.beside import Beside
 from calibrate.validate.report.data import (

@@ -11,8 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop import app
-from calibrate.artefact import load_artefact
-from calibrate.current import current
+from calibrate.artefact import current, load_artefact
 from calibrate.drags.captures import commanded_path, figures_of, read_drags
 from calibrate.drags.fit import chance, fit_drags
 from calibrate.drags.run import FOLDER, LAGGING, STAMPS, DragArtefact

@@ -10,9 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop import app
-from calibrate.artefact import load_artefact
+from calibrate.artefact import current, load_artefact
 from calibrate.compare.field import Alignment, Field, Tone
-from calibrate.current import current
 from calibrate.errors import CalibrationError
 from calibrate.fit.artefact import FOLDER, BrushFit
 from calibrate.fit.captures import read_presses

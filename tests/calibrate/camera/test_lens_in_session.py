@@ -15,18 +15,18 @@ from typer.testing import CliRunner
 
 from bench.preprocess_rigs import CAMERAS, Shot, lens_views, sheet, true_mask, true_scale
 from brushloop import app
-from calibrate.artefact import Calibration, LensUsed, load_artefact
-from calibrate.board.artefact import LensFile, lens_file
+from calibrate.artefact import current, load_artefact
+from calibrate.board.artefact import LensFile, lens_file, read_lens
 from calibrate.board.detect import see
 from calibrate.board.intrinsics import fit_lens
+from calibrate.board.lens import LensUsed
 from calibrate.board.scale import see_board
-from calibrate.board.session import read_lens
+from calibrate.calibration import Calibration
 from calibrate.compare.field import Field, Tone, captured_mm
-from calibrate.current import current
+from calibrate.compare.presses import prepare_press
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.session import FITTED, calibrate_session
 from calibrate.stroke.params import PX_PER_MM, Params
-from calibrate.stroke.presses import prepare_press
 from collect.tui.captures import Review
 from sessions.reader import Recording
 from sessions.recording.schemas import Stroke

@@ -19,8 +19,8 @@ from typing import Any
 import fsspec
 import pytest
 
-from calibrate.artefact import Calibration
-from calibrate.current import current, put_to_use
+from calibrate.artefact import current, put_to_use
+from calibrate.calibration import Calibration
 from calibrate.errors import CalibrationError
 from calibrate.validate import sources
 from calibrate.validate.sources import fetched, open_session

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrate.artefact import Calibration
+from calibrate.calibration import Calibration
 from calibrate.compare.field import Tone
 from calibrate.errors import CalibrationError
 from calibrate.writing.compare import Written

@@ -9,9 +9,9 @@ from typing import Any, cast
 
 import numpy as np
 
-from calibrate.artefact import Artefact, Calibration, load_artefact
+from calibrate.artefact import Artefact, current, load_artefact
 from calibrate.board.artefact import LensFile, RegistrationFile
-from calibrate.current import current
+from calibrate.calibration import Calibration
 from calibrate.errors import CalibrationError
 from calibrate.files import read_bounded
 from calibrate.fit.artefact import BrushFit

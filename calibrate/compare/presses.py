@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from calibrate.artefact import Calibration
+from calibrate.calibration import Calibration
 from calibrate.compare.field import Field, crop_at_anchor
 from calibrate.errors import CaptureRefused
 from calibrate.stroke.preprocess import PX_PER_MM, Params, Prepared, on_raster, on_window, prepare, rescale

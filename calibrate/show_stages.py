@@ -9,15 +9,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from calibrate.artefact import current
 from calibrate.board.lens import Gray, unknown_lens
 from calibrate.board.plane import Plane
 from calibrate.board.session import NO_BOARD, board_of, known_lens
 from calibrate.board.view import see_straight
 from calibrate.compare.field import Field
-from calibrate.current import current
-from calibrate.current_calibration import calibration_of
 from calibrate.errors import CalibrationError
 from calibrate.files import read_gray, write_whole
+from calibrate.session import calibration_of
 from calibrate.stroke.difference import new_stroke
 from calibrate.stroke.params import Params
 from calibrate.stroke.picture import contact_sheet

@@ -1,0 +1,93 @@
+"""The calibration of a session: where the paper lies in its photographs, an immutable file."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+from calibrate.artefact import Artefact
+from calibrate.board.lens import LensUsed
+from calibrate.board.scale import BoardSpec, apply
+
+SCHEMA_VERSION = 2
+"""2 names the lens, the board and the still, and says whether it was made for another session."""
+
+
+class Foreign(BaseModel):
+    """Another session's calibration, applied by force: where it comes from, and how far off it is here."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    digest: str
+    """Of the artefact that was applied."""
+    session_id: str
+    source: str
+    recording_sha256: str
+    board_off_mm: float | None
+    """Root mean square by which this session's own board lies off under it; missing where no board is seen."""
+
+
+class Calibration(Artefact):
+    """What was measured, from which recording, with which software. Equal inputs give an equal file."""
+
+    versions: ClassVar[tuple[int, ...]] = (1, 2)
+
+    schema_version: int = SCHEMA_VERSION
+    session_id: str
+    source: str
+    """`loopback rig` or `real capture`, as the recording says."""
+    recording_sha256: str
+    software: str
+    image_to_paper: tuple[float, float, float, float, float, float, float, float, float]
+    """Homography, row by row: pixels (centres on integers) of the straightened photograph to mm in the paper frame."""
+    mm_per_px: float
+    """pix2len in the middle of the corners that were seen."""
+    mm_per_px_low: float
+    mm_per_px_high: float
+    """95 % interval."""
+    rms_px: float
+    corners: int
+    corners_dropped: int
+    """Outliers: seen, but not on the plane of the others."""
+    preprocess: dict[str, float]
+    lens: LensUsed | None = None
+    """By which photographs are straightened first; none in files of version 1, which knew no lens."""
+    middle_px: tuple[float, float] | None = None
+    """Where `mm_per_px` holds, in the photograph as it was taken."""
+    board: BoardSpec | None = None
+    still_sha256: str = ""
+    """Of the encoded photograph of the board that this was measured on."""
+    flags: tuple[str, ...] = ()
+    """What was not as it should be with that photograph: partly hidden, saturated."""
+    foreign: Foreign | None = None
+
+    def homography(self) -> NDArray[np.float64]:
+        """`image_to_paper` as (3, 3)."""
+        return np.array(self.image_to_paper).reshape(3, 3)
+
+    def to_image(self, paper_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, 2) mm in the paper frame -> pixels of the photograph as it was taken."""
+        straight = apply(np.asarray(np.linalg.inv(self.homography()), np.float64), paper_mm)
+        return straight if self.lens is None else self.lens.lens().bent(straight)
+
+    def to_paper(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, 2) pixels of the photograph as it was taken -> mm in the paper frame."""
+        return apply(self.homography(), pixels if self.lens is None else self.lens.lens().straight(pixels))
+
+    @property
+    def named(self) -> str:
+        """For reports: the digest, and the label where there is one."""
+        return f"{self.digest}, {self.label}" if self.label else self.digest
+
+    @property
+    def label(self) -> str:
+        """What every result must say of it; empty for a session's own."""
+        if self.foreign is None:
+            return ""
+        off = (
+            "" if self.foreign.board_off_mm is None else f", its board lies {self.foreign.board_off_mm:.2f} mm off here"
+        )
+        return f"foreign calibration: {self.foreign.digest} of {self.foreign.session_id} ({self.foreign.source}){off}"
