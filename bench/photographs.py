@@ -33,7 +33,7 @@ from collect.motion.procedures import Procedures, press_moves
 from collect.photograph import frames as frames_of
 from collect.rig.config import RigConfig
 from collect.rig.devices import connected
-from collect.rig.sheet import Sheet
+from collect.rig.paper import Sheet
 from drivers.camera.opencv import OpenCvCamera
 from drivers.clock import HostClock
 from drivers.errors import DeviceError

@@ -10,7 +10,7 @@ from bench.harness import BenchError, Result
 from bench.processes import Process
 from collect.rig.config import RigConfig
 from collect.rig.devices import make_robot
-from collect.rig.sheet import to_base
+from collect.rig.paper import to_base
 from drivers.arcs.robot import AuboArcs
 from drivers.clock import HostClock
 from drivers.geometry import brush_pose

@@ -19,7 +19,7 @@ from calibrate.board.scale import PlaneFit
 from collect.quality.check import check_capture
 from collect.quality.verdict import Failure, Verdict
 from collect.rig.config_quality import QualityConfig
-from collect.rig.sheet import Cell
+from collect.rig.paper import Cell
 
 WHITENED = QualityConfig(bright_level=256.0, glare_mm2=1e6)
 """For paper that whoever published it has set to 255: neither exposure nor glare can be judged any more."""

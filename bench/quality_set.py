@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from calibrate.board.scale import BoardSpec, PlaneFit, see_board
 from collect.quality.verdict import Failure
 from collect.rig.config import PaperConfig
-from collect.rig.sheet import Cell, Sheet
+from collect.rig.paper import Cell, Sheet
 from drivers.geometry import brush_pose
 from drivers.sim.brush.brush import BrushSpec, Flaw, Footprint
 from drivers.sim.brush.paper import PX_PER_MM

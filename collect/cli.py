@@ -102,7 +102,7 @@ def plan(
     from collect.planning.summary import make_plan
     from collect.protocols.loading import load_protocol
     from collect.rig.config import load_rig
-    from collect.rig.plane import PaperPlane
+    from collect.rig.paper import PaperPlane
 
     if picture is not None:
         from collect.planning.picture import check_picture
@@ -147,7 +147,7 @@ def doctor(
     if as_json:
         say(*(json.dumps(finding.as_json()) for finding in findings))
     else:
-        from collect.rig.doctor_table import doctor_table
+        from collect.rig.doctor import doctor_table
 
         say(doctor_table(findings))
     if not all(finding.well for finding in findings):

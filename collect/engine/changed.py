@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from collect.errors import ConfigError
-from collect.rig.config import RigConfig
-from collect.rig.config_environment import overrides
+from collect.rig.config import RigConfig, overrides
 from sessions.difference import ABSENT, Difference
 
 FILES = {"rig.effective.json": "rig.toml", "protocol.effective.json": "protocol.toml"}

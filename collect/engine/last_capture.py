@@ -12,7 +12,7 @@ from calibrate.compare.similarity import csim
 from calibrate.errors import CaptureRefused
 from calibrate.stroke.preprocess import Params, prepare, rectify
 from collect.quality.verdict import Verdict
-from collect.rig.sheet import Cell
+from collect.rig.paper import Cell
 from model.fitted import FittedPress
 
 if TYPE_CHECKING:

@@ -28,7 +28,7 @@ from collect.protocols.config import ProtocolConfig, WriteConfig
 from collect.protocols.plans import cell_mm
 from collect.protocols.steps import MARKING, Result, Step, StepKind
 from collect.rig.devices import Rig
-from collect.rig.sheet import Sheet
+from collect.rig.paper import Sheet
 from collect.touch.selfcheck import partners
 from drivers.errors import ArmMoved, DeviceError
 from sessions.recording.schemas import StepEvent

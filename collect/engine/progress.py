@@ -15,10 +15,10 @@ from collect.engine.tally import Place, Tally
 from collect.operator import Prompt
 from collect.protocols.adaptive import with_choice
 from collect.protocols.again import AGAIN, with_review
-from collect.protocols.planned import Layout, Planned
+from collect.protocols.planned import Planned
 from collect.protocols.plans import ProtocolConfig, planned
 from collect.protocols.steps import MARKING, Result, Step, StepKind
-from collect.rig.sheet import Sheet
+from collect.rig.paper import Layout, Sheet
 from drivers.clock import Clock
 from sessions.store import SessionStore
 

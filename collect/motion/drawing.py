@@ -10,8 +10,7 @@ from collect.protocols.rows import TrajectoryPoint
 from collect.protocols.steps import Step
 from collect.protocols.strokes import strokes_of
 from collect.rig.config import RigConfig
-from collect.rig.plane import PaperPlane
-from collect.rig.sheet import Cell, to_base
+from collect.rig.paper import Cell, PaperPlane, to_base
 from drivers.geometry import brush_pose
 from drivers.limits import Limits
 from drivers.protocols import Robot

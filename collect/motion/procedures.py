@@ -9,8 +9,7 @@ from collect.errors import StepVoid
 from collect.photograph.photographer import Photographer, Ways
 from collect.rig.config import RigConfig, WashConfig
 from collect.rig.devices import Rig, limits_of
-from collect.rig.plane import PaperPlane, to_paper
-from collect.rig.sheet import Cell, to_base
+from collect.rig.paper import Cell, PaperPlane, to_base, to_paper
 from drivers.geometry import brush_pose, interpolate, lean
 from drivers.samples import Frame, Pose, QueuedLine
 

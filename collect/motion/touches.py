@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 from collect.motion.procedures import CLEARANCE_MM, Move
 from collect.rig.config import RigConfig
-from collect.rig.plane import PaperPlane
-from collect.rig.sheet import to_base
+from collect.rig.paper import PaperPlane, to_base
 from drivers.geometry import brush_pose
 from drivers.samples import Pose
 

@@ -15,8 +15,7 @@ from collect.protocols.plans import planned
 from collect.protocols.steps import MARKING, Result, Step, StepKind
 from collect.rig.config import RigConfig
 from collect.rig.devices import limits_of
-from collect.rig.plane import PaperPlane
-from collect.rig.sheet import Cell, Sheet
+from collect.rig.paper import Cell, PaperPlane, Sheet
 from collect.touch.selfcheck import triangle_in
 from drivers.errors import LimitExceeded
 from drivers.samples import Pose

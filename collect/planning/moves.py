@@ -10,8 +10,7 @@ from collect.motion.touches import Room, mark_moves, over, visit_moves
 from collect.protocols.steps import Step, StepKind
 from collect.rig.config import RigConfig
 from collect.rig.config_touch import TouchConfig
-from collect.rig.plane import PaperPlane
-from collect.rig.sheet import Cell
+from collect.rig.paper import Cell, PaperPlane
 from collect.touch.places import patch_spots, touch_rects
 from collect.touch.reach import lowest_z_mm
 from collect.touch.selfcheck import triangle_on

@@ -13,8 +13,7 @@ from collect.planning.walk import sheet_of
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.plans import planned
 from collect.rig.config import RigConfig
-from collect.rig.plane import to_paper
-from collect.rig.sheet import Sheet
+from collect.rig.paper import Sheet, to_paper
 from collect.touch.selfcheck import partners
 
 Axes = Any

@@ -17,7 +17,7 @@ from collect.protocols.config import AdaptiveConfig, ProtocolConfig, ReplayConfi
 from collect.protocols.plans import planned
 from collect.protocols.steps import MARKING, StepKind
 from collect.rig.config import RigConfig
-from collect.rig.sheet import Cell, Sheet
+from collect.rig.paper import Cell, Sheet
 from collect.touch.selfcheck import triangle_in
 from drivers.samples import Pose
 

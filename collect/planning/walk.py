@@ -7,13 +7,11 @@ from dataclasses import dataclass, field, replace
 
 from collect.planning.moves import StepMoves, moves_of
 from collect.protocols.config import ProtocolConfig
-from collect.protocols.planned import Layout
 from collect.protocols.plans import cell_mm, steps
 from collect.protocols.self_check import with_self_check
 from collect.protocols.steps import MARKING, Protocol, Result, Step, StepKind
 from collect.rig.config import RigConfig
-from collect.rig.plane import PaperPlane
-from collect.rig.sheet import Cell, Sheet
+from collect.rig.paper import Cell, Layout, PaperPlane, Sheet
 from collect.touch.selfcheck import partners
 
 

@@ -12,7 +12,7 @@ import itertools
 import random
 from collections.abc import Hashable, Sequence
 
-from collect.protocols.planned import Layout
+from collect.rig.paper import Layout
 
 BANDS = 3
 TRIALS_PER_STROKE = 60

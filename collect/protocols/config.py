@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from collect.protocols.rows import DeepMm, DrawnStroke, DwellS, PressRow, ReplayRow, TiltDeg, stroke_id_problem
-from collect.rig.config_base import Config, Finite
+from collect.rig.config_file import Config, Finite
 
 MAX_STROKES = 10_000
 """Of one protocol, repeats included: a month of pressing."""

@@ -6,9 +6,10 @@ import random
 
 from collect.protocols.config import GridConfig
 from collect.protocols.order import numbered
-from collect.protocols.planned import Layout, Planned
+from collect.protocols.planned import Planned
 from collect.protocols.steps import Protocol
 from collect.protocols.strokes import stroke_steps
+from collect.rig.paper import Layout
 
 
 def planned(config: GridConfig, layout: Layout | None = None) -> list[Planned]:

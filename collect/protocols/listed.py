@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collect.protocols.config import ListConfig
 from collect.protocols.order import numbered, shuffled
-from collect.protocols.planned import Layout, Planned
+from collect.protocols.planned import Planned
 from collect.protocols.steps import Protocol
 from collect.protocols.strokes import stroke_steps
+from collect.rig.paper import Layout
 
 
 def planned(config: ListConfig, layout: Layout | None = None) -> list[Planned]:

@@ -11,7 +11,7 @@ from collect.errors import ConfigError
 from collect.protocols.config import MAX_POINTS, MAX_STROKES, ProtocolConfig, TaggedProtocol
 from collect.protocols.rows import PointRow, PressRow, ReplayRow
 from collect.protocols.table import read_rows
-from collect.rig.reading import read_toml, refusal
+from collect.rig.config_file import read_toml, refusal
 
 MAX_PROTOCOL_BYTES = 4 * 1024 * 1024
 

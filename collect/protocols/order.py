@@ -6,7 +6,8 @@ import random
 from dataclasses import replace
 
 from collect.protocols.balance import balanced
-from collect.protocols.planned import Layout, Planned
+from collect.protocols.planned import Planned
+from collect.rig.paper import Layout
 
 
 def numbered(rounds: list[list[Planned]], seed: int | None, layout: Layout | None) -> list[Planned]:

@@ -8,21 +8,6 @@ from collect.protocols.config import Figure
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
-    """How a sheet is divided into cells, filled row by row from the far edge."""
-
-    columns: int
-    rows: int
-    taken: frozenset[int] = frozenset()
-    """Cells of the first sheet that are used before the first stroke."""
-
-    @property
-    def capacity(self) -> int:
-        """Cells on a sheet."""
-        return self.columns * self.rows
-
-
-@dataclass(frozen=True, slots=True)
 class Planned:
     """One stroke, or one figure of several."""
 

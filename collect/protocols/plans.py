@@ -12,8 +12,9 @@ from collect.protocols.config import (
     ReplayConfig,
     WriteConfig,
 )
-from collect.protocols.planned import Layout, Planned
+from collect.protocols.planned import Planned
 from collect.protocols.steps import Protocol
+from collect.rig.paper import Layout
 
 
 def planned(config: ProtocolConfig, layout: Layout | None = None) -> list[Planned]:

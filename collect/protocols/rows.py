@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field, field_validator, model_validator
 
-from collect.rig.config_base import Config
+from collect.rig.config_file import Config
 
 DeepMm = Annotated[float, Field(gt=0.0, le=100.0)]
 TiltDeg = Annotated[float, Field(ge=0.0, le=30.0)]

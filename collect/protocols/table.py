@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, ValidationError
 
 from collect.errors import ConfigError
-from collect.rig.reading import read_text
+from collect.rig.config_file import read_text
 from sessions.cells import as_text
 
 MAX_TABLE_BYTES = 4 * 1024 * 1024

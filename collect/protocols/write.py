@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collect.protocols.config import WriteConfig
 from collect.protocols.order import shuffled
-from collect.protocols.planned import Layout, Planned
+from collect.protocols.planned import Planned
 from collect.protocols.steps import Protocol
 from collect.protocols.strokes import stroke_steps
+from collect.rig.paper import Layout
 
 
 def planned(config: WriteConfig, layout: Layout | None = None) -> list[Planned]:

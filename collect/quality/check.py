@@ -12,7 +12,7 @@ from collect.quality.mark import measure_mark
 from collect.quality.patch import Point, Rect, around, take
 from collect.quality.verdict import Check, Failure, Verdict
 from collect.rig.config_quality import QualityConfig
-from collect.rig.sheet import Cell
+from collect.rig.paper import Cell
 
 MARGIN_MM = 4.0
 """Around the cell, where a stroke that leaves it may be found."""

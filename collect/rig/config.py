@@ -1,25 +1,66 @@
 """`rig.toml`: frozen, complete, refused with one line that names file, field and range.
 
-Any value can be overridden from the environment: `BRUSHLOOP_ROBOT__HOST=192.0.2.7` sets `[robot] host`.
+The environment overrides any value: `BRUSHLOOP_ROBOT__HOST=192.0.2.7` sets `[robot] host`.
 """
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field, ValidationError, model_validator
-from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, SettingsError
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    SettingsError,
+)
 
 from calibrate.board.scale import BoardSpec
 from collect.errors import ConfigError
-from collect.rig.config_base import Config, Finite, Positive
 from collect.rig.config_devices import CameraConfig, ForceConfig, InkDeviceConfig, RobotConfig
-from collect.rig.config_environment import DELIMITER, PREFIX, overrides, unreadable
+from collect.rig.config_file import Config, Finite, Positive, models_at, nearest, paths, place, read_toml, refusal
 from collect.rig.config_quality import QualityConfig
 from collect.rig.config_touch import SelfCheckConfig, TouchConfig
 from collect.rig.optics import with_optics
-from collect.rig.reading import read_toml, refusal
+
+PREFIX, DELIMITER = "BRUSHLOOP_", "__"
+
+
+def overrides(settings: type[BaseSettings]) -> dict[tuple[str, ...], str]:
+    """Variable by the path that it sets: `("robot", "port")` -> `BRUSHLOOP_ROBOT__PORT`.
+
+    Raises `ConfigError` for a variable whose table or top field is not there: pydantic would pass it over in silence.
+    """
+    found: dict[tuple[str, ...], str] = {}
+    for name in sorted(os.environ):
+        if not name.upper().startswith(PREFIX):
+            continue
+        path = tuple(name[len(PREFIX) :].lower().split(DELIMITER))
+        if path[0] not in settings.model_fields or (len(path) > 1 and not models_at(settings, path[:1])):
+            # Compared without the prefix, which would make all of them alike.
+            meant = nearest(DELIMITER.join(path), [DELIMITER.join(known) for known in paths([settings])])
+            hint = f"; did you mean {PREFIX}{meant.upper()}?" if meant else f": {PREFIX}TABLE{DELIMITER}FIELD would"
+            raise ConfigError(place(name), "", f"sets nothing of rig.toml{hint}")
+        found[path] = name
+    return found
+
+
+def unreadable(settings: type[BaseSettings], error: SettingsError) -> ConfigError:
+    """The refusal of a variable whose text is not what a list or a table is written as."""
+    for path, name in overrides(settings).items():
+        source = EnvSettingsSource(settings)
+        source.env_vars = {name.lower(): os.environ[name]}
+        try:
+            source()
+        except SettingsError:
+            shown = os.environ[name]
+            shown = shown if len(shown) <= 80 else shown[:77] + "..."
+            return ConfigError(place(name), ".".join(path), f"is not JSON, as [40.0, 24.0] is (given: {shown!r})")
+    return ConfigError("environment", "", f"{error}".splitlines()[0])
+
 
 MAX_CONFIG_BYTES = 1024 * 1024
 TRAVEL_CLEARANCE_MM = 15.0

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from calibrate.board.lens import LensUsed
-from collect.rig.config_base import Config, Finite, Positive, Range
+from collect.rig.config_file import Config, Finite, Positive, Range
 from drivers.force.samples import LOOPBACK_CHANNEL
 
 MOST_STALE_MS = 100.0

@@ -16,7 +16,7 @@ from collect.photograph.ink import gray, ink_at
 from collect.rig.config_touch import CameraTouchConfig, TouchConfig
 from collect.rig.devices import Rig
 from collect.rig.optics import straightened
-from collect.rig.plane import PaperPlane, fit_plane
+from collect.rig.paper import PaperPlane, fit_plane
 from collect.touch.arm import TouchArm
 from collect.touch.contact import first_ink
 from collect.touch.reach import Known, Reach, lowest_z_mm

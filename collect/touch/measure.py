@@ -8,7 +8,7 @@ from typing import Protocol
 from collect.errors import StepError
 from collect.rig.config_touch import TouchConfig
 from collect.rig.devices import Rig
-from collect.rig.plane import PaperPlane
+from collect.rig.paper import PaperPlane
 from collect.touch.arm import TouchArm
 from collect.touch.camera import FirstInkTouch, Hands
 from collect.touch.force import touch_by_force

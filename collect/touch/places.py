@@ -6,7 +6,7 @@ import math
 
 from collect.rig.config import PaperConfig
 from collect.rig.config_touch import TouchConfig
-from collect.rig.sheet import Sheet
+from collect.rig.paper import Sheet
 from collect.touch.camera import coarse_count, fine_count
 from collect.touch.reach import Known
 from collect.touch.selfcheck import Triangle

@@ -8,7 +8,7 @@ from typing import Literal
 
 from collect.errors import StepError
 from collect.rig.config_touch import Method, TouchConfig
-from collect.rig.plane import PaperPlane, fit_plane
+from collect.rig.paper import PaperPlane, fit_plane
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,8 +23,7 @@ from collect.photograph.marks import new_marks
 from collect.rig.config_touch import SelfCheckConfig
 from collect.rig.devices import Rig
 from collect.rig.optics import straightened
-from collect.rig.plane import PaperPlane
-from collect.rig.sheet import Cell, Sheet
+from collect.rig.paper import Cell, PaperPlane, Sheet
 from collect.touch.arm import TouchArm
 from collect.touch.camera import Hands
 from drivers.samples import Frame

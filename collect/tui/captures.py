@@ -14,7 +14,7 @@ from calibrate.compare.similarity import csim
 from calibrate.errors import CalibrationError
 from calibrate.session import lens_in_use
 from collect.engine.last_capture import pictures_of
-from collect.rig.sheet import Cell
+from collect.rig.paper import Cell
 from sessions.errors import InputError, SessionDamaged
 from sessions.journal.journal import JOURNAL_NAME, is_open, replay
 from sessions.journal.lines import Line

@@ -13,7 +13,7 @@ from collect.motion.procedures import Move, over_sheet_move, photograph_moves
 from collect.motion.touches import Room
 from collect.planning.moves import StepMoves, Way
 from collect.rig.config import RigConfig
-from collect.rig.plane import to_paper
+from collect.rig.paper import to_paper
 from drivers.geometry import distance
 from drivers.samples import Pose
 from drivers.sim.arm.motion import MotionQueue

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from collect.errors import StepError
 from collect.rig.config import PaperConfig
-from collect.rig.plane import PaperPlane, fit_plane, to_paper
-from collect.rig.sheet import to_base
+from collect.rig.paper import PaperPlane, fit_plane, to_base, to_paper
 from drivers.geometry import brush_pose, distance, lean
 from drivers.samples import Pose
 

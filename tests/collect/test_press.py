@@ -13,7 +13,7 @@ from collect.errors import StepVoid
 from collect.motion.procedures import Procedures, press_moves
 from collect.rig.config import load_rig
 from collect.rig.devices import Rig, limits_of
-from collect.rig.sheet import Sheet
+from collect.rig.paper import Sheet
 from drivers.samples import Identity, Pose, QueuedLine
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml

@@ -13,7 +13,7 @@ from collect.protocols import grid
 from collect.protocols.config import GridConfig
 from collect.protocols.steps import Step, StepKind
 from collect.rig.config import PaperConfig
-from collect.rig.sheet import Sheet, to_base
+from collect.rig.paper import Sheet, to_base
 
 heights = st.lists(st.integers(1, 30).map(float), min_size=1, max_size=5, unique=True)
 tilts = st.lists(st.integers(0, 15).map(float), min_size=1, max_size=4, unique=True)

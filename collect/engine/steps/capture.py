@@ -15,7 +15,7 @@ from collect.operator import Choice, OperatorRequest, Prompt
 from collect.protocols.steps import Result
 from collect.quality.check import check_capture, check_drawing
 from collect.quality.verdict import Family, Verdict
-from collect.rig.sheet import Cell
+from collect.rig.paper import Cell
 from sessions.recording.schemas import Check, Quality, Stroke
 
 KEEP, AGAIN, SKIP = Choice("g", "good all the same: it counts"), Choice("r", "press it again"), Choice("k", "skip it")

@@ -10,7 +10,7 @@ from collect.engine.steps.waiting import uninterrupted
 from collect.protocols.adaptive import cells
 from collect.protocols.config import AdaptiveConfig
 from collect.protocols.steps import Result, StepKind
-from collect.rig.sheet import Cell
+from collect.rig.paper import Cell
 
 if TYPE_CHECKING:
     from calibrate.fit.stepwise import Next, Seen

@@ -15,7 +15,7 @@ from collect.operator import Asker, OperatorRequests
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.steps import Step
 from collect.rig.devices import Rig
-from collect.rig.sheet import Cell, Sheet
+from collect.rig.paper import Cell, Sheet
 from collect.touch.places import used_cells as touched_cells
 from sessions.store import Attempt, SessionStore
 

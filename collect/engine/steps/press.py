@@ -12,7 +12,7 @@ from collect.motion.drawing import Drawn, check_drawn, draw_stroke, stroke_moves
 from collect.motion.procedures import press_moves
 from collect.protocols.steps import Result
 from collect.rig.devices import limits_of
-from collect.rig.sheet import Cell
+from collect.rig.paper import Cell
 from sessions.waits import WAIT
 
 

@@ -15,7 +15,7 @@ from collect.planning.limits import check_poses, check_step
 from collect.planning.moves import touch_of
 from collect.protocols.steps import Result
 from collect.rig.config_touch import TouchConfig
-from collect.rig.plane import PaperPlane
+from collect.rig.paper import PaperPlane
 from collect.touch.jog import asked
 from collect.touch.measure import measure_plane
 from collect.touch.results import PlaneResult, kept

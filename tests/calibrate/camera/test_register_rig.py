@@ -16,7 +16,7 @@ from brushloop import app
 from calibrate.board.rig_file import PaperLines, read_rig
 from calibrate.errors import CalibrationError
 from collect.rig.config import PaperConfig, RigConfig, load_rig
-from collect.rig.sheet import to_base
+from collect.rig.paper import to_base
 from drivers.geometry import brush_pose
 from drivers.sim.camera.scene import Scene
 from drivers.sim.config import SimConfig, Table, View

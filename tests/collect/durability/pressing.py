@@ -12,7 +12,7 @@ from typing import Any, cast
 from collect.motion.procedures import Procedures
 from collect.rig.config import load_rig
 from collect.rig.devices import Rig, make_robot
-from collect.rig.sheet import Sheet
+from collect.rig.paper import Sheet
 from drivers.clock import HostClock
 
 

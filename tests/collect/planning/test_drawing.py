@@ -14,7 +14,7 @@ from collect.protocols.loading import load_protocol
 from collect.protocols.steps import StepKind
 from collect.rig.config import RigConfig, load_rig
 from collect.rig.devices import limits_of, make_robot
-from collect.rig.plane import PaperPlane
+from collect.rig.paper import PaperPlane
 from drivers.arcs.robot import AuboArcs
 from drivers.clock import HostClock
 from drivers.errors import LimitExceeded

@@ -23,7 +23,7 @@ from collect.protocols.loading import load_protocol
 from collect.protocols.steps import MARKING, StepKind
 from collect.rig.config import RigConfig, load_rig
 from collect.rig.devices import limits_of
-from collect.rig.plane import PaperPlane
+from collect.rig.paper import PaperPlane
 from drivers.geometry import brush_pose, distance
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml

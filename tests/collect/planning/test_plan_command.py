@@ -20,7 +20,7 @@ from collect.planning.picture import draw_plan
 from collect.planning.summary import make_plan
 from collect.protocols.loading import load_protocol
 from collect.rig.config import RigConfig, load_rig
-from collect.rig.plane import PaperPlane
+from collect.rig.paper import PaperPlane
 from drivers.arcs.codes import RobotMode
 from drivers.errors import ConnectionLost
 from drivers.sim.arcs.server import ArcsServer

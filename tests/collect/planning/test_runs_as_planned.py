@@ -16,7 +16,7 @@ from collect.planning.moves import moves_of
 from collect.protocols.loading import load_protocol
 from collect.protocols.steps import MARKING, Result, Step, StepKind
 from collect.rig.config import load_rig
-from collect.rig.plane import PaperPlane
+from collect.rig.paper import PaperPlane
 from drivers.samples import Pose
 from tests.collect.conftest import Lab
 from tests.collect.sent import not_checked, not_sent, noting

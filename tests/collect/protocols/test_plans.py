@@ -22,11 +22,11 @@ from collect.protocols.config import (
     WriteConfig,
 )
 from collect.protocols.loading import load_protocol
-from collect.protocols.planned import Layout
 from collect.protocols.plans import planned, steps
 from collect.protocols.rows import DrawnStroke, PressRow, ReplayRow
 from collect.protocols.steps import MARKING, Step, StepKind
 from collect.protocols.strokes import strokes_of, strokes_text
+from collect.rig.paper import Layout
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 

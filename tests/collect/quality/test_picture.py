@@ -17,7 +17,7 @@ from collect.quality.check import cell_is_blank, check_capture, check_drawing, c
 from collect.quality.picture import blur_px, glare, paper_level
 from collect.quality.verdict import Failure, Family
 from collect.rig.config_quality import QualityConfig
-from collect.rig.sheet import Cell
+from collect.rig.paper import Cell
 
 LIMITS = QualityConfig()
 PX = 8.0

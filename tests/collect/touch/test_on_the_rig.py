@@ -13,7 +13,7 @@ from collect.protocols.steps import Step, StepKind
 from collect.rig.config import load_rig
 from collect.rig.config_touch import TouchConfig
 from collect.rig.devices import connected
-from collect.rig.plane import PaperPlane
+from collect.rig.paper import PaperPlane
 from collect.touch.measure import measure_plane
 from drivers.clock import HostClock
 from drivers.samples import Pose

@@ -8,7 +8,7 @@ import pytest
 
 from collect.rig.config import PaperConfig
 from collect.rig.config_touch import TouchConfig
-from collect.rig.sheet import Sheet
+from collect.rig.paper import Sheet
 from collect.touch.places import used_cells
 from collect.touch.selfcheck import triangle_of
 

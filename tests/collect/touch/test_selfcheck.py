@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from collect.errors import StepError
 from collect.rig.config import PaperConfig
 from collect.rig.config_touch import SelfCheckConfig
-from collect.rig.plane import PaperPlane
-from collect.rig.sheet import Sheet, to_base
+from collect.rig.paper import PaperPlane, Sheet, to_base
 from collect.touch.selfcheck import (
     SelfCheck,
     Triangle,

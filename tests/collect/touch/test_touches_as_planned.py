@@ -14,8 +14,7 @@ from collect.planning.moves import moves_of
 from collect.protocols.steps import Step, StepKind
 from collect.rig.config import RigConfig
 from collect.rig.config_touch import TouchConfig
-from collect.rig.plane import PaperPlane
-from collect.rig.sheet import Sheet
+from collect.rig.paper import PaperPlane, Sheet
 from collect.touch.jog import Jogged
 from collect.touch.measure import measure_plane
 from collect.touch.selfcheck import partners, self_check, triangle_on

@@ -1,21 +1,38 @@
-"""Configuration files from disk: bounded, text, TOML; and what pydantic refuses, in one line."""
+"""Configuration files: what a table is made of, how a file is read, and how a wrong value is refused in one line."""
 
 from __future__ import annotations
 
+import difflib
 import stat
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, cast, get_args, get_origin
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from collect.errors import ConfigError
-from collect.rig.config_environment import place
-from collect.rig.config_names import fields, kinds, models_at, nearest
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
+
+MOST = 1e6
+"""Of any number: a length of a kilometre is a slip of the pen, to be told as one."""
+Positive = Annotated[float, Field(gt=0.0, le=MOST, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-MOST, le=MOST, allow_inf_nan=False)]
+Range = tuple[Finite, Finite]
+
+
+class Config(BaseModel):
+    """Base: frozen, extra keys refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+def place(name: str) -> str:
+    """A variable as refusals name it."""
+    return f"environment variable {name}"
 
 
 def read_text(path: Path, max_bytes: int, encoding: str = "utf-8") -> str:
@@ -105,3 +122,55 @@ def _what(first: ErrorDetails, errors: list[ErrorDetails], of: object) -> tuple[
 def _is_tag(part: str | int) -> bool:
     """Whether this is the tag of a union within the file, and no field's name: those tags have a hyphen."""
     return isinstance(part, str) and "-" in part
+
+
+HOLDERS = (Annotated, Union, UnionType, list, tuple)
+
+
+def models_at(of: object, loc: Sequence[str | int]) -> list[type[BaseModel]]:
+    """The models of the table at `loc`: pydantic's place of an error, tags of unions and numbers of items included.
+
+    `of` is a model, or a union of some.
+    """
+    models = list(_models(of))
+    for part in loc:
+        if isinstance(part, int):
+            continue
+        inside = [model.model_fields[part].annotation for model in models if part in model.model_fields]
+        if inside:
+            models = [model for annotation in inside for model in _models(annotation)]
+        else:
+            models = [model for model in models if part in kinds([model])]
+    return models
+
+
+def fields(models: Sequence[type[BaseModel]]) -> list[str]:
+    """Names that any of these tables may have, in their order."""
+    return list(dict.fromkeys(name for model in models for name in model.model_fields))
+
+
+def kinds(models: Sequence[type[BaseModel]]) -> list[str]:
+    """What `kind` may be in these tables."""
+    tags = (model.model_fields["kind"].annotation for model in models if "kind" in model.model_fields)
+    return [str(kind) for tag in tags if get_origin(tag) is Literal for kind in get_args(tag)]
+
+
+def nearest(name: str, known: Sequence[str]) -> str | None:
+    """The known name that is most like it, if any is."""
+    return next(iter(difflib.get_close_matches(name, known, n=1)), None)
+
+
+def paths(models: Sequence[type[BaseModel]], above: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """The path of every field in these tables and the tables in them."""
+    for model in models:
+        for name, field in model.model_fields.items():
+            yield (*above, name)
+            yield from paths(list(_models(field.annotation)), (*above, name))
+
+
+def _models(annotation: object) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(cast("type[Any]", annotation), BaseModel):
+        yield annotation
+    elif get_origin(annotation) in HOLDERS:
+        for inner in get_args(annotation):
+            yield from _models(inner)
