@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from collect.protocols.loading import load_protocol
+from collect.protocols.files import load_protocol
 from sessions.errors import SessionError
 from sessions.reader import Recording
 

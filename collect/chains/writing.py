@@ -13,7 +13,7 @@ from collect.chains.commands import GIVEN_UP, Say, run_command
 from collect.chains.finished import finished_session
 from collect.errors import ConfigError
 from collect.protocols.config import WriteConfig
-from collect.protocols.loading import load_protocol
+from collect.protocols.files import load_protocol
 from collect.rig.config import load_rig
 
 PROTOCOL, PAGE = "protocol-write.toml", "written.html"

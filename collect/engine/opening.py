@@ -12,7 +12,7 @@ from collect.engine.changed import changed
 from collect.engine.dry_run import lifted
 from collect.errors import ConfigError
 from collect.protocols.config import ProtocolConfig
-from collect.protocols.loading import load_protocol
+from collect.protocols.files import load_protocol
 from collect.protocols.steps import StepKind
 from collect.rig.config import RigConfig, load_rig
 from collect.rig.devices import Rig

@@ -14,10 +14,9 @@ from collect.engine.states import State
 from collect.engine.tally import Place, Tally
 from collect.operator import Prompt
 from collect.protocols.adaptive import with_choice
-from collect.protocols.again import AGAIN, with_review
-from collect.protocols.planned import Planned
 from collect.protocols.plans import ProtocolConfig, planned
 from collect.protocols.steps import MARKING, Result, Step, StepKind
+from collect.protocols.strokes import AGAIN, Planned, with_review
 from collect.rig.paper import Layout, Sheet
 from drivers.clock import Clock
 from sessions.store import SessionStore

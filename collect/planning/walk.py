@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 from collect.planning.moves import StepMoves, moves_of
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.plans import cell_mm, steps
-from collect.protocols.self_check import with_self_check
-from collect.protocols.steps import MARKING, Protocol, Result, Step, StepKind
+from collect.protocols.steps import MARKING, Protocol, Result, Step, StepKind, with_self_check
 from collect.rig.config import RigConfig
 from collect.rig.paper import Cell, Layout, PaperPlane, Sheet
 from collect.touch.selfcheck import partners

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from collect.protocols.config import AdaptiveConfig
-from collect.protocols.planned import Planned
 from collect.protocols.steps import Protocol, Result, Step, StepKind
-from collect.protocols.strokes import takes
+from collect.protocols.strokes import Planned, takes
 
 
 def cells(config: AdaptiveConfig) -> list[tuple[float, float]]:

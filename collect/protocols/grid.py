@@ -6,9 +6,8 @@ import random
 
 from collect.protocols.config import GridConfig
 from collect.protocols.order import numbered
-from collect.protocols.planned import Planned
 from collect.protocols.steps import Protocol
-from collect.protocols.strokes import stroke_steps
+from collect.protocols.strokes import Planned, stroke_steps
 from collect.rig.paper import Layout
 
 

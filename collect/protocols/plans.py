@@ -12,8 +12,8 @@ from collect.protocols.config import (
     ReplayConfig,
     WriteConfig,
 )
-from collect.protocols.planned import Planned
 from collect.protocols.steps import Protocol
+from collect.protocols.strokes import Planned
 from collect.rig.paper import Layout
 
 

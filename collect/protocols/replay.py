@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collect.protocols.config import ReplayConfig
 from collect.protocols.order import numbered, shuffled
-from collect.protocols.planned import Planned
 from collect.protocols.steps import Protocol
-from collect.protocols.strokes import stroke_steps
+from collect.protocols.strokes import Planned, stroke_steps
 from collect.rig.paper import Layout
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Generator
@@ -63,3 +64,17 @@ class Step:
 
 Protocol = Generator[Step, Result, None]
 """Yields steps and is sent their results, so that later steps can depend on earlier ones."""
+KNOWING = frozenset({StepKind.ZERO_TOUCH, StepKind.TOUCH, StepKind.BOARD})
+"""Paper and board must be known before it."""
+
+
+def with_self_check(protocol: Protocol) -> Protocol:
+    """The same protocol, with a SELF_CHECK step before the first that is for a mark."""
+    step = next(protocol)
+    checked = False
+    with contextlib.suppress(StopIteration):
+        while True:
+            if not checked and step.kind not in KNOWING:
+                yield Step(StepKind.SELF_CHECK, 0)
+                checked = True
+            step = protocol.send((yield step))

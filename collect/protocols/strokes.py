@@ -1,15 +1,55 @@
-"""The steps that every protocol with strokes has: touch, board, then dip, mark and capture each stroke."""
+"""What a protocol has planned, stroke by stroke, and the steps that each stroke takes."""
 
 from __future__ import annotations
 
 import itertools
 import json
 from collections.abc import Generator, Iterable
+from dataclasses import dataclass, replace
 
-from collect.protocols.config import WriteConfig
-from collect.protocols.planned import Planned
+from collect.protocols.config import Figure, WriteConfig
 from collect.protocols.rows import TrajectoryPoint
 from collect.protocols.steps import Params, Protocol, Result, Step, StepKind
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """One stroke, or one figure of several."""
+
+    stroke_id: str
+    height_mm: float
+    """Depth; of a figure, its deepest."""
+    tilt_deg: float
+    """Of a figure, at its deepest point."""
+    repeat: int
+    """Round, from 1."""
+    index: int = 0
+    """Number in the plan before it was balanced over the sheet: what its steps' keys are made with, so that they do not
+    depend on the sheet."""
+    dwell_s: float = 0.0
+    figure: Figure | None = None
+    """What is drawn; None is a press."""
+    cell_mm: tuple[float, float] | None = None
+    """Paper cell that it needs; None is the rig's own, `paper.cell_mm`."""
+    again_of: str | None = None
+    """The stroke of another session that this one repeats."""
+
+
+AGAIN = "-again"
+
+
+def made_again(marked: Planned, index: int) -> Planned:
+    """The same press under a name of its own: both are in the recording, and the first stays marked."""
+    return replace(marked, stroke_id=f"{marked.stroke_id}{AGAIN}", index=index)
+
+
+def with_review(plan: Iterable[Planned], reviewed: Result) -> list[Planned]:
+    """The plan after a REVIEW step: each marked stroke gives its place to the one that is made again.
+
+    `reviewed` holds `again`: [stroke_id, index] of each.
+    """
+    indices = {str(stroke_id): int(index) for stroke_id, index in reviewed["again"]}
+    return [made_again(p, indices[p.stroke_id]) if p.stroke_id in indices else p for p in plan]
 
 
 def stroke_steps(plan: Iterable[Planned], *, board_every: int | None, write: WriteConfig | None = None) -> Protocol:

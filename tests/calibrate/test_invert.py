@@ -17,7 +17,7 @@ from calibrate.errors import CalibrationError
 from calibrate.invert.files import PROTOCOL, write_inversion
 from calibrate.invert.invert import Row, Settings, invert_recording, lay, off_command
 from collect.protocols.config import ReplayConfig
-from collect.protocols.loading import load_protocol
+from collect.protocols.files import load_protocol
 from model.ccdbsm import Brush, ccdbsm
 from model.coverage import coverage
 from model.inversion.press import Range

@@ -20,7 +20,7 @@ from calibrate.writing.plan import Settings, plan, wanted_of
 from calibrate.writing.plan_files import PICTURE, PROTOCOL, write_plan
 from calibrate.writing.record import load_plan
 from collect.protocols.config import WriteConfig
-from collect.protocols.loading import load_protocol
+from collect.protocols.files import load_protocol
 from model.ccdbsm import Brush
 from model.characters.brush import Reach
 from model.drag import DragModel

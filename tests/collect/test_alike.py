@@ -12,7 +12,7 @@ from collect.engine.steps import touch as touching
 from collect.engine.steps import waited
 from collect.engine.steps.context import Known
 from collect.planning.summary import make_plan
-from collect.protocols.loading import load_protocol
+from collect.protocols.files import load_protocol
 from collect.protocols.plans import steps
 from collect.protocols.steps import StepKind
 from collect.rig.config import load_rig

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.protocols.loading import load_protocol
+from collect.protocols.files import load_protocol
 from collect.protocols.plans import planned
 from sessions.journal.journal import JOURNAL_NAME, is_open, read_lines, replay
 from sessions.reader import Recording

@@ -16,7 +16,7 @@ from collect.planning.limits import check_protocol
 from collect.planning.summary import make_plan
 from collect.protocols.adaptive import planned, steps
 from collect.protocols.config import AdaptiveConfig
-from collect.protocols.loading import load_protocol
+from collect.protocols.files import load_protocol
 from collect.protocols.steps import Result, Step, StepKind
 from collect.rig.config import load_rig
 from model.fitted import FittedPress

@@ -10,7 +10,7 @@ import pytest
 
 from collect.motion.drawing import Drawn, check_drawn, draw_stroke, stroke_moves
 from collect.planning.walk import sheet_of, walk
-from collect.protocols.loading import load_protocol
+from collect.protocols.files import load_protocol
 from collect.protocols.steps import StepKind
 from collect.rig.config import RigConfig, load_rig
 from collect.rig.devices import limits_of, make_robot

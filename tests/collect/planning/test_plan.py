@@ -19,7 +19,7 @@ from collect.planning.summary import Plan, make_plan
 from collect.planning.timing import _apart, move_s, trapezoid_s, way_s
 from collect.planning.walk import sheet_of, walk
 from collect.protocols.config import ProtocolConfig
-from collect.protocols.loading import load_protocol
+from collect.protocols.files import load_protocol
 from collect.protocols.steps import MARKING, StepKind
 from collect.rig.config import RigConfig, load_rig
 from collect.rig.devices import limits_of

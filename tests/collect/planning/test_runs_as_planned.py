@@ -13,7 +13,7 @@ from collect.engine.steps.context import StepContext
 from collect.motion.procedures import inking_moves
 from collect.planning.limits import all_poses, check_protocol
 from collect.planning.moves import moves_of
-from collect.protocols.loading import load_protocol
+from collect.protocols.files import load_protocol
 from collect.protocols.steps import MARKING, Result, Step, StepKind
 from collect.rig.config import load_rig
 from collect.rig.paper import PaperPlane

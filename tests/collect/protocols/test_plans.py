@@ -21,7 +21,7 @@ from collect.protocols.config import (
     ReplayConfig,
     WriteConfig,
 )
-from collect.protocols.loading import load_protocol
+from collect.protocols.files import load_protocol
 from collect.protocols.plans import planned, steps
 from collect.protocols.rows import DrawnStroke, PressRow, ReplayRow
 from collect.protocols.steps import MARKING, Step, StepKind

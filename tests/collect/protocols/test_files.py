@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from collect.errors import ConfigError
-from collect.protocols import loading, table
+from collect.protocols import files
 from collect.protocols.config import GridConfig, ListConfig, WriteConfig
-from collect.protocols.loading import load_protocol
+from collect.protocols.files import load_protocol
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 LIST = 'kind = "list"\nfile = "p.csv"\n'
