@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from bench.harness import BenchError, Result, percentile
 from bench.quality_set import Patch, Sample, draw_set
-from collect.quality.check import cell_is_blank, check_capture
+from collect.quality.checks import cell_is_blank, check_capture
 from collect.quality.verdict import Failure
 from collect.rig.config_quality import QualityConfig
 

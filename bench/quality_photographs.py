@@ -16,7 +16,7 @@ import numpy as np
 
 from bench.harness import BenchError
 from calibrate.board.scale import PlaneFit
-from collect.quality.check import check_capture
+from collect.quality.checks import check_capture
 from collect.quality.verdict import Failure, Verdict
 from collect.rig.config_quality import QualityConfig
 from collect.rig.paper import Cell

@@ -11,7 +11,7 @@ import numpy as np
 
 from calibrate.stroke.preprocess import Gray
 from collect.engine.telemetry import Picture, Telemetry
-from collect.photograph.ink import gray
+from collect.photograph.new_ink import gray
 from collect.quality.picture import blur_px
 from drivers.errors import DeviceError
 from drivers.protocols import Camera

@@ -1,4 +1,4 @@
-"""The camera's frames one after the other, each held against the view without the arm."""
+"""The camera's frames one after the other, each compared with the view without the arm."""
 
 from __future__ import annotations
 
@@ -7,10 +7,36 @@ import contextlib
 from collections.abc import AsyncGenerator, Callable
 from dataclasses import dataclass
 
-from collect.photograph.changes import Thumbnail, changed_share, thumbnail
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 from collect.photograph.delay import Seen
+from collect.photograph.new_ink import gray
 from drivers.protocols import Camera
 from drivers.samples import Frame, Stamp
+
+Thumbnail = NDArray[np.float32]
+WIDTH_PX = 160
+"""A pixel then averages over some 2 mm of a sheet: noise is gone, and an arm is tens of pixels wide."""
+CHANGED_LEVELS = 25.0
+"""Gray levels, the light taken out, from which a pixel counts as changed."""
+
+
+def thumbnail(image: NDArray[np.uint8]) -> Thumbnail:
+    """(h, 160) gray levels of an (h, w) or (h, w, 3) BGR frame."""
+    height, width = image.shape[:2]
+    size = (WIDTH_PX, max(1, round(height * WIDTH_PX / width)))
+    return gray(np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)).astype(np.float32)
+
+
+def changed_share(now: Thumbnail, before: Thumbnail) -> float:
+    """Share of the pixels that differ, 0 to 1, whatever the light does as a whole; 1 for frames of another size."""
+    if now.shape != before.shape:
+        return 1.0
+    light = float(np.median((now + 1.0) / (before + 1.0)))
+    return float(np.mean(np.abs(now - light * before) > CHANGED_LEVELS))
+
 
 ARM_SHARE = 0.02
 """An arm over the sheet hides a far larger share of the picture than a stroke, or a drawn figure, covers with ink."""

@@ -14,9 +14,8 @@ from collections.abc import AsyncGenerator, Awaitable, Callable
 from dataclasses import dataclass, replace
 
 from collect.errors import ArmInPicture, CameraLate
-from collect.photograph.changes import Thumbnail
 from collect.photograph.delay import CameraDelay, Look, Placed, look
-from collect.photograph.frames import ARM_SHARE, Frames, View, watching
+from collect.photograph.frames import ARM_SHARE, Frames, Thumbnail, View, watching
 from collect.rig.config_devices import CameraConfig
 from drivers.clock import Clock
 from drivers.errors import DeviceError

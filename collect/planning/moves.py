@@ -11,8 +11,8 @@ from collect.protocols.steps import Step, StepKind
 from collect.rig.config import RigConfig
 from collect.rig.config_touch import TouchConfig
 from collect.rig.paper import Cell, PaperPlane
+from collect.touch.heights import lowest_z_mm
 from collect.touch.places import patch_spots, touch_rects
-from collect.touch.reach import lowest_z_mm
 from collect.touch.selfcheck import triangle_on
 from drivers.samples import Pose
 

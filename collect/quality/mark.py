@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.stroke.preprocess import PX_PER_MM, Mask, Soft
-from collect.quality.ink import Ink
-from collect.quality.patch import Point
+from collect.quality.ink import Ink, Point
 
 Bits = NDArray[np.uint8]
 OUTLINE_MM = 1.5

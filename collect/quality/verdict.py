@@ -26,37 +26,27 @@ class Failure(StrEnum):
     ink, its place and tone only where hairs carried ink, and its shape last.
     """
 
-    EXPOSURE = "exposure"
-    BLURRED = "blurred"
-    CUT = "cut"
-    GLARE = "glare"
-    NEIGHBOUR = "neighbour"
-    BLANK = "blank"
-    DRY = "dry"
-    MISPLACED = "misplaced"
-    FAINT = "faint"
-    SPLIT = "split"
-    BENT = "bent"
+    family: Family
+    """What it spoils."""
 
-    @property
-    def family(self) -> Family:
-        """What it spoils."""
-        return _FAMILIES[self]
+    def __new__(cls, value: str, family: Family) -> Failure:
+        """A member is its text, and carries its family."""
+        member = str.__new__(cls, value)
+        member._value_ = value
+        member.family = family
+        return member
 
-
-_FAMILIES = {
-    Failure.EXPOSURE: Family.PICTURE,
-    Failure.BLURRED: Family.PICTURE,
-    Failure.CUT: Family.PICTURE,
-    Failure.GLARE: Family.PICTURE,
-    Failure.NEIGHBOUR: Family.PLACE,
-    Failure.MISPLACED: Family.PLACE,
-    Failure.BLANK: Family.INK,
-    Failure.DRY: Family.INK,
-    Failure.FAINT: Family.INK,
-    Failure.SPLIT: Family.SHAPE,
-    Failure.BENT: Family.SHAPE,
-}
+    EXPOSURE = "exposure", Family.PICTURE
+    BLURRED = "blurred", Family.PICTURE
+    CUT = "cut", Family.PICTURE
+    GLARE = "glare", Family.PICTURE
+    NEIGHBOUR = "neighbour", Family.PLACE
+    BLANK = "blank", Family.INK
+    DRY = "dry", Family.INK
+    MISPLACED = "misplaced", Family.PLACE
+    FAINT = "faint", Family.INK
+    SPLIT = "split", Family.SHAPE
+    BENT = "bent", Family.SHAPE
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +80,7 @@ class Verdict:
 
     @property
     def reason(self) -> str:
-        """The cause in words, with the other failures named; empty where all passed."""
+        """The cause's reason, with the other failures named; empty where all passed."""
         failed = [check for check in self.checks if not check.passed]
         if not failed:
             return ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from typing import Protocol
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,73 +12,50 @@ from numpy.typing import NDArray
 from calibrate.board.scale import see_board
 from calibrate.errors import CalibrationError
 from collect.errors import StepError
-from collect.photograph.ink import gray, ink_at
-from collect.rig.config_touch import CameraTouchConfig, TouchConfig
+from collect.photograph.new_ink import gray, ink_at
+from collect.rig.config_touch import TouchConfig
 from collect.rig.devices import Rig
 from collect.rig.optics import straightened
 from collect.rig.paper import PaperPlane, fit_plane
-from collect.touch.arm import TouchArm
-from collect.touch.contact import first_ink
-from collect.touch.reach import Known, Reach, lowest_z_mm
-from collect.touch.results import PointTouches, Touch, at_one_point
+from collect.touch.arm import Hands, TouchArm
+from collect.touch.force import Floats
+from collect.touch.heights import Known, PointTouches, Reach, Touch, at_one_point, lowest_z_mm
+from collect.touch.places import Patch, coarse_count, fine_count
 from drivers.samples import Frame
+
+
+@dataclass(frozen=True, slots=True)
+class FirstInk:
+    """Between which spots of a row the ink begins."""
+
+    clean: int
+    """Index of the last spot without ink."""
+    inked: int
+    """Index of the first one with ink; every spot after it has ink."""
+
+
+def first_ink(ink_mm2: Floats, least_mm2: float) -> FirstInk:
+    """Where the ink begins in a row of spots, (m,) from the highest to the lowest.
+
+    Raises `StepError` where the first spot has ink, where none has, and where ink ends again further down: a brush
+    that ran dry would else pass for one that did not touch.
+    """
+    seen = np.asarray(ink_mm2) >= least_mm2
+    if not seen.any():
+        raise StepError("no spot of the row left ink: nothing was touched")
+    first = int(np.argmax(seen))
+    if first == 0:
+        raise StepError("the highest spot of the row has ink already: the paper lies higher than expected")
+    if not seen[first:].all():
+        missing = first + int(np.argmin(seen[first:]))
+        raise StepError(f"spot {missing + 1} of the row left no ink though a higher one did: is the brush dry?")
+    return FirstInk(first - 1, first)
+
 
 Spot = tuple[float, float, float]
 """x and y in the paper frame, z of the tip in the base frame."""
 WINDOW_SHARE = 0.75
 """Of the pitch: how much of a spot's surroundings counts for it."""
-SLACK_STEPS = 2
-"""Fine steps beyond the coarse one, on either side: the coarse answer is no better than its step."""
-
-
-class Hands(Protocol):
-    """What a rig's procedures do besides moving: both begin and end at travel height."""
-
-    async def dip(self) -> None:
-        """Fill the brush."""
-        ...
-
-    async def capture(self) -> Frame:
-        """Park, and photograph."""
-        ...
-
-
-class Patch:
-    """The places of one point's spots, from its lower left: to and fro, so that neighbours in time are neighbours."""
-
-    def __init__(
-        self, at_mm: tuple[float, float], config: CameraTouchConfig, sheet_mm: tuple[float, float], lowest_z_mm: float
-    ) -> None:
-        """No spot lies lower than `lowest_z_mm`."""
-        self.lowest_z_mm = lowest_z_mm
-        self._at_mm = at_mm
-        self._sheet_mm = sheet_mm
-        self._config = config
-        self._next = 0
-
-    def take(self) -> tuple[float, float]:
-        """The next fresh place. Raises `StepError` where the patch has outgrown the sheet."""
-        row, column = divmod(self._next, self._config.columns)
-        self._next += 1
-        column = self._config.columns - 1 - column if row % 2 else column
-        pitch_mm = self._config.pitch_mm
-        x_mm, y_mm = self._at_mm[0] + column * pitch_mm, self._at_mm[1] + row * pitch_mm
-        if not (0.0 <= x_mm <= self._sheet_mm[0] and 0.0 <= y_mm <= self._sheet_mm[1]):
-            raise StepError(
-                f"the touches at ({self._at_mm[0]:g}, {self._at_mm[1]:g}) mm do not fit on the sheet: "
-                f"spot {self._next} would lie at ({x_mm:g}, {y_mm:g}) mm"
-            )
-        return x_mm, y_mm
-
-
-def fine_count(config: CameraTouchConfig) -> int:
-    """Spots of one fine row."""
-    return 1 + 2 * SLACK_STEPS + math.ceil(config.coarse_step_mm / config.fine_step_mm)
-
-
-def coarse_count(config: CameraTouchConfig, reach: Reach) -> int:
-    """Spots of a whole coarse row; it ends where ink is seen."""
-    return math.ceil((reach.start_z_mm - reach.lowest_z_mm) / config.coarse_step_mm) + 1
 
 
 class FirstInkTouch:

@@ -9,8 +9,7 @@ from collect.errors import JogGivenUp, StepError
 from collect.operator import Asker, Choice, Prompt
 from collect.rig.config_touch import JogTouchConfig
 from collect.touch.arm import TouchArm
-from collect.touch.reach import Reach
-from collect.touch.results import Touch
+from collect.touch.heights import Reach, Touch
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,27 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 from collect.errors import StepError
 from collect.rig.config_touch import TouchConfig
 from collect.rig.devices import Rig
 from collect.rig.paper import PaperPlane
-from collect.touch.arm import TouchArm
-from collect.touch.camera import FirstInkTouch, Hands
+from collect.touch.arm import ForceTap, RigProbe, TouchArm, TouchHands
+from collect.touch.camera import FirstInkTouch
 from collect.touch.force import touch_by_force
+from collect.touch.heights import Known, PlaneResult, PointTouches, Touch, at_one_point, through
 from collect.touch.jog import NextJog, touch_by_jog
-from collect.touch.reach import Known
-from collect.touch.results import PlaneResult, PointTouches, Touch, at_one_point, through
-from collect.touch.tap import ForceTap, RigProbe
-
-
-class TouchHands(Hands, Protocol):
-    """What a rig's procedures do for zero touch."""
-
-    async def zero_touch(self) -> float:
-        """Visit the taught height; returns where the arm rests."""
-        ...
 
 
 async def measure_plane(

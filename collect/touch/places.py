@@ -1,19 +1,60 @@
-"""Which paper cells zero touch and the self-check use up, so that no press ever lands there."""
+"""Where zero touch and the self-check mark the paper, and which cells that uses up."""
 
 from __future__ import annotations
 
 import math
 
+from collect.errors import StepError
 from collect.rig.config import PaperConfig
-from collect.rig.config_touch import TouchConfig
+from collect.rig.config_touch import CameraTouchConfig, TouchConfig
 from collect.rig.paper import Sheet
-from collect.touch.camera import coarse_count, fine_count
-from collect.touch.reach import Known
-from collect.touch.selfcheck import Triangle
+from collect.touch.heights import Known, Reach
+
+Triangle = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+SLACK_STEPS = 2
+"""Fine steps beyond the coarse one, on either side: the coarse answer is no better than its step."""
+
+
+class Patch:
+    """The places of one point's spots, from its lower left: to and fro, so that neighbours in time are neighbours."""
+
+    def __init__(
+        self, at_mm: tuple[float, float], config: CameraTouchConfig, sheet_mm: tuple[float, float], lowest_z_mm: float
+    ) -> None:
+        """No spot lies lower than `lowest_z_mm`."""
+        self.lowest_z_mm = lowest_z_mm
+        self._at_mm = at_mm
+        self._sheet_mm = sheet_mm
+        self._config = config
+        self._next = 0
+
+    def take(self) -> tuple[float, float]:
+        """The next fresh place. Raises `StepError` where the patch has outgrown the sheet."""
+        row, column = divmod(self._next, self._config.columns)
+        self._next += 1
+        column = self._config.columns - 1 - column if row % 2 else column
+        pitch_mm = self._config.pitch_mm
+        x_mm, y_mm = self._at_mm[0] + column * pitch_mm, self._at_mm[1] + row * pitch_mm
+        if not (0.0 <= x_mm <= self._sheet_mm[0] and 0.0 <= y_mm <= self._sheet_mm[1]):
+            raise StepError(
+                f"the touches at ({self._at_mm[0]:g}, {self._at_mm[1]:g}) mm do not fit on the sheet: "
+                f"spot {self._next} would lie at ({x_mm:g}, {y_mm:g}) mm"
+            )
+        return x_mm, y_mm
+
+
+def fine_count(config: CameraTouchConfig) -> int:
+    """Spots of one fine row."""
+    return 1 + 2 * SLACK_STEPS + math.ceil(config.coarse_step_mm / config.fine_step_mm)
+
+
+def coarse_count(config: CameraTouchConfig, reach: Reach) -> int:
+    """Spots of a whole coarse row; it ends where ink is seen."""
+    return math.ceil((reach.start_z_mm - reach.lowest_z_mm) / config.coarse_step_mm) + 1
+
 
 MARK_MM = 3.0
 """Half the side of the paper that one mark may cover; a shallow touch leaves less."""
-
 Rect = tuple[float, float, float, float]
 """x, y, width, height in the paper frame."""
 

@@ -18,18 +18,17 @@ from calibrate.board.scale import see_board
 from calibrate.errors import CalibrationError
 from collect.errors import StepError
 from collect.motion.touches import CHECK_SPEED_MM_S, mark_moves
-from collect.photograph.ink import gray
-from collect.photograph.marks import new_marks
+from collect.photograph.new_ink import gray, new_marks
 from collect.rig.config_touch import SelfCheckConfig
 from collect.rig.devices import Rig
 from collect.rig.optics import straightened
 from collect.rig.paper import Cell, PaperPlane, Sheet
-from collect.touch.arm import TouchArm
-from collect.touch.camera import Hands
+from collect.touch.arm import Hands, TouchArm
+from collect.touch.places import Triangle
 from drivers.samples import Frame
 
 Floats = NDArray[np.float64]
-Triangle = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+
 UNEVEN = 0.2
 """How badly the second best order of the marks must fit, or a mirror image could pass for a turn."""
 LEAST_SPAN_MM = 60.0

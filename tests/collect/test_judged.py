@@ -12,7 +12,7 @@ import pytest
 from collect.engine.states import State
 from collect.engine.steps import capture as capturing
 from collect.errors import CollectAborted, NeedsOperator
-from collect.quality.check import check_drawing
+from collect.quality.checks import check_drawing
 from collect.quality.verdict import Verdict
 from drivers.sim.brush.flaws import Flaw
 from sessions.journal.journal import replay

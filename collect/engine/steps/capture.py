@@ -13,7 +13,7 @@ from collect.engine.steps.waiting import uninterrupted
 from collect.errors import BadPicture, NeedsOperator, StepError
 from collect.operator import Choice, OperatorRequest, Prompt
 from collect.protocols.steps import Result
-from collect.quality.check import check_capture, check_drawing
+from collect.quality.checks import check_capture, check_drawing
 from collect.quality.verdict import Family, Verdict
 from collect.rig.paper import Cell
 from sessions.recording.schemas import Check, Quality, Stroke

@@ -8,9 +8,9 @@ from calibrate.stroke.preprocess import Gray
 from collect.engine.steps.context import RunContext, StepContext
 from collect.engine.steps.waiting import uninterrupted
 from collect.errors import BadPicture, NeedsOperator, StepError
-from collect.photograph.ink import gray
+from collect.photograph.new_ink import gray
 from collect.protocols.steps import Result
-from collect.quality.check import cell_is_blank, check_frame
+from collect.quality.checks import cell_is_blank, check_frame
 from collect.quality.verdict import Check
 from collect.rig.optics import straightened
 

@@ -16,11 +16,11 @@ from collect.planning.moves import touch_of
 from collect.protocols.steps import Result
 from collect.rig.config_touch import TouchConfig
 from collect.rig.paper import PaperPlane
+from collect.touch.arm import ForceTap
+from collect.touch.heights import PlaneResult, kept
 from collect.touch.jog import asked
 from collect.touch.measure import measure_plane
-from collect.touch.results import PlaneResult, kept
 from collect.touch.selfcheck import self_check, triangle_on
-from collect.touch.tap import ForceTap
 from drivers.samples import Frame
 from sessions.recording.messages import Transform
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from calibrate.board.scale import PlaneFit
-from collect.quality.check import cell_is_blank, check_capture, check_drawing, check_frame
+from collect.quality.checks import cell_is_blank, check_capture, check_drawing, check_frame
 from collect.quality.picture import blur_px, glare, paper_level
 from collect.quality.verdict import Failure, Family
 from collect.rig.config_quality import QualityConfig

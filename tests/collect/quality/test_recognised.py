@@ -9,7 +9,7 @@ import pytest
 
 from bench.quality import Score, score
 from bench.quality_set import SPOTLESS_MM2, Bench, Patch, Sample
-from collect.quality.check import cell_is_blank, check_capture
+from collect.quality.checks import cell_is_blank, check_capture
 from collect.quality.verdict import Failure
 from collect.rig.config_quality import QualityConfig
 

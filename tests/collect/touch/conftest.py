@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from collect.motion.procedures import Procedures, photograph_moves
 from collect.rig.config import load_rig
 from collect.rig.devices import Rig, limits_of
-from collect.touch.tap import ForceTap
+from collect.touch.arm import ForceTap
 from drivers.force.samples import ForceSample
 from drivers.geometry import brush_pose
 from drivers.samples import Frame, Identity, Pose, PoseSample, QueuedLine, Stamp

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from collect.errors import StepError
-from collect.touch.contact import find_contact, first_ink
+from collect.touch.camera import first_ink
+from collect.touch.force import find_contact
 
 NOISE_N = 0.002
 

@@ -9,9 +9,8 @@ import pytest
 
 from collect.errors import StepError
 from collect.rig.config_touch import ForceTouchConfig
-from collect.touch.contact import Contact
-from collect.touch.force import Reading, touch_by_force
-from collect.touch.reach import Reach
+from collect.touch.force import Contact, Reading, touch_by_force
+from collect.touch.heights import Reach
 from drivers.sim.brush.brush import Brush, BrushSpec
 from drivers.sim.brush.reaction import Reaction
 from drivers.sim.config import SimConfig

@@ -15,9 +15,9 @@ from pydantic import ValidationError
 from collect.errors import NeedsOperator, StepError
 from collect.operator import Asker
 from collect.rig.config_touch import TouchConfig
+from collect.touch.heights import PlaneResult
 from collect.touch.jog import Jogged, asked
 from collect.touch.measure import measure_plane
-from collect.touch.results import PlaneResult
 from drivers.samples import Pose
 
 if TYPE_CHECKING:

@@ -1,0 +1,286 @@
+"""The checks of a capture, in order, and the verdict that they make.
+
+A new check is a name in `Failure`, a limit in `QualityConfig`, and a function here: of the measured mark in
+`MARK_CHECKS`, of the photograph or the ink where `check_capture` judges those.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrate.board.scale import PlaneFit
+from calibrate.stroke.preprocess import PX_PER_MM, Gray, Params, rectify
+from collect.quality import picture
+from collect.quality.ink import Ink, Point, Rect, around, mm2, take, tell_apart
+from collect.quality.mark import Mark, measure_mark
+from collect.quality.verdict import Check, Failure, Verdict
+from collect.rig.config_quality import QualityConfig
+from collect.rig.paper import Cell
+
+MARGIN_MM = 4.0
+"""Around the cell, where a stroke that leaves it may be found."""
+FAR_MM = 45.0
+"""Around the cell, where a press that left nothing in it is looked for."""
+LIGHT_MM = 22.0
+"""Around the cell, to tell glare from the light."""
+CROSSING_MM = 4.0
+"""Ink across the edge of a cell: more than the end of one stroke that went too far."""
+
+
+def check_frame(image: Gray, plane: PlaneFit, limits: QualityConfig) -> Verdict:
+    """Exposure and blur of an (h, w) frame; needs no ink. For the board's picture, and before any press."""
+    return Verdict((exposure(image, limits), *blurred(image, plane, limits)))
+
+
+def check_capture(
+    image: Gray,
+    plane: PlaneFit,
+    cell: Cell,
+    *,
+    height_mm: float,
+    limits: QualityConfig,
+    previous: Gray | None = None,
+    sheet_mm: tuple[float, float] | None = None,
+    anchor_mm: Point | None = None,
+) -> Verdict:
+    """Judge one press of commanded depth `height_mm` from the (h, w) photograph taken after it.
+
+    `previous` is the last sound photograph before the press, from the same camera pose: with it, old ink is told from
+    new, and a press that landed far off is found. `sheet_mm` (width, height) keeps the table beyond the sheet out.
+    `anchor_mm` is the zero-touch point where it is not the cell's own. Checks that a failed one would spoil are left
+    out of the verdict.
+    """
+    frame = check_frame(image, plane, limits)
+    if not frame.passed:
+        return frame
+    anchor = cell.anchor_mm if anchor_mm is None else anchor_mm
+    press = _Press(image, previous, plane, cell, anchor, height_mm, sheet_mm, limits)
+    ink = press.ink(MARGIN_MM)
+    checks = [
+        *frame.checks,
+        cut(ink, plane, image.shape, anchor, limits),
+        glare(image, plane, press.around(LIGHT_MM), cell.rect_mm, limits),
+    ]
+    if all(check.passed for check in checks):
+        checks += _ink_checks(press, ink)
+    return Verdict(tuple(sorted(checks, key=lambda check: list(Failure).index(check.name))))
+
+
+def check_drawing(
+    image: Gray,
+    plane: PlaneFit,
+    cell: Cell,
+    *,
+    height_mm: float,
+    limits: QualityConfig,
+    previous: Gray | None = None,
+) -> Verdict:
+    """Judge a figure, drawn down to `height_mm`, from the (h, w) photograph taken after it.
+
+    Exposure, blur, whether its cell holds ink that `previous` does not show, and none across the cell's edge, as an arm
+    would be that is still in the picture. Its shape is not judged: no two figures have one in common.
+    """
+    frame = check_frame(image, plane, limits)
+    if not frame.passed:
+        return frame
+    inked = take(image, plane.image_to_paper, cell.rect_mm, Params()).inked(limits.ink_gate)
+    if previous is not None:
+        inked = inked & ~take(previous, plane.image_to_paper, cell.rect_mm, Params()).inked(limits.ink_gate)
+    edge = np.concatenate([inked[0], inked[-1], inked[1:-1, 0], inked[1:-1, -1]])
+    return Verdict((*frame.checks, crossing(float(edge.sum()) / PX_PER_MM), blank(mm2(inked), height_mm, limits)))
+
+
+def cell_is_blank(image: Gray, plane: PlaneFit, cell: Cell, *, limits: QualityConfig) -> Check:
+    """Whether the cell may be pressed on, from an (h, w) photograph; `NEIGHBOUR` where it holds ink or is not seen."""
+    patch = take(image, plane.image_to_paper, cell.rect_mm, Params())
+    hidden_mm2 = mm2(~patch.in_view)
+    if hidden_mm2 > 0.0:
+        return unseen(cell.index, hidden_mm2, limits)
+    return before_press(cell.index, mm2(patch.inked(limits.ink_gate)), limits)
+
+
+@dataclass(frozen=True, slots=True)
+class _Press:
+    """One press as `check_capture` was given it."""
+
+    image: Gray
+    previous: Gray | None
+    plane: PlaneFit
+    cell: Cell
+    anchor_mm: Point
+    height_mm: float
+    sheet_mm: tuple[float, float] | None
+    limits: QualityConfig
+
+    def around(self, margin_mm: float) -> Rect:
+        """The cell with a margin, no farther than the sheet."""
+        return around(self.cell.rect_mm, margin_mm, self.sheet_mm)
+
+    def ink(self, margin_mm: float) -> Ink:
+        """The ink in the cell and a margin around it, told apart."""
+        window, to_paper = self.around(margin_mm), self.plane.image_to_paper
+        now = take(self.image, to_paper, window, Params())
+        before = None if self.previous is None else take(self.previous, to_paper, window, Params())
+        return tell_apart(now, before, self.cell.rect_mm, self.anchor_mm, self.limits.ink_gate)
+
+    def away_mm(self) -> float | None:
+        """Distance from the anchor to new ink outside the cell, if there is as much of it as a press leaves."""
+        if self.previous is None:
+            return None
+        ink = self.ink(FAR_MM)
+        if ink.own_mm2 < self.limits.blank_mm2_per_mm * self.height_mm:
+            return None
+        return float(np.hypot(*(ink.patch.points_mm(ink.own) - np.array(self.anchor_mm)).T).min())
+
+
+def _ink_checks(press: _Press, ink: Ink) -> list[Check]:
+    limits = press.limits
+    checks = [neighbour(ink, limits)]
+    enough = blank(ink.own_mm2, press.height_mm, limits)
+    if not enough.passed:
+        away_mm = press.away_mm()
+        return [*checks, enough if away_mm is None else far_off(away_mm, limits)]
+    mark = measure_mark(ink, press.anchor_mm)
+    assert mark is not None
+    checks += [enough, dry(mark, limits)]
+    if checks[-1].passed:
+        # The head, tip and tone that a dry brush leaves tell nothing.
+        checks += [check(mark, limits) for check in MARK_CHECKS]
+    return checks
+
+
+def _below(name: Failure, score: float, unit: str, limit: float, reason: str) -> Check:
+    passed = score < limit
+    return Check(name, score, unit, limit, passed, "" if passed else reason)
+
+
+def _at_least(name: Failure, score: float, unit: str, limit: float, reason: str) -> Check:
+    passed = score >= limit
+    return Check(name, score, unit, limit, passed, "" if passed else reason)
+
+
+def exposure(image: Gray, limits: QualityConfig) -> Check:
+    """Paper neither dark nor saturated."""
+    level = picture.paper_level(image)
+    reason = ""
+    if level < limits.dark_level:
+        reason = f"The picture is too dark: paper at {level:.0f} of 255. Turn the light on or expose longer."
+    if level >= limits.bright_level:
+        reason = f"The picture is too bright: paper at {level:.0f} of 255. Expose shorter or dim the light."
+    limit = limits.dark_level if level < 0.5 * (limits.dark_level + limits.bright_level) else limits.bright_level
+    return Check(Failure.EXPOSURE, level, "of 255", limit, not reason, reason)
+
+
+def blurred(image: Gray, plane: PlaneFit, limits: QualityConfig) -> tuple[Check, ...]:
+    """Sharp edges; none where the picture has no edge to measure, as with a bare sheet that fills it."""
+    sigma_px = picture.blur_px(image)
+    if sigma_px is None:
+        return ()
+    sigma_mm = sigma_px * plane.mm_per_px
+    reason = f"The picture is blurred by {sigma_mm:.2f} mm. Focus the lens, clean it, and see that nothing shakes."
+    return (_below(Failure.BLURRED, sigma_mm, "mm", limits.blur_mm, reason),)
+
+
+def cut(ink: Ink, plane: PlaneFit, shape: tuple[int, ...], anchor_mm: Point, limits: QualityConfig) -> Check:
+    """The stroke, or where there is none the zero-touch point, wholly in the frame."""
+    points = ink.patch.points_mm(ink.own) if ink.own.any() else np.array([anchor_mm])
+    gap_mm = picture.edge_mm(points, plane, shape)
+    reason = f"The stroke ends {max(gap_mm, 0.0):.1f} mm from the edge of the picture. Move the camera or the sheet."
+    return _at_least(Failure.CUT, gap_mm, "mm", limits.edge_mm, reason)
+
+
+def glare(image: Gray, plane: PlaneFit, window: Rect, cell_mm: Rect, limits: QualityConfig) -> Check:
+    """No reflection in the cell; `window` holds enough of the paper around it to know the light."""
+    spots = picture.glare(rectify(image, plane.image_to_paper, window), limits.glare_share)
+    scale = picture.BRIGHT_PX_PER_MM
+    left, top = cell_mm[0] - window[0], window[1] + window[3] - cell_mm[1] - cell_mm[3]
+    rows = slice(round(top * scale), round((top + cell_mm[3]) * scale))
+    columns = slice(round(left * scale), round((left + cell_mm[2]) * scale))
+    area_mm2 = float(spots[rows, columns].sum()) / scale**2
+    reason = f"{area_mm2:.0f} mm^2 of glare in the cell. Move the lamp, or wait until the ink has lost its shine."
+    return _below(Failure.GLARE, area_mm2, "mm^2", limits.glare_mm2, reason)
+
+
+def before_press(cell: int, area_mm2: float, limits: QualityConfig) -> Check:
+    """The cell holds no ink before its press."""
+    reason = f"Cell {cell} is not blank: {area_mm2:.1f} mm^2 of ink. Is this the sheet that the session says it is?"
+    return _below(Failure.NEIGHBOUR, area_mm2, "mm^2", limits.foreign_mm2, reason)
+
+
+def unseen(cell: int, hidden_mm2: float, limits: QualityConfig) -> Check:
+    """A cell that the frame cuts cannot be said to be blank."""
+    reason = (
+        f"Cell {cell} is not wholly in the picture, {hidden_mm2:.0f} mm^2 are hidden. Move the camera or the sheet."
+    )
+    return Check(Failure.NEIGHBOUR, hidden_mm2, "mm^2", limits.foreign_mm2, False, reason)
+
+
+def neighbour(ink: Ink, limits: QualityConfig) -> Check:
+    """No ink in the cell but the press's own."""
+    area_mm2 = ink.before_mm2 + ink.beside_mm2
+    source = (
+        "a stroke from next door reaches in. Keep this cell out and make the cells larger"
+        if ink.before_mm2 > ink.beside_mm2
+        else "something dripped or lies apart from the stroke. Wipe the brush on the rim after a dip"
+    )
+    reason = f"{area_mm2:.1f} mm^2 of ink in the cell are not the stroke's: {source}."
+    return _below(Failure.NEIGHBOUR, area_mm2, "mm^2", limits.foreign_mm2, reason)
+
+
+def crossing(length_mm: float) -> Check:
+    """No new ink across the edge of a figure's cell."""
+    reason = f"New ink, or the arm, lies across {length_mm:.0f} mm of the cell's edge. Is the arm out of the picture?"
+    return _below(Failure.NEIGHBOUR, length_mm, "mm", CROSSING_MM, reason)
+
+
+def blank(own_mm2: float, height_mm: float, limits: QualityConfig) -> Check:
+    """Some ink at all."""
+    least_mm2 = limits.blank_mm2_per_mm * height_mm
+    reason = f"No stroke: {own_mm2:.1f} mm^2 of ink. Dip again; if the well is full, teach the touch height anew."
+    return _at_least(Failure.BLANK, own_mm2, "mm^2", least_mm2, reason)
+
+
+def far_off(away_mm: float, limits: QualityConfig) -> Check:
+    """A press whose ink lies outside its cell."""
+    reason = f"The stroke lies {away_mm:.0f} mm away from its cell. {_WHERE}"
+    return Check(Failure.MISPLACED, away_mm, "mm", limits.misplaced_mm, False, reason)
+
+
+def dry(mark: Mark, limits: QualityConfig) -> Check:
+    """Ink without streaks of bare paper."""
+    reason = f"The brush was dry: the ink is streaky ({mark.uneven:.2f}). Dip again, deeper or longer."
+    return _below(Failure.DRY, mark.uneven, "of the mean", limits.uneven, reason)
+
+
+def misplaced(mark: Mark, limits: QualityConfig) -> Check:
+    """The mark begins where the tip touched."""
+    along, aside = mark.head_mm
+    off_mm = math.hypot(along - limits.head_mm, aside)
+    reason = f"The stroke begins {off_mm:.1f} mm from where the tip should have touched. {_WHERE}"
+    return _below(Failure.MISPLACED, off_mm, "mm", limits.misplaced_mm, reason)
+
+
+def faint(mark: Mark, limits: QualityConfig) -> Check:
+    """Dark ink."""
+    reason = f"The ink is faint: darkness {mark.tone:.2f}. Stir or renew the ink, and dip again."
+    return _at_least(Failure.FAINT, mark.tone, "of 1", limits.faint_tone, reason)
+
+
+def split(mark: Mark, limits: QualityConfig) -> Check:
+    """One group of hairs, not two."""
+    reason = f"The bristles are split: a gap of {mark.gap_mm:.1f} mm. Comb the brush together on the rim and dip again."
+    return _below(Failure.SPLIT, mark.gap_mm, "mm", limits.split_mm, reason)
+
+
+def bent(mark: Mark, limits: QualityConfig) -> Check:
+    """A mark that runs along the heading."""
+    reason = f"The tip is bent: the stroke runs {mark.bent_deg:.0f} deg off. Wipe the tip straight and dip again."
+    return _below(Failure.BENT, mark.bent_deg, "deg", limits.bent_deg, reason)
+
+
+MARK_CHECKS = (misplaced, faint, split, bent)
+"""What is judged of a mark whose ink is whole."""
+_WHERE = "Check the sheet's origin, that the sheet has not slipped, and that the brush sits firm."
