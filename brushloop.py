@@ -23,6 +23,7 @@ import collect.chains.writing_cli
 import collect.cli
 import model.train.cli
 import sessions.cli.app
+from calibrate.path_or_command import PathOrCommand
 from sessions.terminal import plain, say
 
 
@@ -63,18 +64,18 @@ app.add_typer(calibrate.validate.cli.app, name="validate")
 app.command("fit")(calibrate.fit.cli.fit)
 app.command("invert")(calibrate.invert.cli.invert)
 loop = typer.Typer(
-    cls=calibrate.cli.SessionOrCommand,
+    cls=PathOrCommand,
     help="Recover the presses of a SESSION, press them again and compare (`brushloop loop SESSION`), or only compare.",
 )
-loop.command(calibrate.cli.SESSION)(collect.chains.loop_cli.loop)
+loop.command("session")(collect.chains.loop_cli.loop)
 loop.command("compare")(calibrate.loop.cli.compare)
 app.add_typer(loop, name="loop")
 app.add_typer(sessions.cli.app.app, name="sessions")
 write = typer.Typer(
-    cls=collect.chains.writing_cli.CharactersOrCommand,
+    cls=PathOrCommand,
     help="Write characters on the rig and compare them (`brushloop write 字 --config ...`), or only plan or compare.",
 )
-write.command(collect.chains.writing_cli.CHARACTERS)(collect.chains.writing_cli.write)
+write.command("characters")(collect.chains.writing_cli.write)
 write.command("plan")(calibrate.writing.plan_cli.plan)
 write.command("compare")(calibrate.writing.cli.compare)
 write.command("learn")(calibrate.writing.cli.learn)

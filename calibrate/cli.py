@@ -1,26 +1,14 @@
-"""`brushloop calibrate SESSION` as ever, and `brushloop calibrate preprocess ...` beside it."""
+"""`brushloop calibrate SESSION`, and its further commands: show, diff, apply, preprocess."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from typer.core import TyperGroup
 
+from calibrate.path_or_command import PathOrCommand
 from sessions.terminal import say
-
-SESSION = "session"
-
-
-class SessionOrCommand(TyperGroup):
-    """A group whose first argument may be a session's path: whatever is no command's name is one."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put the command's name before a path; `./preprocess` names a session of that name."""
-        if not args or (args[0] not in self.commands and not args[0].startswith("-")):
-            args = [SESSION, *args]
-        return super().parse_args(ctx, args)
 
 
 def calibrate(
@@ -48,10 +36,10 @@ def calibrate(
 
 
 app = typer.Typer(
-    cls=SessionOrCommand,
+    cls=PathOrCommand,
     help="Fit scale and paper plane of a SESSION (`brushloop calibrate SESSION`), or look at what comes before.",
 )
-app.command(SESSION)(calibrate)
+app.command("session")(calibrate)
 
 
 @app.command()

@@ -6,37 +6,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
 from calibrate.compare.scales import MM_PER_PX
+from calibrate.path_or_command import PathOrCommand
 from sessions.terminal import say
 
 if TYPE_CHECKING:
     from calibrate.validate.diff import Difference
     from calibrate.validate.steps import Progress
 
-SESSIONS = "sessions"
 MUCH = 10
 """Lines that tell of progress where there is no terminal: one a tenth."""
 
 
-class SessionsOrCommand(TyperGroup):
-    """A group whose first argument may be a session: whatever is no command's name is one."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put the command's name before a path or an option; `./diff` names a session of that name."""
-        if not args or (args[0] not in self.commands and args[0] != "--help"):
-            args = [SESSIONS, *args]
-        return super().parse_args(ctx, args)
-
-
 app = typer.Typer(
-    cls=SessionsOrCommand,
+    cls=PathOrCommand,
     help="Compare every stroke model with every captured stroke (`brushloop validate SESSION...`).",
 )
 
 
-@app.command(SESSIONS)
+@app.command("sessions")
 def validate(
     session: Annotated[list[str], typer.Argument(help="Sessions: folders, .mcap files, or URLs with a checksum.")],
     model: Annotated[list[str] | None, typer.Option(help="Only these models; all by default.")] = None,

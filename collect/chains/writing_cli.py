@@ -3,24 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from typer.core import TyperGroup
 
 from sessions.terminal import say
-
-CHARACTERS = "characters"
-
-
-class CharactersOrCommand(TyperGroup):
-    """A group whose first argument may be what is to be written: whatever is no command's name is that."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put the command's name before characters or a file's path."""
-        if not args or (args[0] not in self.commands and not args[0].startswith("-")):
-            args = [CHARACTERS, *args]
-        return super().parse_args(ctx, args)
 
 
 def write(
