@@ -14,6 +14,7 @@ from hypothesis import settings
 for _library in ("OPENBLAS", "OMP", "MKL"):
     # Two workers have the machine's cores already: threads that wait for each other there only take them away.
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
+os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")
 
 # The same examples every time, so that a failure is that of the change; `make soak` looks for new ones.
 settings.register_profile("same", derandomize=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from drivers.camera.options import LOOPBACK_SERVER
 from drivers.samples import Pose
-from drivers.sim.camera.scene import Scene
+from drivers.sim.camera.scene import NOISE_FIELDS, Scene
 from drivers.sim.config import View
 from drivers.sim.faults.board import FaultBoard
 from drivers.sim.faults.pictures import dark, retold, torn
@@ -62,6 +62,8 @@ class MjpegServer(LoopbackServer):
         self._period_s = 1.0 / fps
         self._quality = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
         self._rendering = asyncio.Lock()
+        self._coded: deque[tuple[NDArray[np.uint8], bytes]] = deque(maxlen=NOISE_FIELDS)
+        """The newest images of the scene, which are handed out again while nothing changes, and their JPEGs."""
         self.faults: FaultBoard | None = None
         """What goes wrong here; a rig puts one board in all its servers."""
 
@@ -126,5 +128,11 @@ class MjpegServer(LoopbackServer):
 
     def _encode(self, host_ns: int, tool: Pose, black: bool) -> bytes:
         image: NDArray[np.uint8] = self._scene.render(host_ns, tool)
-        _, encoded = cv2.imencode(".jpg", dark(image.shape, host_ns) if black else image, self._quality)
-        return encoded.tobytes()
+        if black:
+            image = dark(image.shape, host_ns)
+        for coded, data in self._coded:
+            if coded is image:
+                return data
+        _, encoded = cv2.imencode(".jpg", image, self._quality)
+        self._coded.append((image, data := encoded.tobytes()))
+        return data

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -29,24 +31,21 @@ def board(table: Table) -> cv2.aruco.CharucoBoard:
 
 
 class Scene:
-    """Renders the world. The sheet is warped only when it has changed; noise is new in every frame."""
+    """Renders the world. The sheet is warped only when it has changed; each frame's noise differs from the last one's.
+
+    While nothing changes in view, one of `NOISE_FIELDS` finished frames is handed out again.
+    """
 
     def __init__(self, world: World) -> None:
         self._world = world
-        self._rng = np.random.default_rng([world.config.seed, 7])
         table, view = world.config.table, world.config.view
-        left, bottom = (v - MARGIN_MM for v in table.board_origin_mm)
-        self._origin_mm = (left, bottom)
-        board_mm = [n * table.board_square_mm for n in table.board_squares]
-        self._size_mm = (board_mm[0] + 2 * MARGIN_MM, board_mm[1] + 2 * MARGIN_MM)
-        self._blank = self._draw_blank(table)
+        self._origin_mm, self._size_mm = _extent(table)
+        self._blank, self._noise = _draw(table, world.config.seed, view.noise, (view.height_px, view.width_px))
         self.optics = Optics(view, world.config.seed)
         self.paper_to_image = self.optics.homography
         self._plane_to_image = self._raster_to_image()
-        self._noise = [
-            self._rng.normal(0.0, view.noise, (view.height_px, view.width_px)).astype(np.float32)
-            for _ in range(NOISE_FIELDS)
-        ]
+        self._finished: dict[int, tuple[tuple[int, int] | None, NDArray[np.uint8]]] = {}
+        """By noise field: where the tool's disc lay, and the frame. For the sheet as it is lit now."""
         self._lit: NDArray[np.float32] | None = None
         self._lit_version = -1
         self._count = 0
@@ -58,41 +57,29 @@ class Scene:
     def render(self, host_ns: int = 0, tool: Pose | None = None) -> NDArray[np.uint8]:
         """A (height, width) gray image of the world now; `host_ns` goes into the strip where the view has one.
 
-        With `tool` given it only reads, and may run in another thread.
+        With `tool` given it only reads, and may run in another thread. The same array, which nobody may write to, is
+        returned again for as long as it shows the same.
         """
         tool = tool or self.tool()
         if self._lit is None or self._lit_version != self._world.version:
             self._lit_version = self._world.version
             self._lit = self._light_sheet()
-        image = self._lit + self._noise[self._count % NOISE_FIELDS]
+            self._finished.clear()
+        field = self._count % NOISE_FIELDS
         self._count += 1
-        self._hide_behind_tool(image, tool)
-        frame = np.clip(image, 0.0, 255.0).astype(np.uint8)
+        disc_px = self._tool_disc(tool)
+        at_px, frame = self._finished.get(field, (None, None))
+        if frame is None or at_px != disc_px:
+            image = self._lit + self._noise[field]
+            if disc_px is not None:
+                cv2.circle(image, disc_px, self._disc_radius_px, (70.0,), -1)
+            frame = np.clip(image, 0.0, 255.0).astype(np.uint8)
+            frame.flags.writeable = False
+            self._finished[field] = disc_px, frame
         if self._world.config.view.stamp_strip:
+            frame = frame.copy()
             draw_strip(frame, host_ns)
         return frame
-
-    def _draw_blank(self, table: Table) -> NDArray[np.uint8]:
-        width, height = (round(v * PX_PER_MM) for v in self._size_mm)
-        raster = np.full((height, width), TABLE_GRAY, np.uint8)
-        fibre = cv2.GaussianBlur(self._rng.normal(0.0, 6.0, (height, width)).astype(np.float32), (0, 0), 3.0)
-        board_px = tuple(round(n * table.board_square_mm * PX_PER_MM) for n in table.board_squares)
-        x, y = table.board_origin_mm
-        top = round((self._size_mm[1] - (y - self._origin_mm[1])) * PX_PER_MM) - board_px[1]
-        column = round((x - self._origin_mm[0]) * PX_PER_MM)
-        margin = round(3.0 * PX_PER_MM)
-        raster[top - margin : top + board_px[1] + margin, column - margin : column + board_px[0] + margin] = 245
-        picture = board(table).generateImage((board_px[0], board_px[1]))
-        raster[top : top + board_px[1], column : column + board_px[0]] = np.where(picture > 127, 245, 20)
-        rows, columns = self._sheet_slices(table)
-        raster[rows, columns] = np.clip(PAPER_GRAY + fibre[rows, columns], 0, 255).astype(np.uint8)
-        return raster
-
-    def _sheet_slices(self, table: Table) -> tuple[slice, slice]:
-        top = round((self._size_mm[1] - (table.sheet_mm[1] - self._origin_mm[1])) * PX_PER_MM)
-        left = round(-self._origin_mm[0] * PX_PER_MM)
-        rows, columns = self._world.paper.density.shape
-        return slice(top, top + rows), slice(left, left + columns)
 
     def _raster_to_image(self) -> NDArray[np.float64]:
         # raster pixel centres (cv2 convention) -> mm in the paper frame -> image
@@ -104,7 +91,7 @@ class Scene:
     def _light_sheet(self) -> NDArray[np.float32]:
         table, view = self._world.config.table, self._world.config.view
         raster = self._blank.copy()
-        rows, columns = self._sheet_slices(table)
+        rows, columns = _sheet_slices(table)
         kept = 1.0 - (1.0 - INK_REFLECTANCE) * self._world.paper.density
         raster[rows, columns] = (raster[rows, columns] * kept).astype(np.uint8)
         warped = cv2.warpPerspective(
@@ -118,11 +105,57 @@ class Scene:
         lit = blurred.astype(np.float32) * self.optics.light
         return lit if self.optics.glare is None else lit + self.optics.glare
 
-    def _hide_behind_tool(self, image: NDArray[np.float32], tool: Pose) -> None:
+    @property
+    def _disc_radius_px(self) -> int:
+        return round(TOOL_CLEAR_MM * self._world.config.view.px_per_mm)
+
+    def _tool_disc(self, tool: Pose) -> tuple[int, int] | None:
+        """Pixel at the centre of the disc that the arm hides; None where all of it lies outside the image."""
+        view, radius_px = self._world.config.view, self._disc_radius_px
         x_mm, y_mm = self._world.to_paper(tool.x_mm, tool.y_mm)
         [[u, v]] = self.optics.image_of(np.array([[x_mm, y_mm]]))
-        radius_px = round(TOOL_CLEAR_MM * self._world.config.view.px_per_mm)
-        cv2.circle(image, (round(float(u)), round(float(v))), radius_px, (70.0,), -1)
+        u_px, v_px = round(float(u)), round(float(v))
+        beside = max(-u_px, u_px - view.width_px, -v_px, v_px - view.height_px) > radius_px + 1
+        return None if beside else (u_px, v_px)
+
+
+def _extent(table: Table) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Lower left corner, in the paper frame, and size of what is drawn, in mm: the board and a margin of table."""
+    left, bottom = (v - MARGIN_MM for v in table.board_origin_mm)
+    across, along = (n * table.board_square_mm + 2 * MARGIN_MM for n in table.board_squares)
+    return (left, bottom), (across, along)
+
+
+def _sheet_slices(table: Table) -> tuple[slice, slice]:
+    """Rows and columns of the sheet in the drawn raster."""
+    (left_mm, bottom_mm), (_, along_mm) = _extent(table)
+    top = round((along_mm - (table.sheet_mm[1] - bottom_mm)) * PX_PER_MM)
+    left = round(-left_mm * PX_PER_MM)
+    width, height = (round(v * PX_PER_MM) for v in table.sheet_mm)
+    return slice(top, top + height), slice(left, left + width)
+
+
+@functools.lru_cache(maxsize=2)
+def _draw(
+    table: Table, seed: int, noise: float, shape: tuple[int, int]
+) -> tuple[NDArray[np.uint8], list[NDArray[np.float32]]]:
+    """The blank sheet on its board, and fields of noise in `shape`: the same for every rig of this configuration."""
+    rng = np.random.default_rng([seed, 7])
+    (left_mm, bottom_mm), size_mm = _extent(table)
+    width, height = (round(v * PX_PER_MM) for v in size_mm)
+    raster = np.full((height, width), TABLE_GRAY, np.uint8)
+    fibre = cv2.GaussianBlur(rng.normal(0.0, 6.0, (height, width)).astype(np.float32), (0, 0), 3.0)
+    board_px = tuple(round(n * table.board_square_mm * PX_PER_MM) for n in table.board_squares)
+    x, y = table.board_origin_mm
+    top = round((size_mm[1] - (y - bottom_mm)) * PX_PER_MM) - board_px[1]
+    column = round((x - left_mm) * PX_PER_MM)
+    margin = round(3.0 * PX_PER_MM)
+    raster[top - margin : top + board_px[1] + margin, column - margin : column + board_px[0] + margin] = 245
+    picture = board(table).generateImage((board_px[0], board_px[1]))
+    raster[top : top + board_px[1], column : column + board_px[0]] = np.where(picture > 127, 245, 20)
+    rows, columns = _sheet_slices(table)
+    raster[rows, columns] = np.clip(PAPER_GRAY + fibre[rows, columns], 0, 255).astype(np.uint8)
+    return raster, [rng.normal(0.0, noise, shape).astype(np.float32) for _ in range(NOISE_FIELDS)]
 
 
 STRIP_BITS = 64
