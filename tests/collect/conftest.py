@@ -18,10 +18,20 @@ from collect.engine.engine import Engine
 from collect.engine.opening import Opening, find_resumable, open_store
 from drivers.clock import HostClock
 from drivers.sim.brush.flaws import Flaw
-from drivers.sim.config import SimConfig, View
+from drivers.sim.config import SimConfig, Table, View
 from drivers.sim.rig import LoopbackRig
 
 SMALL_VIEW = View(width_px=512, height_px=384, px_per_mm=1.56, fps=50.0)
+SMALL_TABLE = Table(
+    sheet_mm=(110.0, 80.0),
+    board_origin_mm=(-20.0, -20.0),
+    board_squares=(15, 12),
+    board_square_mm=10.0,
+    board_marker_mm=7.0,
+    well_mm=(150.0, 20.0),
+)
+SHARP_VIEW = View(width_px=1024, height_px=832, px_per_mm=6.25, centre_mm=(55.0, 40.0), fps=20.0)
+"""Of the small table, as sharp as the camera is by default: a quarter of its pixels."""
 
 
 @contextmanager
@@ -101,22 +111,23 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
 
 @pytest.fixture
 def sharp_lab(tmp_path: Path) -> Iterator[Lab]:
-    """With the camera's full sharpness, so that captures are judged; one stroke, and nothing splits by itself."""
-    with sharp(tmp_path, View(fps=20.0)) as made:
+    """Sharp enough that captures are judged, on a small sheet; one stroke, and nothing splits by itself."""
+    with sharp(tmp_path, SHARP_VIEW) as made:
         yield made
 
 
 @pytest.fixture
 def bent_lab(tmp_path: Path) -> Iterator[Lab]:
-    """The same with a lens that distorts by ten pixels and more; no lens file is named yet."""
-    with sharp(tmp_path, View(fps=20.0, k1=-0.08), latency_ms=500) as made:
+    """A whole sheet through a lens that distorts by ten pixels and more; no lens file is named yet."""
+    view = View(width_px=1024, height_px=768, px_per_mm=3.125, fps=20.0, k1=-0.08)
+    with sharp(tmp_path, view, Table(), latency_ms=500) as made:
         yield made
 
 
 @contextmanager
-def sharp(tmp_path: Path, view: View, latency_ms: int = 100) -> Iterator[Lab]:
+def sharp(tmp_path: Path, view: View, table: Table = SMALL_TABLE, latency_ms: int = 100) -> Iterator[Lab]:
     """A self-check photographs as soon as the arm has left; on a busy machine frames are older than usual."""
-    with serving(SimConfig(rate=60.0, view=view)) as rig:
+    with serving(SimConfig(rate=60.0, view=view, table=table)) as rig:
         made = Lab(rig, tmp_path)
         text = (
             rig.toml()

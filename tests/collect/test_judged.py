@@ -88,7 +88,7 @@ def test_an_operator_who_watches_may_keep_it(sharp_lab: Lab) -> None:
 def test_ink_on_a_cell_that_should_be_blank_is_seen_before_the_brush_is_dipped(sharp_lab: Lab) -> None:
     world = sharp_lab.rig.world
     ink_ml = world.well.ml
-    world.paper.lay(world.brush.press(13.0, 0.0, ink_load=1.0, press_seed=5), 31.0, 159.0, 0.0)
+    world.paper.lay(world.brush.press(13.0, 0.0, ink_load=1.0, press_seed=5), 31.0, 67.0, 0.0)
     world.version += 1
     with pytest.raises(NeedsOperator, match=r"cells? of sheet 1 that should be blank"):
         run(sharp_lab.engine())
@@ -99,7 +99,7 @@ def test_ink_on_a_cell_that_should_be_blank_is_seen_before_the_brush_is_dipped(s
 def test_a_full_sheet_is_changed_on_the_screen_and_the_run_goes_on(sharp_lab: Lab) -> None:
     text = (sharp_lab.folder / "rig.toml").read_text(encoding="utf-8")
     (sharp_lab.folder / "rig.toml").write_text(
-        text.replace("cell_mm = [40.0, 24.0]", "cell_mm = [200.0, 120.0]"), encoding="utf-8"
+        text.replace("cell_mm = [40.0, 24.0]", "cell_mm = [100.0, 60.0]"), encoding="utf-8"
     )
     sharp_lab.write_protocol("[13.0, 15.0]", "[0.0]")
     engine = sharp_lab.engine(watched=True)
@@ -125,11 +125,11 @@ def test_saying_no_to_real_hardware_leaves_it_as_it_is(sharp_lab: Lab, monkeypat
 
 
 FIGURE = """kind = "write"
-cell_mm = [60.0, 60.0]
+cell_mm = [50.0, 36.0]
 [[figures]]
 name = "bar"
 [[figures.strokes]]
-points = [[15.0, 30.0, 5.0, 0.0, 0.0], [40.0, 30.0, 5.0, 0.0, 0.0]]
+points = [[12.0, 18.0, 5.0, 0.0, 0.0], [37.0, 18.0, 5.0, 0.0, 0.0]]
 """
 
 

@@ -32,8 +32,8 @@ def lens_file(folder: Path, k1: float = K1) -> Path:
         software="brushloop test",
         photographs={},
         board="a board",
-        size_px=(2048, 1536),
-        matrix=(2048.0, 2048.0, 1023.5, 767.5),
+        size_px=(1024, 768),
+        matrix=(1024.0, 1024.0, 511.5, 383.5),
         distortion=(k1, 0.0, 0.0, 0.0, 0.0),
         focal_se_px=(1.0, 1.0),
         rms_px=0.1,
@@ -66,8 +66,8 @@ def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> No
     [(schema, _, message)] = container.messages(Recording(folder).path, [str(Topic.CALIBRATION)])
     told = CameraCalibration.FromString(message.data)
     assert schema is not None
-    assert (schema.name, told.width, told.height) == ("foxglove.CameraCalibration", 2048, 1536)
-    assert (list(told.D), told.K[0]) == ([K1, 0.0, 0.0, 0.0, 0.0], 2048.0)
+    assert (schema.name, told.width, told.height) == ("foxglove.CameraCalibration", 1024, 768)
+    assert (list(told.D), told.K[0]) == ([K1, 0.0, 0.0, 0.0, 0.0], 1024.0)
 
     # The review looks through the recorded lens: the file that rig.toml names does not lie beside its snapshot.
     review = Review(folder)
