@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +22,7 @@ class Line:
     @property
     def interval(self) -> tuple[float, float]:
         """95 % interval of the slope (Student's t with n - 2 degrees of freedom)."""
-        reach = float(stats.t.ppf(0.975, self.n - 2)) * self.slope_se
+        reach = float(stdtrit(self.n - 2, 0.975)) * self.slope_se
         return self.slope - reach, self.slope + reach
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from calibrate.board.cameras import TwoCameras, two_cameras
 from calibrate.board.detect import View
@@ -66,7 +66,7 @@ class Fitted:
         """Half of the 95 % intervals of fx and fy: of the noise in these views, not of a board that is not flat."""
         if self.focal_se_px is None:
             return None
-        reach = float(student.ppf(0.975, min(self.ways, MOST_LEFT_OUT) - 1))
+        reach = float(stdtrit(min(self.ways, MOST_LEFT_OUT) - 1, 0.975))
         return reach * self.focal_se_px[0], reach * self.focal_se_px[1]
 
 

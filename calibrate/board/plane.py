@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from calibrate.board.lens import Floats, Lens
 from calibrate.board.scale import MOST_OUTLIERS, WORST_RMS_PX, apply, homography
@@ -94,7 +94,7 @@ def fit_bent_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, rad
     # How far each corner's error moves the scale, (n, 2).
     pull = (jacobian @ np.linalg.pinv(jacobian.T @ jacobian) @ model.slope(fitted.x, middle)).reshape(-1, 2)
     spread = _spread(pull, left.reshape(-1, 2), paper_mm[kept], float(left @ left) / free)
-    reach = float(student.ppf(0.975, free)) * spread
+    reach = float(stdtrit(free, 0.975)) * spread
     refined, image_to_paper = model.parts(fitted.x)
     straight = lens.straight(pixels[kept])
     flat = apply(homography(paper_mm[kept], straight, where), paper_mm[kept]) - straight
