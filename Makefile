@@ -3,16 +3,24 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+TORCH ?= auto
 
 .PHONY: demo test lint types bench soak clean
 .DELETE_ON_ERROR:
 
-$(STAMP): requirements.lock pyproject.toml
+$(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "brushloop needs python3.11 or newer; set PYTHON=..."; exit 2; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+
+# What brushloop needs; TORCH=cuda or TORCH=cpu overrides the choice of torch's build.
+$(STAMP): requirements/run.lock requirements/install.py pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python requirements/install.py run --torch $(TORCH)
 	@touch $@
+
+# What tests and checks need as well.
+$(STAMP)-dev: requirements/run.lock requirements/dev.lock requirements/install.py pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python requirements/install.py dev --torch $(TORCH)
+	@touch $(STAMP) $@
 
 demo: $(STAMP)  ## collect, calibrate and validate a short session on the loopback rig
 	$(BIN)/brushloop demo
@@ -20,18 +28,18 @@ demo: $(STAMP)  ## collect, calibrate and validate a short session on the loopba
 test: lint types  ## lint, layers, types, and the tests
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
-lint: $(STAMP)
+lint: $(STAMP)-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
-types: $(STAMP)
+types: $(STAMP)-dev
 	$(BIN)/pyright
 
-bench: $(STAMP)  ## every bench, one JSON object a line
+bench: $(STAMP)-dev  ## every bench, one JSON object a line
 	$(BIN)/python -m bench --json
 
-soak: $(STAMP)  ## long kill and load loops, and property tests on new examples
+soak: $(STAMP)-dev  ## long kill and load loops, and property tests on new examples
 	$(BIN)/python -m pytest -m soak --timeout 3600
 	$(BIN)/python -m pytest --hypothesis-profile search
 
