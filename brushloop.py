@@ -100,7 +100,7 @@ def sim(
     """
     from drivers.sim.brush.brush import BrushSpec
     from drivers.sim.config import SimConfig
-    from drivers.sim.rig import serve
+    from drivers.sim.serve import serve
 
     config = SimConfig(seed=seed, rate=rate, arcs_port=arcs_port, camera_port=camera_port, brush=BrushSpec(seed=seed))
     serve(config, write_rig, idle_exit, say, faults=faults, control=control)
@@ -124,7 +124,7 @@ def fault(
     """Break a device of a loopback rig that runs, look at what hangs, or be the person at its pendant."""
     from json import dumps
 
-    from drivers.sim.faults.cli import ask, request_of
+    from drivers.sim.fault_client import ask, request_of
 
     options = {"after_s": after_s, "on": on, "nth": nth, "phase": phase, "press": press, "count": count}
     request = request_of(what, kind, options | {"for_s": for_s, "late_s": late_s, "id": ident})

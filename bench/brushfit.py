@@ -21,7 +21,8 @@ from calibrate.fit.adaptive import next_press
 from calibrate.fit.bezier import RefittedBezier, refit_bezier
 from calibrate.fit.fit import Grid, Pressed, fit_presses
 from calibrate.fit.heldout import predictor
-from drivers.sim.brush.brush import Brush, BrushSpec, Footprint
+from drivers.sim.brush.brush import Brush, BrushSpec
+from drivers.sim.brush.paper import Footprint
 from model.fitted import FittedPress
 
 PX_MM, SIZE_PX = 0.3, 128

@@ -13,7 +13,8 @@ from typing import Any
 
 import torch
 
-from drivers.sim.brush.brush import Brush, BrushSpec, Footprint
+from drivers.sim.brush.brush import Brush, BrushSpec
+from drivers.sim.brush.paper import Footprint
 from model.ccdbsm import Brush as ModelBrush
 from model.ccdbsm import ccdbsm
 

@@ -20,8 +20,8 @@ from collect.quality.verdict import Failure
 from collect.rig.config import PaperConfig
 from collect.rig.paper import Cell, Sheet
 from drivers.geometry import brush_pose
-from drivers.sim.brush.brush import BrushSpec, Flaw, Footprint
-from drivers.sim.brush.paper import PX_PER_MM
+from drivers.sim.brush.brush import BrushSpec, Flaw
+from drivers.sim.brush.paper import PX_PER_MM, Footprint
 from drivers.sim.camera.scene import Scene
 from drivers.sim.config import SimConfig, Table, View
 from drivers.sim.world import World

@@ -14,7 +14,7 @@ from bench import cadence, presses, stops
 from bench.harness import Result, machine, percentile
 from bench.processes import HOST, started
 from collect.rig.config import RigConfig, load_rig
-from drivers.arcs.frames import encode
+from drivers.arcs.framing import encode
 from drivers.arcs.rpc import Framing, RpcConnection, encode_request, request_id
 
 BLOCK = 50

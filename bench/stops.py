@@ -17,7 +17,7 @@ from bench.harness import BenchError, Result, percentile
 from bench.processes import HOST, ROOT
 from collect.rig.config import RigConfig
 from collect.rig.devices import make_robot
-from drivers.arcs.frames import encode
+from drivers.arcs.framing import encode
 from drivers.arcs.rpc import encode_request, request_id
 from drivers.clock import HostClock
 from drivers.geometry import brush_pose

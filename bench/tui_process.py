@@ -63,8 +63,7 @@ def busy_engine() -> Any:
     from collect.engine.snapshot import CellCount, Snapshot
     from collect.engine.states import State
     from collect.engine.telemetry import Picture, Telemetry
-    from drivers.force.samples import ForceSample
-    from drivers.samples import Stamp
+    from drivers.samples import ForceSample, Stamp
 
     class Busy:
         def __init__(self) -> None:

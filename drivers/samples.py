@@ -74,6 +74,15 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True)
+class ForceSample:
+    """Force in N and torque in Nm in the sensor's frame, less the bias; `stamp.device_ns` is the CAN adapter's time."""
+
+    stamp: Stamp
+    force_n: tuple[float, float, float]
+    torque_nm: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
 class Identity:
     """Who answered: goes into the header of every recording, so that a number can be traced to its source."""
 

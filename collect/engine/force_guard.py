@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from collect.errors import ForceTooHigh
 from collect.rig.devices import Rig
-from drivers.force.samples import ForceSample
+from drivers.samples import ForceSample
 
 CHECK_S = 0.02
 """How often a silent sensor is looked for: silence must not pass for no force."""

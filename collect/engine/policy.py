@@ -7,7 +7,7 @@ from enum import StrEnum
 from collect.errors import BadPicture, ForceTooHigh, JogGivenUp, NeedsOperator, SheetFull, StepError, StepVoid
 from collect.protocols.steps import Step, StepKind
 from drivers.errors import ArmMoved, DeviceError, DeviceTimeout, RobotNotSafe, SettingsChanged, Stuck
-from drivers.ink.errors import InkRefused
+from drivers.ink.port import InkRefused
 
 MAX_FAILURES = 3
 """The third failure of one step is not chance: a person decides."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collect.errors import ForceTooHigh, JogGivenUp, SheetFull, StepError, describe
 from collect.operator import Choice, Prompt
 from drivers.errors import ArmMoved, DeviceError, MotionError, SettingsChanged
-from drivers.ink.errors import InkRefused
+from drivers.ink.port import InkRefused
 
 STOP = Choice("x", "stop the run")
 GO_ON = "g"

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 from collect.engine.cadence import Arrivals, Sections
 from drivers.clock import Clock
-from drivers.force.samples import ForceSample
-from drivers.samples import Frame, PoseSample, Stamp
+from drivers.samples import ForceSample, Frame, PoseSample, Stamp
 from sessions.errors import SessionError
 from sessions.recording.messages import (
     Transform,

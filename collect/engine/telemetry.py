@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from drivers.force.samples import ForceSample
 from drivers.protocols import Robot
-from drivers.samples import Identity, Pose, PoseSample, QueuedLine
+from drivers.samples import ForceSample, Identity, Pose, PoseSample, QueuedLine
 
 if TYPE_CHECKING:
     from collections.abc import Callable

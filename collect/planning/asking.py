@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 from collect.errors import ConfigError
 from collect.rig.config import RigConfig
 from drivers.arcs.controller import Controller
-from drivers.arcs.generation import open_arcs
 from drivers.arcs.joints import joint_positions
 from drivers.arcs.robot import AUBOPE_PORT
-from drivers.arcs.rpc import RpcConnection
+from drivers.arcs.rpc import RpcConnection, open_arcs
 from drivers.errors import ProtocolViolation
 from drivers.geometry import to_wire
 from drivers.samples import Pose

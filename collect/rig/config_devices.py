@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from calibrate.board.lens import LensUsed
 from collect.rig.config_file import Config, Finite, Positive, Range
-from drivers.force.samples import LOOPBACK_CHANNEL
+from drivers.force.rounds import LOOPBACK_CHANNEL
 
 MOST_STALE_MS = 100.0
 """At 20 mm/s a brush goes down 2 mm meanwhile, unfelt."""

@@ -16,8 +16,7 @@ from collect.rig.config_touch import ForceTouchConfig
 from collect.rig.devices import Rig
 from collect.touch.force import Reading
 from drivers.clock import Clock
-from drivers.force.samples import ForceSample
-from drivers.samples import Frame, QueuedLine
+from drivers.samples import ForceSample, Frame, QueuedLine
 
 
 class Hands(Protocol):

@@ -1,8 +1,18 @@
-"""Return codes and modes of ARCS by name, and what each means for the person at the arm."""
+"""Return codes, modes and errors of ARCS, and what each means for the person at the arm.
+
+MotionError
+ +-- WrongOperationalMode   the pendant's mode switch is not on Automatic
+ +-- MotionRefused
+ |    +-- QueueFull         another client fills the controller's queue
+ +-- MotionFailed
+      +-- OutOfReach        accepted, then failed in planning: messages 30047 and 30048
+"""
 
 from __future__ import annotations
 
 from enum import IntEnum, StrEnum
+
+from drivers.errors import MotionError, MotionFailed, MotionRefused
 
 LOOPBACK_CONTROL_BOX = "brushloop-loopback"
 """What the loopback controller answers to `getControlBoxType`; no robot maker calls a cabinet that."""
@@ -95,3 +105,35 @@ def refusal(code: int) -> tuple[str, str]:
         ReturnCode.INVALID_ARGUMENT: "Report this as a defect: the controller refuses an argument of the driver.",
     }
     return name, remedies.get(ReturnCode(abs(code)), "") if abs(code) in known else ""
+
+
+class WrongOperationalMode(MotionError):
+    """The operational mode is not one that a program may move the arm in; `mode` is the controller's word for it."""
+
+    def __init__(self, device: str, op: str, mode: str) -> None:
+        self.mode = mode
+        super().__init__(
+            device,
+            op,
+            f"operational mode is {mode}",
+            condition="Nothing was set or powered.",
+            remedy="Turn it to Automatic on the pendant; nothing here does that for you.",
+        )
+
+
+class QueueFull(MotionRefused):
+    """The controller's queue has no room, although this driver queues few lines and waits."""
+
+
+class OutOfReach(MotionFailed):
+    """The controller accepted a target and could not plan a way to it; `code` is its message."""
+
+    def __init__(self, device: str, op: str, code: int, name: str) -> None:
+        self.code = code
+        super().__init__(
+            device,
+            op,
+            f"the controller reports {code} ({name})",
+            condition="The arm was told to stop.",
+            remedy="Bring the target within reach: move the sheet or turn the brush, then teach again.",
+        )

@@ -12,13 +12,13 @@ from drivers.arcs.codes import (
     CONDITION_AND_REMEDY,
     MOVING_ALLOWED,
     UNKNOWN_CONDITION,
+    QueueFull,
     ReturnCode,
     RobotMode,
     SafetyMode,
     refusal,
 )
-from drivers.arcs.errors import QueueFull
-from drivers.arcs.numbers import numbers
+from drivers.arcs.framing import numbers
 from drivers.arcs.rpc import DEVICE, RpcConnection
 from drivers.errors import DeviceError, MotionRefused, ProtocolViolation, RobotNotSafe
 from drivers.geometry import from_wire, to_wire

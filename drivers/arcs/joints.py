@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from drivers.arcs.controller import Controller
-from drivers.arcs.numbers import numbers
+from drivers.arcs.framing import numbers
 from drivers.arcs.rpc import DEVICE
 from drivers.errors import LimitExceeded, ProtocolViolation
 from drivers.geometry import distance, from_wire, to_wire

@@ -8,18 +8,13 @@ from collections.abc import Callable, Coroutine, Sequence
 from drivers.arcs.codes import LOOPBACK_CONTROL_BOX
 from drivers.arcs.controller import Condition, Controller
 from drivers.arcs.departure import Departure
-from drivers.arcs.following import feed, legs_of
-from drivers.arcs.generation import open_arcs
 from drivers.arcs.joints import checked_path, reachable
-from drivers.arcs.messages import Messages
-from drivers.arcs.options import ArcsOptions
-from drivers.arcs.queued import capped, queue_all
-from drivers.arcs.readying import make_ready, power_on
-from drivers.arcs.rpc import DEVICE, RpcConnection
-from drivers.arcs.stopping import Stopper
+from drivers.arcs.queueing import capped, feed, legs_of, queue_all
+from drivers.arcs.rpc import DEVICE, RpcConnection, open_arcs
+from drivers.arcs.settings import ArcsOptions, make_ready, power_on
+from drivers.arcs.stopping import Stopper, Watchdog
 from drivers.arcs.telemetry import Telemetry
-from drivers.arcs.waiting import Tolerance, planned_s, until_settled
-from drivers.arcs.watchdog import Watchdog
+from drivers.arcs.waiting import Messages, Tolerance, planned_s, until_settled
 from drivers.clock import Clock
 from drivers.errors import DeviceError, MotionFailed, NotConnected
 from drivers.limits import Limits

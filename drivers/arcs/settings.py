@@ -1,4 +1,8 @@
-"""What a press depends on and any client may change: read back, and held against what was set."""
+"""How an arm is set up: what is configured, what is set before the arm is powered, and what is read back.
+
+Any client may change what a press depends on, so a return code is no proof, least of all `ignored`. No step here moves
+the arm or clears a stop.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +12,44 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.arcs.controller import Controller
-from drivers.arcs.numbers import numbers
-from drivers.arcs.options import ArcsOptions
-from drivers.arcs.rpc import DEVICE
+from drivers.arcs.codes import RobotMode, WrongOperationalMode
+from drivers.arcs.controller import Controller, accepted
+from drivers.arcs.framing import numbers
+from drivers.arcs.rpc import DEVICE, Framing
+from drivers.arcs.waiting import until_mode
 from drivers.errors import ProtocolViolation, RpcError, SettingsChanged
+
+
+@dataclass(frozen=True, slots=True)
+class ArcsOptions:
+    """Where the controller is and how the arm is set up."""
+
+    host: str
+    port: int = 30004
+    tcp_offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Flange to brush tip."""
+    position_tolerance_mm: float = 0.05
+    rotation_tolerance_deg: float = 0.1
+    poll_s: float = 0.02
+    telemetry_hz: float = 100.0
+    stale_after_ms: float = 500.0
+    power_timeout_s: float = 60.0
+    stop_acc_m_s2: float = 2.0
+    framing: Framing = "sof"
+    """`sof` as the maker's client speaks, `bare` as the maker documents; a cabinet may well take only one of them."""
+    rtde_port: int | None = None
+    """Where poses are pushed from, 30010 on a cabinet; None polls for them."""
+    payload_kg: float | None = None
+    """Mass at the flange; None leaves what is set on the pendant, as with the three below."""
+    payload_cog_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Centre of that mass, from the flange."""
+    collision_level: int | None = None
+    """0 is off, 9 is the most sensitive."""
+    speed_fraction: float | None = None
+    """Of every speed, in (0, 1]."""
+    watchdog_s: float | None = None
+    """After so long without a sign of life the controller goes into a protective stop; None arms no watchdog."""
+
 
 METHOD_NOT_FOUND = -32601
 TOLERANCE = 1e-3
@@ -113,3 +150,57 @@ def _in_words(setting: Setting, value: Value) -> str:
         listed = figures[0] if len(figures) == 1 else f"({', '.join(figures)})"
         parts.append(f"{listed} {unit}".strip())
     return ", ".join(parts)
+
+
+async def make_ready(controller: Controller, options: ArcsOptions, on_notice: Callable[[str], None]) -> Settings:
+    """Check the operational mode, then set tool, payload, collision level and speed, where configured, and read all
+    back: a return code is no proof, least of all `ignored`.
+
+    Raises `WrongOperationalMode`, `MotionRefused` for what the controller does not take, and `SettingsChanged` for what
+    it says that it took and has not.
+    """
+    _require_automatic((await read_back(controller))[OPERATIONAL_MODE], on_notice)
+    await controller.set_tcp_offset(options.tcp_offset_mm)
+    if options.payload_kg is not None:
+        params = {
+            "m": options.payload_kg,
+            "cog": [v / 1e3 for v in options.payload_cog_mm],
+            "aom": [0.0] * 3,
+            "inertia": [0.0] * 6,
+        }
+        accepted("setPayload", await controller.ask("RobotConfig.setPayload", **params))
+    if options.collision_level is not None:
+        code = await controller.ask("RobotConfig.setCollisionLevel", level=options.collision_level)
+        accepted("setCollisionLevel", code)
+    if options.speed_fraction is not None:
+        code = await controller.ask("MotionControl.setSpeedFraction", fraction=options.speed_fraction)
+        accepted("setSpeedFraction", code)
+    found = await read_back(controller)
+    require_same("power on", configured(options), found)
+    for name in (name for name, value in found.items() if value is None and name != OPERATIONAL_MODE):
+        on_notice(f"the controller does not tell its {name}: whether it changes cannot be seen")
+    return found
+
+
+async def power_on(controller: Controller, options: ArcsOptions) -> None:
+    """Power the arm and release its brakes, where that was not done. Raises `RobotNotSafe`, `DeviceTimeout`."""
+
+    async def until(*wanted: RobotMode) -> None:
+        await until_mode(controller, {*wanted}, timeout_s=options.power_timeout_s, poll_s=options.poll_s)
+
+    await controller.require_safe("power on")
+    if await controller.mode() != RobotMode.RUNNING:
+        await controller.ask("RobotManage.poweron")
+        await until(RobotMode.IDLE, RobotMode.RUNNING)
+        await controller.ask("RobotManage.startup")
+        await until(RobotMode.RUNNING)
+
+
+def _require_automatic(mode: Value, on_notice: Callable[[str], None]) -> None:
+    """Manual, or a word that is none, is for a person beside the arm."""
+    if mode is None:
+        on_notice("the controller has no operational mode to check")
+    elif mode == "Disabled":
+        on_notice("operational modes are disabled on this cabinet")
+    elif mode != "Automatic":
+        raise WrongOperationalMode(DEVICE, "power on", str(mode))

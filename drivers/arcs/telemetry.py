@@ -7,10 +7,10 @@ import contextlib
 from collections.abc import Callable, Generator
 
 from drivers.arcs.controller import Controller
-from drivers.arcs.numbers import numbers
-from drivers.arcs.options import ArcsOptions
+from drivers.arcs.framing import numbers
 from drivers.arcs.rpc import DEVICE
 from drivers.arcs.rtde import RtdeStream
+from drivers.arcs.settings import ArcsOptions
 from drivers.arcs.waiting import Tolerance
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceTimeout, NotConnected, ProtocolViolation, Stale

@@ -13,8 +13,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, cast
 
 from drivers.camera.health import FrameHealth
-from drivers.camera.options import DEVICE, CameraOptions
-from drivers.camera.source import Source, open_source
+from drivers.camera.source import DEVICE, CameraOptions, Source, open_source
 from drivers.clock import Clock
 from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected
 from drivers.samples import Frame, Identity, Stamp

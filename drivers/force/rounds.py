@@ -14,7 +14,12 @@ from __future__ import annotations
 
 import struct
 
-from drivers.force.samples import Wrench
+Wrench = tuple[float, float, float, float, float, float]
+"""Fx, Fy, Fz in N and Mx, My, Mz in Nm, in the sensor's frame."""
+
+LOOPBACK_CHANNEL = "loopback-force-board"
+"""The loopback rig's bus on a socketcand gateway. Longer than the 15 characters that a network interface's name may
+have, so no gateway to a real bus can serve it."""
 
 COMMAND_ID = 0x080
 START = b"\x02"

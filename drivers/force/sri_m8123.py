@@ -14,10 +14,9 @@ from dataclasses import dataclass
 
 from drivers.clock import Clock
 from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, LimitExceeded, NotConnected, Stale, Stuck
-from drivers.force.rounds import BITRATE, RoundAssembler
-from drivers.force.samples import ForceHealth, ForceSample, Wrench
-from drivers.force.stream import BusSettings, RoundStream
-from drivers.samples import Identity, Stamp
+from drivers.force.rounds import BITRATE, RoundAssembler, Wrench
+from drivers.force.stream import BusSettings, ForceHealth, RoundStream
+from drivers.samples import ForceSample, Identity, Stamp
 
 DEVICE = "force"
 AXES = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")

@@ -15,8 +15,7 @@ from typing import Any
 import can
 
 from drivers.clock import Clock
-from drivers.force.rounds import COMMAND_ID, START, STOP, RoundAssembler
-from drivers.force.samples import LOOPBACK_CHANNEL, ForceHealth, Wrench
+from drivers.force.rounds import COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, RoundAssembler, Wrench
 from drivers.samples import Stamp
 
 RECEIVE_S = 0.05
@@ -37,6 +36,22 @@ class BusSettings:
     host: str | None = None
     """Of a gateway (`socketcand`); None where the adapter is in this machine."""
     port: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ForceHealth:
+    """How the stream has been since `connect`."""
+
+    rate_hz: float
+    """Measured over the newest rounds; 0 before the second."""
+    rounds: int
+    torn: int
+    """Rounds of which a frame was missing, late or malformed; dropped."""
+    refused: int
+    """Whole rounds with NaN, inf or more than the sensor's range; dropped."""
+    gaps: int
+    """Pauses between good rounds longer than `gap_ms`."""
+    bus_errors: int
 
 
 @dataclass(frozen=True, slots=True)

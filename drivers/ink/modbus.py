@@ -12,7 +12,7 @@ from __future__ import annotations
 import struct
 
 from drivers.errors import ProtocolViolation
-from drivers.ink.crc import crc16
+from drivers.ink.port import crc16
 
 DEVICE = "pump"
 WRITE_REGISTER = 0x06

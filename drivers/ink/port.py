@@ -1,21 +1,73 @@
-"""A serial line that asks and waits for the answer, in one worker thread that owns the port from open to close.
+"""What both ink devices share: the serial line, its checksum, limits on doses, and the error of a refusal.
 
-One thread, so that an exchange whose caller was cancelled still ends before the next begins: two requests at once
-on a half-duplex line would destroy each other.
+One worker thread owns the port from open to close, so that an exchange whose caller was cancelled still ends before
+the next begins: two requests at once on a half-duplex line would destroy each other.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal, Protocol, TypeVar, cast
 
-from drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation
+from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, LimitExceeded, NotConnected, ProtocolViolation
+
+
+class InkRefused(DeviceError):
+    """The device understood the request and refused it; `code` is its own number for the reason."""
+
+    def __init__(self, device: str, op: str, code: int, text: str, *, condition: str = "", remedy: str = "") -> None:
+        self.code = code
+        super().__init__(device, op, f"refused with {code} ({text})", condition=condition, remedy=remedy)
+
+
+_POLYNOMIAL = 0xA001  # 0x8005, reflected
+
+
+def crc16(data: bytes) -> int:
+    """CRC-16/MODBUS of `data`: 0x4B37 for b"123456789"."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc >> 1) ^ (_POLYNOMIAL if crc & 1 else 0)
+    return crc
+
+
+MINUTE_NS = 60 * 10**9
+
+
+class DoseBudget:
+    """A limit per dose and one per minute, both in ml.
+
+    A dose that failed still counts: ink may have flowed before the reply was lost.
+    """
+
+    def __init__(self, device: str, *, smallest_ml: float, max_dose_ml: float, max_per_minute_ml: float) -> None:
+        self._device = device
+        self._smallest_ml = smallest_ml
+        self._max_dose_ml = max_dose_ml
+        self._max_per_minute_ml = max_per_minute_ml
+        self._given: deque[tuple[int, float]] = deque()
+
+    def take(self, volume_ml: float, now_ns: int) -> None:
+        """Count a dose at `now_ns`. Raises `LimitExceeded`, and then counts nothing."""
+        if not math.isfinite(volume_ml) or not self._smallest_ml * (1 - 1e-9) <= volume_ml <= self._max_dose_ml:
+            raise LimitExceeded(self._device, "dose", volume_ml, self._smallest_ml, self._max_dose_ml, "ml")
+        while self._given and now_ns - self._given[0][0] >= MINUTE_NS:
+            self._given.popleft()
+        within_ml = volume_ml + sum(ml for _, ml in self._given)
+        if within_ml > self._max_per_minute_ml * (1 + 1e-9):
+            raise LimitExceeded(self._device, "dose per minute", within_ml, 0.0, self._max_per_minute_ml, "ml")
+        self._given.append((now_ns, volume_ml))
+
 
 MAX_REPLY_BYTES = 4096
 """Far above any reply; a device that chatters without end must not fill the memory."""

@@ -15,10 +15,8 @@ from typing import Any, Literal
 
 from drivers.clock import Clock
 from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, ProtocolViolation
-from drivers.ink.budget import DoseBudget
-from drivers.ink.errors import InkRefused
 from drivers.ink.modbus import DEVICE, EXCEPTIONS, find_reply, write_register
-from drivers.ink.port import SerialPort, SerialSettings
+from drivers.ink.port import DoseBudget, InkRefused, SerialPort, SerialSettings
 from drivers.samples import Identity
 
 SPEED_REGISTER = 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.force.samples import LOOPBACK_CHANNEL
+from drivers.force.rounds import LOOPBACK_CHANNEL
 from drivers.sim.config import SimConfig
 
 LOOPBACK_HEAD = "# The loopback rig"

@@ -5,24 +5,76 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import time
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers.force.samples import Wrench
+from drivers.force.rounds import Wrench
 from drivers.geometry import brush_pose, lean
 from drivers.samples import Pose
 from drivers.sim.arcs.stream import StreamedQueue
 from drivers.sim.brush.brush import MAX_TILT_DEG, Brush
 from drivers.sim.brush.contact import Contact, ContactWatch
-from drivers.sim.brush.drag import ink_left
+from drivers.sim.brush.drag import Waypoint, ink_left
 from drivers.sim.brush.flaws import Flaw, flaw_of_load, natural_split
-from drivers.sim.brush.leash import Waypoint
 from drivers.sim.brush.paper import Paper
 from drivers.sim.brush.reaction import Reaction, leaning_with
-from drivers.sim.clock import SimClock
 from drivers.sim.config import SimConfig
-from drivers.sim.instruments.well import Well
+
+
+class SimClock:
+    """Seconds of simulated time since the start, `rate` of them per real second."""
+
+    def __init__(self, rate: float = 1.0) -> None:
+        if not 0.0 < rate <= 1000.0:
+            raise ValueError(f"rate = {rate} is outside (0, 1000]")
+        self.rate = rate
+        self._start = time.monotonic()
+
+    def now_s(self) -> float:
+        """Simulated seconds since this clock was made."""
+        return (time.monotonic() - self._start) * self.rate
+
+
+BRUSH_ML = 0.5
+"""What a dry brush takes up."""
+
+
+class Well:
+    """Ink in a pot whose bottom is at height 0."""
+
+    def __init__(self, ml: float, capacity_ml: float, ml_per_mm: float = 1.0) -> None:
+        self.ml = ml
+        self.capacity_ml = capacity_ml
+        self._ml_per_mm = ml_per_mm
+
+    @classmethod
+    def round(cls, radius_mm: float, level_mm: float, depth_mm: float) -> Well:
+        """A round pot that is `depth_mm` deep, filled to `level_mm`."""
+        ml_per_mm = math.pi * radius_mm**2 / 1e3
+        return cls(level_mm * ml_per_mm, depth_mm * ml_per_mm, ml_per_mm)
+
+    @property
+    def level_mm(self) -> float:
+        """Height of the ink above the bottom."""
+        return self.ml / self._ml_per_mm
+
+    @property
+    def share(self) -> float:
+        """Filling, 0 to 1."""
+        return min(1.0, self.ml / self.capacity_ml)
+
+    def add(self, volume_ml: float) -> None:
+        """A dose; what does not fit runs over."""
+        self.ml = min(self.capacity_ml, self.ml + volume_ml)
+
+    def dip(self, ink_load: float) -> float:
+        """Fill a brush that holds `ink_load` (0 to 1); returns what it holds then."""
+        taken_ml = min(self.ml, (1.0 - ink_load) * BRUSH_ML)
+        self.ml -= taken_ml
+        return ink_load + taken_ml / BRUSH_ML
+
 
 INK_PER_PRESS = 0.12
 """Share of a full brush that one press takes, and the landing of a drag."""

@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from collect.engine.states import State
 from collect.errors import ForceTooHigh, NeedsOperator
 from drivers.errors import ConnectionLost, Stuck
-from drivers.ink.errors import InkRefused
+from drivers.ink.port import InkRefused
 from drivers.sim.instruments.force_board import Fault
 from sessions.journal.journal import replay
 from sessions.recording.schemas import Topic

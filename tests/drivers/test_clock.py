@@ -3,7 +3,7 @@ import time
 import pytest
 
 from drivers.clock import HostClock
-from drivers.sim.clock import SimClock
+from drivers.sim.world import SimClock
 
 
 def test_the_host_clock_tells_wall_time():

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.arcs.frames import FrameDecoder, encode_short
-from drivers.arcs.rtde_wire import MAX_MESSAGE_BYTES, PING, SET_RECIPE, decode_message, encode_sample
+from drivers.arcs.framing import FrameDecoder, encode_short
+from drivers.arcs.rtde import MAX_MESSAGE_BYTES, PING, SET_RECIPE, decode_message, encode_sample
 from drivers.errors import ProtocolViolation
 from drivers.geometry import to_wire
 from drivers.sim.arcs.cabinet import Cabinet
@@ -17,8 +17,8 @@ from drivers.sim.arcs.io import mask
 from drivers.sim.arcs.methods import runtime_state
 from drivers.sim.arm.motion import Rest
 from drivers.sim.faults.board import FaultBoard
-from drivers.sim.faults.truth import Truth
-from drivers.sim.faults.vocabulary import ALWAYS, KINDS, Device, Fault
+from drivers.sim.faults.kinds import ALWAYS, KINDS, Device, Fault
+from drivers.sim.faults.phases import Truth
 from drivers.sim.server import LoopbackServer
 
 MAX_HZ = 500.0

@@ -12,7 +12,7 @@ from drivers.sim.arm.drift import Drift, JointDrift
 from drivers.sim.arm.kinematics import Joints, Matrix, inverted
 from drivers.sim.arm.motion import Segment
 from drivers.sim.arm.paths import JointLine, Line, Path, fixed
-from drivers.sim.arm.ramp import Ramp
+from drivers.sim.arm.plan import Ramp
 
 STILL = (0.0,) * 6
 

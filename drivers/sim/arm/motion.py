@@ -16,8 +16,7 @@ from drivers.geometry import distance
 from drivers.samples import Pose
 from drivers.sim.arm.kinematics import HOME, Joints, Matrix, inverted
 from drivers.sim.arm.paths import Line, Path, fixed
-from drivers.sim.arm.plan import Corners, Move, pieces_of, ramps_of
-from drivers.sim.arm.ramp import Ramp
+from drivers.sim.arm.plan import Corners, Move, Ramp, pieces_of, ramps_of
 
 __all__ = ["STEADY_LAG_S", "MotionQueue", "Move", "Ramp", "Segment"]
 

@@ -11,10 +11,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.brush.bristles import draw_wander, grow_bristles
 from drivers.sim.brush.drag import Stances, Waypoint, draw_drag
 from drivers.sim.brush.flaws import Flaw, Trouble, draw_trouble
-from drivers.sim.brush.footprint import Footprint, Tuft, blank_footprint, print_footprint
+from drivers.sim.brush.footprint import Tuft, blank_footprint, draw_wander, grow_bristles, print_footprint
+from drivers.sim.brush.paper import Footprint
 from drivers.sim.brush.spine import Bundle, SpineShape, Vector, press_spine, pull_spine, rest_spine
 
 __all__ = ["Brush", "BrushSpec", "Flaw", "Footprint", "Waypoint"]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drivers.force.samples import Wrench
+from drivers.force.rounds import Wrench
 from drivers.geometry import lean
 from drivers.samples import Pose
 from drivers.sim.brush.brush import Brush, BrushSpec

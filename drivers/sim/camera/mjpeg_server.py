@@ -11,14 +11,34 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.camera.options import LOOPBACK_SERVER
+from drivers.camera.source import LOOPBACK_SERVER
 from drivers.samples import Pose
 from drivers.sim.camera.scene import NOISE_FIELDS, Scene
 from drivers.sim.config import View
 from drivers.sim.faults.board import FaultBoard
-from drivers.sim.faults.pictures import dark, retold, torn
-from drivers.sim.faults.vocabulary import KINDS, Device
+from drivers.sim.faults.kinds import KINDS, Device
 from drivers.sim.server import LoopbackServer
+
+NOISE_LEVELS = 6
+"""A covered sensor is not quite zero."""
+
+
+def dark(shape: tuple[int, ...], seed: int) -> NDArray[np.uint8]:
+    """An image of this shape from under a lens cap."""
+    return np.random.default_rng(seed).integers(0, NOISE_LEVELS, shape, np.uint8)
+
+
+def retold(jpeg: bytes, number: int) -> bytes:
+    """The same picture in other bytes: a JPEG comment with a number, after the two bytes of the start."""
+    text = b"%d" % number
+    comment = b"\xff\xfe" + (len(text) + 2).to_bytes(2, "big") + text
+    return jpeg[:2] + comment + jpeg[2:]
+
+
+def torn(jpeg: bytes) -> bytes:
+    """The first half, with a sound end mark: the rest never arrived."""
+    return jpeg[: len(jpeg) // 2] + b"\xff\xd9"
+
 
 BOUNDARY = "brushloop"
 BACKLOG = 64

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from drivers.sim.faults.kinds import Device, Fault
 from drivers.sim.faults.phases import Phase
-from drivers.sim.faults.vocabulary import Device, Fault
 
 KEPT = 100
 """Faults that are over and still told."""

@@ -6,7 +6,9 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
+from drivers.samples import Pose
 from drivers.sim.config import Table
+from drivers.sim.world import World
 
 ON_PAPER_MM = 0.1
 """Nobody teaches the paper's height exactly: a tip that ends or rests so little above it counts as on it."""
@@ -74,3 +76,39 @@ def _over_well(table: Table, spot: Spot) -> bool:
 
 def _over_sheet(table: Table, spot: Spot) -> bool:
     return 0.0 <= spot.x_mm <= table.sheet_mm[0] and 0.0 <= spot.y_mm <= table.sheet_mm[1]
+
+
+class Truth:
+    """One world, seen by what a fault may wait for. To be asked in the thread that owns the world."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+
+    def now_s(self) -> float:
+        """Simulated seconds since the rig started."""
+        return self._world.clock.now_s()
+
+    @property
+    def presses(self) -> int:
+        """Marks on the paper so far: the index of the press to come."""
+        return len(self._world.presses)
+
+    def target(self) -> Pose | None:
+        """Where the piece of the path that runs now ends; None at rest."""
+        queue = self._world.motion
+        queue.advance(self.now_s())
+        line = queue.running
+        return None if line is None else line.pose(line.end_s)
+
+    def phase(self) -> Phase:
+        """What the arm does now."""
+        config, to = self._world.config, self.target()
+        return phase_of(
+            config.table,
+            self._spot(*config.home_mm),
+            self._spot(*self._world.tool().position_mm),
+            None if to is None else self._spot(*to.position_mm),
+        )
+
+    def _spot(self, x_mm: float, y_mm: float, z_mm: float) -> Spot:
+        return Spot(*self._world.to_paper(x_mm, y_mm), z_mm - self._world.config.table.paper_z_mm)

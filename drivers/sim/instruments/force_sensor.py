@@ -14,7 +14,7 @@ from typing import Self
 
 import can
 
-from drivers.force.samples import Wrench
+from drivers.force.rounds import Wrench
 from drivers.sim.instruments.force_board import CanFrame, Fault, ForceBoard
 
 __all__ = ["Fault", "SimForceSensor"]

@@ -13,8 +13,8 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from drivers.errors import ProtocolViolation
-from drivers.ink.line import number_of, seal, unseal
-from drivers.sim.instruments.well import Well
+from drivers.ink.station import number_of, seal, unseal
+from drivers.sim.world import Well
 
 GARBAGE = b"\xff\x00*\n\x86\x01ok 1*0000\n"
 BYTE_S = 0.001

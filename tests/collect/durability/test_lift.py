@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from drivers.sim.config import Table
-from drivers.sim.faults.cli import ask
+from drivers.sim.fault_client import ask
 from drivers.sim.faults.phases import Phase
 
 PAPER_MM = Table().paper_z_mm

@@ -18,9 +18,9 @@ from collect.engine.opening import Opening, find_resumable, open_store
 from drivers.arcs import stopping
 from drivers.arcs.rpc import RpcConnection
 from drivers.clock import HostClock
-from drivers.sim.clock import SimClock
 from drivers.sim.config import SimConfig, View
 from drivers.sim.rig import LoopbackRig
+from drivers.sim.world import SimClock
 
 FAST = 300.0
 RPC_TIMEOUT_S = 0.8

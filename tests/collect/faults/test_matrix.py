@@ -20,8 +20,8 @@ from drivers.arcs.codes import SafetyMode
 from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, MotionFailed, ProtocolViolation, RobotNotSafe
 from drivers.geometry import distance
 from drivers.samples import Pose
+from drivers.sim.faults.kinds import ALWAYS, Fault
 from drivers.sim.faults.phases import Phase
-from drivers.sim.faults.vocabulary import ALWAYS, Fault
 from sessions.journal.journal import read_lines, replay
 from sessions.store import SessionStore
 

@@ -16,9 +16,8 @@ from collect.motion.procedures import Procedures, photograph_moves
 from collect.rig.config import load_rig
 from collect.rig.devices import Rig, limits_of
 from collect.touch.arm import ForceTap
-from drivers.force.samples import ForceSample
 from drivers.geometry import brush_pose
-from drivers.samples import Frame, Identity, Pose, PoseSample, QueuedLine, Stamp
+from drivers.samples import ForceSample, Frame, Identity, Pose, PoseSample, QueuedLine, Stamp
 from drivers.sim.camera.scene import Scene
 from drivers.sim.config import SimConfig, Table, View
 from drivers.sim.rig_toml import Addresses, rig_toml

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.arcs.bare import MAX_DEPTH, BareDecoder
+from drivers.arcs.framing import MAX_DEPTH, BareDecoder
 from drivers.arcs.rpc import encode_bare_request
 from drivers.errors import ProtocolViolation
 

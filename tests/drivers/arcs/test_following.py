@@ -9,9 +9,9 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from drivers.arcs import following
-from drivers.arcs.errors import QueueFull
-from drivers.arcs.following import legs_of
+from drivers.arcs import queueing
+from drivers.arcs.codes import QueueFull
+from drivers.arcs.queueing import legs_of
 from drivers.arcs.robot import AuboArcs
 from drivers.errors import ConnectionLost, LimitExceeded, MotionFailed, MotionRefused, ProtocolViolation, RobotNotSafe
 from drivers.geometry import brush_pose, distance
@@ -49,7 +49,7 @@ def sent(cabinet: ArcsServer) -> int:
 async def way(arm: AuboArcs, cabinet: ArcsServer) -> AsyncIterator[asyncio.Task[None]]:
     """A long slow way that is under way, with more points than are queued at a time."""
     task = asyncio.create_task(arm.follow(line(130, 3.0), **SLOW))
-    while sent(cabinet) < following.MOST_QUEUED or cabinet._world.motion.exec_id(cabinet._now_s) < 1:
+    while sent(cabinet) < queueing.MOST_QUEUED or cabinet._world.motion.exec_id(cabinet._now_s) < 1:
         await asyncio.sleep(0.01)
     yield task
     task.cancel()
@@ -101,10 +101,10 @@ async def test_never_more_lines_are_queued_than_allowed(arm: AuboArcs, cabinet: 
     motion = cabinet._world.motion
     cabinet.cabinet.hold()
     task = asyncio.create_task(arm.follow(arc(), **WAY))
-    while motion.size < following.MOST_QUEUED:
+    while motion.size < queueing.MOST_QUEUED:
         await asyncio.sleep(0.01)
     await asyncio.sleep(0.1)
-    assert motion.size == following.MOST_QUEUED
+    assert motion.size == queueing.MOST_QUEUED
     cabinet.cabinet.resume()
     await task
     assert sent(cabinet) == len(arc())
@@ -176,7 +176,7 @@ async def test_a_queue_that_somebody_else_fills_is_an_error(arm: AuboArcs, cabin
 async def test_a_queue_that_stays_full_in_mid_path_ends_it(
     arm: AuboArcs, cabinet: ArcsServer, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(following, "STUCK_S", 0.2)
+    monkeypatch.setattr(queueing, "STUCK_S", 0.2)
     move_line = cabinet._methods["rob1.MotionControl.moveLine"]
     cabinet._methods["rob1.MotionControl.moveLine"] = lambda p: 2 if sent(cabinet) >= 3 else move_line(p)
     with pytest.raises(MotionFailed, match="does not advance"):
@@ -197,7 +197,7 @@ async def test_a_way_that_is_fed_too_slowly_goes_on_and_is_told(
 ):
     told: list[str] = []
     arm._notice = told.append
-    monkeypatch.setattr(following, "MOST_QUEUED", 1)
+    monkeypatch.setattr(queueing, "MOST_QUEUED", 1)
     await arm.follow(line(4), **WAY)
     assert distance(cabinet._world.tool(), line(4)[-1])[0] <= 0.05
     assert told[0] == "the arm halted at point 1 of 4: lines did not reach the controller in time"
@@ -206,7 +206,7 @@ async def test_a_way_that_is_fed_too_slowly_goes_on_and_is_told(
 async def test_an_arm_that_does_not_advance_is_not_waited_for_for_ever(
     cabinet: ArcsServer, way: asyncio.Task[None], monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(following, "STUCK_S", 0.1)
+    monkeypatch.setattr(queueing, "STUCK_S", 0.1)
     cabinet.cabinet.hold()
     with pytest.raises(MotionFailed, match="does not advance"):
         await way

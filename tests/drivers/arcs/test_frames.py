@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.arcs.frames import MAX_PAYLOAD_BYTES, FrameDecoder, encode
+from drivers.arcs.framing import MAX_PAYLOAD_BYTES, FrameDecoder, encode
 from drivers.arcs.rpc import FACTORY_LOGIN_TOKEN, encode_request
 from drivers.errors import ProtocolViolation
 

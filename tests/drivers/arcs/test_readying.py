@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from drivers.arcs.codes import RobotMode, SafetyMode
-from drivers.arcs.errors import OutOfReach, QueueFull, WrongOperationalMode
+from drivers.arcs.codes import OutOfReach, QueueFull, RobotMode, SafetyMode, WrongOperationalMode
 from drivers.arcs.robot import ArcsOptions, AuboArcs
 from drivers.clock import HostClock
 from drivers.errors import MotionFailed, MotionRefused, RpcError

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from drivers.arcs.frames import FrameDecoder, encode
+from drivers.arcs.framing import FrameDecoder, encode
 from drivers.arcs.rpc import RpcConnection, encode_request
 from drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, RpcError
 

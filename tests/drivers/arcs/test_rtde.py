@@ -15,11 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.arcs import telemetry
-from drivers.arcs.frames import FrameDecoder, encode, encode_short
-from drivers.arcs.options import ArcsOptions
+from drivers.arcs.framing import FrameDecoder, encode, encode_short
 from drivers.arcs.robot import AuboArcs
-from drivers.arcs.rtde import RtdeStream
-from drivers.arcs.rtde_wire import PING, decode_message, encode_sample, encode_topic, outputs_of
+from drivers.arcs.rtde import PING, RtdeStream, decode_message, encode_sample, encode_topic, outputs_of
+from drivers.arcs.settings import ArcsOptions
 from drivers.clock import HostClock
 from drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, Stale
 from drivers.geometry import brush_pose, distance

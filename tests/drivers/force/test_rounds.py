@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.force.rounds import RoundAssembler, encode_round
-from drivers.force.samples import Wrench
+from drivers.force.rounds import RoundAssembler, Wrench, encode_round
 
 THOROUGH = settings(max_examples=2000, deadline=None)
 SOME = settings(max_examples=100, deadline=None)

@@ -15,10 +15,10 @@ from can.interfaces.virtual import VirtualBus
 
 from drivers.clock import HostClock
 from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, LimitExceeded, NotConnected, Stale, Stuck
-from drivers.force.rounds import encode_round
-from drivers.force.samples import ForceSample, Wrench
+from drivers.force.rounds import Wrench, encode_round
 from drivers.force.sri_m8123 import SriM8123, SriOptions
 from drivers.protocols import ForceSensor
+from drivers.samples import ForceSample
 from drivers.sim.instruments.force_sensor import Fault, SimForceSensor
 
 WRENCH: Wrench = (1.0, -2.0, 3.5, 0.25, -0.5, 0.125)

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.arcs.controller import Controller
-from drivers.arcs.messages import Messages
 from drivers.arcs.rpc import RpcConnection
+from drivers.arcs.waiting import Messages
 from drivers.errors import DeviceError, MotionFailed, RpcError
 from tests.drivers.fuzz.inputs import EXAMPLES, LEAST_INPUTS, MANY, mutated, noise, truncated
 

@@ -13,9 +13,8 @@ import cbor2
 import pytest
 from hypothesis import given
 
-from drivers.arcs.frames import encode_short
-from drivers.arcs.rtde import RtdeStream
-from drivers.arcs.rtde_wire import MAX_MESSAGE_BYTES, decode_message, outputs_of
+from drivers.arcs.framing import encode_short
+from drivers.arcs.rtde import MAX_MESSAGE_BYTES, RtdeStream, decode_message, outputs_of
 from drivers.errors import DeviceError, ProtocolViolation
 from tests.drivers.fuzz.inputs import EXAMPLES, LEAST_INPUTS, MANY, mutated, noise, truncated
 

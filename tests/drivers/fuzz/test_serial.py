@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given
 
 from drivers.errors import ProtocolViolation
-from drivers.ink import line, modbus
+from drivers.ink import modbus
+from drivers.ink import station as line
 from tests.drivers.fuzz.inputs import EXAMPLES, LEAST_INPUTS, MANY, bytewise, mutated, noise, pieces, truncated
 
 T = TypeVar("T")

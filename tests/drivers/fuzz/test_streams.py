@@ -10,9 +10,8 @@ from collections.abc import Callable
 import pytest
 from hypothesis import given
 
-from drivers.arcs.bare import BareDecoder
-from drivers.arcs.frames import FrameDecoder, encode, encode_short
-from drivers.arcs.rtde_wire import MAX_MESSAGE_BYTES, PING, encode_sample
+from drivers.arcs.framing import BareDecoder, FrameDecoder, encode, encode_short
+from drivers.arcs.rtde import MAX_MESSAGE_BYTES, PING, encode_sample
 from drivers.errors import ProtocolViolation
 from tests.drivers.fuzz.inputs import (
     EXAMPLES,

@@ -8,8 +8,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import ProtocolViolation
-from drivers.ink.crc import crc16
-from drivers.ink.line import MAX_LINE_BYTES, Line, Reply, find_reply, number_of, seal, unseal
+from drivers.ink.port import crc16
+from drivers.ink.station import MAX_LINE_BYTES, Line, Reply, find_reply, number_of, seal, unseal
 from drivers.sim.instruments.ink_station import StationFirmware
 
 DOC = Path(__file__).parents[3] / "docs" / "ink-station.md"

@@ -18,7 +18,7 @@ from drivers.errors import (
     NotConnected,
     ProtocolViolation,
 )
-from drivers.ink.errors import InkRefused
+from drivers.ink.port import InkRefused
 from drivers.ink.station import InkStation, StationOptions
 from drivers.protocols import Ink
 from drivers.sim.instruments.ink_station import Fault, PtyLine, StationFirmware

@@ -10,8 +10,8 @@ from drivers.sim.arcs.rtde_server import RtdeServer
 from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.camera.mjpeg_server import MjpegServer
 from drivers.sim.config import SimConfig
-from drivers.sim.faults.control import ControlServer
-from drivers.sim.instruments.socketcand_server import SocketcandServer
+from drivers.sim.instruments.force_board import SocketcandServer
+from drivers.sim.serve import ControlServer
 from drivers.sim.server import LoopbackServer, NotLoopback
 from drivers.sim.world import World
 

@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from drivers.arcs.bare import BareDecoder
-from drivers.arcs.frames import FrameDecoder, encode
+from drivers.arcs.framing import BareDecoder, FrameDecoder, encode
 from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.rig import HOST
 

@@ -9,14 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from drivers.arcs.frames import FrameDecoder, encode
+from drivers.arcs.framing import FrameDecoder, encode
 from drivers.camera import CameraOptions, OpenCvCamera
 from drivers.clock import HostClock
 from drivers.samples import Stamp
 from drivers.sim import rig as rig_module
 from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.config import SimConfig, View
-from drivers.sim.rig import HOST, LoopbackRig, serve
+from drivers.sim.rig import HOST, LoopbackRig
+from drivers.sim.serve import serve
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ from typing import Any
 import cbor2
 import pytest
 
-from drivers.arcs.frames import FrameDecoder, encode, encode_short
-from drivers.arcs.rtde_wire import PING, encode_topic
+from drivers.arcs.framing import FrameDecoder, encode, encode_short
+from drivers.arcs.rtde import PING, encode_topic
 from drivers.geometry import brush_pose
 from drivers.sim.arcs.rtde_server import RtdeServer
 from drivers.sim.arcs.server import ArcsServer

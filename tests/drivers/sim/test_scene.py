@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.sim.camera.optics import homography
-from drivers.sim.camera.scene import PAPER_GRAY, Scene, board, read_strip
+from drivers.sim.camera.scene import PAPER_GRAY, Scene, board, homography, read_strip
 from drivers.sim.config import SimConfig, View
 from drivers.sim.world import World
 

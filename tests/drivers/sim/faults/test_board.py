@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import pytest
 
 from drivers.sim.faults.board import MOST, FaultBoard
+from drivers.sim.faults.kinds import HANDED_OVER, KINDS, REPLIES, STOPS, Device, Fault
 from drivers.sim.faults.phases import Phase
-from drivers.sim.faults.vocabulary import HANDED_OVER, KINDS, REPLIES, STOPS, Device, Fault
 from drivers.sim.instruments.force_board import Fault as ForceFault
 from drivers.sim.instruments.ink_station import Fault as InkFault
 

@@ -18,7 +18,7 @@ from drivers.clock import HostClock
 from drivers.errors import DeviceTimeout
 from drivers.samples import Stamp
 from drivers.sim.camera.scene import read_strip
-from drivers.sim.faults.vocabulary import ALWAYS, Device, Fault
+from drivers.sim.faults.kinds import ALWAYS, Device, Fault
 from drivers.sim.rig import HOST, LoopbackRig
 
 CLOCK = HostClock()

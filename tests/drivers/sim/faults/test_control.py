@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from drivers.arcs.codes import SafetyMode
 from drivers.sim.config import SimConfig
-from drivers.sim.faults.control import MAX_LINE_BYTES, ControlPathError, ControlServer, live_control
 from drivers.sim.rig import LoopbackRig
+from drivers.sim.serve import MAX_LINE_BYTES, ControlPathError, ControlServer, live_control
 
 Ask = Callable[[object], Awaitable[dict[str, Any]]]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.sim.faults.cli import FaultRefused, ask, request_of
+from drivers.sim.fault_client import FaultRefused, ask, request_of
 
 NOTHING: dict[str, object] = {"on": None, "count": None, "id": None}
 

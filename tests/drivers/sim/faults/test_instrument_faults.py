@@ -12,11 +12,10 @@ from drivers.clock import HostClock
 from drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation, Stuck
 from drivers.force.sri_m8123 import SriM8123, SriOptions
 from drivers.ink.station import InkStation, StationOptions
-from drivers.sim.faults.rig_faults import Faults
-from drivers.sim.faults.vocabulary import Device, Fault
+from drivers.sim.faults.kinds import Device, Fault
 from drivers.sim.instruments.force_sensor import SimForceSensor
 from drivers.sim.instruments.ink_station import PtyLine, StationFirmware
-from drivers.sim.rig import LoopbackRig
+from drivers.sim.rig import Faults, LoopbackRig
 
 
 @pytest.fixture

@@ -6,8 +6,7 @@ import pytest
 
 from drivers.geometry import brush_pose
 from drivers.sim.config import SimConfig, Table
-from drivers.sim.faults.phases import Phase, Spot, phase_of
-from drivers.sim.faults.truth import Truth
+from drivers.sim.faults.phases import Phase, Spot, Truth, phase_of
 from drivers.sim.world import World
 
 TABLE = Table()

@@ -9,8 +9,8 @@ from collections.abc import AsyncIterator, Callable
 import pytest
 
 from drivers.arcs.codes import RobotMode, SafetyMode
-from drivers.arcs.options import ArcsOptions
 from drivers.arcs.robot import AuboArcs
+from drivers.arcs.settings import ArcsOptions
 from drivers.clock import HostClock
 from drivers.errors import (
     ConnectionLost,
@@ -23,7 +23,7 @@ from drivers.errors import (
 from drivers.geometry import brush_pose, distance
 from drivers.limits import Limits
 from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.faults.vocabulary import ALWAYS, Device, Fault
+from drivers.sim.faults.kinds import ALWAYS, Device, Fault
 from drivers.sim.rig import HOST, LoopbackRig
 
 FAR = brush_pose(250.0, -30.0, 260.0)  # 200 mm from home

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.sim.faults.script import MAX_BYTES, FaultScriptError, fault_of, hang_script, load_faults
-from drivers.sim.faults.vocabulary import Device
+from drivers.sim.faults.kinds import MAX_BYTES, Device, FaultScriptError, fault_of, hang_script, load_faults
 
 SCRIPT = """
 [[fault]]

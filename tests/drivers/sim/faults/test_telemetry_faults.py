@@ -9,13 +9,13 @@ import asyncio
 
 import pytest
 
-from drivers.arcs.options import ArcsOptions
 from drivers.arcs.robot import AuboArcs
+from drivers.arcs.settings import ArcsOptions
 from drivers.clock import HostClock
 from drivers.errors import Stale
 from drivers.limits import Limits
 from drivers.samples import PoseSample
-from drivers.sim.faults.vocabulary import ALWAYS, Device, Fault
+from drivers.sim.faults.kinds import ALWAYS, Device, Fault
 from drivers.sim.rig import HOST, LoopbackRig
 
 

@@ -1,10 +1,12 @@
-"""The control socket of a rig: one JSON object per line in, one per line out, over a unix socket of mode 0600.
+"""The rig as a process: it serves until a signal or until idle, writes its `rig.toml`, and listens on a control socket.
+
+The control socket takes one JSON object per line and answers with one per line, over a unix socket of mode 0600:
 
 | request | answer, beside `"ok": true` |
 |---|---|
 | `{"do": "add", "fault": {...}}` | `id` of the fault |
 | `{"do": "list"}` | `hanging` and `over`: id, fault, how often it has struck |
-| `{"do": "clear"}`, or with `"id": 3` | `taken`: how many were taken down |
+| `{"do": "clear"}`, or with `"id": 3` | `taken`: how many were removed |
 | `{"do": "state"}` | what the world knows: phase, tip, presses, ink load, modes |
 | `{"do": "release"}` | `was`: the safety mode that a person at the arm has ended |
 | `{"do": "fresh-sheet"}` | |
@@ -18,16 +20,88 @@ import asyncio
 import contextlib
 import json
 import os
+import signal
 import socket
 import stat
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Callable
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
+from drivers.sim.config import SimConfig
 from drivers.sim.faults.board import Hung
-from drivers.sim.faults.rig_faults import Faults
-from drivers.sim.faults.script import fault_of
+from drivers.sim.faults.kinds import fault_of, hang_script, load_faults
+from drivers.sim.rig import Faults, LoopbackRig
+from drivers.sim.rig_toml import LOOPBACK_HEAD
 from drivers.sim.server import LoopbackServer
+
+
+def serve(
+    config: SimConfig,
+    write_rig: Path | None,
+    idle_exit_s: float,
+    tell: Callable[[str], None] = lambda _text: None,
+    *,
+    faults: Path | None = None,
+    control: Path | None = None,
+) -> None:
+    """Serve until a signal, or until idle for `idle_exit_s` (0 means never), with a script of faults if there is one.
+
+    Raises `RigFileExists` rather than overwrite a file that no loopback rig wrote, `FaultScriptError`, and
+    `ControlPathError` where no control socket can be made.
+    """
+    asyncio.run(_serve(config, write_rig, idle_exit_s, tell, faults, control))
+
+
+async def _serve(
+    config: SimConfig,
+    write_rig: Path | None,
+    idle_exit_s: float,
+    tell: Callable[[str], None],
+    faults: Path | None,
+    control: Path | None,
+) -> None:
+    over = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, over.set)
+    if write_rig is not None:
+        _refuse_to_overwrite(write_rig)
+    script = load_faults(faults) if faults is not None else ()
+    async with LoopbackRig(config) as rig, live_control(rig.faults, control):
+        if faults is not None:
+            hang_script(faults, rig.faults.hang, script)
+        loop.add_signal_handler(signal.SIGUSR1, rig.world.fresh_sheet)
+        if write_rig is not None:
+            _write_whole(write_rig, rig.toml())
+        tell(f"{rig.where()}; Ctrl-C ends")
+        waits: list[asyncio.Task[object]] = [asyncio.create_task(over.wait())]
+        if idle_exit_s > 0:
+            waits.append(asyncio.create_task(rig.idle(idle_exit_s)))
+        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+        for wait in waits:
+            wait.cancel()
+        await asyncio.gather(*waits, return_exceptions=True)
+
+
+class RigFileExists(Exception):
+    """The file cannot be written: there is no such folder, or it is not a loopback rig's and may be a lab's own."""
+
+    exit_code: ClassVar[int] = 2
+
+
+def _refuse_to_overwrite(path: Path) -> None:
+    if not path.parent.is_dir():
+        raise RigFileExists(f"{path}: there is no folder {path.parent}")
+    if path.exists() and not (path.is_file() and path.read_bytes().startswith(LOOPBACK_HEAD.encode())):
+        raise RigFileExists(f"{path}: exists and was not written by a loopback rig; it is not overwritten")
+
+
+def _write_whole(path: Path, text: str) -> None:
+    """Whoever waits for the file sees all of it or none."""
+    part = path.with_name(path.name + ".part")
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)
+
 
 MAX_LINE_BYTES = 8192
 MAX_CLIENTS = 16

@@ -1,0 +1,202 @@
+"""What goes over the wire of ARCS: SOF frames, bare JSON documents, and lists of numbers within either.
+
+A SOF frame is `53 4F 46`, a flag byte, a big-endian length, a payload:
+
+| flag | length | who sends it |
+|---|---|---|
+| 0x01 | uint32 | the maker's RPC client, always; this driver too |
+| 0x00 | uint16 | the maker's RTDE client |
+
+Bare JSON is one document after another, with nothing between them and no newline at the end. The end of a document is
+found by its brackets: parsing again and again until it succeeds would take quadratic time on a reply that comes in
+small pieces, and could not tell a reply that is cut off from one that is wrong.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import struct
+
+from drivers.errors import ProtocolViolation
+
+MAGIC = b"SOF"
+FLAG_LONG = 0x01
+FLAG_SHORT = 0x00
+MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
+"""Far above any reply of a controller; a hostile length must not make the host allocate gigabytes."""
+
+
+def encode_short(payload: bytes) -> bytes:
+    """One frame with a 16-bit length, as RTDE uses. Raises ValueError where the payload does not fit."""
+    if len(payload) > 0xFFFF:
+        raise ValueError(f"payload of {len(payload)} bytes exceeds 65535")
+    return MAGIC + bytes([FLAG_SHORT]) + struct.pack(">H", len(payload)) + payload
+
+
+def encode(payload: bytes) -> bytes:
+    """One frame with a 32-bit length. Raises ValueError above `MAX_PAYLOAD_BYTES`."""
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        raise ValueError(f"payload of {len(payload)} bytes exceeds {MAX_PAYLOAD_BYTES}")
+    return MAGIC + bytes([FLAG_LONG]) + struct.pack(">I", len(payload)) + payload
+
+
+class FrameDecoder:
+    """Turns a byte stream, cut anywhere, into payloads."""
+
+    def __init__(self, device: str = "arcs", *, skip: bytes = b"", max_bytes: int = MAX_PAYLOAD_BYTES) -> None:
+        """`skip` is what may stand between frames and means nothing."""
+        self._device = device
+        self._skip = skip
+        self._max_bytes = max_bytes
+        self._buffer = bytearray()
+        self._broken: str | None = None
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Payloads completed by `data`, in order.
+
+        Raises `ProtocolViolation` where the stream is not SOF, and from then on always: nothing after it, nor of the
+        same `data`, can be trusted.
+        """
+        if self._broken is not None:
+            raise self._violation(self._broken)
+        self._buffer += data
+        payloads: list[bytes] = []
+        while (payload := self._next()) is not None:
+            payloads.append(payload)
+        return payloads
+
+    def _next(self) -> bytes | None:
+        buffer, skip = self._buffer, self._skip
+        while skip and buffer.startswith(skip):
+            del buffer[: len(skip)]
+        if 0 < len(buffer) < len(skip) and skip.startswith(bytes(buffer)):
+            return None
+        if not MAGIC.startswith(bytes(buffer[:3])):
+            raise self._violation(f"expected SOF, got {bytes(buffer[:8])!r}")
+        if len(buffer) < 4:
+            return None
+        match buffer[3]:
+            case 0x01:
+                head, size = 8, struct.unpack_from(">I", buffer, 4)[0] if len(buffer) >= 8 else None
+            case 0x00:
+                head, size = 6, struct.unpack_from(">H", buffer, 4)[0] if len(buffer) >= 6 else None
+            case flag:
+                raise self._violation(f"unknown SOF flag {flag:#04x}")
+        if size is None:
+            return None
+        if size > self._max_bytes:
+            raise self._violation(f"frame of {size} bytes exceeds {self._max_bytes}")
+        if len(buffer) < head + size:
+            return None
+        payload = bytes(buffer[head : head + size])
+        del buffer[: head + size]
+        return payload
+
+    def _violation(self, what: str) -> ProtocolViolation:
+        self._broken = what
+        self._buffer.clear()
+        return ProtocolViolation(self._device, "decode", what)
+
+
+MAX_DOCUMENT_BYTES = 1024 * 1024
+"""Far above any reply of a controller."""
+MAX_DEPTH = 64
+"""No reply nests deeper than five; the parser must not run out of stack."""
+
+_STRUCTURE = re.compile(rb'["{}\[\]]')
+_STRING_END = re.compile(rb'["\\]')
+_CLOSES = {ord("}"): ord("{"), ord("]"): ord("[")}
+
+
+class BareDecoder:
+    """Turns a byte stream, cut anywhere, into JSON documents; bounded in size and depth."""
+
+    def __init__(self, device: str = "arcs", *, max_bytes: int = MAX_DOCUMENT_BYTES) -> None:
+        self._device = device
+        self._max_bytes = max_bytes
+        self._buffer = bytearray()
+        self._at = 0
+        self._open: list[int] = []
+        self._in_string = False
+        self._broken: str | None = None
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Documents completed by `data`, in order, each JSON as Python takes it: NaN and Infinity are let through.
+
+        Raises `ProtocolViolation`, and from then on always: nothing after it, nor of the same `data`, can be trusted.
+        """
+        if self._broken is not None:
+            raise self._violation(self._broken)
+        self._buffer += data
+        documents: list[bytes] = []
+        while (document := self._next()) is not None:
+            documents.append(document)
+        return documents
+
+    def _next(self) -> bytes | None:
+        if not self._open:
+            del self._buffer[: len(self._buffer) - len(self._buffer.lstrip(b" \t\r\n"))]
+            if self._buffer and self._buffer[0] not in b"{[":
+                raise self._violation(f"expected JSON, got {bytes(self._buffer[:8])!r}")
+        end = self._scan()
+        if (end or len(self._buffer)) > self._max_bytes:
+            raise self._violation(f"document exceeds {self._max_bytes} bytes")
+        if end is None:
+            return None
+        document = bytes(self._buffer[:end])
+        del self._buffer[:end]
+        self._at = 0
+        try:
+            json.loads(document)
+        except (ValueError, RecursionError):
+            raise self._violation(f"not JSON: {document[:40]!r}") from None
+        return document
+
+    def _scan(self) -> int | None:
+        """Go on from where the last piece ended; the end of the document, or None where it is not here yet."""
+        buffer = self._buffer
+        while True:
+            found = (_STRING_END if self._in_string else _STRUCTURE).search(buffer, self._at)
+            if found is None:
+                self._at = len(buffer)
+                return None
+            byte, self._at = buffer[found.start()], found.end()
+            if byte == ord("\\"):
+                if self._at == len(buffer):  # what it escapes is not here yet: look at it again
+                    self._at -= 1
+                    return None
+                self._at += 1
+            elif byte == ord('"'):
+                self._in_string = not self._in_string
+            elif byte in _CLOSES:
+                if self._open.pop() != _CLOSES[byte]:
+                    raise self._violation("brackets do not match")
+                if not self._open:
+                    return self._at
+            else:
+                self._open.append(byte)
+                if len(self._open) > MAX_DEPTH:
+                    raise self._violation(f"nested deeper than {MAX_DEPTH}")
+
+    def _violation(self, what: str) -> ProtocolViolation:
+        self._broken = what
+        self._buffer.clear()
+        return ProtocolViolation(self._device, "decode", what)
+
+
+def numbers(values: object, count: int) -> list[float]:
+    """`values` as floats. Raises ValueError unless it is a list of `count` finite numbers.
+
+    JSON knows integers that no float holds, and a text of six digits is no pose.
+    """
+    if not isinstance(values, list):
+        raise ValueError(f"expected {count} numbers, got {str(values)[:80]!r}")
+    try:
+        found = [float(v) if type(v) in (int, float) else math.nan for v in values]  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+    except OverflowError:
+        found = []
+    if len(found) != count or not all(map(math.isfinite, found)):
+        raise ValueError(f"expected {count} finite numbers, got {str(values)[:80]}")  # pyright: ignore[reportUnknownArgumentType]
+    return found
