@@ -14,7 +14,7 @@ from typing import Protocol
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from collect.engine.snapshot import EngineView, Snapshot
-from sessions.console import PlainConsole
+from sessions.terminal import plain_console
 
 REFRESH_S = 0.1
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -66,7 +66,7 @@ def _show(engine: RunnableEngine) -> None:
         TimeElapsedColumn(),
         TextColumn("{task.fields[eta]}"),
     )
-    with Progress(*columns, console=PlainConsole(stderr=True)) as progress:
+    with Progress(*columns, console=plain_console(stderr=True)) as progress:
         task = progress.add_task("connect", total=None, eta="")
         while True:
             over = engine.finished

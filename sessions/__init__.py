@@ -1,1 +1,1 @@
-"""The store: one folder per session with a journal, one MCAP per step attempt, and one merged MCAP at close."""
+"""Storage of sessions: a folder each, with a journal, one MCAP per step attempt, and one merged MCAP at close."""

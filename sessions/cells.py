@@ -1,4 +1,4 @@
-"""Cells of CSV files: a text that a spreadsheet would run as a formula is written with an apostrophe before it."""
+"""Cells of CSV files: text that a spreadsheet would run as a formula is written with an apostrophe before it."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ FORMULA_STARTS = frozenset("=+-@\t\r\n＝＋－＠")
 
 
 def as_cell(value: object) -> object:
-    """What is written for a value: numbers as they are, also as text (`-0.5`), everything else never as a formula."""
+    """Cell for a value: numbers unchanged, also as text (`-0.5`), and no other text as a formula."""
     if isinstance(value, str) and value and (value[0] in FORMULA_STARTS or _marked(value)) and not _is_number(value):
         return MARK + value
     return value
 
 
 def as_text(cell: str) -> str:
-    """The text that `as_cell` was given."""
+    """Undo `as_cell`."""
     return cell[1:] if _marked(cell) else cell
 
 
 class CsvWriter:
-    """A CSV file, row by row, whose cells hold what others named."""
+    """Writes a CSV file whose cells may hold text from elsewhere."""
 
     def __init__(self, file: Any, lineterminator: str = "\n") -> None:
         self._out = csv.writer(file, lineterminator=lineterminator)  # noqa: TID251 - the one place
@@ -33,7 +33,7 @@ class CsvWriter:
         self._out.writerow([as_cell(value) for value in row])
 
     def writerows(self, rows: Iterable[Sequence[object]]) -> None:
-        """Write many."""
+        """Write many rows."""
         for row in rows:
             self.writerow(row)
 

@@ -1,4 +1,4 @@
-"""What differs between the configuration that a session was started with and another one, field by field."""
+"""Differences between the configuration that a session was started with and another one, field by field."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from pathlib import Path
 from typing import Any, cast
 
 ABSENT = object()
-"""The value of a field that one of the two does not have."""
+"""Value of a field that one of the two does not have."""
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One field, or a whole list where its length changed. An empty `field` is the file: it cannot be compared."""
+    """One field, or a whole list where its length changed; an empty `field` means a file that cannot be compared."""
 
     file: str
     field: tuple[str, ...]
-    """Its path in the file: names, and numbers of items from 0."""
+    """Path in the file: names, and numbers of items from 0."""
     old: Any
     new: Any
 
     def __str__(self) -> str:
         """`paper.cell_mm: [80.0, 80.0] -> [40.0, 24.0]`."""
         if not self.field:
-            return "how it was then is missing or damaged"
-        return f"{'.'.join(self.field)}: {_words(self.old)} -> {_words(self.new)}"
+            return "its earlier content is missing or damaged"
+        return f"{'.'.join(self.field)}: {_short(self.old)} -> {_short(self.new)}"
 
 
 def differences(folder: Path, snapshots: Mapping[str, str]) -> list[Difference]:
-    """From the session's JSON files of these names to the given texts, in the order of the files; empty: the same."""
+    """Compare the session's JSON files of these names with the given texts; empty where nothing changed."""
     found: list[Difference] = []
     for name, text in snapshots.items():
         try:
@@ -55,12 +55,12 @@ def _compared(file: str, at: tuple[str, ...], old: Any, new: Any) -> Iterator[Di
 
 
 def _tables(value: Any) -> list[Any]:
-    """The items of a list of tables; nothing for any other value."""
+    """Items of a list of tables; an empty list for any other value."""
     items = cast("list[Any]", value) if isinstance(value, list) else []
     return items if any(isinstance(item, dict) for item in items) else []
 
 
-def _words(value: Any) -> str:
+def _short(value: Any) -> str:
     if value is ABSENT:
         return "not there"
     if value is None:
@@ -69,5 +69,5 @@ def _words(value: Any) -> str:
         return f"{len(items)} items" if len(items) > 1 else "1 item"
     if isinstance(value, dict):
         return "given"
-    told = json.dumps(value, ensure_ascii=False)
-    return told if len(told) <= 40 else f"{told[:37]}..."
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 40 else f"{text[:37]}..."

@@ -1,16 +1,19 @@
-"""Room on the disk, and ways to put a file somewhere without ever losing the one that is there."""
+"""Room on the disk, durable writes, and ways to put a file somewhere without ever losing the one that is there."""
 
 from __future__ import annotations
 
 import itertools
 import os
 import shutil
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import IO, Any
 
 from sessions.errors import DiskFull, SessionError, disk_error, in_one_line
 
 SPARE_BYTES = 16 * 1024 * 1024
-"""What stays free whatever is written: the journal must have its last word."""
+"""Kept free whatever is written, so that the journal's last lines always fit."""
 _PIECE_BYTES = 1 << 20
 
 
@@ -19,21 +22,62 @@ def free_bytes(folder: Path) -> int:
     try:
         return shutil.disk_usage(folder).free
     except OSError as error:
-        raise SessionError(folder, f"cannot be looked at: {in_one_line(error)}") from error
+        raise SessionError(folder, f"cannot be read: {in_one_line(error)}") from error
 
 
 def check_room(folder: Path, need_bytes: int) -> None:
-    """Raise `DiskFull` unless so much, and a little to spare, is free."""
+    """Raise `DiskFull` unless `need_bytes` and `SPARE_BYTES` more are free."""
     free = free_bytes(folder)
     if free < need_bytes + SPARE_BYTES:
         need_mb, free_mb = (need_bytes + SPARE_BYTES) / 1e6, free / 1e6
         raise DiskFull(folder, f"the disk has {free_mb:.0f} MB left, {need_mb:.0f} MB are needed; make room", free)
 
 
-def set_aside(path: Path, tag: str) -> Path:
-    """Give the file a second name beside it (`x.mcap.damaged-1`) and keep the first; returns the second.
+def sync(file: IO[Any]) -> None:
+    """Wait until what was written to an open file is on disk. Raises `OSError`."""
+    file.flush()
+    os.fsync(file.fileno())
 
-    Done again for the same bytes, it gives the same name. Raises `SessionError` where the disk fails.
+
+def fsync_folder(folder: Path) -> None:
+    """Make a rename or a new file in `folder` durable."""
+    fd = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def write_durably(path: Path, data: bytes) -> None:
+    """Write a new file and wait until it is on disk. Raises `OSError`."""
+    with path.open("xb") as file:
+        file.write(data)
+        sync(file)
+
+
+@contextmanager
+def staged_folder(out: Path) -> Generator[Path]:
+    """Yield a folder beside `out` to write into; it is renamed to `out` at the end, and removed after an exception.
+
+    Replaces an empty folder, and no other. Raises `OSError`.
+    """
+    stage = out.with_name(f".{out.name}.partial")
+    try:
+        shutil.rmtree(stage, ignore_errors=True)  # left by a process that was killed: a copy, nothing recorded
+        stage.mkdir(parents=True)
+        yield stage
+        for path in (stage, *(inside for inside in stage.rglob("*") if inside.is_dir())):
+            fsync_folder(path)
+        stage.rename(out)
+        fsync_folder(out.parent)
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+
+
+def set_aside(path: Path, tag: str) -> Path:
+    """Give the file a second name beside the first (`x.mcap.damaged-1`), and return that name.
+
+    The same bytes always get the same name. Raises `SessionError` where the disk fails.
     """
     try:
         for number in itertools.count(1):
@@ -49,7 +93,7 @@ def set_aside(path: Path, tag: str) -> Path:
 
 
 def same_bytes(one: Path, other: Path) -> bool:
-    """Whether two files hold the same. Raises `OSError`."""
+    """Whether two files have the same content. Raises `OSError`."""
     if one.samefile(other):
         return True
     if one.stat().st_size != other.stat().st_size:
@@ -62,7 +106,7 @@ def same_bytes(one: Path, other: Path) -> bool:
 
 
 def publish(part: Path, target: Path) -> None:
-    """Give a finished file its name, which nobody may have yet. Raises `FileExistsError`, `OSError`."""
+    """Rename a finished file to `target`. Raises `FileExistsError` where there is one already, `OSError`."""
     try:
         os.link(part, target)
     except FileExistsError:
@@ -83,12 +127,11 @@ def _link(path: Path, kept: Path) -> None:
     except OSError:
         with path.open("rb") as source, kept.open("xb") as target:
             shutil.copyfileobj(source, target)
-            target.flush()
-            os.fsync(target.fileno())
+            sync(target)
 
 
 def unwritable(folder: Path) -> tuple[Path, str] | None:
-    """What stands in the way of writing into a folder, or of making it, and why; None where nothing does."""
+    """Path that prevents writing into a folder, or creating it, and the reason; None where nothing does."""
     there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     if not there.is_dir():
         return there, "is a file; a folder is needed"

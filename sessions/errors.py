@@ -1,10 +1,10 @@
-"""Errors of the store, each with the path it is about.
+"""Errors about sessions on disk, each with the path of a file or folder.
 
 SessionError
  +-- InputError          a file from elsewhere cannot be used as it is; nothing was written
  +-- SessionLocked       another process has the session open
  +-- SessionDamaged      what is on disk does not agree with the journal
- +-- DiskFull            no room for what comes next; what is finished stays, and the same command goes on
+ +-- DiskFull            no room for the next step; finished steps stay, and the same command resumes
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import ClassVar
 
 
 class SessionError(Exception):
-    """Something about a session on disk; `path` says which file or folder."""
+    """Problem with a session on disk; `path` is the file or folder."""
 
     exit_code: ClassVar[int] = 4
 
@@ -26,7 +26,7 @@ class SessionError(Exception):
 
 
 class InputError(SessionError):
-    """A file given by the user cannot be used; says which field and what is allowed."""
+    """A file given by the user cannot be used; the message names the field and what is allowed."""
 
     exit_code: ClassVar[int] = 2
 
@@ -38,13 +38,13 @@ class SessionLocked(SessionError):
 
 
 class SessionDamaged(SessionError):
-    """The files and the journal disagree; nothing is thrown away, and nothing is guessed."""
+    """The files and the journal disagree; nothing is discarded, and nothing is guessed."""
 
     exit_code: ClassVar[int] = 6
 
 
 class DiskFull(SessionError):
-    """The disk has no room, or ran out of it. Nothing finished is lost; the attempt at hand was not finished."""
+    """The disk is full. Nothing finished is lost; the current attempt was not finished."""
 
     def __init__(self, path: Path | str, what: str, free_bytes: int | None = None) -> None:
         self.free_bytes = free_bytes
@@ -52,14 +52,14 @@ class DiskFull(SessionError):
 
 
 def disk_error(path: Path | str, what: str, error: BaseException) -> SessionError:
-    """What a failed write becomes: `DiskFull` where there was no room, `SessionError` otherwise."""
-    told = f"{what}: {in_one_line(error)}"
+    """Make the error for a failed write: `DiskFull` where there was no room, `SessionError` otherwise."""
+    message = f"{what}: {in_one_line(error)}"
     full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
-    return DiskFull(path, told) if full else SessionError(path, told)
+    return DiskFull(path, message) if full else SessionError(path, message)
 
 
 def in_one_line(error: BaseException) -> str:
-    """What a library or the system says went wrong, fit for the one line that a user sees."""
+    """Error message of a library or the system, as one line for the user."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return " ".join(f"{type(error).__name__}: {error}".split())[:300]

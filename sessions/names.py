@@ -1,4 +1,4 @@
-"""What a folder that came from elsewhere may name: files of its own, and nothing else.
+"""Names of sessions and files, and the checks that keep a session from elsewhere within its own folder.
 
 Whoever hands a session on may write any name into its journal, and may put links where files should be. Every name
 that is read from a session goes through `bare_name`, and every folder through `check_folder`, before it is used.
@@ -7,11 +7,16 @@ that is read from a session goes through `bare_name`, and every folder through `
 from __future__ import annotations
 
 import os
+import re
 import stat
 from pathlib import Path
 
 from sessions.errors import InputError, in_one_line
 
+SESSION_ID = re.compile(r"[0-9A-Za-z][0-9A-Za-z._-]{0,99}")
+SEGMENT_NAME = re.compile(r"(\d{4,})-([a-z_]+)-([0-9A-Za-z_.-]+?)\.mcap(\.part)?")
+"""File of a step: serial, kind, start of the key, and `.part` while unfinished."""
+SNAPSHOT_NAMES = ("rig.toml", "protocol.toml", "rig.effective.json")
 MAX_NAME_BYTES = 255
 COMPANIONS = (
     "journal.jsonl",
@@ -23,11 +28,11 @@ COMPANIONS = (
     "loop",
     "written",
 )
-"""What is read, or written, beside a recording that lies in a folder of other things."""
+"""Files and folders that belong to a recording which lies among other things."""
 
 
 def bare_name(value: object) -> str:
-    """The name of a file in the folder at hand. Raises `ValueError` for anything that could lead elsewhere."""
+    """Return the name of a file in the session's folder. Raises `ValueError` for a name that could lead elsewhere."""
     if not isinstance(value, str):
         raise ValueError("is not a string")
     plain = value.isprintable() and not any(sign in value for sign in "/\\")
@@ -39,7 +44,7 @@ def bare_name(value: object) -> str:
 def check_folder(folder: Path) -> None:
     """Raise `InputError` where anything in a session's folder is a link, a device or a pipe.
 
-    The folder itself may be given through a link: that is the choice of whoever gives it.
+    The folder itself may be given by the user through a link.
     """
     waiting = [folder]
     while waiting:
@@ -48,7 +53,7 @@ def check_folder(folder: Path) -> None:
             with os.scandir(inside) as entries:
                 found = [(Path(entry.path), entry.stat(follow_symlinks=False).st_mode) for entry in entries]
         except OSError as error:
-            raise InputError(inside, f"cannot be looked at: {in_one_line(error)}") from None
+            raise InputError(inside, f"cannot be read: {in_one_line(error)}") from None
         for path, mode in found:
             _check_mode(path, mode)
             if stat.S_ISDIR(mode):
@@ -56,7 +61,7 @@ def check_folder(folder: Path) -> None:
 
 
 def check_companions(folder: Path) -> None:
-    """The same for what belongs to a single recording, in a folder that may hold anything else as well."""
+    """Check, as `check_folder` does, only the `COMPANIONS` of a recording in a folder of other things."""
     for name in COMPANIONS:
         path = folder / name
         if check_file(path) and path.is_dir():
@@ -64,7 +69,7 @@ def check_companions(folder: Path) -> None:
 
 
 def check_file(path: Path) -> bool:
-    """Whether there is something of this name. Raises `InputError` where that is a link, a device or a pipe."""
+    """Whether the path exists. Raises `InputError` where it is a link, a device or a pipe."""
     try:
         mode = path.lstat().st_mode
     except OSError:

@@ -1,4 +1,4 @@
-"""Reading a recording: the header, the strokes with their stills, one at a time, in flat memory."""
+"""Reading a recording: its header, and its strokes with their stills one at a time, in constant memory."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
 from sessions.errors import InputError, SessionDamaged, in_one_line
+from sessions.folders import check_name, not_a_session
 from sessions.journal.journal import JOURNAL_NAME, is_open, replay
 from sessions.names import check_companions
 from sessions.recording import container
+from sessions.recording.mcap_file import HEADER_METADATA, file_sha256, header_crc
 from sessions.recording.messages import decode_gray, decode_still
 from sessions.recording.schemas import Event, Header, StepEvent, Stroke, Topic
-from sessions.recording.writer import HEADER_METADATA, file_sha256, header_crc
 from sessions.remarks import remarks_of
-from sessions.renamed import check_name, not_a_session
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,18 +28,18 @@ if TYPE_CHECKING:
 
 MAX_ATTACHMENT_BYTES = 1024 * 1024
 STILLS_KEPT = 8
-"""A stroke refers to a still shortly before it; more would hold a session in memory."""
+"""A stroke refers to a still shortly before it, so that older stills need not stay in memory."""
 
 
 @dataclass(frozen=True, slots=True)
 class Capture:
-    """A stroke and the still that shows it."""
+    """Stroke and the still that shows it."""
 
     stroke: Stroke
     still_png: bytes
     where: str
     bad: str = ""
-    """Why it does not count, in a person's words; empty where nobody marked it."""
+    """Reason why it does not count, given by a person; empty where it was not marked bad."""
 
     def image(self) -> NDArray[np.uint8]:
         """(h, w) uint8 gray. Raises `SessionDamaged` naming the stroke."""
@@ -59,23 +59,23 @@ class Recording:
         return file_sha256(self.path)
 
     def attachment(self, name: str) -> bytes:
-        """A file that travels inside the recording (`rig.toml`). Raises `InputError` where there is none."""
+        """File attached to the recording (`rig.toml`). Raises `InputError` where there is none."""
         for attachment in container.attachments(self.path):
             if attachment.name == name and len(attachment.data) <= MAX_ATTACHMENT_BYTES:
                 return attachment.data
         raise InputError(self.path, f"holds no {name} of at most {MAX_ATTACHMENT_BYTES} bytes")
 
     def strokes(self) -> int:
-        """How many strokes the index tells, without reading one."""
+        """Number of strokes according to the index, without reading them."""
         return container.indexed_counts(self.path).get(Topic.STROKE, 0)
 
     def stroke_records(self) -> Iterator[Stroke]:
-        """What was commanded, stroke by stroke, without their stills. Raises `SessionDamaged`."""
+        """Strokes as they were commanded, without their stills. Raises `SessionDamaged`."""
         for _topic, _sequence, data in self._messages([Topic.STROKE]):
             yield _event(self.path, Stroke, data)
 
     def captures(self) -> Iterator[Capture]:
-        """Every stroke in order of capture. Raises `SessionDamaged`."""
+        """Strokes with their stills, in order of capture. Raises `SessionDamaged`."""
         bad = self.marked_bad()
         stills: OrderedDict[int, bytes] = OrderedDict()
         for topic, sequence, data in self._messages([Topic.STILL, Topic.STROKE]):
@@ -91,12 +91,12 @@ class Recording:
             yield Capture(stroke, stills[stroke.still], where, bad.get(stroke.still, ""))
 
     def marked_bad(self) -> dict[int, str]:
-        """Why a person marked a capture bad, by still. Raises `SessionDamaged`."""
+        """Reasons why captures were marked bad, by number of the still. Raises `SessionDamaged`."""
         latest = remarks_of(self.path.parent).values()
         return {one.still: f"was marked bad{f': {one.note}' if one.note else ''}" for one in latest if one.bad}
 
     def stills_of(self, kind: str) -> Iterator[bytes]:
-        """The stills taken in steps of this kind (`board`), encoded."""
+        """Encoded stills taken in steps of this kind (`board`)."""
         current = ""
         for topic, _sequence, data in self._messages([Topic.STEP, Topic.STILL]):
             if topic == Topic.STEP:
@@ -131,11 +131,11 @@ def _read_header(path: Path) -> Header:
             if record.metadata.get("crc", header_crc(record.metadata)) != header_crc(record.metadata):
                 raise SessionDamaged(path, "header does not match its CRC")
             return parse_header(path, record.metadata)
-    raise InputError(path, "is an MCAP file, but not one of brushloop's: it has no header")
+    raise InputError(path, "is an MCAP file without brushloop's header")
 
 
 def parse_header(path: Path, metadata: dict[str, str]) -> Header:
-    """The header from its metadata record, its CRC not looked at. Raises `SessionDamaged`."""
+    """Header from its metadata record; its CRC is not checked. Raises `SessionDamaged`."""
     try:
         values: dict[str, Any] = {name: json.loads(text) for name, text in metadata.items() if name != "crc"}
         return Header.model_validate(values, strict=False)

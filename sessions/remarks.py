@@ -1,7 +1,7 @@
-"""What people say of captures afterwards: bad, good after all, a note. Appended beside the recording, never into it.
+"""Remarks on captures made afterwards (bad, good again, a note), kept beside the recording and never inside it.
 
-`remarks.jsonl` holds one line a remark, with a CRC like the journal's; a later remark on the same still holds. The
-recording itself is never changed, so a closed session stays byte for byte what was recorded.
+`remarks.jsonl` holds one line per remark, with a CRC as in the journal; the latest remark on a still counts. The
+recording itself is never changed, so that a closed session stays byte for byte what was recorded.
 """
 
 from __future__ import annotations
@@ -10,14 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sessions.errors import SessionDamaged
-from sessions.journal.journal import Journal, read_lines
+from sessions.journal.journal import Journal
+from sessions.journal.lines import read_lines
 
 REMARKS_NAME = "remarks.jsonl"
 
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """What holds of one capture."""
+    """Remark on one capture."""
 
     still: int
     """`sequence` of the capture's still, unique in the session."""
@@ -25,7 +26,7 @@ class Remark:
     bad: bool = False
     note: str = ""
     t_ns: int = 0
-    """When it was said, by the host's clock."""
+    """Time of the remark by the host's clock."""
 
 
 def add_remark(folder: Path, remark: Remark) -> None:
@@ -39,14 +40,14 @@ def add_remark(folder: Path, remark: Remark) -> None:
 
 
 def mark_bad_or_good(folder: Path, still: int, stroke_id: str, t_ns: int) -> bool:
-    """Say the other of bad and good about a capture, its note kept; True for bad now. Raises `SessionError`."""
+    """Switch a capture between bad and good, keep its note, and return whether it is bad now. Raises `SessionError`."""
     known = remarks_of(folder).get(still, Remark(still, stroke_id))
     add_remark(folder, Remark(still, stroke_id, not known.bad, known.note, t_ns))
     return not known.bad
 
 
 def remarks_of(folder: Path) -> dict[int, Remark]:
-    """The latest remark by still; empty where nobody said anything. Raises `SessionDamaged`."""
+    """Latest remark for each still; empty where there is none. Raises `SessionDamaged`."""
     path = folder / REMARKS_NAME
     found: dict[int, Remark] = {}
     for line in read_lines(path) if path.is_file() else ():
@@ -56,5 +57,5 @@ def remarks_of(folder: Path) -> dict[int, Remark]:
             still, t_ns = int(line["still"]), int(line["t_ns"])
             found[still] = Remark(still, str(line["stroke_id"]), bool(line["bad"]), str(line["note"]), t_ns)
         except (KeyError, TypeError, ValueError) as error:
-            raise SessionDamaged(path, f"a remark lacks or spoils {error}") from None
+            raise SessionDamaged(path, f"a remark has a missing or wrong field: {error}") from None
     return found

@@ -1,25 +1,29 @@
-"""What is in a session: steps, strokes per cell of the grid, sheets, files, devices. Reads no photograph."""
+"""What is in one session (steps, strokes per cell of the grid, sheets, files, devices), and which sessions there are.
+
+Reads journals and headers, and no photograph.
+"""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
-from sessions.errors import InputError, SessionDamaged, in_one_line
+from sessions.errors import InputError, SessionDamaged, SessionError, in_one_line
+from sessions.folders import check_name, recording_of_renamed
 from sessions.journal.codec import Line
 from sessions.journal.events import NONSENSE
-from sessions.journal.journal import JOURNAL_NAME, Replay, replay_lines
+from sessions.journal.journal import JOURNAL_NAME, Replay, is_open, read_header, replay, replay_lines
+from sessions.names import check_folder
 from sessions.reader import Recording
 from sessions.recording import container
-from sessions.recording.schemas import Header, Stroke, Topic
+from sessions.recording.schemas import Header, Source, Stroke, Topic
 from sessions.remarks import remarks_of
-from sessions.renamed import check_name
-from sessions.store import counts_of, read_header
 
 DEVICES = ("robot", "robot_firmware", "camera", "lens", "brush", "ink", "paper")
 
@@ -45,7 +49,7 @@ class Sheet:
 
 @dataclass(frozen=True, slots=True)
 class GridCell:
-    """How many strokes of one (H, alpha) there are; `planned` is None where the protocol does not tell."""
+    """How many strokes of one (H, alpha) there are; `planned` is None where the protocol does not say."""
 
     height_mm: float | None
     tilt_deg: float | None
@@ -69,9 +73,9 @@ class Details:
     void: list[str] = field(default_factory=list[str])
     """Attempts that were cut, and why."""
     next: str = ""
-    """The step that was being done when the last process ended; empty where none was."""
+    """Step under way when the last process ended; empty where none was."""
     strokes: int = 0
-    """That count: kept by the run, and not marked bad since."""
+    """Kept by the run, and not marked bad since."""
     marked_bad: int = 0
     planned: int | None = None
     grid: list[GridCell] = field(default_factory=list[GridCell])
@@ -93,12 +97,12 @@ def details(path: Path) -> Details:
     if not path.exists():
         raise InputError(path, "no such session: give a session's folder or its .mcap file")
     recording = Recording(path)
-    told = _of_header(recording.header, "recording")
+    found = _of_header(recording.header, "recording")
     strokes = list(recording.stroke_records())
-    told.strokes, told.grid = len(strokes), _grid(strokes, recording.header)
-    told.messages = container.indexed_counts(recording.path)
-    told.file, told.size_bytes = recording.path.name, recording.path.stat().st_size
-    return told
+    found.strokes, found.grid = len(strokes), _grid(strokes, recording.header)
+    found.messages = container.indexed_counts(recording.path)
+    found.file, found.size_bytes = recording.path.name, recording.path.stat().st_size
+    return found
 
 
 def _of_header(header: Header, state: str) -> Details:
@@ -108,41 +112,41 @@ def _of_header(header: Header, state: str) -> Details:
 
 
 def _of_journal(folder: Path) -> Details:
-    """Raises `SessionDamaged` also for what reads well and makes no sense, as a grid of no numbers."""
+    """Raises `SessionDamaged` also for lines that read well and make no sense, as a grid without numbers."""
     state, lines = replay_lines(folder / JOURNAL_NAME)
     try:
-        return _told(folder, state, lines)
+        return _read(folder, state, lines)
     except (*NONSENSE, ValidationError) as error:
         raise SessionDamaged(folder / JOURNAL_NAME, f"makes no sense: {in_one_line(error)}") from None
 
 
-def _told(folder: Path, state: Replay, lines: list[Line]) -> Details:
+def _read(folder: Path, state: Replay, lines: list[Line]) -> Details:
     header = read_header(folder, state)
-    told = _of_header(header, "open" if state.closed is None else "closed")
-    told.session_id = folder.name
-    told.processes = sum(line["event"] == "process" for line in lines)
-    told.finished = dict(Counter(str(line["kind"]) for line in state.segments))
-    told.void, told.next = _voids(lines, state)
-    told.messages = counts_of(state)
-    told.segments = [_segment(folder, line) for line in state.segments]
+    found = _of_header(header, "open" if state.closed is None else "closed")
+    found.session_id = folder.name
+    found.processes = sum(line["event"] == "process" for line in lines)
+    found.finished = dict(Counter(str(line["kind"]) for line in state.segments))
+    found.void, found.next = _voids(lines, state)
+    found.messages = state.counts()
+    found.segments = [_segment(folder, line) for line in state.segments]
     used = {sheet for sheet, _cell in state.used_cells} | {state.sheet}
-    told.sheets = [Sheet(n + 1, sorted(cell for sheet, cell in state.used_cells if sheet == n)) for n in sorted(used)]
+    found.sheets = [Sheet(n + 1, sorted(cell for sheet, cell in state.used_cells if sheet == n)) for n in sorted(used)]
     with_stroke = [line for line in state.segments if Topic.STROKE in line["counts"]]
     bad = {remark.still for remark in remarks_of(folder).values() if remark.bad}
     counted = [line for line in with_stroke if line["result"].get("still") not in bad]
-    told.marked_bad = len(with_stroke) - len(counted)
-    told.strokes = sum(line["counts"].get(Topic.STROKE, 0) for line in counted)
-    told.grid = _grid([_commanded(line, lines) for line in counted], header)
-    told.planned = sum(cell.planned or 0 for cell in told.grid) if _protocol(header) else None
-    told.repairs = [f"{line['event']} {line['file']}: {line.get('why', '')}" for line in state.repairs]
+    found.marked_bad = len(with_stroke) - len(counted)
+    found.strokes = sum(line["counts"].get(Topic.STROKE, 0) for line in counted)
+    found.grid = _grid([_commanded(line, lines) for line in counted], header)
+    found.planned = sum(cell.planned or 0 for cell in found.grid) if _protocol(header) else None
+    found.repairs = [f"{line['event']} {line['file']}: {line.get('why', '')}" for line in state.repairs]
     final = folder / f"{folder.name}.mcap"
     if state.closed is not None and final.is_file():
-        told.file, told.size_bytes = final.name, final.stat().st_size
-    return told
+        found.file, found.size_bytes = final.name, final.stat().st_size
+    return found
 
 
 def _voids(lines: list[Line], state: Replay) -> tuple[list[str], str]:
-    """Every attempt that did not end as it should, and the step that the last process was at."""
+    """Attempts that were cut, and the step under way when the last process ended."""
     began: dict[tuple[Any, Any], Line] = {}
     voids: list[str] = []
     last = ""
@@ -155,17 +159,17 @@ def _voids(lines: list[Line], state: Replay) -> tuple[list[str], str]:
                 began.pop(ident, None)
             case "void" if ident in began:
                 cut = began.pop(ident)
-                voids.append(f"{_words(cut)}, attempt {line['attempt']}: {line.get('why', '')}")
-                last = _words(cut) if cut["key"] not in state.done else ""
+                voids.append(f"{_step_name(cut)}, attempt {line['attempt']}: {line.get('why', '')}")
+                last = _step_name(cut) if cut["key"] not in state.done else ""
             case _:
                 pass
     for line in began.values():
-        voids.append(f"{_words(line)}, attempt {line['attempt']}: the process ended during it")
-        last = _words(line) if line["key"] not in state.done else last
+        voids.append(f"{_step_name(line)}, attempt {line['attempt']}: the process ended during it")
+        last = _step_name(line) if line["key"] not in state.done else last
     return voids, last if state.closed is None else ""
 
 
-def _words(begin: Line) -> str:
+def _step_name(begin: Line) -> str:
     stroke = begin.get("params", {}).get("stroke_id", "")
     return f"{begin['kind']} {stroke}".strip().replace("_", " ")
 
@@ -178,7 +182,7 @@ def _segment(folder: Path, line: Line) -> Segment:
 
 
 def _commanded(line: Line, lines: list[Line]) -> Stroke:
-    """A stroke as far as the journal tells it: height and tilt from its parameters or its result."""
+    """Stroke as the journal describes it: height and tilt from its parameters or its result."""
     params: Line = {}
     for begin in lines:
         if begin["event"] == "begin" and begin["key"] == line["key"]:
@@ -189,13 +193,13 @@ def _commanded(line: Line, lines: list[Line]) -> Stroke:
 
 
 def _protocol(header: Header) -> dict[str, Any]:
-    """The grid's protocol as it was recorded; empty where the recording was made by other means."""
+    """Protocol of a grid session; empty for any other recording."""
     try:
-        told: Any = json.loads(header.protocol)
+        found: Any = json.loads(header.protocol)
     except ValueError:
         return {}
-    protocol: dict[str, Any] = dict(told) if isinstance(told, dict) else {}  # pyright: ignore[reportUnknownArgumentType]
-    # An adaptive one presses what it needs, not the whole grid that it chooses from.
+    protocol: dict[str, Any] = dict(found) if isinstance(found, dict) else {}  # pyright: ignore[reportUnknownArgumentType]
+    # An adaptive protocol presses only part of the grid that it chooses from.
     is_grid = protocol.get("kind", "grid") == "grid" and protocol.keys() >= {"heights_mm", "tilts_deg", "repeats"}
     return protocol if is_grid else {}
 
@@ -212,3 +216,44 @@ def _grid(strokes: list[Stroke], header: Header) -> list[GridCell]:
     return [
         GridCell(h, a, have[h, a], planned.get((h, a)) if h is not None and a is not None else None) for h, a in cells
     ]
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """One session in one line."""
+
+    session_id: str
+    state: str
+    source: str
+    strokes: int
+    file: str
+
+
+def summaries(root: Path) -> Iterator[Summary]:
+    """Sessions under `root`, by name; `state` says which are damaged. Raises `InputError` where `root` is no folder."""
+    if not root.is_dir():
+        raise InputError(root, "is not a folder of sessions")
+    for folder in sorted(path for path in root.iterdir() if path.is_dir()):
+        try:
+            row = _summary(folder)
+        except SessionError as error:
+            row = Summary(folder.name, "damaged", "", 0, error.path.name)
+        if row is not None:
+            yield row
+
+
+def _summary(folder: Path) -> Summary | None:
+    check_folder(folder)
+    collected = (folder / JOURNAL_NAME).is_file()
+    if collected and is_open(state := replay(folder / JOURNAL_NAME)):
+        strokes = sum(line["counts"].get(Topic.STROKE, 0) for line in state.segments)
+        return Summary(folder.name, "open", "", strokes, "")
+    merged = folder / f"{folder.name}.mcap"
+    renamed = None if merged.is_file() else recording_of_renamed(folder)
+    if renamed is None and not merged.is_file():
+        return None
+    recording = Recording(renamed or merged)
+    state_name = "imported" if recording.header.source is Source.IMPORT else "closed"
+    if renamed is not None:
+        return Summary(folder.name, "renamed", recording.header.source, recording.strokes(), renamed.name)
+    return Summary(folder.name, state_name, recording.header.source, recording.strokes(), merged.name)

@@ -1,34 +1,26 @@
-"""A session's folder: made, locked, resumed, closed. The engine writes through this and through nothing else."""
+"""A session's folder open for writing: created, locked, resumed, closed. The engine writes only through this."""
 
 from __future__ import annotations
 
-import datetime as dt
-import os
-import re
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
-from pydantic import ValidationError
 
-from sessions.disk import check_room, free_bytes, set_aside
-from sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked, disk_error, in_one_line
+from sessions.disk import check_room, free_bytes, fsync_folder, write_durably
+from sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked, disk_error
 from sessions.journal.codec import Line
-from sessions.journal.journal import JOURNAL_NAME, Journal, Replay, fsync_folder, is_open, replay
-from sessions.merge import merge, verify
-from sessions.names import check_folder
+from sessions.journal.journal import JOURNAL_NAME, Journal, Replay, read_header, replay
+from sessions.merge import merge_session
+from sessions.names import SEGMENT_NAME, check_folder
+from sessions.recording.mcap_file import check_digest, file_sha256
 from sessions.recording.schemas import Header, Recorded
-from sessions.recording.writer import QUEUE_LIMIT, SegmentWriter, file_sha256
+from sessions.recording.writer import QUEUE_LIMIT, SegmentWriter
 
 STEP_BYTES = 64 * 1024 * 1024
-"""Room that the disk must have before a step begins: more than the photographs and poses of any one step."""
-SESSION_ID = re.compile(r"[0-9A-Za-z][0-9A-Za-z._-]{0,99}")
-SEGMENT_NAME = re.compile(r"(\d{4,})-([a-z_]+)-([0-9A-Za-z_.-]+?)\.mcap(\.part)?")
-"""Serial, kind, start of the key, and `.part` while unfinished."""
-SNAPSHOT_NAMES = ("rig.toml", "protocol.toml", "rig.effective.json")
+"""Room needed on the disk before a step begins: more than the photographs and poses of any one step."""
 Snapshots = dict[str, str]
 """File name -> text of the configuration that a session was started with."""
 
@@ -47,10 +39,10 @@ class Attempt:
 
 
 class SessionStore:
-    """One session open for writing, under its lock. Raises `InputError` where there is none to go on with.
+    """One session open for writing, under its lock. Raises `InputError` where no session can be resumed.
 
-    `snapshots` are the texts of the configuration, for a new session: the journal keeps them as well. A session
-    that is damaged raises `SessionDamaged`, with `brushloop sessions repair` as the way out.
+    A new session is given a header and `snapshots`, the texts of its configuration, which the journal keeps as well.
+    Raises `SessionDamaged` for a damaged session; its note names `brushloop sessions repair`.
     """
 
     def __init__(
@@ -89,7 +81,7 @@ class SessionStore:
         try:
             folder.mkdir(parents=True)
             for name, text in snapshots.items():
-                _write_durably(folder / name, text)
+                write_durably(folder / name, text.encode())
             fsync_folder(folder.parent)
         except FileExistsError:
             raise InputError(folder, "exists already; recordings are never overwritten") from None
@@ -102,21 +94,21 @@ class SessionStore:
         return free_bytes(self.folder)
 
     def check_room(self, need_bytes: int = STEP_BYTES) -> None:
-        """Raise `DiskFull` unless the disk has that much room. `begin` asks by itself, before it journals anything."""
+        """Raise `DiskFull` unless the disk has that much room. `begin` checks this before it journals anything."""
         check_room(self.folder, need_bytes)
 
     def begin(self, key: str, kind: str, *, cell: int | None, notes: Line) -> Attempt:
         """Journal that an attempt starts, then open its file.
 
-        Raises `DiskFull`, or `SessionError` for a press on a sheet that may hold one that nobody knows of; nothing
-        has happened then.
+        Raises `DiskFull`, or `SessionError` for a press on a sheet that may hold an unrecorded one; nothing has
+        happened then.
         """
         self.check_room()
         if cell is not None and self.state.sheet in self.state.doubtful_sheets:
             sheet = self.state.sheet + 1
             raise SessionError(
                 self.folder,
-                f"the record of a press on sheet {sheet} was lost, so a cell may hold ink that nobody knows of. "
+                f"the record of a press on sheet {sheet} was lost, so any of its cells may already hold ink. "
                 f"Put a fresh sheet in, then run the same command with --sheet {sheet + 1}",
             )
         attempt = self.state.attempts.get(key, 0) + 1
@@ -142,7 +134,7 @@ class SessionStore:
         return Attempt(key, kind, serial, attempt, writer, cell)
 
     def done(self, attempt: Attempt, result: dict[str, Any]) -> None:
-        """Finish the file, then journal `done`: from here on the step is never done again."""
+        """Finish the file, then journal `done`: after this the step is never done again."""
         t_ns = self._now_ns()
         identity = {"key": attempt.key, "kind": attempt.kind, "attempt": attempt.attempt}
         file = attempt.writer.final.name
@@ -153,7 +145,7 @@ class SessionStore:
         self.state.segments.append(line)
 
     def void(self, attempt: Attempt, why: str) -> None:
-        """Journal that an attempt was cut; its part file stays as evidence, its cell stays used."""
+        """Journal that an attempt was cut; its part file is kept as evidence, and its cell stays used."""
         attempt.writer.abandon()
         self._log({"event": "void", "key": attempt.key, "attempt": attempt.attempt, "why": why})
         self.state.voids += 1
@@ -167,7 +159,7 @@ class SessionStore:
         """Raise `SessionDamaged` naming the first finished step whose file is missing or has changed."""
         try:
             for line in self.state.segments:
-                verify(self.folder / str(line["file"]), str(line["sha256"]))
+                check_digest(self.folder / str(line["file"]), str(line["sha256"]))
         except SessionDamaged as error:
             error.add_note(f"Try `brushloop sessions repair {self.folder}`.")
             raise
@@ -180,11 +172,11 @@ class SessionStore:
         self.verify()
         self.check_room(sum((self.folder / str(line["file"])).stat().st_size for line in self.state.segments))
         final = merge_session(self.folder, self.state, self.header)
-        self._log(closed_line(final, counts_of(self.state)))
+        self._log(closed_line(final, self.state.counts()))
         return final
 
     def release(self) -> None:
-        """Give the lock back; the session can be resumed or read by anyone."""
+        """Release the lock: any process can now resume or read the session."""
         try:
             if self._journal is not None:
                 self._journal.close()
@@ -202,7 +194,7 @@ class SessionStore:
         return t_ns
 
     def _check_serials(self) -> None:
-        """A journal that lost its last lines would give their numbers, and their cells, away again."""
+        """Refuse a journal that lost its last lines: their numbers, and their cells, would be used again."""
         for path in sorted(self.folder.glob("*.mcap*")):
             serial = SEGMENT_NAME.fullmatch(path.name)
             if serial and int(serial[1]) >= self.state.begun:
@@ -210,8 +202,8 @@ class SessionStore:
 
 
 def lock(folder: Path) -> FileLock:
-    """The session's lock, taken. Raises `SessionLocked` while another process has it."""
-    # One lock for all threads: the engine opens the store in one and may release it in another.
+    """Take the session's lock. Raises `SessionLocked` while another process has it."""
+    # One lock for all threads: the engine opens the store in one thread and may release it in another.
     held = FileLock(folder / ".lock", timeout=0, thread_local=False)
     try:
         held.acquire()
@@ -236,56 +228,3 @@ def done_line(identity: Line, file: str, recorded: Recorded, result: Line) -> Li
 def closed_line(final: Path, counts: dict[str, int]) -> Line:
     """The event of a closed session."""
     return {"event": "closed", "file": final.name, "sha256": file_sha256(final), "counts": counts}
-
-
-def counts_of(state: Replay) -> dict[str, int]:
-    """Messages by topic that the merged file must hold."""
-    counts: Counter[str] = Counter()
-    for line in state.segments:
-        counts.update(line["counts"])
-    return dict(counts)
-
-
-def merge_session(folder: Path, state: Replay, header: Header, tag: str = "superseded") -> Path:
-    """Write and read back the merged file. One that is there already, from a close that was cut, is kept beside."""
-    final = folder / f"{folder.name}.mcap"
-    files = [folder / str(line["file"]) for line in state.segments]
-    snapshots = [path for name in SNAPSHOT_NAMES if (path := folder / name).is_file()]
-    if final.exists():
-        set_aside(final, tag)
-    merge(files, final, header, snapshots, counts_of(state), state.repairs)
-    return final
-
-
-def read_header(folder: Path, state: Replay) -> Header:
-    """The header in the journal. Raises `SessionDamaged`."""
-    if state.opened is None:
-        raise SessionDamaged(folder / JOURNAL_NAME, "has no `open` event")
-    try:
-        return Header.model_validate(state.opened["header"])
-    except (KeyError, ValidationError) as error:
-        raise SessionDamaged(folder / JOURNAL_NAME, f"its `open` event has no header: {in_one_line(error)}") from None
-
-
-def _write_durably(path: Path, text: str) -> None:
-    with path.open("x", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def next_session_id(root: Path, label: str, today: dt.date) -> str:
-    """`2026-11-21-grid-01`: the first number that is free under `root`."""
-    for number in range(1, 1000):
-        session_id = f"{today.isoformat()}-{label}-{number:02d}"
-        if not (root / session_id).exists():
-            return session_id
-    raise InputError(root, f"has 999 sessions of {today.isoformat()}-{label}")
-
-
-def open_sessions(root: Path) -> list[Path]:
-    """Folders under `root` whose journal was opened and has no `closed` event, oldest first."""
-    folders = sorted(path.parent for path in root.glob(f"*/{JOURNAL_NAME}"))
-    for folder in folders:
-        check_folder(folder)
-    return [folder for folder in folders if is_open(replay(folder / JOURNAL_NAME))]

@@ -1,31 +1,36 @@
-"""The one way to a terminal: whatever a file, a folder's name or a device says is printed, and never obeyed."""
+"""Printing to a terminal: text from a file, a folder's name or a device is shown, and never acted on."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 import typer
 
+if TYPE_CHECKING:
+    from rich.console import Console  # noqa: TID251 - the one place
+
 _ACTED_ON = re.compile(
-    # Controls of ASCII and of Latin-1 (an escape sequence begins with one), without the tab.
+    # Control characters of ASCII and Latin-1 (an escape sequence begins with one), except the tab.
     "[\x00-\x08\x0a-\x1f\x7f-\x9f"
-    # What turns the direction of writing, breaks lines or takes no room; halves of characters, from undecodable names.
+    # Marks that turn the direction of writing, break lines or have no width; surrogates, from undecodable names.
     "\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff\U000e0000-\U000e007f]"
 )
 
 
 def plain(text: str, *, keep: str = "") -> str:
-    r"""The text with every character that a terminal acts on written out, as `\u001b`: a JSON string keeps its value.
+    r"""Escape every character that a terminal acts on, as `\u001b`: a JSON string keeps its value.
 
-    Line ends are written out as well: a name may not pretend to be the next line. `keep` names what stays as it is.
+    Line ends are escaped as well: a name may not pretend to be the next line. `keep` lists characters left as they are.
     """
     if text.isprintable():
         return text
-    return _ACTED_ON.sub(lambda found: found[0] if found[0] in keep else _written_out(found[0]), text)
+    return _ACTED_ON.sub(lambda found: found[0] if found[0] in keep else _escaped(found[0]), text)
 
 
 def inert(text: str) -> str:
-    """The text without those characters, for a place whose width is laid out already: they take none."""
+    """Remove those characters, for a place whose width is laid out already: they have none."""
     return text if text.isprintable() else _ACTED_ON.sub("", text)
 
 
@@ -35,11 +40,32 @@ def say(*parts: object, err: bool = False) -> None:
         if isinstance(part, str):
             typer.echo(plain(part), err=err)  # noqa: TID251 - the one place
         else:
-            from sessions.console import PlainConsole
-
-            PlainConsole(stderr=err).print(part)
+            plain_console(stderr=err).print(part)
 
 
-def _written_out(char: str) -> str:
+def plain_console(*, stderr: bool = False) -> Console:
+    """Make a rich console for tables and progress bars: no markup, and no control character but the console's own.
+
+    A colour is given as a style. Rich is imported here because `--help` does without it.
+    """
+    from rich.console import Console  # noqa: TID251 - the one place
+    from rich.segment import Segment
+    from rich.text import Text
+
+    class PlainConsole(Console):
+        def render_str(self, text: str, **options: Any) -> Text:
+            # Escaped before the layout, so that columns are as wide as what is shown.
+            return super().render_str(plain(text, keep="\n"), **options)
+
+        def _render_buffer(self, buffer: Iterable[Segment]) -> str:
+            # Texts and columns that were not made by `render_str` pass here too.
+            return super()._render_buffer(
+                part if part.control else Segment(plain(part.text, keep="\n"), part.style) for part in buffer
+            )
+
+    return PlainConsole(stderr=stderr, markup=False, emoji=False)
+
+
+def _escaped(char: str) -> str:
     units = char.encode("utf-16-be", "surrogatepass")
     return "".join(f"\\u{units[at : at + 2].hex()}" for at in range(0, len(units), 2))

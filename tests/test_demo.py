@@ -17,7 +17,8 @@ import pytest
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.reader import make_reader
 
-from sessions.journal.journal import read_lines, replay
+from sessions.journal.journal import replay
+from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 
 DEMO = [sys.executable, "-m", "brushloop", "demo", "--repeats", "1", "--rate", "40"]

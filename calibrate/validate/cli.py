@@ -9,7 +9,7 @@ import typer
 
 from calibrate.compare.scales import MM_PER_PX
 from calibrate.path_or_command import PathOrCommand
-from sessions.terminal import say
+from sessions.terminal import plain_console, say
 
 if TYPE_CHECKING:
     from calibrate.validate.diff import Difference
@@ -181,9 +181,7 @@ class _shown:  # noqa: N801 - used as a function
         from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
         from rich.progress import Progress as Bar
 
-        from sessions.console import PlainConsole
-
-        self._console = PlainConsole(stderr=True)
+        self._console = plain_console(stderr=True)
         words = TextColumn("{task.description}", markup=False)
         columns = (words, BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
         self._bar = Bar(*columns, console=self._console, transient=True) if self._console.is_terminal else None

@@ -25,8 +25,8 @@ from calibrate.session import calibration_of
 from sessions.errors import SessionDamaged
 from sessions.journal.journal import JOURNAL_NAME, replay
 from sessions.reader import Recording
+from sessions.recording.mcap_file import file_sha256
 from sessions.recording.schemas import Header, Source
-from sessions.recording.writer import file_sha256
 
 PIECE = 1024 * 1024
 MAX_DOWNLOAD_BYTES = 64 * 1024**3

@@ -16,7 +16,7 @@ from collect.chains.commands import GIVEN_UP, run_command
 from collect.chains.finished import finished_session
 from collect.errors import CollectAborted
 from collect.rig.config import RigConfig, load_rig
-from sessions.store import open_sessions
+from sessions.folders import open_sessions
 from sessions.terminal import say
 
 HEIGHTS_MM = [11.0, 13.0, 15.0, 17.0, 20.0]

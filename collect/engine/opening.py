@@ -21,9 +21,10 @@ from drivers.samples import Identity
 from sessions.difference import differences
 from sessions.disk import unwritable
 from sessions.errors import SessionError
+from sessions.folders import next_session_id, open_sessions
 from sessions.journal.journal import JOURNAL_NAME, replay
 from sessions.recording.schemas import Header, Source
-from sessions.store import SessionStore, Snapshots, next_session_id, open_sessions
+from sessions.store import SessionStore, Snapshots
 
 RIG_EFFECTIVE = "rig.effective.json"
 COMPARED = (RIG_EFFECTIVE, "protocol.effective.json")

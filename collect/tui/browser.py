@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collect.engine.engine import Engine
     from collect.rig.doctor import Finding
-    from sessions.show import Details
-    from sessions.summary import Summary
-    from sessions.verify import Verdict
+    from sessions.repair.verify import Verdict
+    from sessions.show import Details, Summary
 
 RECENT = 50
 COLUMNS = 68
@@ -45,7 +44,7 @@ class Desk:
 
     def recent(self) -> list[Summary]:
         """The newest sessions first; none where there is no folder yet."""
-        from sessions.summary import summaries
+        from sessions.show import summaries
 
         if not self.paths.root.is_dir():
             return []
@@ -96,7 +95,7 @@ class Desk:
 
 def verified(folder: Path) -> Verdict:
     """Every file read again. Raises `InputError`."""
-    from sessions.verify import verify_session
+    from sessions.repair.verify import verify_session
 
     return verify_session(folder)
 

@@ -16,14 +16,14 @@ from calibrate.session import lens_in_use
 from collect.engine.last_capture import pictures_of
 from collect.rig.paper import Cell
 from sessions.errors import InputError, SessionDamaged
+from sessions.history import unlike, waits_of
+from sessions.journal.codec import Line
 from sessions.journal.journal import JOURNAL_NAME, is_open, replay
-from sessions.journal.lines import Line
 from sessions.names import check_folder
 from sessions.recording import container
 from sessions.recording.messages import decode_gray, decode_still
 from sessions.recording.schemas import Stroke, Topic
 from sessions.remarks import Remark, remarks_of
-from sessions.waits import unlike, waits_of
 
 if TYPE_CHECKING:
     import numpy as np

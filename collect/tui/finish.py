@@ -19,7 +19,7 @@ from collect.tui.text import plain
 from sessions.errors import SessionError
 
 if TYPE_CHECKING:
-    from sessions.verify import Verdict
+    from sessions.repair.verify import Verdict
 
 MOST_LINES = 400
 

@@ -26,8 +26,7 @@ from sessions.errors import SessionError
 
 if TYPE_CHECKING:
     from collect.rig.doctor import Finding
-    from sessions.show import Details
-    from sessions.summary import Summary
+    from sessions.show import Details, Summary
 
 KEYS = (
     ("enter", "resume or look"),

@@ -1,1 +1,1 @@
-"""Recordings for other tools: images with tables, NumPy, Parquet."""
+"""Exports of recordings for other tools: images with tables, NumPy, Parquet."""

@@ -1,198 +1,111 @@
-"""A recording for other tools: images with a table, NumPy arrays, or Parquet that Hugging Face `datasets` loads.
+"""Export a recording for other tools: images with CSV tables, NumPy arrays, or Parquet.
 
-Every export is a folder, written beside its place and renamed when it is whole; nothing is written into a folder
+Every export is a folder, written beside its place and renamed when it is complete; nothing is written into a folder
 that holds anything. The images are the photographs as they were recorded, byte for byte.
 """
 
 from __future__ import annotations
 
-import os
-import shutil
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+import zipfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from google.protobuf.message import DecodeError
-from pydantic import ValidationError
+from sessions.cells import CsvWriter
+from sessions.disk import check_room, staged_folder, sync, write_durably
+from sessions.errors import InputError, disk_error
+from sessions.export.parquet import write_parquet
+from sessions.export.rows import TEXT_COLUMNS, Export, Row
+from sessions.reader import Recording
 
-from sessions.disk import check_room
-from sessions.errors import InputError, SessionDamaged, disk_error
-from sessions.journal.journal import fsync_folder
-from sessions.reader import Capture, Recording
-from sessions.recording import container
-from sessions.recording.messages import PNG_START
-from sessions.recording.schemas import StepEvent, Stroke, Topic
-from sessions.waits import WAIT, unlike
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
-FORMATS = ("png", "npz", "parquet")
-Row = dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class PoseRow:
-    """The brush tip at one moment of a stroke's press."""
-
-    episode_index: int
-    """Which stroke, in the order of the table of strokes."""
-    frame_index: int
-    """Counts from 0 within the stroke."""
-    t_ns: int
-    """When the host received the sample from the controller."""
-    log_ns: int
-    """When it was recorded."""
-    sequence: int
-    """The sample's own number: a gap is a sample that is missing."""
-    position_mm: tuple[float, float, float]
-    quaternion: tuple[float, float, float, float]
-    """x, y, z, w."""
-
-
-@dataclass(frozen=True, slots=True)
-class Export:
-    """What every format is written from."""
-
-    recording: Recording
-    names: dict[str, str]
-    """Stroke -> file name of its image, without a suffix: nothing that a file system could refuse."""
-    odd: frozenset[str] = frozenset()
-    """Strokes that waited for their touch unlike the others."""
-
-    def captures(self) -> Iterator[tuple[Row, Capture]]:
-        """Each stroke as a row of plain values, None where the recording does not tell, with its photograph."""
-        for index, capture in enumerate(self.recording.captures()):
-            yield self._row(index, capture), capture
-
-    def poses(self) -> Iterator[PoseRow]:
-        """The poses of each stroke's press, in the order of the recording. Raises `SessionDamaged`."""
-        index = {stroke_id: number for number, stroke_id in enumerate(self.names)}
-        current, frame = -1, 0
-        for _schema, channel, message in container.messages(self.recording.path, [Topic.STEP, Topic.TCP]):
-            try:
-                if channel.topic == Topic.STEP:
-                    event = StepEvent.model_validate_json(message.data)
-                    pressed = event.phase == "begin" and event.kind != "capture"
-                    current, frame = index.get(str(event.params.get("stroke_id")), -1) if pressed else -1, 0
-                    continue
-                pose = PoseInFrame.FromString(message.data).pose
-            except (ValidationError, DecodeError):
-                what = f"a message on {channel.topic} does not fit its schema"
-                raise SessionDamaged(self.recording.path, what) from None
-            if current >= 0:
-                at, turned = pose.position, pose.orientation
-                position = (at.x * 1e3, at.y * 1e3, at.z * 1e3)
-                quaternion = (turned.x, turned.y, turned.z, turned.w)
-                times = (message.publish_time, message.log_time)
-                yield PoseRow(current, frame, *times, message.sequence, position, quaternion)
-                frame += 1
-
-    def _wait(self, stroke: Stroke) -> Row:
-        told = stroke.dip_to_touch_s is not None
-        return {
-            WAIT: stroke.dip_to_touch_s,
-            "dip_to_touch_unlike": float(stroke.stroke_id in self.odd) if told else None,
-        }
-
-    def _row(self, index: int, capture: Capture) -> Row:
-        stroke = capture.stroke
-        header = self.recording.header
-        cell = stroke.cell_mm or (None, None, None, None)
-        suffix = "png" if capture.still_png.startswith(PNG_START) else "jpg"
-        return {
-            "episode_index": index,
-            "file": f"images/{self.names[stroke.stroke_id]}.{suffix}",
-            "stroke_id": stroke.stroke_id,
-            "session_id": header.session_id,
-            "source": str(header.source),
-            "kind": stroke.kind,
-            "height_mm": stroke.height_mm,
-            "tilt_deg": stroke.tilt_deg,
-            **self._wait(stroke),
-            "heading_deg": stroke.heading_deg,
-            **_pair("anchor", "mm", stroke.anchor_mm),
-            **_pair("anchor", "px", stroke.anchor_px),
-            **_pair("px_per_mm", "", stroke.px_per_mm),
-            "cell_x_mm": cell[0],
-            "cell_y_mm": cell[1],
-            "cell_width_mm": cell[2],
-            "cell_height_mm": cell[3],
-            **{f"commanded_{name}": value for name, value in stroke.commanded.items()},
-        }
-
-
-def _pair(stem: str, unit: str, values: tuple[float, float] | None) -> Row:
-    first, second = values or (None, None)
-    end = f"_{unit}" if unit else ""
-    return {f"{stem}_x{end}": first, f"{stem}_y{end}": second}
+POSE_COLUMNS = (
+    *("episode_index", "frame_index", "t_ns", "log_ns", "sequence"),
+    *("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw"),
+)
 
 
 def export(source: Path, out: Path, kind: str) -> Path:
-    """Export into the folder `out`. Raises `InputError` for an unknown format or a folder that is not empty,
+    """Export a session into the new or empty folder `out` as `png`, `npz` or `parquet`.
 
-    `SessionDamaged` for a recording that cannot be read: then nothing is left behind.
+    Raises `InputError` for an unknown format or a folder that is not empty, `SessionDamaged` for a recording that
+    cannot be read; nothing is left behind then.
     """
-    write = _writer(kind)
+    writers = {"png": write_png, "npz": write_npz, "parquet": write_parquet}
+    if (write := writers.get(kind)) is None:
+        raise InputError("--format", f"{kind!r}, allowed: {', '.join(writers)}")
     recording = Recording(source)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(out, "exists and is not an empty folder; nothing is ever written over")
     if recording.strokes() == 0:
         raise InputError(recording.path, "holds no strokes to export")
-    stage = out.with_name(f".{out.name}.partial")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         check_room(out.parent, recording.path.stat().st_size)
-        shutil.rmtree(stage, ignore_errors=True)  # left by an export that was killed: a copy
-        stage.mkdir()
-        write(Export(recording, _file_names(recording), _odd(recording)), stage)
-        for path in (stage, *(p for p in stage.rglob("*") if p.is_dir())):
-            fsync_folder(path)
-        stage.rename(out)  # replaces an empty folder, and no other
-        fsync_folder(out.parent)
+        with staged_folder(out) as stage:
+            write(Export.of(recording), stage)
     except OSError as error:
         raise disk_error(out, "cannot write", error) from error
-    finally:
-        shutil.rmtree(stage, ignore_errors=True)
     return out
 
 
-def _writer(kind: str) -> Callable[[Export, Path], None]:
-    match kind:
-        case "png":
-            from sessions.export.table import write_png
-
-            return write_png
-        case "npz":
-            from sessions.export.table import write_npz
-
-            return write_npz
-        case "parquet":
-            from sessions.export.parquet import write_parquet
-
-            return write_parquet
-        case _:
-            raise InputError("--format", f"{kind!r}, allowed: {', '.join(FORMATS)}")
-
-
-def _file_names(recording: Recording) -> dict[str, str]:
-    """Readable, safe and different from each other, whatever the strokes are called."""
-    names: dict[str, str] = {}
-    for number, stroke in enumerate(recording.stroke_records()):
-        if stroke.stroke_id in names:
-            raise SessionDamaged(recording.path, f"holds stroke {stroke.stroke_id} twice")
-        safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stroke.stroke_id)[:80]
-        names[stroke.stroke_id] = f"{number:04d}-{safe}"
-    return names
+def write_png(export: Export, folder: Path) -> None:
+    """Write `images/`, `strokes.csv`, `poses.csv` and `header.json`."""
+    (folder / "images").mkdir()
+    rows: list[Row] = []
+    for row, capture in export.captures():
+        write_durably(folder / str(row["file"]), capture.still_png)
+        rows.append(row)
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    with (folder / "strokes.csv").open("x", newline="", encoding="utf-8") as file:
+        table = CsvWriter(file, "\r\n")
+        table.writerow(columns)
+        table.writerows([row.get(name) for name in columns] for row in rows)
+        sync(file)
+    with (folder / "poses.csv").open("x", newline="", encoding="utf-8") as file:
+        lines = CsvWriter(file, "\r\n")
+        lines.writerow(POSE_COLUMNS)
+        lines.writerows(
+            [p.episode_index, p.frame_index, p.t_ns, p.log_ns, p.sequence, *p.position_mm, *p.quaternion]
+            for p in export.poses()
+        )
+        sync(file)
+    write_durably(folder / "header.json", export.header_json())
 
 
-def _odd(recording: Recording) -> frozenset[str]:
-    waits = {one.stroke_id: one.dip_to_touch_s for one in recording.stroke_records()}
-    return frozenset(unlike({name: wait for name, wait in waits.items() if wait is not None}))
+def write_npz(export: Export, folder: Path) -> None:
+    """Write `strokes.npz` (loads without pickle) and `header.json`.
+
+    One array per column of the table of strokes, (n,), NaN where a value is missing; `image_0000`, ... (h, w) uint8
+    gray; `pose_<column>` (m,), `pose_position_mm` (m, 3) and `pose_quaternion` (m, 4).
+    """
+    import numpy as np
+
+    rows: list[Row] = []
+    with (folder / "strokes.npz").open("xb") as file:
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+            for row, capture in export.captures():
+                _add(archive, f"image_{len(rows):04d}", capture.image())
+                rows.append(row)
+            for name in dict.fromkeys(name for row in rows for name in row):
+                values = [row.get(name) for row in rows]
+                text = name in TEXT_COLUMNS
+                _add(archive, name, np.array(values) if text else np.array(values, np.float64))
+            poses = list(export.poses())
+            for name in POSE_COLUMNS[:5]:
+                _add(archive, f"pose_{name}", np.array([getattr(pose, name) for pose in poses], np.int64))
+            positions = np.array([pose.position_mm for pose in poses], np.float64).reshape(-1, 3)
+            _add(archive, "pose_position_mm", positions)
+            quaternions = np.array([pose.quaternion for pose in poses], np.float64).reshape(-1, 4)
+            _add(archive, "pose_quaternion", quaternions)
+        sync(file)
+    write_durably(folder / "header.json", export.header_json())
 
 
-def write_durably(path: Path, data: bytes) -> None:
-    """A new file, on disk before this returns. Raises `OSError`."""
-    with path.open("xb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+def _add(archive: zipfile.ZipFile, name: str, array: NDArray[np.generic]) -> None:
+    import numpy as np
+
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+        np.lib.format.write_array(member, array, allow_pickle=False)

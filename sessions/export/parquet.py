@@ -1,6 +1,6 @@
 """Parquet that Hugging Face `datasets` loads: one file of strokes with images, one of poses as a time series.
 
-    README.md                                  the data set card: two configurations, `strokes` and `poses`
+    README.md                                  data set card: two configurations, `strokes` and `poses`
     strokes/train-00000-of-00001.parquet       one row a stroke; `image` is a struct {bytes, path}, feature `Image`
     poses/train-00000-of-00001.parquet         one row a pose, columns named as LeRobot names them
     header.json
@@ -17,9 +17,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from sessions.disk import write_durably
 from sessions.errors import InputError
-from sessions.export.export import Export, PoseRow, Row, write_durably
-from sessions.export.table import TEXT_COLUMNS, header_json
+from sessions.export.rows import TEXT_COLUMNS, Export, PoseRow, Row
 
 ROWS_PER_GROUP = 32
 """Photographs held in memory at a time; viewers want small groups for rows with images."""
@@ -29,7 +29,7 @@ STATE_NAMES = ["x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw"]
 
 
 def write_parquet(export: Export, folder: Path) -> None:
-    """Write the four files. Raises `InputError` where pyarrow is not installed."""
+    """Write the files listed above. Raises `InputError` where pyarrow is not installed."""
     try:
         pa: Any = importlib.import_module("pyarrow")  # without type stubs
         pq: Any = importlib.import_module("pyarrow.parquet")
@@ -71,11 +71,11 @@ def write_parquet(export: Export, folder: Path) -> None:
                 writer.write_table(pa.Table.from_pylist(rows, schema=described))
                 counts[name] += len(rows)
     write_durably(folder / "README.md", _card(export, counts))
-    write_durably(folder / "header.json", header_json(export))
+    write_durably(folder / "header.json", export.header_json())
 
 
 def _number_columns(export: Export) -> list[str]:
-    """Every column of numbers that any stroke has: the file has one schema."""
+    """Columns of numbers that any stroke has: the file has one schema."""
     names: dict[str, None] = {}
     for stroke in export.recording.stroke_records():
         names |= dict.fromkeys(f"commanded_{name}" for name in stroke.commanded)
@@ -123,7 +123,7 @@ def _pose_row(pose: PoseRow, index: int, start_ns: int) -> Row:
 
 
 def _features(pa: Any, schema: Any) -> Row:
-    """The same schema as `datasets` writes it into the file's metadata."""
+    """Schema as `datasets` writes it into the file's metadata."""
     features: Row = {}
     for field in schema:
         if field.name == "image":

@@ -1,1 +1,1 @@
-"""Photographs from elsewhere made into sessions."""
+"""Imports: photographs, scans and page sequences from elsewhere become sessions."""

@@ -1,4 +1,4 @@
-"""Photographs from elsewhere become a session: a folder of images and a table of what was commanded.
+"""Import photographs or flatbed scans: a folder of images and a table of what was commanded become a session.
 
 Everything is read and checked before anything is written; a refused import leaves nothing behind.
 """
@@ -6,27 +6,39 @@ Everything is read and checked before anything is written; a refused import leav
 from __future__ import annotations
 
 import hashlib
-import shutil
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from sessions.disk import staged_folder
 from sessions.errors import InputError, SessionDamaged, in_one_line
-from sessions.imports.table import Row, read_table
-from sessions.journal.journal import fsync_folder
-from sessions.recording.messages import MAX_IMAGE_BYTES, PNG_START, decode_gray, image_message
+from sessions.imports.table import Row, parse_table, read_table, read_text
+from sessions.names import SESSION_ID
+from sessions.recording.messages import MAX_IMAGE_BYTES, PNG_START, decode_gray, encode_png, image_message
 from sessions.recording.schemas import Header, Source, Topic
 from sessions.recording.writer import Outgoing, SegmentWriter
-from sessions.store import SESSION_ID
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 QUEUE_LIMIT = 16
-"""Photographs that wait for the disk: an import can slow down, so it need not hold a folder in memory."""
+"""Photographs that may wait for the disk: an import can wait, and so never holds a whole folder in memory."""
 WAIT_S = 60.0
+MM_PER_INCH = 25.4
+LEAST_DPI, MOST_DPI = 20.0, 10_000.0
+BOX = ("left_px", "top_px", "width_px", "height_px")
+LEAST_BOX_PX = 8
+SCANS_KEPT = 2
+"""A table goes through its sheets one after the other; a decoded sheet is tens of megabytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImportOptions:
-    """What the table cannot say."""
+    """What the table does not contain."""
 
     kind: str = "drag"
     """`press` for vertical presses, `drag` for strokes with travel along the paper."""
@@ -36,22 +48,100 @@ class ImportOptions:
     origin: str = ""
     brush: str = ""
     brush_radius_mm: float | None = None
-    """R and L of the bundle, for the models of presses; None takes the nominal brush of the paper."""
+    """R and L of the bundle, for the models of presses; None for the paper's nominal brush."""
     brush_length_mm: float | None = None
 
 
 def import_photographs(
     folder: Path, table: Path, out: Path, options: ImportOptions, software: str, now_ns: Callable[[], int]
 ) -> Path:
-    """Import into the session folder `out` (new); returns its MCAP file. Raises `InputError`, then nothing is left."""
+    """Import into the new session folder `out` and return its MCAP file. Raises `InputError`, leaving nothing."""
     check_target(folder, table, out, options)
     rows = read_table(folder, table, "press" if options.kind == "press" else "drag", options.px_per_mm)
     protocol = f"import of {len(rows)} {options.kind} strokes"
     return store_rows(rows, folder, table, out, options, protocol, software, now_ns)
 
 
+def import_scans(
+    folder: Path,
+    table: Path,
+    out: Path,
+    options: ImportOptions,
+    software: str,
+    now_ns: Callable[[], int],
+    dpi: float | None = None,
+) -> Path:
+    """Import scans into the new session folder `out` and return its MCAP file. Raises `InputError`, leaving nothing.
+
+    The table is that of any import, without px_per_mm: the scale is `dpi`, or the one in the files. Where it has the
+    columns `BOX` (pixels of the scan, from its upper left corner) and `name`, each line is the stroke in that box.
+    """
+    check_target(folder, table, out, options)
+    text = read_text(table)
+    head = [name.strip() for name in text.split("\n", 1)[0].split(",")]
+    boxed = [name for name in BOX if name in head]
+    if boxed and (len(boxed) < len(BOX) or "name" not in head):
+        raise InputError(table, f"needs all of {', '.join(BOX)} and `name`, or none of the boxes")
+    if any(name.startswith("px_per_mm") for name in head):
+        raise InputError(table, "has a px_per_mm column: the scale of a scan is its dpi")
+    kind = "press" if options.kind == "press" else "drag"
+    # 1.0 stands for the scale until it is known from the file.
+    rows = [_scaled(row, dpi) for row in parse_table(folder, table, text, kind, 1.0)]
+    protocol = f"import of {len(rows)} {options.kind} strokes from scans"
+    gray = lru_cache(maxsize=SCANS_KEPT)(_gray)
+
+    def cut(row: Row) -> bytes:
+        if not boxed:
+            return read_bounded(row.image)
+        image = gray(row.image)
+        left, top, width, height = (round(row.stroke.commanded[name]) for name in BOX)
+        inside = min(left, top) >= 0 and left + width <= image.shape[1] and top + height <= image.shape[0]
+        if not inside or min(width, height) < LEAST_BOX_PX:
+            box = f"stroke {row.stroke.stroke_id}: the box {left}, {top}, {width}, {height} is not within"
+            raise InputError(
+                table, f"{box} {image.shape[1]} x {image.shape[0]} px, or less than {LEAST_BOX_PX} px wide"
+            )
+        return encode_png(image[top : top + height, left : left + width])
+
+    return store_rows(rows, folder, table, out, options, protocol, software, now_ns, encoded=cut)
+
+
+def dpi_of(data: bytes) -> tuple[float, float] | None:
+    """Horizontal and vertical dpi of a PNG (pHYs) or JPEG (JFIF density); None where the file has none."""
+    if data.startswith(PNG_START):
+        at = data.find(b"pHYs", 8, 65536)
+        if at < 0 or len(data) < at + 13:
+            return None
+        across, along, unit = struct.unpack_from(">IIB", data, at + 4)
+        return (across * 0.0254, along * 0.0254) if unit == 1 and across and along else None
+    if data[2:4] == b"\xff\xe0" and data[6:11] == b"JFIF\0" and len(data) >= 18:
+        unit, across, along = struct.unpack_from(">BHH", data, 13)
+        factor = {1: 1.0, 2: 2.54}.get(unit)
+        return (across * factor, along * factor) if factor and across and along else None
+    return None
+
+
+def _scaled(row: Row, dpi: float | None) -> Row:
+    found = (dpi, dpi) if dpi is not None else dpi_of(read_bounded(row.image))
+    if found is None:
+        raise InputError(row.image, "does not say its dpi; give --dpi")
+    if not all(LEAST_DPI <= value <= MOST_DPI for value in found):
+        raise InputError(
+            row.image, f"dpi {found[0]:g} x {found[1]:g}, allowed {LEAST_DPI:g} to {MOST_DPI:g}; give --dpi"
+        )
+    scale = (found[0] / MM_PER_INCH, found[1] / MM_PER_INCH)
+    return Row(row.image, row.stroke.model_copy(update={"px_per_mm": scale}))
+
+
+def _gray(path: Path) -> NDArray[np.uint8]:
+    try:
+        return decode_gray(read_bounded(path), str(path))
+    except SessionDamaged as error:
+        raise InputError(path, error.what) from None
+
+
 def check_target(folder: Path, table: Path, out: Path, options: ImportOptions) -> None:
-    """Raises `InputError` for a folder, a target or a kind that cannot be."""
+    """Raise `InputError` for a folder, a target or a kind that cannot be used."""
     if not folder.is_dir():
         raise InputError(folder, "is not a folder of photographs")
     if out.exists():
@@ -75,10 +165,10 @@ def store_rows(
     opening: Path | None = None,
     encoded: Callable[[Row], bytes] | None = None,
 ) -> Path:
-    """Write strokes with their photographs into the session folder `out`; returns its MCAP file.
+    """Write strokes with their photographs into the session folder `out` and return its MCAP file.
 
-    `opening` is a photograph without a stroke that comes first. `encoded` gives a stroke's PNG or JPEG, its file as it
-    is when left out. Raises `InputError`, then nothing is left.
+    `opening` is a photograph without a stroke that comes first. `encoded` returns a stroke's PNG or JPEG, by default
+    its file unchanged. Raises `InputError`, leaving nothing behind.
     """
     encoded = encoded or _whole
     digests = [_check(encoded(row), row.image) for row in rows]
@@ -96,19 +186,11 @@ def store_rows(
         licence=options.licence,
         origin=options.origin or f"{folder.resolve().name}, {table.name}",
     )
-    stage = out.with_name(f".{out.name}.partial")
     try:
-        shutil.rmtree(stage, ignore_errors=True)  # left by an import that was killed: a copy, nothing recorded
-        stage.mkdir(parents=True)
-        _write(rows, digests, stage / f"{out.name}.mcap", header, now_ns, first, encoded)
-        stage.rename(out)
-        fsync_folder(out.parent)
+        with staged_folder(out) as stage:
+            _write(rows, digests, stage / f"{out.name}.mcap", header, now_ns, first, encoded)
     except OSError as error:
-        shutil.rmtree(stage, ignore_errors=True)
         raise InputError(out, f"cannot write: {in_one_line(error)}") from error
-    except BaseException:
-        shutil.rmtree(stage, ignore_errors=True)
-        raise
     return out / f"{out.name}.mcap"
 
 
@@ -148,7 +230,7 @@ def _whole(row: Row) -> bytes:
 
 
 def _check(data: bytes, path: Path) -> bytes:
-    """Decode it once; the digest lets it be read again without decoding. Raises `InputError`."""
+    """Decode a photograph once and return its digest, which is all that is checked later. Raises `InputError`."""
     try:
         decode_gray(data, str(path))
     except SessionDamaged as error:
@@ -157,7 +239,7 @@ def _check(data: bytes, path: Path) -> bytes:
 
 
 def read_bounded(path: Path) -> bytes:
-    """A photograph's bytes. Raises `InputError` where there are too many, or they cannot be read."""
+    """Bytes of a photograph. Raises `InputError` where there are too many, or they cannot be read."""
     try:
         size = path.stat().st_size
         if size > MAX_IMAGE_BYTES:

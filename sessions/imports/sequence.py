@@ -1,7 +1,7 @@
-"""A page photographed again after every stroke becomes a session: frame k + 1 shows one stroke more than frame k.
+"""Import a page that was photographed after every stroke: frame k + 1 shows one stroke more than frame k.
 
-Every frame is a still; stroke k names the still after it, and the still before it has the sequence number one less.
-What the stroke is follows from the two by differencing, which is left to whoever reads the session.
+Every frame is a still. Stroke k refers to the still after it; the still before it has the sequence number one less.
+The reader of the session finds the stroke's ink by comparing the two.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from sessions.imports.table import Row, parse_table, read_text
 from sessions.recording.messages import decode_gray
 
 SEQUENCE = "page sequence"
-"""Begins the header's `protocol`: whoever reads it knows that each still shows what the one before it shows."""
+"""Start of the header's `protocol`: tells a reader that each still also shows all earlier strokes."""
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
 
 
@@ -30,11 +30,11 @@ def import_sequence(
     now_ns: Callable[[], int],
     page_mm: tuple[float, float] | None = None,
 ) -> Path:
-    """Import frames into the new session folder `out`; returns its MCAP file. Raises `InputError`, leaving nothing.
+    """Import frames into the new session folder `out` and return its MCAP file. Raises `InputError`, leaving nothing.
 
-    The table has `before` and `after` columns, each frame `after` being the next one's `before`, and whatever was
-    commanded. Without a table the frames are taken in the order of their names, and nothing is known of the strokes.
-    `page_mm` (width, height of what a photograph shows) gives the scale where the table does not.
+    The table has the columns `before` and `after`, and whatever was commanded; each line's `after` is the next line's
+    `before`. Without a table the frames are taken in the order of their names, and nothing is known of the strokes.
+    `page_mm` (width and height of what a photograph shows) sets the scale where the table has none.
     """
     named = table or folder
     check_target(folder, named, out, options)
@@ -56,7 +56,7 @@ def import_sequence(
 
 
 def _by_table(table: Path) -> tuple[list[str], str]:
-    """(frames in order, the table with `file` for `after`), the chain checked."""
+    """Return the frames in order, and the table with `file` for `after`; check that the frames form one chain."""
     try:
         lines = [[cell.strip() for cell in line] for line in csv.reader(io.StringIO(read_text(table)), strict=True)]
     except csv.Error as error:
@@ -73,8 +73,8 @@ def _by_table(table: Path) -> tuple[list[str], str]:
         if len(cells) != len(head):
             raise InputError(table, f"line {number} has {len(cells)} fields, expected {len(head)}")
         if frames and cells[before] != frames[-1]:
-            told = f"line {number}: `before` is {cells[before][:80]!r}, the frame before it is {frames[-1][:80]!r}"
-            raise InputError(table, told)
+            what = f"line {number}: `before` is {cells[before][:80]!r}, the frame before it is {frames[-1][:80]!r}"
+            raise InputError(table, what)
         frames += [cells[after]] if frames else [cells[before], cells[after]]
     if not frames:
         raise InputError(table, "has no rows")

@@ -24,17 +24,17 @@ PAIRS = (("px_per_mm_x", "px_per_mm_y"), ("start_x_px", "start_y_px"))
 SPECIAL = {"file", "name", "px_per_mm", "height_mm", "tilt_deg", *PAIRS[0], *PAIRS[1]}
 """Columns that become fields of a stroke; all others are kept in `commanded`."""
 DEPTHS = ("height", "depth")
-"""How the names of columns begin that hold a depth: it counts from the touch of the paper down."""
+"""Beginnings of the names of columns that hold a depth, measured downwards from the touch of the paper."""
 DEEPEST_MM = 500.0
 STEEPEST_DEG = 90.0
 MOST = 1e6
-"""Of any other number; a length of a kilometre is a slip of the pen."""
+"""Limit of any other number: a length of a kilometre is a typing error."""
 MAX_NAME_CHARS = 100
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A photograph, and what was commanded for it."""
+    """Photograph, and what was commanded for it."""
 
     image: Path
     stroke: Stroke
@@ -42,7 +42,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """What the header line says, and what holds for every line."""
+    """Header line of the table, and what holds for every line."""
 
     table: Path
     folder: Path
@@ -50,18 +50,18 @@ class _Columns:
     px_per_mm: float | None
     names: list[str]
     commanded: dict[str, tuple[str, float]]
-    """Column -> stored name and factor."""
+    """Stored name and factor of each other column."""
 
 
 def read_table(folder: Path, table: Path, kind: Literal["press", "drag"], px_per_mm: float | None) -> list[Row]:
-    """Every line, checked. Raises `InputError` naming line and column; the photographs are not looked into."""
+    """Read and check every line, without opening a photograph. Raises `InputError` naming line and column."""
     return parse_table(folder, table, read_text(table), kind, px_per_mm)
 
 
 def parse_table(
     folder: Path, table: Path, text: str, kind: Literal["press", "drag"], px_per_mm: float | None
 ) -> list[Row]:
-    """The same for a table whose text is `text`; `table` is what errors name."""
+    """Read a table whose text is `text`; errors name the path `table`."""
     lines = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: list[Row] = []
     seen: set[str] = set()
@@ -84,7 +84,7 @@ def parse_table(
 
 
 def read_text(table: Path) -> str:
-    """A table's text. Raises `InputError` where it is not there, too large or not UTF-8."""
+    """Text of a table. Raises `InputError` where it is missing, too large or not UTF-8."""
     if not table.is_file():
         raise InputError(table, "no such table")
     try:
@@ -126,7 +126,7 @@ def _columns(
 
 
 def _unit(table: Path, column: str) -> tuple[str, float]:
-    """(stored name, factor) of a column `quantity_unit`; mm and deg are what is stored."""
+    """Stored name and factor of a column `quantity_unit`; lengths are stored in mm and angles in deg."""
     stem, _, suffix = column.rpartition("_")
     if suffix in LENGTH_UNITS and stem:
         return f"{stem}_mm", LENGTH_UNITS[suffix]
@@ -153,8 +153,8 @@ def _row(columns: _Columns, line: int, cells: list[str], still: int) -> Row:
             raise InputError(table, f"line {line}, column `{name}`: {fields[name][:80]!r} is not a finite number")
         least, most = _range(name, columns.kind)
         if not least <= parsed <= most:
-            told = f"{fields[name][:80]!r}, allowed: {least / factor:g} to {most / factor:g}"
-            raise InputError(table, f"line {line}, column `{name}`: {told}")
+            wrong = f"{fields[name][:80]!r}, allowed: {least / factor:g} to {most / factor:g}"
+            raise InputError(table, f"line {line}, column `{name}`: {wrong}")
         return parsed
 
     def pair(first: str, second: str) -> tuple[float, float] | None:
@@ -182,7 +182,7 @@ def _row(columns: _Columns, line: int, cells: list[str], still: int) -> Row:
 
 
 def _range(column: str, kind: str) -> tuple[float, float]:
-    """What a column may hold, in the unit that is stored; a drag may lean to either side of its way."""
+    """Allowed range of a column, in the unit that is stored; a drag may lean to either side of its path."""
     if column.startswith(DEPTHS) and column.rpartition("_")[2] in LENGTH_UNITS:
         return 0.0, DEEPEST_MM
     if column == "tilt_deg":
@@ -198,7 +198,7 @@ def _name(columns: _Columns, line: int, name: str) -> str:
 
 
 def _image(columns: _Columns, line: int, name: str) -> Path:
-    """The photograph, links followed; it lies in the folder, or `InputError`."""
+    """Path of the photograph, links followed. Raises `InputError` where it does not lie in the folder."""
     if not name.isprintable():
         raise InputError(columns.table, f"line {line}, column `file`: {name[:80]!r} holds control characters")
     image = columns.folder / name
@@ -206,7 +206,7 @@ def _image(columns: _Columns, line: int, name: str) -> Path:
         image = image.resolve()
         inside, there = image.is_relative_to(columns.folder), image.is_file()
     except (OSError, RuntimeError):
-        inside = there = False  # longer than any name, or links in a circle
+        inside = there = False  # a name that is too long, or links in a circle
     if not inside:
         raise InputError(columns.table, f"line {line}: file {name[:80]!r} lies outside {columns.folder.name}/")
     if not there:

@@ -1,1 +1,1 @@
-"""The journal of a session: chained lines, each durable before anything depends on it."""
+"""The journal of a session: chained lines, each on disk before anything depends on it."""

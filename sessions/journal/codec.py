@@ -1,4 +1,4 @@
-"""One line of a journal as bytes and back. It has a CRC, and it names the line before it by its hash.
+"""One line of a journal as bytes and back. It has a CRC, and holds the hash of the line before it.
 
 `chain` of a line holds `seq` (the line's number, from 1), `session` (its id) and `prev`: the SHA-256 of the line
 before, or, in the first line that has one, of everything before.
@@ -20,7 +20,7 @@ _WHOLE = re.compile(rb'\{"t_ns":.*?,"crc":"[0-9a-f]{8}"\}', re.DOTALL)
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """Which line of which session this is, and what it follows."""
+    """Link to the line before: number of this line, its session, and the hash of what it follows."""
 
     seq: int
     session: str
@@ -29,35 +29,35 @@ class Chain:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line that its own CRC vouches for."""
+    """One line that matches its CRC."""
 
     number: int
-    """Of the line in the file as it is now, from 1."""
+    """Number of the line in the file as it is now, from 1."""
     raw: bytes
     line: Line
-    """What it says, without CRC and chain."""
+    """Content without CRC and chain."""
     chain: Chain | None
 
 
 def encode_line(t_ns: int, line: Line, chain: Chain | None = None) -> bytes:
-    """One line with time and CRC, newline included. Raises `ValueError` for what JSON cannot hold."""
+    """Encode a line with time, CRC and newline. Raises `ValueError` for values that JSON cannot hold."""
     linked: Line = {} if chain is None else {"chain": {"seq": chain.seq, "session": chain.session, "prev": chain.prev}}
     body = json.dumps({"t_ns": t_ns, **line, **linked}, separators=(",", ":"), allow_nan=False).encode()
     return with_crc(body) + b"\n"
 
 
 def with_crc(body: bytes) -> bytes:
-    """A JSON object with `crc`, the CRC-32 of the object without it, as its last field."""
+    """Add `crc`, the CRC-32 of the object so far, as the last field of a JSON object."""
     return body[:-1] + f',"crc":"{zlib.crc32(body):08x}"}}'.encode()
 
 
 def digest(data: bytes) -> str:
-    """What a chained line says of what it follows."""
+    """SHA-256 by which a chained line names what it follows."""
     return hashlib.sha256(data).hexdigest()
 
 
 class BadLine(Exception):
-    """Says what is wrong with a line."""
+    """A line cannot be used; the message says why."""
 
 
 def has_crc(raw: bytes) -> bool:
@@ -66,7 +66,7 @@ def has_crc(raw: bytes) -> bool:
 
 
 def decode_line(raw: bytes, number: int, *, protected: bool) -> Entry:
-    """One line without its newline. Raises `BadLine`; `protected` asks for a CRC."""
+    """Decode a line without its newline; `protected` requires a CRC. Raises `BadLine`."""
     tail = _TAIL.search(raw)
     try:
         line = json.loads(raw)
@@ -83,7 +83,7 @@ def decode_line(raw: bytes, number: int, *, protected: bool) -> Entry:
 
 
 def lines_within(raw: bytes, number: int) -> tuple[list[Entry], list[bytes]]:
-    """The lines in a span in which a newline is damaged, and what is left between them."""
+    """Find the lines in a span with a damaged newline, and the bytes left between them."""
     entries: list[Entry] = []
     spoilt: list[bytes] = []
     at = 0

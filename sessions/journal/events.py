@@ -1,4 +1,4 @@
-"""What each event of a journal must say, so that no command meets a line that it cannot use."""
+"""Fields that each event of a journal must have, so that no command reads a line that it cannot use."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from sessions.journal.codec import Line
 from sessions.names import bare_name
 
 NONSENSE = (KeyError, TypeError, ValueError, OverflowError, AttributeError)
-"""What a line may raise that makes no sense."""
+"""Exceptions that a line without sense may cause."""
 _SERIAL = re.compile(r"\d{1,9}(?=-)")
 MAX_NUMBER = 10**9
 
 
 def check_event(line: Line) -> None:
-    """Raise `ValueError`, naming the field, where a line lacks something or holds another kind of value."""
+    """Raise `ValueError`, naming the field, where one is missing or has a value of another kind."""
     event = line["event"]
     required, optional = FIELDS.get(event, ({}, {}))
     for name, check in required.items():
@@ -30,7 +30,7 @@ def check_event(line: Line) -> None:
 
 
 def serial_of(line: Line) -> int | None:
-    """The number at the beginning of a step's file; None for a line without one."""
+    """Number at the beginning of the name of a step's file; None for a line without one."""
     serial = _SERIAL.match(str(line.get("file", "")))
     return int(serial[0]) if serial else None
 
@@ -99,7 +99,7 @@ def _are_snapshots(value: Any) -> str:
 
 
 def _are_values(value: Any) -> str:
-    """Of a step's parameters or result: those fields that are looked at here."""
+    """Check the fields of a step's parameters or result that this package reads."""
     if wrong := _is_object(value):
         return wrong
     values = cast("dict[str, Any]", value)
@@ -149,4 +149,4 @@ FIELDS: dict[str, tuple[Checks, Checks]] = {
     "lost": ({"file": _is_step_file}, {"why": _is_text}),
     "doubt": ({"sheet": _is_whole}, {"file": _is_file}),
 }
-"""What each event must hold, and what it may hold."""
+"""Required and optional fields of each event."""

@@ -8,16 +8,19 @@ clock was set back), `closed`. A repair adds `repaired`, `held`, `lost`, `doubt`
 from __future__ import annotations
 
 import os
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sessions.errors import SessionDamaged, disk_error
+from pydantic import ValidationError
+
+from sessions.disk import fsync_folder
+from sessions.errors import SessionDamaged, disk_error, in_one_line
 from sessions.journal.codec import Chain, Line, digest, encode_line
 from sessions.journal.events import NONSENSE, check_event, serial_of
 from sessions.journal.lines import Fault, Reading, read, read_journal
-from sessions.journal.lines import read_lines as read_lines
 from sessions.names import check_file
-from sessions.recording.schemas import Topic, TornTail
+from sessions.recording.schemas import Header, Topic, TornTail
 
 JOURNAL_NAME = "journal.jsonl"
 
@@ -25,9 +28,8 @@ JOURNAL_NAME = "journal.jsonl"
 class Journal:
     """Appends to one journal file. One process at a time: the caller holds the session's lock.
 
-    `t_ns` is when it is opened, for the note about a torn tail. Lines are chained where `session`, an id, is given:
-    from the first line on, or from here on where the lines so far are not. Raises `SessionError` where the disk
-    fails, and `InputError` where the file is a link.
+    `t_ns`, the time of opening, is for the note about a torn tail. With a `session` id, new lines are chained, even
+    after lines that are not. Raises `SessionError` where the disk fails, and `InputError` where the file is a link.
     """
 
     def __init__(self, path: Path, t_ns: int, session: str = "") -> None:
@@ -61,21 +63,12 @@ class Journal:
         self._next = _after(self._next, data)
 
     def close(self) -> None:
-        """Close the file; the session stays open until a `closed` event says otherwise."""
+        """Close the file; the session stays open until there is a `closed` event."""
         os.close(self._fd)
 
 
-def fsync_folder(folder: Path) -> None:
-    """Make a rename or a new file in `folder` durable."""
-    fd = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
-
-
 def next_chain(data: bytes, session: str) -> Chain | None:
-    """What the next line of a journal with these bytes, all of them whole lines, carries; None without a session."""
+    """Chain of the next line after these bytes, which are whole lines; None without a session."""
     if not session:
         return None
     *lines, _end = data.split(b"\n")
@@ -88,17 +81,17 @@ def _after(chain: Chain | None, data: bytes) -> Chain | None:
 
 
 def _whole_lines(path: Path, t_ns: int, session: str) -> Chain | None:
-    """Make the journal end with a whole line; returns what the next one carries."""
+    """Make the journal end with a whole line, and return the chain of the next one."""
     data = read_journal(path)
     keep = data.rfind(b"\n") + 1
     if keep == len(data):
         return next_chain(data, session)
     chain = next_chain(data[:keep], session)
     if read(data).torn:
-        # Longer than what it overwrites, and one write: a crash here leaves the old tail or the note, never neither.
+        # Longer than what it overwrites, and one single write: a crash leaves the old tail or the note, never neither.
         note, at = encode_line(t_ns, TornTail(hex=data[keep:].hex()).model_dump(), chain), keep
     else:
-        note, at = b"\n", len(data)  # only that was cut off
+        note, at = b"\n", len(data)  # only the newline was cut off
     with path.open("r+b", buffering=0) as file:
         file.seek(at)
         file.write(note)
@@ -108,7 +101,7 @@ def _whole_lines(path: Path, t_ns: int, session: str) -> Chain | None:
 
 @dataclass(slots=True)
 class Replay:
-    """What a journal says, folded: the memory that a new process starts from."""
+    """State of a session after all events of its journal; a new process starts from it."""
 
     opened: Line | None = None
     closed: Line | None = None
@@ -118,36 +111,43 @@ class Replay:
     """`done` events in order of time: what the merged file is made of."""
     attempts: dict[str, int] = field(default_factory=dict[str, int])
     used_cells: set[tuple[int, int]] = field(default_factory=set[tuple[int, int]])
-    """(sheet, cell) of every press that was begun, finished or not: never to be pressed again."""
+    """(sheet, cell) of every press that was begun, finished or not: never pressed again."""
     doubtful_sheets: set[int] = field(default_factory=set[int])
-    """Sheets on which a press may lie that nobody knows of: nothing more is pressed on them."""
+    """Sheets that may hold an unrecorded press: nothing more is pressed on them."""
     repairs: list[Line] = field(default_factory=list[Line])
-    """`repaired` and `lost` events: what the merged file has to tell of."""
+    """`repaired` and `lost` events, which the merged file records."""
     sheet: int = 0
     begun: int = 0
     voids: int = 0
     last_ns: int = 0
     """Time of the latest line, to notice a clock that was set back."""
 
+    def counts(self) -> dict[str, int]:
+        """Messages by topic that the merged file must hold."""
+        counts: Counter[str] = Counter()
+        for line in self.segments:
+            counts.update(line["counts"])
+        return dict(counts)
+
 
 @dataclass(slots=True)
 class Account:
-    """A journal, read and folded: what it says, and what in it makes no sense."""
+    """Everything read from a journal, with what is wrong in it."""
 
     reading: Reading
     lines: list[Line] = field(default_factory=list[Line])
     """Lines that can be trusted and make sense, in the order in which they were written."""
     state: Replay = field(default_factory=Replay)
     faults: list[Fault] = field(default_factory=list[Fault])
-    """Everything that is wrong, in the order of the file: the one list that all commands go by."""
+    """All problems, in the order of the file; every command uses this list."""
     spoilt: list[bytes] = field(default_factory=list[bytes])
-    """Lines that are there, and say nothing."""
+    """Lines that cannot be used."""
     twice: list[Line] = field(default_factory=list[Line])
-    """Lines that say of a step that it is done though it is."""
+    """`done` lines of steps that were done already."""
 
 
 def account(data: bytes) -> Account:
-    """What the bytes of a journal say. Raises nothing."""
+    """Read and fold the bytes of a journal. Raises nothing."""
     found = Account(read(data))
     found.faults += found.reading.faults
     found.spoilt += [span for _, span in found.reading.spoilt]
@@ -173,7 +173,7 @@ def replay(path: Path) -> Replay:
 
 
 def replay_lines(path: Path) -> tuple[Replay, list[Line]]:
-    """The same, and the lines themselves."""
+    """Fold a journal, and return its lines as well. Raises `SessionDamaged` where anything in it is wrong."""
     found = account(read_journal(path))
     if found.faults:
         more = f" (and {len(found.faults) - 1} more)" if len(found.faults) > 1 else ""
@@ -181,17 +181,27 @@ def replay_lines(path: Path) -> tuple[Replay, list[Line]]:
     return found.state, found.lines
 
 
+def read_header(folder: Path, state: Replay) -> Header:
+    """Header in the journal. Raises `SessionDamaged`."""
+    if state.opened is None:
+        raise SessionDamaged(folder / JOURNAL_NAME, "has no `open` event")
+    try:
+        return Header.model_validate(state.opened["header"])
+    except (KeyError, ValidationError) as error:
+        raise SessionDamaged(folder / JOURNAL_NAME, f"its `open` event has no header: {in_one_line(error)}") from None
+
+
 def is_open(state: Replay) -> bool:
-    """Whether a session can be gone on with. A crash before the first line left nothing to go on with."""
+    """Whether a session can be resumed. A crash before the first line left nothing to resume."""
     return state.opened is not None and state.closed is None
 
 
 class DoneTwice(ValueError):
-    """A step is journalled as done that is done already: its strokes would be there twice."""
+    """A step is journalled as done twice: its strokes would appear twice."""
 
 
 def fold(state: Replay, line: Line) -> None:
-    """Take one line into the memory, or raise one of `NONSENSE` and leave the memory as it was."""
+    """Update the state by one line, or raise one of `NONSENSE` and leave the state unchanged."""
     check_event(line)
     match line["event"]:
         case "open":
@@ -217,7 +227,7 @@ def fold(state: Replay, line: Line) -> None:
 
 
 def _check_once(state: Replay, line: Line) -> None:
-    """Set-up steps are done again under one key, each time as another attempt; a stroke never is."""
+    """Raise `DoneTwice` unless this is a new attempt at a set-up step; a stroke is done only once."""
     for other in state.segments:
         same = other["key"] == line["key"] and other.get("attempt", 1) == line.get("attempt", 1)
         again = other["key"] == line["key"] and Topic.STROKE in {**other["counts"], **line["counts"]}
@@ -227,7 +237,7 @@ def _check_once(state: Replay, line: Line) -> None:
 
 def _begin(state: Replay, line: Line) -> None:
     key, sheet = line["key"], line["sheet"]
-    # A line that was lost must not give its number, which names stills as well, to another attempt.
+    # The number of a lost line, which also numbers stills, must not be used again.
     state.begun = max(state.begun + 1, _next_serial(line))
     state.attempts[key] = max(state.attempts.get(key, 0), line["attempt"])
     state.sheet = max(state.sheet, sheet)

@@ -1,7 +1,7 @@
-"""The lines of a journal: which can be trusted, and what is wrong with the others, line by line.
+"""Reading the lines of a journal: which can be trusted, and what is wrong with each of the others.
 
-Chained lines are trusted where the next one vouches for them. Older journals have lines without a chain, and the
-oldest have no CRC either; they are read as well, and the first chained line vouches for all of them at once.
+A chained line is trusted where the next line holds its hash. Older journals have lines without a chain, and the oldest
+have no CRC either; these are read as well, and the first chained line holds the hash of all of them.
 """
 
 from __future__ import annotations
@@ -14,20 +14,18 @@ from pathlib import Path
 
 from sessions.errors import SessionDamaged, SessionError, in_one_line
 from sessions.journal.codec import BadLine, Entry, Line, decode_line, digest, has_crc, lines_within
-from sessions.journal.codec import encode_line as encode_line
-from sessions.journal.codec import with_crc as with_crc
 from sessions.names import check_file
 
 MAX_STRANGE_BYTES = 30
-"""A rebuilt line may differ from the damaged one in its time (19 digits), its CRC (8) and the damage itself."""
+"""Most bytes in which a rebuilt line may differ from the damaged one: its time (19), its CRC (8), and the damage."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What is wrong with one line."""
+    """Problem with one line."""
 
     number: int
-    """Of the line in the file as it is, from 1."""
+    """Number of the line in the file as it is, from 1."""
     what: str
 
     def __str__(self) -> str:
@@ -37,31 +35,31 @@ class Fault:
 
 @dataclass(slots=True)
 class Reading:
-    """What a journal says, and what in it says nothing."""
+    """Trusted lines of a journal, and what is wrong with the rest."""
 
     entries: list[Entry] = field(default_factory=list[Entry])
     """Lines that can be trusted, in the order in which they were written."""
     faults: list[Fault] = field(default_factory=list[Fault])
-    """In the order of the file; empty for a journal that is as it was written."""
+    """In the order of the file; empty for a journal without damage."""
     spoilt: list[tuple[int, bytes]] = field(default_factory=list[tuple[int, bytes]])
-    """Number and bytes of lines that are there and cannot be trusted any more."""
+    """Number and bytes of lines that can no longer be trusted."""
     gaps: int = 0
-    """Lines that are missing altogether."""
+    """Number of missing lines."""
     torn: bytes = b""
-    """A last line that a crash cut off: harmless, the next process sets it aside."""
+    """Last line, cut off by a crash: harmless, the next process sets it aside."""
 
     @property
     def unchained(self) -> int:
-        """How many lines, at the beginning, were written without a chain."""
+        """Number of lines, at the beginning, written without a chain."""
         return sum(entry.chain is None for entry in self.entries)
 
     def fault(self, number: int, what: str) -> None:
-        """Note what is wrong."""
+        """Note a problem."""
         self.faults.append(Fault(number, what))
 
 
 def read_lines(path: Path) -> Iterator[Line]:
-    """Every complete line. A torn last line is left out; any other damage raises `SessionDamaged`."""
+    """Complete lines, without a torn last one; any other damage raises `SessionDamaged`."""
     reading = read(read_journal(path))
     if reading.faults:
         raise SessionDamaged(path, str(reading.faults[0]))
@@ -69,7 +67,7 @@ def read_lines(path: Path) -> Iterator[Line]:
 
 
 def read_journal(path: Path) -> bytes:
-    """The bytes of a journal. Raises `SessionError`, and `InputError` where it is a link."""
+    """Bytes of a journal. Raises `SessionError`, and `InputError` where it is a link."""
     check_file(path)
     try:
         return path.read_bytes()
@@ -78,7 +76,7 @@ def read_journal(path: Path) -> bytes:
 
 
 def read(data: bytes) -> Reading:
-    """All that the bytes of a journal still say."""
+    """Read whatever can still be trusted in the bytes of a journal."""
     *pieces, tail = data.split(b"\n")
     reading = Reading()
     entries = _decoded(reading, pieces, tail)
@@ -92,7 +90,7 @@ def read(data: bytes) -> Reading:
 
 
 def accounts_for(spoilt: bytes, rebuilt: bytes) -> bool:
-    """Whether a damaged line, cut short or with wrong bytes, was this one; `rebuilt` is without a chain."""
+    """Whether a damaged line, cut short or with wrong bytes, was the rebuilt one; `rebuilt` has no chain."""
     body = rebuilt[: rebuilt.rindex(b',"crc":"')]
     if len(spoilt) < len(body) // 2:
         return False
@@ -101,7 +99,7 @@ def accounts_for(spoilt: bytes, rebuilt: bytes) -> bool:
 
 
 def _decoded(reading: Reading, pieces: list[bytes], tail: bytes) -> list[Entry]:
-    """Every line that its own CRC vouches for, also where the newline between two of them is damaged."""
+    """Lines that match their CRC, also where the newline between two of them is damaged."""
     chained_at = next((at for at, raw in enumerate(pieces) if _is_chained(raw)), len(pieces))
     protected = any(has_crc(raw) for raw in pieces[:chained_at])
     entries: list[Entry] = []
@@ -154,7 +152,7 @@ def _before(entry: Entry, data: bytes) -> bytes:
 
 
 def _link(reading: Reading, entries: list[Entry], data: bytes) -> None:
-    """Find what does not hang together: foreign, doubled, displaced, changed and missing lines."""
+    """Find lines that break the chain: foreign, doubled, displaced, changed and missing ones."""
     sessions = Counter(entry.chain.session for entry in entries if entry.chain is not None)
     session = sessions.most_common(1)[0][0]
     before: list[Entry] = []
@@ -180,7 +178,7 @@ def _link(reading: Reading, entries: list[Entry], data: bytes) -> None:
 
 
 def _vouched(reading: Reading, by_seq: dict[int, list[Entry]]) -> list[Entry]:
-    """One entry for each number, by its successor's word where there is one; in the order of the numbers."""
+    """Choose one entry for each number, the one whose hash the next line holds; in the order of the numbers."""
     held: list[Entry] = []
     for seq in sorted(by_seq, reverse=True):
         after = held[-1] if held else None
@@ -199,9 +197,9 @@ def _vouched(reading: Reading, by_seq: dict[int, list[Entry]]) -> list[Entry]:
 
 
 def _misplaced(reading: Reading, held: list[Entry]) -> None:
-    """Lines outside the longest run that is in order."""
+    """Report lines outside the longest run that is in order."""
     ends: list[int] = []
-    """Of the best run of each length: the index of its last entry."""
+    """Index of the last entry of the best run of each length."""
     before: list[int | None] = []
     for index, entry in enumerate(held):
         at = bisect_right(ends, entry.number, key=lambda end: held[end].number)
@@ -218,7 +216,7 @@ def _misplaced(reading: Reading, held: list[Entry]) -> None:
 
 
 def _missing(reading: Reading, held: list[Entry], before: int) -> None:
-    """Numbers that nothing in the file has, less the lines that are there and cannot be trusted."""
+    """Report numbers that no line has, except those of lines that cannot be trusted."""
     spoilt = {number for number, _ in reading.spoilt}
     known, at = before, 0
     for entry in held:

@@ -1,1 +1,1 @@
-"""MCAP files: topics and schemas, writing them, reading them, and reading what damage has left."""
+"""MCAP files: topics and schemas, writing, reading, and reading what is left of damaged ones."""

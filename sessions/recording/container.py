@@ -38,15 +38,16 @@ UNREADABLE = (
     OSError,
     MemoryError,
 )
-"""Everything that mcap, zstd and the system were seen to raise for damaged files."""
+"""Everything that mcap, zstd and the system raised in tests with damaged files."""
 
+Record = tuple[Schema | None, Channel, Message]
 _T = TypeVar("_T")
 
 
-def messages(path: Path, topics: list[str] | None = None) -> Iterator[tuple[Schema | None, Channel, Message]]:
+def messages(path: Path, topics: list[str] | None = None) -> Iterator[Record]:
     """Messages in the order in which they were written, every CRC checked. Raises `SessionDamaged`.
 
-    By log time a stroke could come before its still, where the host's clock was set back between the two.
+    Not by log time: a stroke would come before its still where the host's clock was set back between the two.
     """
     return _guarded(path, lambda file: _messages(file, topics))
 
@@ -62,25 +63,25 @@ def attachments(path: Path) -> Iterator[Attachment]:
 
 
 def indexed_counts(path: Path) -> dict[str, int]:
-    """Messages by topic as the index tells, without reading them. Raises `SessionDamaged`."""
+    """Messages by topic according to the index, without reading them. Raises `SessionDamaged`."""
     return next(_guarded(path, _indexed_counts))
 
 
 class BoundedFile(io.BufferedReader):
-    """Asks for no more than the file holds, whatever length a damaged record states."""
+    """Reads at most what the file holds, whatever length a damaged record states."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(path))
         self.size = os.fstat(self.fileno()).st_size
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """At most what is left of the file."""
+        """Read at most what is left of the file."""
         left = max(self.size - self.tell(), 0)
         return super().read(left if size is None or size < 0 else min(size, left))
 
 
 def _guarded(path: Path, read: Callable[[BoundedFile], Iterator[_T]]) -> Iterator[_T]:
-    """Only the library's own steps are guarded: an exception of the code between two items is not the file's."""
+    """Guard the library's own steps only: an exception in the code that uses an item is not damage of the file."""
     try:
         file = BoundedFile(path)
     except OSError as error:
@@ -113,7 +114,7 @@ def indexed(file: BoundedFile) -> tuple[SeekingReader, Summary]:
 
 
 def _check_summary_crc(file: BoundedFile) -> None:
-    """The index says which chunks hold which topic: unchecked, one wrong bit would hide strokes in silence."""
+    """Check the index, which says where each topic is: otherwise one wrong bit could silently hide strokes."""
     footer_at = file.size - FOOTER_SIZE - len(MCAP0_MAGIC)
     file.seek(footer_at)
     _opcode, _length, summary_start, _offsets, expected = struct.unpack("<BQQQI", file.read(FOOTER_SIZE))
@@ -128,7 +129,7 @@ def _check_summary_crc(file: BoundedFile) -> None:
         raise McapError("the index does not match its CRC")
 
 
-def _messages(file: BoundedFile, topics: list[str] | None) -> Iterator[tuple[Schema | None, Channel, Message]]:
+def _messages(file: BoundedFile, topics: list[str] | None) -> Iterator[Record]:
     reader, summary = indexed(file)
     if not summary.chunk_indexes:
         if summary.statistics is None or summary.statistics.message_count:
@@ -140,7 +141,7 @@ def _messages(file: BoundedFile, topics: list[str] | None) -> Iterator[tuple[Sch
 
 
 def check_chunk_at(file: BoundedFile, offset: int) -> None:
-    """Refuse a chunk that would unpack to more than `MAX_RECORD_BYTES`, whichever of its three lengths says so."""
+    """Raise `McapError` for a chunk that any of its three lengths puts above `MAX_RECORD_BYTES`."""
     file.seek(offset + 1 + 8 + 8 + 8)
     stream = ReadDataStream(file)
     size = stream.read8()

@@ -30,12 +30,12 @@ MAX_SCANNED_PIXELS = 4_000_000_000
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 JPEG_START = b"\xff\xd8"
 _MARKER = re.compile(rb"\xff+([^\x00\x01\xd0-\xd8\xff])")
-"""A marker that begins a segment or ends the file; in what a scan holds, 0xFF stands before 0 or a restart only."""
+"""Marker that begins a segment or ends the file; within a scan 0xFF stands only before 0 or a restart."""
 
 
 @dataclass(frozen=True, slots=True)
 class Transform:
-    """Where a frame lies in its parent's: from the child's coordinates to the parent's."""
+    """Transform from a child frame's coordinates to its parent's."""
 
     parent: str
     child: str
@@ -57,7 +57,7 @@ def pose_message(
 
 
 def image_message(t_ns: int, encoded: bytes, kind: str = "png") -> CompressedImage:
-    """An encoded image as it will be shown."""
+    """Message with an encoded image."""
     message = CompressedImage(frame_id="camera", data=encoded, format=kind)
     message.timestamp.FromNanoseconds(t_ns)
     return message
@@ -70,7 +70,7 @@ def joints_message(
     velocities_rad_s: Sequence[float] | None = None,
     efforts_nm: Sequence[float] | None = None,
 ) -> JointStates:
-    """The arm's joints in their order. Raises `ValueError` where the lengths differ."""
+    """State of the arm's joints, in order. Raises `ValueError` where the lengths differ."""
     for values in (velocities_rad_s, efforts_nm):
         if values is not None and len(values) != len(names):
             raise ValueError(f"{len(values)} values for {len(names)} joints")
@@ -86,7 +86,7 @@ def joints_message(
 
 
 def transforms_message(t_ns: int, transforms: Iterable[Transform]) -> FrameTransforms:
-    """Where the frames lie; metres on disk."""
+    """Transforms between frames; metres on disk."""
     message = FrameTransforms()
     for transform in transforms:
         added = message.transforms.add(parent_frame_id=transform.parent, child_frame_id=transform.child)
@@ -126,25 +126,15 @@ def calibration_message(
 
 
 def log_message(t_ns: int, text: str, *, warning: bool = False) -> Log:
-    """A line for the operator and for whoever reads the file later."""
+    """Log line for the operator and later readers of the file."""
     message = Log(level=Log.WARNING if warning else Log.INFO, message=text, name="brushloop")
     message.timestamp.FromNanoseconds(t_ns)
     return message
 
 
 def decode_still(data: bytes) -> bytes:
-    """The encoded image in a message on an image topic. Raises `google.protobuf.message.DecodeError`."""
+    """Encoded image of a message on an image topic. Raises `google.protobuf.message.DecodeError`."""
     return CompressedImage.FromString(data).data
-
-
-def encode_jpeg(image: NDArray[np.uint8], quality: int = 80) -> bytes:
-    """A preview; never for what is measured. `quality` is 0 to 100."""
-    import cv2
-
-    ok, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    if not ok:
-        raise ValueError(f"cannot encode an image of shape {image.shape} and type {image.dtype}")
-    return data.tobytes()
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:
@@ -158,20 +148,20 @@ def encode_png(image: NDArray[np.uint8]) -> bytes:
 
 
 def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
-    """(h, w) uint8 gray. Raises `SessionDamaged` for what is no PNG or JPEG, is cut short or is absurdly large."""
+    """(h, w) uint8 gray. Raises `SessionDamaged` for other formats, and for images cut short or absurdly large."""
     import cv2
     import numpy as np
 
     if len(data) > MAX_IMAGE_BYTES:
         raise SessionDamaged(where, f"image of {len(data)} bytes exceeds {MAX_IMAGE_BYTES}")
-    # Before decoding: a megabyte of PNG can state, and would be given, a gigabyte of pixels.
+    # Checked before decoding: a PNG of one megabyte can unpack to a gigabyte of pixels.
     size = _png_size(data) or _jpeg_size(data)
     if size is None:
-        raise SessionDamaged(where, "is no whole PNG or JPEG image")
+        raise SessionDamaged(where, "is not a complete PNG or JPEG image")
     width, height, scans = size
     if width * height > MAX_IMAGE_PIXELS:
         raise SessionDamaged(where, f"image of {width} x {height} pixels exceeds {MAX_IMAGE_PIXELS}")
-    # A scan that changes nothing takes ten bytes, so that a small file could keep us busy for minutes.
+    # An empty scan takes ten bytes, so that a small file could take minutes to decode.
     most = min(MAX_JPEG_SCANS, MAX_SCANNED_PIXELS // max(width * height, 1))
     if scans > most:
         raise SessionDamaged(where, f"JPEG of {width} x {height} pixels in more than {most} scans")
@@ -185,7 +175,7 @@ def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
 
 
 def _png_size(data: bytes) -> tuple[int, int, int] | None:
-    """Width, height and one scan, from the header; None where a chunk fails its CRC: libpng would say so on stderr."""
+    """Width, height and 1 scan, from the header; None where a chunk fails its CRC (libpng would print to stderr)."""
     at = len(PNG_START)
     while data.startswith(PNG_START) and data[12:16] == b"IHDR" and at + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, at)
@@ -200,11 +190,11 @@ def _png_size(data: bytes) -> tuple[int, int, int] | None:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int, int] | None:
-    """Width, height and number of scans, counted no further than is allowed; None for a file without its end mark."""
+    """Width, height and number of scans, counted up to the limit; None for a file without an end mark."""
     size, scans, at = None, 0, len(JPEG_START)
     while data.startswith(JPEG_START) and (found := _MARKER.search(data, at)) and scans <= MAX_JPEG_SCANS:
         marker, at = found[1][0], found.end()
-        if marker == 0xD9:  # an end mark before the frame would be a thumbnail's, which lies in a segment
+        if marker == 0xD9:  # not a thumbnail's, which lies inside a segment
             break
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC) and len(data) >= at + 7:
             size = struct.unpack_from(">HH", data, at + 3)

@@ -1,7 +1,7 @@
-"""What can still be read of a damaged MCAP file: every chunk that its CRC vouches for, and nothing else.
+"""What can still be read of a damaged MCAP file: every chunk that matches its CRC, and nothing else.
 
-The file is walked record by record; where a wrong length leads astray, the index at the end, if it is sound, tells
-where the other chunks lie. A torn tail never yields a wrong record.
+The file is read record by record. Where a wrong length breaks that off, the index at the end, if it is sound, gives
+the offsets of the other chunks. A torn tail never yields a wrong record.
 """
 
 from __future__ import annotations
@@ -24,12 +24,11 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
 from sessions.errors import InputError, in_one_line
-from sessions.recording.container import MAX_RECORD_BYTES, UNREADABLE, BoundedFile, check_chunk_at, indexed
-from sessions.recording.writer import HEADER_METADATA, header_crc, read_note
+from sessions.recording.container import MAX_RECORD_BYTES, UNREADABLE, BoundedFile, Record, check_chunk_at, indexed
+from sessions.recording.mcap_file import HEADER_METADATA, header_crc, read_note
 
-Record = tuple[Schema | None, Channel, Message]
 _STROKE_NAME = re.compile(rb'"stroke_id":"([^"\\]{1,100})","kind"')
-"""As a stroke's message begins."""
+"""Beginning of a stroke's message."""
 _START = struct.Struct("<BQ")
 _PIECE_BYTES = 256
 _MESSAGE_INDEX = struct.Struct("<HI")
@@ -41,7 +40,7 @@ class Part:
 
     offset: int
     counts: Counter[str] | None
-    """Messages by topic; None where nothing tells them."""
+    """Messages by topic; None where they are unknown."""
     sound: bool
     """Whether it reads back with its CRC."""
 
@@ -52,30 +51,30 @@ class Scan:
 
     path: Path
     parts: list[Part] = field(default_factory=list[Part])
-    """Every chunk that is known of, in order."""
+    """Known chunks, in order."""
     complete: bool = False
-    """Whether no other chunk can be there: the walk came to the end, or the index is sound."""
+    """Whether no other chunk can exist: the walk reached the end, or the index is sound."""
     indexed: dict[int, dict[int, int]] = field(default_factory=dict[int, dict[int, int]])
-    """Offset of a chunk -> number of a channel -> messages, as the records behind it tell."""
+    """Messages by offset of the chunk and number of the channel, from the index records behind each chunk."""
     schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
     channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
     notes: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
-    """Our own notes (`brushloop.begin`, ...) whose CRC holds."""
+    """Our own notes (`brushloop.begin`, ...) that match their CRC."""
     metadata: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
-    """All metadata, which the format gives no CRC."""
+    """All metadata; the format gives it no CRC."""
     attachments: list[Attachment] = field(default_factory=list[Attachment])
     counts: Counter[str] = field(default_factory=Counter[str])
     stated: dict[str, int] | None = None
-    """Messages by topic that the index, where it is sound, says there are."""
+    """Messages by topic according to the index; None where it is damaged."""
     stated_attachments: int = 0
     stated_notes: int = 0
-    """Metadata records of ours that the index knows of, the header left out."""
+    """Notes listed in the index, without the header."""
     damage: list[str] = field(default_factory=list[str])
-    """In words; empty for a file that is whole."""
+    """Descriptions; empty for an intact file."""
 
 
 def scan(path: Path) -> Scan:
-    """Look at every record. Raises `InputError` where the file cannot be opened; damage is told, never raised."""
+    """Read every record. Raises `InputError` where the file cannot be opened; damage is reported, never raised."""
     found = Scan(path)
     try:
         file = BoundedFile(path)
@@ -97,12 +96,14 @@ def scan(path: Path) -> Scan:
             else:
                 found.counts += counts
                 found.parts.append(Part(offset, counts, sound=True))
-    found.parts = [part if part.sound else Part(part.offset, _told(found, part.offset), False) for part in found.parts]
+    found.parts = [
+        part if part.sound else Part(part.offset, _indexed_counts(found, part.offset), False) for part in found.parts
+    ]
     return found
 
 
-def _told(found: Scan, offset: int) -> Counter[str] | None:
-    """What the index of a chunk says of the messages in it."""
+def _indexed_counts(found: Scan, offset: int) -> Counter[str] | None:
+    """Messages by topic of a chunk, from the index records behind it; None without them."""
     by_channel = found.indexed.get(offset)
     if not by_channel or not by_channel.keys() <= found.channels.keys():
         return None
@@ -110,20 +111,20 @@ def _told(found: Scan, offset: int) -> Counter[str] | None:
 
 
 def salvaged(found: Scan) -> Iterator[Record]:
-    """The messages of the sound chunks, in the order in which they were written. Raises `OSError`."""
+    """Messages of the sound chunks, in the order in which they were written. Raises `OSError`."""
     for part in found.parts:
         if part.sound:
             yield from read_part(found, part)
 
 
 def read_part(found: Scan, part: Part) -> Iterator[Record]:
-    """The messages of one sound chunk. Raises `OSError`."""
+    """Messages of one sound chunk. Raises `OSError`."""
     with BoundedFile(found.path) as file:
         yield from _chunk(file, part.offset, found)
 
 
 def glimpsed(found: Scan) -> list[str]:
-    """Names of strokes that chunks without a CRC that holds still show, up to where they cannot be unpacked."""
+    """Names of strokes still visible in damaged chunks, as far as these can be unpacked."""
     names: dict[str, None] = {}
     with BoundedFile(found.path) as file:
         for part in found.parts:
@@ -153,7 +154,7 @@ def _unpacked(data: bytes) -> bytes:
 
 
 def _walk(file: BoundedFile, found: Scan) -> list[int]:
-    """Offsets of what look like chunks, up to the end or to where the walk loses its way."""
+    """Offsets of possible chunks, up to the end or to the first record that cannot be followed."""
     offsets: list[int] = []
     if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         found.damage.append("does not begin as an MCAP file does")
@@ -184,7 +185,7 @@ def _walk(file: BoundedFile, found: Scan) -> list[int]:
 
 
 def _message_index(file: BoundedFile, found: Scan, chunk: int) -> None:
-    """The number of a channel, and the length of one entry of 16 bytes for each of its messages in the chunk."""
+    """Count a channel's messages in the chunk: the record holds its number and 16 bytes for each message."""
     start = file.read(_MESSAGE_INDEX.size)
     if len(start) == _MESSAGE_INDEX.size:
         channel, length = _MESSAGE_INDEX.unpack(start)
@@ -192,7 +193,7 @@ def _message_index(file: BoundedFile, found: Scan, chunk: int) -> None:
 
 
 def _record_at(file: BoundedFile, found: Scan, offset: int) -> None:
-    """A record that only the index knows of."""
+    """Read a record that only the index lists."""
     file.seek(offset)
     start = file.read(_START.size)
     if len(start) == _START.size:
@@ -229,7 +230,7 @@ def _metadata(record: Metadata, found: Scan) -> None:
 
 
 def _from_index(file: BoundedFile, found: Scan, known: set[int]) -> list[int]:
-    """Chunks that only the index knows of; its channels stand in for those of a chunk that is lost."""
+    """Offsets of chunks that only the index lists; its channels replace those of a lost chunk."""
     try:
         _reader, summary = indexed(file)
     except UNREADABLE as error:
@@ -252,7 +253,7 @@ def _from_index(file: BoundedFile, found: Scan, known: set[int]) -> list[int]:
         if index.name not in found.metadata:
             _record_at(file, found, index.offset)
     if len(missed) + len(known) > len(summary.chunk_indexes):
-        found.damage.append("holds chunks that its index does not know of")
+        found.damage.append("holds chunks that its index does not list")
     return missed
 
 

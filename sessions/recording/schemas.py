@@ -1,6 +1,6 @@
-"""What is recorded: topics, their schemas, and our own events as frozen pydantic models.
+"""Recorded data: topics, their schemas, and our own events as frozen pydantic models.
 
-Foxglove's types are protobuf, so that any viewer shows them; our events are JSON, so that any reader reads them.
+Foxglove's types are protobuf, which any viewer shows; our events are JSON, which any program reads.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ def _bare_or_empty(value: str) -> str:
 
 
 BareName = Annotated[str, AfterValidator(_bare_or_empty)]
-"""A name that becomes that of a file or folder, and so must not lead to another one; empty before it is known."""
+"""Name used for a file or folder, which must not lead to another one; empty before it is known."""
 
 
 class Topic(StrEnum):
-    """Every topic that a session may hold."""
+    """Topics of a session."""
 
     TCP = "/robot/tcp"
     JOINTS = "/robot/joints"
@@ -43,7 +43,7 @@ class Topic(StrEnum):
 
 
 class Source(StrEnum):
-    """Where the ink comes from. Set by whoever records, from what the devices say; never from configuration."""
+    """Origin of the ink. Set when recording, from what the devices report, and never from configuration."""
 
     LOOPBACK = "loopback rig"
     REAL = "real capture"
@@ -55,7 +55,7 @@ PxPerMm = Annotated[float, Field(ge=MIN_PX_PER_MM, le=MAX_PX_PER_MM)]
 
 
 class Event(BaseModel):
-    """Base of our JSON messages: frozen, nothing unknown is let in, and no NaN (JSON would write it as null)."""
+    """Base of our JSON messages: frozen, without unknown fields or NaN (JSON would write it as null)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -72,7 +72,7 @@ class StepEvent(Event):
 
 
 class Stroke(Event):
-    """One captured mark: what was asked for, where it is, and which still shows it."""
+    """One captured mark: what was commanded, its place, and the still that shows it."""
 
     stroke_id: str
     """Stable name: `H13-a05-r02` for a grid press, the file's stem for an import."""
@@ -80,7 +80,7 @@ class Stroke(Event):
     still: int = Field(ge=0)
     """`sequence` of the message on /camera/still that shows this stroke."""
     height_mm: float | None = None
-    """Commanded press depth H; None where the source does not tell one."""
+    """Commanded press depth H; None where the source has none."""
     tilt_deg: float | None = None
     heading_deg: float = 0.0
     cell_mm: tuple[float, float, float, float] | None = None
@@ -88,9 +88,9 @@ class Stroke(Event):
     anchor_mm: tuple[float, float] | None = None
     """Commanded zero-touch point in the paper frame."""
     anchor_px: tuple[float, float] | None = None
-    """The same in the still, for imports that tell it."""
+    """Commanded zero-touch point in the still, for imports that have it."""
     px_per_mm: tuple[PxPerMm, PxPerMm] | None = None
-    """Scale in x and y, for imports that tell it."""
+    """Scale in x and y, for imports that have it."""
     again_of: str | None = None
     """The stroke of an earlier session that this one repeats."""
     dip_to_touch_s: float | None = Field(default=None, ge=0.0)
@@ -111,7 +111,7 @@ class Wrench(Event):
 
 
 class InkState(Event):
-    """What is known of the ink station; None where it cannot tell."""
+    """State of the ink station; None where it does not report a value."""
 
     level: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
     """Fill of the well."""
@@ -121,7 +121,7 @@ class InkState(Event):
 
 
 class Check(Event):
-    """One question asked of a capture."""
+    """One quality check of a capture."""
 
     name: str
     score: float | None = None
@@ -129,11 +129,11 @@ class Check(Event):
     threshold: float | None = None
     passed: bool
     reason: str = ""
-    """In words for the operator; empty where the check passed."""
+    """Reason for the operator; empty where the check passed."""
 
 
 class Quality(Event):
-    """The checks of one stroke."""
+    """Quality checks of one stroke."""
 
     stroke_id: str
     checks: tuple[Check, ...]
@@ -145,7 +145,7 @@ class Quality(Event):
 
 
 class SlowSection(Event):
-    """A part of a loop that took longer than it may."""
+    """Part of a loop that took longer than allowed."""
 
     name: str
     times: int = Field(ge=1)
@@ -153,20 +153,20 @@ class SlowSection(Event):
 
 
 class Cadence(Event):
-    """How steadily a topic came, over one step."""
+    """Regularity of a topic's messages during one step."""
 
     topic: str
     expected_hz: float = Field(gt=0.0)
     received: int = Field(ge=0)
     missed: int = Field(ge=0)
-    """Slots of 1 / `expected_hz` in which nothing came."""
+    """Intervals of 1 / `expected_hz` without a message."""
     longest_gap_ms: float | None = Field(default=None, ge=0.0)
     """None for fewer than two messages."""
     slow_sections: tuple[SlowSection, ...] = ()
 
 
 class Header(Event):
-    """Who made this recording, on what, with what. Written first, into every file of a session."""
+    """Devices, material and software of a recording. Written first, into every file of a session."""
 
     schema_version: int = SCHEMA_VERSION
     session_id: BareName
@@ -181,7 +181,7 @@ class Header(Event):
     brush_length_mm: float | None = None
     ink: str = ""
     ink_device: str = ""
-    """Empty where a person keeps the well filled."""
+    """Empty where a person refills the well."""
     force_sensor: str = ""
     """Empty where there is none."""
     paper: str = ""

@@ -1,36 +1,32 @@
-"""One MCAP file, written by one thread: queue in, file out, durable when `finish` returns.
+"""The MCAP file of one step, written by a thread of its own from a queue; durable when `finish` returns.
 
-A kill -9 loses at most the last 250 ms of the step that is done again anyway.
+A kill -9 loses at most the last 250 ms of a step, and that step is done again anyway.
 """
 
 from __future__ import annotations
 
-import hashlib
-import os
+import json
 import queue
 import threading
 import time
-import zlib
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any, cast
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 
+from sessions.disk import fsync_folder, sync
 from sessions.errors import SessionError, disk_error
-from sessions.journal.journal import fsync_folder
+from sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE, file_sha256, note, start_mcap
 from sessions.recording.schemas import Event, Header, Recorded, Topic
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
 
-CHUNK_BYTES = 256 * 1024
 FLUSH_S = 0.25
 QUEUE_LIMIT = 20_000
-"""About 200 s of poses: more means that the disk does not keep up, and that must be heard."""
-HEADER_METADATA = "brushloop.header"
-BEGIN_NOTE, DONE_NOTE = "brushloop.begin", "brushloop.done"
+"""About 200 s of poses: more means that the disk does not keep up, which is an error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +58,7 @@ class SegmentWriter:
         self._finished: dict[str, Any] | None = None
         self._error: Exception | None = None
         self._ended = False
-        """Set by the thread once it has taken the end mark off the queue: nothing comes after it."""
+        """Set by the thread once it has taken the end mark, the last item, off the queue."""
         self.counts: Counter[str] = Counter()
         try:
             if final.exists():
@@ -76,7 +72,7 @@ class SegmentWriter:
         self._thread.start()
 
     def write(self, outgoing: Outgoing, wait_s: float = 0.0) -> None:
-        """Queue a message, at once or within `wait_s`. Raises `SessionError` for a disk that failed or is too slow."""
+        """Queue a message, waiting at most `wait_s`. Raises `SessionError` for a disk that failed or is too slow."""
         self._raise_error()
         try:
             self._queue.put(outgoing, block=wait_s > 0.0, timeout=wait_s or None)
@@ -100,7 +96,7 @@ class SegmentWriter:
         return recorded
 
     def abandon(self) -> None:
-        """End the thread and leave the part file where it is: a cut step's evidence is kept."""
+        """End the thread and keep the part file as evidence of a step that was cut."""
         self._join()
 
     def _raise_error(self) -> None:
@@ -116,19 +112,16 @@ class SegmentWriter:
         try:
             with self._file:
                 self._write_all()
-                self._file.flush()
-                os.fsync(self._file.fileno())
+                sync(self._file)
         except Exception as error:
             self._error = error
-            while not self._ended:  # nobody may block on a dead writer
+            while not self._ended:  # whoever writes must not block on a thread that failed
                 self._ended = self._queue.get() is None
 
     def _write_all(self) -> None:
-        writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        writer.start(profile="", library=self._header.software)
-        writer.add_metadata(HEADER_METADATA, header_metadata(self._header))
+        notes = {} if self._begun is None else {BEGIN_NOTE: self._begun}
+        writer = start_mcap(self._file, self._header, notes, {})
         if self._begun is not None:
-            writer.add_metadata(BEGIN_NOTE, note(self._begun))
             writer.flush()
         channels = ChannelTable(writer)
         flushed = time.monotonic()
@@ -153,7 +146,7 @@ class SegmentWriter:
 
 
 class ChannelTable:
-    """Registers a channel the first time a topic is seen, and flushes so that its schema is on disk."""
+    """Registers a channel at the first message on a topic, and flushes so that its schema is on disk."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
@@ -172,14 +165,12 @@ class ChannelTable:
             sequence=outgoing.sequence,
             data=message.model_dump_json().encode() if isinstance(message, Event) else message.SerializeToString(),
         )
-        if new or outgoing.topic == Topic.STROKE:  # what damages a chunk costs one stroke
+        if new or outgoing.topic == Topic.STROKE:  # ends the chunk, so that a damaged chunk costs one stroke
             self._writer.flush()
 
     def _register(self, outgoing: Outgoing) -> int:
         message = outgoing.message
         if isinstance(message, Event):
-            import json
-
             name, encoding = f"brushloop.{type(message).__name__}", "json"
             schema = json.dumps(type(message).model_json_schema(), sort_keys=True).encode()
             schema_encoding = "jsonschema"
@@ -190,52 +181,3 @@ class ChannelTable:
             schema = build_file_descriptor_set(type(message)).SerializeToString()
         schema_id = self._writer.register_schema(name=name, encoding=schema_encoding, data=schema)
         return self._writer.register_channel(topic=outgoing.topic, message_encoding=encoding, schema_id=schema_id)
-
-
-def header_metadata(header: Header) -> dict[str, str]:
-    """The header as MCAP metadata: every value JSON, so that it reads back as it was, and a CRC over all of them."""
-    import json
-
-    values = {name: json.dumps(value) for name, value in header.model_dump(mode="json").items()}
-    return {**values, "crc": header_crc(values)}
-
-
-def header_crc(values: dict[str, str]) -> str:
-    """CRC-32 of a header's metadata, `crc` itself left out."""
-    import json
-
-    texts = {name: text for name, text in values.items() if name != "crc"}
-    return f"{zlib.crc32(json.dumps(texts, sort_keys=True).encode()):08x}"
-
-
-def media_type(name: str) -> str:
-    """Of a file that travels inside a recording, by the ending of its name."""
-    endings = {".toml": "application/toml", ".json": "application/json"}
-    return endings.get(PurePath(name).suffix, "application/octet-stream")
-
-
-def note(values: dict[str, Any]) -> dict[str, str]:
-    """Values as MCAP metadata with a CRC of their own: the format gives metadata none."""
-    import json
-
-    text = json.dumps(values, separators=(",", ":"), allow_nan=False)
-    return {"json": text, "crc": f"{zlib.crc32(text.encode()):08x}"}
-
-
-def read_note(metadata: dict[str, str]) -> dict[str, Any] | None:
-    """The values of a note; None where it does not match its CRC. Raises `ValueError` where it is no note."""
-    import json
-
-    text = metadata.get("json", "")
-    if metadata.get("crc") != f"{zlib.crc32(text.encode()):08x}":
-        return None
-    values = json.loads(text)
-    if not isinstance(values, dict):
-        raise ValueError("holds no values")
-    return cast("dict[str, Any]", values)
-
-
-def file_sha256(path: Path) -> str:
-    """Hex digest of a file, read in pieces."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,1 +1,1 @@
-"""What a damaged session still holds, and its repair."""
+"""Checking sessions for damage, and repairing them."""

@@ -1,7 +1,7 @@
-"""What a session's folder still tells, its journal and its files taken together; nothing is changed here.
+"""What can still be known of a damaged session from its journal and its files together; changes nothing.
 
-Every segment carries the journal's `begin` line, and once finished its `done` line, so that lines which a journal
-lost can be rebuilt word for word, and put back where they were.
+The file of every step carries the journal's `begin` line, and once finished its `done` line. Lost lines of a journal
+are rebuilt from these word for word, and put back in their place.
 """
 
 from __future__ import annotations
@@ -18,19 +18,17 @@ from sessions.journal.codec import Line, encode_line
 from sessions.journal.events import NONSENSE, serial_of
 from sessions.journal.journal import JOURNAL_NAME, Account, DoneTwice, Replay, account, fold
 from sessions.journal.lines import Fault, accounts_for, read_journal
-from sessions.merge import count_messages
-from sessions.names import check_file
+from sessions.names import SEGMENT_NAME, SNAPSHOT_NAMES, check_file
 from sessions.reader import parse_header
+from sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE, HEADER_METADATA, count_messages, file_sha256
 from sessions.recording.salvage import Scan, scan
 from sessions.recording.schemas import Header, Recorded, Topic
-from sessions.recording.writer import BEGIN_NOTE, DONE_NOTE, HEADER_METADATA, file_sha256
-from sessions.repair.soundness import file_problems
-from sessions.store import SEGMENT_NAME, SNAPSHOT_NAMES, closed_line, counts_of, done_line, open_line
+from sessions.store import closed_line, done_line, open_line
 
 
 @dataclass(slots=True)
 class Evidence:
-    """A journal as it is, and as it must have been."""
+    """Journal as it is, and as it must have been."""
 
     folder: Path
     data: bytes | None
@@ -38,24 +36,24 @@ class Evidence:
     lines: list[Line]
     """Lines that can be trusted, in order."""
     faults: list[Fault]
-    """What is wrong with the journal, line by line: the list that every other command goes by as well."""
+    """What is wrong with the journal, line by line; the same list as for every other command."""
     torn: bytes
     unchained: int
-    """How many lines are from before lines were chained."""
+    """Number of lines written before lines were chained."""
     rebuilt: list[Line] = field(default_factory=list[Line])
-    """Lines that the journal lacks and that the files tell."""
+    """Lines missing from the journal and found in the files."""
     lost: int = 0
-    """Lines that are damaged or missing, and that no file tells."""
+    """Number of lines that are damaged or missing, and in no file."""
     doubtful: list[str] = field(default_factory=list[str])
-    """Files of attempts whose sheet and cell nobody knows."""
+    """Files of attempts whose sheet and cell are unknown."""
     strays: list[str] = field(default_factory=list[str])
-    """Files that hold a step which the journal knows by another file."""
+    """Files that hold a step which the journal lists under another file."""
     state: Replay = field(default_factory=Replay)
-    """All trusted and rebuilt lines, folded."""
+    """State after all trusted and rebuilt lines."""
 
     @property
     def all_lines(self) -> list[Line]:
-        """The journal as it must have been: `open` first, what was rebuilt in the place where it was."""
+        """Journal as it must have been, with the rebuilt lines in their places."""
         lines = list(self.lines)
         for line in self.rebuilt:
             lines.insert(_place(lines, line), line)
@@ -63,26 +61,26 @@ class Evidence:
 
     @property
     def intact(self) -> bool:
-        """Whether the journal can stay as it is and only needs lines added."""
+        """Whether the journal can stay as it is, with lines added."""
         return self.data is not None and not self.faults
 
 
 def gather(folder: Path) -> Evidence:
-    """Look at journal and files. Raises `SessionDamaged` where not even a header is left."""
+    """Read journal and files. Raises `SessionDamaged` where not even a header is left."""
     path = folder / JOURNAL_NAME
     data = read_journal(path) if check_file(path) else None
-    told = account(data or b"")
-    found = Evidence(folder, data, told.lines, told.faults, told.reading.torn, told.reading.unchained)
-    _lost_between(found, told.twice)
-    header = _from_files(found, told.state.done)
-    if told.state.opened is None:
+    journal = account(data or b"")
+    found = Evidence(folder, data, journal.lines, journal.faults, journal.reading.torn, journal.reading.unchained)
+    _lost_between(found, journal.twice)
+    header = _from_files(found, journal.state.done)
+    if journal.state.opened is None:
         header = header or _from_any_segment(folder) or _from_final(folder)
         if header is None:
-            raise SessionDamaged(path, "has no `open` event, and no file is left that tells its header")
+            raise SessionDamaged(path, "has no `open` event, and no file holds its header")
         found.rebuilt.insert(0, {"t_ns": 0, **open_line(header, _snapshots(folder))})
     _fold(found)
     _closed(found)
-    found.lost = _lost(told, found.rebuilt)
+    found.lost = _lost(journal, found.rebuilt)
     return found
 
 
@@ -91,12 +89,12 @@ def _fold(found: Evidence) -> None:
         try:
             fold(found.state, line)
         except DoneTwice:
-            # Only a rebuilt line can be: the journal's own were folded one by one.
+            # Only a rebuilt line can raise this: the journal's own lines were folded before.
             found.rebuilt = [other for other in found.rebuilt if other is not line]
 
 
 def _lost_between(found: Evidence, twice: list[Line]) -> None:
-    """A step that is done twice, and whose first file is gone: the line that said so is what is missing."""
+    """Rebuild the `lost` line of a step that is done twice and whose first file is gone."""
     for line in twice:
         held = (one for one in found.lines if one["event"] == "done" and one["key"] == line["key"])
         first = next(held, line)
@@ -106,8 +104,8 @@ def _lost_between(found: Evidence, twice: list[Line]) -> None:
             found.rebuilt += [{**lost, "aside": "", "why": why}, line]
 
 
-def _lost(told: Account, rebuilt: list[Line]) -> int:
-    spoilt, others = list(told.spoilt), 0
+def _lost(journal: Account, rebuilt: list[Line]) -> int:
+    spoilt, others = list(journal.spoilt), 0
     for line in rebuilt:
         body = encode_line(int(line["t_ns"]), _without_time(line))
         span = next((span for span in spoilt if accounts_for(span, body)), None)
@@ -115,11 +113,11 @@ def _lost(told: Account, rebuilt: list[Line]) -> int:
             others += 1
         else:
             spoilt.remove(span)
-    return len(spoilt) + max(0, told.reading.gaps - others)
+    return len(spoilt) + max(0, journal.reading.gaps - others)
 
 
 def _place(lines: list[Line], line: Line) -> int:
-    """Where a rebuilt line belongs: `open` first, `closed` last, a step's before those of the next step."""
+    """Index for a rebuilt line: `open` first, `closed` last, the lines of a step before those of the next."""
     if line["event"] == "open":
         return 0
     serial = serial_of(line)
@@ -133,9 +131,9 @@ def _place(lines: list[Line], line: Line) -> int:
 
 
 def _from_files(found: Evidence, live: dict[str, Line]) -> Header | None:
-    """Rebuild `begin` and `done` lines from the notes in the segments; the header in one of them.
+    """Rebuild `begin` and `done` lines from the notes in the files of steps; return the header from one of them.
 
-    `live` are the `done` lines that the journal has, and that no `lost` line takes back.
+    `live` are the journal's `done` lines that no `lost` line revokes.
     """
     begun = {str(line.get("file")) for line in found.lines if line["event"] == "begin"}
     done = {str(line.get("file")) for line in [*found.lines, *found.rebuilt] if line["event"] == "done"}
@@ -144,7 +142,7 @@ def _from_files(found: Evidence, live: dict[str, Line]) -> Header | None:
     doubted = {line.get("file") for line in found.lines if line["event"] == "doubt"}
     header: Header | None = None
     strays: list[str] = []
-    for path, name, seen in _untold(found.folder, begun, done):
+    for path, name, seen in _uncovered(found.folder, begun, done):
         if path.name.removesuffix(".part") != name:
             strays.append(path.name)
         if name in begun and (name in done or path.name.endswith(".part")):
@@ -162,7 +160,7 @@ def _from_files(found: Evidence, live: dict[str, Line]) -> Header | None:
             found.rebuilt.append(line)
         finish = _done_line(seen.notes.get(DONE_NOTE, {}), name)
         if finished and name not in done and finish is not None and not _superseded(found, finish, live):
-            # A digest that fits nothing has a damaged file looked at, and repaired, like any other.
+            # An empty digest matches no file, so that a damaged one is found and repaired like any other.
             whole = path.name == name and not seen.damage and dict(seen.counts) == finish["counts"]
             found.rebuilt.append({**finish, "sha256": file_sha256(path) if whole else ""})
     begun |= {line["file"] for line in found.rebuilt if line["event"] == "begin"}
@@ -170,13 +168,13 @@ def _from_files(found: Evidence, live: dict[str, Line]) -> Header | None:
     return header
 
 
-def _untold(folder: Path, begun: set[str], done: set[str]) -> Iterator[tuple[Path, str, Scan]]:
-    """Files of which the journal does not tell all, each with the name that it was given when it was written."""
+def _uncovered(folder: Path, begun: set[str], done: set[str]) -> Iterator[tuple[Path, str, Scan]]:
+    """Files not fully covered by the journal, each with the name under which it was written."""
     paths = [path for path in sorted(folder.glob("*.mcap*")) if SEGMENT_NAME.fullmatch(path.name)]
-    told = [
+    covered = [
         path for path in paths if path.name in begun & done or path.name.removesuffix(".part") in begun - {path.name}
     ]
-    others = [path for path in paths if path not in told]
+    others = [path for path in paths if path not in covered]
     exchanged = False
     while others:
         path = others.pop(0)
@@ -185,7 +183,7 @@ def _untold(folder: Path, begun: set[str], done: set[str]) -> Iterator[tuple[Pat
         name: str = path.name if line is None else line["file"]
         if name.removesuffix(".part") != path.name.removesuffix(".part") and not exchanged:
             exchanged = True
-            others += told  # what it should hold may be in a file that has another's name
+            others += covered  # its own content may be in a file that has the name of another
         yield path, name.removesuffix(".part"), seen
 
 
@@ -199,7 +197,7 @@ def _begin_line(note: dict[str, Any]) -> Line | None:
 
 
 def _done_line(note: dict[str, Any], name: str) -> Line | None:
-    """The `done` line that a file's note tells, without a digest; None where it makes no sense."""
+    """Make the `done` line from a file's note, without a digest; None where the note makes no sense."""
     try:
         identity = {field: note[field] for field in ("key", "kind", "attempt")}
         line = done_line(identity, name, Recorded(note["counts"], "", 0), note["result"])
@@ -211,7 +209,7 @@ def _done_line(note: dict[str, Any], name: str) -> Line | None:
 
 
 def _superseded(found: Evidence, finish: Line, live: dict[str, Line]) -> bool:
-    """Whether the journal says that this attempt was cut, or lost, or that the step was done, or begun, again."""
+    """Whether the attempt was cut or lost, or its step begun or done again, according to the journal."""
     held = live.get(finish["key"])
     if held is not None and (held.get("attempt", 1) > finish["attempt"] or Topic.STROKE in held["counts"]):
         return True
@@ -259,32 +257,19 @@ def _snapshots(folder: Path) -> dict[str, str]:
 
 
 def _closed(found: Evidence) -> None:
-    """A merged file that holds just what the journal counts was complete, though `closed` is missing."""
+    """Rebuild the `closed` line where the merged file holds exactly what the journal counts."""
     final = found.folder / f"{found.folder.name}.mcap"
     if found.state.closed is not None or not final.is_file() or not found.state.segments:
         return
     try:
-        complete = count_messages(final) == counts_of(found.state)
+        complete = count_messages(final) == found.state.counts()
     except SessionError:
         return
     if complete:
-        line: Line = {"t_ns": found.state.last_ns, **closed_line(final, counts_of(found.state))}
+        line: Line = {"t_ns": found.state.last_ns, **closed_line(final, found.state.counts())}
         found.rebuilt.append(line)
         fold(found.state, line)
 
 
 def _without_time(line: Line) -> Line:
     return {name: value for name, value in line.items() if name != "t_ns"}
-
-
-def final_is_sound(folder: Path, state: Replay) -> bool:
-    """Whether the merged file is as it was closed, and reads back with every CRC."""
-    final = folder / f"{folder.name}.mcap"
-    if state.closed is None or not final.is_file():
-        return False
-    try:
-        if "sha256" in state.closed and file_sha256(final) != state.closed["sha256"]:
-            return False
-        return count_messages(final) == state.closed.get("counts", counts_of(state)) and not file_problems(final)[1]
-    except (SessionError, OSError):
-        return False

@@ -1,38 +1,37 @@
-"""The repair of a journal: written again from what can be trusted and what the files tell, or added to."""
+"""Repair of a journal: rewritten from its trusted lines and those found in the files, or only added to."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sessions.disk import set_aside
+from sessions.disk import fsync_folder, set_aside, sync
 from sessions.journal.codec import Line, encode_line
-from sessions.journal.journal import JOURNAL_NAME, Journal, fsync_folder, next_chain
+from sessions.journal.journal import JOURNAL_NAME, Journal, next_chain
 from sessions.repair.evidence import Evidence
-from sessions.verify import step_words
+from sessions.repair.verify import step_words
 
 
 @dataclass(slots=True)
 class Report:
-    """What a repair did."""
+    """Result of a repair."""
 
     session: str
     did: list[str] = field(default_factory=list[str])
     lost: list[str] = field(default_factory=list[str])
-    """What could not be given back, in words; empty for a repair without loss."""
+    """Descriptions of what could not be recovered; empty for a repair without loss."""
     strokes: int = 0
-    """Finished strokes that the session now holds."""
+    """Finished strokes in the session after the repair."""
 
     @property
     def lossless(self) -> bool:
-        """Whether everything recorded was given back."""
+        """Whether everything recorded was recovered."""
         return not self.lost
 
 
 def repaired_journal(evidence: Evidence, session: str, now_ns: Callable[[], int], report: Report) -> Journal:
-    """The session's journal, sound and open for what else there is to say. Raises `SessionError`."""
+    """Repair the session's journal and open it for further lines. Raises `SessionError`."""
     if not evidence.intact:
         _rewrite(evidence, session, now_ns, report)
     journal = Journal(evidence.folder / JOURNAL_NAME, now_ns(), session)
@@ -45,13 +44,12 @@ def repaired_journal(evidence: Evidence, session: str, now_ns: Callable[[], int]
 
 
 def write_anew(path: Path, data: bytes) -> str:
-    """Put a file in place of the one there, which is kept; returns the name it is kept under. Raises OSError."""
+    """Replace a file, keep the old one, and return the name of the old one. Raises `OSError`."""
     kept = set_aside(path, "damaged").name if path.exists() else ""
     fresh = path.with_name(path.name + ".repair")
     with fresh.open("wb") as file:
         file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+        sync(file)
     fresh.replace(path)
     fsync_folder(path.parent)
     return kept
@@ -73,7 +71,7 @@ def _rewrite(evidence: Evidence, session: str, now_ns: Callable[[], int], report
     report.did += [f"  {JOURNAL_NAME}: {fault}" for fault in evidence.faults]
     if evidence.lost:
         lines = "1 line" if evidence.lost == 1 else f"{evidence.lost} lines"
-        report.lost.append(f"{lines} of {JOURNAL_NAME} that no file tells")
+        report.lost.append(f"{lines} of {JOURNAL_NAME} that no file holds")
 
 
 def _add_lines(journal: Journal, evidence: Evidence, now_ns: Callable[[], int], report: Report) -> None:
@@ -98,5 +96,5 @@ def _without_time(line: Line) -> Line:
 
 
 def kept_words(name: str) -> str:
-    """Where the damaged file went."""
+    """Say where the damaged file is kept."""
     return f"; the damaged file is kept as {name}" if name else ""

@@ -1,27 +1,38 @@
-"""Repair a session: give back every intact finished stroke, mark the rest as lost, say what was done.
+"""Repair a session: give back every intact finished stroke, mark the rest as lost, and say what was done.
 
-Nothing recorded is overwritten or deleted: a damaged original is kept as `<name>.damaged-1`. Cut short anywhere and
-started again, a repair comes to the same end.
+Order: journal, configuration, steps, merged file. A step is put together from every file that still holds some of it:
+its own, the merged file, and files with another step's name. The merged file is merged again from the steps.
+
+Nothing recorded is overwritten or deleted: a damaged original is kept as `<name>.damaged-1`. A repair that is
+interrupted anywhere and started again ends with the same result.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from sessions.errors import InputError, SessionDamaged, disk_error
-from sessions.journal.journal import JOURNAL_NAME
-from sessions.reader import parse_header
-from sessions.recording.salvage import scan
+from sessions.disk import fsync_folder, set_aside
+from sessions.errors import InputError, SessionDamaged, SessionError, disk_error
+from sessions.folders import check_name, not_a_session
+from sessions.journal.codec import Line
+from sessions.journal.journal import JOURNAL_NAME, Replay, fold, read_header, replay
+from sessions.merge import REPAIRS_NOTE, merge_session
+from sessions.names import SEGMENT_NAME
+from sessions.recording.container import Record
+from sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE, check_digest, count_messages, file_sha256
+from sessions.recording.salvage import Scan, scan
 from sessions.recording.schemas import Topic
-from sessions.recording.writer import HEADER_METADATA, header_crc
-from sessions.renamed import check_name, not_a_session
-from sessions.repair.folder import FolderRepair
-from sessions.repair.journal import Report, kept_words
-from sessions.repair.rewrite import lost_words, replace_damaged, with_their_stills
-from sessions.store import SEGMENT_NAME, lock
-from sessions.verify import verify_session
+from sessions.repair.evidence import gather
+from sessions.repair.journal import Report, kept_words, repaired_journal, write_anew
+from sessions.repair.rewrite import lost_words, repair_file, replace_damaged, with_their_stills
+from sessions.repair.union import Source, identity_of, united
+from sessions.repair.verify import file_problems, step_words
+from sessions.store import closed_line, lock
+
+MEASURED = (str(Topic.STILL), str(Topic.STROKE))
+"""Topics without which a step is useless and is done again; a gap in any other topic is reported and accepted."""
 
 
 def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
@@ -36,13 +47,13 @@ def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
     try:
         check_name(path)
         if target.is_file():
-            return _repair_file(target)
+            return repair_file(target)
         files = [file.name for file in target.glob("*.mcap*")]
         if not (target / JOURNAL_NAME).exists() and not any(map(SEGMENT_NAME.fullmatch, files)):
             final = target / f"{target.name}.mcap"
             if not final.is_file():
                 raise not_a_session(path)
-            return _repair_file(final)
+            return repair_file(final)
         held = lock(target)
         try:
             return FolderRepair(target, now_ns).run()
@@ -52,32 +63,232 @@ def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
         raise disk_error(target, "cannot be repaired", error) from error
 
 
-def _repair_file(path: Path) -> Report:
-    """A recording that stands alone: an import, or a merged file without its session."""
-    report = Report(path.name)
-    verdict = verify_session(path)
-    report.strokes = verdict.strokes
-    if verdict.sound:
-        return report
-    found = scan(path)
-    metadata = found.metadata.get(HEADER_METADATA)
-    if metadata is None:
-        raise SessionDamaged(path, "nothing is left that tells its header; it cannot be repaired")
-    header = parse_header(path, metadata)
-    if metadata.get("crc", "") not in ("", header_crc(metadata)):
-        report.lost.append("the certainty of its header: it does not match its CRC, and is kept as it reads")
-    strokes = with_their_stills(found)
-    notes = {name: values for name, values in found.notes.items() if name != HEADER_METADATA}
-    files = {attachment.name: attachment.data for attachment in found.attachments}
-    kept, counts = replace_damaged(path, header, notes, files, strokes.messages())
-    why = "; ".join(finding.what for finding in verdict.findings)
-    report.did.append(f"wrote {path.name} again from what can be read of it: {why}{kept_words(kept)}")
-    report.strokes = counts.get(Topic.STROKE, 0)
-    report.lost += lost_words(strokes, Counter(found.stated or {}), counts)
-    if found.stated is None and (not found.complete or any(part.counts is None for part in found.parts)):
-        report.lost.append("whatever else lay behind the damage: without its index nobody knows how much that was")
-    if found.stated is None:
-        return report
-    if len(files) < found.stated_attachments or len(found.notes) < found.stated_notes:
-        report.lost.append("an attached file, or a note of what was done to the recording")
-    return report
+class FolderRepair:
+    """One repair of one folder, its lock held."""
+
+    def __init__(self, folder: Path, now_ns: Callable[[], int]) -> None:
+        self._folder = folder
+        self._final = folder / f"{folder.name}.mcap"
+        self._now_ns = now_ns
+        self._report = Report(folder.name)
+        self._lost_steps: list[str] = []
+        """Reported as lost unless the merged file holds them."""
+        self._scans: dict[tuple[int, int, int], tuple[Scan, tuple[str, int] | None]] = {}
+        """Content of each file that was read and the step it belongs to, by inode, size and time."""
+        evidence = gather(folder)
+        self._strays = evidence.strays
+        self._begins = [line for line in evidence.all_lines if line["event"] == "begin"]
+        self._header = read_header(folder, evidence.state)
+        self._journal = repaired_journal(evidence, self._header.session_id, now_ns, self._report)
+        try:
+            self._state = replay(folder / JOURNAL_NAME)
+            self._final_sound = _final_is_sound(folder, self._state)
+            self._totals = Counter[str](self._state.counts())
+            self._merged = self._steps_of_merged()
+        except BaseException:
+            self._journal.close()
+            raise
+
+    def run(self) -> Report:
+        """Configuration, steps, merged file."""
+        try:
+            self._snapshots()
+            for line in list(self._state.segments):
+                self._segment(line)
+            for name in self._strays:
+                kept = self._move_aside(self._folder / name)
+                self._report.did.append(f"put {name} aside: it is a copy of another step{kept_words(kept)}")
+            if self._state.closed is None:
+                self._left_by_a_close()
+            elif not self._final_sound:
+                self._merge_again()
+        finally:
+            self._journal.close()
+        self._report.lost += self._lost_steps
+        counts = (self._state.closed or {}).get("counts", self._state.counts())
+        self._report.strokes = counts.get(Topic.STROKE, 0)
+        return self._report
+
+    def _steps_of_merged(self) -> dict[str, Counter[str]]:
+        """Messages by topic that precede each step's in the merged file; empty where they are unknown."""
+        before: dict[str, Counter[str]] = {}
+        number = Counter[str]()
+        for line in self._state.segments:
+            before[line["file"]] = number.copy()
+            number.update(line["counts"])
+        closed = self._state.closed or {}
+        return before if closed.get("counts", self._totals) == self._totals else {}
+
+    def _snapshots(self) -> None:
+        for name, text in (self._state.opened or {}).get("snapshots", {}).items():
+            path = self._folder / name
+            data = text.encode()
+            if not path.is_file() or path.read_bytes() != data:
+                kept = write_anew(path, data)
+                self._report.did.append(f"wrote {path.name} again from the journal{kept_words(kept)}")
+
+    def _segment(self, line: Line) -> None:
+        path = self._folder / line["file"]
+        held = "held" in line
+        if held and self._final_sound:
+            return
+        try:
+            check_digest(path, str(line["sha256"]))
+        except SessionDamaged as error:
+            if not held or path.exists():
+                self._damaged(path, line, error.what)
+            elif not path.exists():
+                self._lose(path, line, "only the merged file held it, and that is damaged")
+
+    def _damaged(self, path: Path, line: Line, why: str) -> None:
+        step = step_words(line)
+        found = self._look(path)[0] if path.is_file() else Scan(path)
+        why = "; ".join(found.damage) or why
+        counts = Counter[str](line["counts"])
+        records = united(line, self._sources(path, line, counts))
+        missing = counts - Counter(channel.topic for _schema, channel, _message in records)
+        if missing and self._final_sound:
+            kept = self._move_aside(path)
+            self._log({"event": "held", "key": line["key"], "file": path.name, "by": self._final.name, "why": why})
+            self._report.did.append(f"{path.name} ({step}) {why}: the merged file holds all of it{kept_words(kept)}")
+        elif any(topic in missing for topic in _needed(counts)):
+            self._lose(path, line, why)
+        else:
+            self._write_again(path, line, found, records, dict(missing), why)
+
+    def _sources(self, path: Path, line: Line, counts: Counter[str]) -> Iterator[Source]:
+        """Files that may hold messages of the step: its own, the merged file, and any that names this step inside."""
+        identity, nothing = (line["key"], line.get("attempt", 1)), Counter[str]()
+        others = (other for other in sorted(self._folder.glob("*.mcap*")) if other not in (path, self._final))
+        for place in (path, self._final, *others):
+            if not place.is_file():
+                continue
+            if place != self._final:
+                found, whose = self._look(place)
+                if whose == identity:
+                    yield Source(found, counts, nothing)
+            elif path.name in self._merged:
+                yield Source(self._look(place)[0], self._totals, self._merged[path.name])
+
+    def _look(self, path: Path) -> tuple[Scan, tuple[str, int] | None]:
+        """Content of a file and the step it belongs to; read once, even if the file is renamed meanwhile."""
+        stat = path.stat()
+        known = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
+        if known not in self._scans:
+            found = scan(path)
+            self._scans[known] = found, None if path == self._final else identity_of(found)
+        self._scans[known][0].path = path
+        return self._scans[known]
+
+    def _write_again(
+        self, path: Path, line: Line, found: Scan, records: list[Record], missing: dict[str, int], why: str
+    ) -> None:
+        begin = {"t_ns": line["t_ns"], "header": self._header.model_dump(mode="json"), "line": self._begin_of(line)}
+        if self._look(path)[1] == (line["key"], line.get("attempt", 1)) if path.is_file() else False:
+            begin = found.notes.get(BEGIN_NOTE, begin)
+        counts = dict(Counter(channel.topic for _schema, channel, _message in records))
+        done = {name: line[name] for name in ("key", "kind", "result", "t_ns")}
+        notes = {BEGIN_NOTE: begin, DONE_NOTE: {**done, "attempt": line.get("attempt", 1), "counts": counts}}
+        kept, counts = replace_damaged(path, self._header, notes, {}, records)
+        event: Line = {"event": "repaired", "key": line["key"], "file": path.name, "sha256": file_sha256(path)}
+        self._log({**event, "counts": counts, "missing": missing, "aside": kept, "why": why})
+        words = ", ".join(f"{count} of {topic}" for topic, count in missing.items())
+        how = f"without {words}" if words else "whole"
+        self._report.did.append(f"wrote {path.name} ({step_words(line)}) again {how}: {why}{kept_words(kept)}")
+        if words:
+            self._lost_steps.append(f"messages in {path.name} ({step_words(line)}): {words}")
+
+    def _begin_of(self, line: Line) -> Line:
+        """The attempt's `begin` line in the journal; without one, a line made from its `done` line."""
+        for begin in self._begins:
+            if begin["file"] == line["file"]:
+                return {name: value for name, value in begin.items() if name != "t_ns"}
+        known = {"event": "begin", "key": line["key"], "kind": line["kind"], "attempt": line.get("attempt", 1)}
+        return {**known, "sheet": line["result"].get("sheet", self._state.sheet), "cell": None, "file": line["file"]}
+
+    def _lose(self, path: Path, line: Line, why: str) -> None:
+        kept = self._move_aside(path)
+        again = "" if self._state.closed is not None else "; it is done again when the session goes on"
+        self._log({"event": "lost", "key": line["key"], "file": path.name, "aside": kept, "why": why})
+        self._report.did.append(f"marked {path.name} ({step_words(line)}) as lost: {why}{kept_words(kept)}")
+        self._lost_steps.append(f"{step_words(line)}{again}")
+        if self._state.closed is None:
+            self._lose_its_press(line)
+
+    def _lose_its_press(self, line: Line) -> None:
+        """Mark the press as lost too where its sheet is no longer in: it cannot be photographed again."""
+        stroke = line["result"].get("stroke_id")
+        for other in list(self._state.segments):
+            result = other["result"]
+            if stroke is None or result.get("stroke_id") != stroke or "sheet" not in result:
+                continue
+            if result["sheet"] != self._state.sheet:
+                why = f"its photograph is lost and its sheet {int(result['sheet']) + 1} is no longer in"
+                event = {"event": "lost", "key": other["key"], "file": other["file"], "aside": "", "why": why}
+                self._log(event)
+                self._report.did.append(f"marked {other['file']} ({step_words(other)}) as lost: {why}")
+
+    def _move_aside(self, path: Path) -> str:
+        if not path.exists():
+            return ""
+        kept = set_aside(path, "damaged")
+        path.unlink()
+        fsync_folder(self._folder)
+        return kept.name
+
+    def _merge_again(self) -> None:
+        """Merge the steps' files again, or rewrite the damaged merged file where it holds more strokes."""
+        found = self._look(self._final)[0] if self._final.is_file() else Scan(self._final)
+        if not self._merged and len(with_their_stills(found).kept) > self._state.counts().get(Topic.STROKE, 0):
+            self._lost_steps = self._rewrite_final(found)
+            return
+        why = "; ".join(found.damage) or ("has changed" if self._final.is_file() else "is missing")
+        kept = set_aside(self._final, "damaged").name if self._final.is_file() else ""
+        merge_session(self._folder, self._state, self._header, "damaged")
+        self._log(closed_line(self._final, self._state.counts()))
+        self._report.did.append(f"merged {self._final.name} again from the steps' files: it {why}{kept_words(kept)}")
+
+    def _rewrite_final(self, found: Scan) -> list[str]:
+        """Rewrite the merged file, and return descriptions of what was lost."""
+        strokes = with_their_stills(found)
+        names = (self._state.opened or {}).get("snapshots", {})
+        files = {a.name: a.data for a in found.attachments} | {name: text.encode() for name, text in names.items()}
+        notes: dict[str, Line] = {REPAIRS_NOTE: {"repairs": self._state.repairs}} if self._state.repairs else {}
+        kept, counts = replace_damaged(self._final, self._header, notes, files, strokes.messages())
+        before = Counter[str]((self._state.closed or {}).get("counts", {}))
+        self._log(closed_line(self._final, counts))
+        why = "; ".join(found.damage) or "has changed"
+        self._report.did.append(f"wrote {self._final.name} again from what can be read of it: {why}{kept_words(kept)}")
+        return lost_words(strokes, before, counts)
+
+    def _left_by_a_close(self) -> None:
+        """Put aside a damaged merged file of an open session, which is merged again when it closes."""
+        problems = file_problems(self._final)[1] if self._final.is_file() else []
+        if problems:
+            kept = self._move_aside(self._final)
+            self._report.did.append(
+                f"put {self._final.name} aside, which no close was journalled for{kept_words(kept)}"
+            )
+
+    def _log(self, line: Line) -> None:
+        t_ns = self._now_ns()
+        self._journal.append(t_ns, line)
+        fold(self._state, {"t_ns": t_ns, **line})
+
+
+def _needed(counts: Counter[str]) -> tuple[str, ...]:
+    """Topics that a step needs; a photograph without a stroke (the board) is found by the event of its step."""
+    return MEASURED if counts[Topic.STROKE] or not counts[Topic.STILL] else (*MEASURED, str(Topic.STEP))
+
+
+def _final_is_sound(folder: Path, state: Replay) -> bool:
+    """Whether the merged file is unchanged since the close, and reads back with every CRC."""
+    final = folder / f"{folder.name}.mcap"
+    if state.closed is None or not final.is_file():
+        return False
+    try:
+        if "sha256" in state.closed and file_sha256(final) != state.closed["sha256"]:
+            return False
+        return count_messages(final) == state.closed.get("counts", state.counts()) and not file_problems(final)[1]
+    except (SessionError, OSError):
+        return False

@@ -1,8 +1,7 @@
-"""Writing again what could be read of a damaged file: beside it, read back, and only then in its place."""
+"""Rewriting a damaged file: what can be read is written beside it, read back, and only then takes its place."""
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -10,45 +9,33 @@ from pathlib import Path
 
 from google.protobuf.message import DecodeError
 from mcap.records import Message
-from mcap.writer import CompressionType, Writer
 from pydantic import ValidationError
 
-from sessions.disk import set_aside
-from sessions.errors import disk_error
+from sessions.disk import fsync_folder, set_aside
+from sessions.errors import SessionDamaged, disk_error
 from sessions.journal.codec import Line
-from sessions.journal.journal import fsync_folder
-from sessions.merge import Copier, count_messages
+from sessions.reader import parse_header
+from sessions.recording.container import Record
+from sessions.recording.mcap_file import HEADER_METADATA, count_messages, header_crc, write_mcap
 from sessions.recording.messages import decode_still
-from sessions.recording.salvage import Record, Scan, glimpsed, salvaged
+from sessions.recording.salvage import Scan, glimpsed, salvaged, scan
 from sessions.recording.schemas import Header, Stroke, Topic
-from sessions.recording.writer import CHUNK_BYTES, HEADER_METADATA, header_metadata, media_type, note
+from sessions.repair.journal import Report, kept_words
+from sessions.repair.verify import verify_session
 
 
 def replace_damaged(
     path: Path, header: Header, notes: dict[str, Line], attachments: dict[str, bytes], messages: Iterable[Record]
 ) -> tuple[str, dict[str, int]]:
-    """Write a file with these contents in place of `path`, which is kept beside it.
+    """Write a file with these contents in place of `path`, and keep the damaged one beside it.
 
-    Returns the name under which the damaged file is kept (empty where there was none) and the messages by topic, as
-    read back. Raises `SessionError`; the damaged file then still has its name.
+    Returns the name of the damaged file (empty where there was none) and the messages by topic, as read back. Raises
+    `SessionError`; the damaged file then still has its own name.
     """
     fresh = path.with_name(path.name + ".repair")
     try:
         fresh.unlink(missing_ok=True)  # left by a repair that was killed: a copy
-        with fresh.open("xb") as file:
-            writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-            writer.start(profile="", library=header.software)
-            writer.add_metadata(HEADER_METADATA, header_metadata(header))
-            for name, values in notes.items():
-                writer.add_metadata(name, note(values))
-            for name, data in attachments.items():
-                writer.add_attachment(0, 0, name, media_type(name), data)
-            copier = Copier(writer)
-            for schema, channel, message in messages:
-                copier.add(schema, channel, message)
-            writer.finish()
-            file.flush()
-            os.fsync(file.fileno())
+        write_mcap(fresh, header, notes, attachments, messages)
         counts = count_messages(fresh)
         kept = set_aside(path, "damaged").name if path.exists() else ""
         fresh.replace(path)
@@ -60,21 +47,21 @@ def replace_damaged(
 
 @dataclass(frozen=True, slots=True)
 class Strokes:
-    """What can be given back of a recording that stands alone: strokes with their photographs, each once."""
+    """Strokes that can be recovered from one file with their photographs, each once."""
 
     found: Scan
     kept: tuple[str, ...]
     photograph_lost: tuple[str, ...]
     """Strokes whose still cannot be read."""
     numbers_lost: tuple[int, ...]
-    """Which strokes of the recording, counted from 1, cannot be read themselves."""
+    """Numbers, from 1, of the strokes that cannot be read themselves."""
     names_lost: tuple[str, ...]
-    """What their chunks still show of their names, as far as that can be read."""
+    """Names of strokes still visible in damaged chunks."""
     total: int
-    """Strokes that the recording held, as far as anything tells."""
+    """Strokes that the recording held, as far as known."""
 
     def messages(self) -> Iterator[Record]:
-        """Everything that can be read, less strokes without their photograph and those that are there already."""
+        """Everything readable, except strokes without a photograph and strokes that were read before."""
         gone, seen = set(self.photograph_lost), set[str]()
         for schema, channel, message in salvaged(self.found):
             stroke = _stroke(message) if channel.topic == Topic.STROKE else None
@@ -86,7 +73,7 @@ class Strokes:
 
 
 def with_their_stills(found: Scan) -> Strokes:
-    """Which strokes of a salvaged recording are there with their stills, and which are lost."""
+    """Sort the strokes of a damaged file into those with their stills and those that are lost."""
     there = {m.sequence for _, channel, m in salvaged(found) if channel.topic == Topic.STILL and _shows(m)}
     names: dict[str, bool] = {}
     for _schema, channel, message in salvaged(found):
@@ -105,18 +92,49 @@ def with_their_stills(found: Scan) -> Strokes:
 
 
 def lost_words(strokes: Strokes, before: Counter[str], now: dict[str, int]) -> list[str]:
-    """What was lost: each stroke by its name, or by its number where its name is lost with it, then the rest."""
+    """Describe what was lost: each stroke by its name, or by its number without one, then other messages."""
     lost = [f"stroke {name}: its photograph is lost" for name in strokes.photograph_lost]
     named = len(strokes.names_lost) == len(strokes.numbers_lost)
     for at, number in enumerate(strokes.numbers_lost):
         name = f"{strokes.names_lost[at]}, " if named else ""
         lost.append(f"stroke {name}number {number} of {strokes.total} in the recording: it cannot be read")
-    told = len(strokes.numbers_lost) + len(strokes.photograph_lost)
-    unknown = before[Topic.STROKE] - now.get(Topic.STROKE, 0) - told
+    named_count = len(strokes.numbers_lost) + len(strokes.photograph_lost)
+    unknown = before[Topic.STROKE] - now.get(Topic.STROKE, 0) - named_count
     if unknown > 0:
-        lost.append(f"{unknown} strokes of which nothing is left that names them")
+        lost.append(f"{unknown} strokes whose names are lost too")
     gone = {topic: count - now.get(topic, 0) for topic, count in before.items() if topic != Topic.STROKE}
     return lost + [f"messages on {topic}: {count}" for topic, count in gone.items() if count > 0]
+
+
+def repair_file(path: Path) -> Report:
+    """Repair one MCAP file: an import, or a merged file without its session. Raises `SessionDamaged`."""
+    report = Report(path.name)
+    verdict = verify_session(path)
+    report.strokes = verdict.strokes
+    if verdict.sound:
+        return report
+    found = scan(path)
+    metadata = found.metadata.get(HEADER_METADATA)
+    if metadata is None:
+        raise SessionDamaged(path, "has lost its header; it cannot be repaired")
+    header = parse_header(path, metadata)
+    if metadata.get("crc", "") not in ("", header_crc(metadata)):
+        report.lost.append("the certainty of its header: it does not match its CRC, and is kept as it reads")
+    strokes = with_their_stills(found)
+    notes = {name: values for name, values in found.notes.items() if name != HEADER_METADATA}
+    files = {attachment.name: attachment.data for attachment in found.attachments}
+    kept, counts = replace_damaged(path, header, notes, files, strokes.messages())
+    why = "; ".join(finding.what for finding in verdict.findings)
+    report.did.append(f"wrote {path.name} again from what can be read of it: {why}{kept_words(kept)}")
+    report.strokes = counts.get(Topic.STROKE, 0)
+    report.lost += lost_words(strokes, Counter(found.stated or {}), counts)
+    if found.stated is None and (not found.complete or any(part.counts is None for part in found.parts)):
+        report.lost.append("anything else behind the damage: without its index its amount is unknown")
+    if found.stated is None:
+        return report
+    if len(files) < found.stated_attachments or len(found.notes) < found.stated_notes:
+        report.lost.append("an attached file, or a note of what was done to the recording")
+    return report
 
 
 def _shows(message: Message) -> bool:

@@ -1,8 +1,8 @@
-"""The messages of one finished step, put together from every file that still holds some of them.
+"""Messages of one finished step, put together from every file that still holds some of them.
 
-A message is known by its topic and its number within the step. In a step's own file that is its number in the file; in
-the merged file, the steps of which follow each other, the messages of the steps before it are counted off. Chunks that
-cannot be read are counted by their index; those behind one that cannot be counted either are counted from the end.
+A message is identified by its topic and its number within the step. In the step's own file that is its number in the
+file; in the merged file, where the steps follow each other, the messages of the earlier steps are subtracted. Chunks
+that cannot be read are counted by their index; those behind a chunk without an index are counted from the end.
 """
 
 from __future__ import annotations
@@ -11,32 +11,32 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from mcap.records import Channel, Message, Schema
+from mcap.records import Message
 from pydantic import ValidationError
 
 from sessions.journal.codec import Line
+from sessions.recording.container import Record
+from sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE
 from sessions.recording.salvage import Part, Scan, read_part, salvaged
 from sessions.recording.schemas import StepEvent, Topic
-from sessions.recording.writer import BEGIN_NOTE, DONE_NOTE
 
-Record = tuple[Schema | None, Channel, Message]
 Place = tuple[str, int]
 """Topic, and number within the step."""
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A file that may hold messages of the step, and where in it they are."""
+    """File that may hold messages of the step, and where they are in it."""
 
     found: Scan
     totals: Counter[str]
-    """Messages by topic of the whole file, as it was written."""
+    """Messages by topic in the whole file, as it was written."""
     before: Counter[str]
-    """Of which these precede the step."""
+    """Messages by topic that precede the step."""
 
 
 def identity_of(found: Scan) -> tuple[str, int] | None:
-    """Key and attempt of the step that a file is of, as it tells itself, whatever it is called."""
+    """Key and attempt of the step recorded in a file, from its content, whatever its name."""
     for values in (found.notes.get(BEGIN_NOTE, {}).get("line"), found.notes.get(DONE_NOTE)):
         match values:
             case {"key": str(key), "attempt": int(attempt)}:
@@ -51,11 +51,11 @@ def identity_of(found: Scan) -> tuple[str, int] | None:
 
 
 def united(line: Line, sources: Iterable[Source]) -> list[Record]:
-    """What is left of the finished step that this `done` line tells of, in the order in which it was written."""
+    """Messages left of the step with this `done` line, in the order in which they were written."""
     counts = Counter[str](line["counts"])
     records: dict[Place, Record] = {}
     after: dict[Place | None, Place | None] = {None: None}
-    """Each place, and None for the beginning, with the place that follows it."""
+    """Place that follows each place; None is the beginning."""
     for source in sources:
         part = dict(_of_step(source, counts))
         if not _agrees(part, records, line):
@@ -77,7 +77,7 @@ def united(line: Line, sources: Iterable[Source]) -> list[Record]:
 
 
 def _agrees(part: dict[Place, Record], records: dict[Place, Record], line: Line) -> bool:
-    """Whether what is placed in the step is of this step, and the same where another file has it too."""
+    """Whether these messages belong to this step and equal those that another file holds in the same place."""
     for place, (_schema, channel, message) in part.items():
         if place in records and records[place][2].data != message.data:
             return False
@@ -89,7 +89,7 @@ def _agrees(part: dict[Place, Record], records: dict[Place, Record], line: Line)
 
 
 def _of_step(source: Source, counts: Counter[str]) -> Iterator[tuple[Place, Record]]:
-    """Messages of a file that lie in the step, each with its place."""
+    """Messages of the step in a file, each with its place."""
     for part, first in placed(source.found, source.totals):
         numbers = first.copy()
         wanted = {topic: range(source.before[topic], source.before[topic] + count) for topic, count in counts.items()}
@@ -104,9 +104,9 @@ def _of_step(source: Source, counts: Counter[str]) -> Iterator[tuple[Place, Reco
 
 
 def placed(found: Scan, totals: Counter[str]) -> list[tuple[Part, Counter[str]]]:
-    """The sound chunks of a file, each with the number, by topic, of its first message; `totals` are the file's.
+    """Sound chunks of a file, each with the number, by topic, of its first message; `totals` are the file's.
 
-    A chunk between two that nobody can count is left out.
+    A chunk between two others whose messages cannot be counted is left out.
     """
     lost = [at for at, part in enumerate(found.parts) if part.counts is None]
     if not found.complete:

@@ -18,7 +18,7 @@ from collect.protocols.steps import StepKind
 from collect.rig.config import load_rig
 from collect.tui.captures import Review
 from drivers.samples import Pose
-from sessions.journal.journal import read_lines
+from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 from sessions.recording import container
 from sessions.recording.schemas import Quality, Topic

@@ -141,7 +141,7 @@ def test_values_of_any_length_and_kind_have_short_words() -> None:
 
 def test_a_session_whose_old_values_cannot_be_read_is_not_gone_on_with(lab: Path) -> None:
     Path("sessions/grid-01/rig.effective.json").write_text("{")
-    assert refused()[1] == "rig.toml: how it was then is missing or damaged"
+    assert refused()[1] == "rig.toml: its earlier content is missing or damaged"
 
 
 def test_where_hardware_may_move_the_rig_is_checked_first_unless_it_is_switched_off(lab: Path) -> None:

@@ -15,7 +15,8 @@ from collect.errors import CollectAborted, ConfigError
 from drivers.arcs.codes import SafetyMode
 from drivers.errors import RobotNotSafe
 from drivers.samples import Identity
-from sessions.journal.journal import read_lines, replay
+from sessions.journal.journal import replay
+from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 from tests.collect.until import until
 

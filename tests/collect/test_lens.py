@@ -16,7 +16,8 @@ from collect.engine.states import State
 from collect.errors import ConfigError, StepError
 from collect.rig.config import load_rig
 from collect.tui.captures import Review, counts
-from sessions.journal.journal import read_lines, replay
+from sessions.journal.journal import replay
+from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 from sessions.recording import container
 from sessions.recording.schemas import Topic

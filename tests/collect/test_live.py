@@ -33,7 +33,7 @@ from sessions.recording import container
 from sessions.recording.messages import encode_png, image_message, pose_message
 from sessions.recording.schemas import Topic, Wrench
 from sessions.recording.writer import Outgoing
-from sessions.verify import verify_session
+from sessions.repair.verify import verify_session
 
 if TYPE_CHECKING:
     from conftest import Lab

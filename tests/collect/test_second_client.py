@@ -14,7 +14,7 @@ from drivers.arcs.rpc import RpcConnection
 from drivers.arcs.waiting import Tolerance, until_settled
 from drivers.errors import MotionFailed, SettingsChanged
 from drivers.geometry import brush_pose, from_wire, lean
-from sessions.journal.journal import read_lines
+from sessions.journal.lines import read_lines
 from tests.collect.until import until as waited_until
 
 if TYPE_CHECKING:

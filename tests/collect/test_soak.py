@@ -22,11 +22,12 @@ import pytest
 
 from collect.protocols.files import load_protocol
 from collect.protocols.plans import planned
-from sessions.journal.journal import JOURNAL_NAME, is_open, read_lines, replay
+from sessions.journal.journal import JOURNAL_NAME, is_open, replay
+from sessions.journal.lines import read_lines
 from sessions.reader import Recording
+from sessions.recording.mcap_file import file_sha256
 from sessions.recording.schemas import Stroke
-from sessions.recording.writer import file_sha256
-from sessions.verify import verify_session
+from sessions.repair.verify import verify_session
 
 if TYPE_CHECKING:
     from conftest import Lab

@@ -19,7 +19,8 @@ from mcap.reader import make_reader
 
 from sessions.errors import InputError
 from sessions.imports.photographs import ImportOptions, import_photographs
-from sessions.journal.journal import JOURNAL_NAME, read_lines
+from sessions.journal.journal import JOURNAL_NAME
+from sessions.journal.lines import read_lines
 from sessions.recording.messages import encode_png, image_message, pose_message
 from sessions.recording.schemas import Header, Source, StepEvent, Stroke, Topic
 from sessions.recording.writer import Outgoing, SegmentWriter

@@ -7,11 +7,11 @@ import pytest
 
 from sessions.errors import SessionDamaged
 from sessions.journal.codec import encode_line
-from sessions.journal.journal import JOURNAL_NAME, read_lines, replay
-from sessions.journal.lines import read
+from sessions.journal.journal import JOURNAL_NAME, replay
+from sessions.journal.lines import read, read_lines
 from sessions.repair.repair import repair_session
+from sessions.repair.verify import verify_session
 from sessions.store import SessionStore
-from sessions.verify import verify_session
 
 
 @pytest.fixture

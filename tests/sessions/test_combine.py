@@ -6,15 +6,13 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from sessions import combine as module
-from sessions.cli.app import app
-from sessions.combine import PARTS_NOTE, combine
 from sessions.errors import InputError, SessionError
+from sessions.merge import PARTS_NOTE, merge_recordings
 from sessions.reader import Recording
+from sessions.recording.mcap_file import read_note
 from sessions.recording.schemas import Source
-from sessions.recording.writer import read_note
+from sessions.repair.verify import verify_session
 from sessions.store import SessionStore
-from sessions.verify import verify_session
 
 
 @pytest.fixture
@@ -33,7 +31,7 @@ def closed(make, tmp_path):
 
 
 def test_strokes_keep_their_names_under_their_sessions_and_their_own_photographs(make, tmp_path, closed):
-    out = combine([closed("monday"), closed("tuesday")], tmp_path / "week.mcap")
+    out = merge_recordings([closed("monday"), closed("tuesday")], tmp_path / "week.mcap")
     recording = Recording(out)
     captures = list(recording.captures())
     assert [capture.stroke.stroke_id for capture in captures] == [
@@ -51,14 +49,14 @@ def test_strokes_keep_their_names_under_their_sessions_and_their_own_photographs
 
 def test_every_message_is_there_with_its_own_times(make, tmp_path, closed):
     parts = [closed("monday"), closed("tuesday")]
-    out = combine(parts, tmp_path / "week.mcap")
+    out = merge_recordings(parts, tmp_path / "week.mcap")
     times = [sorted(m[2:4] for part in parts for m in make.messages(part / f"{part.name}.mcap").elements())]
     assert times == [sorted(m[2:4] for m in make.messages(out).elements())]
 
 
 def test_the_file_says_what_it_was_made_of(tmp_path, closed):
     parts = [closed("monday", software="brushloop 1"), closed("tuesday", software="brushloop 2")]
-    out = combine(parts, tmp_path / "week.mcap")
+    out = merge_recordings(parts, tmp_path / "week.mcap")
     with out.open("rb") as file:
         notes = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
     monday, tuesday = read_note(notes[PARTS_NOTE])["parts"]
@@ -70,7 +68,7 @@ def test_the_file_says_what_it_was_made_of(tmp_path, closed):
 
 def test_steps_of_one_open_session_need_no_prefix(make, store, tmp_path):
     make.collect(store)
-    out = combine(sorted(store.folder.glob("*-capture-*.mcap")), tmp_path / "some.mcap")
+    out = merge_recordings(sorted(store.folder.glob("*-capture-*.mcap")), tmp_path / "some.mcap")
     assert make.stroke_names(out) == ["H13-a05-r00", "H13-a05-r01"]
 
 
@@ -83,7 +81,7 @@ def test_steps_of_one_open_session_need_no_prefix(make, store, tmp_path):
 )
 def test_recordings_of_different_setups_are_refused(tmp_path, closed, fields, told):
     with pytest.raises(InputError, match=told):
-        combine([closed("monday"), closed("tuesday", **fields)], tmp_path / "week.mcap")
+        merge_recordings([closed("monday"), closed("tuesday", **fields)], tmp_path / "week.mcap")
     assert not list(tmp_path.glob("*week*"))
 
 
@@ -91,14 +89,14 @@ def test_another_configuration_is_another_setup(make, tmp_path, closed, monkeypa
     monday = closed("monday")
     monkeypatch.setitem(make.snapshots, "rig.toml", 'name = "moved"\n')
     with pytest.raises(InputError, match=r"was recorded with another rig\.toml"):
-        combine([monday, closed("tuesday")], tmp_path / "week.mcap")
+        merge_recordings([monday, closed("tuesday")], tmp_path / "week.mcap")
 
 
 def test_a_stroke_that_is_there_twice_is_refused(tmp_path, closed):
     monday = closed("monday")
     segment = next(monday.glob("*-capture-*.mcap"))
     with pytest.raises(InputError, match="holds stroke H13-a05-r00 of monday, as does"):
-        combine([monday, segment], tmp_path / "week.mcap")
+        merge_recordings([monday, segment], tmp_path / "week.mcap")
 
 
 def test_the_same_recording_twice_is_refused_whatever_it_is_called(tmp_path, closed):
@@ -107,38 +105,38 @@ def test_the_same_recording_twice_is_refused_whatever_it_is_called(tmp_path, clo
     copy.write_bytes((monday / "monday.mcap").read_bytes())
     for again in (monday, monday / "monday.mcap", copy):
         with pytest.raises(InputError, match=r"is, or holds, the same recording as .*/monday\.mcap") as caught:
-            combine([monday, again], tmp_path / "week.mcap")
+            merge_recordings([monday, again], tmp_path / "week.mcap")
         assert "\n" not in str(caught.value)
     assert not list(tmp_path.glob("*week*"))
 
 
 def test_a_recording_is_refused_beside_a_file_that_it_was_merged_into(make, tmp_path, closed):
     monday, tuesday = closed("monday"), closed("tuesday")
-    week = combine([monday, tuesday], tmp_path / "week.mcap")
+    week = merge_recordings([monday, tuesday], tmp_path / "week.mcap")
     with pytest.raises(InputError, match=r"monday\.mcap: is, or holds, the same recording as .*/week\.mcap"):
-        combine([week, monday], tmp_path / "month.mcap")
+        merge_recordings([week, monday], tmp_path / "month.mcap")
     with pytest.raises(InputError, match=r"holds stroke H13-a05-r01 of tuesday, as does .*/week\.mcap"):
-        combine([week, sorted(tuesday.glob("*-capture-*.mcap"))[1]], tmp_path / "month.mcap")
+        merge_recordings([week, sorted(tuesday.glob("*-capture-*.mcap"))[1]], tmp_path / "month.mcap")
 
 
 def test_a_step_of_no_stroke_is_refused_twice_as_well(tmp_path, closed):
     board = next(closed("monday").glob("*-board-*.mcap"))
     with pytest.raises(InputError, match="the same recording"):
-        combine([board, board], tmp_path / "boards.mcap")
+        merge_recordings([board, board], tmp_path / "boards.mcap")
 
 
 def test_an_existing_file_is_never_written_over(tmp_path, closed):
     out = tmp_path / "week.mcap"
     out.write_bytes(b"precious")
     with pytest.raises(InputError, match="never overwritten"):
-        combine([closed("monday"), closed("tuesday")], out)
+        merge_recordings([closed("monday"), closed("tuesday")], out)
     assert out.read_bytes() == b"precious"
 
 
 @pytest.mark.parametrize("name", ["week", "a b.mcap", ".mcap"])
 def test_a_name_that_is_no_sessions_is_refused(tmp_path, name):
     with pytest.raises(InputError, match=r"ends in \.mcap"):
-        combine([tmp_path, tmp_path], tmp_path / name)
+        merge_recordings([tmp_path, tmp_path], tmp_path / name)
 
 
 def test_a_disk_that_fails_leaves_nothing_half_written(tmp_path, closed, monkeypatch):
@@ -147,9 +145,9 @@ def test_a_disk_that_fails_leaves_nothing_half_written(tmp_path, closed, monkeyp
     def fail(_):
         raise OSError(5, "Input/output error")
 
-    monkeypatch.setattr(module.os, "fsync", fail)
+    monkeypatch.setattr("os.fsync", fail)
     with pytest.raises(SessionError, match="Input/output error"):
-        combine(parts, tmp_path / "week.mcap")
+        merge_recordings(parts, tmp_path / "week.mcap")
     assert not list(tmp_path.glob("*week*"))
 
 

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sessions.cli.app import app
 from sessions.errors import InputError, SessionError
-from sessions.export import export as module
 from sessions.export.export import export
 from sessions.reader import Recording
 from sessions.recording.messages import decode_gray
@@ -110,7 +108,7 @@ def test_without_pyarrow_the_way_out_is_told_and_nothing_is_left(session, to, mo
 @pytest.mark.parametrize("kind", ["png", "npz", "parquet"])
 def test_a_damaged_photograph_or_a_full_disk_leaves_nothing(make, tmp_path, to, kind, monkeypatch):
     path = make.record(tmp_path / "a.mcap", make.still(0), make.stroke(0))
-    monkeypatch.setattr(module, "fsync_folder", lambda _: (_ for _ in ()).throw(OSError(28, "No space left")))
+    monkeypatch.setattr("sessions.disk.fsync_folder", lambda _: (_ for _ in ()).throw(OSError(28, "No space left")))
     with pytest.raises(SessionError, match="No space left"):
         export(path, to, kind)
     assert list(tmp_path.glob("*exported*")) == []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sessions.history import Found, history_of
+from sessions.history import ZeroTouch, history_of
 
 
 def did(store, key: str, kind: str, result: dict[str, object]) -> None:
@@ -22,7 +22,7 @@ def test_takes_that_did_not_count_are_told_from_strokes_that_were_given_up(store
     told = history_of(store.folder)
     assert told is not None
     assert (told.photographed, told.pressed_again, told.left_out) == (3, ("a",), ("b", "c"))
-    assert told.found == (Found("taught", 120.0), Found("jog", 122.0))
+    assert told.found == (ZeroTouch("taught", 120.0), ZeroTouch("jog", 122.0))
     assert told.moved_mm == pytest.approx(2.0)
 
 

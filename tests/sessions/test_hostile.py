@@ -13,10 +13,11 @@ from typer.main import get_command
 
 from brushloop import app
 from sessions.errors import InputError
+from sessions.folders import open_sessions
 from sessions.journal.codec import encode_line
 from sessions.journal.journal import JOURNAL_NAME
 from sessions.names import bare_name
-from sessions.store import SessionStore, open_sessions
+from sessions.store import SessionStore
 
 BRUSHLOOP = get_command(app)
 SECRET = b"the key to the safe"

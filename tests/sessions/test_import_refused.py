@@ -80,9 +80,12 @@ def lines(*rows):
         (lines("file,px_per_mm,height_mm,tilt_deg", '"' + "a" * 200_000), "line 2: "),
         (
             lines("file,px_per_mm,height_mm,tilt_deg", "text.png,1,1,1"),
-            "photos/text.png: is no whole PNG or JPEG image",
+            "photos/text.png: is not a complete PNG or JPEG image",
         ),
-        (lines("file,px_per_mm,height_mm,tilt_deg", "cut.png,1,1,1"), "photos/cut.png: is no whole PNG or JPEG image"),
+        (
+            lines("file,px_per_mm,height_mm,tilt_deg", "cut.png,1,1,1"),
+            "photos/cut.png: is not a complete PNG or JPEG image",
+        ),
     ],
     ids=lambda value: "table" if "\n" in value else value,
 )
@@ -179,7 +182,7 @@ def test_a_damaged_photograph_is_told_by_us_and_not_by_a_library_on_stderr(make,
     data = bytearray(make.png())
     data[data.index(b"IDAT") + 9] ^= 1
     (photos / "a.png").write_bytes(data)
-    assert refusal() == "photos/a.png: is no whole PNG or JPEG image"
+    assert refusal() == "photos/a.png: is not a complete PNG or JPEG image"
     assert capfd.readouterr().err == ""
 
 

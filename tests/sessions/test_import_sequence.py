@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sessions.cli.app import app
 from sessions.errors import InputError
-from sessions.imports.photographs import ImportOptions
-from sessions.imports.scan import dpi_of, import_scans
+from sessions.imports.photographs import ImportOptions, dpi_of, import_scans
 from sessions.imports.sequence import SEQUENCE, import_sequence
 from sessions.reader import Recording
 from sessions.recording.schemas import Topic

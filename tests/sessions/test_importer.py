@@ -9,7 +9,6 @@ import cv2
 import pytest
 from typer.testing import CliRunner
 
-from sessions.cli.app import app
 from sessions.imports.photographs import ImportOptions
 from sessions.reader import Recording
 from sessions.recording.schemas import Source
@@ -110,7 +109,7 @@ def test_the_command_imports(make, photos, out):
     ("spoil", "told"),
     [
         (lambda photos: (photos / "b.png").unlink(), "file 'b.png' is not in photos/"),
-        (lambda photos: (photos / "b.png").write_bytes(b"\x89PNG\r\n\x1a\n"), "b.png: is no whole PNG or JPEG"),
+        (lambda photos: (photos / "b.png").write_bytes(b"\x89PNG\r\n\x1a\n"), "b.png: is not a complete PNG or JPEG"),
         (lambda photos: (photos / "table.csv").write_text("file\n"), "column `px_per_mm`"),
     ],
     ids=["missing", "unreadable", "no scale"],

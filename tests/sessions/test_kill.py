@@ -6,8 +6,8 @@ import sys
 import time
 from collections import Counter
 
+from sessions.folders import open_sessions
 from sessions.reader import Recording
-from sessions.store import open_sessions
 
 KEYS = [f"step-{number:02d}" for number in range(12)]
 KILLS = 10

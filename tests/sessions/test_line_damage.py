@@ -23,8 +23,8 @@ from sessions.journal.codec import with_crc
 from sessions.journal.journal import JOURNAL_NAME
 from sessions.recording.schemas import Topic
 from sessions.repair.repair import repair_session
+from sessions.repair.verify import verify_session
 from sessions.store import SessionStore
-from sessions.verify import verify_session
 
 STROKES = 3
 QUICK = 15

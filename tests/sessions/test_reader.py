@@ -11,8 +11,8 @@ from mcap.writer import Writer
 
 from sessions.errors import InputError, SessionDamaged
 from sessions.reader import Recording
+from sessions.recording.mcap_file import HEADER_METADATA, header_metadata
 from sessions.recording.messages import decode_gray
-from sessions.recording.writer import HEADER_METADATA, header_metadata
 
 
 @pytest.fixture
@@ -111,7 +111,7 @@ def test_an_open_session_is_refused_with_the_way_out(make, store):
 
 
 def test_an_mcap_file_that_is_not_ours_is_refused(path):
-    with pytest.raises(InputError, match="not one of brushloop's"):
+    with pytest.raises(InputError, match="without brushloop's header"):
         Recording(foreign(path, metadata={"ros": {"a": "b"}}, messages=[("/tf", "json", b"{}")]))
 
 

@@ -7,16 +7,14 @@ import shutil
 import pytest
 from typer.testing import CliRunner
 
-from sessions.cli.app import app
 from sessions.errors import InputError
 from sessions.export.export import export
 from sessions.journal.journal import JOURNAL_NAME
 from sessions.reader import Recording
 from sessions.repair.repair import repair_session
-from sessions.show import details
+from sessions.repair.verify import verify_session
+from sessions.show import Summary, details, summaries
 from sessions.store import SessionStore
-from sessions.summary import Summary, summaries
-from sessions.verify import verify_session
 
 
 @pytest.fixture

@@ -7,19 +7,17 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from sessions import merge
-from sessions.cli.app import app
 from sessions.errors import DiskFull, InputError, SessionDamaged, SessionError, SessionLocked
 from sessions.journal.codec import encode_line
 from sessions.journal.journal import JOURNAL_NAME
 from sessions.journal.lines import read_lines
 from sessions.reader import Recording
-from sessions.recording import writer
+from sessions.recording import mcap_file
 from sessions.repair import rewrite
 from sessions.repair.repair import repair_session
+from sessions.repair.verify import verify_session
 from sessions.show import details
 from sessions.store import SessionStore
-from sessions.verify import verify_session
 
 
 @pytest.fixture
@@ -211,7 +209,7 @@ def test_a_closed_session_whose_steps_are_damaged_still_has_it_all(make, closed,
 
 
 def test_where_steps_and_merged_file_are_damaged_the_better_one_is_taken(make, store, repair, monkeypatch):
-    monkeypatch.setattr(merge, "CHUNK_BYTES", 256)
+    monkeypatch.setattr(mcap_file, "CHUNK_BYTES", 256)
     make.collect(store)
     final, closed = store.close(), store.folder
     store.release()
@@ -227,7 +225,7 @@ def test_where_steps_and_merged_file_are_damaged_the_better_one_is_taken(make, s
 
 
 def test_an_import_keeps_every_stroke_whose_photograph_is_whole(make, photos, out, run, repair, monkeypatch):
-    monkeypatch.setattr(writer, "CHUNK_BYTES", 256)
+    monkeypatch.setattr(mcap_file, "CHUNK_BYTES", 256)
     rows = [{"file": f"{n}.png", "px_per_mm": "10", "height_mm": "13", "tilt_deg": "5"} for n in range(5)]
     make.photographs(photos, *rows)
     final = run()
@@ -285,7 +283,7 @@ def test_a_full_disk_leaves_the_damaged_file_with_its_name(make, folder, repair,
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as disk:
-        disk.setattr(rewrite.os, "fsync", full)
+        disk.setattr("os.fsync", full)
         with pytest.raises(DiskFull, match="No space left"):
             repair(folder)
     assert path.read_bytes() == data
@@ -301,7 +299,7 @@ def test_a_folder_that_may_not_be_written_is_a_session_error(folder, repair, rea
 
 def test_nothing_to_rebuild_from_is_told(tmp_path, repair):
     (tmp_path / JOURNAL_NAME).write_bytes(b"\x00" * 50)
-    with pytest.raises(SessionDamaged, match="no file is left that tells its header"):
+    with pytest.raises(SessionDamaged, match="no file holds its header"):
         repair(tmp_path)
     with pytest.raises(InputError, match="no such session"):
         repair_session(tmp_path.parent / "gone", int)

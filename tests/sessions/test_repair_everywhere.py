@@ -18,8 +18,8 @@ from mcap.opcode import Opcode
 from sessions.journal.journal import JOURNAL_NAME
 from sessions.recording.schemas import Topic
 from sessions.repair.repair import repair_session
+from sessions.repair.verify import verify_session
 from sessions.store import SessionStore
-from sessions.verify import verify_session
 
 PLACES = 60
 """Random places in each of the two sessions, open and closed."""

@@ -5,7 +5,6 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from sessions.cli.app import app
 from sessions.errors import InputError
 from sessions.remarks import mark_bad_or_good
 from sessions.show import GridCell, Sheet, details
@@ -86,7 +85,7 @@ def test_cells_that_follow_each_other_are_put_together():
 def test_the_command_prints_it_and_json_holds_all_of_it(collected):
     ran = CliRunner(env={"COLUMNS": "160"}).invoke(app, ["show", str(collected.folder)])
     assert ran.exit_code == 0
-    for word in ("2 of 4 planned", "3 cells used: 0-2", "13 mm", "1/2", "press H13-a5-r02 (was being done", "goat"):
+    for word in ("2 of 4 planned", "3 cells used: 0-2", "13 mm", "1/2", "press H13-a5-r02 (under way", "goat"):
         assert word in ran.output
     as_json = json.loads(CliRunner().invoke(app, ["show", str(collected.folder), "--json"]).output)
     assert as_json["segments"][1]["messages"] == {"/camera/still": 1, "/stroke": 1}

@@ -10,14 +10,15 @@ import threading
 import pytest
 from mcap.reader import make_reader
 
-from sessions.combine import combine
 from sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked
+from sessions.folders import next_session_id, open_sessions
+from sessions.journal.codec import with_crc
 from sessions.journal.journal import JOURNAL_NAME, Journal
-from sessions.journal.lines import with_crc
-from sessions.merge import count_messages
+from sessions.merge import merge_recordings
 from sessions.reader import Recording
 from sessions.recording.container import attachments
-from sessions.store import SessionStore, next_session_id, open_sessions
+from sessions.recording.mcap_file import count_messages
+from sessions.store import SessionStore
 
 CRC = re.compile(rb',"crc":"[0-9a-f]{8}"\}$')
 
@@ -160,7 +161,7 @@ def test_each_attached_file_says_what_it_is(make, tmp_path):
         finals.append(store.close())
         store.release()
     expected = dict.fromkeys(make.snapshots, "application/toml") | {"rig.effective.json": "application/json"}
-    for path in (*finals, combine([final.parent for final in finals], tmp_path / "week.mcap")):
+    for path in (*finals, merge_recordings([final.parent for final in finals], tmp_path / "week.mcap")):
         assert {a.name: a.media_type for a in attachments(path)} == expected
 
 

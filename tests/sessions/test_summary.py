@@ -3,10 +3,9 @@
 import pytest
 from typer.testing import CliRunner
 
-from sessions.cli.app import app
 from sessions.errors import InputError
 from sessions.journal.journal import JOURNAL_NAME
-from sessions.summary import Summary, summaries
+from sessions.show import Summary, summaries
 
 
 @pytest.fixture

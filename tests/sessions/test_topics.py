@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -14,7 +15,6 @@ from pydantic import ValidationError
 from sessions.recording.messages import (
     Transform,
     calibration_message,
-    encode_jpeg,
     image_message,
     joints_message,
     log_message,
@@ -31,7 +31,7 @@ K = [[1500.0, 0.0, 1024.0], [0.0, 1500.0, 768.0], [0.0, 0.0, 1.0]]
 def each(make):
     """One message on every topic."""
     t_ns = make.t0_ns
-    jpeg = encode_jpeg(np.full((32, 32), 200, np.uint8))
+    jpeg = cv2.imencode(".jpg", np.full((32, 32), 200, np.uint8))[1].tobytes()
     messages = {
         Topic.JOINTS: joints_message(t_ns, JOINTS, range(6), efforts_nm=[0.5] * 6),
         Topic.TRANSFORMS: transforms_message(t_ns, [Transform("base", "paper", (400, -100, 5), (0, 0, 0, 1))]),

@@ -19,8 +19,8 @@ from sessions.errors import DiskFull, SessionError
 from sessions.journal.journal import JOURNAL_NAME
 from sessions.journal.lines import read_lines
 from sessions.reader import Recording
+from sessions.repair.verify import verify_session
 from sessions.store import STEP_BYTES, SessionStore
-from sessions.verify import verify_session
 
 Usage = namedtuple("Usage", "total used free")
 

@@ -4,10 +4,9 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from sessions.cli.app import app
 from sessions.errors import InputError
 from sessions.journal.journal import JOURNAL_NAME
-from sessions.verify import verify_session
+from sessions.repair.verify import verify_session
 
 
 @pytest.fixture
@@ -61,13 +60,13 @@ def test_a_damaged_journal_line_is_told_and_whether_the_files_make_up_for_it(fol
     journal = folder / JOURNAL_NAME
     flip(journal, journal.read_bytes().index(b'"depth_mm"'))
     assert words(folder) == ["journal.jsonl: line 8 is not JSON"]
-    assert "journal.jsonl: what is wrong with it can be made good from the files" in verify_session(folder).notes
+    assert "journal.jsonl: all of it can be rebuilt from the files" in verify_session(folder).notes
 
 
 def test_an_image_that_does_not_decode_is_damage_though_every_crc_holds(make, store):
     make.take(store, "a", "capture", [make.still(0, b"no image"), make.stroke(0)], {})
     [told] = words(store.folder)
-    assert told.endswith("(capture) the image 0 on /camera/still is no whole PNG or JPEG image")
+    assert told.endswith("(capture) the image 0 on /camera/still is not a complete PNG or JPEG image")
 
 
 def test_a_stroke_without_its_still_is_damage(make, tmp_path):

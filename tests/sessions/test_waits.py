@@ -7,8 +7,8 @@ import csv
 import pytest
 
 from sessions.export.export import export
+from sessions.history import unlike, waits_of
 from sessions.recording.schemas import Stroke
-from sessions.waits import unlike, waits_of
 
 
 def step(kind: str, stroke_id: str, **result: object) -> dict[str, object]:

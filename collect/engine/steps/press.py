@@ -13,7 +13,7 @@ from collect.motion.procedures import press_moves
 from collect.protocols.steps import Result
 from collect.rig.devices import limits_of
 from collect.rig.paper import Cell
-from sessions.waits import WAIT
+from sessions.history import WAIT
 
 
 async def press(context: StepContext) -> Result:

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from collect.engine.steps.context import StepContext
 from collect.motion.procedures import TOUCH_TOLERANCE_MM, Move
 from drivers.samples import PoseSample
+from sessions.history import limit_s, unlike, waits_of
 from sessions.recording.schemas import Check
-from sessions.waits import limit_s, unlike, waits_of
 
 STALE_INK_S = 5.0
 """A brush that waited longer for its press to begin dips again: a pause, a question, a photograph in between."""

@@ -152,7 +152,11 @@ def test_check_names_the_remedy_for_a_lens_that_bends(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("data", "told"),
-    [(b"", "no whole PNG or JPEG"), (b"\x89PNG\r\n\x1a\nabc", "no whole PNG or JPEG"), (None, "No such file")],
+    [
+        (b"", "not a complete PNG or JPEG"),
+        (b"\x89PNG\r\n\x1a\nabc", "not a complete PNG or JPEG"),
+        (None, "No such file"),
+    ],
     ids=["empty", "torn", "missing"],
 )
 def test_what_is_no_photograph_is_refused(tmp_path: Path, data: bytes | None, told: str) -> None:

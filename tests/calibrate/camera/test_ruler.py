@@ -10,7 +10,7 @@ import pytest
 
 from calibrate.board.ruler import bars, check_scale
 from calibrate.errors import CalibrationError
-from sessions.imports.scan import dpi_of
+from sessions.imports.photographs import dpi_of
 
 SCAN = Path(__file__).parents[4] / "shared" / "data" / "ardibid_scan_400dpi" / "01.jpg"
 

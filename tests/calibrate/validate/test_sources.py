@@ -194,7 +194,7 @@ def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: 
     folder.mkdir()
     (folder / "presses.mcap").write_bytes((session / "presses.mcap").read_bytes())
     lines = [{"t_ns": 1, "event": "open", "header": {}}, {"t_ns": 2, "event": "closed", "sha256": "0" * 64}]
-    from sessions.journal.lines import encode_line
+    from sessions.journal.codec import encode_line
 
     with (folder / "journal.jsonl").open("wb") as file:
         for line in lines:

@@ -20,7 +20,8 @@ from collect.protocols.files import load_protocol
 from collect.protocols.steps import Result, Step, StepKind
 from collect.rig.config import load_rig
 from model.fitted import FittedPress
-from sessions.journal.journal import JOURNAL_NAME, read_lines, replay
+from sessions.journal.journal import JOURNAL_NAME, replay
+from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 
 if TYPE_CHECKING:

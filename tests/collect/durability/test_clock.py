@@ -11,10 +11,11 @@ import pytest
 from collect.engine.engine import Engine
 from collect.engine.snapshot import Snapshot
 from collect.errors import CollectAborted
-from sessions.journal.journal import JOURNAL_NAME, read_lines
+from sessions.journal.journal import JOURNAL_NAME
+from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 from sessions.recording import container
-from sessions.verify import verify_session
+from sessions.repair.verify import verify_session
 from tests.collect.durability.conftest import the_session
 
 if TYPE_CHECKING:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
-from sessions.journal.journal import JOURNAL_NAME, read_lines, replay
+from sessions.journal.journal import JOURNAL_NAME, replay
+from sessions.journal.lines import read_lines
 from sessions.reader import Recording
-from sessions.verify import verify_session
+from sessions.repair.verify import verify_session
 from tests.collect.durability.conftest import Disk, parked, the_session
 
 if TYPE_CHECKING:

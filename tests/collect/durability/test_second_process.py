@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from drivers.sim.config import SimConfig
 from drivers.sim.rig import LoopbackRig
-from sessions.verify import verify_session
+from sessions.repair.verify import verify_session
 from tests.collect.conftest import SMALL_VIEW, serving
 from tests.collect.durability.conftest import the_session
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from sessions.reader import Recording
-from sessions.verify import verify_session
+from sessions.repair.verify import verify_session
 from tests.collect.durability.conftest import the_session
 
 if TYPE_CHECKING:

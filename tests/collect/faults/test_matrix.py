@@ -22,7 +22,8 @@ from drivers.geometry import distance
 from drivers.samples import Pose
 from drivers.sim.faults.kinds import ALWAYS, Fault
 from drivers.sim.faults.phases import Phase
-from sessions.journal.journal import read_lines, replay
+from sessions.journal.journal import replay
+from sessions.journal.lines import read_lines
 from sessions.store import SessionStore
 
 if TYPE_CHECKING:

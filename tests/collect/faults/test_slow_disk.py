@@ -17,7 +17,8 @@ import pytest
 from collect.engine.states import State
 from drivers.sim.faults.phases import Phase
 from sessions.errors import SessionError
-from sessions.journal.journal import read_lines, replay
+from sessions.journal.journal import replay
+from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 from sessions.recording.writer import ChannelTable
 

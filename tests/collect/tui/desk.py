@@ -13,8 +13,7 @@ from collect.tui.captures import Looked, Review, Seen
 from collect.tui.pictures import Pictures
 from collect.tui.review import ReviewScreen
 from sessions.remarks import Remark
-from sessions.show import Details, Sheet
-from sessions.summary import Summary
+from sessions.show import Details, Sheet, Summary
 from tests.collect.tui.fake import blot
 
 FINDINGS = [

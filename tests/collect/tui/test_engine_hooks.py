@@ -15,7 +15,7 @@ from collect.engine.tally import Mark
 from collect.errors import CollectAborted, NeedsOperator, Parked
 from collect.operator import OperatorRequest, OperatorRequests
 from drivers.clock import HostClock
-from sessions.journal.journal import read_lines
+from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 from sessions.remarks import mark_bad_or_good
 from tests.collect.conftest import Lab

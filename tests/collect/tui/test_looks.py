@@ -11,7 +11,7 @@ from textual.pilot import Pilot
 from collect.engine.states import State
 from collect.tui.app import OperatorApp
 from collect.tui.finish import FinishScreen
-from sessions.verify import Verdict
+from sessions.repair.verify import Verdict
 from tests.collect.tui.desk import FakeDesk, a_review
 from tests.collect.tui.fake import DONE, FAILED, JOGGED, PAUSED, SET_UP, SPLIT, TOUCHED, FakeEngine, full_picture
 

@@ -24,7 +24,7 @@ from collect.tui.set_up import SetUpScreen
 from collect.tui.start import StartScreen
 from sessions.reader import Recording
 from sessions.remarks import remarks_of
-from sessions.verify import verify_session
+from sessions.repair.verify import verify_session
 from tests.collect.tui.test_app import shown
 
 STROKES = 6

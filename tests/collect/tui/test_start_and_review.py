@@ -20,7 +20,7 @@ from collect.tui.pictures import HALF, CellPicture, ImagePicture, Pictures, _str
 from collect.tui.start import StartScreen
 from collect.tui.trace import force_bar, plot, spark
 from sessions.remarks import remarks_of
-from sessions.verify import Finding, Verdict
+from sessions.repair.verify import Finding, Verdict
 from tests.collect.tui.desk import FakeDesk, a_review
 from tests.collect.tui.fake import FakeEngine, picture
 from tests.collect.tui.test_app import look, shown

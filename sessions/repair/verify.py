@@ -1,4 +1,4 @@
-"""Is a session as it was recorded? Every file is read again in full, and what is damaged is named in words."""
+"""Check whether a session is as it was recorded: every file is read again in full, and all damage is described."""
 
 from __future__ import annotations
 
@@ -6,22 +6,28 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from google.protobuf.message import DecodeError
+from pydantic import ValidationError
+
 from sessions.errors import InputError, SessionDamaged, SessionError
+from sessions.folders import check_name, not_a_session
 from sessions.journal.codec import Line
 from sessions.journal.journal import JOURNAL_NAME
-from sessions.merge import verify as verify_digest
+from sessions.names import SEGMENT_NAME
 from sessions.reader import Recording
-from sessions.recording.schemas import Topic
-from sessions.renamed import check_name, not_a_session
+from sessions.recording.mcap_file import check_digest
+from sessions.recording.messages import decode_gray, decode_still
+from sessions.recording.salvage import Scan, salvaged, scan
+from sessions.recording.schemas import Stroke, Topic
 from sessions.repair.evidence import Evidence, gather
-from sessions.repair.soundness import file_problems
 from sessions.show import details
-from sessions.store import SEGMENT_NAME, counts_of
+
+IMAGES = (Topic.STILL, Topic.PREVIEW)
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that is not as it was recorded."""
+    """One difference from what was recorded."""
 
     file: str
     what: str
@@ -29,16 +35,16 @@ class Finding:
 
 @dataclass(slots=True)
 class Verdict:
-    """What a check of a session found."""
+    """Result of checking a session."""
 
     session: str
     state: str
     """`closed`, `open`, or `recording` for a file or folder without a journal."""
     findings: list[Finding] = field(default_factory=list[Finding])
     notes: list[str] = field(default_factory=list[str])
-    """Worth knowing, and no damage."""
+    """Remarks that are no damage."""
     files: int = 0
-    """How many were read in full."""
+    """Number of files read in full."""
     strokes: int = 0
     messages: int = 0
 
@@ -69,7 +75,7 @@ def verify_session(path: Path) -> Verdict:
 
 
 def step_words(line: Line) -> str:
-    """A step as people call it: `capture H13-a05-r02`."""
+    """Name of a step for people: `capture H13-a05-r02`."""
     stroke = line.get("result", {}).get("stroke_id", "")
     return f"{line.get('kind', 'step')} {stroke}".strip().replace("_", " ")
 
@@ -108,12 +114,12 @@ def _verify_folder(folder: Path) -> Verdict:
         verdict.state = "closed"
         _final(verdict, folder, evidence)
     elif (final := folder / f"{folder.name}.mcap").is_file():
-        # Of a close that was cut, or whose line is lost: it was read back before it got its name.
+        # Left by a close that was cut, or whose line is lost.
         verdict.files += 1
         verdict.findings += [Finding(final.name, problem) for problem in file_problems(final)[1]]
     if verdict.sound:
         _shown(verdict, folder)
-    _count(verdict, Counter(counts_of(state)))
+    _count(verdict, Counter(state.counts()))
     verdict.notes += [f"{line['file']}: {_repair_words(line)}" for line in state.repairs]
     kept = [p for p in folder.iterdir() if ".damaged-" in p.name or ".superseded-" in p.name]
     if kept:
@@ -133,7 +139,7 @@ def _repair_words(line: Line) -> str:
 
 
 def _shown(verdict: Verdict, folder: Path) -> None:
-    """What `show` and every reader refuse is not sound."""
+    """Note as damage whatever `show` or a reader refuses."""
     try:
         details(folder)
         if verdict.state == "closed":
@@ -145,9 +151,9 @@ def _shown(verdict: Verdict, folder: Path) -> None:
 def _journal(verdict: Verdict, evidence: Evidence) -> None:
     verdict.findings += [Finding(JOURNAL_NAME, str(fault)) for fault in evidence.faults]
     if evidence.lost:
-        verdict.notes.append(f"{JOURNAL_NAME}: {evidence.lost} of its lines are beyond rebuilding")
+        verdict.notes.append(f"{JOURNAL_NAME}: {evidence.lost} of its lines cannot be rebuilt")
     elif evidence.faults:
-        verdict.notes.append(f"{JOURNAL_NAME}: what is wrong with it can be made good from the files")
+        verdict.notes.append(f"{JOURNAL_NAME}: all of it can be rebuilt from the files")
     if evidence.data is None:
         verdict.findings.append(Finding(JOURNAL_NAME, "is missing, though the folder holds recordings"))
     if evidence.torn:
@@ -155,7 +161,7 @@ def _journal(verdict: Verdict, evidence: Evidence) -> None:
     if evidence.unchained:
         verdict.notes.append(
             f"{JOURNAL_NAME}: {evidence.unchained} of {len(evidence.lines)} lines are unchained, as older versions "
-            "wrote them: that one of these was taken out or put in would not be noticed"
+            "wrote them: a line removed from these or added to them would not be noticed"
         )
     for line in evidence.rebuilt:
         match line["event"]:
@@ -168,9 +174,9 @@ def _journal(verdict: Verdict, evidence: Evidence) -> None:
             case _:
                 verdict.findings.append(Finding(JOURNAL_NAME, "does not say how the session was opened"))
     for name in evidence.strays:
-        verdict.findings.append(Finding(name, "holds a step that the journal knows by another file"))
+        verdict.findings.append(Finding(name, "holds a step that the journal lists under another file"))
     for name in evidence.doubtful:
-        verdict.findings.append(Finding(name, "nothing tells which cell of which sheet it pressed"))
+        verdict.findings.append(Finding(name, "the cell and the sheet that it pressed are unknown"))
 
 
 def _segment(verdict: Verdict, folder: Path, line: Line) -> list[Finding]:
@@ -179,7 +185,7 @@ def _segment(verdict: Verdict, folder: Path, line: Line) -> list[Finding]:
         return []
     verdict.files += 1
     try:
-        verify_digest(path, str(line["sha256"]))
+        check_digest(path, str(line["sha256"]))
     except SessionDamaged as error:
         if not path.is_file():
             return [Finding(path.name, f"({step}) {error.what}")]
@@ -201,7 +207,7 @@ def _final(verdict: Verdict, folder: Path, evidence: Evidence) -> None:
     verdict.files += 1
     try:
         if "sha256" in closed:
-            verify_digest(path, str(closed["sha256"]))
+            check_digest(path, str(closed["sha256"]))
         elif not path.is_file():
             raise SessionDamaged(path, "is missing, though the journal says it was closed")
     except SessionDamaged as error:
@@ -209,7 +215,37 @@ def _final(verdict: Verdict, folder: Path, evidence: Evidence) -> None:
     if not path.is_file():
         return
     found, problems = file_problems(path)
-    expected = closed.get("counts", counts_of(state))
+    expected = closed.get("counts", state.counts())
     if dict(found.counts) != expected and not problems:
         problems.append(f"holds {dict(found.counts)}, but the journal says {expected}")
     verdict.findings += [Finding(path.name, problem) for problem in problems]
+
+
+def file_problems(path: Path) -> tuple[Scan, list[str]]:
+    """Read a file in full and list what is wrong with its chunks, index, images, and the stills of its strokes."""
+    found = scan(path)
+    problems = list(found.damage)
+    if found.stated is not None and not problems and found.stated != dict(found.counts):
+        problems.append(f"holds {dict(found.counts)}, but its index says {found.stated}")
+    stills: set[int] = set()
+    strokes: set[str] = set()
+    try:
+        for _schema, channel, message in salvaged(found):
+            if channel.topic in IMAGES:
+                decode_gray(decode_still(message.data), f"the image {message.sequence} on {channel.topic}")
+            if channel.topic == Topic.STILL:
+                stills.add(message.sequence)
+            elif channel.topic == Topic.STROKE:
+                stroke = Stroke.model_validate_json(message.data)
+                if stroke.stroke_id in strokes:
+                    problems.append(f"stroke {stroke.stroke_id} is there twice")
+                strokes.add(stroke.stroke_id)
+                if stroke.still not in stills:
+                    problems.append(f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there")
+    except SessionDamaged as error:
+        problems.append(f"{error.path} {error.what}")
+    except (DecodeError, ValidationError) as error:
+        problems.append(f"a message does not fit its schema ({type(error).__name__})")
+    except OSError as error:
+        problems.append(f"cannot be read: {error.strerror}")
+    return found, problems

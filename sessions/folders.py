@@ -1,13 +1,13 @@
-"""A session's folder that was renamed: its recording still has the old name, and nothing is damaged."""
+"""Folders of sessions: which are open, which names are free, and what to do about one that was renamed."""
 
 from __future__ import annotations
 
+import datetime as dt
 from pathlib import Path
 
 from sessions.errors import InputError, SessionDamaged
 from sessions.journal.journal import JOURNAL_NAME, is_open, replay
-from sessions.names import check_folder
-from sessions.store import SEGMENT_NAME
+from sessions.names import SEGMENT_NAME, check_folder
 
 
 def check_name(folder: Path) -> None:
@@ -27,9 +27,9 @@ def check_name(folder: Path) -> None:
 
 
 def recording_of_renamed(folder: Path) -> Path | None:
-    """The one recording in the folder, where it is called otherwise than the folder.
+    """Return the only recording in a folder that has another name than the folder; None otherwise.
 
-    None for an open session: the files of its steps do not have its name, so it may be renamed.
+    Also None for an open session, which may be renamed: the files of its steps do not carry its name.
     """
     name = folder.resolve().name
     recordings = [path for path in folder.glob("*.mcap") if not SEGMENT_NAME.fullmatch(path.name)]
@@ -39,7 +39,7 @@ def recording_of_renamed(folder: Path) -> Path | None:
 
 
 def not_a_session(folder: Path) -> InputError:
-    """What is wrong with a folder without a recording of its name, and what to give instead."""
+    """Make the error for a folder without a recording of its name; it says what to give instead."""
     name = f"{folder.resolve().name}.mcap"
     if (folder / JOURNAL_NAME).is_file():
         return InputError(folder, f"has lost its recording {name}: `brushloop sessions repair {folder}` makes it again")
@@ -54,3 +54,20 @@ def _is_open(folder: Path) -> bool:
         return (folder / JOURNAL_NAME).is_file() and is_open(replay(folder / JOURNAL_NAME))
     except SessionDamaged:
         return False
+
+
+def next_session_id(root: Path, label: str, today: dt.date) -> str:
+    """Return `2026-11-21-grid-01` with the first number that is free under `root`."""
+    for number in range(1, 1000):
+        session_id = f"{today.isoformat()}-{label}-{number:02d}"
+        if not (root / session_id).exists():
+            return session_id
+    raise InputError(root, f"has 999 sessions of {today.isoformat()}-{label}")
+
+
+def open_sessions(root: Path) -> list[Path]:
+    """Folders under `root` whose journal was opened and has no `closed` event, oldest first."""
+    folders = sorted(path.parent for path in root.glob(f"*/{JOURNAL_NAME}"))
+    for folder in folders:
+        check_folder(folder)
+    return [folder for folder in folders if is_open(replay(folder / JOURNAL_NAME))]

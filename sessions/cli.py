@@ -1,0 +1,233 @@
+"""`brushloop sessions ...`: inspect, check, repair, import, merge and export recordings.
+
+Heavy imports wait until a command runs. Exit codes beside the usual ones: 3 repaired, but something is lost; 6 damaged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sessions.terminal import say
+
+if TYPE_CHECKING:
+    from sessions.imports.photographs import ImportOptions
+
+LOSSY, DAMAGED = 3, 6
+Session = Annotated[Path, typer.Argument(help="A session's folder, or its .mcap file.")]
+Out = Annotated[Path | None, typer.Option(help="New session folder; sessions/<folder's name> by default.")]
+Licence = Annotated[str, typer.Option(help="Licence of the photographs, kept in the recording.")]
+Origin = Annotated[str, typer.Option(help="Where they come from, kept in the recording.")]
+Brush = Annotated[str, typer.Option(help="What is known of the brush.")]
+Radius = Annotated[float | None, typer.Option(min=0.5, max=50.0, help="R of the brush; 6 where it is not given.")]
+Length = Annotated[float | None, typer.Option(min=5.0, max=500.0, help="L of the brush; 48 where it is not given.")]
+Kind = Annotated[str, typer.Option(help="press (vertical presses) or drag (strokes that travel).")]
+
+app = typer.Typer(help="Inspect, check, repair, import and export recordings.", no_args_is_help=True)
+
+
+@app.command("list")
+def list_(
+    root: Annotated[Path, typer.Argument(help="Folder that holds sessions.")] = Path("sessions"),
+) -> None:
+    """List the sessions under a folder: closed, imported, or still open."""
+    from rich.table import Table
+
+    from sessions.show import summaries
+
+    table = Table("session", "state", "source", "strokes", "file")
+    for row in summaries(root):
+        table.add_row(row.session_id, row.state, row.source, str(row.strokes), row.file)
+    say(table)
+
+
+@app.command()
+def show(
+    session: Session,
+    as_json: Annotated[bool, typer.Option("--json", help="Everything, as one JSON object.")] = False,
+    files: Annotated[bool, typer.Option("--files", help="List every step's file too.")] = False,
+) -> None:
+    """Show what is in a session: steps, strokes per cell of the grid, sheets, files, devices."""
+    import json
+    from dataclasses import asdict
+
+    from sessions.show import details
+
+    found = details(session)
+    if as_json:
+        say(json.dumps(asdict(found), ensure_ascii=False))
+        return
+
+    from sessions.show_text import renderables
+
+    say(*renderables(found, files=files))
+
+
+@app.command()
+def verify(session: Session) -> None:
+    """Read every file again, check each against its CRC, its counts and the journal, and decode every image.
+
+    Exit code 0: all is sound. 6: something is damaged, and is named.
+    """
+    from sessions.repair.verify import verify_session
+
+    verdict = verify_session(session)
+    for finding in verdict.findings:
+        say(f"damaged: {finding.file}: {finding.what}")
+    for note in verdict.notes:
+        say(f"note: {note}")
+    read = f"{verdict.files} files, {verdict.strokes} strokes, {verdict.messages} messages"
+    if verdict.sound:
+        say(f"{verdict.session} ({verdict.state}) is sound: {read}")
+        return
+    say(f"{verdict.session} ({verdict.state}) is damaged. Try `brushloop sessions repair {session}`")
+    raise typer.Exit(DAMAGED)
+
+
+@app.command()
+def repair(session: Session) -> None:
+    """Give back every intact finished stroke of a damaged session, mark the rest as lost, and say what was done.
+
+    Nothing recorded is overwritten: damaged files are kept as `<name>.damaged-1`. Exit code 0: nothing was lost.
+    3: something was, and is named. 6: nothing could be rebuilt.
+    """
+    import time
+
+    from sessions.repair.repair import repair_session
+
+    report = repair_session(session, time.time_ns)
+    for line in report.did:
+        say(line)
+    for line in report.lost:
+        say(f"lost: {line}")
+    if report.lossless:
+        what = "nothing was lost" if report.did else "was sound; nothing was changed"
+        say(f"{report.session}: {what}, {report.strokes} strokes")
+        return
+    say(f"{report.session}: {report.strokes} strokes were given back whole, the rest is named above")
+    raise typer.Exit(LOSSY)
+
+
+@app.command()
+def close(session: Annotated[Path, typer.Argument(help="The folder of a session that was left open.")]) -> None:
+    """Write the merged MCAP of a session that was left open, and read it back; collecting into it then ends."""
+    import time
+
+    from sessions.store import SessionStore
+
+    store = SessionStore(session.resolve(), None, time.time_ns)
+    try:
+        final = store.close()
+    finally:
+        store.release()
+    say(f"Closed: {final}")
+
+
+def _import(
+    run: Callable[..., Path], folder: Path, table: Path | None, out: Path | None, options: ImportOptions, *more: object
+) -> None:
+    import time
+    from importlib.metadata import version
+
+    target = out or Path("sessions") / folder.resolve().name
+    path = run(folder, table, target, options, f"brushloop {version('brushloop')}", time.time_ns, *more)
+    say(f"Imported into {path}")
+
+
+@app.command("import")
+def import_(
+    folder: Annotated[Path, typer.Argument(help="Folder of photographs.")],
+    csv: Annotated[Path, typer.Option(help="Table with a `file` column, px_per_mm, and one column per parameter.")],
+    out: Out = None,
+    kind: Kind = "drag",
+    px_per_mm: Annotated[float | None, typer.Option(help="Scale, where the table has none.")] = None,
+    licence: Licence = "",
+    origin: Origin = "",
+    brush: Brush = "",
+    brush_radius_mm: Radius = None,
+    brush_length_mm: Length = None,
+) -> None:
+    """Turn a folder of photographs with a parameter table into a session that every later command accepts."""
+    from sessions.imports.photographs import ImportOptions, import_photographs
+
+    options = ImportOptions(kind, px_per_mm, licence, origin, brush, brush_radius_mm, brush_length_mm)
+    _import(import_photographs, folder, csv, out, options)
+
+
+@app.command("import-sequence")
+def import_sequence(
+    folder: Annotated[Path, typer.Argument(help="Folder of frames of one page.")],
+    csv: Annotated[Path | None, typer.Option(help="Table with `before`, `after` and what was commanded.")] = None,
+    page_mm: Annotated[str, typer.Option(help="Width x height of what a frame shows, as 203.2x279.4.")] = "",
+    px_per_mm: Annotated[float | None, typer.Option(help="Scale, instead of --page-mm.")] = None,
+    out: Out = None,
+    licence: Licence = "",
+    origin: Origin = "",
+    brush: Brush = "",
+) -> None:
+    """Import a page that was photographed after every stroke; without --csv the frames are taken by name."""
+    from sessions.errors import InputError
+    from sessions.imports.photographs import ImportOptions
+    from sessions.imports.sequence import import_sequence as run
+
+    page: tuple[float, float] | None = None
+    if page_mm:
+        try:
+            width, height = (float(part) for part in page_mm.lower().split("x"))
+        except ValueError:
+            raise InputError(folder, f"--page-mm is {page_mm!r}, expected a size like 203.2x279.4") from None
+        if not (1.0 <= width <= 1e5 and 1.0 <= height <= 1e5):
+            raise InputError(folder, f"--page-mm is {page_mm!r}, allowed 1 to 100000 mm")
+        page = (width, height)
+    options = ImportOptions("drag", px_per_mm, licence, origin, brush)
+    _import(run, folder, csv, out, options, page)
+
+
+@app.command("import-scans")
+def import_scans(
+    folder: Annotated[Path, typer.Argument(help="Folder of scans.")],
+    csv: Annotated[Path, typer.Option(help="Table as for `import`; with boxes and names where a scan holds many.")],
+    dpi: Annotated[float | None, typer.Option(help="Of the scanner; what the files say by default.")] = None,
+    kind: Kind = "drag",
+    out: Out = None,
+    licence: Licence = "",
+    origin: Origin = "",
+    brush: Brush = "",
+    brush_radius_mm: Radius = None,
+    brush_length_mm: Length = None,
+) -> None:
+    """Import flatbed scans; the scale is their dpi, and a sheet is cut into strokes where the table has boxes."""
+    from sessions.imports.photographs import ImportOptions
+    from sessions.imports.photographs import import_scans as run
+
+    options = ImportOptions(kind, None, licence, origin, brush, brush_radius_mm, brush_length_mm)
+    _import(run, folder, csv, out, options, dpi)
+
+
+@app.command()
+def merge(
+    out: Annotated[Path, typer.Argument(help="The new .mcap file.")],
+    parts: Annotated[list[Path], typer.Argument(help="Two or more session folders or .mcap files, in order.")],
+) -> None:
+    """Merge recordings of one setup (brush, ink, paper, rig) into one file that says where each part came from.
+
+    The camera must not have been moved between them: the merged file is calibrated as one.
+    """
+    from sessions.merge import merge_recordings
+
+    say(f"Merged into {merge_recordings(parts, out)}")
+
+
+@app.command()
+def export(
+    session: Annotated[Path, typer.Argument(help="A closed session's folder, or an .mcap file.")],
+    out: Annotated[Path, typer.Argument(help="The new folder.")],
+    kind: Annotated[str, typer.Option("--format", help="png (images and CSV), npz, or parquet.")] = "png",
+) -> None:
+    """Export strokes and poses: images with CSV, NumPy arrays, or Parquet that Hugging Face `datasets` loads."""
+    from sessions.export.export import export as write
+
+    say(f"Exported into {write(session, out, kind)}")

@@ -1,1 +1,0 @@
-"""`brushloop sessions`: what a scientist does with recordings."""
