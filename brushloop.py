@@ -70,7 +70,7 @@ loop = typer.Typer(
 loop.command("session")(collect.chains.loop_cli.loop)
 loop.command("compare")(calibrate.loop.cli.compare)
 app.add_typer(loop, name="loop")
-app.add_typer(sessions.cli, name="sessions")
+app.add_typer(sessions.cli.app, name="sessions")
 write = typer.Typer(
     cls=PathOrCommand,
     help="Write characters on the rig and compare them (`brushloop write 字 --config ...`), or only plan or compare.",

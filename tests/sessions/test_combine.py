@@ -6,6 +6,7 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
+from sessions.cli import app
 from sessions.errors import InputError, SessionError
 from sessions.merge import PARTS_NOTE, merge_recordings
 from sessions.reader import Recording

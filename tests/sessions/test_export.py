@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from sessions.cli import app
 from sessions.errors import InputError, SessionError
 from sessions.export.export import export
 from sessions.reader import Recording

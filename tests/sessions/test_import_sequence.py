@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from sessions.cli import app
 from sessions.errors import InputError
 from sessions.imports.photographs import ImportOptions, dpi_of, import_scans
 from sessions.imports.sequence import SEQUENCE, import_sequence

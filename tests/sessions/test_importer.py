@@ -9,6 +9,7 @@ import cv2
 import pytest
 from typer.testing import CliRunner
 
+from sessions.cli import app
 from sessions.imports.photographs import ImportOptions
 from sessions.reader import Recording
 from sessions.recording.schemas import Source

@@ -7,6 +7,7 @@ import shutil
 import pytest
 from typer.testing import CliRunner
 
+from sessions.cli import app
 from sessions.errors import InputError
 from sessions.export.export import export
 from sessions.journal.journal import JOURNAL_NAME

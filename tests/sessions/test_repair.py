@@ -7,6 +7,7 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
+from sessions.cli import app
 from sessions.errors import DiskFull, InputError, SessionDamaged, SessionError, SessionLocked
 from sessions.journal.codec import encode_line
 from sessions.journal.journal import JOURNAL_NAME

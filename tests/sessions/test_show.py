@@ -5,6 +5,7 @@ import json
 import pytest
 from typer.testing import CliRunner
 
+from sessions.cli import app
 from sessions.errors import InputError
 from sessions.remarks import mark_bad_or_good
 from sessions.show import GridCell, Sheet, details

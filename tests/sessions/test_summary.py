@@ -3,6 +3,7 @@
 import pytest
 from typer.testing import CliRunner
 
+from sessions.cli import app
 from sessions.errors import InputError
 from sessions.journal.journal import JOURNAL_NAME
 from sessions.show import Summary, summaries

@@ -4,6 +4,7 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
+from sessions.cli import app
 from sessions.errors import InputError
 from sessions.journal.journal import JOURNAL_NAME
 from sessions.repair.verify import verify_session
