@@ -9,13 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.command import brushloop
+
 ROOT = Path(__file__).parent.parent
 HEAVY = ("torch", "cv2", "textual", "numpy", "pydantic", "mcap", "scipy", "drivers.sim")
-
-
-def brushloop(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "brushloop", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)
 
 
 def loaded(program: str) -> list[str]:
@@ -85,3 +82,9 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path, arguments: tuple[
     assert ran.stderr.count("\n") == 1
     assert words in ran.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_process_ends_with_that_line_and_that_code() -> None:
+    command = [sys.executable, "-m", "brushloop", "sessions", "list", "nowhere"]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stderr) == (2, brushloop("sessions", "list", "nowhere").stderr)

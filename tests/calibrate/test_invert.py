@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -25,6 +23,7 @@ from sessions.imports.photographs import ImportOptions, import_photographs
 from sessions.reader import Capture
 from sessions.recording.messages import encode_png
 from sessions.recording.schemas import Stroke
+from tests.command import brushloop
 
 PRESSES = [(12.0, 3.0), (15.0, 6.0), (18.5, 9.0)]
 PX = 12.0  # of the pretended scan, per mm
@@ -132,15 +131,13 @@ def test_the_summary_compares_with_what_was_commanded() -> None:
 
 def test_the_command_says_what_came_out(tmp_path: Path) -> None:
     session(tmp_path)
-    command = [sys.executable, "-m", "brushloop", "invert", "sessions/shots", "--out", "again/recovered.csv"]
-    ran = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    command = ["invert", "sessions/shots", "--out", "again/recovered.csv"]
+    ran = brushloop(*command, cwd=tmp_path)
     assert ran.returncode == 0, ran.stderr
     words = " ".join(ran.stdout.split())
     assert "3 presses recovered by ccd-bsm (imported photographs)" in words
     assert "H: recovered - commanded" in words
     assert load_protocol(tmp_path / "again" / PROTOCOL).kind == "replay"
-    bad = subprocess.run(
-        [*command, "--tilt-range", "0", "50"], capture_output=True, text=True, check=False, cwd=tmp_path
-    )
+    bad = brushloop(*command, "--tilt-range", "0", "50", cwd=tmp_path)
     assert bad.returncode == 2
     assert bad.stderr.count("\n") == 1

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -26,16 +24,12 @@ from model.characters.brush import Reach
 from model.drag import DragModel
 from model.registry import stroke_model
 from tests.calibrate.given import BY
+from tests.command import brushloop
 
 MODEL = stroke_model("ccd-bsm", Brush())
 QUICK = Settings(steps=4)
 LAG = DragModel(half_mm=0.4, half_per_mm=0.4, leash_mm=2.5, leash_per_mm=0.3, settle_mm=2.0).vector().tolist()
 BAR = {"strokes": ["M 100 400 L 900 400 L 900 480 L 100 480 Z"], "medians": [[[110, 440], [890, 440]]]}
-
-
-def brushloop(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "brushloop", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)
 
 
 def test_the_command_writes_a_protocol_and_a_picture(tmp_path: Path) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from typing import TYPE_CHECKING
 
 import pytest
@@ -15,6 +13,7 @@ from drivers.arcs.codes import SafetyMode
 from drivers.clock import HostClock
 from drivers.sim.instruments.force_board import Fault
 from drivers.sim.instruments.ink_station import Fault as InkFault
+from tests.command import brushloop
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -81,8 +80,7 @@ async def test_a_protective_stop_is_told_and_not_cleared(lab: Lab) -> None:
 def test_a_cabinet_that_does_not_answer_ends_with_code_4_and_the_rest_is_told(lab: Lab, flag: tuple[str, ...]) -> None:
     path = lab.folder / "rig.toml"
     path.write_text(path.read_text().replace(f"port = {lab.rig.arcs.port}\n", "port = 9\n"))
-    command = [sys.executable, "-m", "brushloop", "doctor", "--config", str(path), *flag]
-    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    ran = brushloop("doctor", "--config", path, *flag)
     assert ran.returncode == 4
     assert "Traceback" not in ran.stderr
     if flag:

@@ -8,7 +8,6 @@ import json
 import os
 import socket
 import struct
-import subprocess
 import sys
 import threading
 import time
@@ -34,6 +33,7 @@ from sessions.recording.messages import encode_png, image_message, pose_message
 from sessions.recording.schemas import Topic, Wrench
 from sessions.recording.writer import Outgoing
 from sessions.repair.verify import verify_session
+from tests.command import brushloop
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -302,10 +302,8 @@ def test_a_run_with_a_viewer_shows_what_it_records_and_records_the_same(lab: Lab
 
 
 def test_the_command_refuses_a_port_that_is_taken_before_anything_is_connected(lab: Lab, live: LiveView) -> None:
-    command = [sys.executable, "-m", "brushloop", "collect", "--no-tui", "--live", "--live-port", str(live.port)]
-    command += ["--out", str(lab.sessions), "--config", str(lab.folder / "rig.toml")]
-    command += ["--protocol", str(lab.folder / "protocol.toml")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    command = ["collect", "--no-tui", "--live", "--live-port", str(live.port), "--out", lab.sessions]
+    done = brushloop(*command, "--config", lab.folder / "rig.toml", "--protocol", lab.folder / "protocol.toml")
     assert done.returncode == 2, done.stderr
     assert done.stderr.startswith(f"brushloop: --live: cannot listen on 127.0.0.1:{live.port}")
     assert lab.rig.arcs.mode == "PowerOff"

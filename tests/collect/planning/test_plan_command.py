@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -27,6 +25,7 @@ from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml
 from drivers.sim.world import World
+from tests.command import brushloop
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 HERE = "127.0.0.1"
@@ -84,7 +83,7 @@ def test_every_kind_has_a_picture(rig_path: Path, tmp_path: Path, name: str) -> 
 @pytest.mark.parametrize("ending", [".svg", ".pdf", ".JPG"])
 def test_a_picture_has_the_format_of_its_ending(rig_path: Path, tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"plan{ending}"
-    plan(rig_path, "protocol.toml", "--picture", str(path))
+    plan(rig_path, "protocol-list.toml", "--picture", str(path))
     head = {".svg": b"<?xml", ".pdf": b"%PDF", ".JPG": b"\xff\xd8"}
     assert path.read_bytes().startswith(head[ending])
 
@@ -183,8 +182,6 @@ async def test_a_controller_that_does_not_answer_is_an_error_of_the_device(rig_p
 def test_the_command_line_says_what_is_missing(
     tmp_path: Path, arguments: tuple[str, ...], code: int, words: str
 ) -> None:
-    ran = subprocess.run(
-        [sys.executable, "-m", "brushloop", *arguments], capture_output=True, text=True, check=False, cwd=tmp_path
-    )
+    ran = brushloop(*arguments, cwd=tmp_path)
     assert ran.returncode == code
     assert words in ran.stderr

@@ -1,0 +1,31 @@
+"""`brushloop` as one types it, within the test's own process: what it imports is imported once, not by every test."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import subprocess
+import sys
+from pathlib import Path
+from unittest import mock
+
+from brushloop import main
+
+
+def brushloop(*words: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """What the command printed, and its exit code, as if it had been a process in the folder `cwd`."""
+    arguments = ["brushloop", *map(str, words)]
+    out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True) for _ in range(2))
+    code = 0
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(mock.patch.object(sys, "argv", arguments))
+        stack.enter_context(contextlib.redirect_stdout(out))
+        stack.enter_context(contextlib.redirect_stderr(err))
+        if cwd is not None:
+            stack.enter_context(contextlib.chdir(cwd))
+        try:
+            main()
+        except SystemExit as ended:
+            code = ended.code if isinstance(ended.code, int) else int(ended.code is not None)
+    printed = [stream.buffer.getvalue().decode() for stream in (out, err)]  # pyright: ignore[reportAttributeAccessIssue]
+    return subprocess.CompletedProcess(arguments, code, *printed)
