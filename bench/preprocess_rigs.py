@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.scale import BoardSpec
+from calibrate.board.spec import BoardSpec
 from drivers.geometry import brush_pose
 from drivers.sim.brush.brush import BrushSpec
 from drivers.sim.brush.paper import PX_PER_MM as SHEET_PX_PER_MM

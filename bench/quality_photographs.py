@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 
 from bench.harness import BenchError
-from calibrate.board.scale import PlaneFit
+from calibrate.board.lens import unknown_lens
+from calibrate.board.plane import Plane
 from collect.quality.checks import check_capture
 from collect.quality.verdict import Failure, Verdict
 from collect.rig.config_quality import QualityConfig
@@ -46,7 +47,17 @@ def judge(folder: Path, row: dict[str, str], limits: QualityConfig) -> Verdict:
     scale = float(np.sqrt(x_mm * y_mm))
     return check_capture(
         image.astype(np.uint8),
-        PlaneFit(to_paper, scale, (scale, scale), 0.0, 0, 0),
+        Plane(
+            unknown_lens((image.shape[1], image.shape[0])),
+            to_paper,
+            scale,
+            (scale, scale),
+            rms_px=0.0,
+            distortion_px=0.0,
+            middle_px=(0.0, 0.0),
+            corners=0,
+            dropped=(),
+        ),
         Cell(0, 0.0, 0.0, width_mm, height_mm),
         height_mm=max(float(row.get("depth_mid_mm_nominal") or DEPTH_MM), 1.0),
         limits=limits,

@@ -15,7 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.scale import BoardSpec, PlaneFit, see_board
+from calibrate.board.plane import Plane
+from calibrate.board.spec import BoardSpec
+from calibrate.board.view import see_board
 from collect.quality.verdict import Failure
 from collect.rig.config import PaperConfig
 from collect.rig.paper import Cell, Sheet
@@ -52,7 +54,7 @@ class Sample:
     image: Gray
     before: Gray
     """The still before this press."""
-    plane: PlaneFit
+    plane: Plane
     cell: Cell
     height_mm: float
     tilt_deg: float
@@ -65,7 +67,7 @@ class Patch:
 
     blank: bool
     image: Gray
-    plane: PlaneFit
+    plane: Plane
     cell: Cell
 
 

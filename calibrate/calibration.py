@@ -10,7 +10,8 @@ from pydantic import BaseModel, ConfigDict
 
 from calibrate.artefact import Artefact
 from calibrate.board.lens import LensUsed
-from calibrate.board.scale import BoardSpec, apply
+from calibrate.board.plane import apply
+from calibrate.board.spec import BoardSpec
 
 SCHEMA_VERSION = 2
 """2 names the lens, the board and the still, and says whether it was made for another session."""
@@ -42,7 +43,7 @@ class Calibration(Artefact):
     recording_sha256: str
     software: str
     image_to_paper: tuple[float, float, float, float, float, float, float, float, float]
-    """Homography, row by row: pixels (centres on integers) of the straightened photograph to mm in the paper frame."""
+    """Homography, row by row: pixels (centres on integers) of the undistorted photograph to mm in the paper frame."""
     mm_per_px: float
     """pix2len in the middle of the corners that were seen."""
     mm_per_px_low: float
@@ -70,12 +71,12 @@ class Calibration(Artefact):
 
     def to_image(self, paper_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, 2) mm in the paper frame -> pixels of the photograph as it was taken."""
-        straight = apply(np.asarray(np.linalg.inv(self.homography()), np.float64), paper_mm)
-        return straight if self.lens is None else self.lens.lens().bent(straight)
+        undistorted = apply(np.asarray(np.linalg.inv(self.homography()), np.float64), paper_mm)
+        return undistorted if self.lens is None else self.lens.lens().distorted(undistorted)
 
     def to_paper(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, 2) pixels of the photograph as it was taken -> mm in the paper frame."""
-        return apply(self.homography(), pixels if self.lens is None else self.lens.lens().straight(pixels))
+        return apply(self.homography(), pixels if self.lens is None else self.lens.lens().undistorted(pixels))
 
     @property
     def named(self) -> str:

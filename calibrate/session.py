@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from calibrate.artefact import current, load_artefact, put_to_use
-from calibrate.board.detect import see
+from calibrate.board.detect import find_board
 from calibrate.board.lens import LensUsed
 from calibrate.board.session import NO_BOARD, board_of, board_stills, known_lens, lens_of_session, sheet_of
-from calibrate.board.view import paper_mm, see_straight
+from calibrate.board.view import calibration_plane, paper_mm
 from calibrate.calibration import Calibration, Foreign
 from calibrate.errors import CalibrationError
 from calibrate.stroke.params import Params
@@ -38,8 +38,8 @@ def calibrate_session(session: Path, lens: Path | None = None) -> Path:
     stills = list(recording.stills_of("board"))
     if not stills:
         raise CalibrationError(where, NO_BOARD)
-    image, straight = decode_gray(stills[-1], where), known.lens() if known else None
-    plane, flags = see_straight(image, spec, straight, where, sheet_of(recording))
+    image, given = decode_gray(stills[-1], where), known.lens() if known else None
+    plane = calibration_plane(image, spec, given, where, sheet_of(recording))
     low, high = plane.interval_mm_per_px
     calibration = Calibration(
         session_id=recording.header.session_id,
@@ -57,7 +57,7 @@ def calibrate_session(session: Path, lens: Path | None = None) -> Path:
         lens=LensUsed.of(plane.lens, known.source if known else FITTED),
         middle_px=plane.middle_px,
         board=spec,
-        flags=flags,
+        flags=plane.flags,
         still_sha256=hashlib.sha256(stills[-1]).hexdigest(),
     )
     return put_to_use(calibration, recording.path.parent)
@@ -137,7 +137,7 @@ def _board_off_mm(given: Calibration, recording: Recording) -> float | None:
         if given.lens is not None:
             given.lens.lens().check_size(image, where)
         try:
-            view = see(image, spec, where)
+            view = find_board(image, spec, where)
         except CalibrationError:
             continue
         there = given.to_paper(view.pixels) - paper_mm(view, spec)

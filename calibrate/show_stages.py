@@ -13,7 +13,7 @@ from calibrate.artefact import current
 from calibrate.board.lens import Gray, unknown_lens
 from calibrate.board.plane import Plane
 from calibrate.board.session import NO_BOARD, board_of, known_lens
-from calibrate.board.view import see_straight
+from calibrate.board.view import calibration_plane
 from calibrate.compare.field import Field
 from calibrate.errors import CalibrationError
 from calibrate.files import read_gray, write_whole
@@ -71,7 +71,7 @@ def _plane(recording: Recording, one: Stroke, image: Gray, lens: Path | None, wh
         raise CalibrationError(str(recording.path), NO_BOARD)
     known = known_lens(recording, lens)
     photograph = decode_gray(boards[-1], where)
-    return see_straight(photograph, board_of(recording), known.lens() if known else None, where)[0]
+    return calibration_plane(photograph, board_of(recording), known.lens() if known else None, where)
 
 
 def show_photograph(

@@ -8,6 +8,7 @@ from typing import ClassVar, Literal
 from calibrate.artefact import Artefact, load_artefact
 from calibrate.board.intrinsics import Fitted
 from calibrate.board.lens import Lens, LensUsed, lens_of
+from calibrate.board.register import Registration
 
 
 class LensFile(Artefact):
@@ -106,3 +107,25 @@ class RegistrationFile(Artefact):
     """Of every point, predicted by the others."""
     residuals_mm: dict[str, tuple[float, float]]
     dropped: dict[str, tuple[float, float]]
+
+
+def registration_file(
+    fitted: Registration, board_origin_mm: tuple[float, float], source: str, software: str
+) -> RegistrationFile:
+    """The artefact of a registration."""
+    a, b, x, c, d, y = (float(v) for v in fitted.matrix.ravel())
+    residuals = {n: (float(r[0]), float(r[1])) for n, r in zip(fitted.names, fitted.residuals_mm, strict=True)}
+    return RegistrationFile(
+        software=software,
+        source=source,
+        model=fitted.model,
+        robot_to_paper=(a, b, x, c, d, y),
+        board_origin_mm=board_origin_mm,
+        origin_mm=fitted.origin_mm,
+        yaw_deg=fitted.yaw_deg,
+        scale=fitted.scale,
+        rms_mm=fitted.rms_mm,
+        left_out_rms_mm=fitted.left_out_rms_mm,
+        residuals_mm={n: r for n, r in residuals.items() if n not in fitted.dropped},
+        dropped={n: residuals[n] for n in fitted.dropped},
+    )

@@ -15,9 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.detect import View
-from calibrate.board.lens import Floats
-from calibrate.board.zhang import Solved, flat, solve, through
+from calibrate.board.detect import BoardView
+from calibrate.board.lens import Floats, Lens
 from calibrate.errors import CalibrationError
 
 LEAST = 3
@@ -39,6 +38,59 @@ Part = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
+class Solved:
+    """A lens, and how each board lies before it."""
+
+    lens: Lens
+    rms_px: float
+    residuals_px: Floats
+    """(views,) root mean square of each."""
+    turns: tuple[Floats, ...]
+    shifts_mm: tuple[Floats, ...]
+    """Rotation vector and translation of each board."""
+
+    @property
+    def normals(self) -> Floats:
+        """(views, 3) unit vectors out of each board, toward the camera."""
+        found = np.stack([np.asarray(cv2.Rodrigues(turn)[0], np.float64)[:, 2] for turn in self.turns])
+        return np.asarray(np.where(found[:, 2:] < 0.0, -found, found), np.float64)
+
+
+def solve(views: Sequence[BoardView], where: str) -> Solved:
+    """`cv2.calibrateCamera` (k1, k2, p1, p2, k3). Raises `CalibrationError` where no lens explains the views."""
+    size = views[0].size_px
+    objects = [flat(view).astype(np.float32) for view in views]
+    pixels = [view.pixels.astype(np.float32).reshape(-1, 1, 2) for view in views]
+    try:
+        rms, matrix, distortion, turns, shifts, _, _, per_view = cv2.calibrateCameraExtended(
+            objects, pixels, size, np.zeros((3, 3)), np.zeros(5)
+        )
+    except cv2.error as error:
+        raise CalibrationError(where, f"no lens explains these views: {error.err}") from None
+    return Solved(
+        Lens(np.asarray(matrix, np.float64), np.asarray(distortion, np.float64).ravel()[:5], size),
+        float(rms),
+        np.asarray(per_view, np.float64).ravel(),
+        tuple(np.asarray(turn, np.float64) for turn in turns),
+        tuple(np.asarray(shift, np.float64) for shift in shifts),
+    )
+
+
+def flat(view: BoardView) -> Floats:
+    """(n, 3) corners of a view on its board, which is flat."""
+    return np.column_stack([view.board_mm, np.zeros(len(view.board_mm))])
+
+
+def through(lens: Lens, view: BoardView) -> float:
+    """Residual of a view, root mean square in px, its board laid as well as this lens allows."""
+    board = flat(view)
+    _, turn, shift = cv2.solvePnP(board, view.pixels, lens.matrix, lens.distortion)
+    turn, shift = cv2.solvePnPRefineLM(board, view.pixels, lens.matrix, lens.distortion, turn, shift)
+    seen, _ = cv2.projectPoints(board, turn, shift, lens.matrix, lens.distortion)
+    return float(np.sqrt(((view.pixels - np.asarray(seen, np.float64).reshape(-1, 2)) ** 2).sum(axis=1).mean()))
+
+
+@dataclass(frozen=True, slots=True)
 class TwoCameras:
     """Which photographs belong together."""
 
@@ -48,7 +100,7 @@ class TwoCameras:
     """Root mean square residual through one lens, and through two."""
 
 
-def two_cameras(views: Sequence[View], solved: Solved) -> TwoCameras | None:
+def two_cameras(views: Sequence[BoardView], solved: Solved) -> TwoCameras | None:
     """The two parts of a set that one lens does not explain as two do; None for one camera, or too few views."""
     part = _best_part(views, solved)
     if part is None:
@@ -70,12 +122,12 @@ def two_cameras(views: Sequence[View], solved: Solved) -> TwoCameras | None:
     return TwoCameras((these, those), solved.rms_px, solved.rms_px * left**0.5)
 
 
-def _halves(views: Sequence[View], part: Part) -> tuple[list[View], list[View]]:
+def _halves(views: Sequence[BoardView], part: Part) -> tuple[list[BoardView], list[BoardView]]:
     pairs = list(zip(views, part.tolist(), strict=True))
     return [view for view, is_in in pairs if is_in], [view for view, is_in in pairs if not is_in]
 
 
-def _worse(half: Sequence[View], own: Solved, other: Solved) -> bool:
+def _worse(half: Sequence[BoardView], own: Solved, other: Solved) -> bool:
     return float(np.median([through(other.lens, v) / through(own.lens, v) for v in half])) >= WORSE
 
 
@@ -92,7 +144,7 @@ def _as_named(names: Sequence[str], part: Part) -> Part | None:
     return None
 
 
-def _best_part(views: Sequence[View], solved: Solved) -> Part | None:
+def _best_part(views: Sequence[BoardView], solved: Solved) -> Part | None:
     """The views to give a lens of their own so that the squared residuals shrink most, to first order.
 
     From many random halves, each view goes to the lens that it pulls at least, until none moves.
@@ -128,7 +180,7 @@ def _costs(curves: Floats, pulls: Floats, part: Part) -> Floats:
     return np.asarray(np.einsum("i,nij,j->n", step, curves, step) - 2.0 * pulls @ step, np.float64)
 
 
-def _reduced(views: Sequence[View], solved: Solved) -> tuple[Floats, Floats]:
+def _reduced(views: Sequence[BoardView], solved: Solved) -> tuple[Floats, Floats]:
     """(n, 9, 9) and (n, 9): how each view holds the lens, and which way it pulls, its own board free to move."""
     curves, pulls = list[Floats](), list[Floats]()
     for view, turn, shift in zip(views, solved.turns, solved.shifts_mm, strict=True):

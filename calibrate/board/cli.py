@@ -11,7 +11,7 @@ import typer
 from sessions.terminal import say
 
 if TYPE_CHECKING:
-    from calibrate.board.detect import Board
+    from calibrate.board.spec import Board
 
 
 class Kind(StrEnum):
@@ -43,7 +43,8 @@ def board(
     page: Annotated[str, typer.Option(help="a4, a3, a2 or letter.")] = "a4",
 ) -> None:
     """Write a printable board as a PDF at true scale, with a ruler to check the print."""
-    from calibrate.board.pdf import describe, write_pdf
+    from calibrate.board.pdf import write_pdf
+    from calibrate.board.spec import describe
 
     made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
     say(f"{write_pdf(made, out, page)}: {describe(made)}")
@@ -68,20 +69,19 @@ def intrinsics(
     from importlib.metadata import version
 
     from calibrate.board.artefact import lens_file
-    from calibrate.board.detect import View, see
-    from calibrate.board.intrinsics import fit_lens
-    from calibrate.board.pdf import describe
-    from calibrate.board.views import named
+    from calibrate.board.detect import BoardView, find_board
+    from calibrate.board.intrinsics import fit_lens, named
+    from calibrate.board.spec import describe
     from calibrate.errors import CalibrationError
     from calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
 
     made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
-    seen, unusable, digests = list[View](), dict[str, str](), dict[str, str]()
+    seen, unusable, digests = list[BoardView](), dict[str, str](), dict[str, str]()
     for name, path in named(photographs).items():
         image = read_gray(path)
         digests[name] = hashlib.sha256(read_bounded(path, MAX_PHOTOGRAPH_BYTES)).hexdigest()
         try:
-            seen.append(see(image, made, name))
+            seen.append(find_board(image, made, name))
         except CalibrationError as error:
             unusable[name] = error.what
     fitted = fit_lens(seen, limit_px, unusable, one_camera=one_camera)
@@ -118,8 +118,8 @@ def check(
     """Pre-flight: pix2len with its interval from one photograph of the board, and warnings. Exit code 5 with any."""
     from calibrate.artefact import load_artefact
     from calibrate.board.artefact import LensFile
-    from calibrate.board.check import preflight
-    from calibrate.board.scale import BoardSpec
+    from calibrate.board.spec import BoardSpec
+    from calibrate.board.view import preflight
     from calibrate.files import read_gray
 
     spec = _board("", charuco, square_mm, marker_mm, dictionary)
@@ -191,12 +191,12 @@ def register(
     import hashlib
     from importlib.metadata import version
 
-    from calibrate.board.artefact import read_lens
-    from calibrate.board.points import read_points, registration_file
+    from calibrate.board.artefact import read_lens, registration_file
+    from calibrate.board.register import read_points
     from calibrate.board.register import register as fit
     from calibrate.board.rig_file import PaperLines, read_rig
-    from calibrate.board.scale import BoardSpec
-    from calibrate.board.view import see_straight
+    from calibrate.board.spec import BoardSpec
+    from calibrate.board.view import calibration_plane
     from calibrate.errors import CalibrationError
     from calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
 
@@ -217,7 +217,7 @@ def register(
     points = read_points(table)
     lens = lens or (rig.lens_file if rig else None)
     known = read_lens(lens) if lens else None
-    plane, flags = see_straight(read_gray(photograph), spec, known.lens() if known else None, str(photograph))
+    plane = calibration_plane(read_gray(photograph), spec, known.lens() if known else None, str(photograph))
     fitted = fit(points.names, points.robot_mm, plane.to_paper(points.image_px), model.value)
     for name, (dx, dy) in zip(fitted.names, fitted.residuals_mm.tolist(), strict=True):
         out_of_it = ", dropped: it does not fit the others" if name in fitted.dropped else ""
@@ -226,7 +226,7 @@ def register(
     through = known.source if known else "no lens"
     source = f"{table.name}, sha256 {points.sha256}; {photograph.name}, sha256 {seen}; {through}"
     file = registration_file(fitted, spec.origin_mm, source, f"brushloop {version('brushloop')}")
-    for flag in flags:
+    for flag in plane.flags:
         say(f"warning: {flag}")
     say(
         f"scale {file.scale:.5f}, residual {file.rms_mm:.3f} mm, "
@@ -247,8 +247,7 @@ def register(
 def _board(checkerboard: str, charuco: str, square_mm: float, marker_mm: float, dictionary: str) -> Board:
     from pydantic import ValidationError
 
-    from calibrate.board.detect import Checkerboard
-    from calibrate.board.scale import BoardSpec
+    from calibrate.board.spec import BoardSpec, Checkerboard
     from calibrate.errors import CalibrationError, invalid
 
     if bool(checkerboard) == bool(charuco):

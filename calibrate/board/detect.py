@@ -1,23 +1,24 @@
-"""Boards in photographs: which corners are seen, and what is wrong where none are."""
+"""Find the corners of a board in a photograph, or say why they cannot be found."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
 
 from calibrate.board.edges import on_edges
 from calibrate.board.lens import Floats, Gray
-from calibrate.board.scale import MIN_CORNERS, BoardSpec, apply, charuco_board
+from calibrate.board.plane import apply
+from calibrate.board.spec import Board, BoardSpec, Checkerboard, charuco_board
 from calibrate.errors import CalibrationError
 
+MIN_CORNERS = 8
 WINDOW_SHARE = 0.3
-"""Half the window of corner refinement as a share of the way to the next edge: a wider one would see that too."""
+"""Half the window of corner refinement as a share of the way to the next edge: a wider one would include that edge."""
 MOST_WINDOW_PX = 8
 SATURATED = 254
 MOST_SATURATED = 0.4
@@ -31,26 +32,11 @@ BLANK = "is blank: nothing in it is darker than the rest"
 GOES_ON = 0.75
 """Of the contrast of its own corners: at its outer edge a board has half."""
 GRID_ERROR = 0.25
-"""In squares: a strong lens bends a board by less."""
-
-Corners = Annotated[int, Field(ge=3, le=60)]
-
-
-class Checkerboard(BaseModel):
-    """A plain checkerboard, named by its inner corners as OpenCV does."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    inner_corners: tuple[Corners, Corners]
-    """Columns and rows."""
-    square_mm: Annotated[float, Field(gt=0.0, le=1000.0)]
-
-
-Board = Checkerboard | BoardSpec
+"""In squares: a strong lens displaces corners by less."""
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class BoardView:
     """One photograph of a board."""
 
     name: str
@@ -59,17 +45,17 @@ class View:
     pixels: Floats
     """(n, 2) corners in it."""
     board_mm: Floats
-    """(n, 2) the same on the board: x right, y down, from its upper left corner."""
+    """(n, 2) the same corners on the board: x right, y down, from its upper left corner."""
     ids: NDArray[np.int64]
     """(n,) number of each corner, row by row."""
     flags: tuple[str, ...] = ()
-    """What is not as it should be, though corners were found."""
+    """What is wrong with the photograph, though corners were found."""
 
 
-def see(image: Gray, board: Board, name: str, expected: int | None = None) -> View:
-    """The corners of the board in a gray photograph. Raises `CalibrationError` that says what is wrong.
+def find_board(image: Gray, board: Board, name: str, expected: int | None = None) -> BoardView:
+    """Find the corners of the board in a gray photograph. Raises `CalibrationError` that says what is wrong.
 
-    `expected` is how many corners can be seen where a sheet lies on the board; all of them by default.
+    `expected` is the number of corners that a sheet on the board leaves visible; all of them by default.
     """
     flags = _exposure(image)
     found = _checkerboard(image, board, name) if isinstance(board, Checkerboard) else _charuco(image, board, name)
@@ -77,7 +63,7 @@ def see(image: Gray, board: Board, name: str, expected: int | None = None) -> Vi
     wanted = total if expected is None else expected
     if len(ids) < PARTLY_HIDDEN * wanted:
         flags = (*flags, f"only {len(ids)} of {wanted} corners are seen: the board is partly hidden or out of view")
-    return View(name, (image.shape[1], image.shape[0]), pixels, board_mm, ids, flags)
+    return BoardView(name, (image.shape[1], image.shape[0]), pixels, board_mm, ids, flags)
 
 
 def _blank(image: Gray) -> bool:
@@ -104,7 +90,7 @@ def _charuco(image: Gray, spec: BoardSpec, name: str) -> tuple[Floats, NDArray[n
             f"0 to {own.max()}: it is another board",
         )
     total = (spec.squares[0] - 1) * (spec.squares[1] - 1)
-    pixels, ids = _charuco_corners(image, board)
+    pixels, ids = _charuco_corners(image, board, markers, numbers)
     if len(ids) < MIN_CORNERS:
         why = f"{len(ids)} of {total} board corners found, at least {MIN_CORNERS} are needed"
         if _blank(image):
@@ -113,7 +99,7 @@ def _charuco(image: Gray, spec: BoardSpec, name: str) -> tuple[Floats, NDArray[n
             why += f", though {len(markers)} markers are seen: they do not lie as this board has them"
         mirrored, _ = _markers(np.ascontiguousarray(image[:, ::-1]), board)
         if len(mirrored) >= max(4, 2 * len(markers)):
-            why = "is mirrored: its markers can only be read the other way round"
+            why = "the photograph is mirrored: its markers can only be read the other way round"
         raise CalibrationError(name, why)
     board_mm = np.asarray(board.getChessboardCorners(), np.float64)[ids, :2]
     gap_mm = 0.5 * (spec.square_mm - spec.marker_mm)
@@ -121,21 +107,26 @@ def _charuco(image: Gray, spec: BoardSpec, name: str) -> tuple[Floats, NDArray[n
     return fine, ids, board_mm, total
 
 
-def _markers(image: Gray, board: cv2.aruco.CharucoBoard) -> tuple[list[Floats], NDArray[np.int64]]:
-    detector = cv2.aruco.ArucoDetector(board.getDictionary())
-    corners, ids, _ = detector.detectMarkers(image)
-    empty = ids is None  # pyright: ignore[reportUnnecessaryComparison]
-    return [np.asarray(c, np.float64) for c in corners], np.zeros(0, np.int64) if empty else np.ravel(ids).astype(
-        np.int64
-    )
-
-
-def _charuco_corners(image: Gray, board: cv2.aruco.CharucoBoard) -> tuple[Floats, NDArray[np.int64]]:
+def _markers(image: Gray, board: cv2.aruco.CharucoBoard) -> tuple[Sequence[cv2.typing.MatLike], NDArray[np.int64]]:
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    detector = cv2.aruco.CharucoDetector(board)
-    detector.setDetectorParameters(parameters)
-    pixels, ids, _, _ = detector.detectBoard(image)
+    corners, ids, _ = cv2.aruco.ArucoDetector(board.getDictionary(), parameters).detectMarkers(image)
+    empty = ids is None  # pyright: ignore[reportUnnecessaryComparison]
+    return corners, np.zeros(0, np.int64) if empty else np.ravel(ids).astype(np.int64)
+
+
+def _charuco_corners(
+    image: Gray,
+    board: cv2.aruco.CharucoBoard,
+    markers: Sequence[cv2.typing.MatLike],
+    numbers: NDArray[np.int64],
+) -> tuple[Floats, NDArray[np.int64]]:
+    if not len(markers):
+        return np.zeros((0, 2)), np.zeros(0, np.int64)
+    found = cv2.aruco.CharucoDetector(board).detectBoard(
+        image, markerCorners=markers, markerIds=numbers.astype(np.int32).reshape(-1, 1)
+    )
+    pixels, ids = found[:2]
     if ids is None:  # pyright: ignore[reportUnnecessaryComparison]
         return np.zeros((0, 2)), np.zeros(0, np.int64)
     return np.asarray(pixels, np.float64).reshape(-1, 2), np.ravel(ids).astype(np.int64)

@@ -9,9 +9,9 @@ import numpy as np
 
 from calibrate.board.lens import Gray, Lens
 from calibrate.board.plane import Plane
-from calibrate.board.scale import BoardSpec
 from calibrate.board.session import NO_BOARD, board_stills, sheet_of
-from calibrate.board.view import see_flagged
+from calibrate.board.spec import BoardSpec
+from calibrate.board.view import see_board_and_lens
 from calibrate.errors import CalibrationError
 from calibrate.line import Line, fit_line
 from sessions.reader import Recording
@@ -23,7 +23,7 @@ CHANGED = 5e-4
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class BoardAt:
     """The board at one moment."""
 
     t_ns: int
@@ -32,8 +32,6 @@ class Seen:
     """pix2len in the board's own middle: a view that shows other corners would else tell another place's."""
     moved_px: float
     """How far the board's middle lies from where it was first seen."""
-    flags: tuple[str, ...]
-    """What is not as it should be with the photograph."""
 
     @property
     def reach(self) -> float:
@@ -46,7 +44,7 @@ class Seen:
 class Drift:
     """The board through a session."""
 
-    seen: tuple[Seen, ...]
+    seen: tuple[BoardAt, ...]
     unseen: tuple[tuple[int, str], ...]
     """(t_ns, why) of stills of the board that cannot be used."""
     trend: Line | None
@@ -72,18 +70,18 @@ def drift(
 
     Raises `CalibrationError` where it is seen in none.
     """
-    seen: list[Seen] = []
+    seen: list[BoardAt] = []
     unseen: list[tuple[int, str]] = []
     for t_ns, image in stills:
         try:
-            plane, flags = see_flagged(image, spec, lens, f"the board at {t_ns} ns", sheet_mm)
+            plane = see_board_and_lens(image, spec, lens, f"the board at {t_ns} ns", sheet_mm)
         except CalibrationError as error:
             unseen.append((t_ns, error.what))
             continue
         middle = np.array([spec.squares]) * spec.square_mm / 2.0 + np.array([spec.origin_mm])
         first = seen[0].plane if seen else plane
         here, then = plane.to_image(middle)[0], first.to_image(middle)[0]
-        seen.append(Seen(t_ns, plane, plane.scale_at(here), float(np.linalg.norm(here - then)), flags))
+        seen.append(BoardAt(t_ns, plane, plane.scale_at(here), float(np.linalg.norm(here - then))))
     if not seen:
         told = (
             f"is not seen in any of {len(unseen)} photographs: {unseen[0][1]}" if unseen else "was never photographed"
@@ -92,7 +90,7 @@ def drift(
     return Drift(tuple(seen), tuple(unseen), _trend(seen), _warnings(seen, unseen))
 
 
-def _trend(seen: Sequence[Seen]) -> Line | None:
+def _trend(seen: Sequence[BoardAt]) -> Line | None:
     if len(seen) < 3:
         return None
     first = seen[0]
@@ -100,9 +98,9 @@ def _trend(seen: Sequence[Seen]) -> Line | None:
     return fit_line(hours, [s.mm_per_px / first.mm_per_px - 1.0 for s in seen])
 
 
-def _warnings(seen: Sequence[Seen], unseen: Sequence[tuple[int, str]]) -> tuple[str, ...]:
+def _warnings(seen: Sequence[BoardAt], unseen: Sequence[tuple[int, str]]) -> tuple[str, ...]:
     told = [f"the board is not seen at {t_ns} ns: {why}" for t_ns, why in unseen]
-    told += [f"at {s.t_ns} ns: {flag}" for s in seen for flag in s.flags]
+    told += [f"at {s.t_ns} ns: {flag}" for s in seen for flag in s.plane.flags]
     first = seen[0]
     for s in seen[1:]:
         change = s.mm_per_px / first.mm_per_px - 1.0

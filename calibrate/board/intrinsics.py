@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from calibrate.board.cameras import TwoCameras, two_cameras
-from calibrate.board.detect import View
-from calibrate.board.lens import Lens
-from calibrate.board.views import Ways, held, nominal_normals, reasons, told_apart
-from calibrate.board.zhang import solve
+from calibrate.board.cameras import TwoCameras, solve, two_cameras
+from calibrate.board.detect import BoardView
+from calibrate.board.lens import Floats, Lens, unknown_lens
+from calibrate.board.plane import homography
 from calibrate.errors import CalibrationError
 
+Ways = NDArray[np.int64]
 LEAST_VIEWS = 4
 GOOD_VIEWS = 10
 EARNED_WAYS = 6
@@ -35,6 +37,10 @@ GRID_WORDS = (
 )
 LEAST_SLANT_DEG = 15.0
 """Boards face on tell focal length and distance together only."""
+SAME_SHARE = 0.0015
+"""Of the image's longer side. Corners that lie nearer are the same but for noise: 1 px of 640."""
+DISTINCT_DEG = 5.0
+"""Boards less than this apart are held alike: parallel planes tell a lens's focal length no more than one of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +77,7 @@ class Fitted:
 
 
 def fit_lens(
-    views: Sequence[View],
+    views: Sequence[BoardView],
     rms_limit_px: float = RMS_LIMIT_PX,
     unusable: Mapping[str, str] | None = None,
     *,
@@ -82,7 +88,7 @@ def fit_lens(
     Raises `CalibrationError` for fewer than `LEAST_VIEWS` views that differ, and for photographs of two cameras, by
     their size or (unless they are said to be of `one_camera`) by what they tell of the lens.
     """
-    seen, left_out = told_apart(views)
+    seen, left_out = distinct_views(views)
     left_out = {**(unusable or {}), **left_out}
     where = f"{len(views) + len(unusable or {})} photographs"
     _one_size(seen, where)
@@ -127,7 +133,7 @@ def fit_lens(
     )
 
 
-def _one_size(views: Sequence[View], where: str) -> None:
+def _one_size(views: Sequence[BoardView], where: str) -> None:
     sizes: dict[tuple[int, int], list[str]] = {}
     for view in views:
         sizes.setdefault(view.size_px, []).append(view.name)
@@ -144,7 +150,7 @@ def _two_cameras(two: TwoCameras) -> str:
     )
 
 
-def _focal(views: Sequence[View], ways: Ways, where: str) -> tuple[float, float] | None:
+def _focal(views: Sequence[BoardView], ways: Ways, where: str) -> tuple[float, float] | None:
     """Standard errors of fx and fy, by leaving out each way in which the board was held (jackknife).
 
     Views that are held alike err alike, and so go together. None where too few ways do not earn an error.
@@ -159,7 +165,7 @@ def _focal(views: Sequence[View], ways: Ways, where: str) -> tuple[float, float]
     return float(spread[0]), float(spread[1])
 
 
-def guidance(views: Sequence[View], slants_deg: Sequence[float], ways: int = EARNED_WAYS) -> tuple[str, ...]:
+def guidance(views: Sequence[BoardView], slants_deg: Sequence[float], ways: int = EARNED_WAYS) -> tuple[str, ...]:
     """What is missing in these views, held in so many ways, as instructions."""
     wanted: list[str] = []
     if len(views) < GOOD_VIEWS:
@@ -179,3 +185,70 @@ def guidance(views: Sequence[View], slants_deg: Sequence[float], ways: int = EAR
             f"slant the board by {LEAST_SLANT_DEG:.0f} to 45 deg in at least 4 photographs ({slanted} so far)"
         )
     return tuple(wanted)
+
+
+def named(photographs: Sequence[Path]) -> dict[str, Path]:
+    """Each photograph by a name of its own: the file's, with its folder where there are several, else numbered."""
+    folders = len({path.parent for path in photographs})
+    found: dict[str, Path] = {}
+    for path in photographs:
+        name = plain = f"{path.parent.name}/{path.name}" if folders > 1 else path.name
+        number = 1
+        while name in found:
+            number += 1
+            name = f"{plain} ({number})"
+        found[name] = path
+    return found
+
+
+def distinct_views(views: Iterable[BoardView]) -> tuple[list[BoardView], dict[str, str]]:
+    """The views that show the board somewhere else than those before; of each other one, which it repeats."""
+    kept, again = list[BoardView](), dict[str, str]()
+    for view in views:
+        twin = next((one for one in kept if _same(one, view)), None)
+        if twin is None:
+            kept.append(view)
+        else:
+            again[view.name] = f"shows the board where {twin.name} does: they count once"
+    return kept, again
+
+
+def held(normals: Floats) -> Ways:
+    """(n,) number of the way in which each board is held, by the (n, 3) unit vectors out of them."""
+    first, ways = list[Floats](), list[int]()
+    for normal in normals:
+        near = [k for k, one in enumerate(first) if float(normal @ one) > np.cos(np.radians(DISTINCT_DEG))]
+        ways.append(near[0] if near else len(first))
+        if not near:
+            first.append(normal)
+    return np.array(ways, np.int64)
+
+
+def nominal_normals(views: Sequence[BoardView]) -> Floats:
+    """(n, 3) unit vectors out of each board as a straight lens of one image width sees them.
+
+    Rough, but no lens that was fitted to boards that are all held alike can tell them apart here.
+    """
+    rays = np.linalg.inv(unknown_lens(views[0].size_px).matrix)
+    found = list[Floats]()
+    for view in views:
+        across, along, _ = (rays @ homography(view.board_mm, view.pixels, view.name)).T
+        normal = np.cross(across, along)
+        found.append(normal / (np.linalg.norm(normal) * (-1.0 if normal[2] < 0.0 else 1.0)))
+    return np.array(found)
+
+
+def reasons(why: Mapping[str, str]) -> list[str]:
+    """What is wrong with which photographs, once each."""
+    names: dict[str, list[str]] = {}
+    for name, told in why.items():
+        names.setdefault(told, []).append(name)
+    return [f"{', '.join(those)}: {told}" for told, those in names.items()]
+
+
+def _same(one: BoardView, other: BoardView) -> bool:
+    shared, here, there = np.intersect1d(one.ids, other.ids, return_indices=True)
+    if one.size_px != other.size_px or 2 * len(shared) < min(len(one.ids), len(other.ids)):
+        return False
+    apart = np.linalg.norm(one.pixels[here] - other.pixels[there], axis=1)
+    return bool(np.median(apart) < SAME_SHARE * max(one.size_px))

@@ -1,4 +1,4 @@
-"""A lens: where a pixel would lie if the lens were straight, and the way back (OpenCV's five-parameter model)."""
+"""A lens: where a pixel would lie without its distortion, and the way back (OpenCV's five-parameter model)."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ class Lens:
     """Width and height."""
 
     def check_size(self, image: Gray, where: str) -> None:
-        """Raises `CalibrationError` for an (h, w) photograph of another size: the lens says nothing of it."""
+        """Raise `CalibrationError` for an (h, w) photograph of another size: the lens does not apply to it."""
         size_px = (image.shape[1], image.shape[0])
         if size_px != self.size_px:
             is_px, was_px = (f"{width} x {height} px" for width, height in (size_px, self.size_px))
             raise CalibrationError(where, f"is {is_px}, the lens was calibrated at {was_px}")
 
-    def straight(self, pixels: Floats) -> Floats:
-        """(n, 2) pixels of a photograph -> where they lie in the straightened one."""
+    def undistorted(self, pixels: Floats) -> Floats:
+        """(n, 2) pixels of a photograph -> where they lie in the undistorted one."""
         none = np.eye(3)
         found = cv2.undistortPointsIter(
             pixels.reshape(-1, 1, 2).astype(np.float64), self.matrix, self.distortion, none, self.matrix, ROUNDS
         )
         return np.asarray(found, np.float64).reshape(-1, 2)
 
-    def bent(self, pixels: Floats) -> Floats:
-        """(n, 2) pixels of the straightened photograph -> where they lie in the photograph as it was taken."""
+    def distorted(self, pixels: Floats) -> Floats:
+        """(n, 2) pixels of the undistorted photograph -> where they lie in the photograph as it was taken."""
         focal, centre = np.array([self.matrix[0, 0], self.matrix[1, 1]]), self.matrix[:2, 2]
         return distort((pixels - centre) / focal, self.distortion) * focal + centre
 
-    def straighten(self, image: Gray) -> Gray:
+    def undistort(self, image: Gray) -> Gray:
         """The photograph as a lens without distortion would have taken it, same size and camera matrix."""
         return cast("Gray", cv2.undistort(image, self.matrix, self.distortion))
 
@@ -58,32 +58,32 @@ def lens_of(
     distortion: tuple[float, float, float, float, float],
     size_px: tuple[int, int],
 ) -> Lens:
-    """A lens from what files hold: fx, fy, cx, cy in pixels; k1, k2, p1, p2, k3; width and height."""
+    """A lens from the numbers in files: fx, fy, cx, cy in pixels; k1, k2, p1, p2, k3; width and height."""
     fx, fy, cx, cy = matrix
     return Lens(np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.array(distortion), size_px)
 
 
 class LensUsed(BaseModel):
-    """The lens by which photographs are straightened, and where it is known from."""
+    """The lens by which photographs are undistorted, as it stands in files, and its source."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     source: str
-    """`lens file <hash>`, or `k1 fitted on the board` where no lens was known and none was missed."""
+    """`lens file <hash>`, or `k1 fitted on the board` where no lens file was given and none was needed."""
     size_px: tuple[int, int]
-    """Width and height of the photographs that it holds for."""
+    """Width and height of the photographs that it applies to."""
     matrix: tuple[float, float, float, float]
     """fx, fy, cx, cy in pixels, pixel centres on integers."""
     distortion: tuple[float, float, float, float, float]
     """k1, k2, p1, p2, k3 of OpenCV's model."""
 
     def lens(self) -> Lens:
-        """To look through."""
+        """The lens to compute with."""
         return lens_of(self.matrix, self.distortion, self.size_px)
 
     @classmethod
     def of(cls, lens: Lens, source: str) -> LensUsed:
-        """What stands in a file of a lens."""
+        """The file form of a lens."""
         m, d = lens.matrix, [float(v) for v in lens.distortion]
         return cls(
             source=source,
@@ -94,7 +94,7 @@ class LensUsed(BaseModel):
 
 
 def distort(rays: Floats, distortion: Floats) -> Floats:
-    """(n, 2) points at distance 1 through Brown's model as OpenCV has it; `distortion` is k1, k2, p1, p2, k3."""
+    """Distort (n, 2) points at distance 1 by Brown's model as OpenCV defines it; `distortion` is k1, k2, p1, p2, k3."""
     k1, k2, p1, p2, k3 = distortion
     x, y = rays[:, 0], rays[:, 1]
     r2 = x * x + y * y
@@ -105,7 +105,7 @@ def distort(rays: Floats, distortion: Floats) -> Floats:
 
 
 def unknown_lens(size_px: tuple[int, int]) -> Lens:
-    """What is assumed of a camera without intrinsics: no distortion, axis in the middle, one image width of focus."""
+    """Assumed for a camera without intrinsics: no distortion, axis in the middle, focal length of one image width."""
     width, height = size_px
     focal = float(max(width, height))
     matrix = np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibrate.board.detect import Board, Checkerboard
-from calibrate.board.scale import charuco_board
+from calibrate.board.spec import Board, Checkerboard, charuco_board, describe, size_mm
 from calibrate.errors import CalibrationError
 from calibrate.files import check_target
 
@@ -54,24 +53,6 @@ def rectangles(board: Board) -> list[Rectangle]:
             for start, end in _runs(np.asarray(bits)[row] == 0):
                 black.append((left + start * bit_mm, top + row * bit_mm, (end - start) * bit_mm, bit_mm))
     return black
-
-
-def size_mm(board: Board) -> tuple[float, float]:
-    """Width and height of the board."""
-    columns, rows = (n + 1 for n in board.inner_corners) if isinstance(board, Checkerboard) else board.squares
-    return columns * board.square_mm, rows * board.square_mm
-
-
-def describe(board: Board) -> str:
-    """The board in words, as it is printed below it."""
-    if isinstance(board, Checkerboard):
-        columns, rows = board.inner_corners
-        return f"checkerboard, {columns} x {rows} inner corners, squares of {board.square_mm:g} mm"
-    columns, rows = board.squares
-    return (
-        f"ChArUco, {columns} x {rows} squares of {board.square_mm:g} mm, "
-        f"markers of {board.marker_mm:g} mm, {board.dictionary}"
-    )
 
 
 def _page(board: Board, page: str) -> tuple[float, float]:

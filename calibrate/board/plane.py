@@ -1,18 +1,22 @@
-"""The paper plane through a lens that bends: homography and radial terms fitted together, pix2len with its interval."""
+"""The paper plane in a photograph: homography and radial lens terms fitted together, pix2len with its interval."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
 from calibrate.board.lens import Floats, Lens
-from calibrate.board.scale import MOST_OUTLIERS, WORST_RMS_PX, apply, homography
 from calibrate.errors import CalibrationError
 
+MOST_OUTLIERS = 0.1
+WORST_RMS_PX = 1.0
+"""Above this the board was not flat, not seen sharply, or is not the board of the configuration."""
 RADIAL_TERMS = 1
 """k1 is fitted anew on every view: refocusing changes it. A second term costs a flat view three times the interval."""
 OUTLIER_SIGMAS = 5.0
@@ -24,6 +28,32 @@ LAGS = 2
 """Squares over which the errors of corners may be correlated."""
 
 
+def apply(homography: Floats, points: Floats) -> Floats:
+    """(n, 2) points through a (3, 3) homography."""
+    mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
+    return mapped[:, :2] / mapped[:, 2:]
+
+
+def homography(pixels: Floats, paper_mm: Floats, where: str) -> Floats:
+    """(3, 3) from (n, 2) to (n, 2) points by least squares. Raises `CalibrationError` where they lie on a line."""
+    found, _ = cv2.findHomography(pixels, paper_mm, 0)
+    if found is None or not np.all(np.isfinite(found)):  # pyright: ignore[reportUnnecessaryComparison]
+        raise CalibrationError(where, "the board's corners lie on a line: no plane can be had from them")
+    return np.asarray(found, np.float64)
+
+
+def local_scale(to_paper: Callable[[Floats], Floats], pixel: Floats) -> float:
+    """mm per pixel at a pixel (2,): square root of the area of its image on the paper."""
+    return float(np.sqrt(_area(to_paper, pixel))) / (2.0 * STEP_PX)
+
+
+def _area(to_paper: Callable[[Floats], Floats], pixel: Floats) -> float:
+    around = pixel + STEP_PX * np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+    left, right, up, down = to_paper(around)
+    across, along = right - left, down - up
+    return abs(float(across[0] * along[1] - across[1] * along[0]))
+
+
 @dataclass(frozen=True, slots=True)
 class Plane:
     """The paper plane as a camera sees it, and the lens that it was seen through."""
@@ -31,45 +61,45 @@ class Plane:
     lens: Lens
     """With the radial terms of this view."""
     image_to_paper: Floats
-    """(3, 3) homography: pixels of the straightened photograph (centres on integers) to mm in the paper frame."""
+    """(3, 3) homography: pixels of the undistorted photograph (centres on integers) to mm in the paper frame."""
     mm_per_px: float
     """pix2len in the middle of the corners, of the photograph as it was taken."""
     interval_mm_per_px: tuple[float, float]
     """95 %: the noise of corners carried through homography and radial terms, not an error of the printed board."""
     rms_px: float
-    bend_px: float
-    """How much the lens as it was given leaves bent: root mean square of what the radial terms of this view explain."""
+    distortion_px: float
+    """Distortion that the given lens does not describe: root mean square of what this view's radial terms explain."""
     middle_px: tuple[float, float]
     """Where pix2len holds, in the photograph as it was taken."""
     corners: int
     dropped: tuple[int, ...]
-    """Corners, by their place among those given, that do not lie on the plane of the others."""
+    """Indices of the given corners that do not lie on the plane of the others."""
+    flags: tuple[str, ...] = ()
+    """What is wrong with the photograph, though the board was found: partly hidden, saturated."""
 
     def scale_at(self, pixel: Floats) -> float:
         """mm per pixel of the photograph as it was taken, at one of its pixels (2,)."""
-        around = pixel + STEP_PX * np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
-        left, right, up, down = self.to_paper(around)
-        across, along = right - left, down - up
-        return float(np.sqrt(abs(across[0] * along[1] - across[1] * along[0]))) / (2.0 * STEP_PX)
+        return local_scale(self.to_paper, pixel)
 
     def to_paper(self, pixels: Floats) -> Floats:
         """(n, 2) pixels of the photograph as it was taken -> mm in the paper frame."""
-        return apply(self.image_to_paper, self.lens.straight(pixels))
+        return apply(self.image_to_paper, self.lens.undistorted(pixels))
 
     def to_image(self, paper_mm: Floats) -> Floats:
         """(n, 2) mm in the paper frame -> pixels of the photograph as it was taken."""
-        return self.lens.bent(apply(np.asarray(np.linalg.inv(self.image_to_paper), np.float64), paper_mm))
+        return self.lens.distorted(apply(np.asarray(np.linalg.inv(self.image_to_paper), np.float64), paper_mm))
 
 
-def fit_bent_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_terms: int = RADIAL_TERMS) -> Plane:
-    """Least squares on reprojection in the photograph as it was taken, over (n, 2) corners but outliers.
+def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_terms: int = RADIAL_TERMS) -> Plane:
+    """Fit the plane to (n, 2) corners by least squares on reprojection in the photograph as it was taken.
 
-    Minimises |bent(H mm) - px| over the eight numbers of H and the first `radial_terms` of k1, k2. pix2len is a
-    function of the same numbers, so its standard error follows by the delta method (Hartley and Zisserman, Multiple
-    View Geometry, 2nd ed., section 5.2), with corners that err alike counted as such. Raises `CalibrationError` as
-    `fit_plane` does.
+    Minimises |distort(H mm) - px| over the eight numbers of H and the first `radial_terms` of k1, k2; with 0 the lens
+    stays as given. pix2len is a function of the same numbers, so its standard error follows by the delta method
+    (Hartley and Zisserman, Multiple View Geometry, 2nd ed., section 5.2), with the correlation of neighbouring corners
+    counted. Raises `CalibrationError` where more than a tenth of the corners are outliers or the residual is above
+    `WORST_RMS_PX`: a wrong or curled board.
     """
-    model = _Model(lens, paper_mm.mean(axis=0), float(np.ptp(paper_mm, axis=0).max()), radial_terms)
+    model = _Model.of(lens, paper_mm, radial_terms)
     start = model.start(pixels, paper_mm, where)
 
     def residuals(theta: Floats, kept: NDArray[np.bool_]) -> Floats:
@@ -96,8 +126,8 @@ def fit_bent_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, rad
     spread = _spread(pull, left.reshape(-1, 2), paper_mm[kept], float(left @ left) / free)
     reach = float(stdtrit(free, 0.975)) * spread
     refined, image_to_paper = model.parts(fitted.x)
-    straight = lens.straight(pixels[kept])
-    flat = apply(homography(paper_mm[kept], straight, where), paper_mm[kept]) - straight
+    undistorted = lens.undistorted(pixels[kept])
+    flat = apply(homography(paper_mm[kept], undistorted, where), paper_mm[kept]) - undistorted
     flat_rms_px = float(np.sqrt((flat**2).sum(axis=1).mean()))
     return Plane(
         refined,
@@ -112,11 +142,26 @@ def fit_bent_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, rad
     )
 
 
-def _spread(pull: Floats, left: Floats, paper_mm: Floats, variance: float) -> float:
-    """Standard error of what corners pull at by `pull`, their errors correlated as their residuals are.
+def distorted_share(pixels: Floats, paper_mm: Floats, lens: Lens, where: str) -> float:
+    """Share of a flat board's squared residuals through this lens that its k1 would explain; outliers count."""
 
-    Where edges fall alike on the pixels, neighbours err alike: the correlation is read from pairs one and two squares
-    apart and tapered as by Newey and West (Econometrica 55, 1987). It may only widen the interval.
+    def cost(radial_terms: int) -> float:
+        model = _Model.of(lens, paper_mm, radial_terms)
+
+        def residuals(theta: Floats) -> Floats:
+            return (model.project(theta, paper_mm) - pixels).ravel()
+
+        return float(least_squares(residuals, model.start(pixels, paper_mm, where), x_scale="jac").cost)
+
+    flat = cost(0)
+    return 1.0 - cost(1) / flat if flat > 0.0 else 0.0
+
+
+def _spread(pull: Floats, left: Floats, paper_mm: Floats, variance: float) -> float:
+    """Standard error of a quantity that each corner error moves by `pull`; errors correlate as the residuals do.
+
+    Neighbouring edges that fall alike on the pixel rows have similar errors: the correlation is taken from pairs one
+    and two squares apart and tapered as by Newey and West (Econometrica 55, 1987). It may only widen the interval.
     """
     apart = np.linalg.norm(paper_mm[:, None] - paper_mm[None], axis=2)
     squares = np.rint(apart / np.min(apart[apart > 0.0])).astype(np.int64)
@@ -135,16 +180,21 @@ def _steps(theta: Floats) -> list[Floats]:
 
 @dataclass(frozen=True, slots=True)
 class _Model:
-    """Plane to photograph with parameters of one size: paper in board lengths, pixels in focal lengths."""
+    """Plane to photograph with parameters of similar size: paper in board lengths, pixels in focal lengths."""
 
     lens: Lens
     middle_mm: Floats
     length_mm: float
     radial_terms: int
 
+    @classmethod
+    def of(cls, lens: Lens, paper_mm: Floats, radial_terms: int) -> _Model:
+        """Scaled to the board's corners."""
+        return cls(lens, paper_mm.mean(axis=0), float(np.ptp(paper_mm, axis=0).max()), radial_terms)
+
     def start(self, pixels: Floats, paper_mm: Floats, where: str) -> Floats:
-        straight = self.lens.straight(pixels)
-        paper_to_rays = self._rays() @ homography(paper_mm, straight, where) @ self._from_unit()
+        undistorted = self.lens.undistorted(pixels)
+        paper_to_rays = self._rays() @ homography(paper_mm, undistorted, where) @ self._from_unit()
         return np.concatenate(
             [(paper_to_rays / paper_to_rays[2, 2]).ravel()[:8], self.lens.distortion[: self.radial_terms]]
         )
@@ -152,16 +202,13 @@ class _Model:
     def project(self, theta: Floats, paper_mm: Floats) -> Floats:
         lens, paper_to_rays = self._lens(theta), self._matrix(theta)
         unit = (paper_mm - self.middle_mm) / self.length_mm
-        return lens.bent(apply(np.linalg.inv(self._rays()) @ paper_to_rays, unit))
+        return lens.distorted(apply(np.linalg.inv(self._rays()) @ paper_to_rays, unit))
 
     def log_scale(self, theta: Floats, pixel: Floats) -> float:
         """Logarithm of mm per px of the photograph as it was taken, at a pixel."""
         lens, image_to_paper = self.parts(theta)
-        around = pixel + STEP_PX * np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
-        left, right, up, down = apply(image_to_paper, lens.straight(around))
-        across, along = right - left, down - up
-        area = abs(float(across[0] * along[1] - across[1] * along[0])) / (2.0 * STEP_PX) ** 2
-        return 0.5 * float(np.log(area))
+        area = _area(lambda at: apply(image_to_paper, lens.undistorted(at)), pixel)
+        return 0.5 * float(np.log(area / (2.0 * STEP_PX) ** 2))
 
     def slope(self, theta: Floats, pixel: Floats) -> Floats:
         """Derivative of `log_scale` by each parameter, by central differences."""
@@ -170,7 +217,7 @@ class _Model:
         return np.array(change) / (2.0 * np.diag(np.array(steps)))
 
     def parts(self, theta: Floats) -> tuple[Lens, Floats]:
-        """The lens, and straightened pixels to mm."""
+        """The lens, and the homography from undistorted pixels to mm."""
         paper_to_image = np.linalg.inv(self._rays()) @ self._matrix(theta) @ np.linalg.inv(self._from_unit())
         image_to_paper = np.linalg.inv(paper_to_image)
         return self._lens(theta), np.asarray(image_to_paper / image_to_paper[2, 2], np.float64)

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import csv
+import hashlib
+import io
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -12,8 +17,10 @@ from numpy.typing import NDArray
 
 from calibrate.board.lens import Floats
 from calibrate.errors import CalibrationError
+from calibrate.files import read_bounded
 
 Model = Literal["rigid", "similarity", "affine"]
+COLUMNS = ("name", "robot_x_mm", "robot_y_mm", "image_x_px", "image_y_px")
 LEAST_POINTS = {"rigid": 3, "similarity": 3, "affine": 4}
 WORST_RMS_MM = 5.0
 TRIALS = 500
@@ -151,3 +158,46 @@ def _apply(matrix: Floats, points: Floats) -> Floats:
 
 def _rms(residuals: Floats) -> float:
     return float(np.sqrt((residuals**2).sum(axis=1).mean()))
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """What the robot was told and where the camera saw it."""
+
+    names: tuple[str, ...]
+    robot_mm: Floats
+    """(n, 2) in the base frame."""
+    image_px: Floats
+    """(n, 2) in the photograph as it was taken, pixel centres on integers."""
+    sha256: str
+
+
+def read_points(table: Path) -> Points:
+    """Read `COLUMNS`. Raises `CalibrationError` naming line and column."""
+    data = read_bounded(table)
+    try:
+        rows = list(csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise CalibrationError(str(table), f"is no CSV table in UTF-8: {error}") from None
+    missing = [name for name in COLUMNS if not rows or name not in rows[0]]
+    if missing:
+        raise CalibrationError(str(table), f"needs rows with the columns {', '.join(COLUMNS)}; missing: {missing[0]}")
+    values = [[_number(table, line, name, row[name]) for name in COLUMNS[1:]] for line, row in enumerate(rows, start=2)]
+    names = tuple(row["name"].strip() for row in rows)
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise CalibrationError(str(table), f"point {twice!r} appears twice")
+    numbers = np.array(values)
+    return Points(names, numbers[:, :2], numbers[:, 2:], hashlib.sha256(data).hexdigest())
+
+
+def _number(table: Path, line: int, name: str, text: str | None) -> float:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise CalibrationError(
+            str(table), f"line {line}, column `{name}`: {(text or '')[:80]!r} is not a finite number"
+        )
+    return value

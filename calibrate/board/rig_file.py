@@ -13,7 +13,7 @@ from typing import Any, cast
 
 from pydantic import ValidationError
 
-from calibrate.board.scale import BoardSpec
+from calibrate.board.spec import BoardSpec
 from calibrate.errors import CalibrationError, invalid
 from calibrate.files import read_bounded, write_whole
 

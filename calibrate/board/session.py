@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 
 from calibrate.board.artefact import read_lens
 from calibrate.board.lens import Gray, LensUsed
-from calibrate.board.scale import BoardSpec
+from calibrate.board.spec import BoardSpec
 from calibrate.errors import CalibrationError
 from calibrate.files import read_bounded
 from sessions.reader import Recording

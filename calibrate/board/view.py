@@ -1,70 +1,125 @@
-"""The paper plane in one photograph: corners found, lens undone, plane fitted."""
+"""The board in one photograph: corners found, plane fitted, lens checked; for live use, artefacts and pre-flight."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from calibrate.board.detect import View, see
+from calibrate.board.artefact import LensFile
+from calibrate.board.detect import BoardView, find_board
+from calibrate.board.intrinsics import RMS_LIMIT_PX
 from calibrate.board.lens import Floats, Gray, Lens, unknown_lens
-from calibrate.board.plane import Plane, fit_bent_plane
-from calibrate.board.scale import BENT, OTHER_LENS, BoardSpec
+from calibrate.board.plane import Plane, distorted_share, fit_plane
+from calibrate.board.spec import BoardSpec
 from calibrate.errors import CalibrationError
 
-BEND_PX = 0.5
-"""A lens that bends the board by more (root mean square) is visible: one flat view is too little to calibrate it by."""
-LEFT_PX = 1.5
-"""A lens file that leaves more is not of this camera; less is a focus that breathes: the view's own k1 takes it up."""
+VISIBLE_PX = 0.5
+"""A lens that distorts the board by more (root mean square) needs a lens file: one flat view cannot calibrate it."""
+REMAINING_PX = 1.5
+"""A lens file that leaves more is of another camera; less is a focus that breathes: the view's own k1 describes it."""
+DISTORTED_SHARE = 0.85
+"""Of the squared residuals. One radial term explains 0.7 of a board that is curled along its length, more of a lens."""
+NO_LENS_FILE = (
+    "the lens bends straight lines: calibrate it with `brushloop camera intrinsics`, then name the lens file as "
+    "camera.lens_file in rig.toml, or with --lens"
+)
+OTHER_LENS = "distortion remains after the lens was corrected: the lens file is of another camera, or of another focus"
+LEAST_PX_PER_MM = 4.0
+"""Below this a tip of 0.5 mm is two pixels wide."""
+WORST_INTERVAL = 5e-4
+"""Relative half width of pix2len's interval: 0.01 mm over 20 mm."""
+REFOCUSED = 0.02
+"""Difference of k1 from the calibrated one beyond which the lens is not as it was."""
 
 
-def see_plane(image: Gray, spec: BoardSpec, lens: Lens | None = None, where: str = "camera") -> Plane:
-    """The paper plane from one photograph, its own radial term fitted. Raises `CalibrationError`."""
-    return see_flagged(image, spec, lens, where)[0]
+def see_board(image: Gray, spec: BoardSpec, where: str = "camera", lens: Lens | None = None) -> Plane:
+    """The paper plane in an undistorted photograph, or in one seen through a known lens, which stays as given.
+
+    Raises `CalibrationError`; where the lens distorts, it says what to do about it.
+    """
+    view, through = _find(image, spec, where, lens)
+    corners_mm = paper_mm(view, spec)
+    try:
+        return replace(fit_plane(view.pixels, corners_mm, through, where, radial_terms=0), flags=view.flags)
+    except CalibrationError as error:
+        if distorted_share(view.pixels, corners_mm, through, where) > DISTORTED_SHARE:
+            raise CalibrationError(where, f"{error.what}; {NO_LENS_FILE if lens is None else OTHER_LENS}") from None
+        raise
 
 
-def see_flagged(
+def see_board_and_lens(
     image: Gray,
     spec: BoardSpec,
     lens: Lens | None = None,
     where: str = "camera",
     sheet_mm: tuple[float, float] | None = None,
-) -> tuple[Plane, tuple[str, ...]]:
-    """The same, and what is not as it should be with the photograph; a sheet of that size may lie on the board.
+) -> Plane:
+    """The paper plane in a photograph as it was taken, with the lens's k1 fitted anew.
 
-    Raises `CalibrationError`.
+    A sheet of that size may lie on the board. Raises `CalibrationError`.
     """
-    if lens is not None:
-        lens.check_size(image, where)
-    view = see(image, spec, where, None if sheet_mm is None else beside(spec, sheet_mm))
-    return fit_bent_plane(view.pixels, paper_mm(view, spec), lens or unknown_lens(view.size_px), where), view.flags
+    view, through = _find(image, spec, where, lens, sheet_mm)
+    return replace(fit_plane(view.pixels, paper_mm(view, spec), through, where), flags=view.flags)
 
 
-def see_straight(
+def calibration_plane(
     image: Gray, spec: BoardSpec, lens: Lens | None, where: str, sheet_mm: tuple[float, float] | None = None
-) -> tuple[Plane, tuple[str, ...]]:
-    """The same, for what is to be measured with. Raises `CalibrationError` also where more is bent than is known of."""
-    plane, flags = see_flagged(image, spec, lens, where, sheet_mm)
-    if told := bend(plane, known=lens is not None):
-        raise CalibrationError(where, told)
-    return plane, flags
+) -> Plane:
+    """The same, for measuring with. Raises `CalibrationError` also where the lens distorts more than is known of it."""
+    plane = see_board_and_lens(image, spec, lens, where, sheet_mm)
+    if problem := lens_problem(plane, known=lens is not None):
+        raise CalibrationError(where, problem)
+    return plane
 
 
-def bend(plane: Plane, *, known: bool) -> str:
-    """What is to be done about the lens, in words; empty where it is straight enough, or as it is known to be."""
-    if plane.bend_px <= (LEFT_PX if known else BEND_PX):
+def lens_problem(plane: Plane, *, known: bool) -> str:
+    """What to do about the lens; empty where it distorts little, or as its file says."""
+    if plane.distortion_px <= (REMAINING_PX if known else VISIBLE_PX):
         return ""
-    return f"the board is bent by {plane.bend_px:.1f} px: if it lies flat, {OTHER_LENS if known else BENT}"
+    advice = OTHER_LENS if known else NO_LENS_FILE
+    return f"the board is bent by {plane.distortion_px:.1f} px: if it lies flat, {advice}"
 
 
-def paper_mm(view: View, spec: BoardSpec) -> Floats:
-    """(n, 2) places of a view's corners in the paper frame."""
+def preflight(
+    image: Gray, spec: BoardSpec, lens: LensFile | None = None, rms_limit_px: float = RMS_LIMIT_PX
+) -> tuple[Plane, tuple[str, ...]]:
+    """The plane in a photograph of the board, and warnings for the operator before a session.
+
+    Raises `CalibrationError` where the board is not seen at all.
+    """
+    plane = see_board_and_lens(image, spec, lens.lens() if lens else None)
+    warnings = list(plane.flags)
+    if lens is not None and lens.rms_px > rms_limit_px:
+        warnings.append(f"the lens was calibrated with a residual of {lens.rms_px:.2f} px, limit {rms_limit_px:g} px")
+    if problem := lens_problem(plane, known=lens is not None):
+        warnings.append(problem)
+    if plane.rms_px > rms_limit_px:
+        warnings.append(f"the board's residual is {plane.rms_px:.2f} px, limit {rms_limit_px:g} px: is the board flat?")
+    k1 = float(plane.lens.distortion[0])
+    if lens is not None and abs(k1 - lens.distortion[0]) > REFOCUSED:
+        warnings.append(f"k1 is {k1:+.3f} here and was {lens.distortion[0]:+.3f}: was the lens refocused?")
+    if 1.0 / plane.mm_per_px < LEAST_PX_PER_MM:
+        warnings.append(f"only {1.0 / plane.mm_per_px:.1f} px/mm, at least {LEAST_PX_PER_MM:g} are needed")
+    low, high = plane.interval_mm_per_px
+    if (high - low) / 2.0 > WORST_INTERVAL * plane.mm_per_px:
+        reach = 50.0 * (high - low) / plane.mm_per_px
+        warnings.append(f"pix2len is only known to {reach:.2f} %: show more of the board")
+    if plane.dropped:
+        warnings.append(f"{len(plane.dropped)} corners do not lie on the plane of the others")
+    return plane, tuple(warnings)
+
+
+def paper_mm(view: BoardView, spec: BoardSpec) -> Floats:
+    """(n, 2) the corners of a view in the paper frame."""
     height_mm = spec.squares[1] * spec.square_mm
     # The board counts y downward from its upper left corner; the paper frame counts it upward.
     flip = np.array([1.0, -1.0])
     return np.array([spec.origin_mm[0], spec.origin_mm[1] + height_mm]) + flip * view.board_mm
 
 
-def beside(spec: BoardSpec, sheet_mm: tuple[float, float]) -> int:
-    """Corners of the board that lie half a square and more beside a sheet at the origin of the paper frame."""
+def corners_beside(spec: BoardSpec, sheet_mm: tuple[float, float]) -> int:
+    """Number of corners at least half a square outside a sheet that lies at the origin of the paper frame."""
     (columns, rows), side, (x_mm, y_mm) = spec.squares, spec.square_mm, spec.origin_mm
     across = x_mm + side * np.arange(1, columns)
     along = y_mm + side * np.arange(1, rows)
@@ -72,3 +127,12 @@ def beside(spec: BoardSpec, sheet_mm: tuple[float, float]) -> int:
     clear_x = (across <= -gap_mm) | (across >= sheet_mm[0] + gap_mm)
     clear_y = (along <= -gap_mm) | (along >= sheet_mm[1] + gap_mm)
     return int((clear_x[:, None] | clear_y[None, :]).sum())
+
+
+def _find(
+    image: Gray, spec: BoardSpec, where: str, lens: Lens | None, sheet_mm: tuple[float, float] | None = None
+) -> tuple[BoardView, Lens]:
+    if lens is not None:
+        lens.check_size(image, where)
+    view = find_board(image, spec, where, None if sheet_mm is None else corners_beside(spec, sheet_mm))
+    return view, lens or unknown_lens(view.size_px)

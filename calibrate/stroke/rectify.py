@@ -35,10 +35,10 @@ def rectify_by(image: Gray, calibration: Calibration, window_mm: tuple[float, fl
     if (width, height) != calibration.lens.size_px:
         wanted = "{} x {}".format(*calibration.lens.size_px)
         raise CaptureRefused(where, f"is {width} x {height} px, the calibration is for {wanted} px")
-    return rectify_bent(image, calibration, window_mm)
+    return rectify_distorted(image, calibration, window_mm)
 
 
-def rectify_bent(image: Gray, plane: SeenPlane, window_mm: tuple[float, float, float, float]) -> Gray:
+def rectify_distorted(image: Gray, plane: SeenPlane, window_mm: tuple[float, float, float, float]) -> Gray:
     """The window (x, y, width, height in the paper frame) at 20 px/mm, as `preprocess.rectify` gives it.
 
     The photograph is as it was taken: what the lens bends is undone here.

@@ -26,7 +26,7 @@ from calibrate.stroke.preprocess import (
     to_levels,
     touches_edge,
 )
-from calibrate.stroke.rectify import rectify_bent
+from calibrate.stroke.rectify import rectify_distorted
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +73,10 @@ def trace_seen(
     """
     k1, k2, p1, p2, k3 = (float(v) for v in plane.lens.distortion)
     lens = {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
-    raster = rectify_bent(image, plane, window_mm)
+    raster = rectify_distorted(image, plane, window_mm)
     stages = (
         Stage("captured", image, {"width_px": float(image.shape[1]), "height_px": float(image.shape[0])}),
-        Stage("undistort", plane.lens.straighten(image), lens),
+        Stage("undistort", plane.lens.undistort(image), lens),
         Stage(
             "rectify", raster, {"px_per_mm": PX_PER_MM, "pix2len_mm_per_px": plane.mm_per_px, "rms_px": plane.rms_px}
         ),

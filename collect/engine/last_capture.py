@@ -18,7 +18,7 @@ from model.fitted import FittedPress
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from calibrate.board.scale import PlaneFit
+    from calibrate.board.plane import Plane
     from calibrate.stroke.preprocess import Gray
 
 PX_PER_MM = 20.0
@@ -66,7 +66,7 @@ def published_mark(
     return np.asarray(fine.reshape(SIZE_PX, FINE, SIZE_PX, FINE).mean(axis=(1, 3)) > 0.5)
 
 
-def pictures_of(image: Gray, plane: PlaneFit, cell: Cell) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+def pictures_of(image: Gray, plane: Plane, cell: Cell) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     """The field around the cell's zero-touch point, and its ink on 128 x 128; no ink where none is found."""
     field = Field()
     window = field.window_mm(cell.anchor_mm)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from dataclasses import replace
 
-from calibrate.board.scale import WORST_RMS_PX
+from calibrate.board.plane import WORST_RMS_PX
 from collect.engine.questions import GO_ON, KEEP, STOP
 from collect.engine.set_up_steps import SET_UP, TITLES, Fact, SetUpStep, Standing
 from collect.operator import Choice, Prompt

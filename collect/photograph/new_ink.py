@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.scale import Floats, apply, local_scale
+from calibrate.board.lens import Floats
+from calibrate.board.plane import apply, local_scale
 from calibrate.stroke.preprocess import PX_PER_MM, rectify
 
 Gray = NDArray[np.uint8]
@@ -78,7 +79,7 @@ def new_marks(before: Gray, after: Gray, image_to_paper: Floats, least_ink_mm2: 
     darker = np.asarray((first - second / max(light, 1e-3)) / np.maximum(first, DARK_SHARE * paper), np.float32)
     height, width = darker.shape
     middle = np.array([0.5 * width, 0.5 * height])
-    reach_px = max(1, round(0.5 * JOIN_MM / local_scale(image_to_paper, middle)))
+    reach_px = max(1, round(0.5 * JOIN_MM / local_scale(lambda at: apply(image_to_paper, at), middle)))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach_px + 1, 2 * reach_px + 1))
     joined = cv2.dilate((darker > DARKER).astype(np.uint8), kernel)
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(joined, connectivity=8)
@@ -100,4 +101,4 @@ def _mark(
     rows, columns = np.mgrid[y : y + height, x : x + width]
     pixel = np.array([float((columns * weights).sum()), float((rows * weights).sum())]) / total
     [[x_mm, y_mm]] = apply(image_to_paper, pixel[None])
-    return Mark(float(x_mm), float(y_mm), total * local_scale(image_to_paper, pixel) ** 2)
+    return Mark(float(x_mm), float(y_mm), total * local_scale(lambda at: apply(image_to_paper, at), pixel) ** 2)

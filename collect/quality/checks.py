@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.board.scale import PlaneFit
+from calibrate.board.plane import Plane
 from calibrate.stroke.preprocess import PX_PER_MM, Gray, Params, rectify
 from collect.quality import picture
 from collect.quality.ink import Ink, Point, Rect, around, mm2, take, tell_apart
@@ -30,14 +30,14 @@ CROSSING_MM = 4.0
 """Ink across the edge of a cell: more than the end of one stroke that went too far."""
 
 
-def check_frame(image: Gray, plane: PlaneFit, limits: QualityConfig) -> Verdict:
+def check_frame(image: Gray, plane: Plane, limits: QualityConfig) -> Verdict:
     """Exposure and blur of an (h, w) frame; needs no ink. For the board's picture, and before any press."""
     return Verdict((exposure(image, limits), *blurred(image, plane, limits)))
 
 
 def check_capture(
     image: Gray,
-    plane: PlaneFit,
+    plane: Plane,
     cell: Cell,
     *,
     height_mm: float,
@@ -71,7 +71,7 @@ def check_capture(
 
 def check_drawing(
     image: Gray,
-    plane: PlaneFit,
+    plane: Plane,
     cell: Cell,
     *,
     height_mm: float,
@@ -93,7 +93,7 @@ def check_drawing(
     return Verdict((*frame.checks, crossing(float(edge.sum()) / PX_PER_MM), blank(mm2(inked), height_mm, limits)))
 
 
-def cell_is_blank(image: Gray, plane: PlaneFit, cell: Cell, *, limits: QualityConfig) -> Check:
+def cell_is_blank(image: Gray, plane: Plane, cell: Cell, *, limits: QualityConfig) -> Check:
     """Whether the cell may be pressed on, from an (h, w) photograph; `NEIGHBOUR` where it holds ink or is not seen."""
     patch = take(image, plane.image_to_paper, cell.rect_mm, Params())
     hidden_mm2 = mm2(~patch.in_view)
@@ -108,7 +108,7 @@ class _Press:
 
     image: Gray
     previous: Gray | None
-    plane: PlaneFit
+    plane: Plane
     cell: Cell
     anchor_mm: Point
     height_mm: float
@@ -174,7 +174,7 @@ def exposure(image: Gray, limits: QualityConfig) -> Check:
     return Check(Failure.EXPOSURE, level, "of 255", limit, not reason, reason)
 
 
-def blurred(image: Gray, plane: PlaneFit, limits: QualityConfig) -> tuple[Check, ...]:
+def blurred(image: Gray, plane: Plane, limits: QualityConfig) -> tuple[Check, ...]:
     """Sharp edges; none where the picture has no edge to measure, as with a bare sheet that fills it."""
     sigma_px = picture.blur_px(image)
     if sigma_px is None:
@@ -184,7 +184,7 @@ def blurred(image: Gray, plane: PlaneFit, limits: QualityConfig) -> tuple[Check,
     return (_below(Failure.BLURRED, sigma_mm, "mm", limits.blur_mm, reason),)
 
 
-def cut(ink: Ink, plane: PlaneFit, shape: tuple[int, ...], anchor_mm: Point, limits: QualityConfig) -> Check:
+def cut(ink: Ink, plane: Plane, shape: tuple[int, ...], anchor_mm: Point, limits: QualityConfig) -> Check:
     """The stroke, or where there is none the zero-touch point, wholly in the frame."""
     points = ink.patch.points_mm(ink.own) if ink.own.any() else np.array([anchor_mm])
     gap_mm = picture.edge_mm(points, plane, shape)
@@ -192,7 +192,7 @@ def cut(ink: Ink, plane: PlaneFit, shape: tuple[int, ...], anchor_mm: Point, lim
     return _at_least(Failure.CUT, gap_mm, "mm", limits.edge_mm, reason)
 
 
-def glare(image: Gray, plane: PlaneFit, window: Rect, cell_mm: Rect, limits: QualityConfig) -> Check:
+def glare(image: Gray, plane: Plane, window: Rect, cell_mm: Rect, limits: QualityConfig) -> Check:
     """No reflection in the cell; `window` holds enough of the paper around it to know the light."""
     spots = picture.glare(rectify(image, plane.image_to_paper, window), limits.glare_share)
     scale = picture.BRIGHT_PX_PER_MM

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from calibrate.board.scale import Floats, apply
+from calibrate.board.lens import Floats
+from calibrate.board.plane import apply
 from calibrate.stroke.preprocess import PX_PER_MM, Gray, Mask, Params, Soft, flatten, rectify
 
 Rect = tuple[float, float, float, float]

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.scale import Floats, PlaneFit, apply
+from calibrate.board.lens import Floats
+from calibrate.board.plane import Plane, apply
 from calibrate.stroke.preprocess import PX_PER_MM, Gray, Mask
 
 FINE_PX, WIDE_PX = 1.0, 2.0
@@ -68,7 +69,7 @@ def _slope(image: Gray, sigma_px: float, dx: int, dy: int) -> NDArray[np.float32
     return np.abs(cv2.filter2D(smooth, cv2.CV_32F, kernel if dx else kernel.T)).astype(np.float32)
 
 
-def edge_mm(points_mm: Floats, plane: PlaneFit, shape: tuple[int, ...]) -> float:
+def edge_mm(points_mm: Floats, plane: Plane, shape: tuple[int, ...]) -> float:
     """Distance of the outermost of (n, 2) points of the paper from the edge of the frame; negative beyond it."""
     pixels = apply(np.asarray(np.linalg.inv(plane.image_to_paper), np.float64), points_mm)
     most = np.array([shape[1], shape[0]]) - 1.0

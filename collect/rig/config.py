@@ -18,7 +18,7 @@ from pydantic_settings import (
     SettingsError,
 )
 
-from calibrate.board.scale import BoardSpec
+from calibrate.board.spec import BoardSpec
 from collect.errors import ConfigError
 from collect.rig.config_devices import CameraConfig, ForceConfig, InkDeviceConfig, RobotConfig
 from collect.rig.config_file import Config, Finite, Positive, models_at, nearest, paths, place, read_toml, refusal

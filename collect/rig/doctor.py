@@ -13,7 +13,7 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from calibrate.board.scale import see_board
+from calibrate.board.view import see_board
 from calibrate.errors import CalibrationError
 from collect.rig.config import RigConfig
 from collect.rig.config_devices import ForceConfig, InkDeviceConfig

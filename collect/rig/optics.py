@@ -46,4 +46,4 @@ def straightened(camera: CameraConfig, image: Gray) -> Gray:
             f"the camera gives {width} x {height} px, its lens was calibrated at {lens.size_px[0]} x {lens.size_px[1]} "
             "px: set camera.locked, or calibrate the lens at this size"
         )
-    return lens.straighten(image)
+    return lens.undistort(image)

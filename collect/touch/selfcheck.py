@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.scale import see_board
+from calibrate.board.view import see_board
 from calibrate.errors import CalibrationError
 from collect.errors import StepError
 from collect.motion.touches import CHECK_SPEED_MM_S, mark_moves

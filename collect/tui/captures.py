@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from calibrate.board.scale import BoardSpec, PlaneFit, see_board
+from calibrate.board.plane import Plane
 from calibrate.board.session import board_of
+from calibrate.board.spec import BoardSpec
+from calibrate.board.view import see_board
 from calibrate.compare.similarity import csim
 from calibrate.errors import CalibrationError
 from calibrate.session import lens_in_use
@@ -75,7 +77,7 @@ class Review:
         if not (folder / JOURNAL_NAME).is_file():
             raise InputError(folder, f"holds no {JOURNAL_NAME}: imported photographs are looked at with `validate`")
         check_folder(folder)
-        self._plane: PlaneFit | None = None
+        self._plane: Plane | None = None
         self._looked: dict[int, Looked] = {}
         self._board: BoardSpec | None = None
         self._lens: Lens | None = None
@@ -143,7 +145,7 @@ class Review:
         if self._lens is not None:
             if image.shape[::-1] != self._lens.size_px:
                 return Looked(image, None, log_ns)  # the lens says nothing of a photograph of another size
-            image = self._lens.straighten(image)
+            image = self._lens.undistort(image)
         try:
             self._plane = see_board(image, self._board)
         except CalibrationError:

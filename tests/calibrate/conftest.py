@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calibrate.board.lens import LensUsed
-from calibrate.board.scale import BoardSpec
+from calibrate.board.spec import BoardSpec
 from sessions.recording.messages import encode_png, image_message
 from sessions.recording.schemas import Header, Source, StepEvent, Stroke, Topic
 from sessions.recording.writer import Outgoing

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from bench.preprocess_rigs import board_of
 from brushloop import app
 from calibrate.artefact import current, load_artefact
-from calibrate.board.scale import BoardSpec
+from calibrate.board.spec import BoardSpec
 from calibrate.calibration import Calibration
 from calibrate.errors import CalibrationError
 from drivers.geometry import brush_pose

@@ -7,11 +7,11 @@ import pytest
 
 from bench.preprocess_rigs import BRUSHES, Shot, heading_free_window, sheet, true_mask
 from calibrate.board.plane import Plane
-from calibrate.board.view import see_plane
+from calibrate.board.view import see_board_and_lens
 from calibrate.compare.scales import MM_PER_PX
 from calibrate.stroke.params import PX_PER_MM, Params
 from calibrate.stroke.preprocess import prepare
-from calibrate.stroke.rectify import rectify_bent
+from calibrate.stroke.rectify import rectify_distorted
 from calibrate.stroke.stages import trace_seen
 
 
@@ -20,7 +20,7 @@ def overlaps(shot: Shot, plane: Plane) -> list[float]:
     found: list[float] = []
     for anchor in shot.anchors_mm:
         window = heading_free_window(anchor)
-        raster = rectify_bent(shot.image, plane, window)
+        raster = rectify_distorted(shot.image, plane, window)
         at = ((anchor[0] - window[0]) * PX_PER_MM, (window[1] + window[3] - anchor[1]) * PX_PER_MM)
         mask = prepare(raster, at, "rig", Params()).mask
         truth = true_mask(shot, window, PX_PER_MM)
@@ -38,7 +38,7 @@ def anchor_error_mm(shot: Shot, plane: Plane) -> float:
 @pytest.mark.parametrize("rig", [2, 3], ids=["shadow and pincushion", "barrel"])
 def test_strokes_and_anchors_are_where_they_are(rig: int) -> None:
     shot = sheet(rig, 1)
-    plane = see_plane(shot.image, shot.board)
+    plane = see_board_and_lens(shot.image, shot.board)
     assert min(overlaps(shot, plane)) >= 0.95
     assert anchor_error_mm(shot, plane) <= 0.1
     window = heading_free_window(shot.anchors_mm[0])
@@ -58,7 +58,7 @@ def test_every_brush_under_every_camera() -> None:
     every: list[float] = []
     for rig in range(len(BRUSHES)):
         shot = sheet(rig, 15)
-        plane = see_plane(shot.image, shot.board)
+        plane = see_board_and_lens(shot.image, shot.board)
         found, anchor_mm = overlaps(shot, plane), anchor_error_mm(shot, plane)
         print(f"rig {rig}: IoU mean {np.mean(found):.4f}, worst {min(found):.4f}, anchor {anchor_mm:.4f} mm")  # noqa: T201
         assert anchor_mm <= 0.1

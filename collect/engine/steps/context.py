@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from calibrate.board.scale import PlaneFit
+from calibrate.board.plane import Plane
 from collect.engine.force_guard import ForceGuard
 from collect.engine.inking import Inking
 from collect.engine.progress import Progress
@@ -29,7 +29,7 @@ class Known:
 
     left_ink_ns: int | None = None
     """When the brush left the ink, by the host's clock; None where it has marked since, or may have lost it."""
-    image_plane: PlaneFit | None = None
+    image_plane: Plane | None = None
     """Of the newest frame in which the board was seen."""
     sound_frame: Gray | None = None
     """The newest gray photograph of the sheet that is in."""

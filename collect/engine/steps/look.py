@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from calibrate.board.scale import PlaneFit, see_board
+from calibrate.board.plane import Plane
+from calibrate.board.view import see_board
 from calibrate.errors import CalibrationError
 from calibrate.stroke.preprocess import Gray
 from collect.engine.steps.context import RunContext, StepContext
@@ -76,7 +77,7 @@ def camera_delay(context: StepContext) -> Result:
     return {"camera_delay_ms": round(1e3 * delay.delay_s, 1), "camera_jitter_ms": round(1e3 * delay.spread_s, 1)}
 
 
-def image_plane(run: RunContext, image: Gray) -> PlaneFit:
+def image_plane(run: RunContext, image: Gray) -> Plane:
     """Where the paper is in this frame: from its own board, else from the newest that was seen."""
     try:
         run.known.image_plane = see_board(image, run.rig.config.board)
@@ -86,7 +87,7 @@ def image_plane(run: RunContext, image: Gray) -> PlaneFit:
     return run.known.image_plane
 
 
-def _board(run: RunContext, image: Gray) -> tuple[PlaneFit, tuple[Check, ...]]:
+def _board(run: RunContext, image: Gray) -> tuple[Plane, tuple[Check, ...]]:
     try:
         plane = see_board(image, run.rig.config.board)
     except CalibrationError as error:

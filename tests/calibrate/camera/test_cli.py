@@ -16,7 +16,8 @@ from typer.testing import CliRunner, Result
 from brushloop import app
 from calibrate.board.artefact import LensFile
 from calibrate.board.lens import Gray
-from calibrate.board.scale import BoardSpec, apply, charuco_board
+from calibrate.board.plane import apply
+from calibrate.board.spec import BoardSpec, charuco_board
 from calibrate.errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -310,7 +311,7 @@ def test_intrinsics_names_every_useless_photograph_and_writes_nothing(tmp_path: 
     paths = [saved(tmp_path / f"{name}.png", image) for name, image in images.items()]
     ran = run("intrinsics", *paths, *BOARD, "--out", tmp_path / "out")
     refused(ran, "4 photographs: 1 usable views of the board, at least 4 needed")
-    for told in ("blank.png: is blank", "mirrored.png: is mirrored", "two.png: shows two boards"):
+    for told in ("blank.png: is blank", "mirrored.png: the photograph is mirrored", "two.png: shows two boards"):
         assert told in str(ran.exception)
     assert not (tmp_path / "out").exists()
 

@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.board.check import preflight
 from calibrate.board.drift import drift
-from calibrate.board.scale import BoardSpec, charuco_board
-from calibrate.board.view import see_plane
+from calibrate.board.spec import BoardSpec, charuco_board
+from calibrate.board.view import preflight, see_board_and_lens
 from calibrate.errors import CalibrationError
 
 SPEC = BoardSpec(squares=(9, 7), square_mm=20.0, marker_mm=14.0, dictionary="DICT_5X5_100", origin_mm=(-10.0, 5.0))
@@ -63,6 +62,6 @@ def test_what_is_wrong_with_a_view_is_said_before_the_session() -> None:
     _, warnings = preflight(hidden, SPEC)
     assert any("partly hidden" in line for line in warnings)
     small = cv2.resize(photograph(), None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA)
-    assert any("px/mm are few" in line for line in preflight(small, SPEC)[1])
+    assert any("px/mm, at least" in line for line in preflight(small, SPEC)[1])
     with pytest.raises(CalibrationError, match="is blank"):
-        see_plane(np.full((800, 1024), 200, np.uint8), SPEC)
+        see_board_and_lens(np.full((800, 1024), 200, np.uint8), SPEC)

@@ -13,12 +13,11 @@ import pytest
 
 from calibrate.artefact import HASH_CHARS, load_artefact
 from calibrate.board.artefact import LensFile, lens_file
-from calibrate.board.cameras import two_cameras
-from calibrate.board.detect import Checkerboard, View, see
+from calibrate.board.cameras import solve, two_cameras
+from calibrate.board.detect import BoardView, find_board
 from calibrate.board.intrinsics import fit_lens, guidance
 from calibrate.board.lens import Lens, lens_of
-from calibrate.board.scale import BoardSpec, charuco_board
-from calibrate.board.zhang import solve
+from calibrate.board.spec import BoardSpec, Checkerboard, charuco_board
 from calibrate.errors import CalibrationError
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "opencv_calib"
@@ -44,12 +43,12 @@ def charuco() -> np.ndarray:
     return cv2.copyMakeBorder(picture, 50, 50, 50, 50, cv2.BORDER_CONSTANT, value=255)
 
 
-def views(count: int, noise_px: float = 0.1, seed: int = 0, lens: Lens = TRUE) -> list[View]:
+def views(count: int, noise_px: float = 0.1, seed: int = 0, lens: Lens = TRUE) -> list[BoardView]:
     """Corners as a lens sees them, each by `noise_px` off."""
     rng = np.random.default_rng(seed)
     ids = np.arange(54)
     board = np.column_stack([ids % 9 + 1.0, ids // 9 + 1.0]) * 25.0
-    made: list[View] = []
+    made: list[BoardView] = []
     while len(made) < count:
         turn = np.array([rng.uniform(-0.6, 0.6), rng.uniform(-0.6, 0.6), rng.uniform(-3, 3)])
         place = np.array([rng.uniform(-220, 40), rng.uniform(-180, 40), rng.uniform(420, 700)])
@@ -58,28 +57,28 @@ def views(count: int, noise_px: float = 0.1, seed: int = 0, lens: Lens = TRUE) -
         pixels = pixels.reshape(-1, 2)
         if pixels.min() > 0 and (pixels < TRUE.size_px).all():
             noisy = pixels + rng.normal(0, noise_px, pixels.shape)
-            made.append(View(f"{len(made)}.png", TRUE.size_px, noisy, board, ids))
+            made.append(BoardView(f"{len(made)}.png", TRUE.size_px, noisy, board, ids))
     return made
 
 
-def renamed(seen: Sequence[View], stem: str) -> list[View]:
+def renamed(seen: Sequence[BoardView], stem: str) -> list[BoardView]:
     return [dataclasses.replace(view, name=f"{stem}{k:02d}.png") for k, view in enumerate(seen)]
 
 
-def jogged(view: View, name: str, noise_px: float = 0.1) -> View:
+def jogged(view: BoardView, name: str, noise_px: float = 0.1) -> BoardView:
     """Another photograph of a board that nobody moved."""
     noise = np.random.default_rng(9).normal(0, noise_px, view.pixels.shape)
     return dataclasses.replace(view, name=name, pixels=view.pixels + noise)
 
 
 @pytest.fixture(scope="module")
-def opencv() -> list[View]:
+def opencv() -> list[BoardView]:
     """OpenCV's 13 photographs by one camera."""
-    return [see(cv2.imread(str(path), 0), CHECKERS, path.name) for path in sorted(DATA.glob("left[0-9]*.jpg"))]
+    return [find_board(cv2.imread(str(path), 0), CHECKERS, path.name) for path in sorted(DATA.glob("left[0-9]*.jpg"))]
 
 
 @real
-def test_opencvs_own_photographs_give_its_own_lens(opencv: list[View]) -> None:
+def test_opencvs_own_photographs_give_its_own_lens(opencv: list[BoardView]) -> None:
     fitted = fit_lens(opencv)
     assert fitted.focal_reach_px is not None
     assert fitted.focal_reach_px[0] < 3.0
@@ -91,7 +90,7 @@ def test_opencvs_own_photographs_give_its_own_lens(opencv: list[View]) -> None:
 
 @real
 def test_a_real_charuco_board_is_seen_whole() -> None:
-    assert len(see(cv2.imread(str(DATA / "choriginal.jpg"), 0), CHARUCO, "photograph").ids) == 24
+    assert len(find_board(cv2.imread(str(DATA / "choriginal.jpg"), 0), CHARUCO, "photograph").ids) == 24
 
 
 @pytest.mark.parametrize("times", [1, 3], ids=["each once", "each three times"])
@@ -118,7 +117,7 @@ def test_views_given_again_do_not_make_a_lens_surer() -> None:
 
 @pytest.mark.parametrize("slant", [0.0, 0.4], ids=["face on", "slanted alike"])
 def test_a_board_that_is_always_held_alike_tells_no_lens(slant: float) -> None:
-    rng, made = np.random.default_rng(3), list[View]()
+    rng, made = np.random.default_rng(3), list[BoardView]()
     for view in views(10):
         turn = np.array([slant, 0.0, 0.0]) + rng.normal(0, 0.01, 3)
         place = np.array([rng.uniform(-180, 0), rng.uniform(-150, 0), rng.uniform(450, 650)])
@@ -160,7 +159,7 @@ def test_two_cameras_in_one_set_are_told_apart_whatever_the_files_are_called() -
 
 
 @real
-def test_left_and_right_cameras_mixed_are_named(opencv: list[View]) -> None:
+def test_left_and_right_cameras_mixed_are_named(opencv: list[BoardView]) -> None:
     """A second camera as a stereo rig has it: its axis 14 px away, its focal length 0.6 % longer."""
     middle = np.array([319.5, 239.5])
     there = [(view.pixels - middle) * 1.006 + middle + [-14.0, 14.0] for view in opencv]
@@ -174,7 +173,7 @@ def test_left_and_right_cameras_mixed_are_named(opencv: list[View]) -> None:
 
 
 @real
-def test_no_choice_of_one_cameras_photographs_is_taken_for_two_cameras(opencv: list[View]) -> None:
+def test_no_choice_of_one_cameras_photographs_is_taken_for_two_cameras(opencv: list[BoardView]) -> None:
     rng = np.random.default_rng(4)
     for count in (6, 8, 8, 10, 10):
         chosen = sorted(rng.choice(13, count, replace=False))
@@ -203,14 +202,14 @@ def test_a_known_lens_is_found_within_its_standard_errors() -> None:
         assert abs(fitted.lens.matrix[k, k] - TRUE.matrix[k, k]) < 4 * fitted.focal_se_px[k]
     assert fitted.rms_px == pytest.approx(0.1 * 2**0.5, rel=0.1)
     corners = np.array([[10.0, 10.0], [630.0, 10.0], [320.0, 470.0]])
-    assert fitted.lens.straight(corners) == pytest.approx(TRUE.straight(corners), abs=1.5)
-    assert TRUE.bent(TRUE.straight(corners)) == pytest.approx(corners, abs=1e-6)
+    assert fitted.lens.undistorted(corners) == pytest.approx(TRUE.undistorted(corners), abs=1.5)
+    assert TRUE.distorted(TRUE.undistorted(corners)) == pytest.approx(corners, abs=1e-6)
 
 
 def test_a_view_that_does_not_fit_is_dropped_by_name() -> None:
     seen = views(10)
     bent = seen[4].pixels + np.random.default_rng(1).normal(0, 2.0, seen[4].pixels.shape)
-    seen[4] = View("bent.png", TRUE.size_px, bent, seen[4].board_mm, seen[4].ids)
+    seen[4] = BoardView("bent.png", TRUE.size_px, bent, seen[4].board_mm, seen[4].ids)
     fitted = fit_lens(seen)
     assert list(fitted.dropped) == ["bent.png"]
     assert "bent.png" not in fitted.residuals_px
@@ -235,7 +234,7 @@ def test_too_few_photographs_or_mixed_sizes_are_refused() -> None:
     with pytest.raises(CalibrationError, match="3 usable views of the board, at least 4 needed"):
         fit_lens(views(3))
     mixed = views(5)
-    mixed[0] = View("big.png", (1280, 960), mixed[0].pixels, mixed[0].board_mm, mixed[0].ids)
+    mixed[0] = BoardView("big.png", (1280, 960), mixed[0].pixels, mixed[0].board_mm, mixed[0].ids)
     told = r"have several sizes, .*640 x 480 px: 1\.png, 2\.png, 3\.png, 4\.png; 1280 x 960 px: big\.png"
     with pytest.raises(CalibrationError, match=told):
         fit_lens(mixed)
@@ -263,15 +262,15 @@ def test_too_few_photographs_or_mixed_sizes_are_refused() -> None:
 )
 def test_a_photograph_of_no_use_is_refused_with_the_reason(image: np.ndarray, board: object, told: str) -> None:
     with pytest.raises(CalibrationError, match=told):
-        see(image.astype(np.uint8), board, "photograph")
+        find_board(image.astype(np.uint8), board, "photograph")
 
 
 def test_what_is_seen_but_not_as_it_should_be_is_flagged() -> None:
     half = charuco()
     half[:, :240] = 128
-    assert "partly hidden" in see(half, CHARUCO, "half").flags[0]
+    assert "partly hidden" in find_board(half, CHARUCO, "half").flags[0]
     bright = np.where(charuco() > 100, 255, 40).astype(np.uint8)
-    assert "saturated" in see(bright, CHARUCO, "bright").flags[0]
+    assert "saturated" in find_board(bright, CHARUCO, "bright").flags[0]
 
 
 def test_a_lens_file_cannot_be_edited(tmp_path: Path) -> None:

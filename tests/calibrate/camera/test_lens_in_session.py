@@ -17,10 +17,10 @@ from bench.preprocess_rigs import CAMERAS, Shot, lens_views, sheet, true_mask, t
 from brushloop import app
 from calibrate.artefact import current, load_artefact
 from calibrate.board.artefact import LensFile, lens_file, read_lens
-from calibrate.board.detect import see
+from calibrate.board.detect import find_board
 from calibrate.board.intrinsics import fit_lens
 from calibrate.board.lens import LensUsed
-from calibrate.board.scale import see_board
+from calibrate.board.view import see_board
 from calibrate.calibration import Calibration
 from calibrate.compare.field import Field, Tone, captured_mm
 from calibrate.compare.presses import prepare_press
@@ -178,7 +178,7 @@ def test_the_quick_look_at_a_board_knows_a_lens_too(tmp_path: Path, shot: Shot, 
         see_board(shot.image, shot.board, lens=wrong)
     known = read_lens(lens).lens()
     plane = see_board(shot.image, shot.board, lens=known)
-    again = see_board(known.straighten(shot.image), shot.board)
+    again = see_board(known.undistort(shot.image), shot.board)
     assert plane.rms_px < 0.3
     assert again.mm_per_px == pytest.approx(plane.mm_per_px, rel=2e-4)
     with pytest.raises(CalibrationError, match="the lens was calibrated at 2048 x 1536 px"):
@@ -250,7 +250,7 @@ def test_every_stage_is_shown_with_the_lens(photographed: Photographed, tmp_path
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("rig", [1, 2, 3, 4])
 def test_a_lens_from_slanted_boards_carries_a_session(photographed: Photographed, tmp_path: Path, rig: int) -> None:
-    views = [see(image, sheet(rig, 1).board, f"{k}") for k, image in enumerate(lens_views(rig, 12))]
+    views = [find_board(image, sheet(rig, 1).board, f"{k}") for k, image in enumerate(lens_views(rig, 12))]
     lens = lens_file(fit_lens(views), "a board", {}, 0.5, "test").save(tmp_path)
     seen = sheet(rig, 15)
     holds(load_artefact(calibrate_session(collected(photographed, tmp_path / "s", seen), lens), Calibration), seen)

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrate.board.detect import Checkerboard, see
+from calibrate.board.detect import find_board
 from calibrate.board.pdf import POINTS_PER_MM, write_pdf
-from calibrate.board.scale import BoardSpec
+from calibrate.board.spec import BoardSpec, Checkerboard
 from calibrate.errors import CalibrationError
 
 BOARD = BoardSpec(squares=(7, 5), square_mm=25.0, marker_mm=18.0, dictionary="DICT_5X5_50", origin_mm=(0.0, 0.0))
@@ -34,7 +34,7 @@ def printed(path: Path) -> tuple[np.ndarray, str]:
 
 def test_a_printed_charuco_board_is_seen_whole_and_at_true_scale(tmp_path: Path) -> None:
     page, words = printed(write_pdf(BOARD, tmp_path / "board.pdf"))
-    view = see(page, BOARD, "print")
+    view = find_board(page, BOARD, "print")
     assert len(view.ids) == 24
     fit = np.polyfit(view.board_mm[:, 0], view.pixels[:, 0], 1)
     assert fit[0] == pytest.approx(PX_PER_MM, rel=1e-4)
@@ -45,7 +45,7 @@ def test_a_printed_charuco_board_is_seen_whole_and_at_true_scale(tmp_path: Path)
 def test_a_printed_checkerboard_too(tmp_path: Path) -> None:
     board = Checkerboard(inner_corners=(7, 5), square_mm=20.0)
     page, _ = printed(write_pdf(board, tmp_path / "board.pdf"))
-    assert see(page, board, "print").pixels[0, 0] != 0
+    assert find_board(page, board, "print").pixels[0, 0] != 0
 
 
 def test_the_cross_reference_table_points_at_the_objects(tmp_path: Path) -> None:

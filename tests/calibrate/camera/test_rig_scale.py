@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from bench.preprocess_rigs import CAMERAS, board_of, boards, lens_views, true_scale
-from calibrate.board.detect import see
+from calibrate.board.detect import find_board
 from calibrate.board.intrinsics import fit_lens
 from calibrate.board.lens import Lens
-from calibrate.board.view import see_plane
+from calibrate.board.view import see_board_and_lens
 from drivers.sim.camera.scene import Optics
 from drivers.sim.config import Table
 
@@ -21,7 +21,7 @@ def draws(rig: int, count: int, seed: int = 0) -> list[tuple[float, bool]]:
     """(relative error of pix2len, whether the interval holds the truth) for the camera aimed anew each time."""
     found: list[tuple[float, bool]] = []
     for shot in boards(rig, count, seed):
-        plane = see_plane(shot.image, shot.board)
+        plane = see_board_and_lens(shot.image, shot.board)
         truth = true_scale(shot, plane.middle_px)
         low, high = plane.interval_mm_per_px
         found.append((plane.mm_per_px / truth - 1.0, low <= truth <= high))
@@ -52,10 +52,10 @@ def test_its_interval_holds_the_truth_as_often_as_it_says(seed: int) -> None:
 @pytest.mark.parametrize("rig", range(len(CAMERAS)))
 def test_slanted_boards_give_back_the_lens(rig: int) -> None:
     view = CAMERAS[rig]
-    fitted = fit_lens([see(image, BOARD, f"{k}") for k, image in enumerate(lens_views(rig, 12))])
+    fitted = fit_lens([find_board(image, BOARD, f"{k}") for k, image in enumerate(lens_views(rig, 12))])
     assert fitted.rms_px < 0.2
     assert fitted.lens.matrix[0, 0] == pytest.approx(view.width_px, rel=1e-3)
     # Where it matters: pixels of the corners of the image, straightened.
     corners = np.array([[20.0, 20.0], [view.width_px - 20.0, 20.0], [view.width_px / 2, view.height_px - 20.0]])
     truth = Lens(Optics(view, 1).camera_matrix, np.append(Optics(view, 1).distortion, 0.0), fitted.lens.size_px)
-    assert fitted.lens.straight(corners) == pytest.approx(truth.straight(corners), abs=1.0)
+    assert fitted.lens.undistorted(corners) == pytest.approx(truth.undistorted(corners), abs=1.0)

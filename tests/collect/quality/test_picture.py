@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from calibrate.board.scale import PlaneFit
+from calibrate.board.lens import unknown_lens
+from calibrate.board.plane import Plane
 from collect.quality.checks import cell_is_blank, check_capture, check_drawing, check_frame
 from collect.quality.picture import blur_px, glare, paper_level
 from collect.quality.verdict import Failure, Family
@@ -25,11 +26,11 @@ CELL = Cell(0, 20.0, 15.0, 40.0, 24.0)
 Gray = NDArray[np.uint8]
 
 
-def plane(height_px: int = 480) -> PlaneFit:
+def plane(height_px: int = 480) -> Plane:
     """8 px/mm, the paper's lower left corner at the picture's."""
     step = 1.0 / PX
     to_paper = np.array([[step, 0.0, 0.5 * step], [0.0, -step, height_px * step - 0.5 * step], [0.0, 0.0, 1.0]])
-    return PlaneFit(to_paper, step, (step, step), 0.0, 0, 0)
+    return Plane(unknown_lens((640, height_px)), to_paper, step, (step, step), 0.0, 0.0, (0.0, 0.0), 0, ())
 
 
 def paper(*, seed: int = 0) -> Gray:

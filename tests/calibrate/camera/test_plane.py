@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from calibrate.board.scale import BENT_SHARE, BoardSpec, apply, bent_share, find_corners, fit_plane, local_scale
+from calibrate.board.detect import find_board
+from calibrate.board.lens import unknown_lens
+from calibrate.board.plane import Plane, apply, distorted_share, fit_plane, local_scale
+from calibrate.board.spec import BoardSpec
+from calibrate.board.view import DISTORTED_SHARE, paper_mm, see_board
 from calibrate.errors import CalibrationError
 
 SPEC = BoardSpec(squares=(7, 5), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_50", origin_mm=(-10.0, 5.0))
@@ -34,9 +38,18 @@ def photograph(spec: BoardSpec = SPEC, noise: float = 2.0) -> tuple[np.ndarray, 
     return np.clip(noisy, 0, 255).astype(np.uint8), picture_to_paper @ np.linalg.inv(slant)
 
 
+def corners_of(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    view = find_board(image, SPEC, "photo")
+    return view.pixels, paper_mm(view, SPEC)
+
+
+def flat(pixels: np.ndarray, paper: np.ndarray) -> Plane:
+    return fit_plane(pixels, paper, unknown_lens((900, 640)), "photo", radial_terms=0)
+
+
 def test_the_plane_is_found_to_hundredths_of_a_millimetre() -> None:
     image, truth = photograph()
-    plane = fit_plane(*find_corners(image, SPEC, "photo"), "photo")
+    plane = see_board(image, SPEC)
     assert plane.corners == 24
     points = np.array([[200.0, 150.0], [650.0, 150.0], [450.0, 300.0], [200.0, 420.0]])
     assert apply(plane.image_to_paper, points) == pytest.approx(apply(truth, points), abs=0.02)
@@ -44,48 +57,48 @@ def test_the_plane_is_found_to_hundredths_of_a_millimetre() -> None:
 
 def test_the_scale_is_within_its_interval_and_that_is_narrow() -> None:
     image, truth = photograph()
-    pixels, paper = find_corners(image, SPEC, "photo")
-    plane = fit_plane(pixels, paper, "photo")
+    pixels, paper = corners_of(image)
+    plane = flat(pixels, paper)
     low, high = plane.interval_mm_per_px
     assert low < plane.mm_per_px < high
     assert high - low < 1e-3 * plane.mm_per_px
-    assert plane.mm_per_px == pytest.approx(local_scale(truth, pixels.mean(axis=0)), rel=5e-4)
+    assert plane.mm_per_px == pytest.approx(local_scale(lambda at: apply(truth, at), pixels.mean(axis=0)), rel=5e-4)
 
 
 def test_paper_y_grows_upward_in_the_image() -> None:
     image, _ = photograph()
-    pixels, paper = find_corners(image, SPEC, "photo")
+    pixels, paper = corners_of(image)
     assert np.corrcoef(pixels[:, 1], paper[:, 1])[0, 1] < -0.99
     assert np.corrcoef(pixels[:, 0], paper[:, 0])[0, 1] > 0.99
 
 
-def test_a_blank_page_tells_how_many_corners_were_found() -> None:
-    with pytest.raises(CalibrationError, match="0 of 24 board corners found, at least 8"):
-        find_corners(np.full((480, 640), 230, np.uint8), SPEC, "blank.png")
+def test_a_blank_page_is_called_blank() -> None:
+    with pytest.raises(CalibrationError, match="is blank: nothing in it is darker"):
+        see_board(np.full((480, 640), 230, np.uint8), SPEC, "blank.png")
 
 
 def test_a_board_that_is_mostly_hidden_is_refused() -> None:
     image, _ = photograph()
     image[:, 240:] = 200
     with pytest.raises(CalibrationError, match="of 24 board corners"):
-        find_corners(image, SPEC, "hidden.png")
+        see_board(image, SPEC, "hidden.png")
 
 
 def test_a_misnamed_corner_is_dropped_and_counted() -> None:
     image, truth = photograph()
-    pixels, paper = find_corners(image, SPEC, "photo")
+    pixels, paper = corners_of(image)
     pixels[3] += (7.0, -5.0)
-    plane = fit_plane(pixels, paper, "photo")
-    assert (plane.corners, plane.dropped) == (23, 1)
+    plane = flat(pixels, paper)
+    assert (plane.corners, plane.dropped) == (23, (3,))
     points = np.array([[200.0, 150.0], [650.0, 420.0]])
     assert apply(plane.image_to_paper, points) == pytest.approx(apply(truth, points), abs=0.03)
 
 
 def test_corners_that_do_not_fit_one_plane_are_refused() -> None:
     image, _ = photograph()
-    pixels, paper = find_corners(image, SPEC, "photo")
+    pixels, paper = corners_of(image)
     with pytest.raises(CalibrationError, match="residual"):
-        fit_plane(pixels + np.random.default_rng(1).normal(0, 4, pixels.shape), paper, "bent.png")
+        flat(pixels + np.random.default_rng(1).normal(0, 4, pixels.shape), paper)
 
 
 @pytest.mark.parametrize(
@@ -107,6 +120,7 @@ def test_a_lens_is_told_from_a_board_that_is_curled_misread_or_noisy() -> None:
     bent = middle + 1280.0 * away * (1.0 - 0.1 * r2)
     curled = middle + 1280.0 * away * (1.0 + 0.1 * away[:, :1] ** 2)
     noisy = pixels + np.random.default_rng(3).normal(0.0, 3.0, pixels.shape)
-    assert bent_share(bent, paper, middle, "lens") > 0.99 > BENT_SHARE
-    assert bent_share(curled, paper, middle, "board") < BENT_SHARE
-    assert bent_share(noisy, paper, middle, "noise") < 0.1
+    lens = unknown_lens((1281, 961))
+    assert distorted_share(bent, paper, lens, "lens") > 0.99 > DISTORTED_SHARE
+    assert distorted_share(curled, paper, lens, "board") < DISTORTED_SHARE
+    assert distorted_share(noisy, paper, lens, "noise") < 0.1
