@@ -149,10 +149,7 @@ def main() -> None:
     """Run the app; an error of ours is one line on stderr and its exit code, anything else a traceback."""
     try:
         if len(sys.argv) == 1 and sys.stdin.isatty() and sys.stdout.isatty():
-            from collect.tui.browser import Paths
-            from collect.tui.running import run_desk
-
-            run_desk(Paths())
+            collect.cli.browse()
         else:
             app()
     except Exception as error:

@@ -21,13 +21,14 @@ from textual.pilot import Pilot
 
 from collect.engine.states import State
 from collect.errors import CollectAborted
+from collect.start import engine_for
 from collect.tui.app import OperatorApp
-from collect.tui.ask import AskScreen
-from collect.tui.browser import Desk, Paths
-from collect.tui.finish import FinishScreen
-from collect.tui.review import ReviewScreen
-from collect.tui.set_up import SetUpScreen
-from collect.tui.start import StartScreen
+from collect.tui.browser import Paths, SessionBrowser
+from collect.tui.finish_screen import FinishScreen
+from collect.tui.question_screens import AskScreen
+from collect.tui.review_screen import ReviewScreen
+from collect.tui.set_up_screen import SetUpScreen
+from collect.tui.start_screen import StartScreen
 from drivers.sim.brush.flaws import Flaw
 from drivers.sim.config import SimConfig, View
 from drivers.sim.rig import LoopbackRig
@@ -47,7 +48,7 @@ def main(arguments: list[str] | None = None) -> int:
     out.mkdir(parents=True, exist_ok=True)
     # In a folder of its own, so that no picture names one of this machine's.
     with tempfile.TemporaryDirectory() as scratch, contextlib.chdir(scratch), _serving() as rig:
-        app = OperatorApp(desk=Desk(Paths()))
+        app = OperatorApp(browser=SessionBrowser(Paths(), engine_for))
         try:
             asyncio.run(_tour(app, rig, out))
         finally:

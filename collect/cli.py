@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from sessions.terminal import say
 
-
-class Preview(StrEnum):
-    """How the screen shows the camera."""
-
-    CELLS = "cells"
-    AUTO = "auto"
-    OFF = "off"
-
+if TYPE_CHECKING:
+    from collect.engine.engine import Engine
+    from collect.engine.opening import Opening
 
 app = typer.Typer(invoke_without_command=True, pretty_exceptions_enable=False)
 
@@ -45,8 +39,9 @@ def collect(
         bool, typer.Option("--set-up", help="On the screen: accept what each set-up step measured, or measure again.")
     ] = False,
     preview: Annotated[
-        Preview, typer.Option(help="Camera on the screen: half-cells; auto: pixels where the terminal has them.")
-    ] = Preview.CELLS,
+        Literal["cells", "auto", "off"],
+        typer.Option(help="Camera on the screen: half-cells; auto: pixels where the terminal has them."),
+    ] = "cells",
     live: Annotated[bool, typer.Option("--live", help="Let a Foxglove viewer on this machine look on.")] = False,
     live_port: Annotated[int, typer.Option(min=0, max=65535, help="Where it listens; 0: any.")] = 8765,
 ) -> None:
@@ -71,11 +66,24 @@ def collect(
         on_screen=on_screen,
         live=LiveView(live_port) if live else None,
         guided=set_up and on_screen,
-        preview=preview.value,
+        preview=preview,
     )
     if given_up:
         say(f"finished; {given_up} strokes came out badly every time and were left out", err=True)
         raise typer.Exit(3)
+
+
+def browse() -> None:
+    """Open the start screen: `brushloop` without arguments. The screen is up before the engine is imported."""
+    from collect.tui.browser import Paths, SessionBrowser
+    from collect.tui.runner import run_browser
+
+    def engine_for(opening: Opening, *, watched: bool, guided: bool, preview: bool) -> Engine:
+        from collect import start
+
+        return start.engine_for(opening, watched=watched, guided=guided, preview=preview)
+
+    run_browser(SessionBrowser(Paths(), engine_for))
 
 
 @app.command()

@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Generator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from types import FrameType
 from typing import Protocol
 
@@ -20,19 +20,11 @@ REFRESH_S = 0.1
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class Stoppable(Protocol):
-    """What a signal does."""
-
-    def stop(self) -> None:
-        """Stop the arm now; from any thread."""
-        ...
-
-
 class RunnableEngine(EngineView, Protocol):
     """An engine that can be started and waited for."""
 
     def start(self) -> None:
-        """Begin."""
+        """Begin the run."""
         ...
 
     @property
@@ -47,7 +39,7 @@ class RunnableEngine(EngineView, Protocol):
 
 def run_headless(engine: RunnableEngine) -> None:
     """Run to the end; raises what ended the run. If the screen goes away, the arm is stopped."""
-    with stopping_signals(engine):
+    with stop_signals(lambda _number: engine.stop()):
         engine.start()
         try:
             # A terminal or a pipe that is gone; rich makes a broken pipe a SystemExit.
@@ -76,8 +68,8 @@ def _show(engine: RunnableEngine) -> None:
             shown = now.messages_before + len(now.messages)
             if (now.no_pose_s is not None) is not silent:
                 silent = now.no_pose_s is not None
-                words = f"warning: {no_pose_text(now)}" if silent else "the arm tells its pose again"
-                progress.console.print(words, highlight=False)
+                line = f"warning: {no_pose_text(now)}" if silent else "the arm sends its pose again"
+                progress.console.print(line, highlight=False)
             progress.update(
                 task,
                 description=", ".join(part for part in (f"{now.state}: {now.step}", no_pose_text(now)) if part),
@@ -91,7 +83,7 @@ def _show(engine: RunnableEngine) -> None:
 
 
 def _end(engine: RunnableEngine) -> None:
-    """Nobody watches any more: an engine that still runs is stopped."""
+    """Wait for the end; an engine that still runs is stopped first, as nobody watches it any more."""
     if not engine.finished:
         engine.stop()
     engine.join()
@@ -101,24 +93,29 @@ def eta_text(now: Snapshot) -> str:
     """`ETA 12:05`, or nothing while no stroke has been timed."""
     if now.eta_s is None:
         return ""
-    minutes, seconds = divmod(round(now.eta_s), 60)
-    return f"ETA {minutes}:{seconds:02d}"
+    return f"ETA {minutes_text(now.eta_s)}"
+
+
+def minutes_text(seconds: float) -> str:
+    """Minutes and seconds as `12:05`."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02d}"
 
 
 def no_pose_text(now: Snapshot) -> str:
-    """`no pose for 1.4 s`, or nothing while the arm tells where it is."""
+    """`no pose for 1.4 s`, or nothing while the arm sends its pose."""
     if now.no_pose_s is None:
         return ""
     return f"no pose for {now.no_pose_s:.{1 if now.no_pose_s < 10.0 else 0}f} s"
 
 
 @contextmanager
-def stop_signals(heed: Callable[[int], None]) -> Generator[None]:
-    """Call `heed` with the number of each SIGINT, SIGTERM and SIGHUP, in a thread of its own."""
+def stop_signals(handle: Callable[[int], None]) -> Generator[None]:
+    """Call `handle` with the number of each SIGINT, SIGTERM and SIGHUP, in a thread of its own."""
 
     def on_signal(number: int, _frame: FrameType | None) -> None:
         # Not from the handler itself: it may have interrupted a holder of the engine's lock.
-        threading.Thread(target=heed, args=(number,), name="stop key").start()
+        threading.Thread(target=handle, args=(number,), name="stop key").start()
 
     before = {number: signal.signal(number, on_signal) for number in STOP_SIGNALS}
     try:
@@ -126,8 +123,3 @@ def stop_signals(heed: Callable[[int], None]) -> Generator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def stopping_signals(engine: Stoppable) -> AbstractContextManager[None]:
-    """SIGINT, SIGTERM and SIGHUP stop the arm at once; the run then ends by itself."""
-    return stop_signals(lambda _number: engine.stop())

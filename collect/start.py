@@ -6,9 +6,9 @@ import contextlib
 import sys
 import tempfile
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING
 
-from collect.chains.finished import ending
+from collect.chains.commands import ending
 from collect.engine.engine import Engine
 from collect.engine.live import LiveView
 from collect.engine.opening import Opening, check_writable, find_resumable, open_store
@@ -18,8 +18,8 @@ from collect.planning.limits import check_protocol
 from drivers.clock import HostClock
 from sessions.terminal import plain
 
-Kind = Literal["auto", "cells", "off"]
-"""How the camera is shown on a screen: in pixels where the terminal has them, in half-cells, or not at all."""
+if TYPE_CHECKING:
+    from collect.tui.pictures import Preview
 
 
 def engine_for(
@@ -31,7 +31,7 @@ def engine_for(
     preview: bool = False,
     make: type[Engine] = Engine,
 ) -> Engine:
-    """An engine that goes on with the open session, or makes a new one. Raises `ConfigError`; connects nothing yet."""
+    """Make an engine that resumes the open session or begins a new one; connects nothing yet. Raises `ConfigError`."""
     resume = find_resumable(opening)
     if resume is not None:
         opening = opening.as_begun(resume)
@@ -52,9 +52,9 @@ def engine_for(
 
 
 def start(
-    opening: Opening, *, on_screen: bool, live: LiveView | None = None, guided: bool = False, preview: Kind = "cells"
+    opening: Opening, *, on_screen: bool, live: LiveView | None = None, guided: bool = False, preview: Preview = "cells"
 ) -> int:
-    """Run to the end, say where the recording lies and what comes next, and return how many strokes had to be given up.
+    """Run to the end and print where the recording lies and what comes next; return how many strokes were left out.
 
     Raises what ended the run.
     """
@@ -70,16 +70,16 @@ def start(
 
 
 def dry_run(config: Path, protocol: Path, height_mm: float, *, armed: bool, on_screen: bool) -> None:
-    """Walk through the protocol in the air; what is recorded is thrown away, so that no cell counts as used."""
+    """Move through the protocol in the air; the recording is thrown away, so that no cell counts as used."""
     with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:
         opening = Opening.load(Path(folder), config, protocol, armed=armed, dry_run_mm=height_mm)
         _run(engine_for(opening, watched=on_screen, preview=on_screen, make=DryRunEngine), "cells", on_screen=on_screen)
     _say("dry run done; nothing was kept\n")
 
 
-def _run(engine: Engine, preview: Kind, *, on_screen: bool) -> None:
+def _run(engine: Engine, preview: Preview, *, on_screen: bool) -> None:
     if on_screen:
-        from collect.tui.running import run_screen
+        from collect.tui.runner import run_screen
 
         run_screen(engine, preview)
     else:
@@ -91,4 +91,4 @@ def _say(text: str) -> None:
         sys.stdout.write(plain(text, keep="\n"))
         sys.stdout.flush()
     except OSError:
-        sys.stdout = None  # nobody reads any more; Python would try again at its exit, and change the code
+        sys.stdout = None  # nobody reads any more; Python would write again at its exit, and change the exit code

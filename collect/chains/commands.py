@@ -1,4 +1,4 @@
-"""Other brushloop commands, each in a process of its own: what it imports and holds is gone when it ends."""
+"""What chains of commands share: running another brushloop command, and finding the session that it finished."""
 
 from __future__ import annotations
 
@@ -7,13 +7,19 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from collect.protocols.files import load_protocol
+from sessions.errors import SessionError
+from sessions.reader import Recording
+
 Say = Callable[[str], None]
 GIVEN_UP = 3
 """Exit code of a collection that finished but left strokes out."""
+PRESSES = frozenset({"grid", "adaptive", "list"})
+"""Protocols whose recording is calibrated and validated by itself; for others, what comes next is not one command."""
 
 
 class CommandFailed(Exception):
-    """A command ended with an exit code; it has said why itself."""
+    """A command ended with an exit code; it has printed why itself."""
 
     def __init__(self, words: list[str], code: int) -> None:
         self.words = words
@@ -24,7 +30,10 @@ class CommandFailed(Exception):
 
 
 def run_command(say: Say, *arguments: str | Path, accepts: tuple[int, ...] = (0,)) -> int:
-    """Run `brushloop ARGUMENTS` on this terminal to its end; returns its exit code. Raises `CommandFailed`."""
+    """Run `brushloop ARGUMENTS` on this terminal, in a process of its own; return its exit code.
+
+    Raises `CommandFailed` for a code that is not in `accepts`.
+    """
     words = [str(argument) for argument in arguments]
     say(f"$ brushloop {' '.join(words)}")
     process = subprocess.Popen([sys.executable, "-m", "brushloop", *words])
@@ -37,3 +46,26 @@ def run_command(say: Say, *arguments: str | Path, accepts: tuple[int, ...] = (0,
     if code not in accepts:
         raise CommandFailed(words, code if code > 0 else 4)
     return code
+
+
+def finished_session(root: Path, protocol: Path) -> Path | None:
+    """The newest finished session of exactly this protocol under `root`. Raises `ConfigError` for a bad protocol."""
+    wanted = load_protocol(protocol).model_dump_json()
+    found: list[Path] = []
+    for folder in root.iterdir() if root.is_dir() else ():
+        try:
+            if folder.is_dir() and Recording(folder).header.protocol == wanted:
+                found.append(folder)
+        except SessionError:
+            continue  # open, damaged, or no session
+    return max(found, key=lambda path: (path / f"{path.name}.mcap").stat().st_mtime_ns, default=None)
+
+
+def ending(folder: Path, kind: str) -> str:
+    """Lines that name the recording of a finished session and the next command; `kind` is its protocol's."""
+    lines = [f"recorded: {folder / folder.name}.mcap"]
+    if kind in PRESSES:
+        # On the screen it may have been calibrated already.
+        command = "validate" if (folder / "calibration").is_dir() else "calibrate"
+        lines.append(f"next:     brushloop {command} {folder}")
+    return "".join(f"{line}\n" for line in lines)

@@ -12,8 +12,7 @@ import sys
 import time
 from pathlib import Path
 
-from collect.chains.commands import GIVEN_UP, run_command
-from collect.chains.finished import finished_session
+from collect.chains.commands import GIVEN_UP, finished_session, run_command
 from collect.errors import CollectAborted
 from collect.rig.config import RigConfig, load_rig
 from sessions.folders import open_sessions

@@ -23,7 +23,7 @@ def loop(
 ) -> None:
     """Recover every press from its image, press it again, compare. The same command goes on where it stopped."""
     from collect.chains.commands import CommandFailed
-    from collect.chains.loop import Wanted, run_loop
+    from collect.chains.loop import LoopRequest, run_loop
     from sessions.reader import Recording
 
     options = ["--arm"] if arm else []
@@ -31,6 +31,6 @@ def loop(
     options += [] if tui is None else ["--tui" if tui else "--no-tui"]
     folder = out if out is not None else Recording(session).path.parent / "loop"
     try:
-        run_loop(Wanted(session, config, folder, fit, repeats, seed, tuple(options)), say)
+        run_loop(LoopRequest(session, config, folder, fit, repeats, seed, tuple(options)), say)
     except CommandFailed as error:
         raise typer.Exit(error.exit_code) from None  # the command has said why

@@ -1,4 +1,4 @@
-"""Plan characters, write them on the rig, calibrate, compare; before that, learn from a few writings, if asked.
+"""`brushloop write 字`, stage by stage: plan, write on the rig, calibrate, compare; if asked, learn before that.
 
 What a stage has finished is kept on disk and found again. Every round is an ordinary session of `brushloop collect`.
 """
@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calibrate.artefact import artefacts
-from collect.chains.commands import GIVEN_UP, Say, run_command
-from collect.chains.finished import finished_session
+from collect.chains.commands import GIVEN_UP, Say, finished_session, run_command
 from collect.errors import ConfigError
 from collect.protocols.config import WriteConfig
 from collect.protocols.files import load_protocol
@@ -20,7 +19,7 @@ PROTOCOL, PAGE = "protocol-write.toml", "written.html"
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class WritingRequest:
     """What the command line asked for."""
 
     what: str
@@ -34,73 +33,73 @@ class Wanted:
     learn_count: int = 2
     """Writings of each character in such a round."""
     sheet: int | None = None
-    """The operator's word for the sheet that is in: good for one collection, as the next needs a fresh sheet."""
+    """Number of the sheet that the operator has put in: for one collection, as the next needs a fresh sheet."""
     plan_options: tuple[str, ...] = ()
-    """Passed to `brushloop write plan` as they are."""
+    """Passed on to `brushloop write plan`."""
     references: tuple[str, ...] = ()
     collect_options: tuple[str, ...] = ()
-    """Passed to `brushloop collect` as they are: `--arm`, `--no-tui`."""
+    """Passed on to `brushloop collect`: `--arm`, `--no-tui`."""
 
 
 class Writing:
     """One run of the chain in this process."""
 
-    def __init__(self, wanted: Wanted, say: Say) -> None:
-        self._wanted = wanted
+    def __init__(self, request: WritingRequest, say: Say) -> None:
+        self._request = request
         self._say = say
-        self._sheet = wanted.sheet
+        self._sheet = request.sheet
 
     def run(self) -> Path:
-        """What is not done yet; returns the report's path.
+        """Run what is not done yet; return the report's path.
 
         Raises `ConfigError`, `SessionError`, `CommandFailed`.
         """
-        wanted = self._wanted
+        request = self._request
         plan = self._first_plan()
-        for number in range(1, wanted.learn + 1):
+        for number in range(1, request.learn + 1):
             plan = self._learn(plan, number)
-        _check_plan(plan / PROTOCOL, wanted, wanted.count)
+        _check_plan(plan / PROTOCOL, request, request.count)
         session = self._written(plan / PROTOCOL)
-        references = [word for given in wanted.references for word in ("--reference", given)]
-        self._do("write", "compare", session, "--plan", plan, "--out", wanted.out, *references)
-        return wanted.out / PAGE
+        references = [word for given in request.references for word in ("--reference", given)]
+        self._do("write", "compare", session, "--plan", plan, "--out", request.out, *references)
+        return request.out / PAGE
 
     def _first_plan(self) -> Path:
-        wanted, plan = self._wanted, self._wanted.out / "plan"
+        request, plan = self._request, self._request.out / "plan"
         if not (plan / PROTOCOL).exists():
-            brush = load_rig(wanted.config).brush
+            brush = load_rig(request.config).brush
             options = ["--radius-mm", str(brush.radius_mm), "--length-mm", str(brush.length_mm)]
-            options += ["--repeats", str(self._repeats(1)), *wanted.plan_options]
-            self._do("write", "plan", "--out", plan, *options, "--", wanted.what)
+            options += ["--repeats", str(self._repeats(1)), *request.plan_options]
+            self._do("write", "plan", "--out", plan, *options, "--", request.what)
         return plan
 
     def _learn(self, plan: Path, number: int) -> Path:
         """The plan of the next round."""
-        after = self._wanted.out / f"plan-{number}"
+        after = self._request.out / f"plan-{number}"
         if not (after / PROTOCOL).exists():
-            _check_plan(plan / PROTOCOL, self._wanted, self._repeats(number))
+            _check_plan(plan / PROTOCOL, self._request, self._repeats(number))
             session = self._written(plan / PROTOCOL)
-            self._do("write", "compare", session, "--plan", plan, "--out", self._wanted.out / f"round-{number}")
+            self._do("write", "compare", session, "--plan", plan, "--out", self._request.out / f"round-{number}")
             options = ("--out", after, "--repeats", str(self._repeats(number + 1)))
             self._do("write", "learn", session, "--plan", plan, *options)
         return after
 
     def _repeats(self, number: int) -> int:
-        """How often each is written in that round, from 1; the last is the one that counts."""
-        return self._wanted.count if number > self._wanted.learn else self._wanted.learn_count
+        """How often each character is written in that round, from 1; the last round is the one that counts."""
+        return self._request.count if number > self._request.learn else self._request.learn_count
 
     def _written(self, protocol: Path) -> Path:
-        """The finished, calibrated session of a plan."""
-        wanted = self._wanted
-        session = finished_session(wanted.sessions, protocol)
+        """The finished and calibrated session of a plan."""
+        request = self._request
+        session = finished_session(request.sessions, protocol)
         if session is None:
-            options = ["--config", str(wanted.config), "--protocol", str(protocol), "--out", str(wanted.sessions)]
+            options = ["--config", str(request.config), "--protocol", str(protocol), "--out", str(request.sessions)]
             options += [] if self._sheet is None else ["--sheet", str(self._sheet)]
-            self._sheet = None  # what the operator said is used up: the next session asks again
-            self._do("collect", *options, *wanted.collect_options, accepts=(0, GIVEN_UP))
-            session = finished_session(wanted.sessions, protocol)
+            self._sheet = None  # used up: the next session asks again
+            self._do("collect", *options, *request.collect_options, accepts=(0, GIVEN_UP))
+            session = finished_session(request.sessions, protocol)
         if session is None:
-            raise ConfigError(wanted.sessions, "", "holds no finished session of the plan, though collection ended")
+            raise ConfigError(request.sessions, "", "holds no finished session of the plan, though collection ended")
         if not artefacts(session):
             self._do("calibrate", session)
         return session
@@ -109,12 +108,12 @@ class Writing:
         run_command(self._say, *arguments, accepts=accepts)
 
 
-def _check_plan(path: Path, wanted: Wanted, repeats: int) -> None:
-    """A plan that is there already must be of what is asked for now."""
+def _check_plan(path: Path, request: WritingRequest, repeats: int) -> None:
+    """Refuse a plan, made before, of other characters or another count."""
     plan = load_protocol(path)
     assert isinstance(plan, WriteConfig)
     names = "".join(figure.name for figure in plan.figures)
-    if not wanted.what.lower().endswith((".csv", ".json")) and names != wanted.what:
-        raise ConfigError(path, "figures", f"plans {names}, not {wanted.what}: use another --out")
+    if not request.what.lower().endswith((".csv", ".json")) and names != request.what:
+        raise ConfigError(path, "figures", f"plans {names}, not {request.what}: use another --out")
     if plan.repeats != repeats:
         raise ConfigError(path, "repeats", f"plans {plan.repeats} writings, not {repeats}: use another --out")

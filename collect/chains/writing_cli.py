@@ -28,13 +28,13 @@ def write(
 ) -> None:
     """Plan characters, write them on the rig, compare with simulation and reference. The same command goes on."""
     from collect.chains.commands import CommandFailed
-    from collect.chains.writing import Wanted, Writing
+    from collect.chains.writing import Writing, WritingRequest
 
     plan_options = ["--cell-mm", str(cell_mm), "--speed-mm-s", str(speed_mm_s)]
     plan_options += [] if data is None else ["--data", str(data)]
     options = ["--arm"] if arm else []
     options += [] if tui is None else ["--tui" if tui else "--no-tui"]
-    wanted = Wanted(
+    request = WritingRequest(
         what,
         config,
         out,
@@ -48,6 +48,6 @@ def write(
         tuple(options),
     )
     try:
-        Writing(wanted, say).run()
+        Writing(request, say).run()
     except CommandFailed as error:
         raise typer.Exit(error.exit_code) from None  # the command has said why

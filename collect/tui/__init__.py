@@ -1,1 +1,1 @@
-"""The operator's screen for a run: looks at an engine through `EngineView`, and only this package reaches textual."""
+"""The operator's screens: start, set-up, run, questions, review; only this folder imports textual."""

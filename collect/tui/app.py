@@ -1,4 +1,4 @@
-"""The operator's app: looks at the engine ten times a second and shows it; its keys ask the engine for things."""
+"""The operator's app: shows the engine's snapshot ten times a second; its keys send the engine requests."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import asyncio
 import threading
 import time
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
 from textual import events, work
 from textual.app import SystemCommand
-from textual.binding import Binding, BindingType
+from textual.binding import BindingType
 from textual.screen import Screen
 
 from collect.engine.snapshot import Snapshot
@@ -19,67 +20,42 @@ from collect.engine.states import FINAL, State
 from collect.errors import ConfigError
 from collect.headless import REFRESH_S, RunnableEngine
 from collect.operator import OperatorRequest
-from collect.tui.ask import AskScreen
-from collect.tui.browser import Desk
-from collect.tui.confirm import AT_WORK, AT_WORK_KEYS, NOT_AT_REST, NOT_PARKED, NOT_PARKED_KEYS, Confirm
-from collect.tui.help import HelpScreen
-from collect.tui.keys import CAN_PAUSE, CAN_RESUME
+from collect.tui.browser import SessionBrowser
+from collect.tui.keys import CAN_PAUSE, CAN_RESUME, RUN_BINDINGS, RUN_KEYS, HelpScreen, is_stop_key
 from collect.tui.pictures import Pictures
-from collect.tui.run import RunScreen
-from collect.tui.set_up import SetUpScreen
-from collect.tui.start import StartScreen
+from collect.tui.question_screens import AT_WORK, NOT_AT_REST, NOT_PARKED, AskScreen, Confirm
+from collect.tui.run_screen import RunScreen
+from collect.tui.set_up_screen import SetUpScreen
+from collect.tui.start_screen import StartScreen
 from collect.tui.terminal import PlainApp, TerminalDriver
 from collect.tui.text import plain
 from sessions.errors import SessionError
 from sessions.remarks import mark_bad_or_good
 
 BOUNCE_S = 0.7
-"""After an answer, letters that ask a run for something are not heard: a key pressed twice would be a request."""
-STOP_KEYS = frozenset({"s", "ctrl+c"})
-COMMANDS = (
-    ("Stop the arm now", "A software stop; the red button is the emergency stop", "stop"),
-    ("Pause or go on", "Before the next step", "pause"),
-    ("Retake", "Press the stroke in hand again", "request('RETAKE')"),
-    ("Skip", "Leave the stroke in hand out", "request('SKIP')"),
-    ("New sheet", "Put a new sheet in before the next stroke", "request('NEW_SHEET')"),
-    ("Jog", "Find the paper again by jog before the next stroke", "request('JOG')"),
-    ("Last capture bad", "It does not count, and is pressed again at the end", "mark_last"),
-    ("Review", "Look through the captures", "review"),
-    ("Leave", "Finish the step, park, leave", "quit"),
-)
+"""For so long after an answer the keys of requests do nothing: an answer's key pressed twice would be a request."""
 
 
 class OperatorApp(PlainApp):
-    """One app for a whole day, or, handed an engine, for one run."""
+    """With a browser, one app for a whole day; with an engine, for one run."""
 
     TITLE = "brushloop"
     # A selection would be copied with ctrl+c, which is a stop key here.
     ALLOW_SELECT = False
-    BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("ctrl+c", "quit", "Leave", show=False, priority=True),
-        Binding("space,p", "pause", "Pause or go on"),
-        Binding("r", "request('RETAKE')", "Retake"),
-        Binding("k", "request('SKIP')", "Skip"),
-        Binding("n", "request('NEW_SHEET')", "New sheet"),
-        Binding("j", "request('JOG')", "Jog"),
-        Binding("b", "mark_last", "Last capture bad"),
-        Binding("v", "review", "Review"),
-        Binding("question_mark", "help", "Help"),
-        Binding("q", "quit", "Leave"),
-    ]
+    BINDINGS: ClassVar[list[BindingType]] = [*RUN_BINDINGS]
 
     def __init__(
         self,
         engine: RunnableEngine | None = None,
         *,
-        desk: Desk | None = None,
+        browser: SessionBrowser | None = None,
         pictures: Pictures | None = None,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """With an engine, that run; with a desk, the start screen first. `now_s` is the clock of questions."""
+        """With an engine, show that run; with a browser, the start screen first. `now_s` is the clock of questions."""
         super().__init__(driver_class=TerminalDriver)
         self.engine = engine
-        self._desk = desk
+        self._browser = browser
         self._pictures = pictures or Pictures()
         self._now_s = now_s
         self._now: Snapshot | None = None if engine is None else engine.snapshot()
@@ -89,17 +65,17 @@ class OperatorApp(PlainApp):
         self._deaf_until_s = 0.0
 
     def on_mount(self) -> None:
-        """Look now, then at 10 Hz."""
-        if self._desk is not None:
-            self.push_screen(StartScreen(self._desk, self._begin, self._review_named))
+        """Show the first screen; then poll the engine at 10 Hz."""
+        if self._browser is not None:
+            self.push_screen(StartScreen(self._browser, self._begin, self._review_named))
         if self.engine is not None:
             self._show_run()
-        self.call_after_refresh(self._look)
-        self.set_interval(REFRESH_S, self._look)
+        self.call_after_refresh(self._poll)
+        self.set_interval(REFRESH_S, self._poll)
 
     @property
     def leaving(self) -> bool:
-        """True once asked to leave."""
+        """True once `leave` was called."""
         return self._leave.is_set()
 
     def leave(self) -> None:
@@ -112,14 +88,14 @@ class OperatorApp(PlainApp):
         return self._now is not None and self._now.state not in FINAL
 
     async def on_event(self, event: events.Event) -> None:
-        """The stop keys first of all: textual would leave a letter to a field that takes text, as the palette has."""
-        if isinstance(event, events.Key) and event.key in STOP_KEYS and self.at_work:
+        """Handle stop keys before textual, which would give a letter to a field that takes text, as in the palette."""
+        if is_stop_key(event) and self.at_work:
             self.action_stop()
             return
         await super().on_event(event)
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Without a run, the keys of a run do nothing."""
+        """Switch off the keys of a run where there is none."""
         if action == "stop":
             return self.at_work
         if action == "pause":
@@ -131,10 +107,11 @@ class OperatorApp(PlainApp):
         return super().check_action(action, parameters)
 
     def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
-        """The keys by name, then light and dark."""
-        for title, what, action in COMMANDS:
-            if self.check_action(action.partition("(")[0], ()):
-                yield SystemCommand(title, what, lambda action=action: self.call_later(self.run_action, action))
+        """List the keys of a run by name, then light and dark colours."""
+        for key in RUN_KEYS:
+            if key.title and self.check_action(key.action.partition("(")[0], ()):
+                run = partial(self.call_later, self.run_action, key.action)
+                yield SystemCommand(key.title, key.what, run)
         dark = self.theme != "textual-light"
         yield SystemCommand(
             "Light colours" if dark else "Dark colours",
@@ -143,7 +120,7 @@ class OperatorApp(PlainApp):
         )
 
     def action_stop(self) -> None:
-        """Stop the arm, without a question; shown at once, whatever lies over the run."""
+        """Stop the arm at once, and show it, whatever lies over the run."""
         if self.engine is not None:
             self.engine.stop()
             if self._main is not None and self._main.is_mounted:
@@ -157,13 +134,13 @@ class OperatorApp(PlainApp):
             (self.engine.resume if self._now.state in CAN_RESUME else self.engine.pause)()
 
     def action_request(self, name: str) -> None:
-        """Ask the engine for something, or take it back."""
+        """Send the engine a request, or take it back."""
         if self.engine is not None and self._now_s() >= self._deaf_until_s:
             self.engine.request(OperatorRequest[name])
-            self._look()
+            self._poll()
 
     def action_mark_last(self) -> None:
-        """The newest capture is bad, or good after all; at once on disk."""
+        """Mark the newest capture bad, or good after all; at once on disk."""
         last = None if self._now is None else self._now.last
         if self._now is None or last is None or not last.kept or self.screen is not self._main:
             return
@@ -172,11 +149,11 @@ class OperatorApp(PlainApp):
         except SessionError as error:
             self.notify(plain(str(error)), severity="error")
             return
-        told = "marked bad: pressed again once the plan is through" if bad else "good after all"
-        self.notify(f"{last.stroke_id}: {told}")
+        mark = "marked bad: pressed again once the plan is through" if bad else "good after all"
+        self.notify(f"{last.stroke_id}: {mark}")
 
     def action_help(self) -> None:
-        """Every key."""
+        """Show every key."""
         if not isinstance(self.screen, HelpScreen):
             self.push_screen(HelpScreen())
 
@@ -186,7 +163,7 @@ class OperatorApp(PlainApp):
             self._review(Path(self._now.folder))
 
     async def action_quit(self) -> None:
-        """Leave, but only with the arm parked, or after a word about it."""
+        """Leave, but with the arm not parked only after a question."""
         if isinstance(self.screen, Confirm):
             return
         now = self._now
@@ -195,13 +172,13 @@ class OperatorApp(PlainApp):
         elif now.state is State.STOPPING:
             self.notify("The arm is being stopped. The red button, if it moves on.", severity="warning")
         elif now.rest_unknown:
-            self.push_screen(Confirm(NOT_AT_REST, NOT_PARKED_KEYS), self._leave_answered)
+            self.push_screen(Confirm(*NOT_AT_REST), self._leave_answered)
         elif now.state not in FINAL:
-            self.push_screen(Confirm(AT_WORK, AT_WORK_KEYS), self._park_answered)
+            self.push_screen(Confirm(*AT_WORK), self._park_answered)
         elif now.parked or now.target_mm is None:
             self._away()
         else:
-            self.push_screen(Confirm(NOT_PARKED, NOT_PARKED_KEYS), self._leave_answered)
+            self.push_screen(Confirm(*NOT_PARKED), self._leave_answered)
 
     def _park_answered(self, yes: bool | None) -> None:
         if yes and self.engine is not None:
@@ -213,30 +190,28 @@ class OperatorApp(PlainApp):
             self._away()
 
     def _away(self) -> None:
-        """Back to the start screen where there is one, else out."""
-        if self._desk is None:
+        """Go back to the start screen where there is one, else end the app."""
+        if self._browser is None:
             self.exit()
             return
         while len(self.screen_stack) > 2:
             self.pop_screen()
         if self._now is not None and self._now.rest_unknown and isinstance(self.screen, StartScreen):
-            self.screen.trouble("The arm was not seen at rest when the run ended. Use the emergency stop if it moves.")
+            self.screen.show_trouble(
+                "The arm was not seen at rest when the run ended. Use the emergency stop if it moves."
+            )
         self._main = self._now = None
         self._leave_when_over = False
 
-    def _begin(self, session_id: str | None) -> None:
-        self._make_engine(session_id)
-
     @work(exclusive=True, group="begin")
-    async def _make_engine(self, session_id: str | None) -> None:
-        """Read and check the files off the screen's loop, then start."""
-        assert self._desk is not None
-        preview = self._pictures.kind != "off"
+    async def _begin(self, session_id: str | None) -> None:
+        """Read and check the files off the screen's loop, then start the run."""
+        assert self._browser is not None
         try:
-            engine = await asyncio.to_thread(self._desk.engine, session_id, guided=True, preview=preview)
+            engine = await asyncio.to_thread(self._browser.engine, session_id, preview=self._pictures.camera_shown)
         except (ConfigError, SessionError, OSError) as error:
             if isinstance(self.screen, StartScreen):
-                self.screen.trouble(str(error))
+                self.screen.show_trouble(str(error))
             return
         self.engine = engine
         engine.start()
@@ -244,12 +219,12 @@ class OperatorApp(PlainApp):
         self._show_run()
 
     def _review_named(self, session_id: str) -> None:
-        assert self._desk is not None
-        self._review(self._desk.paths.root / session_id)
+        assert self._browser is not None
+        self._review(self._browser.paths.root / session_id)
 
     def _review(self, folder: Path) -> None:
         from collect.tui.captures import Review
-        from collect.tui.review import ReviewScreen
+        from collect.tui.review_screen import ReviewScreen
 
         try:
             review = Review(folder)
@@ -259,7 +234,7 @@ class OperatorApp(PlainApp):
         self.push_screen(ReviewScreen(review, self._pictures, at_work=lambda: self.at_work))
 
     def _show_run(self) -> None:
-        """The wizard while the set-up lasts, then the run."""
+        """Show the wizard while the set-up lasts, then the run screen."""
         assert self.engine is not None
         assert self._now is not None
         wizard = bool(self._now.set_up) and self._now.state not in FINAL
@@ -271,10 +246,10 @@ class OperatorApp(PlainApp):
         elif self.screen is self._main:
             self.switch_screen(screen)  # pyright: ignore[reportUnknownMemberType]
         else:
-            return  # something lies over it; at the next look
+            return  # something lies over it; at the next poll
         self._main = screen
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         if self.leaving:
             self.exit()
         if self.engine is None or self._now is None:
@@ -299,7 +274,7 @@ class OperatorApp(PlainApp):
         shown = next((screen for screen in self.screen_stack if isinstance(screen, AskScreen)), None)
         if shown is not None and prompt is not None and shown.prompt.number == prompt.number:
             if shown.is_mounted:
-                shown.tell_time()
+                shown.show_time_left()
             return
         if shown is not None and shown is self.screen:
             self.pop_screen()

@@ -1,26 +1,21 @@
-"""What the start screen works with: the sessions that there are, how each stands, the rig's health, and engines.
+"""What the start screen works with: recent sessions and how each stands, the rig's health, and engines.
 
-Imports wait for what is asked: the screen is up first.
+Heavy imports wait until they are needed, so that the screen is up first.
 """
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from collect.engine.engine import Engine
+    from collect.engine.opening import Opening
+    from collect.headless import RunnableEngine
     from collect.rig.doctor import Finding
-    from sessions.repair.verify import Verdict
     from sessions.show import Details, Summary
 
 RECENT = 50
-COLUMNS = 68
-"""Of what commands say: as wide as the finish page is on a terminal of 80."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,14 +27,23 @@ class Paths:
     protocol: Path = Path("protocol.toml")
 
 
-class Desk:
-    """Reads, and makes engines; connects to nothing by itself but in `health`."""
+class EngineFor(Protocol):
+    """Makes the engine of a run; see `collect.start.engine_for`."""
 
-    def __init__(self, paths: Paths) -> None:
+    def __call__(self, opening: Opening, *, watched: bool, guided: bool, preview: bool) -> RunnableEngine:
+        """Make an engine that is not started yet. Raises `ConfigError`."""
+        ...
+
+
+class SessionBrowser:
+    """Reads sessions and makes engines; connects to devices only in `health`."""
+
+    def __init__(self, paths: Paths, engine_for: EngineFor) -> None:
         self.paths = paths
+        self._engine_for = engine_for
 
     def choose(self, config: str, protocol: str) -> None:
-        """Another rig, another protocol."""
+        """Work with another rig and another protocol."""
         self.paths = replace(self.paths, config=Path(config), protocol=Path(protocol))
 
     def recent(self) -> list[Summary]:
@@ -72,38 +76,21 @@ class Desk:
         from collect.protocols.files import load_protocol
         from collect.rig.config import load_rig
 
-        made = make_plan(load_rig(self.paths.config).settled(armed=False), load_protocol(self.paths.protocol))
-        sheets = "1 sheet" if made.sheets == 1 else f"{made.sheets} sheets"
-        return f"{len(made.placed)} strokes on {sheets}, about {made.seconds / 60:.0f} min"
+        plan = make_plan(load_rig(self.paths.config).settled(armed=False), load_protocol(self.paths.protocol))
+        sheets = "1 sheet" if plan.sheets == 1 else f"{plan.sheets} sheets"
+        return f"{len(plan.placed)} strokes on {sheets}, about {plan.seconds / 60:.0f} min"
 
-    def engine(self, session_id: str | None, *, guided: bool, preview: bool) -> Engine:
-        """An engine to go on with that open session; with None, for a new one on a fresh sheet.
+    def engine(self, session_id: str | None, *, preview: bool) -> RunnableEngine:
+        """An engine that resumes that open session, with the set-up wizard; with None, of a new one on a fresh sheet.
 
-        Connects nothing yet. Raises `ConfigError`, also where another session goes on with these files.
+        Connects nothing yet. Raises `ConfigError`, also where these files belong to another open session.
         """
         from collect.engine.opening import Opening, find_resumable
         from collect.errors import ConfigError
-        from collect.start import engine_for
 
         paths, new = self.paths, session_id is None
         opening = Opening.load(paths.root, paths.config, paths.protocol, new=new, sheet=1 if new else None)
-        found = None if new else find_resumable(opening)
-        if found is not None and found.name != session_id:
-            raise ConfigError(paths.config, "", f"goes on with session {found.name}, which is open as well")
-        return engine_for(opening, watched=True, guided=guided, preview=preview)
-
-
-def verified(folder: Path) -> Verdict:
-    """Every file read again. Raises `InputError`."""
-    from sessions.repair.verify import verify_session
-
-    return verify_session(folder)
-
-
-def run_command(name: str, folder: Path) -> tuple[int, str]:
-    """`brushloop NAME FOLDER` in a process of its own: (exit code, what it said; how far it got only where it failed).
-    May take minutes."""
-    command = [sys.executable, "-m", "brushloop", name, str(folder)]
-    fits = os.environ | {"COLUMNS": str(COLUMNS)}
-    ran = subprocess.run(command, capture_output=True, text=True, check=False, env=fits)
-    return ran.returncode, (ran.stdout if ran.returncode == 0 else ran.stdout + ran.stderr).strip()
+        resumable = None if new else find_resumable(opening)
+        if resumable is not None and resumable.name != session_id:
+            raise ConfigError(paths.config, "", f"goes on with session {resumable.name}, which is open as well")
+        return self._engine_for(opening, watched=True, guided=True, preview=preview)

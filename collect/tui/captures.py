@@ -1,4 +1,4 @@
-"""A session as it is looked through: its captures by cell, their pictures, and how alike the presses of a cell are."""
+"""What the review shows of a session: its captures, their pictures, and how alike the presses of a cell are."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class ReviewCapture:
     """One capture of a session."""
 
     stroke_id: str
@@ -49,36 +49,41 @@ class Seen:
     file: str
     remark: Remark | None
     waited_s: float | None = None
-    """From dip to touch; None where the session does not tell."""
+    """From dip to touch; None where the session did not record it."""
     unlike: str = ""
     """Why that is far from the other strokes of the session; empty where it is not."""
 
+    @property
+    def counts(self) -> bool:
+        """Whether it counts: kept by the run, and not marked bad since."""
+        return self.kept and not (self.remark is not None and self.remark.bad)
+
 
 @dataclass(frozen=True, slots=True)
-class Looked:
-    """What one capture shows, and where it is in the recording."""
+class CapturePictures:
+    """The pictures of one capture, and where it is in the recording."""
 
     photo: NDArray[np.uint8]
     """(h, w) gray: the field around its zero-touch point, or the whole photograph where the board is not seen."""
     binary: NDArray[np.bool_] | None
     log_ns: int
-    """When the still came to the host: where to jump to in a viewer."""
+    """When the still came to the host: the time to jump to in a viewer."""
 
 
 class Review:
     """One session's folder, open or closed; reads, and writes nothing."""
 
-    untold: str = ""
-    """Why photographs are shown whole and presses are not compared; empty where the session tells board and lens."""
+    not_compared: str = ""
+    """Why photographs are shown whole and presses are not compared; empty where board and lens are known."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises `InputError` where it was not collected here or holds links, `SessionDamaged`."""
+        """Raises `SessionDamaged`, and `InputError` where the session was not collected here or holds links."""
         self.folder = folder
         if not (folder / JOURNAL_NAME).is_file():
-            raise InputError(folder, f"holds no {JOURNAL_NAME}: imported photographs are looked at with `validate`")
+            raise InputError(folder, f"holds no {JOURNAL_NAME}: imported photographs are compared with `validate`")
         check_folder(folder)
         self._plane: Plane | None = None
-        self._looked: dict[int, Looked] = {}
+        self._pictures: dict[int, CapturePictures] = {}
         self._board: BoardSpec | None = None
         self._lens: Lens | None = None
         try:
@@ -87,7 +92,7 @@ class Review:
             self._lens = None if lens is None else lens.lens()
             self._board = board_of(folder)
         except CalibrationError as error:
-            self.untold = str(error)
+            self.not_compared = str(error)
         self.read()
 
     def read(self) -> None:
@@ -97,19 +102,19 @@ class Review:
         waits = waits_of(state.segments)
         odd = unlike(waits)
         try:
-            captures = [_seen(line, remarks) for line in state.segments if line["kind"] == "capture"]
+            captures = [_capture_of(line, remarks) for line in state.segments if line["kind"] == "capture"]
         except (KeyError, TypeError, ValueError) as error:
             raise SessionDamaged(self.folder / JOURNAL_NAME, f"a capture's {error} is missing or not valid") from None
         self.captures = tuple(replace(c, waited_s=waits.get(c.still), unlike=odd.get(c.still, "")) for c in captures)
 
-    def look(self, seen: Seen) -> Looked:
-        """The pictures of one capture; kept once made. Takes a tenth of a second: call it off a screen's loop.
+    def pictures(self, capture: ReviewCapture) -> CapturePictures:
+        """The pictures of one capture, made once. Takes a tenth of a second: call it off a screen's loop.
 
         Raises `SessionDamaged` where the still is not there.
         """
-        if seen.still not in self._looked:
-            self._looked[seen.still] = self._look(seen)
-        return self._looked[seen.still]
+        if capture.still not in self._pictures:
+            self._pictures[capture.still] = self._make_pictures(capture)
+        return self._pictures[capture.still]
 
     def repeatability(self, height_mm: float, tilt_deg: float) -> tuple[float, int] | None:
         """(mean CSIM of every pair, captures) of the counted presses of one cell; None for fewer than two.
@@ -117,59 +122,54 @@ class Review:
         CSIM is that of the validation, on the binarised 128 x 128 images in the millimetre alignment.
         """
         binaries = [
-            looked.binary.astype("float32")
-            for seen in self.captures
-            if (seen.height_mm, seen.tilt_deg) == (height_mm, tilt_deg) and counts(seen)
-            if (looked := self.look(seen)).binary is not None
+            pictures.binary.astype("float32")
+            for capture in self.captures
+            if (capture.height_mm, capture.tilt_deg) == (height_mm, tilt_deg) and capture.counts
+            if (pictures := self.pictures(capture)).binary is not None
         ]
         if len(binaries) < 2:
             return None
         return statistics.fmean(csim(a, b) for a, b in itertools.combinations(binaries, 2)), len(binaries)
 
-    def _look(self, seen: Seen) -> Looked:
-        path = self.folder / seen.file
+    def _make_pictures(self, capture: ReviewCapture) -> CapturePictures:
+        path = self.folder / capture.file
         path = path if path.is_file() else self.folder / f"{self.folder.name}.mcap"
         image, log_ns, stroke = None, 0, None
         for _schema, channel, message in container.messages(path, [Topic.STILL, Topic.STROKE]):
-            if message.sequence != seen.still:
+            if message.sequence != capture.still:
                 continue
             if channel.topic == Topic.STILL:
-                image, log_ns = decode_gray(decode_still(message.data), f"still {seen.still}"), message.log_time
+                image, log_ns = decode_gray(decode_still(message.data), f"still {capture.still}"), message.log_time
             else:
                 stroke = Stroke.model_validate_json(message.data)
         if image is None:
-            raise SessionDamaged(path, f"holds no still {seen.still}")
+            raise SessionDamaged(path, f"holds no still {capture.still}")
         cell = self._cell(stroke)
         if cell is None or self._board is None:
-            return Looked(image, None, log_ns)
+            return CapturePictures(image, None, log_ns)
         if self._lens is not None:
             if image.shape[::-1] != self._lens.size_px:
-                return Looked(image, None, log_ns)  # the lens says nothing of a photograph of another size
+                return CapturePictures(image, None, log_ns)  # the lens was calibrated for another size
             image = self._lens.undistort(image)
         try:
             self._plane = see_board(image, self._board)
         except CalibrationError:
             if self._plane is None:
-                return Looked(image, None, log_ns)
+                return CapturePictures(image, None, log_ns)
         photo, binary = pictures_of(image, self._plane, cell)
-        return Looked(photo, binary, log_ns)
+        return CapturePictures(photo, binary, log_ns)
 
     def _cell(self, stroke: Stroke | None) -> Cell | None:
-        """Where it lies, from its stroke record; a take that does not count has none, and is shown whole."""
+        """Where the stroke lies; None for a take that does not count, which has no stroke record and is shown whole."""
         if stroke is None or stroke.cell_mm is None:
             return None
         return Cell(0, *stroke.cell_mm)
 
 
-def counts(seen: Seen) -> bool:
-    """Whether it counts: kept by the run, and not marked bad since."""
-    return seen.kept and not (seen.remark is not None and seen.remark.bad)
-
-
-def _seen(line: Line, remarks: dict[int, Remark]) -> Seen:
+def _capture_of(line: Line, remarks: dict[int, Remark]) -> ReviewCapture:
     result = line["result"]
     still = int(result["still"])
-    return Seen(
+    return ReviewCapture(
         str(result["stroke_id"]),
         float(result["height_mm"]),
         float(result["tilt_deg"]),

@@ -1,4 +1,4 @@
-"""Gray pictures in a terminal: half-cells that work anywhere, or pixels where textual-image finds that it has them.
+"""Gray pictures in a terminal: half-cells that work anywhere, or pixels (sixels, kitty's protocol) where it has them.
 
 A half-cell is `▀` with its own two grays: over SSH and tmux as good as any other text.
 """
@@ -9,16 +9,15 @@ from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Literal
 
-from rich.segment import Segment
+from rich.segment import ControlType, Segment
 from rich.style import Style
 from textual.app import ComposeResult
 from textual.containers import Container
-from textual.geometry import Size
+from textual.geometry import Region, Size
 from textual.strip import Strip
 from textual.widget import Widget
 
-from collect.tui.gray import fitted, runs
-from collect.tui.sixel import SixelPicture
+from collect.tui.sixel import fitted, lines_of, runs, sixels, terminal_cell_px
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,8 +25,9 @@ if TYPE_CHECKING:
 
 HALF = "▀"
 LEVELS = 32
-"""Grays that are told apart: fewer styles, longer runs, less to send over a slow line."""
-Kind = Literal["auto", "cells", "off"]
+"""Grays of a picture in half-cells: fewer styles make longer runs, less to send over a slow line."""
+Preview = Literal["auto", "cells", "off"]
+"""How the camera is shown: in pixels where the terminal has them, in half-cells, or not at all."""
 
 
 class CellPicture(Widget):
@@ -44,23 +44,93 @@ class CellPicture(Widget):
         self._made_for: Size | None = None
 
     def show(self, image: NDArray[np.uint8] | None) -> None:
-        """Draw another picture; the same object is not drawn twice."""
+        """Draw this picture, unless it is the same object."""
         if image is not self._image:
             self._image, self._made_for = image, None
             self.refresh()
 
     def render_line(self, y: int) -> Strip:
-        """One line of half-cells."""
+        """Draw one line of half-cells."""
         if self._made_for != self.size:
-            self._strips, self._made_for = _strips(self._image, self.size), self.size
+            self._strips, self._made_for = half_cells(self._image, self.size), self.size
         width, ground = self.size.width, self.rich_style
         if y >= len(self._strips):
             return Strip.blank(width, ground)
         return self._strips[y].extend_cell_length(width, ground)
 
 
+class SixelPicture(Container):
+    """A picture in sixels, as large as its place allows, its shape kept.
+
+    The border goes around a widget of its own: textual cuts and pads the lines of a widget that has one, and drops the
+    pixels.
+    """
+
+    DEFAULT_CSS = """
+    SixelPicture { width: 1fr; height: 1fr; }
+    """
+
+    def __init__(self, id: str | None = None) -> None:  # noqa: A002 - textual's name
+        super().__init__(id=id)
+        self._pixels = Pixels()
+
+    def compose(self) -> ComposeResult:
+        """Lay out the pixels."""
+        yield self._pixels
+
+    def show(self, image: NDArray[np.uint8] | None) -> None:
+        """Draw this picture, unless it is the same object."""
+        self._pixels.show(image)
+
+
+class Pixels(Widget):
+    """The sixels themselves, one image for each line of cells.
+
+    textual repaints lines, not pictures: an image over many lines would be drawn again at every change of one of them,
+    and where it reaches below the last line it scrolls the screen.
+    """
+
+    DEFAULT_CSS = """
+    Pixels { width: 1fr; height: 1fr; }
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._image: NDArray[np.uint8] | None = None
+        self._lines: list[NDArray[np.int64]] = []
+        self._made_for: Size | None = None
+
+    def show(self, image: NDArray[np.uint8] | None) -> None:
+        """Draw the lines of this picture that changed; nothing where it is the same object."""
+        if image is self._image:
+            return
+        self._image = image
+        before, size = self._lines, self.size
+        self._fit()
+        for y in range(size.height):
+            old, new = (lines[y] if y < len(lines) else None for lines in (before, self._lines))
+            if old is None or new is None or old.shape != new.shape or (old != new).any():
+                self.refresh(Region(0, y, size.width, 1))
+
+    def render_line(self, y: int) -> Strip:
+        """Draw blank cells, which erase what was there, and the pixels over them."""
+        if self._made_for != self.size:
+            self._fit()
+        width, ground = self.size.width, self.rich_style
+        # While something lies over the screen textual dims what is below, which pixels cannot be.
+        if y >= len(self._lines) or not self.screen.is_active:
+            return Strip.blank(width, ground)
+        pixels = f"\x1b[{width}D\x1b7{sixels(self._lines[y])}\x1b8\x1b[{width}C"
+        control = Segment(pixels, Style.null(), ((ControlType.CURSOR_FORWARD, 0),))
+        return Strip([Segment(" " * width, ground), control], width)
+
+    def _fit(self) -> None:
+        self._made_for = self.size
+        self._lines = lines_of(self._image, self.size, terminal_cell_px())
+
+
 class ImagePicture(Container):
-    """The same over textual-image, in pixels by kitty's protocol."""
+    """A picture by textual-image, in pixels by kitty's protocol."""
 
     DEFAULT_CSS = """
     ImagePicture { width: 1fr; height: 1fr; }
@@ -73,11 +143,11 @@ class ImagePicture(Container):
         self._image: NDArray[np.uint8] | None = None
 
     def compose(self) -> ComposeResult:
-        """textual-image's own widget."""
+        """Lay out textual-image's own widget."""
         yield self._inner
 
     def show(self, image: NDArray[np.uint8] | None) -> None:
-        """Draw another picture."""
+        """Draw this picture, unless it is the same object."""
         if image is self._image:
             return
         self._image = image
@@ -90,15 +160,28 @@ class ImagePicture(Container):
 
 
 class Pictures:
-    """Makes picture widgets of the kind that this terminal shows best. Made before the app takes the terminal."""
+    """Makes picture widgets of the kind that this terminal shows best. Make it before the app takes the terminal."""
 
-    def __init__(self, kind: Kind = "cells") -> None:
-        self.kind: Kind = kind
-        self._make = _pixels() if kind == "auto" else CellPicture
+    def __init__(self, preview: Preview = "cells") -> None:
+        self.camera_shown = preview != "off"
+        self._make = _best_kind() if preview == "auto" else CellPicture
 
     def make(self, id: str) -> CellPicture | SixelPicture | ImagePicture:  # noqa: A002 - textual's name
-        """A new widget."""
+        """Make a widget."""
         return self._make(id)
+
+
+def _best_kind() -> Callable[[str], CellPicture | SixelPicture | ImagePicture]:
+    """Ask the terminal which kind it shows; half-cells where textual-image is not installed."""
+    try:
+        from textual_image.renderable import Image, SixelImage, TGPImage
+        from textual_image.widget import TGPImage as Widget
+    except (ImportError, OSError, ValueError):
+        # The extra is missing, or textual-image does not understand the terminal's answer.
+        return CellPicture
+    if Image is SixelImage:
+        return SixelPicture
+    return partial(ImagePicture, Widget) if Image is TGPImage else CellPicture
 
 
 def binary_picture(binary: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -108,30 +191,14 @@ def binary_picture(binary: NDArray[np.bool_]) -> NDArray[np.uint8]:
     return np.where(binary, 0, 255).astype(np.uint8)
 
 
-def _pixels() -> Callable[[str], CellPicture | SixelPicture | ImagePicture]:
-    """What this terminal shows best; asks it, so call it early. Half-cells where textual-image is not installed."""
-    try:
-        from textual_image.renderable import Image, SixelImage, TGPImage
-        from textual_image.widget import TGPImage as Widget
-    except (ImportError, OSError, ValueError):
-        # The extra is missing, or the terminal answered its question in a way that it does not understand.
-        return CellPicture
-    if Image is SixelImage:
-        return SixelPicture
-    return partial(ImagePicture, Widget) if Image is TGPImage else CellPicture
-
-
-def _strips(image: NDArray[np.uint8] | None, size: Size) -> list[Strip]:
+def half_cells(image: NDArray[np.uint8] | None, size: Size) -> list[Strip]:
+    """The picture fitted into `size` cells, one strip of half-cells for each line that it reaches."""
     if image is None or not image.size or size.width < 1 or size.height < 1:
         return []
     # A cell is about twice as high as wide: a half-cell is a square.
     levels = fitted(image, size.width, 2 * size.height, LEVELS, step=2)
-    return [_strip(levels[y], levels[y + 1]) for y in range(0, len(levels), 2)]
-
-
-def _strip(top: NDArray[np.int64], bottom: NDArray[np.int64]) -> Strip:
-    pair = top * LEVELS + bottom
-    return Strip([Segment(HALF * count, _style(value)) for value, count in runs(pair)], len(pair))
+    pairs = levels[::2] * LEVELS + levels[1::2]
+    return [Strip([Segment(HALF * count, _style(pair)) for pair, count in runs(row)], len(row)) for row in pairs]
 
 
 @lru_cache(maxsize=LEVELS * LEVELS)

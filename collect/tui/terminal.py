@@ -1,7 +1,7 @@
-"""A terminal that may go away (a closed window, a lost ssh) without taking the process along.
+"""A terminal that may go away (a closed window, a lost ssh), and on which no text acts.
 
-textual's own driver then waits for ever: its writer thread dies of the first failed write, and SIGCONT, which comes
-with every hang-up, starts a second set of threads that nobody ends.
+textual's own driver waits for ever once the terminal is gone: its writer thread dies of the first failed write, and
+SIGCONT, which comes with every hang-up, starts a second set of threads that nobody ends.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from sessions.terminal import inert
 
 
 class TerminalDriver(LinuxDriver):
-    """textual's driver, less its two ways to hang."""
+    """textual's driver without its two ways to hang."""
 
     _suspended = False
 
     def start_application_mode(self) -> None:
         """Take the terminal."""
-        self._file = _Forgiving(self._file)
+        self._file = _LostWrites(self._file)
         super().start_application_mode()
 
     def suspend_application_mode(self) -> None:
@@ -46,23 +46,23 @@ class PlainApp(App[None]):
     """An app on which no text acts on the terminal, whoever wrote it."""
 
     def get_line_filters(self) -> Sequence[LineFilter]:
-        """Textual's, and one behind them."""
+        """Add one behind textual's own."""
         return [*super().get_line_filters(), PLAIN_LINES]
 
 
 class PlainLines(LineFilter):
-    """Takes out what a terminal acts on; textual's own controls stay."""
+    """Takes characters that a terminal acts on out of all text; textual's own controls stay."""
 
     def apply(self, segments: list[Segment], background: Color) -> list[Segment]:
-        """See `LineFilter`."""
+        """Filter one line."""
         return [part if part.control else Segment(inert(part.text), part.style) for part in segments]
 
 
 PLAIN_LINES = PlainLines()
 
 
-class _Forgiving(io.StringIO):
-    """A file whose writes are lost where the terminal is."""
+class _LostWrites(io.StringIO):
+    """A file whose failed writes are dropped: those to a terminal that is gone."""
 
     def __init__(self, file: TextIO) -> None:
         super().__init__()

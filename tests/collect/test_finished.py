@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.chains.finished import ending
+from collect.chains.commands import ending
 from collect.engine.opening import Opening
 from collect.start import start
 
@@ -28,7 +28,7 @@ def test_it_is_told_after_the_screen_too(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
-    monkeypatch.setattr("collect.tui.running.run_screen", lambda engine, _preview: (engine.start(), engine.join()))
+    monkeypatch.setattr("collect.tui.runner.run_screen", lambda engine, _preview: (engine.start(), engine.join()))
     opening = Opening.load(lab.sessions, lab.folder / "rig.toml", lab.folder / "protocol.toml")
     assert start(opening, on_screen=True, preview="off") == 0
     [folder] = lab.sessions.iterdir()

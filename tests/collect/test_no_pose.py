@@ -68,7 +68,7 @@ async def test_the_run_screen_is_not_green_without_a_pose() -> None:
         await pilot.pause(0.15)
         assert str(state.render()) == "RUNNING\nno pose for 1.4 s"
         assert state.styles.background != green
-        assert "no pose for 1.4 s" in str(app.screen.query_one("#facts").render())
+        assert "no pose for 1.4 s" in str(app.screen.query_one("#figures").render())
         engine.now = picture(state=State.PAUSED, tip_mm=None, no_pose_s=75.2)
         await pilot.pause(0.15)
         assert str(state.render()) == "PAUSED\nno pose for 75 s"
@@ -105,4 +105,4 @@ def test_without_a_screen_it_is_one_line_when_it_begins_and_one_when_it_ends(
     monkeypatch.setattr(headless, "REFRESH_S", 0.0)
     headless._show(Scripted(iter([*shots, picture(state=State.DONE, messages=())])))
     told = [line for line in capsys.readouterr().err.splitlines() if "pose" in line]
-    assert told == ["warning: no pose for 1.0 s", "the arm tells its pose again"]
+    assert told == ["warning: no pose for 1.0 s", "the arm sends its pose again"]

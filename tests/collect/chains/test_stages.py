@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from collect.chains.commands import CommandFailed, run_command
-from collect.chains.loop import check_recovered
-from collect.chains.loop_settings import FILE, Settings, begun_with, keep
+from collect.chains.loop import SETTINGS as FILE
+from collect.chains.loop import Settings, begun_with, check_recovered, keep_settings
 from collect.errors import ConfigError
 
 SETTINGS = Settings(
@@ -25,15 +25,15 @@ SETTINGS = Settings(
 def test_a_loop_goes_on_with_what_it_was_begun_with_and_nothing_else(tmp_path: Path) -> None:
     folder = tmp_path / "loop"
     assert begun_with(folder) is None
-    keep(SETTINGS, folder)
-    keep(SETTINGS, folder)
+    keep_settings(SETTINGS, folder)
+    keep_settings(SETTINGS, folder)
     assert begun_with(folder) == SETTINGS
     for name, value in (("fit", "ef"), ("original_sha256", "xy"), ("height_range_mm", (2.0, 20.0))):
         with pytest.raises(ConfigError, match=f"{name}: this loop was begun with"):
-            keep(SETTINGS.model_copy(update={name: value}), folder)
+            keep_settings(SETTINGS.model_copy(update={name: value}), folder)
     (folder / FILE).write_text("{}")
     with pytest.raises(ConfigError, match="does not hold the settings of a loop"):
-        keep(SETTINGS, folder)
+        keep_settings(SETTINGS, folder)
 
 
 def test_a_fit_that_does_not_describe_the_brush_is_not_pressed(tmp_path: Path) -> None:

@@ -12,11 +12,11 @@ from textual.widgets import Static
 
 from collect.engine.states import FINAL, State
 from collect.tui.app import OperatorApp
-from collect.tui.confirm import Confirm
-from collect.tui.help import HelpScreen
-from collect.tui.line import Line
+from collect.tui.keys import HelpScreen
+from collect.tui.question_screens import Confirm
+from collect.tui.run_screen import GOES_ON, OVER, STOP_SENT
 from collect.tui.text import SOFTWARE_STOP
-from collect.tui.view import GOES_ON, OVER, STOP_SENT
+from collect.tui.widgets import Line
 from tests.collect.tui.fake import (
     DONE,
     ERROR,

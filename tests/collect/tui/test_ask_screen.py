@@ -9,9 +9,8 @@ import pytest
 from collect.engine.states import State
 from collect.operator import Choice, Prompt
 from collect.tui.app import OperatorApp
-from collect.tui.ask import AskScreen
-from collect.tui.confirm import Confirm
-from collect.tui.set_up import SetUpScreen
+from collect.tui.question_screens import AskScreen, Confirm
+from collect.tui.set_up_screen import SetUpScreen
 from tests.collect.tui.fake import SET_UP, SPLIT, TOUCHED, FakeEngine, picture
 from tests.collect.tui.test_app import look
 

@@ -10,10 +10,10 @@ from textual.pilot import Pilot
 
 from collect.engine.states import State
 from collect.tui.app import OperatorApp
-from collect.tui.finish import FinishScreen
+from collect.tui.finish_screen import FinishScreen
 from sessions.repair.verify import Verdict
-from tests.collect.tui.desk import FakeDesk, a_review
 from tests.collect.tui.fake import DONE, FAILED, JOGGED, PAUSED, SET_UP, SPLIT, TOUCHED, FakeEngine, full_picture
+from tests.collect.tui.fake_browser import FakeBrowser, a_review
 
 SIZES = {"80x24": (80, 24), "120x40": (120, 40), "200x60": (200, 60)}
 NOW = {
@@ -76,7 +76,7 @@ def test_over_the_run(snap_compare: Callable[..., bool], name: str, keys: list[s
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("name", ["start", "review"])
 def test_without_a_run(snap_compare: Callable[..., bool], tmp_path: Path, name: str, size: str) -> None:
-    app = OperatorApp(desk=FakeDesk())
+    app = OperatorApp(browser=FakeBrowser())
     if name == "review":
 
         async def review(pilot: Pilot[None]) -> None:
@@ -94,8 +94,8 @@ def test_without_a_run(snap_compare: Callable[..., bool], tmp_path: Path, name: 
 @pytest.mark.parametrize("size", SIZES)
 def test_the_end_of_a_session(snap_compare: Callable[..., bool], monkeypatch: pytest.MonkeyPatch, size: str) -> None:
     sound = Verdict("2026-11-21-grid-01", "closed", files=44, strokes=12, messages=22528)
-    monkeypatch.setattr("collect.tui.finish.verified", lambda _folder: sound)
-    app = OperatorApp(desk=FakeDesk())
+    monkeypatch.setattr("collect.tui.finish_screen.verify", lambda _folder: sound)
+    app = OperatorApp(browser=FakeBrowser())
 
     async def finish(pilot: Pilot[None]) -> None:
         await settled(pilot)

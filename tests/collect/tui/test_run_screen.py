@@ -13,8 +13,8 @@ from textual.pilot import Pilot
 
 from collect.errors import CollectAborted
 from collect.tui.app import OperatorApp
-from collect.tui.running import ScreenCrashed, run_screen
-from collect.tui.terminal import TerminalDriver, _Forgiving
+from collect.tui.runner import ScreenCrashed, run_screen
+from collect.tui.terminal import TerminalDriver, _LostWrites
 from tests.collect.tui.fake import FakeEngine, picture
 
 
@@ -103,7 +103,7 @@ def test_writes_to_a_lost_terminal_are_lost_and_hurt_nobody() -> None:
         def flush(self) -> None:
             raise OSError(5, "Input/output error")
 
-    file = _Forgiving(Gone())
+    file = _LostWrites(Gone())
     assert file.write("abc") == 3
     file.flush()
 

@@ -14,14 +14,15 @@ from textual.pilot import Pilot
 from bench.processes import Process, started
 from collect.engine.snapshot import Snapshot
 from collect.engine.states import State
+from collect.start import engine_for
 from collect.tui.app import OperatorApp
-from collect.tui.ask import AskScreen
-from collect.tui.browser import Desk, Paths
-from collect.tui.finish import FinishScreen
-from collect.tui.review import ReviewScreen
-from collect.tui.run import RunScreen
-from collect.tui.set_up import SetUpScreen
-from collect.tui.start import StartScreen
+from collect.tui.browser import Paths, SessionBrowser
+from collect.tui.finish_screen import FinishScreen
+from collect.tui.question_screens import AskScreen
+from collect.tui.review_screen import ReviewScreen
+from collect.tui.run_screen import RunScreen
+from collect.tui.set_up_screen import SetUpScreen
+from collect.tui.start_screen import StartScreen
 from sessions.reader import Recording
 from sessions.remarks import remarks_of
 from sessions.repair.verify import verify_session
@@ -129,8 +130,8 @@ def day(tmp_path: Path) -> Iterator[Day]:
 
 @pytest.mark.timeout(400)
 async def test_a_day_at_the_rig(day: Day) -> None:
-    desk = Desk(Paths(day.sessions, day.folder / "rig.toml", day.folder / "protocol.toml"))
-    app = OperatorApp(desk=desk)
+    paths = Paths(day.sessions, day.folder / "rig.toml", day.folder / "protocol.toml")
+    app = OperatorApp(browser=SessionBrowser(paths, engine_for))
     async with app.run_test(size=(80, 24)) as pilot:
         operator = Operator(app, pilot)
 

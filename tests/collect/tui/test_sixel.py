@@ -12,7 +12,8 @@ from textual.app import App, ComposeResult
 from textual.geometry import Size
 from textual.strip import Strip
 
-from collect.tui.sixel import LEVELS, NOTHING, Pixels, SixelPicture, lines_of, sixels
+from collect.tui.pictures import Pixels, SixelPicture
+from collect.tui.sixel import NOTHING, SIXEL_LEVELS, lines_of, sixels
 
 
 def drawn(sequence: str) -> NDArray[np.int64]:
@@ -45,9 +46,9 @@ def drawn(sequence: str) -> NDArray[np.int64]:
 @pytest.mark.parametrize("shape", [(15, 8), (20, 61), (1, 1), (6, 300)])
 def test_what_is_drawn_is_what_was_given(shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(0)
-    levels = rng.integers(-1, LEVELS, shape)
+    levels = rng.integers(-1, SIXEL_LEVELS, shape)
     levels[:, : shape[1] // 2] = NOTHING
-    expected = np.where(levels == NOTHING, -1, np.round(100 * levels / (LEVELS - 1)).astype(int))
+    expected = np.where(levels == NOTHING, -1, np.round(100 * levels / (SIXEL_LEVELS - 1)).astype(int))
     assert np.array_equal(drawn(sixels(levels)), expected)
 
 
@@ -58,7 +59,7 @@ def test_a_picture_keeps_its_shape_and_never_reaches_below_its_lines(size: Size,
     assert len(made) == lines
     if made:
         assert {line.shape[0] for line in made} == {20}
-        white = np.concatenate(made) == LEVELS - 1
+        white = np.concatenate(made) == SIXEL_LEVELS - 1
         assert white.any(axis=0).sum() == white.any(axis=1).sum() == min(10 * size.width, 20 * size.height)
 
 

@@ -14,23 +14,23 @@ from textual.pilot import Pilot
 
 from collect.errors import ConfigError
 from collect.tui.app import OperatorApp
-from collect.tui.confirm import Confirm
-from collect.tui.finish import FinishScreen, verdict_content
-from collect.tui.pictures import HALF, CellPicture, ImagePicture, Pictures, _strips
-from collect.tui.start import StartScreen
-from collect.tui.trace import force_bar, plot, spark
+from collect.tui.finish_screen import FinishScreen, verdict_content
+from collect.tui.pictures import HALF, CellPicture, ImagePicture, Pictures, half_cells
+from collect.tui.question_screens import Confirm
+from collect.tui.start_screen import StartScreen
+from collect.tui.text import force_bar, plot, spark
 from sessions.remarks import remarks_of
 from sessions.repair.verify import Finding, Verdict
-from tests.collect.tui.desk import FakeDesk, a_review
 from tests.collect.tui.fake import FakeEngine, picture
+from tests.collect.tui.fake_browser import FakeBrowser, a_review
 from tests.collect.tui.test_app import look, shown
 
 
-class Beginning(FakeDesk):
+class Beginning(FakeBrowser):
     """Notes which session is gone on with."""
 
-    def engine(self, session_id: str | None, **options: Any) -> Any:
-        self.asked.append((session_id, options["guided"]))
+    def engine(self, session_id: str | None, *, preview: bool) -> Any:
+        self.asked.append((session_id, preview))
         if session_id is None:
             raise ConfigError("rig.toml", "robot", "another brushloop is driving the arm")
         return FakeEngine(picture())
@@ -44,7 +44,7 @@ async def ready(app: OperatorApp, pilot: Pilot[None]) -> str:
 
 
 async def test_the_start_screen_tells_what_is_finished_void_and_next() -> None:
-    app = OperatorApp(desk=FakeDesk())
+    app = OperatorApp(browser=FakeBrowser())
     async with app.run_test(size=(80, 24)) as pilot:
         text = await ready(app, pilot)
         for part in ("▶ 2026-11-21-grid-02 open", "13 of 30 strokes", "1 cut short", "the process", "press H15-a5-r01"):
@@ -56,7 +56,7 @@ async def test_the_start_screen_tells_what_is_finished_void_and_next() -> None:
 
 
 async def test_the_first_day_says_what_to_do() -> None:
-    app = OperatorApp(desk=FakeDesk(rows=()))
+    app = OperatorApp(browser=FakeBrowser(rows=()))
     async with app.run_test(size=(80, 24)) as pilot:
         text = await ready(app, pilot)
         assert "No session yet" in text
@@ -66,24 +66,24 @@ async def test_the_first_day_says_what_to_do() -> None:
 
 
 async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_first() -> None:
-    desk = Beginning()
-    app = OperatorApp(desk=desk)
+    browser = Beginning()
+    app = OperatorApp(browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
         await ready(app, pilot)
         await pilot.press("n")
         await ready(app, pilot)
         assert isinstance(app.screen, Confirm)
         await pilot.press("n")
-        assert desk.asked == []
+        assert browser.asked == []
         await pilot.press("n")
         await ready(app, pilot)
         await pilot.press("y")
         text = await ready(app, pilot)
-        assert desk.asked == [(None, True)]
+        assert browser.asked == [(None, True)]
         assert "rig.toml: robot: another brushloop is driving the arm" in text
         await pilot.press("enter")
         await ready(app, pilot)
-        assert desk.asked[1:] == [("2026-11-21-grid-02", True)]
+        assert browser.asked[1:] == [("2026-11-21-grid-02", True)]
         assert app.engine is not None
         assert app.engine.calls == ["start"]  # type: ignore[attr-defined]
         await look(app, pilot)
@@ -92,21 +92,21 @@ async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_f
 
 
 async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
-    desk = FakeDesk()
-    app = OperatorApp(desk=desk)
+    browser = FakeBrowser()
+    app = OperatorApp(browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
         await ready(app, pilot)
         await pilot.press("e", "ctrl+u", *"s2.toml", "enter")
         await ready(app, pilot)
-        assert str(desk.paths.config) == "s2.toml"
+        assert str(browser.paths.config) == "s2.toml"
         assert isinstance(app.screen, StartScreen)
 
 
 async def test_escape_leaves_the_files_as_they_were() -> None:
-    desk = FakeDesk()
-    app = OperatorApp(desk=desk)
+    browser = FakeBrowser()
+    app = OperatorApp(browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
-        before = desk.paths
+        before = browser.paths
         await ready(app, pilot)
         await pilot.press("e", *"xx")
         assert "escape back, as they were" in await ready(app, pilot)
@@ -115,11 +115,11 @@ async def test_escape_leaves_the_files_as_they_were() -> None:
         assert str(before.config) in text
         assert f"{before.config}xx" not in text
         assert "q leave" in text
-        assert desk.paths == before
+        assert browser.paths == before
 
 
 async def test_marks_and_notes_are_kept_beside_the_recording(tmp_path: Path) -> None:
-    app = OperatorApp(desk=FakeDesk())
+    app = OperatorApp(browser=FakeBrowser())
     async with app.run_test(size=(120, 40)) as pilot:
         await ready(app, pilot)
         review = a_review(tmp_path)
@@ -155,8 +155,7 @@ async def test_no_note_is_typed_while_the_arm_is_at_work(tmp_path: Path) -> None
     app = OperatorApp(engine)
     async with app.run_test(size=(120, 40)) as pilot:
         await look(app, pilot)
-        review = a_review(tmp_path)
-        review._at_work = lambda: app.at_work
+        review = a_review(tmp_path, lambda: app.at_work)
         app.push_screen(review)
         text = await ready(app, pilot)
         for words in ("The arm is at work", "red button", "s STOP"):
@@ -174,9 +173,9 @@ async def test_finishing_verifies_and_runs_what_comes_next(tmp_path: Path, monke
         ran.append((name, folder))
         return 0, "\n".join(f"line {n}" for n in range(30))
 
-    monkeypatch.setattr("collect.tui.finish.run_command", command)
-    monkeypatch.setattr("collect.tui.finish.verified", lambda _folder: Verdict("s", "closed", files=3, strokes=2))
-    app = OperatorApp(desk=FakeDesk())
+    monkeypatch.setattr("collect.tui.finish_screen.run_command", command)
+    monkeypatch.setattr("collect.tui.finish_screen.verify", lambda _folder: Verdict("s", "closed", files=3, strokes=2))
+    app = OperatorApp(browser=FakeBrowser())
     async with app.run_test(size=(120, 40)) as pilot:
         await ready(app, pilot)
         app.push_screen(FinishScreen(tmp_path, is_open=False))
@@ -216,11 +215,11 @@ async def test_pictures_by_the_extra_are_shown_and_changed() -> None:
 
 def test_a_picture_fits_its_place_and_keeps_its_shape() -> None:
     image = np.tile(np.arange(64, dtype=np.uint8) * 4, (32, 1))
-    strips = _strips(image, Size(40, 30))
+    strips = half_cells(image, Size(40, 30))
     assert (len(strips), strips[0].cell_length) == (10, 40)
     assert {segment.text[0] for strip in strips for segment in strip} == {HALF}
-    assert _strips(None, Size(40, 30)) == []
-    assert _strips(image, Size(0, 0)) == []
+    assert half_cells(None, Size(40, 30)) == []
+    assert half_cells(image, Size(0, 0)) == []
 
 
 def test_a_force_is_drawn_to_scale_and_noise_does_not_fill_its_place() -> None:

@@ -1,23 +1,24 @@
-"""All that the run screen shows, as widgets that are handed one `Snapshot` after the other."""
+"""The run screen: one `Snapshot` after the other, from the first retreat to the end of the run."""
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from textual import events
 from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, ScrollableContainer, Vertical, VerticalScroll
 from textual.content import Content
+from textual.screen import Screen
 
 from collect.engine.snapshot import Snapshot
 from collect.engine.states import FINAL, State
 from collect.headless import no_pose_text
-from collect.tui.capture import CapturePane
-from collect.tui.facts import facts_content
-from collect.tui.grid import LEGEND, Grid
-from collect.tui.line import Line
+from collect.tui.keys import RUN_BAR, keys_in
+from collect.tui.panes import LEGEND, CapturePane, Grid, figures_content, sheet_content, sheet_title
 from collect.tui.pictures import Pictures
-from collect.tui.sheet import sheet_content, sheet_title
-from collect.tui.text import SHORT_STOP, SOFTWARE_STOP, one_line, plain
-from collect.tui.trace import plot
+from collect.tui.text import SHORT_STOP, SOFTWARE_STOP, one_line, plain, plot
+from collect.tui.widgets import KeyBar, Line
 
 OVER = "Over: q leaves"
 GOES_ON = "The same command goes on from here; this screen does not."
@@ -28,74 +29,76 @@ PANES = ("overview", "capture", "camera")
 TRACE_ROWS = 4
 
 
-class RunView(Vertical):
-    """One snapshot, drawn; holds nothing but what is on the screen."""
+class RunScreen(Screen[None]):
+    """Draws snapshots; keeps nothing but what is on the screen."""
 
+    AUTO_FOCUS = "#log-pane"
     DEFAULT_CSS = """
-    RunView #title { height: 1; background: $panel; }
-    RunView #session { width: 1fr; padding: 0 1; text-style: bold; text-wrap: nowrap; text-overflow: ellipsis; }
-    RunView #source {
+    RunScreen #title { height: 1; background: $panel; }
+    RunScreen #session { width: 1fr; padding: 0 1; text-style: bold; text-wrap: nowrap; text-overflow: ellipsis; }
+    RunScreen #source {
         width: auto; max-width: 50%; padding: 0 1; text-style: bold; text-wrap: nowrap; text-overflow: ellipsis;
         background: $accent; color: $text;
     }
-    RunView #band { height: 7; }
-    RunView #state {
+    RunScreen #band { height: 7; }
+    RunScreen #state {
         width: 18; height: 7; margin: 0 1; content-align: center middle; text-align: center; text-style: bold;
         background: $panel; color: $text;
     }
-    RunView #state.-running { background: $success; }
-    RunView #state.-recovering, RunView #state.-pausing, RunView #state.-stopping, RunView #state.-asking {
+    RunScreen #state.-running { background: $success; }
+    RunScreen #state.-recovering, RunScreen #state.-pausing, RunScreen #state.-stopping, RunScreen #state.-asking {
         background: $warning;
     }
-    RunView #state.-paused { background: $primary; }
-    RunView #state.-stopped, RunView #state.-failed { background: $error; }
-    RunView #state.-done { background: $success-darken-2; }
-    RunView #state.-silent { background: $error; }
-    RunView #facts { width: 1fr; height: 7; text-wrap: nowrap; text-overflow: ellipsis; }
-    RunView #body { height: 1fr; }
-    RunView .pane {
+    RunScreen #state.-paused { background: $primary; }
+    RunScreen #state.-stopped, RunScreen #state.-failed { background: $error; }
+    RunScreen #state.-done { background: $success-darken-2; }
+    RunScreen #state.-silent { background: $error; }
+    RunScreen #figures { width: 1fr; height: 7; text-wrap: nowrap; text-overflow: ellipsis; }
+    RunScreen #body { height: 1fr; }
+    RunScreen .pane {
         border-top: solid $foreground 40%; border-title-style: bold; border-title-color: $foreground; padding: 0 1;
     }
-    RunView .pane:focus { border-top: solid $accent; }
-    RunView #why-pane {
+    RunScreen .pane:focus { border-top: solid $accent; }
+    RunScreen #why-pane {
         display: none; height: auto; max-height: 60%; border: heavy $error; border-title-color: $text-error;
         border-title-style: bold; padding: 0 1;
     }
-    RunView.-wrong #why-pane { display: block; }
-    RunView #left { width: 1fr; }
-    RunView #right { width: 45%; }
-    RunView #top { height: auto; max-height: 60%; }
-    RunView.-wrong #top { max-height: 70%; }
-    RunView.-narrow.-wrong #sheet-pane { display: none; }
-    RunView #grid-pane { width: 1fr; height: auto; }
-    RunView #sheet-pane { width: auto; max-width: 40%; height: auto; min-width: 18; }
-    RunView #trace-pane { height: 6; display: none; }
-    RunView.-tall #trace-pane { display: block; }
-    RunView #legend { width: auto; display: none; }
-    RunView.-tall #legend { display: block; }
-    RunView #log-pane { height: 1fr; }
-    RunView #log { width: 1fr; height: auto; min-height: 100%; }
-    RunView #camera-pane { height: 1fr; }
-    RunView.-narrow #right { display: none; }
-    RunView.-narrow.-capture #right, RunView.-narrow.-camera #right { display: block; width: 1fr; }
-    RunView.-narrow.-capture #left, RunView.-narrow.-camera #left { display: none; }
-    RunView.-narrow.-capture #camera-pane, RunView.-narrow.-camera #capture-pane { display: none; }
-    RunView #note { height: 1; padding: 0 1; background: $panel; text-wrap: nowrap; text-overflow: ellipsis; }
+    RunScreen.-wrong #why-pane { display: block; }
+    RunScreen #left { width: 1fr; }
+    RunScreen #right { width: 45%; }
+    RunScreen #top { height: auto; max-height: 60%; }
+    RunScreen.-wrong #top { max-height: 70%; }
+    RunScreen.-narrow.-wrong #sheet-pane { display: none; }
+    RunScreen #grid-pane { width: 1fr; height: auto; }
+    RunScreen #sheet-pane { width: auto; max-width: 40%; height: auto; min-width: 18; }
+    RunScreen #trace-pane { height: 6; display: none; }
+    RunScreen.-tall #trace-pane { display: block; }
+    RunScreen #legend { width: auto; display: none; }
+    RunScreen.-tall #legend { display: block; }
+    RunScreen #log-pane { height: 1fr; }
+    RunScreen #log { width: 1fr; height: auto; min-height: 100%; }
+    RunScreen #camera-pane { height: 1fr; }
+    RunScreen.-narrow #right { display: none; }
+    RunScreen.-narrow.-capture #right, RunScreen.-narrow.-camera #right { display: block; width: 1fr; }
+    RunScreen.-narrow.-capture #left, RunScreen.-narrow.-camera #left { display: none; }
+    RunScreen.-narrow.-capture #camera-pane, RunScreen.-narrow.-camera #capture-pane { display: none; }
+    RunScreen #note { height: 1; padding: 0 1; background: $panel; text-wrap: nowrap; text-overflow: ellipsis; }
     """
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("tab", "next_pane", "Next pane")]
 
     def __init__(self, pictures: Pictures) -> None:
         super().__init__()
-        # Held, not queried: a poll may come before the parts are mounted or after they are gone.
+        # Kept, not queried: a snapshot may come before the parts are mounted or after they are gone.
         self._session, self._source = Line("session"), Line("source")
-        self._state, self._facts = Line("state"), Line("facts")
+        self._state, self._figures = Line("state"), Line("figures")
         self._why, self._why_pane = Line("why"), VerticalScroll(id="why-pane")
         self._grid, self._grid_pane = Grid(), ScrollableContainer(id="grid-pane", classes="pane")
         self._sheet = Line("sheet-pane", classes="pane")
         self._trace = Line("trace-pane", classes="pane")
         self._log, self._log_pane = Line("log"), VerticalScroll(id="log-pane", classes="pane")
         self._capture = CapturePane(pictures)
-        self._camera, self._with_camera = pictures.make("camera-pane"), pictures.kind != "off"
-        self._note = Line("note")
+        self._camera, self._with_camera = pictures.make("camera-pane"), pictures.camera_shown
+        self._note, self._keys = Line("note"), KeyBar(RUN_BAR)
         self._messages: tuple[str, ...] = ()
         self._pane = 0
         self._stop_sent = False
@@ -108,13 +111,13 @@ class RunView(Vertical):
         self._camera.border_title = "Camera"
 
     def compose(self) -> ComposeResult:
-        """Top to bottom, by how soon the operator needs it."""
+        """Lay out top to bottom, by how soon the operator needs it."""
         with Horizontal(id="title"):
             yield self._session
             yield self._source
         with Horizontal(id="band"):
             yield self._state
-            yield self._facts
+            yield self._figures
         with self._why_pane:
             yield self._why
         with Horizontal(id="body"):
@@ -132,35 +135,36 @@ class RunView(Vertical):
                 if self._with_camera:
                     yield self._camera
         yield self._note
+        yield self._keys
 
     def on_mount(self) -> None:
-        """Stay at the newest line until the operator scrolls away."""
+        """Keep the log at its newest line until the operator scrolls away."""
         self._log_pane.anchor()
 
     def on_resize(self, event: events.Resize) -> None:
-        """What fits is decided by the terminal's size alone."""
+        """Choose what is shown by the terminal's size."""
         self.set_class(event.size.width < NARROW_COLUMNS, "-narrow")
         self.set_class(event.size.height >= TALL_ROWS, "-tall")
 
-    def next_pane(self) -> None:
-        """On a narrow screen: overview, last capture, camera in turn."""
+    def action_next_pane(self) -> None:
+        """Show overview, last capture, and camera in turn, on a narrow screen."""
         shown = PANES if self._with_camera else PANES[:-1]
         self._pane = (self._pane + 1) % len(shown)
         for name in PANES:
             self.set_class(name == shown[self._pane], f"-{name}")
 
     def stop_sent(self) -> None:
-        """Show at once that the stop key was heard, before the engine has answered."""
+        """Show at once that a stop key was pressed, before the engine answers."""
         self._stop_sent = True
         self._state.show(STOP_SENT)
         self._state.set_class(True, "-stopping")
 
     def show(self, now: Snapshot) -> None:
-        """Draw what differs from the last snapshot."""
+        """Draw what differs from the snapshot before."""
         self._session.show(f"brushloop  {one_line(now.session_id) or 'no session yet'}")
         self._source.show(f"source: {one_line(now.source) or 'not known yet'}")
         self._show_state(now)
-        self._facts.show(facts_content(now, self._facts.content_size.width))
+        self._figures.show(figures_content(now, self._figures.content_size.width))
         self.set_class(bool(now.error), "-wrong")
         failed = now.state is State.FAILED
         self._why_pane.border_title = "Why it failed" if failed else "Why it stopped"
@@ -176,7 +180,8 @@ class RunView(Vertical):
         self._capture.show(now.last)
         if now.picture is not None and self._camera.display:
             self._camera.show(now.picture.image)
-        self._note.show(note_content(now))
+        self._note.show(_note_content(now))
+        self._keys.show(keys_in(now.state, RUN_BAR))
 
     def _show_state(self, now: Snapshot) -> None:
         state = now.state
@@ -198,11 +203,11 @@ def _message_content(line: str) -> Content:
     return Content.styled(text, "bold $text-warning") if text.startswith(WARNING) else Content(text)
 
 
-def note_content(now: Snapshot) -> Content:
-    """What was asked for by key and waits, and what the stop key is."""
+def _note_content(now: Snapshot) -> Content:
+    """Requests that still wait, and what the stop key is; once the run is over, how to leave."""
     if now.state in FINAL:
-        told = SOFTWARE_STOP if now.state is State.DONE or now.rest_unknown else GOES_ON
-        return Content.assemble((f" {OVER} ", "bold reverse"), f"  {told}")
+        following = SOFTWARE_STOP if now.state is State.DONE or now.rest_unknown else GOES_ON
+        return Content.assemble((f" {OVER} ", "bold reverse"), f"  {following}")
     if now.state is State.STOPPING:
         return Content.styled(" not seen at rest yet: the red button, if it moves on ", "bold reverse")
     if now.requests:

@@ -1,8 +1,11 @@
-"""The end of a session: is the recording sound, and what comes next."""
+"""The end of a session: reads its recording again, and offers to calibrate, fit and report."""
 
 from __future__ import annotations
 
 import asyncio
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -13,19 +16,21 @@ from textual.containers import VerticalScroll
 from textual.content import Content
 from textual.screen import ModalScreen
 
-from collect.tui.browser import run_command, verified
-from collect.tui.line import Line
 from collect.tui.text import plain
+from collect.tui.widgets import Line
 from sessions.errors import SessionError
 
 if TYPE_CHECKING:
     from sessions.repair.verify import Verdict
 
 MOST_LINES = 400
+"""Of a command's output, the last so many are shown."""
+COLUMNS = 68
+"""Width that commands format their output for: that of this page on a terminal of 80 columns."""
 
 
 class FinishScreen(ModalScreen[None]):
-    """Verifies at once; calibrate and report on a key, each in a process of its own."""
+    """Verifies the session at once; runs each further command on a key, in a process of its own."""
 
     DEFAULT_CSS = """
     FinishScreen { align: center middle; }
@@ -50,7 +55,7 @@ class FinishScreen(ModalScreen[None]):
         self._busy = False
 
     def compose(self) -> ComposeResult:
-        """Verdict, what comes next, what a command said."""
+        """Lay out the verdict, what comes next, what a command said."""
         with VerticalScroll() as page:
             page.border_title = "Finish"
             yield self._verdict
@@ -58,19 +63,19 @@ class FinishScreen(ModalScreen[None]):
             yield self._said
 
     def on_mount(self) -> None:
-        """Read every file again."""
+        """Begin to verify."""
         self._verdict.show("Reading every file again ...")
         self._next.show(self._next_content())
         self._verify()
 
     def action_close(self) -> None:
-        """Back to the captures."""
+        """Go back to the captures."""
         self.dismiss(None)
 
     @work(exclusive=True, group="verify")
     async def _verify(self) -> None:
         try:
-            self._verdict.show(verdict_content(await asyncio.to_thread(verified, self._folder)))
+            self._verdict.show(verdict_content(await asyncio.to_thread(verify, self._folder)))
         except SessionError as error:
             self._verdict.show(Content.styled(plain(str(error)), "$text-error"))
 
@@ -88,7 +93,7 @@ class FinishScreen(ModalScreen[None]):
         tail = "\n".join(plain(said).splitlines()[-MOST_LINES:])
         sign = "✓ done" if code == 0 else f"! exit code {code}"
         self._said.show(f"$ brushloop {name} {self._folder}\n{tail}\n{sign}")
-        # The end tells where the report lies; what was above can be scrolled to.
+        # The last line names the report; what is above can be scrolled to.
         self.call_after_refresh(self.query_one(VerticalScroll).scroll_end, animate=False)
 
     def _next_content(self) -> Content:
@@ -97,16 +102,31 @@ class FinishScreen(ModalScreen[None]):
                 "The session is open. The same `brushloop collect` finishes it, merges it, and reads it back;\n"
                 f"`brushloop sessions close {self._folder}` ends it as it is.\nescape  back"
             )
-        return Content.assemble(
-            ("c", "bold $text-accent"),
-            f"  brushloop calibrate {self._folder}\n",
-            ("t", "bold $text-accent"),
-            f"  brushloop fit {self._folder}\n",
-            ("w", "bold $text-accent"),
-            f"  brushloop validate {self._folder}  (report)\n",
-            ("escape", "bold $text-accent"),
-            "  back",
-        )
+        keys = [
+            ("c", f"brushloop calibrate {self._folder}"),
+            ("t", f"brushloop fit {self._folder}"),
+            ("w", f"brushloop validate {self._folder}  (report)"),
+            ("escape", "back"),
+        ]
+        return Content("\n").join(Content.assemble((key, "bold $text-accent"), f"  {what}") for key, what in keys)
+
+
+def verify(folder: Path) -> Verdict:
+    """Read every file of a session again. Raises `InputError`."""
+    from sessions.verify import verify_session
+
+    return verify_session(folder)
+
+
+def run_command(name: str, folder: Path) -> tuple[int, str]:
+    """Run `brushloop NAME FOLDER` in a process of its own; it may take minutes.
+
+    Returns its exit code and its output, with its progress (stderr) only where it failed.
+    """
+    command = [sys.executable, "-m", "brushloop", name, str(folder)]
+    environment = os.environ | {"COLUMNS": str(COLUMNS)}
+    ran = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    return ran.returncode, (ran.stdout if ran.returncode == 0 else ran.stdout + ran.stderr).strip()
 
 
 def verdict_content(verdict: Verdict) -> Content:

@@ -16,14 +16,13 @@ from collect.engine.snapshot import EngineView, Snapshot
 from collect.headless import no_pose_text
 from collect.operator import Prompt
 from collect.protocols.steps import StepKind
-from collect.tui.ask import choices_content
-from collect.tui.facts import target_text
-from collect.tui.keys import STOP_KEY, KeyBar, keys_in
-from collect.tui.line import Line
+from collect.tui.keys import SET_UP_BAR, keys_in
+from collect.tui.panes import target_text
 from collect.tui.pictures import Pictures
-from collect.tui.text import SOFTWARE_STOP, one_line, plain, tip_text
-from collect.tui.trace import force_bar, spark
-from collect.tui.view import NARROW_COLUMNS
+from collect.tui.question_screens import answer_by_key, choices_content
+from collect.tui.run_screen import NARROW_COLUMNS
+from collect.tui.text import SOFTWARE_STOP, force_bar, one_line, plain, spark, tip_text
+from collect.tui.widgets import KeyBar, Line
 
 SIGNS = {
     Standing.TO_COME: ("·", "dim"),
@@ -32,15 +31,14 @@ SIGNS = {
     Standing.DOUBTFUL: ("!", "bold $text-warning"),
 }
 SHARP_PX = 2.0
-"""Of the full frame: what a lens in focus easily reaches; a hint while turning it, the measured blur decides."""
+"""Blur in the full frame below which the lens counts as in focus: a hint while turning it, the step's own check decides."""
 FORCE_SCALE_N = 0.1
-"""Full bar: a soft brush pushes with a few tens of mN."""
-BAR = 30
-KEYS = (STOP_KEY, ("space", "pause"), ("q", "leave"), ("?", "help"), ("ctrl-p", "commands"), ("tab", "camera"))
+"""Force at which the bar is full: a soft brush pushes with a few tens of mN."""
+BAR_COLUMNS = 30
 
 
 class SetUpScreen(Screen[None]):
-    """One screen for all steps: the list, what was found, the live figures, the question."""
+    """One screen for all steps: the list, what was measured, the live figures, the question."""
 
     DEFAULT_CSS = """
     SetUpScreen #set-up-title { height: 1; padding: 0 1; background: $panel; text-style: bold; text-wrap: nowrap; }
@@ -65,12 +63,12 @@ class SetUpScreen(Screen[None]):
         self._prompt: Prompt | None = None
         self._title, self._steps, self._found = Line("set-up-title"), Line("steps"), Line("found-text")
         self._live, self._question, self._note = Line("live"), Line("question-text"), Line("set-up-note")
-        self._keys = KeyBar(KEYS)
+        self._keys = KeyBar(SET_UP_BAR)
         self._camera = pictures.make("set-up-camera")
-        self._with_camera = pictures.kind != "off"
+        self._with_camera = pictures.camera_shown
 
     def compose(self) -> ComposeResult:
-        """List, findings, live figures, question."""
+        """Lay out list, measurements, live figures, question."""
         yield self._title
         with Horizontal(id="set-up-body"):
             yield self._steps
@@ -86,15 +84,15 @@ class SetUpScreen(Screen[None]):
         yield self._keys
 
     def on_resize(self, event: events.Resize) -> None:
-        """The camera beside the findings where there is room."""
+        """Show the camera beside the measurements where there is room."""
         self.set_class(event.size.width < NARROW_COLUMNS, "-narrow")
 
     def action_picture(self) -> None:
-        """On a narrow screen, the camera instead of the findings."""
+        """Show the camera instead of the measurements, on a narrow screen."""
         self.toggle_class("-picture")
 
     def stop_sent(self) -> None:
-        """Show at once that the stop key was heard."""
+        """Show at once that a stop key was pressed."""
         self._note.show(Content.styled(" STOP SENT ", "bold reverse"))
 
     def show(self, now: Snapshot) -> None:
@@ -103,9 +101,9 @@ class SetUpScreen(Screen[None]):
         doing = ", ".join(part for part in (f"{now.state}: {one_line(now.step)}", no_pose_text(now)) if part)
         self._title.show(f"Set-up   {session}   {doing}")
         self._title.set_class(now.no_pose_s is not None, "-silent")
-        self._steps.show(steps_content(now.set_up))
-        self._found.show(found_content(now.set_up))
-        self._live.show(live_content(now))
+        self._steps.show(_steps_content(now.set_up))
+        self._found.show(_found_content(now.set_up))
+        self._live.show(_live_content(now))
         if now.picture is not None and self._camera.display:
             self._camera.show(now.picture.image)
         self._prompt = now.prompt
@@ -114,26 +112,24 @@ class SetUpScreen(Screen[None]):
             question = Content.styled(plain(now.prompt.question), "bold")
             self._question.show(Content("\n").join((question, choices_content(now.prompt))))
         self._note.show(SOFTWARE_STOP)
-        self._keys.show(keys_in(now.state, KEYS))
+        self._keys.show(keys_in(now.state, SET_UP_BAR))
 
     def on_key(self, event: events.Key) -> None:
-        """An answer's key answers."""
-        prompt = self._prompt
-        if prompt is not None and any(choice.key == event.character for choice in prompt.choices):
-            event.stop()
-            self._engine.answer(prompt.number, str(event.character))
+        """Answer, if it is the key of an answer."""
+        if self._prompt is not None:
+            answer_by_key(self._prompt, self._engine, event)
 
 
-def steps_content(steps: tuple[SetUpStep, ...]) -> Content:
-    """`✓ Camera, board, scale`, one a line."""
+def _steps_content(steps: tuple[SetUpStep, ...]) -> Content:
+    """One line a step: `✓ Camera, board, scale`."""
     lines = [
         Content.assemble(SIGNS[step.standing], f" {step.title}\n", (f"  {step.standing}", "dim")) for step in steps
     ]
     return Content("\n").join(lines)
 
 
-def found_content(steps: tuple[SetUpStep, ...]) -> Content:
-    """What was measured, newest step first: the operator is asked about that."""
+def _found_content(steps: tuple[SetUpStep, ...]) -> Content:
+    """What was measured, newest step first: the question is about that one."""
     parts: list[Content] = []
     for step in reversed(steps):
         if step.facts:
@@ -143,16 +139,16 @@ def found_content(steps: tuple[SetUpStep, ...]) -> Content:
     return Content("\n").join(parts) if parts else Content.styled("nothing measured yet", "dim")
 
 
-def live_content(now: Snapshot) -> Content:
-    """Tip, target, force bar, focus: as they are at this moment."""
+def _live_content(now: Snapshot) -> Content:
+    """Tip, target, force, and focus at this moment."""
     blur = "no picture yet"
     if now.picture is not None:
         blur_px = now.picture.blur_px
         if blur_px is None:
-            blur = "no edge in view to tell by"
+            blur = "no edge in view to measure it by"
         else:
             blur = f"blur {blur_px:.1f} px  {'✓ sharp' if blur_px < SHARP_PX else '! turn the lens'}"
-    force = f"{force_bar(now.force_n, FORCE_SCALE_N, BAR)} {spark(now.trace_n, 20)}"
+    force = f"{force_bar(now.force_n, FORCE_SCALE_N, BAR_COLUMNS)} {spark(now.trace_n, 20)}"
     if now.force_n is not None and not _zeroed(now.set_up):
         force = f"{now.force_n:.3f} N, weight of the holder included: set to zero with zero touch"
     tip = no_pose_text(now) or tip_text(now.tip_mm)

@@ -1,4 +1,4 @@
-"""The start screen: recent sessions and how each stands, the files to work with, and the rig's health."""
+"""The start screen: recent sessions and how each stands, the rig's and the protocol's file, the rig's health."""
 
 from __future__ import annotations
 
@@ -15,13 +15,10 @@ from textual.screen import Screen
 from textual.widgets import Input, OptionList
 
 from collect.errors import ConfigError
-from collect.tui.browser import Desk
-from collect.tui.confirm import Confirm
-from collect.tui.host import host
-from collect.tui.keys import KeyBar
-from collect.tui.line import Line
-from collect.tui.rows import Rows
+from collect.tui.browser import SessionBrowser
+from collect.tui.question_screens import Confirm
 from collect.tui.text import one_line, plain
+from collect.tui.widgets import KeyBar, Line, Rows, app_of
 from sessions.errors import SessionError
 
 if TYPE_CHECKING:
@@ -50,12 +47,10 @@ SIGNS = {
     "renamed": ("!", "bold $text-warning"),
 }
 FRESH = "A new session: is a blank sheet in as its sheet 1?"
-Begin = Callable[[str | None], None]
-"""Goes on with a session of that name; None is a new one."""
 
 
 class StartScreen(Screen[None]):
-    """Where a day begins."""
+    """Lists sessions; resumes, begins, or looks through one."""
 
     AUTO_FOCUS = "#sessions"
     DEFAULT_CSS = """
@@ -76,9 +71,12 @@ class StartScreen(Screen[None]):
         Binding("escape", "list", "Sessions", show=False),
     ]
 
-    def __init__(self, desk: Desk, begin: Begin, look: Callable[[str], None]) -> None:
+    def __init__(
+        self, browser: SessionBrowser, begin: Callable[[str | None], object], look: Callable[[str], None]
+    ) -> None:
+        """`begin` resumes the session of that name, or begins a new one (None); `look` looks through one."""
         super().__init__()
-        self._desk = desk
+        self._browser = browser
         self._begin = begin
         self._look = look
         self._rows: list[Summary] = []
@@ -86,12 +84,12 @@ class StartScreen(Screen[None]):
         self._health, self._trouble = Line("health-text"), Line("trouble")
         self._options = Rows("sessions")
         self._keys = KeyBar(KEYS)
-        paths = desk.paths
+        paths = browser.paths
         self._config = Input(str(paths.config), id="config", compact=True, select_on_focus=False)
         self._protocol = Input(str(paths.protocol), id="protocol", compact=True, select_on_focus=False)
 
     def compose(self) -> ComposeResult:
-        """Sessions and standing, files, health, keys."""
+        """Lay out sessions and standing, health, files, keys."""
         yield self._title
         with Horizontal(id="start-body"):
             yield self._options
@@ -108,23 +106,23 @@ class StartScreen(Screen[None]):
         yield self._keys
 
     def on_mount(self) -> None:
-        """Look what there is."""
+        """List the sessions."""
         self.query_one("#rig-label", Line).show("rig")
         self.query_one("#protocol-label", Line).show("protocol")
         self._health.show(UNASKED)
         self.reread()
 
     def on_screen_resume(self) -> None:
-        """After a run the list has changed."""
+        """List the sessions again, as a run has changed them."""
         self.reread()
 
     def reread(self) -> None:
-        """List the sessions again."""
-        self._title.show(f"brushloop   sessions in {one_line(str(self._desk.paths.root))}")
+        """Read which sessions there are, and show them."""
+        self._title.show(f"brushloop   sessions in {one_line(str(self._browser.paths.root))}")
         try:
-            self._rows = self._desk.recent()
+            self._rows = self._browser.recent()
         except (SessionError, OSError) as error:
-            self.trouble(str(error))
+            self.show_trouble(str(error))
             return
         self._options.fill([(row.session_id, _row_content(row)) for row in self._rows])
         if self._rows:
@@ -132,18 +130,18 @@ class StartScreen(Screen[None]):
         else:
             self._standing.show(WELCOME)
 
-    def trouble(self, words: str) -> None:
-        """One clear line, or none."""
-        self._trouble.show(plain(words))
+    def show_trouble(self, text: str) -> None:
+        """Show what went wrong, or with an empty text nothing."""
+        self._trouble.show(plain(text))
 
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
-        """How the session under the cursor stands."""
+        """Show how the session under the cursor stands."""
         self._show_standing(str(event.option.id))
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
-        """Resume an open session, look through a closed one."""
+        """Resume an open session, or look through a closed one."""
         row = next(row for row in self._rows if row.session_id == event.option.id)
-        self.trouble("")
+        self.show_trouble("")
         if row.state == "open":
             self._choose()
             self._begin(row.session_id)
@@ -151,19 +149,19 @@ class StartScreen(Screen[None]):
             self._look(row.session_id)
 
     def on_input_submitted(self, _event: Input.Submitted) -> None:
-        """Back to the list with the files that were typed; what was said of others is gone."""
+        """Go back to the list with the files that were typed; what was shown of others is gone."""
         self._choose()
         self._health.show(UNASKED)
-        self.trouble("")
+        self.show_trouble("")
         self._to_list()
 
     def action_list(self) -> None:
-        """Focus on the sessions; files that were being typed are as before."""
-        self._config.value, self._protocol.value = str(self._desk.paths.config), str(self._desk.paths.protocol)
+        """Go back to the list; files that were being typed stay as before."""
+        self._config.value, self._protocol.value = str(self._browser.paths.config), str(self._browser.paths.protocol)
         self._to_list()
 
     def action_files(self) -> None:
-        """Type other files."""
+        """Let other files be typed."""
         self._keys.show(TYPING_KEYS)
         self._config.focus()
 
@@ -175,38 +173,38 @@ class StartScreen(Screen[None]):
     async def action_new(self) -> None:
         """Ask for a blank sheet, then begin."""
         self._choose()
-        self.trouble("reading the files ...")
+        self.show_trouble("reading the files ...")
         try:
-            words = f"{FRESH}\n\n{await asyncio.to_thread(self._desk.planned)}"
+            question = f"{FRESH}\n\n{await asyncio.to_thread(self._browser.planned)}"
         except (ConfigError, OSError) as error:
-            self.trouble(str(error))
+            self.show_trouble(str(error))
             return
-        self.trouble("")
+        self.show_trouble("")
 
         def answered(yes: bool | None) -> None:
             if yes:
                 self._begin(None)
 
-        host(self).push_screen(Confirm(words, "y  it is in: begin      n  back"), answered)
+        app_of(self).push_screen(Confirm(question, "y  it is in: begin      n  back"), answered)
 
     @work(exclusive=True, group="health")
     async def action_health(self) -> None:
-        """Ask every device, off the screen's loop."""
+        """Ask every device how it is, off the screen's loop."""
         self._choose()
         self._health.show("Rig health: asking every device ...")
         try:
-            findings = await asyncio.to_thread(self._desk.health)
+            findings = await asyncio.to_thread(self._browser.health)
         except (ConfigError, OSError) as error:
             self._health.show(Content.styled(f"Rig health: {plain(str(error))}", "$text-error"))
             return
-        self._health.show(health_content(findings))
+        self._health.show(_health_content(findings))
 
     def _choose(self) -> None:
-        self._desk.choose(self._config.value, self._protocol.value)
+        self._browser.choose(self._config.value, self._protocol.value)
 
     def _show_standing(self, session_id: str) -> None:
         try:
-            self._standing.show(standing_content(self._desk.standing(session_id)))
+            self._standing.show(_standing_content(self._browser.standing(session_id)))
         except SessionError as error:
             self._standing.show(Content.styled(plain(str(error)), "$text-error"))
 
@@ -216,29 +214,29 @@ def _row_content(row: Summary) -> Content:
     return Content.assemble((sign, style), f" {one_line(row.session_id)} {row.state}")
 
 
-def standing_content(told: Details) -> Content:
+def _standing_content(details: Details) -> Content:
     """What is finished, what is void, what comes next."""
-    planned = "" if told.planned is None else f" of {told.planned}"
-    bad = f", {told.marked_bad} marked bad" if told.marked_bad else ""
+    planned = "" if details.planned is None else f" of {details.planned}"
+    bad = f", {details.marked_bad} marked bad" if details.marked_bad else ""
     parts = [
-        Content.assemble((told.session_id, "bold"), f"  {told.state}\n{told.source}"),
-        Content.assemble(("Finished  ", "dim"), (f"{told.strokes}{planned} strokes", "bold"), bad),
+        Content.assemble((details.session_id, "bold"), f"  {details.state}\n{details.source}"),
+        Content.assemble(("Finished  ", "dim"), (f"{details.strokes}{planned} strokes", "bold"), bad),
     ]
-    if told.void:
-        parts.append(Content.assemble(("Void      ", "dim"), (f"{len(told.void)} cut short", "bold $text-warning")))
-        parts += [Content(f"  × {plain(line)}") for line in told.void[-5:]]
-    if told.state == "open":
-        following = told.next or ("the next stroke" if told.strokes else "set-up")
+    if details.void:
+        parts.append(Content.assemble(("Void      ", "dim"), (f"{len(details.void)} cut short", "bold $text-warning")))
+        parts += [Content(f"  × {plain(line)}") for line in details.void[-5:]]
+    if details.state == "open":
+        following = details.next or ("the next stroke" if details.strokes else "set-up")
         parts.append(Content.assemble(("Next      ", "dim"), (plain(following), "bold")))
         parts.append(Content("The arm first lifts and parks; then it goes on there. No stroke is made twice."))
-    parts.append(Content.assemble(("Sheets    ", "dim"), f"{len(told.sheets)}"))
-    if told.repairs:
-        parts.append(Content.styled(f"{len(told.repairs)} repairs", "$text-warning"))
+    parts.append(Content.assemble(("Sheets    ", "dim"), f"{len(details.sheets)}"))
+    if details.repairs:
+        parts.append(Content.styled(f"{len(details.repairs)} repairs", "$text-warning"))
     return Content("\n").join(parts)
 
 
-def health_content(findings: list[Finding]) -> Content:
-    """One line a device, the verdict as a sign and in words."""
+def _health_content(findings: list[Finding]) -> Content:
+    """One line for each device, its verdict as a sign and in words."""
     lines: list[Content] = []
     for finding in findings:
         sign = ("✓ well   ", "$text-success") if finding.well else ("! trouble", "bold $text-error")

@@ -1,4 +1,4 @@
-"""Runs the app around engines, so that no arm is ever left unwatched: signals, lost terminals, its own defects."""
+"""Runs the app around engines so that no arm is left unwatched: on a signal, a lost terminal, a crash of the screen."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from contextlib import AbstractContextManager
 from collect.errors import CollectAborted
 from collect.headless import RunnableEngine, stop_signals
 from collect.tui.app import OperatorApp
-from collect.tui.browser import Desk, Paths
-from collect.tui.pictures import Kind, Pictures
+from collect.tui.browser import SessionBrowser
+from collect.tui.pictures import Pictures, Preview
 
 
 class ScreenCrashed(Exception):
-    """The screen ended by a defect of its own, which it has printed; the arm was stopped."""
+    """The screen ended by a defect, and has printed it; the arm was stopped."""
 
 
-def run_screen(engine: RunnableEngine, preview: Kind = "cells") -> None:
+def run_screen(engine: RunnableEngine, preview: Preview = "cells") -> None:
     """Run under the screen until the operator leaves; raises what ended the run."""
     app = OperatorApp(engine, pictures=Pictures(preview))
     with _signals(app):
@@ -26,9 +26,9 @@ def run_screen(engine: RunnableEngine, preview: Kind = "cells") -> None:
         engine.join()
 
 
-def run_desk(paths: Paths, preview: Kind = "cells") -> None:
-    """The start screen, and from it as many runs as a day has; raises what ended the last one."""
-    app = OperatorApp(desk=Desk(paths), pictures=Pictures(preview))
+def run_browser(browser: SessionBrowser) -> None:
+    """Show the start screen, and run what is begun from it; raises what ended the last run."""
+    app = OperatorApp(browser=browser, pictures=Pictures())
     with _signals(app):
         _run(app)
         if app.engine is not None:
@@ -39,7 +39,7 @@ def _run(app: OperatorApp) -> None:
     intact = False
     try:
         app.run()
-        # A screen that lost its terminal was told to leave; that is no defect.
+        # A screen that ended because its terminal was lost did not crash.
         intact = app.leaving or not app.return_code
     finally:
         engine = app.engine
@@ -56,12 +56,14 @@ def _run(app: OperatorApp) -> None:
 
 
 def _signals(app: OperatorApp) -> AbstractContextManager[None]:
-    """SIGINT and SIGTERM stop the arm at once. SIGHUP, a terminal that is lost, finishes the step and parks the arm:
-    nobody is there to lift a brush that was stopped on the paper. Each ends the screen."""
+    """On SIGINT and SIGTERM stop the arm; on SIGHUP, a lost terminal, finish the step and park it. Then end the screen.
 
-    def heed(number: int) -> None:
+    With the terminal lost, nobody is there to lift a brush that was stopped on the paper.
+    """
+
+    def on_signal(number: int) -> None:
         if app.engine is not None:
             (app.engine.park if number == signal.SIGHUP else app.engine.stop)()
         app.leave()
 
-    return stop_signals(heed)
+    return stop_signals(on_signal)

@@ -1,17 +1,18 @@
-"""A desk and a session without a disk, for screens that show them."""
+"""A session browser and a session without a disk, for screens that show them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from collect.rig.doctor import Finding
-from collect.tui.browser import Desk, Paths
-from collect.tui.captures import Looked, Review, Seen
+from collect.tui.browser import Paths, SessionBrowser
+from collect.tui.captures import CapturePictures, Review, ReviewCapture
 from collect.tui.pictures import Pictures
-from collect.tui.review import ReviewScreen
+from collect.tui.review_screen import ReviewScreen
 from sessions.remarks import Remark
 from sessions.show import Details, Sheet, Summary
 from tests.collect.tui.fake import blot
@@ -41,11 +42,15 @@ FINDINGS = [
 LATE = "touched the paper 10.2 s after its dip, the others after 1.1 s"
 
 
-class FakeDesk(Desk):
+def engine_for(*_arguments: Any, **_options: Any) -> Any:
+    raise AssertionError("no engine is made")
+
+
+class FakeBrowser(SessionBrowser):
     """Two sessions, one cut in its middle, and a rig with trouble."""
 
     def __init__(self, rows: tuple[Summary, ...] | None = None) -> None:
-        super().__init__(Paths())
+        super().__init__(Paths(), engine_for)
         self._rows = rows
         self.asked: list[Any] = []
 
@@ -84,18 +89,18 @@ class FakeReview(Review):
         self.open = False
         bad = Remark(7, "H13-a0-r02", True, "smudged, 墨 ran", 1)
         self.captures = (
-            Seen("H13-a0-r01", 13.0, 0.0, 4, True, "", "0004-capture-a.mcap", None, 1.24),
-            Seen("H13-a0-r02", 13.0, 0.0, 7, True, "", "0007-capture-b.mcap", bad),
-            Seen("H13-a0-r03", 13.0, 0.0, 10, False, "split", "0010-capture-c.mcap", None, 10.2, LATE),
+            ReviewCapture("H13-a0-r01", 13.0, 0.0, 4, True, "", "0004-capture-a.mcap", None, 1.24),
+            ReviewCapture("H13-a0-r02", 13.0, 0.0, 7, True, "", "0007-capture-b.mcap", bad),
+            ReviewCapture("H13-a0-r03", 13.0, 0.0, 10, False, "split", "0010-capture-c.mcap", None, 10.2, LATE),
         )
 
-    def look(self, seen: Seen) -> Looked:
+    def pictures(self, capture: ReviewCapture) -> CapturePictures:
         binary = blot()
-        return Looked(np.where(binary, 40, 210).astype(np.uint8), binary, 1_795_273_966_402_000_000)
+        return CapturePictures(np.where(binary, 40, 210).astype(np.uint8), binary, 1_795_273_966_402_000_000)
 
     def repeatability(self, height_mm: float, tilt_deg: float) -> tuple[float, int] | None:
         return 0.914, 9
 
 
-def a_review(folder: Path) -> ReviewScreen:
-    return ReviewScreen(FakeReview(folder), Pictures(), now_ns=lambda: 5)
+def a_review(folder: Path, at_work: Callable[[], bool] = lambda: False) -> ReviewScreen:
+    return ReviewScreen(FakeReview(folder), Pictures(), at_work=at_work, now_ns=lambda: 5)

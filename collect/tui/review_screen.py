@@ -1,4 +1,4 @@
-"""Looking through a session: captures by cell, their pictures, marks and notes, and how alike the presses are."""
+"""The review of a session: captures by cell, their pictures, marks and notes, and how alike the presses are."""
 
 from __future__ import annotations
 
@@ -16,14 +16,12 @@ from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Input, OptionList
 
-from collect.tui.captures import Looked, Review, Seen, counts
-from collect.tui.finish import FinishScreen
-from collect.tui.host import host
-from collect.tui.keys import STOP_KEY, KeyBar
-from collect.tui.line import Line
+from collect.tui.captures import CapturePictures, Review, ReviewCapture
+from collect.tui.finish_screen import FinishScreen
+from collect.tui.keys import STOP_LABEL
 from collect.tui.pictures import Pictures, binary_picture
-from collect.tui.rows import Rows
 from collect.tui.text import SOFTWARE_STOP, one_line, plain
+from collect.tui.widgets import KeyBar, Line, Rows, app_of
 from sessions.errors import SessionError
 from sessions.remarks import Remark, add_remark
 
@@ -35,19 +33,19 @@ KEYS = (
     ("f", "finish"),
     ("?", "help"),
 )
-
 KEYS_S = 0.5
+"""How often the line of keys is made anew, as a run may begin or end."""
 
 
 class ReviewScreen(Screen[None]):
-    """One session's captures. Remarks are appended beside the recording; nothing recorded changes."""
+    """One session's captures. Remarks are appended to a file beside the recording, which never changes."""
 
     AUTO_FOCUS = "#captures"
     DEFAULT_CSS = """
     ReviewScreen #review-title { height: 1; padding: 0 1; background: $panel; text-style: bold; }
     ReviewScreen #review-body { height: 1fr; }
     ReviewScreen #captures { width: 34; height: 100%; border: none; padding: 0; }
-    ReviewScreen #looked { width: 1fr; padding: 0 1; border-left: solid $foreground 40%; }
+    ReviewScreen #shown { width: 1fr; padding: 0 1; border-left: solid $foreground 40%; }
     ReviewScreen #words { height: auto; }
     ReviewScreen #pictures { height: 1fr; }
     ReviewScreen #review-photo { margin-right: 1; }
@@ -72,14 +70,14 @@ class ReviewScreen(Screen[None]):
         at_work: Callable[[], bool] = lambda: False,
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """`at_work` tells whether a run is on: then no text is typed, as `s` stops the arm."""
+        """`at_work` says whether a run is on: then no text is typed, as `s` stops the arm."""
         super().__init__()
         self._review = review
         self._at_work = at_work
         self._now_ns = now_ns
-        self._rows: tuple[Seen, ...] = ()
-        self._seen: Seen | None = None
-        self._looked: Looked | None = None
+        self._rows: tuple[ReviewCapture, ...] = ()
+        self._capture: ReviewCapture | None = None
+        self._pictures: CapturePictures | None = None
         self._alike: dict[tuple[float, float], tuple[float, int] | None] = {}
         self._title, self._words = Line("review-title"), Line("words")
         self._options = Rows("captures")
@@ -88,12 +86,12 @@ class ReviewScreen(Screen[None]):
         self._note = Input(placeholder="note, enter keeps it, escape leaves it", id="note-line", compact=True)
 
     def compose(self) -> ComposeResult:
-        """The list, the pictures, the keys."""
+        """Lay out the list, the pictures, the keys."""
         yield self._title
         yield self._stop_note
         with Horizontal(id="review-body"):
             yield self._options
-            with Vertical(id="looked"):
+            with Vertical(id="shown"):
                 yield self._words
                 with Horizontal(id="pictures"):
                     yield self._photo
@@ -109,15 +107,15 @@ class ReviewScreen(Screen[None]):
 
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
         """Show the capture under the cursor."""
-        self._seen = self._rows[event.option_index]
-        self._looked = None
+        self._capture = self._rows[event.option_index]
+        self._pictures = None
         self._show_words()
-        self._load(self._seen)
+        self._load(self._capture)
 
     def _show_keys(self) -> None:
-        """While a run is on, how to stop it; notes and the finish wait."""
+        """Show the keys; while a run is on, how to stop it, and neither note nor finish."""
         at_work = self._at_work()
-        self._keys.show((STOP_KEY, *(pair for pair in KEYS if pair[0] not in ("o", "f"))) if at_work else KEYS)
+        self._keys.show((STOP_LABEL, *(pair for pair in KEYS if pair[0] not in ("o", "f"))) if at_work else KEYS)
         self._stop_note.show(f"The arm is at work. {SOFTWARE_STOP}" if at_work else "")
         self.set_class(at_work, "-at-work")
 
@@ -127,65 +125,65 @@ class ReviewScreen(Screen[None]):
             self.remove_class("-noting")
             self._options.focus()
         else:
-            host(self).pop_screen()
+            app_of(self).pop_screen()
 
     def action_mark(self) -> None:
-        """Bad, or good after all."""
-        if self._seen is not None and not self._seen.kept:
-            self.notify(f"{self._seen.stroke_id}: the run did not count it; there is nothing to mark.")
-        elif self._seen is not None:
-            note = self._seen.remark.note if self._seen.remark is not None else ""
-            bad = counts(self._seen)
-            self._say(bad=bad, note=note)
+        """Mark the capture bad, or good after all."""
+        if self._capture is not None and not self._capture.kept:
+            self.notify(f"{self._capture.stroke_id}: the run did not count it; there is nothing to mark.")
+        elif self._capture is not None:
+            note = self._capture.remark.note if self._capture.remark is not None else ""
+            bad = self._capture.counts
+            self._remark(bad=bad, note=note)
             if bad and self._review.open:
-                self.notify(f"{self._seen.stroke_id}: pressed again once the plan is through")
+                self.notify(f"{self._capture.stroke_id}: pressed again once the plan is through")
 
     def action_note(self) -> None:
-        """Type a note."""
-        if self._seen is None:
+        """Let a note be typed."""
+        if self._capture is None:
             return
         if self._at_work():
             self.notify("Notes wait until the run is over: while the arm is at work, s stops it.", severity="warning")
             return
-        self._note.value = self._seen.remark.note if self._seen.remark is not None else ""
+        self._note.value = self._capture.remark.note if self._capture.remark is not None else ""
         self.add_class("-noting")
         self._note.focus()
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
         """Keep the note."""
-        if self._seen is not None:
-            self._say(bad=self._seen.remark is not None and self._seen.remark.bad, note=event.value)
+        if self._capture is not None:
+            self._remark(bad=self._capture.remark is not None and self._capture.remark.bad, note=event.value)
         self.action_back()
 
     def action_time(self) -> None:
-        """Where a viewer has to jump to."""
-        if self._looked is not None:
-            host(self).copy_to_clipboard(f"{self._looked.log_ns / 1e9:.9f}")
-            self.notify(f"{self._looked.log_ns / 1e9:.9f} s copied: log time of the still in the MCAP")
+        """Copy the time to jump to in a viewer."""
+        if self._pictures is not None:
+            app_of(self).copy_to_clipboard(f"{self._pictures.log_ns / 1e9:.9f}")
+            self.notify(f"{self._pictures.log_ns / 1e9:.9f} s copied: log time of the still in the MCAP")
 
     def action_finish(self) -> None:
-        """Verify, then calibrate and report."""
+        """Show whether the recording is sound, and what comes next."""
         if self._at_work():
             self.notify("The run is on; finish once it is over.", severity="warning")
             return
-        host(self).push_screen(FinishScreen(self._review.folder, is_open=self._review.open))
+        app_of(self).push_screen(FinishScreen(self._review.folder, is_open=self._review.open))
 
-    def _say(self, *, bad: bool, note: str) -> None:
-        seen = self._seen
-        if seen is None:
+    def _remark(self, *, bad: bool, note: str) -> None:
+        capture = self._capture
+        if capture is None:
             return
         try:
-            add_remark(self._review.folder, Remark(seen.still, seen.stroke_id, bad, note, self._now_ns()))
+            add_remark(self._review.folder, Remark(capture.still, capture.stroke_id, bad, note, self._now_ns()))
             self._review.read()
         except SessionError as error:
             self.notify(plain(str(error)), severity="error")
             return
-        self._alike.pop((seen.height_mm, seen.tilt_deg), None)
+        self._alike.pop(_cell(capture), None)
         self._list(self._options.highlighted or 0)
 
     def _list(self, at: int) -> None:
-        self._rows = tuple(sorted(self._review.captures, key=lambda s: (s.height_mm, s.tilt_deg, s.stroke_id, s.still)))
-        good = sum(map(counts, self._rows))
+        self._rows = tuple(sorted(self._review.captures, key=lambda c: (*_cell(c), c.stroke_id, c.still)))
+        good = sum(row.counts for row in self._rows)
         state = "open" if self._review.open else "closed"
         self._title.show(f"Review   {one_line(self._review.folder.name)} ({state})   {good} of {len(self._rows)} count")
         self._options.fill([(None, _row_content(row)) for row in self._rows])
@@ -195,18 +193,18 @@ class ReviewScreen(Screen[None]):
             self._words.show("no captures yet")
 
     def _show_words(self) -> None:
-        if self._seen is not None:
-            self._words.show(_words(self._seen, self._looked, self._alike, self._review))
+        if self._capture is not None:
+            self._words.show(_words(self._capture, self._pictures, self._alike, self._review))
 
     @work(exclusive=True, group="look")
-    async def _load(self, seen: Seen) -> None:
-        """Pictures first, then how alike the cell's presses are: both off the screen's loop."""
+    async def _load(self, capture: ReviewCapture) -> None:
+        """Show its pictures, then how alike the presses of its cell are; both are made off the screen's loop."""
         try:
-            self._looked = await asyncio.to_thread(self._review.look, seen)
-            self._photo.show(self._looked.photo)
-            self._binary.show(None if self._looked.binary is None else binary_picture(self._looked.binary))
+            self._pictures = await asyncio.to_thread(self._review.pictures, capture)
+            self._photo.show(self._pictures.photo)
+            self._binary.show(None if self._pictures.binary is None else binary_picture(self._pictures.binary))
             self._show_words()
-            cell = (seen.height_mm, seen.tilt_deg)
+            cell = _cell(capture)
             if cell not in self._alike:
                 self._alike[cell] = await asyncio.to_thread(self._review.repeatability, *cell)
                 self._show_words()
@@ -214,48 +212,54 @@ class ReviewScreen(Screen[None]):
             self._words.show(Content.styled(plain(str(error)), "$text-error"))
 
 
-def _row_content(seen: Seen) -> Content:
-    sign, style = ("✓", "") if counts(seen) else ("!", "bold $text-warning")
-    noted = " ✎" if seen.remark is not None and seen.remark.note else ""
-    waited = " dip?" if seen.unlike else ""
-    return Content.assemble((sign, style), f" {one_line(seen.stroke_id)}{noted}", (waited, "bold $text-warning"))
+def _cell(capture: ReviewCapture) -> tuple[float, float]:
+    return capture.height_mm, capture.tilt_deg
+
+
+def _row_content(capture: ReviewCapture) -> Content:
+    sign, style = ("✓", "") if capture.counts else ("!", "bold $text-warning")
+    noted = " ✎" if capture.remark is not None and capture.remark.note else ""
+    waited = " dip?" if capture.unlike else ""
+    return Content.assemble((sign, style), f" {one_line(capture.stroke_id)}{noted}", (waited, "bold $text-warning"))
 
 
 def _words(
-    seen: Seen,
-    looked: Looked | None,
+    capture: ReviewCapture,
+    pictures: CapturePictures | None,
     alike: dict[tuple[float, float], tuple[float, int] | None],
     review: Review,
 ) -> Content:
     why = ""
-    if not seen.kept:
-        why = f"  not counted by the run{f': {seen.verdict}' if seen.verdict else ''}"
-    elif not counts(seen):
+    if not capture.kept:
+        why = f"  not counted by the run{f': {capture.verdict}' if capture.verdict else ''}"
+    elif not capture.counts:
         why = "  marked bad"
-    lines: list[Content] = [
-        Content.assemble((seen.stroke_id, "bold"), f"  H {seen.height_mm:g} mm  α {seen.tilt_deg:g}°", (why, "bold")),
-        Content.assemble(("MCAP      ", "dim"), _where(seen, looked, review.folder)),
-        Content.assemble(("Repeats   ", "dim"), _alike_text(alike, (seen.height_mm, seen.tilt_deg), review.untold)),
+    place = f"  H {capture.height_mm:g} mm  α {capture.tilt_deg:g}°"
+    rows: list[tuple[str, str | tuple[str, str]]] = [
+        ("MCAP", _where(capture, pictures, review.folder)),
+        ("Repeats", _alike_text(alike, _cell(capture), review.not_compared)),
     ]
-    if seen.unlike:
-        lines.append(Content.assemble(("Waited    ", "dim"), (f"! {seen.unlike}", "bold $text-warning")))
-    elif seen.waited_s is not None:
-        lines.append(Content.assemble(("Waited    ", "dim"), f"{seen.waited_s:.1f} s from dip to touch"))
-    if seen.remark is not None and seen.remark.note:
-        lines.append(Content.assemble(("Note      ", "dim"), plain(seen.remark.note)))
+    if capture.unlike:
+        rows.append(("Waited", (f"! {capture.unlike}", "bold $text-warning")))
+    elif capture.waited_s is not None:
+        rows.append(("Waited", f"{capture.waited_s:.1f} s from dip to touch"))
+    if capture.remark is not None and capture.remark.note:
+        rows.append(("Note", plain(capture.remark.note)))
+    lines = [Content.assemble((capture.stroke_id, "bold"), place, (why, "bold"))]
+    lines += [Content.assemble((name.ljust(10), "dim"), text) for name, text in rows]
     return Content("\n").join(lines)
 
 
-def _where(seen: Seen, looked: Looked | None, folder: Path) -> str:
-    file = seen.file if (folder / seen.file).is_file() else f"{folder.name}.mcap"
-    return f"{file}  still {seen.still}" + ("" if looked is None else f"  at {looked.log_ns / 1e9:.3f} s")
+def _where(capture: ReviewCapture, pictures: CapturePictures | None, folder: Path) -> str:
+    file = capture.file if (folder / capture.file).is_file() else f"{folder.name}.mcap"
+    return f"{file}  still {capture.still}" + ("" if pictures is None else f"  at {pictures.log_ns / 1e9:.3f} s")
 
 
 def _alike_text(
-    alike: dict[tuple[float, float], tuple[float, int] | None], cell: tuple[float, float], untold: str
+    alike: dict[tuple[float, float], tuple[float, int] | None], cell: tuple[float, float], not_compared: str
 ) -> str:
-    if untold:
-        return f"not compared: {plain(untold)}"
+    if not_compared:
+        return f"not compared: {plain(not_compared)}"
     if cell not in alike:
         return "comparing ..."
     found = alike[cell]

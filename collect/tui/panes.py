@@ -1,0 +1,257 @@
+"""The parts of the run screen: figures, the grid of strokes, the map of the sheet, the newest capture."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from rich.cells import cell_len
+from textual.app import ComposeResult, RenderResult
+from textual.containers import Horizontal, Vertical
+from textual.content import Content
+from textual.widget import Widget
+
+from collect.engine.snapshot import CellCount, Snapshot
+from collect.engine.states import FINAL
+from collect.engine.tally import Mark, SheetMap
+from collect.headless import eta_text, minutes_text, no_pose_text
+from collect.quality.verdict import Check
+from collect.tui.pictures import Pictures, binary_picture
+from collect.tui.text import bar_text, one_line, spark, tip_text
+from collect.tui.widgets import Line
+
+if TYPE_CHECKING:
+    from collect.engine.last_capture import LastCapture
+
+LABEL, LONGEST_TRACE = 9, 60
+"""Columns of a figure's name, and of the force trace at most."""
+COMPLETE, NOW, NEXT, BAD, LEFT_OUT = "✓", "▶", "›", "!", "×"
+LEGEND = f"{COMPLETE} done {NOW} now {NEXT} next {BAD} bad takes {LEFT_OUT} left out"
+GRID_STYLES = {
+    NOW: "bold reverse",
+    LEFT_OUT: "bold $text-error",
+    BAD: "bold $text-warning",
+    COMPLETE: "bold $text-success",
+    NEXT: "bold",
+}
+GAP = 2
+SHEET_SIGNS: dict[Mark | None, tuple[str, str]] = {
+    None: ("·", "dim"),
+    Mark.NOW: ("▶", "bold reverse"),
+    Mark.WAITING: ("●", "bold"),
+    Mark.KEPT: ("●", "$text-success"),
+    Mark.BAD: ("!", "bold $text-warning"),
+    Mark.VOID: ("×", "bold $text-error"),
+    Mark.CHECK: ("△", "dim"),
+}
+A_LINE, CHECK_WIDTH = 3, 16
+"""Quality checks on a line, and columns of each: as many as fit beside the grid on 120 columns."""
+
+
+def figures_content(now: Snapshot, width: int) -> Content:
+    """Seven lines: step, strokes, time, counts, tip, target, force."""
+    rows = (
+        ("Step", one_line(now.step) or "-", "bold"),
+        ("Strokes", _strokes(now, width), ""),
+        ("Time", _time(now), ""),
+        ("Counts", *_counts(now)),
+        ("Tip", no_pose_text(now) or tip_text(now.tip_mm), "" if now.tip_mm else "bold $text-warning"),
+        ("Target", target_text(now), ""),
+        ("Force", _force(now, width - LABEL), ""),
+    )
+    lines = [Content.assemble((label.ljust(LABEL), "dim"), (text, style)) for label, text, style in rows]
+    return Content("\n").join(lines)
+
+
+def _strokes(now: Snapshot, width: int) -> str:
+    counts = bar_text(now.strokes_done, now.strokes_planned, 0)
+    return bar_text(now.strokes_done, now.strokes_planned, max(width - LABEL - cell_len(counts) - 1, 4))
+
+
+def _time(now: Snapshot) -> str:
+    elapsed = f"elapsed {minutes_text(now.elapsed_s)}"
+    if now.state in FINAL:
+        return elapsed
+    left = max(now.strokes_planned - now.strokes_done - now.given_up, 0)
+    return f"{elapsed}   {eta_text(now) or 'no ETA yet'}   {left} strokes left"
+
+
+def _counts(now: Snapshot) -> tuple[str, str]:
+    parts = [f"voids {now.voids}"]
+    if now.given_up:
+        parts.append(f"left out {now.given_up}")
+    parts.append("ink not gauged" if now.ink_level is None else f"ink {now.ink_level:.0%} of the well")
+    return "   ".join(parts), "bold $text-warning" if now.voids or now.given_up else ""
+
+
+def target_text(now: Snapshot) -> str:
+    """Where the arm was sent, and how far that is from where it is."""
+    if now.target_mm is None:
+        return "not sent anywhere yet"
+    if now.tip_mm is None:
+        return tip_text(now.target_mm)
+    return f"{tip_text(now.target_mm)}   {math.dist(now.target_mm, now.tip_mm):.2f} mm to go"
+
+
+def _force(now: Snapshot, room: int) -> str:
+    if now.force_n is None:
+        return "not measured now" if now.state in FINAL else "no force sensor, or silent"
+    force = f"{now.force_n:6.3f} N  "
+    return force + spark(now.trace_n, max(0, min(room - len(force), LONGEST_TRACE)))
+
+
+class Grid(Widget):
+    """Done and planned strokes by depth H and tilt alpha, with a sign for each state as well as a colour."""
+
+    DEFAULT_CSS = """
+    Grid { width: auto; min-width: 100%; height: auto; text-wrap: nowrap; }
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._cells: tuple[CellCount, ...] = ()
+        self._room = 0
+
+    def show(self, cells: tuple[CellCount, ...], room: int) -> None:
+        """Render the counts for `room` columns, if either changed."""
+        if (cells, room) != (self._cells, self._room):
+            self._cells, self._room = cells, room
+            self.refresh(layout=True)
+
+    def render(self) -> RenderResult:
+        """Draw the table."""
+        return grid_content(self._cells, self._room)
+
+
+def grid_content(cells: tuple[CellCount, ...], room: int) -> Content:
+    """The table with a row per tilt (there are fewer of them), or per depth where only that fits `room` columns."""
+    if not cells:
+        return Content.styled("no strokes planned", "dim")
+    by_tilt, by_depth = _table(cells, tilts_down=True), _table(cells, tilts_down=False)
+    # The lines of a table are equally wide.
+    lines = by_depth if by_depth[0].cell_length <= room < by_tilt[0].cell_length else by_tilt
+    return Content("\n").join(lines)
+
+
+def _table(cells: tuple[CellCount, ...], *, tilts_down: bool) -> list[Content]:
+    by_place = {(cell.height_mm, cell.tilt_deg): cell for cell in cells}
+    heights = sorted({cell.height_mm for cell in cells})
+    tilts = sorted({cell.tilt_deg for cell in cells})
+    names, heads, corner = [f"{a:g}°" for a in tilts], [f"{h:g} mm" for h in heights], "α \\ H"
+    rows = [[by_place.get((h, a)) for h in heights] for a in tilts]
+    if not tilts_down:
+        names, heads, corner = heads, names, "H \\ α"
+        rows = [list(column) for column in zip(*rows, strict=True)]
+    first = max(len(text) for text in (*names, corner))
+    width = max(len(text) for text in (*heads, *(_cell_text(cell) for row in rows for cell in row))) + GAP
+    lines = [Content.styled(corner.rjust(first) + "".join(head.rjust(width) for head in heads), "bold")]
+    for name, row in zip(names, rows, strict=True):
+        styled = [(_cell_text(cell).rjust(width), _cell_style(cell)) for cell in row]
+        lines.append(Content.assemble((name.rjust(first), "bold"), *styled))
+    return lines
+
+
+def _cell_text(cell: CellCount | None) -> str:
+    # The sign has a column of its own, so that counts stay aligned.
+    return "-  " if cell is None else f"{cell.done}/{cell.planned} {_cell_sign(cell)}"
+
+
+def _cell_sign(cell: CellCount) -> str:
+    """What matters most about a cell."""
+    if cell.now:
+        return NOW
+    if cell.left_out:
+        return LEFT_OUT
+    if cell.done >= cell.planned:
+        return BAD if cell.bad else COMPLETE
+    if cell.next:
+        return NEXT
+    return BAD if cell.bad else " "
+
+
+def _cell_style(cell: CellCount | None) -> str:
+    if cell is None:
+        return "dim"
+    return GRID_STYLES.get(_cell_sign(cell), "" if cell.done else "dim")
+
+
+def sheet_content(sheet: SheetMap | None) -> Content:
+    """A sign for what became of each paper cell, in rows from the far edge, as the camera sees the sheet."""
+    if sheet is None or not sheet.marks:
+        return Content.styled("no sheet yet", "dim")
+    rows: list[Content] = []
+    for row in range(sheet.rows):
+        marks = sheet.marks[row * sheet.columns : (row + 1) * sheet.columns]
+        rows.append(Content(" ").join(Content.styled(*SHEET_SIGNS[mark]) for mark in marks))
+    return Content("\n").join(rows)
+
+
+def sheet_title(sheet: SheetMap | None) -> str:
+    """Which sheet is in, and how many of its cells are free."""
+    if sheet is None:
+        return "Sheet"
+    free = sum(mark is None for mark in sheet.marks)
+    return f"Sheet {sheet.number}: {free} free"
+
+
+class CapturePane(Vertical):
+    """The newest capture: its photograph, the binarised image, the model's image, and how it was judged."""
+
+    DEFAULT_CSS = """
+    CapturePane { height: 1fr; }
+    CapturePane #capture-words { height: auto; max-height: 50%; }
+    CapturePane #capture-pictures { height: 1fr; min-height: 4; }
+    CapturePane #photo, CapturePane #binary { margin-right: 1; }
+    """
+
+    def __init__(self, pictures: Pictures) -> None:
+        super().__init__(id="capture-pane", classes="pane")
+        self.border_title = "Last capture: photograph, binarised, CCD-BSM"
+        self._words = Line("capture-words")
+        self._photo, self._binary, self._model = (pictures.make(name) for name in ("photo", "binary", "model"))
+        self._shown: LastCapture | None = None
+
+    def compose(self) -> ComposeResult:
+        """Lay out the words above, the pictures below."""
+        yield self._words
+        with Horizontal(id="capture-pictures"):
+            yield self._photo
+            yield self._binary
+            yield self._model
+
+    def show(self, last: LastCapture | None) -> None:
+        """Draw this capture, if it is another one."""
+        if last is None:
+            self._words.show(Content.styled("nothing captured by this process yet", "dim"))
+            return
+        if last is self._shown:
+            return
+        self._shown = last
+        self._words.show(_capture_words(last))
+        self._photo.show(last.photo)
+        self._binary.show(None if last.binary is None else binary_picture(last.binary))
+        self._model.show(None if last.model is None else binary_picture(last.model))
+
+
+def _capture_words(last: LastCapture) -> Content:
+    """Name, verdict, and the score of each check."""
+    kept = ("✓ counts", "bold $text-success") if last.kept else ("! does not count", "bold $text-warning")
+    lines = [Content.assemble((last.stroke_id, "bold"), f"  H {last.height_mm:g} mm  α {last.tilt_deg:g}°  ", kept)]
+    if last.verdict is None:
+        lines.append(Content.styled("not judged: [quality] is switched off", "dim"))
+    else:
+        if last.verdict.reason:
+            lines.append(Content.styled(last.verdict.reason, "$text-warning"))
+        checks = [_check(check) for check in last.verdict.checks]
+        lines += [Content("  ").join(checks[k : k + A_LINE]) for k in range(0, len(checks), A_LINE)]
+    if last.model is not None:
+        csim = "" if last.likeness is None else f": CSIM {100.0 * last.likeness:.1f} % in mm"
+        lines.append(Content.styled(f"CCD-BSM as published for this H and α, right{csim}", "dim"))
+    return Content("\n").join(lines)
+
+
+def _check(check: Check) -> Content:
+    sign, style = ("✓", "") if check.passed else ("!", "bold $text-warning")
+    score = f"{check.score:.2f}" if abs(check.score) < 10.0 else f"{check.score:.0f}"
+    # In columns: a line that is broken anywhere would part the sign from its check.
+    return Content.styled(f"{sign} {check.name} {score}".ljust(CHECK_WIDTH), style)

@@ -1,0 +1,143 @@
+"""Questions to the operator: the engine's, with its picture and its answers on keys, and the screen's own yes or no.
+
+The stop keys work over both.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import ClassVar
+
+from textual import events
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Vertical
+from textual.content import Content
+from textual.screen import ModalScreen
+from textual.widgets import Static
+
+from collect.engine.snapshot import EngineView
+from collect.operator import Prompt
+from collect.tui.pictures import Pictures
+from collect.tui.text import plain
+from collect.tui.widgets import Line
+
+LEAVE_LINE = "q  leave: park the arm, answer nothing"
+STOP_LINE = "s  stop the arm now: software stop; red button: emergency stop"
+LEAVE_KEYS = "y  leave it so      n  stay"
+AT_WORK = (
+    "The arm is at work. Finish this step, park the arm, and leave?",
+    "y  park and leave      n  go on      s  stop now",
+)
+NOT_PARKED = (
+    "The arm is not parked: it rests where it was stopped, perhaps with the brush down. "
+    "The next run begins by lifting it. Leave it so?",
+    LEAVE_KEYS,
+)
+NOT_AT_REST = (
+    "The arm was not seen at rest: it may still be moving. Use the emergency stop, the red button. "
+    "Leave this screen all the same?",
+    LEAVE_KEYS,
+)
+
+
+class AskScreen(ModalScreen[None]):
+    """One prompt of the engine, until it is answered here or its time is over."""
+
+    DEFAULT_CSS = """
+    AskScreen { align: center middle; }
+    AskScreen Vertical {
+        width: 90%; max-width: 76; height: auto; max-height: 95%; padding: 0 2;
+        border: heavy $warning; background: $surface; overflow-y: auto;
+    }
+    AskScreen #question { text-style: bold; margin-bottom: 1; }
+    AskScreen #cause { height: 9; margin-bottom: 1; }
+    AskScreen #left { color: $text-muted; }
+    """
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("q", "app.quit", "Leave"),
+        Binding("question_mark", "app.help", "Help"),
+    ]
+
+    def __init__(
+        self, prompt: Prompt, engine: EngineView, pictures: Pictures, now_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        super().__init__()
+        self.prompt = prompt
+        self._engine = engine
+        self._pictures = pictures
+        self._now_s = now_s
+        self._left = Line("left")
+        self.show_time_left()
+
+    def compose(self) -> ComposeResult:
+        """Lay out the question, its picture, and a line for each answer."""
+        with Vertical():
+            yield Static(plain(self.prompt.question), id="question", markup=False)
+            if self.prompt.image is not None:
+                picture = self._pictures.make("cause")
+                picture.show(self.prompt.image)
+                yield picture
+            yield Static(choices_content(self.prompt), markup=False)
+            yield Static(LEAVE_LINE, markup=False)
+            yield Static(STOP_LINE, markup=False)
+            yield self._left
+
+    def on_key(self, event: events.Key) -> None:
+        """Answer, if it is the key of an answer."""
+        answer_by_key(self.prompt, self._engine, event)
+
+    def show_time_left(self) -> None:
+        """Show how long the default still waits, or that nothing happens without an answer."""
+        prompt = self.prompt
+        if prompt.timeout_s is None:
+            self._left.show("Waits until it is answered; the arm does not move meanwhile.")
+        else:
+            left_s = max(0.0, prompt.timeout_s - (self._now_s() - prompt.asked_s))
+            self._left.show(f"{left_s:.0f} s left")
+
+
+def answer_by_key(prompt: Prompt, engine: EngineView, event: events.Key) -> None:
+    """Send the answer that this key stands for, if it stands for one."""
+    if any(choice.key == event.character for choice in prompt.choices):
+        event.stop()
+        engine.answer(prompt.number, str(event.character))
+
+
+def choices_content(prompt: Prompt) -> Content:
+    """A line for each answer, with a mark at the one that is taken when the time is over."""
+    lines: list[Content] = []
+    for choice in prompt.choices:
+        timed = prompt.timeout_s is not None and choice.key == prompt.default
+        mark = "   (if nobody answers)" if timed else ""
+        lines.append(Content.assemble((choice.key, "bold $text-accent"), f"  {plain(choice.label)}{mark}"))
+    return Content("\n").join(lines)
+
+
+class Confirm(ModalScreen[bool]):
+    """A question of the screen itself with yes and no; true for yes."""
+
+    DEFAULT_CSS = """
+    Confirm { align: center middle; }
+    Confirm Vertical {
+        width: 90%; max-width: 64; height: auto; padding: 1 2; border: heavy $warning; background: $surface;
+    }
+    Confirm Static { text-align: center; }
+    Confirm #question { text-style: bold; margin-bottom: 1; }
+    """
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("y", "dismiss(True)", "Yes"),
+        Binding("n,escape", "dismiss(False)", "No"),
+    ]
+
+    def __init__(self, question: str, keys: str) -> None:
+        super().__init__()
+        self._question = question
+        self._keys = keys
+
+    def compose(self) -> ComposeResult:
+        """Lay out the question and its keys."""
+        with Vertical():
+            yield Static(self._question, id="question", markup=False)
+            yield Static(self._keys, id="keys", markup=False)
