@@ -113,7 +113,7 @@ class FinishScreen(ModalScreen[None]):
 
 def verify(folder: Path) -> Verdict:
     """Read every file of a session again. Raises `InputError`."""
-    from sessions.verify import verify_session
+    from sessions.repair.verify import verify_session
 
     return verify_session(folder)
 

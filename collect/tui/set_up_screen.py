@@ -31,7 +31,7 @@ SIGNS = {
     Standing.DOUBTFUL: ("!", "bold $text-warning"),
 }
 SHARP_PX = 2.0
-"""Blur in the full frame below which the lens counts as in focus: a hint while turning it, the step's own check decides."""
+"""Blur in the full frame that a lens in focus stays below: a hint while turning it; the step's own check decides."""
 FORCE_SCALE_N = 0.1
 """Force at which the bar is full: a soft brush pushes with a few tens of mN."""
 BAR_COLUMNS = 30

@@ -15,7 +15,7 @@ from calibrate.session import calibrate_session
 from collect.engine.states import State
 from collect.errors import ConfigError, StepError
 from collect.rig.config import load_rig
-from collect.tui.captures import Review, counts
+from collect.tui.captures import Review
 from sessions.journal.journal import replay
 from sessions.journal.lines import read_lines
 from sessions.reader import Recording
@@ -72,7 +72,7 @@ def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> No
 
     # The review looks through the recorded lens: the file that rig.toml names does not lie beside its snapshot.
     review = Review(folder)
-    looked = review.look(next(seen for seen in review.captures if counts(seen)))
+    looked = review.pictures(next(capture for capture in review.captures if capture.counts))
     assert looked.binary is not None
     assert looked.binary.any()
 

@@ -190,9 +190,9 @@ def test_the_review_looks_through_the_lens_that_the_session_recorded(
 ) -> None:
     session = collected(photographed, tmp_path / "own", shot, read_lens(lens))
     review = Review(session)
-    assert review.untold == ""
+    assert review.not_compared == ""
     for seen in review.captures:
-        looked = review.look(seen)
+        looked = review.pictures(seen)
         assert looked.binary is not None
         assert looked.photo.shape == (768, 768), "the field, not the whole photograph"
         anchor = shot.anchors_mm[review.captures.index(seen)]
@@ -216,8 +216,8 @@ def test_the_review_says_why_it_compares_nothing(photographed: Photographed, tmp
     session = collected(photographed, tmp_path / "spoilt", shot)
     (session / "rig.effective.json").write_text('{"board": 7}')
     review = Review(session)
-    assert "rig.effective.json: board: Input should be" in review.untold
-    assert review.look(review.captures[0]).photo.shape == shot.image.shape
+    assert "rig.effective.json: board: Input should be" in review.not_compared
+    assert review.pictures(review.captures[0]).photo.shape == shot.image.shape
 
 
 def test_every_stage_is_shown_with_the_lens(photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path) -> None:

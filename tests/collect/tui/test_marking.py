@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from collect.engine.snapshot import Snapshot
 from collect.engine.states import State
 from collect.tui.app import OperatorApp
@@ -43,8 +45,11 @@ async def test_b_says_nothing_of_a_capture_that_does_not_count_nor_once_the_run_
         assert remarks_of(tmp_path) == {}
 
 
-async def test_a_disk_that_refuses_is_told(tmp_path: Path) -> None:
+async def test_a_disk_that_refuses_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     app = OperatorApp(FakeEngine(at(tmp_path / "gone")))
+    notices: list[str] = []
+    monkeypatch.setattr(app, "notify", lambda message, **_options: notices.append(message))
     async with app.run_test(size=(120, 40)) as pilot:
         await pilot.press("b")
-        assert "gone" in "".join(n.message for n in app._notifications)
+    [notice] = notices
+    assert "gone" in notice

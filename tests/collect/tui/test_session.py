@@ -26,7 +26,7 @@ from collect.tui.start_screen import StartScreen
 from sessions.reader import Recording
 from sessions.remarks import remarks_of
 from sessions.repair.verify import verify_session
-from tests.collect.tui.test_app import shown
+from tests.collect.tui.screen_text import shown
 
 STROKES = 6
 SPLIT = "split"

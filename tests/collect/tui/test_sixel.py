@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from textual.app import App, ComposeResult
+from textual.drivers.headless_driver import HeadlessDriver
 from textual.geometry import Size
-from textual.strip import Strip
+from textual.pilot import Pilot
 
-from collect.tui.pictures import Pixels, SixelPicture
+from collect.tui.pictures import SixelPicture
 from collect.tui.sixel import NOTHING, SIXEL_LEVELS, lines_of, sixels
 
 
@@ -63,31 +63,41 @@ def test_a_picture_keeps_its_shape_and_never_reaches_below_its_lines(size: Size,
         assert white.any(axis=0).sum() == white.any(axis=1).sum() == min(10 * size.width, 20 * size.height)
 
 
+class Recorder(HeadlessDriver):
+    """A terminal that keeps what is written to it."""
+
+    written = ""
+    is_headless = False
+
+    def write(self, data: str) -> None:
+        Recorder.written += data
+
+
+class One(App[None]):
+    CSS = "#picture { border-top: solid white; }"
+
+    def compose(self) -> ComposeResult:
+        yield SixelPicture("picture")
+
+
 async def test_a_line_that_did_not_change_is_not_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    painted: list[int] = []
+    monkeypatch.setattr(Recorder, "written", "")
+    images: list[str] = []
 
-    def counted(pixels: Pixels, y: int, render: Callable[[Pixels, int], Strip] = Pixels.render_line) -> Strip:
-        painted.append(y)
-        return render(pixels, y)
-
-    monkeypatch.setattr(Pixels, "render_line", counted)
-
-    class One(App[None]):
-        CSS = "#picture { border-top: solid white; }"
-
-        def compose(self) -> ComposeResult:
-            yield SixelPicture("picture")
-
-    async with One().run_test(size=(20, 10)) as pilot:
+    async def show_two(pilot: Pilot[None]) -> None:
         picture = pilot.app.query_one("#picture", SixelPicture)
         first = np.zeros((200, 200), np.uint8)
-        picture.show(first)
-        await pilot.pause()
-        painted.clear()
         second = first.copy()
         second[105:110] = 255
-        picture.show(second)
-        await pilot.pause()
-        assert set(painted) == {4}
-        strips = pilot.app.screen._compositor.render_strips()
-        assert ["\x1bP0;1;0q" in "".join(part.text for part in strip) for strip in strips] == [False, *[True] * 9]
+        for image in (first, second):
+            await pilot.pause()
+            Recorder.written = ""
+            picture.show(image)
+            await pilot.pause()
+            images.append(Recorder.written)
+        pilot.app.exit()
+
+    await One(driver_class=Recorder).run_async(size=(20, 10), auto_pilot=show_two)
+    assert [written.count("\x1bP0;1;0q") for written in images] == [9, 1], (
+        "lines below the border; the one that changed"
+    )

@@ -23,7 +23,8 @@ from sessions.remarks import remarks_of
 from sessions.repair.verify import Finding, Verdict
 from tests.collect.tui.fake import FakeEngine, picture
 from tests.collect.tui.fake_browser import FakeBrowser, a_review
-from tests.collect.tui.test_app import look, shown
+from tests.collect.tui.screen_text import shown
+from tests.collect.tui.test_app import look
 
 
 class Beginning(FakeBrowser):
