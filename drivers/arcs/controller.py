@@ -118,15 +118,6 @@ class Controller:
             await self.require_safe("moveLine")
         accepted("moveLine", code)
 
-    async def move_joint(self, joints: list[float], speed_rad_s: float, acc_rad_s2: float) -> None:
-        """Queue a move that is straight in joints. Raises as `move_line` does."""
-        code = await self.ask(
-            "MotionControl.moveJoint", q=joints, a=acc_rad_s2, v=speed_rad_s, blend_radius=0.0, duration=0.0
-        )
-        if code not in (ReturnCode.OK, ReturnCode.REQUEST_IGNORED):
-            await self.require_safe("moveJoint")
-        accepted("moveJoint", code)
-
     async def at_rest(self) -> bool:
         """True when the queue is empty and the arm is steady."""
         return await self.ask("MotionControl.getExecId") == -1 and await self.ask("RobotState.isSteady") is True

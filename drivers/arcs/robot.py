@@ -8,7 +8,6 @@ from collections.abc import Callable, Coroutine, Sequence
 from drivers.arcs.codes import LOOPBACK_CONTROL_BOX
 from drivers.arcs.controller import Condition, Controller
 from drivers.arcs.departure import Departure
-from drivers.arcs.joints import checked_path, reachable
 from drivers.arcs.queueing import capped, feed, legs_of, queue_all
 from drivers.arcs.rpc import DEVICE, RpcConnection, open_arcs
 from drivers.arcs.settings import ArcsOptions, make_ready, power_on
@@ -176,21 +175,6 @@ class AuboArcs:
             self._held = False
             await self._telemetry.reaching(lines[-1].target, tolerance)
             return [*seen]
-
-    async def move_joint(self, joints_rad: Sequence[float], *, speed_rad_s: float, acc_rad_s2: float) -> None:
-        """moveJoint, then wait as `move` does. The whole way is checked, by poses that the controller computes.
-
-        Only for an arm that is enabled: before, its tool is not set and the poses are of something else.
-        """
-        await self._depart("moveJoint", [])
-        target, expected_s = await checked_path(self._motion, self._limits, joints_rad, speed_rad_s, acc_rad_s2)
-        await self._carry_out(self._motion.move_joint([*joints_rad], speed_rad_s, acc_rad_s2), target, expected_s)
-
-    async def reachable(self, target: Pose) -> bool:
-        """Whether the controller finds joints for the tip pose. Raises `NotConnected` before `enable`."""
-        if not self._enabled:
-            raise NotConnected(DEVICE, "reachable", "not enabled")
-        return await reachable(self._motion, target)
 
     async def _carry_out(self, command: Coroutine[None, None, None], target: Pose, expected_s: float) -> None:
         options = self._options

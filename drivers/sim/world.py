@@ -13,7 +13,7 @@ import numpy as np
 from drivers.force.rounds import Wrench
 from drivers.geometry import brush_pose, lean
 from drivers.samples import Pose
-from drivers.sim.arcs.stream import StreamedQueue
+from drivers.sim.arm.queue import ArmQueue
 from drivers.sim.brush.brush import MAX_TILT_DEG, Brush
 from drivers.sim.brush.contact import Contact, ContactWatch
 from drivers.sim.brush.drag import Waypoint, ink_left
@@ -136,7 +136,7 @@ class World:
         self._watch = ContactWatch(self._above_mm)
         tool = np.eye(4)
         tool[2, 3] = config.tool_mm / 1e3
-        self.motion = StreamedQueue(brush_pose(*config.home_mm), self._travelled, tool)
+        self.motion = ArmQueue(brush_pose(*config.home_mm), self._travelled, tool)
 
     def flaw_next(self, flaw: Flaw, severity: float = 1.0) -> None:
         """Let something go wrong with the next press to lift off; raises ValueError unless severity is in 0 .. 1."""
@@ -158,12 +158,6 @@ class World:
         tip = self.tool()
         x_mm, y_mm, depth_mm = self._on_sheet(tip)
         return self.reaction.wrench(tip, 0.0 if self._in_well(x_mm, y_mm) else depth_mm, self._normal)
-
-    def push_n(self) -> tuple[float, float, float]:
-        """Force of the paper on the bundle, in the base frame."""
-        tip = self.tool()
-        x_mm, y_mm, depth_mm = self._on_sheet(tip)
-        return self.reaction.push(tip, 0.0 if self._in_well(x_mm, y_mm) else depth_mm, self._normal)
 
     def to_paper(self, x_mm: float, y_mm: float) -> tuple[float, float]:
         """Base frame to paper frame, in the plane."""

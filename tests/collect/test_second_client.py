@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import functools
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ from drivers.arcs.controller import Controller
 from drivers.arcs.rpc import RpcConnection
 from drivers.arcs.waiting import Tolerance, until_settled
 from drivers.errors import MotionFailed, SettingsChanged
-from drivers.geometry import brush_pose, from_wire, lean
+from drivers.geometry import brush_pose, from_wire, lean, to_wire
 from sessions.journal.lines import read_lines
 from tests.collect.until import until as waited_until
 
@@ -129,7 +130,9 @@ def test_an_arm_that_somebody_still_moves_is_asked_about_and_left_alone(lab: Lab
     engine = lab.engine(watched=True)
     start_and_pause(engine)
     here = lab.rig.world.tool()
-    second_client(lab, MotionControl_speedLine={"xd": [0.0, 0.0, 0.00005, 0.0, 0.0, 0.0], "a": 1.0, "t": 600.0})
+    up = to_wire(dataclasses.replace(here, z_mm=here.z_mm + 30.0))
+    slowly = {"pose": up, "a": 1.0, "v": 0.00005, "blend_radius": 0.0, "duration": 0.0}
+    second_client(lab, MotionControl_moveLine=slowly)
     sent = lines_sent(lab)
     engine.resume()
     prompt = until(engine, lambda now: now.prompt is not None).prompt

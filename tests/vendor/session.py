@@ -128,39 +128,10 @@ def blend(robot: Any) -> None:
         blending,
         max(abs(a - b) for a, b in zip(end, state.getTcpPose(), strict=True)),
     ]
-    via = [start[0] + 0.04 + 0.02, start[1] + 0.02, *start[2:]]
-    SEEN["circle"] = [motion.setCirclePathMode(1), motion.moveCircle(via, corner, 1.0, 0.1, 0.0, 0.0), until(at_rest)]
-    SEEN["circle off"] = max(abs(a - b) for a, b in zip(corner, state.getTcpPose(), strict=True))
-    q = state.getJointPositions()
-    points = [[q[0] + 0.02 * k, *q[1:]] for k in range(1, 4)]
-    SEEN["spline"] = [motion.moveSpline(p, 1.0, 0.5, 0.0) for p in (*points, [])]
-    SEEN["spline done"] = until(at_rest)
-    SEEN["spline off"] = max(abs(a - b) for a, b in zip(points[-1], state.getJointPositions(), strict=True))
-
-
-def steer(robot: Any) -> None:
-    motion, state = robot.getMotionControl(), robot.getRobotState()
-
-    def at_rest() -> bool:
-        return motion.getExecId() == -1 and state.isSteady()
-
-    before = state.getTcpPose()
-    SEEN["speed"] = [
-        motion.speedLine([0.0, 0.0, 0.01, 0.0, 0.0, 0.0], 0.5, 0.0),
-        str(robot.getRobotManage().getRobotControlMode()),
-    ]
-    time.sleep(0.1)
-    SEEN["speed stopped"] = [motion.stopLine(1.0, 1.0), until(at_rest), state.getTcpPose()[2] - before[2]]
-    q = state.getJointPositions()
-    SEEN["servo off"] = motion.servoJoint(q, 0.0, 0.0, 0.05, 0.1, 200.0)
-    SEEN["servo on"] = [motion.setServoModeSelect(2), motion.isServoModeEnabled()]
-    SEEN["servo"] = [motion.servoJoint([q[0] + 0.005 * k, *q[1:]], 0.0, 0.0, 0.05, 0.1, 200.0) for k in range(1, 11)]
-    SEEN["servo done"] = [until(at_rest), motion.setServoModeSelect(0)]
-    SEEN["servo moved"] = state.getJointPositions()[0] - q[0]
 
 
 def limits(rpc: Any, robot: Any) -> None:
-    config, state, force = robot.getRobotConfig(), robot.getRobotState(), robot.getForceControl()
+    config, state = robot.getRobotConfig(), robot.getRobotState()
     SEEN["limits"] = [
         *(config.getJointMaxPositions(), config.getJointMinPositions(), config.getJointMaxSpeeds()),
         *(config.getJointMaxAccelerations(), config.getTcpMaxSpeeds(), config.getTcpMaxAccelerations()),
@@ -169,7 +140,21 @@ def limits(rpc: Any, robot: Any) -> None:
     SEEN["joint state"] = [str(s) for s in state.getJointState()]
     SEEN["speeds at rest"] = [state.getTcpSpeed(), state.getJointSpeeds()]
     SEEN["simulated"] = robot.getRobotManage().isSimulationEnabled()
-    SEEN["not simulated"] = [force.fcEnable(), force.isFcEnabled(), robot.getMotionControl().pathBufferAlloc("x", 2, 3)]
+
+
+def refused(robot: Any) -> None:
+    """What the loopback knows and does not simulate, force control aside, would have moved the arm or put a level."""
+    motion, force, control = robot.getMotionControl(), robot.getForceControl(), robot.getIoControl()
+    pose, q = robot.getRobotState().getTcpPose(), robot.getRobotState().getJointPositions()
+    SEEN["force control"] = force.isFcEnabled()
+    SEEN["not simulated"] = [
+        *(force.fcEnable(), motion.pathBufferAlloc("x", 2, 3)),
+        *(motion.moveCircle(pose, pose, 1.0, 0.1, 0.0, 0.0), motion.moveSpline(q, 1.0, 0.5, 0.0)),
+        *(motion.speedLine([0.0, 0.0, 0.01, 0.0, 0.0, 0.0], 0.5, 0.0), motion.setServoModeSelect(2)),
+        *(motion.servoJoint(q, 0.0, 0.0, 0.05, 0.1, 200.0), control.setToolDigitalOutputPulse(2, True, 0.1)),
+        control.setStandardAnalogOutput(0, 0.5),
+    ]
+    SEEN["still at rest"] = motion.getExecId() == -1
 
 
 def io(rpc: Any, robot: Any) -> None:
@@ -177,9 +162,6 @@ def io(rpc: Any, robot: Any) -> None:
     SEEN["tool io"] = [control.setToolDigitalOutput(1, True), control.getToolDigitalOutput(1)]
     SEEN["standard io"] = [control.setStandardDigitalOutput(3, True), control.getStandardDigitalOutputs()]
     SEEN["configurable io"] = [control.setConfigurableDigitalOutput(4, True), control.getConfigurableDigitalOutputs()]
-    SEEN["analog io"] = [control.setStandardAnalogOutput(0, 0.5), control.getStandardAnalogOutput(0)]
-    SEEN["pulse"] = control.setToolDigitalOutputPulse(2, True, 0.1)
-    SEEN["pulse over"] = until(lambda: not control.getToolDigitalOutput(2))
     SEEN["bad io"] = control.setStandardDigitalOutput(99, True)
     SEEN["watchdog"] = [register.setWatchDog("test", 5.0, 3), register.setWatchDog("test", 5.0, 0)]
 
@@ -203,7 +185,7 @@ def subscribe(port: int) -> None:
         if channel >= 0:
             break
     SEEN["rtde topic"] = [channel, rtde.subscribe(channel, take)]
-    time.sleep(0.6)
+    until(lambda: len(pushed) >= 10)
     SEEN["rtde pushed"] = [len(pushed), *pushed[-1]] if pushed else [0]
     SEEN["rtde removed"] = rtde.removeTopic(False, channel)
     time.sleep(3.5)  # after three seconds of silence it pings
@@ -232,8 +214,8 @@ def main(port: int, rtde_port: int) -> None:
     move(rpc, robot)
     joints(robot)
     blend(robot)
-    steer(robot)
     limits(rpc, robot)
+    refused(robot)
     io(rpc, robot)
     subscribe(rtde_port)
     go_wrong(robot)

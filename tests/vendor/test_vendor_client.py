@@ -138,26 +138,6 @@ def test_its_moves_are_rounded_into_each_other(seen: dict[str, Any]):
     assert off_m < 1e-6
 
 
-def test_its_circles_and_splines_arrive(seen: dict[str, Any]):
-    assert seen["circle"] == [0, 0, True]
-    assert seen["circle off"] < 1e-6
-    assert seen["spline"] == [0] * 4
-    assert seen["spline done"]
-    assert seen["spline off"] < 1e-5
-
-
-def test_it_steers_by_velocities_and_servo_steps(seen: dict[str, Any]):
-    assert seen["speed"] == [0, "RobotControlModeType.Speed"]
-    code, at_rest, moved_m = seen["speed stopped"]
-    assert (code, at_rest) == (0, True)
-    assert moved_m > 0.005
-    assert seen["servo off"] == -13
-    assert seen["servo on"] == [0, True]
-    assert seen["servo"] == [0] * 10
-    assert seen["servo done"] == [True, 0]
-    assert seen["servo moved"] == pytest.approx(0.05, abs=1e-5)
-
-
 def test_it_reads_limits_and_is_told_what_is_not_simulated(seen: dict[str, Any]):
     highest, lowest, *others = seen["limits"]
     assert lowest == [-v for v in highest]
@@ -166,16 +146,15 @@ def test_it_reads_limits_and_is_told_what_is_not_simulated(seen: dict[str, Any])
     assert seen["joint state"] == ["JointStateType.Running"] * 6
     assert seen["speeds at rest"] == [[0.0] * 6, [0.0] * 6]
     assert seen["simulated"] is True
-    assert seen["not simulated"] == [-6, False, -6]
+    assert seen["force control"] is False
+    assert seen["not simulated"] == [-6] * 9
+    assert seen["still at rest"]
 
 
 def test_it_sets_outputs_and_watchdogs(seen: dict[str, Any]):
     assert seen["tool io"] == [0, True]
     assert seen["standard io"] == [0, 8]
     assert seen["configurable io"] == [0, 16]
-    assert seen["analog io"] == [0, 0.5]
-    assert seen["pulse"] == 0
-    assert seen["pulse over"]
     assert seen["bad io"] == -5
     assert seen["watchdog"] == [0, 0]
 
@@ -185,7 +164,7 @@ def test_it_subscribes_to_telemetry(seen: dict[str, Any]):
     assert seen["rtde outputs"]["R1_actual_TCP_pose"] == 1021
     assert seen["rtde topic"] == [0, 0]
     count, q, pose, running, normal = seen["rtde pushed"]
-    assert 10 <= count <= 40
+    assert count >= 10
     assert (len(q), len(pose)) == (6, 6)
     assert running
     assert normal

@@ -14,13 +14,14 @@ import numpy as np
 from drivers.arcs.codes import MOVING_ALLOWED, ReturnCode, RobotMode, SafetyMode
 from drivers.geometry import from_wire, to_wire
 from drivers.samples import Pose
-from drivers.sim.arcs.io import Io
 from drivers.sim.arcs.power import EMERGENCY_STOPS, Power
 from drivers.sim.arm.kinematics import Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
 from drivers.sim.world import World
 
 ROBOT = "rob1"
 IK_NO_CONVERGE = -23
+OUTPUTS = {"Standard": 8, "Configurable": 16, "Tool": 4}
+"""Digital outputs by place, as many as in the examples of the SDK's headers."""
 HARD_STOP_M_S2 = 10.0
 SOFT_STOP_M_S2 = 2.0
 
@@ -34,13 +35,12 @@ class Cabinet:
         self.world = world
         self.motion = world.motion
         self.power = Power(self.now_s)
-        self.io = Io(self.now_s)
+        self.outputs = {place: [False] * count for place, count in OUTPUTS.items()}
+        """Digital outputs by place. They stay where they are put and drive nothing."""
         self.tcp_offset = [0.0] * 6
         self.payload: list[Any] = [0.0, [0.0] * 3, [0.0] * 3, [0.0] * 6]
         self.collision_level = 6
         self.operational_mode = "Automatic"
-        self.servo_mode = 0
-        """0 off; the others as `setServoModeSelect` numbers them."""
         self.messages: list[dict[str, Any]] = []
         self.watchdogs: dict[str, tuple[float, int]] = {}
         """(timeout in real seconds, action) by key."""
@@ -62,21 +62,15 @@ class Cabinet:
             return
         if self.power.safety in EMERGENCY_STOPS:
             return  # nothing less takes its place
-        self.power.safety, self.servo_mode = mode, 0
+        self.power.safety = mode
         if mode == SafetyMode.PROTECTIVE_STOP:
             self.hold(HARD_STOP_M_S2)
         else:
             self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
 
-    def collide(self) -> None:
-        """The arm hits something: a protective stop that says so."""
-        self.power.collision = True
-        self.safety_stop(SafetyMode.PROTECTIVE_STOP)
-
     def emergency_stop(self, mode: SafetyMode = SafetyMode.ROBOT_EMERGENCY_STOP) -> None:
         """A person pushes the button."""
         self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
-        self.servo_mode = 0
         self.power.press_emergency_stop(mode)
 
     def power_off(self) -> int:
@@ -119,24 +113,23 @@ class Cabinet:
         """The joints that put the tip where it is."""
         return self.motion.joints(self.now_s())
 
-    def flange(self) -> Pose:
-        """Where the flange is."""
-        return pose_of(matrix_of(self.world.tool()) @ inverted(self.motion.tool))
+    def fk(self, q: list[float]) -> list[Any]:
+        """[pose of the configured tool centre point, return code]."""
+        return [to_wire(pose_of(forward([float(v) for v in q]) @ self.tool())), 0]
 
-    def force(self) -> list[float]:
-        """[Fx, Fy, Fz N, Mx, My, Mz Nm] in the base frame: the bristles' push while the tip is below the paper."""
-        return [*self.world.push_n(), 0.0, 0.0, 0.0]
-
-    def fk(self, q: list[float], *, tip: bool) -> list[Any]:
-        """[pose, return code]."""
-        flange = forward([float(v) for v in q])
-        return [to_wire(pose_of(flange @ self.tool() if tip else flange)), 0]
-
-    def ik(self, near: list[float], pose: list[float], *, tip: bool = True) -> list[Any]:
+    def ik(self, near: list[float], pose: list[float]) -> list[Any]:
         """[joints, return code]; the joints are `near` where there is no solution."""
         target = matrix_of(from_wire([float(v) for v in pose]))
-        found = inverse(target @ inverted(self.tool()) if tip else target, near)
+        found = inverse(target @ inverted(self.tool()), near)
         return [list(near), IK_NO_CONVERGE] if found is None else [list(found), 0]
+
+    def put(self, place: str, index: object, value: object) -> int:
+        """Set a digital output."""
+        levels = self.outputs[place]
+        if type(index) is not int or type(value) is not bool or not 0 <= index < len(levels):
+            return -ReturnCode.INVALID_ARGUMENT
+        levels[index] = value
+        return ReturnCode.OK
 
     def stop(self, acc_m_s2: float, acc_rad_s2: float) -> int:
         """Decelerate and forget the path."""

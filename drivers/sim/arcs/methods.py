@@ -1,4 +1,8 @@
-"""The methods of the loopback controller by their names on the wire."""
+"""The methods of the loopback controller by their names on the wire: those that it simulates, and those it refuses.
+
+A method that is known and not simulated answers the controller's own NOT_IMPLEMENTED. One whose answer is no return
+code is unknown here (-32601).
+"""
 
 from __future__ import annotations
 
@@ -6,13 +10,10 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from drivers.arcs.codes import LOOPBACK_CONTROL_BOX, MOVING_ALLOWED, ReturnCode, RobotMode
+from drivers.arcs.codes import LOOPBACK_CONTROL_BOX, ReturnCode, RobotMode
 from drivers.geometry import to_wire
-from drivers.sim.arcs.cabinet import ROBOT, SOFT_STOP_M_S2, Cabinet
-from drivers.sim.arcs.limits import tables
+from drivers.sim.arcs.cabinet import OUTPUTS, ROBOT, SOFT_STOP_M_S2, Cabinet
 from drivers.sim.arcs.moves import Moves
-from drivers.sim.arcs.refused import CABINET_METHODS, ROBOT_METHODS, refusals
-from drivers.sim.arcs.steering import Steering
 
 INTERFACE_VERSION = 24000
 CONTROL_SOFTWARE_VERSION = 31001
@@ -22,13 +23,71 @@ OPERATIONAL_MODES = ("Disabled", "Automatic", "Manual")
 Params = dict[str, Any]
 Table = dict[str, Callable[[Params], Any]]
 
+REFUSED_BY_ROBOT: dict[str, tuple[str, ...]] = {
+    "ForceControl": (
+        *("fcEnable", "fcDisable", "setTargetForce", "setDynamicModel", "toolContact", "softFloatEnable"),
+        *("setSoftFloatParams", "speedChangeEnable", "speedChangeTune", "setDamping", "resetDamping", "setLpFilter"),
+        *("resetLpFilter", "setCondActive", "setCondAdvanced", "setCondCylinder", "setCondDistance", "setCondForce"),
+        *("setCondOrient", "setCondPlane", "setCondSphere", "setCondTcpSpeed", "setSupvForce", "setSupvOrient"),
+        *("setSupvPosBox", "setSupvPosCylinder", "setSupvPosSphere", "setSupvReoriSpeed", "setSupvTcpSpeed"),
+    ),
+    "IoControl": (
+        *("setStandardDigitalOutputPulse", "setConfigurableDigitalOutputPulse", "setToolDigitalOutputPulse"),
+        *("setStandardAnalogOutput", "setToolAnalogOutput", "setStandardAnalogInputDomain", "setToolAnalogInputDomain"),
+        *("setStandardAnalogOutputDomain", "setToolAnalogOutputDomain", "setToolIoInput", "setToolVoltageOutputDomain"),
+        *("setStandardDigitalInputAction", "setConfigurableDigitalInputAction", "setToolDigitalInputAction"),
+        *("setStandardDigitalOutputRunstate", "setConfigurableDigitalOutputRunstate", "setToolDigitalOutputRunstate"),
+        *("setStandardAnalogOutputRunstate", "setToolAnalogOutputRunstate", "setDigitalInputActionDefault"),
+        *("setDigitalOutputRunstateDefault", "setEncDecoderType", "setEncTickCount", "unwindEncDeltaTickCount"),
+    ),
+    "MotionControl": (
+        *("moveCircle", "setCirclePathMode", "moveSpline", "speedLine", "speedJoint", "setServoMode"),
+        *("setServoModeSelect", "servoJoint", "servoCartesian", "servoJointWithAxes", "servoCartesianWithAxes"),
+        *("pathBufferAlloc", "pathBufferAppend", "pathBufferEval", "pathBufferFree", "movePathBuffer"),
+        *("moveCircle2", "moveSpiral", "moveIntersection", "moveProcess", "setEqradius", "setLookAheadSize"),
+        *("pathOffsetEnable", "pathOffsetSet", "pathOffsetLimits", "pathOffsetCoordinate", "jointOffsetEnable"),
+        *("jointOffsetSet", "trackJoint", "trackCartesian", "followJoint", "followLine", "weaveStart", "weaveEnd"),
+        *("storePath", "restoPath", "setWorkObjectHold", "conveyorTrackLine", "conveyorTrackCircle"),
+        *("conveyorTrackStop", "speedFractionCritical", "resumeMoveJoint", "resumeMoveLine", "resumeSpeedJoint"),
+        *("resumeSpeedLine", "resumeStopJoint", "resumeStopLine", "setFuturePointSamplePeriod"),
+    ),
+    "RobotConfig": (
+        *("setGravity", "setMountingPose", "setHomePosition", "setCollisionStopType", "selectTcpForceSensor"),
+        *("setTcpForceOffset", "setTcpForceSensorPose", "selectBaseForceSensor", "setBaseForceOffset"),
+        *("setToolInertial", "setFreedriveDamp", "setSlowDownFraction", "setPersistentParameters"),
+        *("setKinematicsCompensate", "setHardwareCustomParameters", "setRobotZero", "confirmSafetyParameters"),
+        *("firmwareUpdate",),
+    ),
+    "RobotManage": (
+        *("freedrive", "backdrive", "handguideMode", "exitHandguideMode", "setSim", "setLinkModeEnable"),
+        *("startRecord", "stopRecord", "pauseRecord"),
+    ),
+    "Trace": ("textmsg", "popup"),
+}
+REFUSED_BY_CONTROLLER: dict[str, tuple[str, ...]] = {
+    "RuntimeMachine": (
+        *("loadProgram", "runProgram", "start", "step", "gotoLine", "setPlanContext", "newTask", "deleteTask"),
+        *("setBreakPoint", "removeBreakPoint", "clearBreakPoints"),
+    ),
+}
+
 
 def methods(cabinet: Cabinet) -> Table:
     """Every method that the controller knows; each takes named params and returns what goes on the wire."""
-    table = refusals(ROBOT_METHODS) | _of_the_robot(cabinet) | _of_the_state(cabinet) | tables() | cabinet.io.methods()
-    table |= Moves(cabinet).methods() | Steering(cabinet).methods()
-    whole = {f"{ROBOT}.{name}": method for name, method in table.items()}
-    return whole | refusals(CABINET_METHODS) | _of_the_controller(cabinet)
+    of_robot = _refusals(REFUSED_BY_ROBOT) | _of_the_robot(cabinet) | _of_the_state(cabinet) | Moves(cabinet).methods()
+    for place in OUTPUTS:
+        of_robot |= _outputs(cabinet, place)
+    whole = {f"{ROBOT}.{name}": method for name, method in of_robot.items()}
+    return whole | _refusals(REFUSED_BY_CONTROLLER) | _of_the_controller(cabinet)
+
+
+def refuse(_: Params) -> int:
+    """What a method answers that is not simulated, whatever its params."""
+    return -ReturnCode.NOT_IMPLEMENTED
+
+
+def _refusals(names: dict[str, tuple[str, ...]]) -> Table:
+    return {f"{owner}.{name}": refuse for owner, of_owner in names.items() for name in of_owner}
 
 
 def _of_the_controller(cabinet: Cabinet) -> Table:
@@ -36,21 +95,18 @@ def _of_the_controller(cabinet: Cabinet) -> Table:
         "SystemInfo.getInterfaceVersionCode": lambda _: INTERFACE_VERSION,
         "SystemInfo.getControlSoftwareVersionCode": lambda _: CONTROL_SOFTWARE_VERSION,
         "SystemInfo.getControlSoftwareFullVersion": lambda _: SOFTWARE_VERSION,
-        "SystemInfo.getControlSystemTime": lambda _: int(cabinet.now_s() * 1e9),
         "getRobotNames": lambda _: [ROBOT],
         "getAxisNames": lambda _: [],
         "RuntimeMachine.abort": lambda _: cabinet.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2),
-        # Stops a program; motion that clients asked for is none of its business.
+        # Stops a program, not motion that clients asked for.
         "RuntimeMachine.stop": lambda _: ReturnCode.OK,
         "RuntimeMachine.pause": lambda _: cabinet.hold(),
         "RuntimeMachine.resume": lambda _: cabinet.resume(),
-        "RuntimeMachine.getRuntimeState": lambda _: runtime_state(cabinet),
-        "RuntimeMachine.getStatus": lambda _: runtime_state(cabinet),
+        # Motion from a client runs with the runtime Stopped.
+        "RuntimeMachine.getRuntimeState": lambda _: "Paused" if cabinet.motion.held else "Stopped",
         "RegisterControl.setWatchDog": lambda p: cabinet.set_watchdog(
             str(p["key"]), float(p["timeout"]), int(p["action"])
         ),
-        "RegisterControl.getWatchDogAction": lambda p: cabinet.watchdogs.get(str(p["key"]), (0.0, 0))[1],
-        "RegisterControl.getWatchDogTimeout": lambda p: cabinet.watchdogs.get(str(p["key"]), (0.0, 0))[0],
     }
 
 
@@ -60,13 +116,7 @@ def _of_the_robot(cabinet: Cabinet) -> Table:
         "RobotConfig.getRobotType": lambda _: "aubo_i5",
         "RobotConfig.getRobotSubType": lambda _: "aubo_i5_11",
         "RobotConfig.getControlBoxType": lambda _: LOOPBACK_CONTROL_BOX,
-        "RobotConfig.getName": lambda _: ROBOT,
         "RobotConfig.getDof": lambda _: 6,
-        "RobotConfig.getCycletime": lambda _: 0.005,
-        "RobotConfig.hasTcpForceSensor": lambda _: False,
-        "RobotConfig.getTcpForceSensorNames": lambda _: [],
-        "RobotConfig.hasBaseForceSensor": lambda _: False,
-        "RobotConfig.getBaseForceSensorNames": lambda _: [],
         "RobotConfig.setTcpOffset": lambda p: _set_tcp_offset(cabinet, p),
         "RobotConfig.getTcpOffset": lambda _: cabinet.tcp_offset,
         "RobotConfig.setPayload": lambda p: _set_payload(cabinet, p),
@@ -80,16 +130,10 @@ def _of_the_robot(cabinet: Cabinet) -> Table:
         "RobotManage.setOperationalMode": lambda p: _set_operational_mode(cabinet, p),
         "RobotManage.setUnlockProtectiveStop": lambda _: power.unlock(),
         "RobotManage.restartInterfaceBoard": lambda _: power.restart_interface_board(),
-        "RobotManage.getRobotControlMode": lambda _: control_mode(cabinet),
         # No arm is behind this controller.
         "RobotManage.isSimulationEnabled": lambda _: True,
-        "RobotManage.isFreedriveEnabled": lambda _: False,
-        "RobotManage.isBackdriveEnabled": lambda _: False,
-        "RobotManage.isLinkModeEnabled": lambda _: False,
         "ForceControl.isFcEnabled": lambda _: False,
-        "ForceControl.fcDisable": lambda _: ReturnCode.OK,
         "Trace.peek": lambda p: _peek(cabinet, int(p["num"]), int(p.get("last_time", 0))),
-        "Trace.textmsg": lambda _: ReturnCode.OK,
     }
 
 
@@ -99,41 +143,29 @@ def _of_the_state(cabinet: Cabinet) -> Table:
         "RobotState.getRobotModeType": lambda _: power.mode.value,
         "RobotState.getSafetyModeType": lambda _: power.safety.value,
         "RobotState.isPowerOn": lambda _: power.on,
-        "RobotState.isCollisionOccurred": lambda _: power.collision,
-        "RobotState.isWithinSafetyLimits": lambda _: power.safety in MOVING_ALLOWED,
         "RobotState.isSteady": lambda _: motion.steady(now_s()),
         "RobotState.getTcpPose": lambda _: to_wire(cabinet.tcp()),
-        "RobotState.getToolPose": lambda _: to_wire(cabinet.flange()),
-        "RobotState.getActualTcpOffset": lambda _: cabinet.tcp_offset,
-        "RobotState.getJointPositions": lambda _: cabinet.joints(),
-        "RobotState.getJointTargetPositions": lambda _: cabinet.joints(),
-        "RobotState.getJointState": lambda _: [joint_state(power.mode)] * 6,
-        "RobotState.getTcpTargetPose": lambda _: to_wire(cabinet.tcp()),
-        "RobotState.getTargetTcpPose": lambda _: to_wire(cabinet.configured(motion.ends(now_s()))),
         "RobotState.getTcpSpeed": lambda _: cabinet.tcp_speed(),
+        "RobotState.getJointPositions": lambda _: cabinet.joints(),
         "RobotState.getJointSpeeds": lambda _: motion.joint_velocity(now_s()),
-        "RobotState.getTcpForce": lambda _: cabinet.force(),
-        "RobotAlgorithm.forwardKinematics": lambda p: cabinet.fk(p["q"], tip=True),
-        "RobotAlgorithm.forwardToolKinematics": lambda p: cabinet.fk(p["q"], tip=False),
+        "RobotState.getJointState": lambda _: [_joint_state(power.mode)] * 6,
+        "RobotAlgorithm.forwardKinematics": lambda p: cabinet.fk(p["q"]),
         "RobotAlgorithm.inverseKinematics": lambda p: cabinet.ik(_floats(p["qnear"], 6), p["pose"]),
-        "RobotAlgorithm.inverseToolKinematics": lambda p: cabinet.ik(_floats(p["qnear"], 6), p["pose"], tip=False),
     }
 
 
-def runtime_state(cabinet: Cabinet) -> str:
-    """Motion from a client runs with the runtime Stopped."""
-    return "Paused" if cabinet.motion.held else "Stopped"
+def _outputs(cabinet: Cabinet, place: str) -> Table:
+    levels = cabinet.outputs[place]
+    name = f"IoControl.{{}}{place}DigitalOutput"
+    return {
+        name.format("set"): lambda p: cabinet.put(place, p["index"], p["value"]),
+        name.format("get"): lambda p: dict(enumerate(levels)).get(p["index"], False),
+        name.format("get") + "s": lambda _: sum(1 << i for i, level in enumerate(levels) if level),
+    }
 
 
-def control_mode(cabinet: Cabinet) -> str:
-    """How the arm is controlled, in the maker's words."""
-    if cabinet.servo_mode:
-        return "Servo"
-    return "Speed" if cabinet.motion.drifting(cabinet.now_s()) else "Position"
-
-
-def joint_state(mode: RobotMode) -> str:
-    """What every joint says of itself in a robot mode."""
+def _joint_state(mode: RobotMode) -> str:
+    """What every joint reports in a robot mode."""
     if mode in {RobotMode.POWER_ON, RobotMode.IDLE, RobotMode.BRAKE_RELEASING}:
         return "Idle"
     return "Running" if mode == RobotMode.RUNNING else "Poweroff"

@@ -1,47 +1,52 @@
-"""Moves as clients queue them: lines, moves in joints, circles and splines, and what is told of them.
+"""Moves of the loopback arm as clients queue them: who may move it, how fast and how far.
 
 A pose out of reach is accepted first and fails in planning, as in a controller. Speeds above what the arm allows are
-clipped.
+clipped. The joints' speeds are those of the maker's URDF for the i5; the other maxima are the examples of the SDK's
+headers, which are for an i5H. A real cabinet reports its own.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
-from drivers.arcs.codes import ReturnCode
+from drivers.arcs.codes import MOVING_ALLOWED, ReturnCode, RobotMode, SafetyMode
 from drivers.geometry import from_wire
-from drivers.sim.arcs.admission import Admission, six, within
+from drivers.samples import Pose
 from drivers.sim.arcs.cabinet import SOFT_STOP_M_S2, Cabinet
-from drivers.sim.arcs.limits import (
-    JOINT_ACCS_RAD_S2,
-    JOINT_SPEEDS_RAD_S,
-    REDUCED_M_S,
-    REDUCED_RAD_S,
-    TCP_ACC_M_S2,
-    TCP_SPEED_M_S,
-)
-from drivers.sim.arcs.motion import Pace
+from drivers.sim.arm.kinematics import LIMITS_DEG, Joints, inverse, inverted, matrix_of
+
+JOINT_SPEEDS_RAD_S = (2.5964, 2.5964, 2.5964, 3.1105, 3.1105, 3.1105)
+JOINT_ACCS_RAD_S2 = (31.1, 31.1, 31.1, 20.7, 20.7, 20.7)
+TCP_SPEED_M_S, TCP_TURN_RAD_S = 2.0, 5.0
+TCP_ACC_M_S2, TCP_TURN_RAD_S2 = 10.0, 10.0
+REDUCED_M_S = 0.25
+"""Reduced mode and manual operation: ISO 10218-1 calls 250 mm/s reduced speed. A real cabinet is configured."""
+REACH_M = 0.8865
+REDUCED_RAD_S = REDUCED_M_S / REACH_M
+"""So slow that the tip of the stretched arm stays below `REDUCED_M_S`."""
+POSE_OUT_OF_REACH = 30047
+BLEND_M = (0.001, 1.0)
 
 Params = dict[str, Any]
 
 
-class Moves(Admission):
-    """The queue of one cabinet."""
+class Moves:
+    """The queue of one cabinet, and its limits."""
 
     def __init__(self, cabinet: Cabinet) -> None:
-        super().__init__(cabinet)
-        self._circle_mode = 1
+        self._cabinet = cabinet
+        self._near = cabinet.motion.near
+        """Joints of the last pose that was asked for: the next one is likely to be near."""
 
     def methods(self) -> dict[str, Callable[[Params], Any]]:
-        """By `MotionControl.method`."""
-        cabinet, motion = self.cabinet, self.cabinet.motion
+        """By `Class.method`, without the robot's name."""
+        cabinet, motion = self._cabinet, self._cabinet.motion
+        positions = [math.radians(v) for v in LIMITS_DEG]
         return {
-            "MotionControl.moveLine": self.line,
-            "MotionControl.moveJoint": self.joint,
-            "MotionControl.moveCircle": self.circle,
-            "MotionControl.setCirclePathMode": self._set_circle_mode,
-            "MotionControl.moveSpline": self.spline,
+            "MotionControl.moveLine": self._line,
+            "MotionControl.moveJoint": self._joint,
             "MotionControl.stopLine": lambda p: cabinet.stop(float(p["acc"]), float(p["acc_rot"])),
             "MotionControl.stopJoint": lambda p: cabinet.stop(SOFT_STOP_M_S2, float(p["acc"])),
             "MotionControl.clearPath": lambda _: cabinet.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2),
@@ -50,82 +55,85 @@ class Moves(Admission):
             "MotionControl.setSpeedFraction": lambda p: cabinet.set_speed_fraction(float(p["fraction"])),
             "MotionControl.getSpeedFraction": lambda _: motion.fraction,
             "MotionControl.getExecId": lambda _: motion.exec_id(cabinet.now_s()),
-            "MotionControl.getQueueSize": lambda _: self.queue_size(),
-            "MotionControl.getTrajectoryQueueSize": lambda _: self.queue_size(),
+            "MotionControl.getQueueSize": lambda _: self._queue_size(),
+            "MotionControl.getTrajectoryQueueSize": lambda _: self._queue_size(),
             "MotionControl.isBlending": lambda _: motion.blending(cabinet.now_s()),
-            "MotionControl.getProgress": lambda _: motion.progress(cabinet.now_s()),
-            "MotionControl.getDuration": lambda p: motion.times(int(p["id"]), cabinet.now_s())[0],
-            "MotionControl.getMotionLeftTime": lambda p: motion.times(int(p["id"]), cabinet.now_s())[1],
-            "MotionControl.getPauseJointPositions": lambda _: cabinet.joints() if motion.held else [],
+            "RobotConfig.getJointMaxPositions": lambda _: positions,
+            "RobotConfig.getJointMinPositions": lambda _: [-v for v in positions],
+            "RobotConfig.getJointMaxSpeeds": lambda _: JOINT_SPEEDS_RAD_S,
+            "RobotConfig.getJointMaxAccelerations": lambda _: JOINT_ACCS_RAD_S2,
+            "RobotConfig.getTcpMaxSpeeds": lambda _: [TCP_SPEED_M_S, TCP_TURN_RAD_S],
+            "RobotConfig.getTcpMaxAccelerations": lambda _: [TCP_ACC_M_S2, TCP_TURN_RAD_S2],
         }
 
-    def line(self, p: Params) -> int:
-        """moveLine."""
+    def _line(self, p: Params) -> int:
         target = from_wire([float(v) for v in p["pose"]])
-        if (code := self.admit(p)) != ReturnCode.OK:
+        if (code := self._admit(p)) != ReturnCode.OK:
             return code
-        if not self.reachable(target):
-            return self.out_of_reach()
-        pace = self.pace(p, TCP_SPEED_M_S, TCP_ACC_M_S2, REDUCED_M_S)
-        cabinet = self.cabinet
+        if not self._reachable(target):
+            return self._out_of_reach()
+        cabinet = self._cabinet
+        speed_m_s, acc_m_s2 = self._pace(p, TCP_SPEED_M_S, TCP_ACC_M_S2, REDUCED_M_S)
         added = cabinet.motion.add(
             target,
-            pace.speed * 1e3,
-            pace.acc * 1e3,
+            speed_m_s * 1e3,
+            acc_m_s2 * 1e3,
             cabinet.now_s(),
-            pace.duration_s,
-            blend_mm=pace.blend_mm,
+            float(p.get("duration", 0.0)),
+            blend_mm=float(p.get("blend_radius", 0.0)) * 1e3,
             fix=cabinet.fix,
         )
         return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
 
-    def joint(self, p: Params) -> int:
-        """moveJoint."""
-        q = six(p["q"])
-        if q is None:
+    def _joint(self, p: Params) -> int:
+        q = [float(v) for v in p["q"]]
+        if len(q) != 6 or not all(math.isfinite(v) for v in q):
             return -ReturnCode.INVALID_ARGUMENT
-        if (code := self.admit(p)) != ReturnCode.OK:
+        if (code := self._admit(p)) != ReturnCode.OK:
             return code
-        if not within(q):
-            return self.out_of_reach()
-        added = self.cabinet.motion.add_joints(q, self._joint_pace(p), self.cabinet.now_s())
+        if any(abs(v) > math.radians(limit) for v, limit in zip(q, LIMITS_DEG, strict=True)):
+            return self._out_of_reach()
+        speed_rad_s, acc_rad_s2 = self._pace(p, min(JOINT_SPEEDS_RAD_S), min(JOINT_ACCS_RAD_S2), REDUCED_RAD_S)
+        joints: Joints = (q[0], q[1], q[2], q[3], q[4], q[5])
+        least_s = float(p.get("duration", 0.0))
+        added = self._cabinet.motion.add_joints(joints, speed_rad_s, acc_rad_s2, self._cabinet.now_s(), least_s)
         return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
 
-    def circle(self, p: Params) -> int:
-        """moveCircle: one arc; every circle begins and ends at rest."""
-        via, end = (from_wire([float(v) for v in p[name]]) for name in ("via_pose", "end_pose"))
-        if (code := self.admit(p)) != ReturnCode.OK:
-            return code
-        if not (self.reachable(via) and self.reachable(end)):
-            return self.out_of_reach()
-        pace, cabinet = self.pace(p, TCP_SPEED_M_S, TCP_ACC_M_S2, REDUCED_M_S), self.cabinet
-        pace = Pace(pace.speed * 1e3, pace.acc * 1e3, pace.duration_s)
-        try:
-            cabinet.motion.add_arc(via, end, self._circle_mode, cabinet.fix, pace, cabinet.now_s())
-        except ValueError:
+    def _admit(self, p: Params) -> int:
+        """Whether a move may be queued."""
+        if self._cabinet.power.mode != RobotMode.RUNNING:
+            return -1
+        if self._cabinet.power.safety not in MOVING_ALLOWED:
+            return ReturnCode.BAD_STATE
+        acc, speed, duration_s = float(p["a"]), float(p["v"]), float(p.get("duration", 0.0))
+        blend_m = float(p.get("blend_radius", 0.0))
+        timed = math.isfinite(duration_s) and duration_s > 0.0  # then a and v may be left at 0
+        if not (duration_s == 0.0 or timed) or math.isnan(acc) or math.isnan(speed):
             return -ReturnCode.INVALID_ARGUMENT
+        if not (timed or (acc > 0.0 and speed > 0.0)) or not (blend_m == 0.0 or BLEND_M[0] <= blend_m <= BLEND_M[1]):
+            return -ReturnCode.INVALID_ARGUMENT
+        return ReturnCode.QUEUE_FULL if self._cabinet.motion.full else ReturnCode.OK
+
+    def _pace(self, p: Params, fastest: float, hardest: float, reduced: float) -> tuple[float, float]:
+        """Speed and acceleration, clipped to what the arm allows; the maxima where only a duration was given."""
+        speed, acc = float(p["v"]), float(p["a"])
+        slow = self._cabinet.power.safety == SafetyMode.REDUCED or self._cabinet.operational_mode == "Manual"
+        limit = reduced if slow else fastest
+        return min(speed, limit) if speed > 0.0 else limit, min(acc, hardest) if acc > 0.0 else hardest
+
+    def _reachable(self, target: Pose) -> bool:
+        """Whether there are joints for a pose of the configured tool centre point."""
+        flange = matrix_of(target) @ inverted(self._cabinet.tool())
+        found = inverse(flange, self._near) or inverse(flange, self._cabinet.motion.near)
+        self._near = found or self._near
+        return found is not None
+
+    def _out_of_reach(self) -> int:
+        """Accepted, then found to be out of reach: the arm stops and a message says why."""
+        self._cabinet.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2)
+        self._cabinet.tell(POSE_OUT_OF_REACH)
         return ReturnCode.OK
 
-    def spline(self, p: Params) -> int:
-        """moveSpline: points are collected; an empty one ends the spline, and with it the motion begins."""
-        q = six(p["q"]) if p["q"] else None
-        if p["q"] and q is None:
-            return -ReturnCode.INVALID_ARGUMENT
-        if (code := self.admit(p)) != ReturnCode.OK:
-            return code
-        if q is not None:
-            if not within(q):
-                return self.out_of_reach()
-            self.cabinet.motion.spline_through(q, self.cabinet.now_s())
-            return ReturnCode.OK
-        added = self.cabinet.motion.add_spline(self._joint_pace(p), self.cabinet.now_s())
-        return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
-
-    def _set_circle_mode(self, p: Params) -> int:
-        if p["mode"] not in (0, 1, 2):
-            return -ReturnCode.INVALID_ARGUMENT
-        self._circle_mode = int(p["mode"])
-        return ReturnCode.OK
-
-    def _joint_pace(self, p: Params) -> Pace:
-        return self.pace(p, min(JOINT_SPEEDS_RAD_S), min(JOINT_ACCS_RAD_S2), REDUCED_RAD_S)
+    def _queue_size(self) -> int:
+        self._cabinet.motion.advance(self._cabinet.now_s())
+        return self._cabinet.motion.size

@@ -22,7 +22,6 @@ class Power:
         self._now_s = now_s
         self._steps: list[tuple[float, RobotMode]] = [(-1.0, RobotMode.POWER_OFF)]
         self.safety = SafetyMode.NORMAL
-        self.collision = False
         self.button_down = False
         """The emergency stop button: a person pushes and releases it."""
 
@@ -81,10 +80,10 @@ class Power:
             self.safety = SafetyMode.REDUCED if reduced else SafetyMode.NORMAL
 
     def unlock(self) -> int:
-        """Clear a protective stop, collision included; nothing else. The arm does not go on by itself."""
+        """Clear a protective stop and nothing else. The arm does not go on by itself."""
         if self.safety != SafetyMode.PROTECTIVE_STOP:
             return ReturnCode.REQUEST_IGNORED if self.safety == SafetyMode.NORMAL else ReturnCode.BAD_STATE
-        self.safety, self.collision = SafetyMode.NORMAL, False
+        self.safety = SafetyMode.NORMAL
         return ReturnCode.OK
 
     def restart_interface_board(self) -> int:

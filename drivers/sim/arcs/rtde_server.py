@@ -13,8 +13,6 @@ from drivers.arcs.rtde import MAX_MESSAGE_BYTES, PING, SET_RECIPE, decode_messag
 from drivers.errors import ProtocolViolation
 from drivers.geometry import to_wire
 from drivers.sim.arcs.cabinet import Cabinet
-from drivers.sim.arcs.io import mask
-from drivers.sim.arcs.methods import runtime_state
 from drivers.sim.arm.motion import Rest
 from drivers.sim.faults.board import FaultBoard
 from drivers.sim.faults.kinds import ALWAYS, KINDS, Device, Fault
@@ -50,15 +48,10 @@ class RtdeServer(LoopbackServer):
         """Keep-alives seen, for tests."""
         self._outputs: dict[str, tuple[int, Callable[[], Any]]] = {
             "timestamp": (100, cabinet.now_s),
-            "runtime_state": (102, lambda: runtime_state(cabinet)),
-            "R1_target_q": (1001, lambda: list(cabinet.joints())),
             "R1_actual_q": (1006, lambda: list(cabinet.joints())),
             "R1_robot_mode": (1014, lambda: cabinet.power.mode.value),
             "R1_safety_mode": (1015, lambda: cabinet.power.safety.value),
-            "R1_speed_scaling": (1019, lambda: cabinet.motion.fraction),
             "R1_actual_TCP_pose": (1021, lambda: to_wire(cabinet.tcp())),
-            "R1_actual_TCP_force": (1023, cabinet.force),
-            "R1_tool_digital_output_bits": (1049, lambda: mask(cabinet.io.outputs["Tool"])),
         }
 
     @property
@@ -122,7 +115,7 @@ class RtdeServer(LoopbackServer):
                     return rest.at_s
                 case "R1_actual_TCP_pose":
                     return to_wire(self._cabinet.configured(rest.pose))
-                case "R1_actual_q" | "R1_target_q":
+                case "R1_actual_q":
                     return list(self._cabinet.motion.near_joints(rest.pose))
                 case _:
                     pass

@@ -17,7 +17,7 @@ from drivers.arcs.framing import BareDecoder, FrameDecoder, encode
 from drivers.arcs.rpc import named
 from drivers.errors import ProtocolViolation
 from drivers.sim.arcs.cabinet import Cabinet
-from drivers.sim.arcs.methods import methods
+from drivers.sim.arcs.methods import methods, refuse
 from drivers.sim.faults.board import FaultBoard
 from drivers.sim.faults.kinds import ALWAYS, LOST, REPLIES, STOPS, Device, Fault
 from drivers.sim.faults.phases import Truth
@@ -234,7 +234,9 @@ class ArcsServer(LoopbackServer):
         if method is None:
             return _error(ident, METHOD_NOT_FOUND, f"method not found: {name}")
         try:
-            result = method(named(name, params) if isinstance(params, list) else params or {})  # pyright: ignore[reportUnknownArgumentType]
+            if isinstance(params, list):
+                params = {} if method is refuse else named(name, params)  # pyright: ignore[reportUnknownArgumentType]
+            result = method(params or {})
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             return _error(ident, INVALID_PARAMS, f"invalid params: {error!r}")
         return _reply(ident, result=result)

@@ -1,9 +1,8 @@
-"""The ways of the loopback arm's tip: lines in space and in joints, and the corners that join two of them."""
+"""Paths of the loopback arm's tip: lines in space and in joints, and the corners that join two lines in space."""
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -18,7 +17,7 @@ ROTATION_AS_LINEAR_MM = 1.0
 """Below this travel, ARCS reads speed and acceleration as rad/s and rad/s2."""
 TURN_RAD = 1e-4
 STRETCHES = 16
-"""Straight pieces that a curved way is told to the world in."""
+"""Straight pieces in which a curved path is reported to the world."""
 
 
 class Path(Protocol):
@@ -54,20 +53,6 @@ class InSpace:
     def joints(self, done: float) -> Joints | None:
         """None: not given in joints."""
         return None
-
-
-class InJoints(ABC):
-    """A way that is given in joints: the tip follows from them and the tool."""
-
-    tool: Matrix
-
-    @abstractmethod
-    def joints(self, done: float) -> Joints:
-        """The joints after `done`."""
-
-    def pose(self, done: float) -> Pose:
-        """Where the tip is."""
-        return pose_of(forward(self.joints(done)) @ self.tool)
 
 
 @dataclass(frozen=True)
@@ -140,7 +125,7 @@ class Corner(InSpace):
 
 
 @dataclass(frozen=True)
-class JointLine(InJoints):
+class JointLine:
     """Straight in joints; its length is that of the joint that turns farthest."""
 
     start: Joints
@@ -162,39 +147,13 @@ class JointLine(InJoints):
         """The joints after `done`."""
         if done >= self.length:
             return self.end
-        return mixed(self.start, self.end, max(done, 0.0) / self.length)
-
-
-@dataclass(frozen=True)
-class JointCorner:
-    """A `Corner` in joints."""
-
-    a: JointLine
-    b: JointLine
-    cut: float
-    angular: bool = True
-    stretches: int = STRETCHES
-
-    @property
-    def length(self) -> float:
-        """What is cut off."""
-        return 2.0 * self.cut
-
-    @cached_property
-    def bend(self) -> float:
-        """The largest difference of the two directions in any joint."""
-        ways = [np.subtract(w.end, w.start) / w.length for w in (self.a, self.b)]
-        return float(np.abs(ways[1] - ways[0]).max())
-
-    def joints(self, done: float) -> Joints:
-        """By de Casteljau."""
-        u = done / self.length
-        start, end = self.a.joints(self.a.length - self.cut), self.b.joints(self.cut)
-        return mixed(mixed(start, self.a.end, u), mixed(self.b.start, end, u), u)
+        share = max(done, 0.0) / self.length
+        q = [a + share * (b - a) for a, b in zip(self.start, self.end, strict=True)]
+        return (q[0], q[1], q[2], q[3], q[4], q[5])
 
     def pose(self, done: float) -> Pose:
         """Where the tip is."""
-        return pose_of(forward(self.joints(done)) @ self.a.tool)
+        return pose_of(forward(self.joints(done)) @ self.tool)
 
 
 @dataclass(frozen=True)
@@ -231,9 +190,3 @@ class Part:
 def fixed(pose: Pose, fix: Matrix | None) -> Pose:
     """The true tip, from the tool centre point that was configured."""
     return pose if fix is None else pose_of(matrix_of(pose) @ fix)
-
-
-def mixed(a: Joints, b: Joints, share: float) -> Joints:
-    """Between two joint positions."""
-    q = [p + share * (r - p) for p, r in zip(a, b, strict=True)]
-    return (q[0], q[1], q[2], q[3], q[4], q[5])

@@ -7,8 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from drivers.geometry import distance
-from drivers.sim.arm.paths import Corner, JointCorner, JointLine, Line, Path
+from drivers.sim.arm.paths import Corner, Line, Path
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,11 +119,11 @@ class Piece:
     from_rest: bool = False
 
 
-Corners = dict[tuple[int, int, float], Corner | JointCorner | None]
+Corners = dict[tuple[int, int, float], Corner | None]
 """By the two moves, and by where the first was held."""
 
 
-def corner_of(a: Move, b: Move) -> Corner | JointCorner | None:
+def corner_of(a: Move, b: Move) -> Corner | None:
     """The corner between two moves, or None where the arm comes to rest between them."""
     if a.blend_mm <= 0.0:
         return None
@@ -132,9 +131,6 @@ def corner_of(a: Move, b: Move) -> Corner | JointCorner | None:
         case Line() as one, Line() as two if not one.angular and not two.angular and one.fix is two.fix:
             cut = min(a.blend_mm, 0.5 * one.length, 0.5 * two.length, one.length - a.enter)
             return Corner(one, two, cut) if cut > SHORTEST_CUT else None
-        case JointLine() as one, JointLine() as two:
-            cut = min(_near(one, a.blend_mm, end=True), _near(two, a.blend_mm, end=False), one.length - a.enter)
-            return JointCorner(one, two, cut) if cut > SHORTEST_CUT else None
         case _:
             return None
 
@@ -146,7 +142,7 @@ def pieces_of(
 
     `corners_known` is looked into and added to.
     """
-    corners: list[Corner | JointCorner | None] = []
+    corners: list[Corner | None] = []
     for a, b in itertools.pairwise(moves):
         key = (a.ident, b.ident, a.enter if a.held else 0.0)
         if key not in corners_known:
@@ -215,14 +211,3 @@ def ramps_of(pieces: Sequence[Piece], v_in: float) -> list[Ramp] | None:
 def _rests(move: Move, enter: float) -> int:
     """At how many of its ends the move is meant to be at rest."""
     return 2 - (enter > 0.0 and not move.held) - (move.blend_mm > 0.0)
-
-
-def _near(path: JointLine, radius_mm: float, *, end: bool) -> float:
-    """How far along the joints the tip stays within `radius_mm` of one end, half the way at most."""
-    corner = path.pose(path.length if end else 0.0)
-    low, high = 0.0, 0.5 * path.length
-    for _ in range(30):
-        middle = 0.5 * (low + high)
-        there = path.pose(path.length - middle if end else middle)
-        low, high = (middle, high) if distance(there, corner)[0] <= radius_mm else (low, middle)
-    return low

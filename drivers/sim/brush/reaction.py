@@ -49,20 +49,13 @@ class Reaction:
         at_tilts = np.array([np.interp(depth_mm, steps_mm, rows[k]) for k in range(len(TILTS_DEG))], np.float64)
         return float(np.interp(tilt_deg, np.array(TILTS_DEG), at_tilts))
 
-    def push(
-        self, tip: Pose, depth_mm: float, normal: tuple[float, float, float] = LEVEL
-    ) -> tuple[float, float, float]:
-        """Force in N of the paper on the bundle, in the base frame: along `normal`, a unit vector out of it."""
-        tilt_deg, _ = lean(leaning_with(tip, normal))
-        push_n = self.push_n(depth_mm, tilt_deg)
-        return normal[0] * push_n, normal[1] * push_n, normal[2] * push_n
-
     def wrench(self, tip: Pose, depth_mm: float, normal: tuple[float, float, float] = LEVEL) -> Wrench:
         """Force in N and torque in Nm on the sensor, in the tool's frame: z along the tool, towards the tip.
 
         `normal` is the unit vector out of the paper, in the base frame.
         """
-        force_n = np.array(self.push(tip, depth_mm, normal)) - np.array([0.0, 0.0, self._weight_n])
+        push_n = self.push_n(depth_mm, lean(leaning_with(tip, normal))[0])
+        force_n = np.multiply(normal, push_n) - np.array([0.0, 0.0, self._weight_n])
         fx, fy, fz = (float(v) for v in Rotation.from_quat(tip.quaternion).inv().apply(force_n))
         return fx, fy, fz, -self._arm_m * fy, self._arm_m * fx, 0.0
 

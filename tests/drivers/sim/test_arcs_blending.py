@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from drivers.geometry import brush_pose, distance
 from drivers.samples import Pose
-from drivers.sim.arcs.motion import ArmQueue, Pace
-from drivers.sim.arm.kinematics import HOME, Joints
+from drivers.sim.arm.kinematics import HOME
 from drivers.sim.arm.motion import MotionQueue
+from drivers.sim.arm.queue import ArmQueue
 from drivers.sim.config import SimConfig
 from drivers.sim.world import World
 
@@ -223,32 +223,14 @@ def test_a_duration_is_how_long_a_move_takes_rounded_or_not(blend_mm: float):
     assert sum(spent_s[i] for i in range(3)) == pytest.approx(9.0, abs=0.1)
 
 
-def turned(by_rad: float, joint: int) -> Joints:
-    q = list(HOME)
-    q[joint] += by_rad
-    return (q[0], q[1], q[2], q[3], q[4], q[5])
-
-
-def test_moves_in_joints_are_rounded_in_joints():
-    def run(blend_mm: float) -> tuple[float, float]:
-        queue = ArmQueue(at(0.0), lambda *_: None)
-        queue.add_joints(HOME, Pace(1.0, 2.0), 0.0)
-        queue.advance(1e3)
-        via = turned(0.4, 0)
-        for q in (via, turned(0.4, 1)):
-            queue.add_joints(q, Pace(0.5, 2.0, blend_mm=blend_mm), 1e3)
-        ids: list[int] = []
-        nearest, t = math.inf, 1e3
-        while (ident := queue.exec_id(t)) != -1:
-            ids.append(ident)
-            nearest = min(nearest, max(abs(a - b) for a, b in zip(queue.joints(t), via, strict=True)))
-            t += 0.005
-        assert [i for i, _ in itertools.groupby(ids)] == [1, 2]
-        return nearest, t
-
-    (rest, slow_s), (rounded, quick_s) = run(0.0), run(30.0)
-    assert rest < 2e-3 < rounded
-    assert quick_s < slow_s - 0.05
+def test_a_move_in_joints_is_not_rounded():
+    queue = ArmQueue(at(0.0), lambda *_: None)
+    first, second = (0.4, *HOME[1:]), (0.8, *HOME[1:])
+    queue.add_joints(first, 0.5, 2.0, 0.0, 0.0)
+    queue.add_joints(second, 0.5, 2.0, 0.0, 0.0)
+    assert [segment.ramp.v_out for segment in queue._queue] == [0.0, 0.0]
+    assert queue.joints(queue._queue[0].end_s - 1e-9) == pytest.approx(first)
+    assert not any(segment.corner for segment in queue._queue)
 
 
 RATES = (20.0, 500.0)
@@ -269,5 +251,8 @@ def test_the_same_moves_leave_the_same_path_at_any_rate():
         return told
 
     slow, quick = (stretches(rate) for rate in RATES)
-    assert slow == quick
     assert len(slow) > 20
+    assert len(slow) == len(quick)
+    # where a line is cut into stretches depends on when the clock was read, in the last digits
+    for a, b in zip(slow, quick, strict=True):
+        assert max(math.dist(p.position_mm, q.position_mm) for p, q in zip(a, b, strict=True)) < 1e-9

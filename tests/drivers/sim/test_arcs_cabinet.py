@@ -160,14 +160,14 @@ def test_stopping_a_program_does_not_stop_motion(on: Any):
 def test_a_protective_stop_keeps_the_path_until_a_person_unlocks_and_someone_resumes(on: Any):
     on.line(NEAR)
     on.clock.s += 0.5
-    on.cabinet.collide()
+    on.cabinet.safety_stop(SafetyMode.PROTECTIVE_STOP)
     on.clock.s += 1.0
     rest_mm = on.off_mm(NEAR)
-    assert (on.safety, on.exec_id, on.ask("RobotState.isCollisionOccurred")) == ("ProtectiveStop", 0, True)
+    assert (on.safety, on.exec_id) == ("ProtectiveStop", 0)
     assert (on.line(START), on.ask("RuntimeMachine.resume")) == (1, 1)
     assert on.ask("RobotManage.setUnlockProtectiveStop") == 0
     on.clock.s += 5.0
-    assert (on.safety, on.exec_id, on.ask("RobotState.isCollisionOccurred")) == ("Normal", 0, False)
+    assert (on.safety, on.exec_id) == ("Normal", 0)
     assert on.off_mm(NEAR) == rest_mm
     on.ask("RuntimeMachine.resume")
     on.clock.s += 5.0
@@ -202,7 +202,6 @@ def test_joints_and_pose_agree_with_the_tool_on(on: Any):
     pose, code = on.ask("RobotAlgorithm.forwardKinematics", q=joints)
     assert code == 0
     assert distance(from_wire(pose), on.world.tool())[0] < 1e-3
-    assert distance(from_wire(on.ask("RobotState.getToolPose")), on.world.tool())[0] == pytest.approx(180.0)
     back, code = on.ask("RobotAlgorithm.inverseKinematics", qnear=joints, pose=pose)
     assert code == 0
     assert back == pytest.approx(joints, abs=1e-5)
@@ -266,57 +265,76 @@ def test_what_is_set_is_what_is_got(on: Any):
     assert on.ask("RobotConfig.setTcpOffset", offset=[0.0] * 5) == -5
 
 
-@pytest.mark.parametrize("place", ["Standard", "Tool"])
-def test_outputs_stay_as_they_are_put_and_inputs_are_the_worlds(on: Any, place: str):
+@pytest.mark.parametrize("place", ["Standard", "Configurable", "Tool"])
+def test_outputs_stay_as_they_are_put(on: Any, place: str):
     digital = f"IoControl.set{place}DigitalOutput"
     assert on.ask(digital, index=1, value=True) == 0
     assert on.ask(f"IoControl.get{place}DigitalOutput", index=1) is True
     assert on.ask(f"IoControl.get{place}DigitalOutputs") == 2
     for index, value in ((-1, True), (99, True), (0, 1), ("0", True)):
         assert on.ask(digital, index=index, value=value) == -5
-    on.cabinet.io.inputs[place][3] = True
-    assert on.ask(f"IoControl.get{place}DigitalInput", index=3) is True
-    assert on.ask(f"IoControl.get{place}DigitalInputs") == 8
+    assert on.ask(f"IoControl.get{place}DigitalOutput", index=99) is False
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        *("ForceControl.fcEnable", "IoControl.setToolDigitalOutputPulse", "MotionControl.moveCircle"),
+        *("MotionControl.moveSpline", "MotionControl.speedLine", "MotionControl.servoJoint"),
+        *("MotionControl.pathBufferAlloc", "RobotManage.freedrive", "RuntimeMachine.loadProgram"),
+    ],
+)
+def test_what_is_known_and_not_simulated_is_refused(on: Any, method: str):
+    assert on.ask(method, any_parameter=1) == -6
+    assert on.exec_id == -1
 
 
 def test_the_brush_pushes_back_only_while_it_is_on_the_paper(on: Any):
     table = on.world.config.table
-    assert on.ask("RobotState.getTcpForce") == [0.0] * 6
+    air_n = on.world.wrench()[2]
     x, y = table.origin_mm[0] - 80.0, table.origin_mm[1] + 100.0
     on.line(brush_pose(x, y, table.paper_z_mm - 10.0), v=1.0)
     on.clock.s += 20.0
-    *push, mx, my, mz = on.ask("RobotState.getTcpForce")
-    assert push == pytest.approx([0.0, 0.0, on.world.reaction.push_n(10.0, 0.0)])
-    assert push[2] > 0.05
-    assert [mx, my, mz] == [0.0] * 3
+    fx, fy, fz, mx, my, mz = on.world.wrench()
+    push_n = on.world.reaction.push_n(10.0, 0.0)
+    assert push_n > 0.05
+    assert [fx, fy, fz] == pytest.approx([0.0, 0.0, air_n - push_n])
+    assert [mx, my, mz] == pytest.approx([0.0] * 3)
+
+
+async def bitten(on: Any) -> None:
+    """Return once no watchdog waits any more."""
+    async with asyncio.timeout(5.0):
+        while on.cabinet._timers:
+            await asyncio.sleep(0.01)
 
 
 async def test_a_watchdog_that_is_not_fed_bites_and_one_that_is_fed_does_not(on: Any):
     on.line(NEAR)
+    ends_s: list[float] = []
     for _ in range(4):
-        assert on.ask("RegisterControl.setWatchDog", key="wd", timeout=0.15, action=3) == 0
-        await asyncio.sleep(0.08)
+        assert on.ask("RegisterControl.setWatchDog", key="wd", timeout=0.1, action=3) == 0
+        assert len(on.cabinet._timers) == 1, "the timer set before is cancelled"
+        ends_s.append(on.cabinet._timers["wd"].when())
+    assert ends_s == sorted(ends_s)
     assert on.safety == "Normal"
-    await asyncio.sleep(0.2)
+    await bitten(on)
     assert on.safety == "ProtectiveStop"
     on.ask("RobotManage.setUnlockProtectiveStop")
-    await asyncio.sleep(0.2)
-    assert on.safety == "Normal"  # it bites once
+    assert not on.cabinet._timers, "it bites once"
 
 
 async def test_a_watchdog_can_be_disarmed_and_its_actions_differ(on: Any):
     on.ask("RegisterControl.setWatchDog", key="wd", timeout=0.1, action=3)
-    assert on.ask("RegisterControl.getWatchDogAction", key="wd") == 3
     on.ask("RegisterControl.setWatchDog", key="wd", timeout=0.1, action=0)
-    await asyncio.sleep(0.15)
-    assert on.safety == "Normal"
+    assert not on.cabinet._timers
     for wrong in ({"timeout": 0.05, "action": 3}, {"timeout": math.nan, "action": 3}, {"timeout": 1.0, "action": 4}):
         assert on.ask("RegisterControl.setWatchDog", key="wd", **wrong) == -5
     for action, held in ((1, True), (2, False)):
         on.line(NEAR if held else START)
         on.clock.s += 0.3
         on.ask("RegisterControl.setWatchDog", key="wd", timeout=0.1, action=action)
-        await asyncio.sleep(0.15)
+        await bitten(on)
         assert on.cabinet.motion.held is held
         on.ask("RuntimeMachine.resume")
     on.cabinet.close()

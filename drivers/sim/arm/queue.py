@@ -1,34 +1,22 @@
-"""The arm's queue as a controller knows it: moves in joints, circles and splines, held paths."""
+"""The arm's queue as a controller knows it: it also takes moves in joints, and can hold its path and go on."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drivers.geometry import distance
 from drivers.samples import Pose
-from drivers.sim.arm.curves import Arc, Spline
 from drivers.sim.arm.kinematics import Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
 from drivers.sim.arm.motion import SAME_POSE_DEG, SAME_POSE_MM, MotionQueue
-from drivers.sim.arm.paths import JointLine, Part, Path, fixed
+from drivers.sim.arm.paths import JointLine, Part
 from drivers.sim.arm.plan import Move
 
 SAME_JOINT_RAD = 1e-6
 DT_S = 1e-3
-
-
-@dataclass(frozen=True, slots=True)
-class Pace:
-    """How fast a move goes: speed and acceleration in mm and s, or rad and s, and the time it takes at least."""
-
-    speed: float
-    acc: float
-    duration_s: float = 0.0
-    blend_mm: float = 0.0
 
 
 class ArmQueue(MotionQueue):
@@ -40,7 +28,6 @@ class ArmQueue(MotionQueue):
         super().__init__(home, on_path, capacity)
         self.tool: Matrix = np.eye(4) if tool is None else tool
         self._held: list[Move] | None = None
-        self._spline: list[Joints] = []
 
     @property
     def size(self) -> int:
@@ -52,8 +39,8 @@ class ArmQueue(MotionQueue):
         """True between `hold` and `resume`, also where nothing was under way."""
         return self._held is not None
 
-    def add_joints(self, joints: Joints, pace: Pace, now_s: float) -> bool:
-        """Append a move that is straight in joints; False where the arm will be there already."""
+    def add_joints(self, joints: Joints, speed_rad_s: float, acc_rad_s2: float, now_s: float, least_s: float) -> bool:
+        """Append a move that is straight in joints, from rest to rest; False where the arm will be there already."""
         self.advance(now_s)
         target = pose_of(forward(joints) @ self.tool)
         travel_mm, turn_deg = distance(self._last(), target)
@@ -61,46 +48,14 @@ class ArmQueue(MotionQueue):
         turned = max(abs(a - b) for a, b in zip(joints, self.near, strict=True))
         if travel_mm <= SAME_POSE_MM and turn_deg <= SAME_POSE_DEG and (not idle or turned <= SAME_JOINT_RAD):
             return False
-        self._append(_move(self._next_id, JointLine(self._last_joints(), joints, self.tool), pace), now_s)
-        return True
-
-    def add_arc(self, via: Pose, end: Pose, mode: int, fix: Matrix | None, pace: Pace, now_s: float) -> None:
-        """Append a circle through `via` to `end`. Raises ValueError where there is none.
-
-        On a circle of radius r the speed stays below sqrt(acc r), so that the bend needs no more than `acc`.
-        """
-        self.advance(now_s)
-        start = self._last() if fix is None else fixed(self._last(), inverted(fix))
-        arc = Arc(start, via, end, mode, fix)
-        speed = min(pace.speed, math.sqrt(pace.acc * arc.radius_mm))
-        self._append(_move(self._next_id, arc, replace(pace, speed=speed, blend_mm=0.0)), now_s)
-
-    def spline_through(self, joints: Joints, now_s: float) -> None:
-        """Note a point for `add_spline`."""
-        self.advance(now_s)
-        if joints != (self._spline[-1] if self._spline else None):
-            self._spline.append(joints)
-
-    def add_spline(self, pace: Pace, now_s: float) -> bool:
-        """Append the spline through the points noted since the last one; False where there are none."""
-        self.advance(now_s)
-        points, self._spline = [self._last_joints(), *self._spline], []
-        if len(points) > 1 and max(abs(a - b) for a, b in zip(points[0], points[1], strict=True)) <= SAME_JOINT_RAD:
-            del points[0]
-        if len(points) < 2:
-            return False
-        spline = Spline(points, self.tool)
-        speed = pace.speed / spline.steepest
-        if spline.sharpest > 0.0:
-            speed = min(speed, math.sqrt(pace.acc / spline.sharpest))
-        acc = pace.acc / spline.steepest
-        self._append(_move(self._next_id, spline, replace(pace, speed=speed, acc=acc, blend_mm=0.0)), now_s)
+        path = JointLine(self._last_joints(), joints, self.tool)
+        self._append(Move(self._next_id, path, speed_rad_s, acc_rad_s2, least_s), now_s)
         return True
 
     def stop(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
         """Decelerate on the path and forget the rest, held or not; this ends a hold."""
         super().stop(acc_mm_s2, acc_rad_s2, now_s)
-        self._held, self._spline = None, []
+        self._held = None
 
     def hold(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
         """Decelerate on the path and keep it; the id stays that of the move in which the arm comes to rest."""
@@ -114,9 +69,7 @@ class ArmQueue(MotionQueue):
         if resting is None:
             return
         segment, done = resting
-        rest = next((i for i, m in enumerate(moves) if m.ident == segment.ident), None)
-        if rest is None:
-            return  # speed or servo motion: there is no path to keep
+        rest = next(i for i, m in enumerate(moves) if m.ident == segment.ident)
         move = moves[rest]
         if segment.corner:
             after = next(s.enter for s in planned if s.ident == segment.ident and not s.corner)
@@ -158,23 +111,6 @@ class ArmQueue(MotionQueue):
         self.advance(now_s)
         return bool(self._queue) and self._queue[0].corner
 
-    def progress(self, now_s: float) -> float:
-        """Share of the running move that is done, 0 to 1; 0 at rest."""
-        self.advance(now_s)
-        if not self._queue:
-            return 0.0
-        front = self._queue[0]
-        done = front.enter + front.at(now_s)[0]
-        # half of a corner lies on the move before
-        whole = next((s.path for s in self._queue if s.ident == front.ident and not s.corner), front.path)
-        return (0.5 * done if front.corner else done) / whole.length if whole.length else 0.0
-
-    def times(self, ident: int, now_s: float) -> tuple[float, float]:
-        """(from the first piece that a move still has to its end, from now to its end) in s; zeros where it is over."""
-        self.advance(now_s)
-        mine = [s for s in self._queue if s.ident == ident]
-        return (mine[-1].end_s - mine[0].begin_s, mine[-1].end_s - now_s) if mine else (0.0, 0.0)
-
     def velocity(self, now_s: float) -> tuple[float, ...]:
         """[mm/s x3, rad/s x3] of the tip in the base frame, over the next millisecond."""
         self.advance(now_s)
@@ -195,11 +131,6 @@ class ArmQueue(MotionQueue):
         a = self.joints(now_s)
         b = front.joints(later_s) or self.near_joints(front.pose(later_s))
         return tuple((q - p) / DT_S for p, q in zip(a, b, strict=True))
-
-    def ends(self, now_s: float) -> Pose:
-        """Where the running move ends; where the arm is, at rest."""
-        self.advance(now_s)
-        return next((m.path.pose(m.path.length) for m in (*(self._held or ()), *self._moves)), self.pose(now_s))
 
     def near_joints(self, tip: Pose) -> Joints:
         """The joints for a tip pose, near those seen last; those themselves where no solution is found."""
@@ -223,7 +154,3 @@ class ArmQueue(MotionQueue):
         else:
             self._next_id += 1
             self._held.append(move)
-
-
-def _move(ident: int, path: Path, pace: Pace) -> Move:
-    return Move(ident, path, pace.speed, pace.acc, pace.duration_s, pace.blend_mm)
