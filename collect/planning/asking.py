@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from collect.errors import ConfigError
 from collect.rig.config import RigConfig
 from drivers.arcs.controller import Controller
-from drivers.arcs.joints import joint_positions
 from drivers.arcs.robot import AUBOPE_PORT
 from drivers.arcs.rpc import RpcConnection, open_arcs
 from drivers.errors import ProtocolViolation
@@ -34,7 +33,7 @@ async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[tuple[Pos
         await controller.connection.login()
         [controller.robot, *_] = await controller.robot_names()
         offset = await _tool(controller)
-        near = await joint_positions(controller)
+        near = await controller.joint_positions()
         asked: set[Pose] = set()
         for pose, _, where in poses:
             if pose in asked:

@@ -67,6 +67,14 @@ class Controller:
         except ValueError as error:
             raise ProtocolViolation(DEVICE, "getTcpPose", str(error)) from None
 
+    async def joint_positions(self) -> list[float]:
+        """Six joints in rad. Raises `ProtocolViolation`."""
+        values = await self.ask("RobotState.getJointPositions")
+        try:
+            return numbers(values, 6)
+        except ValueError as error:
+            raise ProtocolViolation(DEVICE, "getJointPositions", str(error)) from None
+
     async def mode(self) -> RobotMode:
         """The robot mode. Raises `ProtocolViolation` for a word that is none."""
         mode = await self.ask("RobotState.getRobotModeType")
