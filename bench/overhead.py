@@ -150,11 +150,10 @@ def _collect(folder: Path) -> None:
 @contextlib.contextmanager
 def _watching(watch: Watch) -> Iterator[None]:
     """Note when each part begins and ends."""
-    from collect.engine.inking import Inking
     from collect.engine.perform import Performer
     from collect.engine.recorder import Recorder
     from collect.engine.steps import capture as capturing
-    from collect.engine.steps import look as looking
+    from collect.engine.steps import dip as dipping
     from drivers.arcs.robot import AuboArcs
     from drivers.camera import OpenCvCamera
     from sessions.store import SessionStore
@@ -182,10 +181,10 @@ def _watching(watch: Watch) -> Iterator[None]:
         (Performer, "perform", None),  # by the kind of its step
         (AuboArcs, "move", "move"),
         (OpenCvCamera, "fresh", FRAME),
-        (Inking, "before_dip", INK),
+        (dipping, "fill_well", INK),
         (Recorder, "still", ENCODE),
         (capturing, "_judge", JUDGE),
-        (looking, "_inked_cells", BLANK),
+        (capturing, "_inked_cells", BLANK),
         (SessionStore, "begin", FILES),
         (SessionStore, "done", FILES),
         (SessionStore, "close", "merge"),

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from textual.pilot import Pilot
 
-from collect.engine.states import State
+from collect.engine.control import State
 from collect.errors import CollectAborted
 from collect.start import engine_for
 from collect.tui.app import OperatorApp

@@ -60,9 +60,9 @@ def busy_engine() -> Any:
     """An engine without an arm whose telemetry comes at a rig's rates."""
     import numpy as np
 
-    from collect.engine.snapshot import CellCount, Snapshot
-    from collect.engine.states import State
-    from collect.engine.telemetry import Picture, Telemetry
+    from collect.engine.control import State
+    from collect.engine.snapshot import CellCount, Picture, Snapshot
+    from collect.engine.telemetry import Telemetry
     from drivers.samples import ForceSample, Stamp
 
     class Busy:

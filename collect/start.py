@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from collect.chains.commands import ending
+from collect.engine.dry_run import DryRunEngine
 from collect.engine.engine import Engine
 from collect.engine.live import LiveView
 from collect.engine.opening import Opening, check_writable, find_resumable, open_store
-from collect.engine.rehearsal import DryRunEngine
 from collect.headless import run_headless
 from collect.planning.limits import check_protocol
 from drivers.clock import HostClock

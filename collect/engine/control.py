@@ -1,19 +1,63 @@
-"""The state of a run, and what its keys have asked of it: asked from any thread, heeded by the engine's."""
+"""The state of a run, and what pause, park and stop keys ask of it, from any thread."""
 
 from __future__ import annotations
 
 import asyncio
 import threading
 from collections.abc import Callable
+from enum import StrEnum
 
-from collect.engine.states import FINAL, State, check_transition
+
+class State(StrEnum):
+    """What the engine is doing."""
+
+    IDLE = "idle"
+    RUNNING = "running"
+    PAUSING = "pausing"
+    PAUSED = "paused"
+    RECOVERING = "recovering"
+    ASKING = "asking"
+    STOPPING = "stopping"
+    STOPPED = "stopped"
+    FAILED = "failed"
+    DONE = "done"
+
+
+TRANSITIONS: dict[State, frozenset[State]] = {
+    State.IDLE: frozenset({State.RECOVERING, State.STOPPING, State.FAILED}),
+    State.RECOVERING: frozenset({State.RUNNING, State.PAUSING, State.ASKING, State.STOPPING, State.FAILED}),
+    State.RUNNING: frozenset({State.PAUSING, State.RECOVERING, State.ASKING, State.STOPPING, State.DONE, State.FAILED}),
+    State.PAUSING: frozenset(
+        {State.PAUSED, State.RUNNING, State.RECOVERING, State.ASKING, State.STOPPING, State.DONE, State.FAILED}
+    ),
+    State.ASKING: frozenset({State.RECOVERING, State.RUNNING, State.PAUSING, State.STOPPING, State.FAILED}),
+    State.PAUSED: frozenset({State.RUNNING, State.STOPPING, State.FAILED}),
+    State.STOPPING: frozenset({State.STOPPED, State.FAILED}),
+    State.STOPPED: frozenset(),
+    State.FAILED: frozenset(),
+    State.DONE: frozenset(),
+}
+"""The states that may follow each state. `recovering` covers the first retreat of a process and the lift after a failed
+step; `asking` waits for a person, with the arm at rest."""
+
+FINAL = frozenset({State.STOPPED, State.FAILED, State.DONE})
+
+
+class IllegalTransition(Exception):
+    """The engine tried a transition that is not in the table: a defect."""
+
+
+def check_transition(old: State, new: State) -> None:
+    """Raise `IllegalTransition` unless `new` may follow `old`."""
+    if new not in TRANSITIONS[old]:
+        raise IllegalTransition(f"{old} -> {new}")
 
 
 class RunControl:
-    """One lock over the state and the requests to stop, pause and park. Nothing here talks to a device."""
+    """One lock over the state and what the keys asked for. Talks to no device."""
 
     def __init__(self, doing: Callable[[str], None]) -> None:
-        """`doing` is told what the run does, in words."""
+        """`doing` is called with what the run is doing, in words."""
         self._doing = doing
         self._lock = threading.Lock()
         self._state = State.IDLE
@@ -36,23 +80,23 @@ class RunControl:
 
     @property
     def closing(self) -> bool:
-        """All is collected and the arm parked; what is left ends by itself."""
+        """Whether everything is collected and the arm parked; the run then ends by itself."""
         return self._closing
 
     def entered(self, task: asyncio.Task[None]) -> None:
-        """The engine's loop runs, and `task` in it; a stop that came before cancels it."""
+        """Take note that the engine's event loop runs `task`; cancels it where a stop came before."""
         with self._lock:
             self._loop = asyncio.get_running_loop()
             if self._stop_wanted:
                 task.cancel()
 
     def left(self) -> None:
-        """The engine's loop ends: nothing can be asked of it any more."""
+        """Take note that the engine's event loop ends; keys have no effect any more."""
         with self._lock:
             self._loop = None
 
     def stop(self, act: Callable[[], None]) -> None:
-        """Have `act` run in the engine's loop now; from any thread, in any state, any number of times."""
+        """Run `act` in the engine's event loop now; from any thread, in any state, any number of times."""
         with self._lock:
             self._stop_wanted = True
             if self._loop is None or self._state in FINAL:
@@ -69,7 +113,7 @@ class RunControl:
                 self._set(State.PAUSING)
 
     def resume(self) -> None:
-        """Go on after a pause, or forget one that has not begun; from any thread."""
+        """Go on after a pause, or drop one that has not begun; from any thread."""
         with self._lock:
             self._pause_wanted = False
             if self._state == State.PAUSING:
@@ -83,7 +127,7 @@ class RunControl:
             self._wake()
 
     async def pause_point(self) -> None:
-        """Between two steps: wait here while paused."""
+        """Wait here, between two steps, while the run is paused."""
         with self._lock:
             if self._state != State.PAUSING:
                 return
@@ -95,24 +139,24 @@ class RunControl:
         self.move_to(State.RUNNING)
 
     def running(self) -> State:
-        """The state to go on in."""
+        """The state to go on in: running, or pausing where that was asked for."""
         return State.PAUSING if self._pause_wanted else State.RUNNING
 
     def move_to(self, new: State) -> None:
-        """Change the state. Raises `CancelledError` where the stop key was faster than this step."""
+        """Change the state. Raises `CancelledError` once a stop was asked for."""
         with self._lock:
             self._refuse_after_a_stop()
             if new is not self._state:  # one question after another
                 self._set(new)
 
     def begin_closing(self) -> None:
-        """From here on a stop ends nothing: it would lose the merge. Raises `CancelledError` where it was faster."""
+        """From now on ignore a stop, which would lose the merge. Raises `CancelledError` where one was asked for."""
         with self._lock:
             self._refuse_after_a_stop()
             self._closing = True
 
     def end(self, state: State) -> None:
-        """The run is over."""
+        """End the run in a final state."""
         with self._lock:
             if state is State.STOPPED and self._state is not State.STOPPING:
                 self._set(State.STOPPING)

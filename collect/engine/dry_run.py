@@ -1,7 +1,11 @@
-"""A dry run: the same moves, lifted so high that the brush meets neither paper nor ink."""
+"""A dry run: the same moves, lifted so high that the brush meets neither paper nor ink; nothing is kept."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from collect.engine.engine import Engine
+from collect.engine.snapshot import Snapshot
 from collect.errors import ConfigError
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.plans import planned
@@ -9,12 +13,31 @@ from collect.rig.config import TRAVEL_CLEARANCE_MM, InkConfig, RigConfig
 
 CLEAR_MM = 5.0
 """Least distance of the tip from the paper at the deepest point."""
+BEGUN = "dry run: nothing is pressed, dipped or kept"
+OVER = "dry run: every move was made"
+
+
+class DryRunEngine(Engine):
+    """Makes every move of a run, lifted. Its log does not name the session folder, which will be deleted."""
+
+    presses = False
+
+    def snapshot(self) -> Snapshot:
+        """The state of the run, without the folder's path in the log."""
+        now = super().snapshot()
+        return replace(now, messages=tuple(_without_path(line, now.folder) for line in now.messages))
+
+
+def _without_path(line: str, folder: str) -> str:
+    if line == f"session: {folder}":
+        return BEGUN
+    return OVER if line.startswith(f"closed: {folder}") else line
 
 
 def lifted(rig: RigConfig, protocol: ProtocolConfig, by_mm: float) -> RigConfig:
-    """The rig with paper and well `by_mm` higher, and without anything that would touch, dose or judge.
+    """The rig with paper and ink `by_mm` higher, and without touch, doses, self-check or judgement of captures.
 
-    Raises `ConfigError`, with the allowed range, where the brush would still meet the paper or travel would not clear.
+    Raises `ConfigError`, with the allowed range, where the brush would still meet the paper or travel too low.
     """
     deepest_mm = max((stroke.height_mm for stroke in planned(protocol)), default=0.0)
     low_mm = deepest_mm + CLEAR_MM

@@ -1,7 +1,8 @@
-"""The engine: interprets a protocol on a rig, one step at a time, so that a stroke is pressed exactly once.
+"""The engine: runs a protocol on a rig in a thread and event loop of its own, so that each stroke is pressed exactly
+once. Screens see `Snapshot`s.
 
-Resume is memoised replay: the generator runs from the top, and a step that the journal says is done gets its stored
-result while nothing moves. The engine runs in its own thread with its own event loop; screens see `Snapshot`s.
+To resume, the protocol runs from its first step, and every step that is done in the journal returns its stored result
+without any motion (see `run.py`).
 """
 
 from __future__ import annotations
@@ -15,21 +16,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import ClassVar
 
-from collect.engine.arming import arm
-from collect.engine.control import RunControl
+from collect.engine.control import FINAL, RunControl, State
 from collect.engine.live import LiveView, watching
 from collect.engine.perform import Performer
-from collect.engine.preview import previewing
 from collect.engine.progress import Progress
 from collect.engine.run import Run
 from collect.engine.set_up import board_first, listed
-from collect.engine.set_up_steps import SetUpStep
-from collect.engine.snapshot import Snapshot
-from collect.engine.states import FINAL, State
-from collect.engine.steps.waiting import uninterrupted
-from collect.engine.telemetry import NotedRobot, Telemetry
-from collect.errors import CollectAborted, Parked, describe, rest_is_unknown
-from collect.operator import Asker, OperatorRequest, OperatorRequests
+from collect.engine.snapshot import SetUpStep, Snapshot
+from collect.engine.steps.context import RunContext, uninterrupted
+from collect.engine.telemetry import Telemetry, noting_targets, previewing
+from collect.errors import CollectAborted, ConfigError, Parked, describe, rest_is_unknown
+from collect.motion.procedures import Procedures
+from collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
 from collect.planning.walk import layout_of, sheet_of, steps_on
 from collect.protocols.config import ProtocolConfig
 from collect.rig.config import RigConfig
@@ -39,24 +37,26 @@ from drivers.errors import DeviceError, NotConnected, Stale
 from sessions.store import SessionStore
 
 PARKED_MM = 2.0
-"""How near to the park position counts as parked."""
-
+"""Distance from the park position that counts as parked."""
 SILENT_S = 1.0
-"""So long without a pose is told: the arm, or the way to it, is dead."""
+"""Time without a pose after which the snapshot says so: the arm or the connection to it has failed."""
 UNCHECKED = (
-    "no self-check: it is switched off in rig.toml, or this session was begun without it. Nothing tells whether arm, "
+    "no self-check: it is switched off in rig.toml, or this session was begun without it. Nothing checks whether arm, "
     "camera and configuration agree"
 )
 
+ARM = Choice("a", "arm it: I look at the cell, my hand is at the emergency stop")
+LEAVE = Choice("x", "leave it")
+
 OpenStore = Callable[[Rig], SessionStore]
-"""Makes or resumes the session, once the devices have said who they are and before anything is powered."""
+"""Makes or resumes the session, once the devices have been identified and before anything is powered."""
 
 
 class Engine:
-    """Runs one session. `start`, then look at `snapshot` until `finished`, then `join`."""
+    """Runs one session. Call `start`, look at `snapshot` until `finished`, then call `join`."""
 
     presses: ClassVar[bool] = True
-    """Whether this is a real run: one without its self-check says so."""
+    """False for a dry run. A real run warns when it has no self-check."""
 
     def __init__(
         self,
@@ -71,8 +71,8 @@ class Engine:
         guided: bool = False,
         preview: bool = False,
     ) -> None:
-        """`watched`: a screen can answer. `armed`: the operator has let real hardware move. `live` has been started.
-        `guided`: a person accepts each set-up step. `preview`: snapshots carry what the camera sees."""
+        """`watched`: a screen can answer questions. `armed`: the operator allows real hardware to move. `live` was
+        started already. `guided`: a person accepts each set-up step. `preview`: snapshots hold a camera picture."""
         self._rig_config = rig
         self._protocol_config = protocol
         self._open_store = open_store
@@ -100,18 +100,18 @@ class Engine:
 
     @property
     def finished(self) -> bool:
-        """True once the run is over, in whatever way."""
+        """True once the run is over, however it ended."""
         return self._outcome.done()
 
     def join(self) -> None:
-        """Wait for the end; raises what ended the run: `CollectAborted`, or a device, step or session error."""
+        """Wait for the end of the run. Raises what ended it: `CollectAborted`, or a device, step or session error."""
         try:
             self._outcome.result()
         finally:
             self._thread.join()
 
     def snapshot(self) -> Snapshot:
-        """The engine now; from any thread."""
+        """The state of the run; from any thread."""
         tip_mm = force_n = None
         no_pose_s, state = 0.0, self._control.state
         if (rig := self._rig) is not None:
@@ -147,16 +147,16 @@ class Engine:
         return listed(self._rig_config, self._progress.found, self._progress.set_up)
 
     def request(self, request: OperatorRequest) -> None:
-        """Ask for something, or take it back; granted at the next moment that allows it. From any thread."""
+        """Make a request, or withdraw it; carried out between steps. From any thread."""
         self._requests.toggle(request)
 
     def park(self) -> None:
-        """End the run after this step, the arm lifted and parked; nobody is asked any more. From any thread."""
+        """End the run after this step with the arm lifted and parked; nobody is asked any more. From any thread."""
         self._control.park()
         self._asker.abandon()
 
     def answer(self, number: int, key: str) -> bool:
-        """Answer the prompt of that number; False where it is over. From any thread."""
+        """Answer question `number`; False where it is closed. From any thread."""
         return self._asker.answer(number, key)
 
     def pause(self) -> None:
@@ -164,7 +164,7 @@ class Engine:
         self._control.pause()
 
     def resume(self) -> None:
-        """Go on after a pause, or forget one that has not begun."""
+        """Go on after a pause, or drop one that has not begun."""
         self._control.resume()
 
     def stop(self) -> None:
@@ -174,12 +174,12 @@ class Engine:
     def _stop_now(self) -> None:
         if self._stopper is None or self._stopper.done():
             self._stopper = asyncio.create_task(self._stop_arm(), name="stop")
-        # Once all is collected the arm is parked; the merge ends by itself and loses nothing.
+        # Once everything is collected the arm is parked, and the merge must not be cut short.
         if self._task is not None and not self._control.closing and not self._task.cancelling():
             self._task.cancel()
 
     async def _stop_arm(self) -> None:
-        # Its own socket: it neither waits for the session's task nor for what that waits for.
+        # Stop uses a socket of its own: it waits neither for the session's task nor for what that waits for.
         if self._rig is not None:
             try:
                 await self._rig.robot.stop()
@@ -218,7 +218,7 @@ class Engine:
         if self._stopper is not None:
             await self._stopper
         if self._stop_failure is not None and not isinstance(self._stop_failure, NotConnected):
-            # Never told as stopped: the arm was not seen at rest.
+            # Not reported as stopped: the arm was not seen at rest.
             self._rest_unknown = True
             self._end(State.FAILED, describe(self._stop_failure))
             raise self._stop_failure
@@ -228,9 +228,9 @@ class Engine:
     async def _session(self) -> None:
         self._progress.doing("connect")
         async with connected(self._rig_config, self._clock, self._progress.log) as rig:
-            rig = replace(rig, robot=NotedRobot(rig.robot, self._telemetry))
+            rig = replace(rig, robot=noting_targets(rig.robot, self._telemetry))
             self._rig = rig
-            await arm(rig, self._asker, armed=self._armed)
+            await self._arm(rig)
             store = self._open_store(rig)
             try:
                 self._progress.opened(store, sheet_of(self._rig_config, self._protocol_config))
@@ -249,18 +249,34 @@ class Engine:
                 store.release()
         self._control.end(State.DONE)
 
+    async def _arm(self, rig: Rig) -> None:
+        """Ask whether real hardware may move, unless the command line said so. Nothing was powered and nothing moved.
+
+        Raises `ConfigError` where nobody can answer, `CollectAborted` for a no.
+        """
+        if self._armed or rig.robot_identity.simulated:
+            return
+        robot = rig.config.robot
+        hardware = f"{rig.robot_identity.model} at {robot.host}:{robot.port} is real hardware"
+        if not self._asker.watched:
+            raise ConfigError(
+                "rig.toml", "robot", f"{hardware}: look at the cell, keep a hand at the emergency stop, then add --arm"
+            )
+        if await self._asker.ask(Prompt(f"{hardware}. May it move?", (ARM, LEAVE), LEAVE.key)) != ARM.key:
+            raise CollectAborted("not armed; nothing was powered and nothing moved")
+
     async def _protocol(self, rig: Rig, store: SessionStore) -> None:
-        performer = Performer(
+        context = RunContext(
             rig,
             store,
-            self._protocol_config,
             self._progress,
             self._asker,
-            self._live,
-            telemetry=self._telemetry,
-            requests=self._requests,
+            Procedures(rig),
+            sheet_of(self._rig_config, self._protocol_config),
+            self._protocol_config,
+            self._requests,
         )
-        run = Run(rig, store, performer, self._progress, self._asker, self._control, self._requests, self._guided)
+        run = Run(context, Performer(context, self._live, self._telemetry), self._control, self._guided)
         steps = steps_on(self._rig_config, self._protocol_config)
         await run.protocol(board_first(steps) if self._guided else steps)
 

@@ -1,4 +1,4 @@
-"""Watches the force while the brush is down, and stops the arm above the ceiling."""
+"""Watches the force while the brush is down, and stops the arm when it exceeds the ceiling."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from collect.rig.devices import Rig
 from drivers.samples import ForceSample
 
 CHECK_S = 0.02
-"""How often a silent sensor is looked for: silence must not pass for no force."""
+"""How often the sensor is checked for silence, which must not be taken for zero force."""
 
 _R = TypeVar("_R")
 
 
 class ForceGuard:
-    """One force sensor, one ceiling; without a sensor it lets everything pass."""
+    """Passes on the force sensor's samples, and compares them with `force.max_n`; does nothing without a sensor."""
 
     def __init__(self, rig: Rig, on_sample: Callable[[ForceSample], None] | None = None) -> None:
         self._rig = rig
@@ -27,16 +27,16 @@ class ForceGuard:
         self._over: asyncio.Event = asyncio.Event()
         self._guarding = False
         self.peak_n = 0.0
-        """The largest force since `guarded` began."""
+        """Largest force since `guarded` began."""
 
     def listen(self) -> None:
-        """Take every sample from now on."""
+        """Begin to accept samples."""
         if self._rig.force is not None:
             self._rig.force.listen(self._sample)
 
     @contextmanager
     def also(self, on_sample: Callable[[ForceSample], None]) -> Generator[None]:
-        """Hand every sample to one more listener, within the block."""
+        """Within the block, pass every sample to one more listener."""
         self._listeners.append(on_sample)
         try:
             yield
@@ -44,15 +44,15 @@ class ForceGuard:
             self._listeners.remove(on_sample)
 
     def deafen(self) -> None:
-        """Take none any more."""
+        """Stop accepting samples."""
         if self._rig.force is not None:
             self._rig.force.listen(None)
 
     async def guarded(self, procedure: Coroutine[Any, Any, _R]) -> _R:
-        """Do the procedure under the ceiling.
+        """Run the procedure while the force is watched.
 
-        Raises `ForceTooHigh` once the arm was stopped, and `Stale` or `ConnectionLost` where the sensor went silent:
-        the arm is stopped then too.
+        Raises `ForceTooHigh` above the ceiling, and `Stale` or `ConnectionLost` where the sensor falls silent; in each
+        case the arm was stopped before.
         """
         if self._rig.force is None or self._guarding:
             return await procedure
@@ -62,7 +62,7 @@ class ForceGuard:
         try:
             await asyncio.wait((work, watch), return_when=asyncio.FIRST_COMPLETED)
             if watch.done():
-                # The arm first; what the procedure makes of being stopped does not matter any more.
+                # Stop the arm first; how the procedure ends then no longer matters.
                 await self._rig.robot.stop()
                 watch.result()
             return await work

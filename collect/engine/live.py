@@ -1,12 +1,11 @@
-"""`--live`: what is being recorded, for a Foxglove viewer on this machine. Looks on; never slows the run.
+"""`--live`: shows what is being recorded to a Foxglove viewer on this machine. Never slows the run.
 
-Messages wait in a short queue for a thread of their own; where that is full they are dropped and counted. What is
-recorded does not pass through here.
+Messages wait in a short queue for a thread of their own; when it is full they are dropped and counted. Recording does
+not pass through here.
 """
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import queue
 import threading
@@ -14,10 +13,10 @@ import time
 from collections.abc import AsyncGenerator, Callable
 from typing import TYPE_CHECKING, Any, cast
 
+from collect.engine.telemetry import FRAME_PERIOD_S, each_frame
 from collect.errors import ConfigError
-from drivers.errors import DeviceError
 from drivers.protocols import Camera
-from drivers.samples import Frame, Stamp
+from drivers.samples import Frame
 from sessions.errors import SessionDamaged
 from sessions.recording.messages import decode_gray, image_message
 from sessions.recording.schemas import Topic
@@ -30,29 +29,27 @@ if TYPE_CHECKING:
     from sessions.recording.messages import CompressedImage
 
 HOST = "127.0.0.1"
-"""This machine only, and not to be configured: a viewer needs no password."""
+"""This machine only, and not configurable: a viewer needs no password."""
 PORT = 8765
-"""Where Foxglove looks by itself."""
+"""The default port of Foxglove."""
 QUEUE_LIMIT = 2000
-"""About two seconds of everything, the force at 1 kHz included."""
+"""About two seconds of all messages, with the force at 1 kHz."""
 BACKLOG = 1024
-"""Messages that wait for one slow viewer; the oldest are dropped."""
-PREVIEW_S = 0.2
-"""Between two pictures."""
+"""Messages that may wait for one slow viewer; the oldest are dropped."""
 PREVIEW_PX = 1024
-"""The longer side of a preview."""
+"""Longer side of a preview."""
 JPEG_QUALITY = 80
 
 
 class LiveView:
-    """A server for viewers, from `start` to `close`. `offer` and `frame` may be called from any thread, always."""
+    """A server for viewers, from `start` to `close`. `offer` and `frame` may be called at any time, from any thread."""
 
     def __init__(self, port: int = PORT) -> None:
         self.port = port
         self.sent = 0
         """Messages that went to at least one viewer."""
         self.dropped = 0
-        """Messages for which there was no room; of pictures, only those that were due."""
+        """Messages that found no room in the queue; of pictures, only those that were due."""
         self._queue: queue.Queue[Outgoing | Frame | None] = queue.Queue(QUEUE_LIMIT)
         self._next_preview_s = 0.0
         self._thread: threading.Thread | None = None
@@ -65,11 +62,11 @@ class LiveView:
             import foxglove
         except ImportError:
             raise ConfigError("--live", "", "needs foxglove-sdk: pip install 'brushloop[live]'") from None
-        # A viewer that leaves without a word is no news, and no line across the operator's screen.
+        # A viewer that hangs up must not write across the operator's screen.
         foxglove.set_log_level("CRITICAL")
         context = foxglove.Context()
         try:
-            # No capability: a viewer can look and nothing else.
+            # No capabilities: a viewer can only look.
             self._server = foxglove.start_server(
                 name="brushloop", host=HOST, port=self.port, context=context, message_backlog_size=BACKLOG
             )
@@ -81,25 +78,25 @@ class LiveView:
 
     @property
     def url(self) -> str:
-        """For "Open connection" in Foxglove."""
+        """Address to enter at "Open connection" in Foxglove."""
         return f"ws://{HOST}:{self.port}"
 
     def offer(self, outgoing: Outgoing) -> None:
-        """Show a message that is being recorded; returns at once, and never raises. A still becomes a preview."""
+        """Show a message that is being recorded, a still as a preview; returns at once and never raises."""
         if outgoing.topic is not Topic.STILL or self._preview_is_due():
             self._put(outgoing)
 
     def frame(self, frame: Frame) -> None:
-        """Show a camera frame, at most one each `PREVIEW_S`; returns at once, and never raises."""
+        """Show a camera frame, at most one every `FRAME_PERIOD_S`; returns at once and never raises."""
         if self._preview_is_due():
             self._put(frame)
 
     def close(self) -> None:
-        """End the thread, then the server; what still waits is not shown."""
+        """End the thread, then the server; waiting messages are not shown."""
         self._closing.set()
         if self._thread is not None:
             with contextlib.suppress(queue.Full):
-                self._queue.put_nowait(None)  # wakes it up; where there is no room it is awake
+                self._queue.put_nowait(None)  # wakes the thread; while the queue is full it is awake
             self._thread.join()
             self._thread = None
         if self._server is not None:
@@ -110,7 +107,7 @@ class LiveView:
         now_s = time.monotonic()
         if now_s < self._next_preview_s:
             return False
-        self._next_preview_s = now_s + PREVIEW_S
+        self._next_preview_s = now_s + FRAME_PERIOD_S
         return True
 
     def _put(self, item: Outgoing | Frame) -> None:
@@ -120,14 +117,14 @@ class LiveView:
             self.dropped += 1
 
     def _run(self, channels: _Channels) -> None:
-        # The same code as for the file registers topics and schemas, so that they are the same.
+        # The code that writes files registers topics and schemas here too, so that they are the same.
         table = ChannelTable(cast("Writer", channels))
         while not self._closing.is_set():
             item = self._queue.get()
             if item is None:
                 continue
             picture = isinstance(item, Frame) or item.topic is Topic.STILL
-            # Nothing is encoded for nobody.
+            # Encode nothing while nobody looks.
             if channels.watched(Topic.PREVIEW if picture else cast("Outgoing", item).topic):
                 with contextlib.suppress(SessionDamaged):
                     table.add(_preview(item) if picture else cast("Outgoing", item))
@@ -135,31 +132,22 @@ class LiveView:
 
 
 @contextlib.asynccontextmanager
-async def watching(live: LiveView | None, camera: Camera, tell: Callable[[str], None]) -> AsyncGenerator[None]:
-    """Within the block show the camera's newest frame, and `tell` where to look; without `live` do nothing."""
+async def watching(live: LiveView | None, camera: Camera, log: Callable[[str], None]) -> AsyncGenerator[None]:
+    """Within the block show the camera's newest frames, and `log` where to look; without `live` do nothing."""
     if live is None:
         yield
         return
-    tell(f"live view: {live.url}")
-    watch = asyncio.create_task(_watch(live, camera), name="live view")
+    log(f"live view: {live.url}")
     try:
-        yield
+        async with each_frame(camera, live.frame):
+            yield
     finally:
-        watch.cancel()
-        await asyncio.gather(watch, return_exceptions=True)
         if live.dropped:
-            tell(f"live view: {live.dropped} messages were not shown; all are recorded")
-
-
-async def _watch(live: LiveView, camera: Camera) -> None:
-    while True:
-        with contextlib.suppress(DeviceError):  # the run hears of it by its own question
-            live.frame(await camera.fresh(Stamp(0)))
-        await asyncio.sleep(PREVIEW_S)
+            log(f"live view: {live.dropped} messages were not shown; all are recorded")
 
 
 class _Channels:
-    """What `ChannelTable` needs of an MCAP writer, over a viewer's channels."""
+    """The methods of an MCAP writer that `ChannelTable` calls, on a viewer's channels."""
 
     def __init__(self, context: Any) -> None:
         self._context = context
@@ -191,10 +179,10 @@ class _Channels:
             self.sent += 1
 
     def flush(self) -> None:
-        """Nothing waits here."""
+        """Do nothing: no message waits here."""
 
     def watched(self, topic: Topic) -> bool:
-        """Whether a viewer wants it; True as well where no viewer can know of it yet."""
+        """Whether a viewer subscribed to the topic; also True where it has not been advertised yet."""
         known = self._topics.get(topic)
         return known is None or self._channels[known].has_sinks()
 

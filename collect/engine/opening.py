@@ -1,24 +1,25 @@
-"""Which session a command works on: resume the open one that it was started with, or make a new one."""
+"""Decides which session a command works on: the open one that began with the same files, or a new one."""
 
 from __future__ import annotations
 
 import datetime as dt
 import json
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
-from collect.engine.changed import changed
 from collect.engine.dry_run import lifted
 from collect.errors import ConfigError
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.files import load_protocol
 from collect.protocols.steps import StepKind
-from collect.rig.config import RigConfig, load_rig
+from collect.rig.config import RigConfig, load_rig, overrides
 from collect.rig.devices import Rig
 from drivers.clock import Clock
 from drivers.samples import Identity
-from sessions.difference import differences
+from sessions.difference import ABSENT, Difference, differences
 from sessions.disk import unwritable
 from sessions.errors import SessionError
 from sessions.folders import next_session_id, open_sessions
@@ -28,18 +29,24 @@ from sessions.store import SessionStore, Snapshots
 
 RIG_EFFECTIVE = "rig.effective.json"
 COMPARED = (RIG_EFFECTIVE, "protocol.effective.json")
+FILES = {"rig.effective.json": "rig.toml", "protocol.effective.json": "protocol.toml"}
+"""Name by which the user knows each compared file; compared are its values, with the environment and side files."""
+OPTIONS = {"rig.toml": "--config", "protocol.toml": "--protocol"}
+MOST_SHOWN = 5
+"""Differences that are listed; with more, the way out would not fit on a screen of 24 lines."""
+SIDE_FILE = re.compile(r"^\s*(lens_)?file\s*=|\{\s*file\s*=", re.MULTILINE)
 MACHINE_NAMES = {
     "robot": {"host", "port", "rtde_port"},
     "camera": {"source"},
     "force": {"interface", "channel", "host", "port"},
     "ink": {"device": {"port"}},
 }
-"""What may differ between two runs of one session: where the devices are, not what they do."""
+"""Fields that may differ between two runs of one session: where the devices are, not what they do."""
 
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """What the command line said about the session, with its configuration as it was read once."""
+    """What the command line says about the session, and its configuration, which is read only once."""
 
     root: Path
     rig_path: Path
@@ -50,11 +57,11 @@ class Opening:
     new: bool = False
     """Start a new session although another one is open."""
     sheet: int | None = None
-    """The number of the sheet that is in, counted from 1: the operator's word for it."""
+    """Number of the sheet that is in, from 1, as the operator gave it."""
     armed: bool = False
-    """The operator has looked at the cell: real hardware may move."""
+    """The operator has looked at the robot cell: real hardware may move."""
     self_check_left_out: bool = False
-    """rig.toml does not say whether there is a self-check: `armed` does, and for an open session how it was begun."""
+    """rig.toml does not say whether there is a self-check: `armed` decides, or for an open session how it began."""
 
     @classmethod
     def load(
@@ -68,7 +75,7 @@ class Opening:
         armed: bool = False,
         dry_run_mm: float | None = None,
     ) -> Opening:
-        """Read both files once; a dry run is lifted by so much. Raises `ConfigError`."""
+        """Read both files; `dry_run_mm` lifts paper and ink for a dry run. Raises `ConfigError`."""
         rig, protocol = load_rig(rig_path), load_protocol(protocol_path)
         left_out, rig = rig.self_check.enabled is None, rig.settled(armed)
         if dry_run_mm is not None:
@@ -76,15 +83,15 @@ class Opening:
         snapshots = {
             "rig.toml": rig_path.read_text(encoding="utf-8"),
             "protocol.toml": protocol_path.read_text(encoding="utf-8"),
-            # What really holds, the environment included: a touch height from there is part of the record.
+            # The effective values: a touch height from the environment is part of the record.
             RIG_EFFECTIVE: _effective(rig),
-            # With the rows of the files that it names.
+            # With the rows of the tables that the protocol names.
             "protocol.effective.json": protocol.model_dump_json(indent=2) + "\n",
         }
         return cls(root, rig_path, protocol_path, rig, protocol, snapshots, new, sheet, armed, left_out)
 
     def as_begun(self, folder: Path) -> Opening:
-        """The same for going on with that session: where rig.toml leaves the self-check out, as it was begun."""
+        """The same, to resume that session: where rig.toml leaves the self-check out, as the session began."""
         if not self.self_check_left_out:
             return self
         try:
@@ -100,7 +107,7 @@ def _effective(rig: RigConfig) -> str:
 
 
 def find_resumable(opening: Opening) -> Path | None:
-    """The open session to go on with, None for a new one.
+    """The open session to resume, None for a new one.
 
     Raises `ConfigError` where the configuration changed, or where a new session might press on a used sheet.
     """
@@ -112,7 +119,7 @@ def find_resumable(opening: Opening) -> Path | None:
         if not found:
             return folder
         given = {"rig.toml": opening.rig_path, "protocol.toml": opening.protocol_path}
-        refusals.append(changed(folder, found, given, {name: opening.snapshots[name] for name in given}))
+        refusals.append(_changed(folder, found, given, {name: opening.snapshots[name] for name in given}))
     if refusals:
         raise refusals[0]
     if opening.sheet is None and any(map(_has_pressed, opening.root.glob(f"*/{JOURNAL_NAME}"))):
@@ -127,6 +134,50 @@ def find_resumable(opening: Opening) -> Path | None:
     return None
 
 
+def _changed(folder: Path, found: Sequence[Difference], given: dict[str, Path], texts: dict[str, str]) -> ConfigError:
+    """The refusal to resume a session whose configuration was another: each difference on a line, then what to do.
+
+    `given` and `texts` are paths and contents of this run's `rig.toml` and `protocol.toml`.
+    """
+    environment = overrides(RigConfig)
+    lines: list[str] = []
+    variables: list[str] = []
+    for one in found:
+        variable = environment.get(one.field) if FILES[one.file] == "rig.toml" else None
+        variables += [variable] if variable else []
+        lines.append(f"{FILES[one.file]}: {one}{f' (by {variable})' if variable else ''}")
+    if len(lines) > MOST_SHOWN:
+        lines[MOST_SHOWN - 1 :] = [f"and {len(lines) - MOST_SHOWN + 1} more"]
+    differing = {FILES[one.file] for one in found}
+    options = [
+        _option(folder / name, given[name])
+        for name, text in texts.items()
+        if name in differing and (folder / name).is_file() and (folder / name).read_text(encoding="utf-8") != text
+    ]
+    old = " ".join(options)
+    if variables:
+        old += f"{' ' if old else ''}without {' and '.join(variables)} in the environment"
+    if any(_of_this_version(one, found) for one in found):
+        old += f"{' ' if old else ''}with the brushloop that began it, whose files had other fields"
+    elif not old:
+        old = "with the environment, and the files that it names, as they were then"
+    way_out = f"Go on with the old one: {old}; or start a new session with --new."
+    return ConfigError(folder, "", "\n".join(["was begun with another configuration:", *lines, way_out]))
+
+
+def _of_this_version(one: Difference, found: Sequence[Difference]) -> bool:
+    """Whether only the software version differs: one of the two lacks the field, in a table of the same kind."""
+    kind = (*one.field[:-1], "kind")
+    known = ABSENT not in (one.old, one.new)
+    return bool(one.field) and not known and not any((o.file, o.field) == (one.file, kind) for o in found)
+
+
+def _option(old: Path, given: Path) -> str:
+    """The option that names the old file. A file that names side files must be copied next to them first."""
+    beside = f" (copied beside {given}: it names other files)" if SIDE_FILE.search(old.read_text("utf-8")) else ""
+    return f"{OPTIONS[old.name]} {old}{beside}"
+
+
 def check_writable(folder: Path) -> None:
     """Raise `ConfigError` unless sessions can be written there, or made; before anything is connected."""
     if (found := unwritable(folder)) is not None:
@@ -137,13 +188,13 @@ def _has_pressed(journal: Path) -> bool:
     try:
         return bool(replay(journal).used_cells)
     except SessionError:
-        return True  # nobody knows; ask
+        return True  # unknown: ask the operator
 
 
 def put_in_sheet(store: SessionStore, sheet: int | None) -> None:
-    """Take the operator's word for the sheet that is in. The same word twice changes nothing.
+    """Record which sheet the operator says is in; the same number again changes nothing.
 
-    Raises `ConfigError` for a number that cannot be, or while a press still has to be photographed.
+    Raises `ConfigError` for an impossible number, or while a press still has to be photographed.
     """
     now = store.state.sheet + 1
     if sheet is None or sheet == now:

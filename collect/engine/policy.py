@@ -1,16 +1,21 @@
-"""What follows a failed step. A plain function of step, error and count, so that it reads as a table."""
+"""What follows a failed step: try again, ask a person, or stop the run; and the question that is then asked."""
 
 from __future__ import annotations
 
 from enum import StrEnum
 
-from collect.errors import BadPicture, ForceTooHigh, JogGivenUp, NeedsOperator, SheetFull, StepError, StepVoid
+from collect.errors import BadPicture, ForceTooHigh, JogGivenUp, NeedsOperator, SheetFull, StepError, StepVoid, describe
+from collect.operator import Choice, Prompt
 from collect.protocols.steps import Step, StepKind
-from drivers.errors import ArmMoved, DeviceError, DeviceTimeout, RobotNotSafe, SettingsChanged, Stuck
+from drivers.errors import ArmMoved, DeviceError, DeviceTimeout, MotionError, RobotNotSafe, SettingsChanged, Stuck
 from drivers.ink.port import InkRefused
 
 MAX_FAILURES = 3
-"""The third failure of one step is not chance: a person decides."""
+"""The third failure of one step is no coincidence: a person decides."""
+
+STOP = Choice("x", "stop the run")
+GO_ON = "g"
+KEEP = "k"
 
 
 class Action(StrEnum):
@@ -19,18 +24,18 @@ class Action(StrEnum):
     RETRY = "again"
     """Retreat, then do the step again; a press takes a new cell."""
     ASK = "ask"
-    """A person decides. Where nobody watches, it means to stop the run."""
+    """Let a person decide; where nobody watches, stop the run."""
     ABORT = "stop the run"
-    """The session stays open; the same command goes on from there."""
+    """Leave the session open; the same command goes on from there."""
 
 
 def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
-    """The action for the `failures`-th failure of `step`. Motion is never blindly repeated."""
+    """Return the action for the `failures`-th failure of `step`. Motion is never blindly repeated."""
     match step.kind, error:
-        # What only a person can put right: paper, ink, a sensor, the arm's own stops, and what lies under the brush.
+        # Only a person can change paper or ink, mend a sensor, release the arm, or see what lies under the brush.
         case _, SheetFull() | NeedsOperator() | ForceTooHigh() | InkRefused() | RobotNotSafe() | Stuck():
             return Action.ASK
-        # Somebody else has had the arm.
+        # Another client controlled the arm.
         case _, ArmMoved() | SettingsChanged():
             return Action.ASK
         case StepKind.ZERO_TOUCH, JogGivenUp():
@@ -38,10 +43,10 @@ def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
         case StepKind.PRESS | StepKind.DRAW, StepVoid():
             action = Action.RETRY
         case StepKind.PRESS | StepKind.DRAW, DeviceTimeout(device="force"):
-            # Stopped because nothing was felt any more; if the sensor is not back, the next press says so at once.
+            # The arm was stopped because the sensor fell silent; if it still is, the next press fails at once.
             action = Action.RETRY
         case StepKind.PRESS | StepKind.DRAW | StepKind.SELF_CHECK, BadPicture():
-            return Action.ASK  # another try would burn another cell
+            return Action.ASK  # another try would use up another cell
         case _, BadPicture():
             action = Action.RETRY
         case StepKind.CAPTURE | StepKind.BOARD, DeviceTimeout(device="camera"):
@@ -49,3 +54,29 @@ def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
         case _:
             return Action.ABORT
     return action if failures < MAX_FAILURES else Action.ASK
+
+
+def question(error: StepError | DeviceError, sheet: int) -> Prompt:
+    """The question that `error` leads to, while sheet `sheet` (from 0) is in. The default is always to stop: nothing
+    moves because nobody answered."""
+    text = describe(error)
+    match error:
+        case SheetFull():
+            text = f"Sheet {sheet + 1} is full. Put a fresh one in, then go on."
+            go_on = f"sheet {sheet + 2} is in, and blank"
+        case InkRefused():
+            go_on = "there is ink, dip again"
+        case ForceTooHigh():
+            go_on = "nothing is under the brush, lift it and go on"
+        case ArmMoved():
+            go_on = "nobody else has the arm, lift it and go on"
+        case SettingsChanged():
+            go_on = "nobody else has the arm: set it anew, lift it and go on"
+        case JogGivenUp(height=height):
+            text += f". {height[0].upper()}{height[1:]} can be kept: H is then counted from there."
+            return Prompt(text, (Choice(KEEP, "keep that height, go on"), Choice("a", "jog again"), STOP), STOP.key)
+        case MotionError():
+            go_on = "the arm is released and clear, lift it and go on"
+        case _:
+            go_on = "the cause is removed, try again"
+    return Prompt(text, (Choice(GO_ON, go_on), STOP), STOP.key)

@@ -1,12 +1,13 @@
-"""Puts what happens during a step attempt into its file."""
+"""Writes what happens during one attempt at a step into its file, and how steadily the samples came."""
 
 from __future__ import annotations
 
 import contextlib
+import time
+from collections import defaultdict
 from collections.abc import Callable, Generator, Iterable
 from typing import TYPE_CHECKING
 
-from collect.engine.cadence import Arrivals, Sections
 from drivers.clock import Clock
 from drivers.samples import ForceSample, Frame, PoseSample, Stamp
 from sessions.errors import SessionError
@@ -20,7 +21,17 @@ from sessions.recording.messages import (
     pose_message,
     transforms_message,
 )
-from sessions.recording.schemas import Event, InkState, Quality, StepEvent, Stroke, Topic, Wrench
+from sessions.recording.schemas import (
+    Cadence,
+    Event,
+    InkState,
+    Quality,
+    SlowSection,
+    StepEvent,
+    Stroke,
+    Topic,
+    Wrench,
+)
 from sessions.recording.writer import Outgoing, SegmentWriter
 
 if TYPE_CHECKING:
@@ -29,11 +40,13 @@ if TYPE_CHECKING:
     from calibrate.board.lens import LensUsed
 
 POSE_HZ = 100.0
-"""What the driver asks of the arm."""
+"""Rate at which the driver asks the arm for its pose."""
+SLOW_MS = 250.0
+"""Sections that take longer are recorded: an operator waits for them."""
 
 
 class Recorder:
-    """One attempt's writer, spoken to in the engine's terms."""
+    """Writer of one attempt, with one method for each kind of message."""
 
     def __init__(
         self,
@@ -42,7 +55,7 @@ class Recorder:
         force_hz: float | None = None,
         show: Callable[[Outgoing], None] | None = None,
     ) -> None:
-        """`show` is handed every message as well, and neither waits nor raises."""
+        """`show` is called with every message as well; it must neither block nor raise."""
         self._writer = writer
         self._show = show
         self._clock = clock
@@ -53,7 +66,7 @@ class Recorder:
 
     @contextlib.contextmanager
     def also(self, on_sample: Callable[[PoseSample], None]) -> Generator[None]:
-        """Hand every pose to one more listener, within the block."""
+        """Within the block, pass every pose to one more listener."""
         self._listeners.append(on_sample)
         try:
             yield
@@ -61,7 +74,7 @@ class Recorder:
             self._listeners.remove(on_sample)
 
     def pose(self, sample: PoseSample) -> None:
-        """A pose, and the joints where they came with it, stamped when the host got them."""
+        """Record a pose, and the joint angles where they came with it, stamped when the host got them."""
         stamp = sample.stamp
         for listener in self._listeners:
             listener(sample)
@@ -72,7 +85,7 @@ class Recorder:
             self._sample(Topic.JOINTS, stamp, joints_message(stamp.host_ns, names, sample.joints_rad))
 
     def force(self, sample: ForceSample) -> None:
-        """A sample of the force sensor, stamped when the host got it."""
+        """Record a sample of the force sensor, stamped when the host got it."""
         if self._forces is not None:
             self._forces.arrived(sample.stamp.host_ns)
         (fx, fy, fz), (mx, my, mz) = sample.force_n, sample.torque_nm
@@ -80,28 +93,26 @@ class Recorder:
         self._sample(Topic.WRENCH, sample.stamp, wrench)
 
     def ink(self, level: float | None, dosed_ml: float, light: float | None) -> None:
-        """The well before a dip."""
-        now_ns = self._clock.now_ns()
-        self._put(Topic.INK, now_ns, now_ns, 0, InkState(level=level, dosed_ml=dosed_ml, light=light))
+        """Record the state of the well before a dip."""
+        self._now(Topic.INK, InkState(level=level, dosed_ml=dosed_ml, light=light))
 
     def frames(self, transforms: Iterable[Transform]) -> None:
-        """Where the frames lie."""
+        """Record where the coordinate frames lie."""
         now_ns = self._clock.now_ns()
         self._put(Topic.TRANSFORMS, now_ns, now_ns, 0, transforms_message(now_ns, transforms))
 
     def optics(self, used: LensUsed) -> None:
-        """The lens that photographs are straightened by before they are judged."""
+        """Record the lens by which photographs are undistorted before they are judged."""
         now_ns = self._clock.now_ns()
         message = calibration_message(now_ns, used.size_px, used.lens().matrix.tolist(), used.distortion)
         self._put(Topic.CALIBRATION, now_ns, now_ns, 0, message)
 
     def quality(self, quality: Quality, number: int) -> None:
-        """The checks of the stroke that still `number` shows."""
-        now_ns = self._clock.now_ns()
-        self._put(Topic.QUALITY, now_ns, now_ns, number, quality)
+        """Record the checks of the stroke on still `number`."""
+        self._now(Topic.QUALITY, quality, number)
 
     def cadence(self) -> None:
-        """How steadily samples came so far, and what was slow: once, at the end of the step."""
+        """Record how steadily samples came and which sections were slow; call it once, at the end of the step."""
         now_ns = self._clock.now_ns()
         slow = self.sections.report()
         for arrivals in (self._poses, self._forces):
@@ -110,28 +121,30 @@ class Recorder:
                 self._put(Topic.CADENCE, now_ns, now_ns, 0, report)
 
     def still(self, frame: Frame, number: int) -> None:
-        """A lossless still; `number` is unique in the session. Encoding takes tens of ms: call it off the loop."""
+        """Record a lossless still; `number` is unique in the session. Encoding takes tens of ms: call in a thread."""
         stamp = frame.stamp
         message = image_message(stamp.host_ns, encode_png(frame.image))
         self._put(Topic.STILL, self._clock.now_ns(), stamp.host_ns, number, message)
 
     def stroke(self, stroke: Stroke) -> None:
-        """A captured stroke; after its still."""
-        now_ns = self._clock.now_ns()
-        self._put(Topic.STROKE, now_ns, now_ns, stroke.still, stroke)
+        """Record a captured stroke; call it after its still."""
+        self._now(Topic.STROKE, stroke, stroke.still)
 
     def step(self, event: StepEvent) -> None:
-        """Begin or end of the step."""
-        now_ns = self._clock.now_ns()
-        self._put(Topic.STEP, now_ns, now_ns, event.index, event)
+        """Record the begin or the end of the step."""
+        self._now(Topic.STEP, event, event.index)
 
     def log(self, text: str, *, warning: bool = False) -> None:
-        """A line of the log."""
+        """Record a line of the log."""
         now_ns = self._clock.now_ns()
         self._put(Topic.LOG, now_ns, now_ns, 0, log_message(now_ns, text, warning=warning))
 
+    def _now(self, topic: Topic, event: Event, sequence: int = 0) -> None:
+        now_ns = self._clock.now_ns()
+        self._put(topic, now_ns, now_ns, sequence, event)
+
     def _sample(self, topic: Topic, stamp: Stamp, message: Event | Message) -> None:
-        # A failed disk must not end the telemetry that raised this; the step's next event hears of it.
+        # A failed disk must not end the telemetry that raised this; the step's next event fails on it.
         with contextlib.suppress(SessionError):
             self._put(topic, stamp.host_ns, stamp.device_ns or stamp.host_ns, stamp.seq, message)
 
@@ -140,3 +153,62 @@ class Recorder:
         self._writer.write(outgoing)
         if self._show is not None:
             self._show(outgoing)
+
+
+class Arrivals:
+    """Counts the samples of one topic, and the slots of 1 / `expected_hz` without a sample."""
+
+    def __init__(self, topic: Topic, expected_hz: float) -> None:
+        self._topic = topic
+        self._expected_hz = expected_hz
+        self._received = 0
+        self._missed = 0
+        self._last_ns: int | None = None
+        self._longest_ns = 0
+
+    def arrived(self, host_ns: int) -> None:
+        """Count a sample that came at `host_ns`."""
+        self._received += 1
+        if self._last_ns is not None:
+            gap_ns = host_ns - self._last_ns
+            self._longest_ns = max(self._longest_ns, gap_ns)
+            # Half a slot late is late, not missed.
+            self._missed += max(0, round(gap_ns * self._expected_hz / 1e9) - 1)
+        self._last_ns = host_ns
+
+    def report(self, slow: tuple[SlowSection, ...] = ()) -> Cadence | None:
+        """The counts, to be recorded with `slow`; None where no sample came."""
+        if not self._received:
+            return None
+        return Cadence(
+            topic=self._topic,
+            expected_hz=self._expected_hz,
+            received=self._received,
+            missed=self._missed,
+            longest_gap_ms=self._longest_ns / 1e6 if self._received > 1 else None,
+            slow_sections=slow,
+        )
+
+
+class Sections:
+    """Wall time of named sections of one step."""
+
+    def __init__(self) -> None:
+        self._slow_ms: defaultdict[str, list[float]] = defaultdict(list)
+
+    @contextlib.contextmanager
+    def timed(self, name: str) -> Generator[None]:
+        """Time the block; only times above `SLOW_MS` are kept."""
+        began_s = time.perf_counter()
+        try:
+            yield
+        finally:
+            took_ms = (time.perf_counter() - began_s) * 1e3
+            if took_ms > SLOW_MS:
+                self._slow_ms[name].append(took_ms)
+
+    def report(self) -> tuple[SlowSection, ...]:
+        """The slow sections."""
+        return tuple(
+            SlowSection(name=name, times=len(took), longest_ms=max(took)) for name, took in self._slow_ms.items()
+        )

@@ -1,4 +1,4 @@
-"""What a set-up step measured, held against its limits, and the questions of a guided set-up."""
+"""Compares what a set-up step measured with its limits, and asks the questions of a guided set-up."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import contextlib
 from dataclasses import replace
 
 from calibrate.board.plane import WORST_RMS_PX
-from collect.engine.questions import GO_ON, KEEP, STOP
-from collect.engine.set_up_steps import SET_UP, TITLES, Fact, SetUpStep, Standing
+from collect.engine.policy import GO_ON, KEEP, STOP
+from collect.engine.snapshot import SET_UP, TITLES, Fact, SetUpStep, Standing
 from collect.operator import Choice, Prompt
 from collect.protocols.steps import Protocol, Result, Step, StepKind
 from collect.rig.config import RigConfig
@@ -18,7 +18,7 @@ METHODS = {BY_JOG.key: "jog", BY_FORCE.key: "force", KEEP: "kept"}
 
 
 def facts_of(kind: StepKind, result: Result, config: RigConfig) -> tuple[Fact, ...]:
-    """What a finished set-up step found, from its result in the journal."""
+    """What a finished set-up step measured, from its result in the journal."""
     match kind:
         case StepKind.BOARD:
             return _board(result, config)
@@ -31,30 +31,30 @@ def facts_of(kind: StepKind, result: Result, config: RigConfig) -> tuple[Fact, .
 
 
 def listed(config: RigConfig, found: dict[StepKind, Result], now: StepKind | None) -> tuple[SetUpStep, ...]:
-    """Every set-up step that this rig has, with what it found so far."""
+    """Every set-up step of this rig, with what was measured so far; `now` is in progress."""
     kinds = SET_UP if config.self_check.enabled else SET_UP[:-1]
     return tuple(_listed(kind, found.get(kind), config, now is kind) for kind in kinds)
 
 
 def question(kind: StepKind, result: Result, config: RigConfig) -> Prompt:
-    """Is it good enough? Nothing goes on because nobody answered."""
+    """Ask whether the result is good enough. The default is to stop: nothing goes on because nobody answered."""
     facts = facts_of(kind, result, config)
     good = all(fact.good is not False for fact in facts)
-    words = f"{TITLES[kind]}: " + ("all within limits." if good else "not all is within limits.")
+    text = f"{TITLES[kind]}: " + ("all within limits." if good else "not all is within limits.")
     choices = [Choice(GO_ON, "good, go on" if good else "go on all the same"), AGAIN]
     if kind is StepKind.ZERO_TOUCH:
         choices += [BY_JOG, *([BY_FORCE] if config.force is not None else [])]
-    return Prompt(words, (*choices, STOP), STOP.key)
+    return Prompt(text, (*choices, STOP), STOP.key)
 
 
 def again(step: Step, answer: str) -> Step:
-    """The same step, by the method that was chosen."""
+    """The same step, by the method that the answer names."""
     return replace(step, params={**step.params, "method": METHODS[answer]}) if answer in METHODS else step
 
 
 def board_first(protocol: Protocol) -> Protocol:
-    """The same steps, but the camera is looked through before the brush comes down. Its key is that of the board step
-    that follows, which is then done already."""
+    """The same steps, but the board is looked at before the brush comes down. The step has the key of the later board
+    step, which is then already done."""
     yield Step(StepKind.BOARD, 0)
     step = next(protocol)
     with contextlib.suppress(StopIteration):

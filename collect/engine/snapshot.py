@@ -1,46 +1,129 @@
-"""What a screen may know: one immutable picture of the engine, made anew when asked for."""
+"""What a screen shows of a run: one immutable `Snapshot`, plain values only, so that a screen imports it quickly."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import TYPE_CHECKING, Protocol
 
+from collect.protocols.steps import StepKind
+
 if TYPE_CHECKING:
-    # A screen is up before what it shows is imported.
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from collect.engine.control import State
     from collect.engine.last_capture import LastCapture
-    from collect.engine.set_up_steps import SetUpStep
-    from collect.engine.states import State
-    from collect.engine.tally import SheetMap
-    from collect.engine.telemetry import Picture
     from collect.operator import OperatorRequest, Prompt
 
 
 @dataclass(frozen=True, slots=True)
 class CellCount:
-    """Progress of one (H, alpha) of the grid."""
+    """Strokes of one cell of the grid: one depth H at one tilt alpha."""
 
     height_mm: float
     tilt_deg: float
     done: int
     planned: int
     bad: int = 0
-    """Captures that came out badly."""
+    """Captures that did not count."""
     left_out: int = 0
     """Strokes that were given up."""
     now: bool = False
-    """One of its strokes is being made."""
+    """The stroke in progress belongs to this cell."""
     next: bool = False
-    """The next stroke is one of its."""
+    """The next planned stroke belongs to this cell."""
 
     @property
     def over(self) -> bool:
-        """Whether nothing more is to come."""
+        """Whether every planned stroke was made or given up."""
         return self.done + self.left_out >= self.planned
+
+
+class Mark(StrEnum):
+    """State of a paper cell that is not blank."""
+
+    NOW = "now"
+    WAITING = "pressed"
+    """Not photographed yet."""
+    KEPT = "kept"
+    BAD = "bad"
+    """Photographed, but does not count."""
+    VOID = "void"
+    """The press was cut short."""
+    CHECK = "self-check"
+
+
+@dataclass(frozen=True, slots=True)
+class SheetMap:
+    """The current sheet, cell by cell, row by row from the far edge."""
+
+    number: int
+    """From 1."""
+    columns: int
+    rows: int
+    marks: tuple[Mark | None, ...]
+    """None for a blank cell."""
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A reduced picture of the camera's newest frame."""
+
+    number: int
+    image: NDArray[np.uint8]
+    """(h, w) gray."""
+    blur_px: float | None = None
+    """Standard deviation of the blur at the steepest edges, in pixels of the full frame; None without an edge."""
+
+
+SET_UP = (StepKind.BOARD, StepKind.ZERO_TOUCH, StepKind.SELF_CHECK)
+"""Steps of the set-up, in their order."""
+TITLES = {
+    StepKind.BOARD: "Camera, board, scale",
+    StepKind.ZERO_TOUCH: "Zero touch and plane",
+    StepKind.SELF_CHECK: "Self-check",
+}
+
+
+class Standing(StrEnum):
+    """Progress of a set-up step."""
+
+    TO_COME = "to come"
+    NOW = "now"
+    GOOD = "good"
+    DOUBTFUL = "look"
+    """Measured, and outside its limits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """One measured value of a set-up step, as text."""
+
+    name: str
+    value: str
+    limit: str = ""
+    good: bool | None = None
+    """Whether the value is within its limit; None without one."""
+
+
+@dataclass(frozen=True, slots=True)
+class SetUpStep:
+    """One step of the set-up, as a screen lists it."""
+
+    kind: StepKind
+    standing: Standing
+    facts: tuple[Fact, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """What the step measures."""
+        return TITLES[self.kind]
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """The engine now."""
+    """State of a run at one moment."""
 
     session_id: str
     source: str
@@ -51,77 +134,78 @@ class Snapshot:
     strokes_planned: int
     grid: tuple[CellCount, ...]
     voids: int
+    """Attempts that were cut short."""
     elapsed_s: float
     eta_s: float | None
     """Seconds to go; None until a stroke has been timed."""
     tip_mm: tuple[float, float, float] | None
-    """None where the arm has not told its pose lately."""
+    """Position of the brush tip; None while the arm sends no fresh pose."""
     messages: tuple[str, ...]
     """The newest lines of the log, oldest first."""
     error: str
-    """Why it failed or stopped; empty while all is well."""
+    """Why the run failed or stopped; empty otherwise."""
     given_up: int = 0
-    """Strokes that came out badly every time and were left out."""
+    """Strokes that were left out, because every take was bad or the operator asked for it."""
     force_n: float | None = None
-    """Of the force sensor, less its bias; None without one, or where it has not told lately."""
+    """Force less the sensor's bias; None without a sensor or a fresh sample."""
     ink_level: float | None = None
-    """Of the well, 0 to 1, before the last dip; None where nothing can tell."""
+    """Level of the well before the last dip, 0 to 1; None where nothing measures it."""
     prompt: Prompt | None = None
-    """What waits for an answer."""
+    """Question that waits for an answer."""
     messages_before: int = 0
-    """How many older lines of the log are not in `messages` any more."""
+    """Number of older log lines that `messages` no longer holds."""
     target_mm: tuple[float, float, float] | None = None
     """Where the arm was last sent."""
     parked: bool = False
     """Whether the tip was last seen at the park position."""
     rest_unknown: bool = False
-    """The run is over, and nobody knows that the arm rests."""
+    """The run is over, and it is not known that the arm is at rest."""
     trace_n: tuple[float, ...] = ()
-    """Peaks of the force by tenth of a second, oldest first."""
+    """Peak force of each tenth of a second, oldest first."""
     picture: Picture | None = None
-    """What the camera sees; None where no preview is wanted."""
+    """Picture of the camera; None without a preview."""
     sheet: SheetMap | None = None
     last: LastCapture | None = None
-    """The newest capture of this process."""
+    """Newest capture of this process."""
     stroke: str = ""
-    """The stroke in hand."""
+    """Name of the stroke in progress."""
     requests: tuple[OperatorRequest, ...] = ()
-    """What was asked for by key and still waits."""
+    """Requests by key that still wait."""
     set_up: tuple[SetUpStep, ...] = ()
-    """Of a guided set-up; empty once it is over, and where there is none."""
+    """Steps of a guided set-up; empty once it is over, and in a run without one."""
     folder: str = ""
-    """Of the session, once there is one."""
+    """Folder of the session; empty until there is one."""
     no_pose_s: float | None = None
-    """For so long the arm has told no pose, though it should; None below a second. Nothing on the screen is live."""
+    """Time since the arm last sent a pose; None below a second. Meanwhile no value on the screen is live."""
 
 
 class EngineView(Protocol):
-    """What a screen may do: look, pause, go on, request, park, stop."""
+    """What a screen may do with an engine. Every method may be called from any thread."""
 
     def snapshot(self) -> Snapshot:
-        """The engine now; never blocks."""
+        """Return the state of the run; never blocks."""
         ...
 
     def pause(self) -> None:
-        """Pause before the next step; from any thread."""
+        """Pause before the next step."""
         ...
 
     def resume(self) -> None:
-        """Go on after a pause; from any thread."""
+        """Go on after a pause."""
         ...
 
     def answer(self, number: int, key: str) -> bool:
-        """Answer the prompt of that number; False where it is over. From any thread."""
+        """Answer question `number`; False where it is closed."""
         ...
 
     def request(self, request: OperatorRequest) -> None:
-        """Ask for something, or take it back; from any thread."""
+        """Make a request, or withdraw it."""
         ...
 
     def park(self) -> None:
-        """End the run after this step with the arm lifted and parked; from any thread. Nobody is asked any more."""
+        """End the run after this step with the arm lifted and parked; nobody is asked any more."""
         ...
 
     def stop(self) -> None:
-        """Stop the arm now and end the run; from any thread, in any state. Not an emergency stop."""
+        """Stop the arm now and end the run, in any state. Not an emergency stop."""
         ...

@@ -1,58 +1,56 @@
-"""Latest values for a screen: written at the devices' rates, looked at ten times a second."""
+"""Newest values for a screen: force, target and camera picture, written at the devices' rates."""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import itertools
 import math
 import threading
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import AsyncGenerator, Callable, Sequence
+from typing import Any, cast
 
-from drivers.protocols import Robot
-from drivers.samples import ForceSample, Identity, Pose, PoseSample, QueuedLine
+import cv2
+import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    import numpy as np
-    from numpy.typing import NDArray
+from calibrate.stroke.preprocess import Gray
+from collect.engine.snapshot import Picture
+from collect.photograph.new_ink import gray
+from collect.quality.picture import blur_px
+from drivers.errors import DeviceError
+from drivers.protocols import Camera, Robot
+from drivers.samples import ForceSample, Frame, Pose, QueuedLine, Stamp
 
 SLOT_NS = 100_000_000
-"""One value of the trace: the largest force of a tenth of a second, so that a short peak is seen."""
+"""Time that one value of the trace covers. It holds the peak force, so that a short peak is seen."""
 TRACE_SLOTS = 300
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """A small picture of the camera's newest frame."""
-
-    number: int
-    image: NDArray[np.uint8]
-    """(h, w) gray."""
-    blur_px: float | None = None
-    """Standard deviation of the blur at its steepest edges, in pixels of the full frame; None without an edge."""
+FRAME_PERIOD_S = 0.2
+"""Time between two pictures of the camera."""
+WIDTH_PX = 320
+TILES = 4
+"""Rows and columns of tiles in a frame. The blur is measured in the tile with most contrast, which shows the board."""
 
 
 class Telemetry:
-    """Slots that are overwritten; each write is short and none waits for a reader."""
+    """Newest values. Each write is short, and none waits for a reader."""
 
     def __init__(self) -> None:
         self.target_mm: tuple[float, float, float] | None = None
         """Where the arm was last sent."""
         self.tip_mm: tuple[float, float, float] | None = None
-        """Where it was last seen, however long ago."""
+        """Where the brush tip was last seen, however long ago."""
         self.picture: Picture | None = None
         self._lock = threading.Lock()
         self._peaks: deque[float] = deque(maxlen=TRACE_SLOTS)
         self._slot = -1
 
     def force(self, sample: ForceSample) -> None:
-        """A sample of the force sensor, at its full rate."""
+        """Take a sample of the force sensor; called at its full rate."""
         self.note_force(math.hypot(*sample.force_n), sample.stamp.host_ns)
 
     def note_force(self, force_n: float, t_ns: int) -> None:
-        """A force in N at a time of the host."""
+        """Take a force in N at a time of the host."""
         slot = t_ns // SLOT_NS
         with self._lock:
             if slot != self._slot:
@@ -62,69 +60,86 @@ class Telemetry:
                 self._peaks[-1] = force_n
 
     def trace_n(self) -> tuple[float, ...]:
-        """Peaks by tenth of a second, oldest first."""
+        """Peak force of each tenth of a second, oldest first."""
         with self._lock:
             return tuple(self._peaks)
 
 
-class NotedRobot:
-    """A robot that notes where it is sent; all else is passed on."""
+def noting_targets(robot: Robot, telemetry: Telemetry) -> Robot:
+    """The same robot; where it is sent is noted in `telemetry`."""
+    return cast("Robot", _NotedRobot(robot, telemetry))
+
+
+class _NotedRobot:
+    """Notes targets; every method that gives none is the robot's own."""
 
     def __init__(self, robot: Robot, telemetry: Telemetry) -> None:
         self._robot = robot
         self._telemetry = telemetry
 
-    async def connect(self) -> Identity:
-        """See `Robot`."""
-        return await self._robot.connect()
-
-    async def enable(self) -> None:
-        """See `Robot`."""
-        await self._robot.enable()
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._robot, name)
 
     async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
-        """See `Robot`."""
         self._telemetry.target_mm = target.position_mm
         await self._robot.move(target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
 
     async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float) -> None:
-        """See `Robot`."""
         self._telemetry.target_mm = poses[-1].position_mm if poses else None
         await self._robot.follow(poses, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=blend_mm)
 
     async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
-        """See `Robot`."""
         self._telemetry.target_mm = min((line.target.position_mm for line in lines), key=lambda at: at[2], default=None)
         return await self._robot.sequence(lines, acc_mm_s2=acc_mm_s2)
 
-    async def stop(self) -> None:
-        """See `Robot`."""
-        await self._robot.stop()
 
-    def latest(self) -> PoseSample:
-        """See `Robot`."""
-        return self._robot.latest()
+@contextlib.asynccontextmanager
+async def each_frame(camera: Camera, show: Callable[[Frame], None]) -> AsyncGenerator[None]:
+    """Within the block call `show`, in a thread, with the newest frame every `FRAME_PERIOD_S`. Never slows the run."""
 
-    async def where(self) -> Pose:
-        """See `Robot`."""
-        return await self._robot.where()
+    async def watch() -> None:
+        while True:
+            with contextlib.suppress(DeviceError):  # the run finds out when it takes a photograph itself
+                await asyncio.to_thread(show, await camera.fresh(Stamp(0)))
+            await asyncio.sleep(FRAME_PERIOD_S)
 
-    async def confirm(self) -> None:
-        """See `Robot`."""
-        await self._robot.confirm()
+    task = asyncio.create_task(watch(), name="camera picture")
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
 
-    async def take_up(self) -> Pose:
-        """See `Robot`."""
-        return await self._robot.take_up()
 
-    def listen(self, on_sample: Callable[[PoseSample], None] | None) -> None:
-        """See `Robot`."""
-        self._robot.listen(on_sample)
+@contextlib.asynccontextmanager
+async def previewing(telemetry: Telemetry, camera: Camera, *, wanted: bool) -> AsyncGenerator[None]:
+    """Within the block keep `telemetry.picture` up to date, if `wanted`."""
+    numbers = itertools.count()
 
-    def check(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
-        """See `Robot`."""
-        self._robot.check(target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
+    def show(frame: Frame) -> None:
+        telemetry.picture = _picture_of(frame, next(numbers))
 
-    async def close(self) -> None:
-        """See `Robot`."""
-        await self._robot.close()
+    async with each_frame(camera, show) if wanted else contextlib.nullcontext():
+        yield
+
+
+def _picture_of(frame: Frame, number: int) -> Picture:
+    image = gray(frame.image)
+    height, width = image.shape
+    size = (WIDTH_PX, max(1, round(height * WIDTH_PX / width)))
+    small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return Picture(number, small, blur_px(_busiest_tile(image, small)))
+
+
+def _busiest_tile(image: Gray, small: Gray) -> Gray:
+    """The tile of the full frame with most contrast."""
+    tiles = [(row, column) for row in range(TILES) for column in range(TILES)]
+    row, column = max(tiles, key=lambda at: float(_tile(small, *at).std()))
+    return np.ascontiguousarray(_tile(image, row, column))
+
+
+def _tile(image: Gray, row: int, column: int) -> Gray:
+    height, width = image.shape
+    return image[
+        row * height // TILES : (row + 1) * height // TILES, column * width // TILES : (column + 1) * width // TILES
+    ]

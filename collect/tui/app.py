@@ -15,8 +15,8 @@ from textual.app import SystemCommand
 from textual.binding import BindingType
 from textual.screen import Screen
 
+from collect.engine.control import FINAL, State
 from collect.engine.snapshot import Snapshot
-from collect.engine.states import FINAL, State
 from collect.errors import ConfigError
 from collect.headless import REFRESH_S, RunnableEngine
 from collect.operator import OperatorRequest

@@ -15,7 +15,7 @@ from textual.containers import VerticalScroll
 from textual.screen import ModalScreen
 from textual.widgets import Static
 
-from collect.engine.states import FINAL, State
+from collect.engine.control import FINAL, State
 from collect.tui.text import SOFTWARE_STOP
 from collect.tui.widgets import Key
 

@@ -11,9 +11,8 @@ from textual.containers import Horizontal, Vertical
 from textual.content import Content
 from textual.widget import Widget
 
-from collect.engine.snapshot import CellCount, Snapshot
-from collect.engine.states import FINAL
-from collect.engine.tally import Mark, SheetMap
+from collect.engine.control import FINAL
+from collect.engine.snapshot import CellCount, Mark, SheetMap, Snapshot
 from collect.headless import eta_text, minutes_text, no_pose_text
 from collect.quality.verdict import Check
 from collect.tui.pictures import Pictures, binary_picture

@@ -11,8 +11,8 @@ from textual.containers import Horizontal, ScrollableContainer, Vertical, Vertic
 from textual.content import Content
 from textual.screen import Screen
 
+from collect.engine.control import FINAL, State
 from collect.engine.snapshot import Snapshot
-from collect.engine.states import FINAL, State
 from collect.headless import no_pose_text
 from collect.tui.keys import RUN_BAR, keys_in
 from collect.tui.panes import LEGEND, CapturePane, Grid, figures_content, sheet_content, sheet_title

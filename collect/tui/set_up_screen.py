@@ -11,8 +11,7 @@ from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
 from textual.screen import Screen
 
-from collect.engine.set_up_steps import Fact, SetUpStep, Standing
-from collect.engine.snapshot import EngineView, Snapshot
+from collect.engine.snapshot import EngineView, Fact, SetUpStep, Snapshot, Standing
 from collect.headless import no_pose_text
 from collect.operator import Prompt
 from collect.protocols.steps import StepKind

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from collect.engine.progress import Progress
+from collect.engine.steps import dip as dipping
 from collect.engine.steps import touch as touching
-from collect.engine.steps import waited
-from collect.engine.steps.context import Known
+from collect.engine.steps.context import RunMemory
 from collect.planning.summary import make_plan
 from collect.protocols.files import load_protocol
 from collect.protocols.plans import steps
@@ -106,7 +106,7 @@ def test_a_brush_that_waited_with_its_ink_dips_again(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, targets: list[str], screen: list[str]
 ) -> None:
     """A pause between dip and press is as good as any length: every wait counts as too long here."""
-    monkeypatch.setattr(waited, "STALE_INK_S", 0.0)
+    monkeypatch.setattr(dipping, "STALE_INK_S", 0.0)
     lab.write_protocol("[11.0]", "[0.0]")
     run(lab)
     assert targets.count("ink") == 2
@@ -114,14 +114,14 @@ def test_a_brush_that_waited_with_its_ink_dips_again(
 
 
 async def test_a_dip_of_zero_touch_or_the_self_check_is_none_for_a_press(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = Known()
+    memory = RunMemory()
 
     async def dipped(_context: Any) -> None:
-        known.left_ink_ns = 1
+        memory.left_ink_ns = 1
 
     monkeypatch.setattr(touching, "fill_brush", dipped)
-    await touching._Hands(cast(Any, SimpleNamespace(run=SimpleNamespace(known=known)))).dip()
-    assert known.left_ink_ns is None
+    await touching._Effector(cast(Any, SimpleNamespace(run=SimpleNamespace(memory=memory)))).dip()
+    assert memory.left_ink_ns is None
 
 
 @pytest.mark.parametrize(("protocol", "kind"), [(LIST, "press"), (FIGURE, "draw")])
@@ -167,15 +167,15 @@ def test_a_plan_counts_the_wait(lab: Lab) -> None:
 def test_a_stroke_that_waited_unlike_the_others_is_named_and_still_counts(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begin, number = waited.DipToTouch.begin, iter(range(9))
+    begin, number = dipping.DipToTouch.begin, iter(range(9))
 
-    async def late(self: waited.DipToTouch, first: Any) -> None:
+    async def late(self: dipping.DipToTouch, first: Any) -> None:
         await begin(self, first)
         assert self._left_ns is not None
         if next(number) == 2:
             self._left_ns -= 8_000_000_000  # as if eight seconds had passed
 
-    monkeypatch.setattr(waited.DipToTouch, "begin", late)
+    monkeypatch.setattr(dipping.DipToTouch, "begin", late)
     lab.write_protocol("[11.0]", "[0.0]", repeats=4)
     engine = lab.engine()
     engine.start()

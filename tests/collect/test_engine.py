@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from collect.engine.control import State
 from collect.engine.engine import UNCHECKED, Engine
 from collect.engine.snapshot import Snapshot
-from collect.engine.states import State
 from collect.errors import CollectAborted, ConfigError
 from drivers.arcs.codes import SafetyMode
 from drivers.errors import RobotNotSafe

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from collect.engine.control import State
 from collect.engine.snapshot import Snapshot
-from collect.engine.states import State
 from collect.headless import eta_text
 from sessions.reader import Recording
 

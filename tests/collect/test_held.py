@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from collect.engine.control import State
 from collect.engine.opening import Opening
-from collect.engine.states import State
 from collect.errors import ConfigError
 from drivers.arcs.codes import SafetyMode
 from drivers.errors import RobotNotSafe
@@ -113,8 +113,8 @@ def test_a_dry_run_moves_all_the_way_and_leaves_neither_ink_nor_session(lab: Lab
     ran = subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout == "dry run done; nothing was kept\n"
-    assert "rehearsal: nothing is pressed, dipped or kept" in ran.stderr
-    assert "rehearsal: every move was made" in ran.stderr
+    assert "dry run: nothing is pressed, dipped or kept" in ran.stderr
+    assert "dry run: every move was made" in ran.stderr
     assert "brushloop-dry-" not in ran.stderr
     assert "session" not in ran.stderr
     assert not lab.sessions.exists()

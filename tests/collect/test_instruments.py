@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from mcap.reader import make_reader
 
-from collect.engine.states import State
+from collect.engine.control import State
 from collect.errors import ForceTooHigh, NeedsOperator
 from drivers.errors import ConnectionLost, Stuck
 from drivers.ink.port import InkRefused

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from collect.engine.states import State
+from collect.engine.control import State
 from collect.engine.steps import capture as capturing
 from collect.errors import CollectAborted, NeedsOperator
 from collect.quality.checks import check_drawing

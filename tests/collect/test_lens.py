@@ -12,7 +12,7 @@ from calibrate.artefact import load_artefact
 from calibrate.board.artefact import LensFile
 from calibrate.calibration import Calibration
 from calibrate.session import calibrate_session
-from collect.engine.states import State
+from collect.engine.control import State
 from collect.errors import ConfigError, StepError
 from collect.rig.config import load_rig
 from collect.tui.captures import Review

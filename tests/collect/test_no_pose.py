@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from collect import headless
+from collect.engine.control import State
 from collect.engine.engine import Engine
 from collect.engine.snapshot import Snapshot
-from collect.engine.states import State
 from collect.protocols.config import GridConfig
 from collect.rig.config import load_rig
 from collect.rig.devices import Rig, make_robot

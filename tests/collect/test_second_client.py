@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from collect.engine.states import State
+from collect.engine.control import State
 from drivers.arcs.controller import Controller
 from drivers.arcs.rpc import RpcConnection
 from drivers.arcs.waiting import Tolerance, until_settled

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from collect.engine.control import FINAL, TRANSITIONS, IllegalTransition, State, check_transition
 from collect.engine.policy import MAX_FAILURES, Action, decide
-from collect.engine.states import FINAL, TRANSITIONS, IllegalTransition, State, check_transition
 from collect.errors import SheetFull, StepVoid
 from collect.protocols.steps import Step, StepKind
 from drivers.errors import DeviceError, DeviceTimeout, MotionFailed, RobotNotSafe, Stuck

@@ -1,29 +1,118 @@
-"""Photographs a mark, judges it, and decides whether it counts."""
+"""Photographs: the BOARD step, the look at a blank sheet, and the CAPTURE step, which decides whether a stroke counts,
+is pressed again or is left out."""
 
 from __future__ import annotations
 
 import contextlib
 
+import numpy as np
+
+from calibrate.board.plane import Plane
+from calibrate.board.view import see_board
+from calibrate.errors import CalibrationError
+from calibrate.stroke.preprocess import Gray
 from collect.engine.last_capture import LastCapture, pictures_of, published_mark
 from collect.engine.steps.choose import measured
-from collect.engine.steps.context import RunContext, StepContext
-from collect.engine.steps.look import Gray, camera_delay, image_plane, photograph
-from collect.engine.steps.waited import wait_check
-from collect.engine.steps.waiting import uninterrupted
+from collect.engine.steps.context import RunContext, StepContext, uninterrupted
 from collect.errors import BadPicture, NeedsOperator, StepError
 from collect.operator import Choice, OperatorRequest, Prompt
+from collect.photograph.new_ink import gray
 from collect.protocols.steps import Result
-from collect.quality.checks import check_capture, check_drawing
-from collect.quality.verdict import Family, Verdict
+from collect.quality.checks import cell_is_blank, check_capture, check_drawing, check_frame
+from collect.quality.verdict import Check, Family, Verdict
+from collect.rig.optics import straightened
 from collect.rig.paper import Cell
-from sessions.recording.schemas import Check, Quality, Stroke
+from sessions.history import limit_s, unlike, waits_of
+from sessions.recording import schemas
 
 KEEP, AGAIN, SKIP = Choice("g", "good all the same: it counts"), Choice("r", "press it again"), Choice("k", "skip it")
 PICTURE_MARGIN_PX = 40
+"""Margin around the cell in the picture that goes with a question."""
+
+
+async def board(context: StepContext) -> Result:
+    """The BOARD step. Raises `StepError` where the board is not seen: nothing that follows could be measured."""
+    image = await photograph(context)
+    with context.recorder.sections.timed("see the board"):
+        plane, checks = await uninterrupted(_board, context.run, image)
+    return {
+        "still": context.attempt.serial,
+        "corners": plane.corners,
+        "mm_per_px": plane.mm_per_px,
+        "rms_px": plane.rms_px,
+        **_camera_delay(context),
+        "checks": [
+            {"name": str(c.name), "score": c.score, "threshold": c.threshold, "passed": c.passed} for c in checks
+        ],
+    }
+
+
+def _board(run: RunContext, image: Gray) -> tuple[Plane, tuple[Check, ...]]:
+    try:
+        plane = see_board(image, run.rig.config.board)
+    except CalibrationError as error:
+        raise StepError(f"the board is not seen: {error.what}") from None
+    run.memory.image_plane = plane
+    limits = run.rig.config.quality
+    frame = check_frame(image, plane, limits)
+    if limits.enabled and frame.cause is not None:
+        raise BadPicture(frame.cause.reason)
+    return plane, frame.checks
+
+
+async def look_at_sheet(context: StepContext) -> None:
+    """Once for each sheet, check that every free cell is blank. Raises `NeedsOperator`.
+
+    The operator says that a fresh sheet is in; the camera confirms it before ink goes on ink. If the brush was full of
+    ink, it counts as dry afterwards.
+    """
+    run = context.run
+    sheet = run.store.state.sheet
+    if run.memory.looked_at_sheet == sheet or not run.rig.config.quality.enabled:
+        return
+    run.memory.left_ink_ns = None
+    with run.progress.meanwhile("look whether the sheet is blank"):
+        image = await photograph(context)
+        inked = await uninterrupted(_inked_cells, run, image, context.cell.index if context.cell is not None else None)
+    if inked:
+        raise NeedsOperator(
+            f"{len(inked)} cells of sheet {sheet + 1} that should be blank are not: {inked[0]} "
+            "Put in a blank sheet, or the one that belongs here."
+        )
+    run.memory.looked_at_sheet = sheet
+
+
+def _inked_cells(run: RunContext, image: Gray, begun: int | None) -> list[str]:
+    plane = run.image_plane(image)
+    used = run.used_cells() - {begun}  # the cell of this very attempt is still to be pressed
+    free = [run.sheet.cell(index) for index in range(run.sheet.capacity) if index not in used]
+    checks = [cell_is_blank(image, plane, cell, limits=run.rig.config.quality) for cell in free]
+    return [check.reason for check in checks if not check.passed]
+
+
+async def photograph(context: StepContext) -> Gray:
+    """Park, take a fresh frame, record it as the still of this attempt, and return it in gray, undistorted."""
+    run, photographer = context.run, context.run.procedures.photographer
+    known = photographer.delay
+    with context.recorder.sections.timed("wait for a fresh frame"):
+        frame = await run.procedures.capture()
+    if photographer.delay is not known:
+        context.recorder.log(f"camera delay: {photographer.delay}")
+        run.progress.log(f"camera delay: {photographer.delay}")
+    with context.recorder.sections.timed("encode still"):
+        await uninterrupted(context.recorder.still, frame, context.attempt.serial)
+    return await uninterrupted(straightened, run.rig.config.camera, gray(frame.image))
+
+
+def _camera_delay(context: StepContext) -> Result:
+    delay = context.run.procedures.photographer.delay
+    if delay is None:
+        return {}
+    return {"camera_delay_ms": round(1e3 * delay.delay_s, 1), "camera_jitter_ms": round(1e3 * delay.spread_s, 1)}
 
 
 async def capture(context: StepContext) -> Result:
-    """The CAPTURE step: `kept` where the stroke counts, `retake` where it is to be made again on another cell.
+    """The CAPTURE step: `kept` where the stroke counts, `retake` where it is to be pressed again on another cell.
 
     Raises `BadPicture` where the photograph, not the stroke, is at fault.
     """
@@ -32,11 +121,11 @@ async def capture(context: StepContext) -> Result:
         raise StepError(f"{stroke_id} lies on another sheet than the one that is in")
     cell = run.sheet.cell(int(context.number("cell")))
     image = await photograph(context)
-    waited = wait_check(context)
+    waited = _wait_check(context)
     verdict = await _judged(context, image, cell, waited)
-    run.known.sound_frame = image
+    run.memory.sound_frame = image
     if run.asker.watched:
-        await uninterrupted(_show, context, verdict, image, cell, True)
+        await uninterrupted(_show, context, verdict, image, cell)
     kept, retake = True, False
     if run.requests.take(OperatorRequest.RETAKE):
         kept, retake = False, True
@@ -57,13 +146,29 @@ async def capture(context: StepContext) -> Result:
         "tilt_deg": context.number("tilt_deg"),
         "kept": kept,
         "retake": retake,
-        **camera_delay(context),
+        **_camera_delay(context),
         "verdict": "" if verdict is None or verdict.cause is None else str(verdict.cause.name),
         **(await measured(context, image, cell) if context.step.params.get("measured") else {}),
     }
 
 
-async def _judged(context: StepContext, image: Gray, cell: Cell, waited: Check | None) -> Verdict | None:
+def _wait_check(context: StepContext) -> schemas.Check | None:
+    """Time from dip to touch of this stroke, compared with those before; None where none was recorded.
+
+    It is recorded as a remark and decides nothing: the ink is judged by how it looks.
+    """
+    still, stroke_id = context.attempt.serial, context.step.params["stroke_id"]
+    this = {"kind": "capture", "result": {"stroke_id": stroke_id, "still": still}}
+    waits = waits_of([*context.run.store.state.segments, this])
+    if still not in waits:
+        return None
+    reason, found = unlike(waits).get(still, ""), limit_s(waits.values())
+    threshold = None if found is None else sum(found)
+    return schemas.Check(name="dip_to_touch", score=waits[still], threshold=threshold, passed=not reason, reason=reason)
+
+
+async def _judged(context: StepContext, image: Gray, cell: Cell, waited: schemas.Check | None) -> Verdict | None:
+    """Judge the capture and record the checks; None where captures are not judged."""
     run, stroke_id = context.run, str(context.step.params["stroke_id"])
     if waited is not None and not waited.passed:
         run.progress.log(f"{stroke_id}: {waited.reason}", warning=True)
@@ -72,11 +177,11 @@ async def _judged(context: StepContext, image: Gray, cell: Cell, waited: Check |
     with context.recorder.sections.timed("judge the capture"):
         verdict = await uninterrupted(_judge, context, image, cell)
     checks = tuple(
-        Check(name=c.name, score=c.score, threshold=c.threshold, passed=c.passed, reason=c.reason)
+        schemas.Check(name=c.name, score=c.score, threshold=c.threshold, passed=c.passed, reason=c.reason)
         for c in verdict.checks
     )
     remarks = () if waited is None else (waited,)
-    context.recorder.quality(Quality(stroke_id=stroke_id, checks=(*checks, *remarks)), context.attempt.serial)
+    context.recorder.quality(schemas.Quality(stroke_id=stroke_id, checks=(*checks, *remarks)), context.attempt.serial)
     if verdict.cause is not None:
         run.progress.log(f"{stroke_id}: {verdict.reason}", warning=True)
         if verdict.cause.name.family is Family.PICTURE:
@@ -90,13 +195,12 @@ def _drawn(context: StepContext) -> bool:
 
 def _judge(context: StepContext, image: Gray, cell: Cell) -> Verdict:
     run, height_mm = context.run, context.number("height_mm")
-    config, previous = run.rig.config, run.known.sound_frame
+    config, previous, plane = run.rig.config, run.memory.sound_frame, run.image_plane(image)
     if _drawn(context):
-        plane = image_plane(run, image)
         return check_drawing(image, plane, cell, height_mm=height_mm, limits=config.quality, previous=previous)
     return check_capture(
         image,
-        image_plane(run, image),
+        plane,
         cell,
         height_mm=height_mm,
         limits=config.quality,
@@ -106,15 +210,14 @@ def _judge(context: StepContext, image: Gray, cell: Cell) -> Verdict:
 
 
 async def _decide(context: StepContext, verdict: Verdict, image: Gray, cell: Cell) -> tuple[bool, bool]:
-    """(kept, retake): again while takes are left, then a person decides; unwatched, the stroke is given up."""
+    """(kept, retake): retake while takes are left, then a person decides; unwatched, the stroke is given up."""
     run = context.run
     take = int(context.step.params.get("take") or 1)
     if take <= run.rig.config.quality.retakes:
         return False, True
     stroke_id = str(context.step.params["stroke_id"])
-    prompt = Prompt(
-        f"{stroke_id}, take {take}: {verdict.reason}", (KEEP, AGAIN, SKIP), SKIP.key, image=_cut_out(run, image, cell)
-    )
+    text = f"{stroke_id}, take {take}: {verdict.reason}"
+    prompt = Prompt(text, (KEEP, AGAIN, SKIP), SKIP.key, image=_cut_out(run, image, cell))
     try:
         with run.progress.meanwhile("wait for an answer"):
             answer = await run.asker.ask(prompt)
@@ -124,23 +227,21 @@ async def _decide(context: StepContext, verdict: Verdict, image: Gray, cell: Cel
     return answer == KEEP.key, answer == AGAIN.key
 
 
-def _show(context: StepContext, verdict: Verdict | None, image: Gray, cell: Cell, kept: bool) -> None:
+def _show(context: StepContext, verdict: Verdict | None, image: Gray, cell: Cell) -> None:
     photo = binary = None
     with contextlib.suppress(BadPicture):
-        photo, binary = pictures_of(image, image_plane(context.run, image), cell)
+        photo, binary = pictures_of(image, context.run.image_plane(image), cell)
     stroke_id, still = str(context.step.params["stroke_id"]), context.attempt.serial
     height_mm, tilt_deg = context.number("height_mm"), context.number("tilt_deg")
     brush = context.run.rig.config.brush
     sizes = {"radius_mm": brush.radius_mm, "length_mm": brush.length_mm}
     model = None if _drawn(context) else published_mark(height_mm, tilt_deg, **sizes)
-    context.run.progress.show(LastCapture(stroke_id, height_mm, tilt_deg, still, kept, verdict, photo, binary, model))
+    context.run.progress.show(LastCapture(stroke_id, height_mm, tilt_deg, still, True, verdict, photo, binary, model))
 
 
 def _cut_out(run: RunContext, image: Gray, cell: Cell) -> Gray:
-    """The cell and a little around it."""
-    import numpy as np
-
-    plane = run.known.image_plane
+    """The cell and a margin around it."""
+    plane = run.memory.image_plane
     assert plane is not None
     x_mm, y_mm, width_mm, height_mm = cell.rect_mm
     corners = np.array([[x, y, 1.0] for x in (x_mm, x_mm + width_mm) for y in (y_mm, y_mm + height_mm)])
@@ -151,8 +252,9 @@ def _cut_out(run: RunContext, image: Gray, cell: Cell) -> Gray:
     return image[max(0, top - m) : bottom + m, max(0, left - m) : right + m]
 
 
-def _stroke(context: StepContext, cell: Cell, dip_to_touch_s: float | None) -> Stroke:
-    return Stroke(
+def _stroke(context: StepContext, cell: Cell, dip_to_touch_s: float | None) -> schemas.Stroke:
+    again_of = context.step.params.get("again_of")
+    return schemas.Stroke(
         stroke_id=str(context.step.params["stroke_id"]),
         kind="drag" if _drawn(context) else "press",
         still=context.attempt.serial,
@@ -160,6 +262,6 @@ def _stroke(context: StepContext, cell: Cell, dip_to_touch_s: float | None) -> S
         tilt_deg=context.number("tilt_deg"),
         cell_mm=cell.rect_mm,
         anchor_mm=cell.anchor_mm,
-        again_of=None if context.step.params.get("again_of") is None else str(context.step.params["again_of"]),
+        again_of=None if again_of is None else str(again_of),
         dip_to_touch_s=dip_to_touch_s,
     )

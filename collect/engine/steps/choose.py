@@ -1,12 +1,13 @@
-"""Chooses the next press of an adaptive protocol from the ink of those before; nothing moves meanwhile."""
+"""Chooses the next press of an adaptive protocol from the ink of the presses before it; nothing moves."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from collect.engine.steps.context import RunContext, StepContext
-from collect.engine.steps.look import Gray, image_plane
-from collect.engine.steps.waiting import uninterrupted
+from calibrate.errors import CaptureRefused
+from calibrate.stroke.preprocess import Gray, Params, prepare
+from collect.engine.last_capture import cell_raster
+from collect.engine.steps.context import RunContext, StepContext, uninterrupted
 from collect.protocols.adaptive import cells
 from collect.protocols.config import AdaptiveConfig
 from collect.protocols.steps import Result, StepKind
@@ -17,9 +18,9 @@ if TYPE_CHECKING:
 
 
 async def choose(context: StepContext) -> Result:
-    """The CHOOSE step: `height_mm` and `tilt_deg` of the next press, or `stop` with what that saved.
+    """The CHOOSE step: `height_mm` and `tilt_deg` of the next press, or `stop` with the number of presses saved.
 
-    A function of the captures in the journal alone, so that after a kill the same press is chosen.
+    Depends only on the captures in the journal, so that after a kill the same press is chosen.
     """
     run, protocol = context.run, context.run.protocol
     assert isinstance(protocol, AdaptiveConfig)
@@ -49,16 +50,17 @@ async def choose(context: StepContext) -> Result:
 
 
 async def measured(context: StepContext, image: Gray, cell: Cell) -> Result:
-    """The ink of a captured press as the journal holds it; empty where no whole stroke is seen."""
+    """The ink of a captured press, packed for the journal; empty where no whole stroke is seen."""
     with context.recorder.sections.timed("measure the ink"):
         ink, why = await uninterrupted(_ink, context.run, image, cell)
     if why:
-        context.run.progress.log(f"{context.step.params['stroke_id']}: not used for the choice: {why}", warning=True)
+        stroke_id = context.step.params["stroke_id"]
+        context.run.progress.log(f"{stroke_id}: not used for the choice: {why}", warning=True)
     return {"ink": ink}
 
 
 def _seen(run: RunContext) -> list[Seen]:
-    """What the captures showed, in the order in which they were made; takes that were made again do not count."""
+    """Ink of the captures so far, in the order in which they were made, without those that were retaken."""
     from calibrate.fit.stepwise import Seen
 
     results = [line["result"] for line in run.store.state.segments if line["kind"] == StepKind.CAPTURE]
@@ -84,19 +86,12 @@ def _fitted(run: RunContext, protocol: AdaptiveConfig, seen: list[Seen]) -> Next
 
 
 def _ink(run: RunContext, image: Gray, cell: Cell) -> tuple[str, str]:
-    from calibrate.errors import CaptureRefused
-    from calibrate.fit.stepwise import FIELD, packed
-    from calibrate.stroke.preprocess import PX_PER_MM, Params, prepare, rectify
+    """(ink, why there is none)."""
+    from calibrate.fit.stepwise import packed
 
-    window = FIELD.window_mm(cell.anchor_mm)
-    left, top = (mm * PX_PER_MM for mm in FIELD.anchor_mm)
-    top_of_cell = window[1] + window[3] - (cell.y_mm + cell.height_mm)
-    x, y, width, height = (
-        round(mm * PX_PER_MM) for mm in (cell.x_mm - window[0], top_of_cell, cell.width_mm, cell.height_mm)
-    )
     try:
-        raster = rectify(image, image_plane(run, image).image_to_paper, window)
-        prepared = prepare(raster, (left, top), "the capture", Params(), (x, y, width, height))
+        raster, anchor_px, cell_px = cell_raster(image, run.image_plane(image), cell)
+        prepared = prepare(raster, anchor_px, "the capture", Params(), cell_px)
     except CaptureRefused as error:
         return "", error.what
     return ("", "is cut by the edge of its cell") if prepared.cut else (packed(prepared.mask), "")

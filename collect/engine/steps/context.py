@@ -1,15 +1,19 @@
-"""What a step works with: the rig and what is known of it in this process, and the attempt that is being recorded."""
+"""What steps work with: the rig for the length of a run, and the attempt that is being recorded."""
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from calibrate.board.plane import Plane
+from calibrate.board.view import see_board
+from calibrate.errors import CalibrationError
 from collect.engine.force_guard import ForceGuard
-from collect.engine.inking import Inking
 from collect.engine.progress import Progress
 from collect.engine.recorder import Recorder
+from collect.errors import BadPicture
 from collect.motion.procedures import Procedures
 from collect.operator import Asker, OperatorRequests
 from collect.protocols.config import ProtocolConfig
@@ -22,41 +26,71 @@ from sessions.store import Attempt, SessionStore
 if TYPE_CHECKING:
     from calibrate.stroke.preprocess import Gray
 
+_R = TypeVar("_R")
+
 
 @dataclass(slots=True)
-class Known:
-    """What one process has found out and does not keep: a new one looks again."""
+class RunMemory:
+    """What this process has seen and done on the rig; a new process starts without it."""
 
     left_ink_ns: int | None = None
-    """When the brush left the ink, by the host's clock; None where it has marked since, or may have lost it."""
+    """When the brush left the ink, by the host's clock; None where it has marked since, or may have lost its ink."""
     image_plane: Plane | None = None
-    """Of the newest frame in which the board was seen."""
+    """Plane of the newest frame in which the board was seen."""
     sound_frame: Gray | None = None
-    """The newest gray photograph of the sheet that is in."""
+    """Newest valid gray photograph of the current sheet."""
     looked_at_sheet: int | None = None
-    """The sheet whose free cells were seen to be blank."""
+    """Sheet whose free cells were seen to be blank."""
+    dips: int = 0
+    """Dips since the run began, where doses are counted by dips."""
+    dosed_ml: float = 0.0
+    """Ink dosed since the run began."""
+    light: float | None = None
+    """Light of the ink station as it was set; None without one."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunContext:
-    """The rig for the length of a run."""
+    """The rig, the session and the operator, for the length of a run."""
 
     rig: Rig
     store: SessionStore
     progress: Progress
     asker: Asker
     procedures: Procedures
-    inking: Inking
     sheet: Sheet
     protocol: ProtocolConfig
-    known: Known = field(default_factory=Known)
     requests: OperatorRequests = field(default_factory=OperatorRequests)
+    memory: RunMemory = field(default_factory=RunMemory)
 
     def used_cells(self) -> set[int]:
-        """Cells of the sheet that is in on which a mark was ever begun, or that zero touch may ink."""
+        """Cells of the current sheet on which a mark was ever begun, or which zero touch may ink."""
         state, config = self.store.state, self.rig.config
         marked = {cell for sheet, cell in state.used_cells if sheet == state.sheet}
         return marked | touched_cells(self.sheet, config.paper, config.touch)
+
+    def image_plane(self, image: Gray) -> Plane:
+        """Where the paper lies in this frame: from its own board, else from the newest board that was seen.
+
+        Raises `BadPicture` where none was.
+        """
+        try:
+            self.memory.image_plane = see_board(image, self.rig.config.board)
+        except CalibrationError as error:
+            if self.memory.image_plane is None:
+                raise BadPicture(f"the board is not seen: {error.what}") from None
+        return self.memory.image_plane
+
+    def forget_camera(self) -> None:
+        """Measure the camera's delay again before the next photograph: a person may have changed what it sees."""
+        self.procedures.photographer.forget()
+
+    def fresh_sheet(self) -> None:
+        """Record that a person has put a fresh sheet in."""
+        self.store.fresh_sheet()
+        self.memory.sound_frame = None
+        self.forget_camera()
+        self.progress.sheet_in(self.store.state.sheet)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +100,9 @@ class StepContext:
     run: RunContext
     step: Step
     cell: Cell | None
-    """That it marks."""
+    """Cell to press."""
     more_cells: tuple[Cell, ...]
-    """That it marks besides."""
+    """Further cells that this step marks."""
     attempt: Attempt
     recorder: Recorder
     guard: ForceGuard
@@ -78,3 +112,16 @@ class StepContext:
         value = self.step.params[name]
         assert isinstance(value, float | int)
         return float(value)
+
+
+async def uninterrupted(function: Callable[..., _R], *args: object) -> _R:
+    """Run `function` in a thread; on cancellation wait until it has returned.
+
+    Half of a file operation is worse than one that ends a few milliseconds after the stop key.
+    """
+    task = asyncio.ensure_future(asyncio.to_thread(function, *args))
+    try:
+        return await asyncio.shield(task)
+    except asyncio.CancelledError:
+        await task
+        raise

@@ -1,28 +1,130 @@
-"""Into the ink and out again; looked at the paper before, so that the ink does not wait for that."""
+"""The dip: keeps the well filled, fills the brush, and times how long the ink then waits before it meets the paper."""
 
 from __future__ import annotations
 
-from collect.engine.inking import InkSeen
-from collect.engine.steps.context import StepContext
-from collect.engine.steps.look import look_at_sheet
+import asyncio
+from collections.abc import Generator
+from contextlib import contextmanager
+
+from collect.engine.steps.capture import look_at_sheet
+from collect.engine.steps.context import RunContext, StepContext
+from collect.errors import NeedsOperator
+from collect.motion.procedures import TOUCH_TOLERANCE_MM, Move
 from collect.protocols.steps import Result
+from collect.rig.config_devices import InkStationConfig, ModbusPumpConfig
+from drivers.samples import PoseSample
+
+LEVEL_RISES = 0.005
+"""A dose that raises the level of the well by less has not arrived."""
+STALE_INK_S = 5.0
+"""After a longer wait (a pause, a question, a photograph) the brush dips again before it presses."""
 
 
 async def dip(context: StepContext) -> Result:
-    """The DIP step."""
+    """The DIP step. Looks at the sheet first, so that the ink does not wait for that."""
     await look_at_sheet(context)
-    seen = await fill_brush(context)
-    return {} if seen.level is None else {"ink_level": seen.level, "dosed_ml": seen.dosed_ml}
+    level = await fill_brush(context)
+    return {} if level is None else {"ink_level": level, "dosed_ml": context.run.memory.dosed_ml}
 
 
-async def fill_brush(context: StepContext) -> InkSeen:
-    """Fill up the well if need be, then dip."""
-    run = context.run
+async def fill_brush(context: StepContext) -> float | None:
+    """Fill up the well if need be, then dip. Returns the level of the well, 0 to 1; None where nothing measures it."""
+    run, memory = context.run, context.run.memory
     with run.progress.meanwhile("dip"):
-        seen = await run.inking.before_dip()
+        level = await fill_well(run)
         if run.rig.ink is not None:
-            context.recorder.ink(seen.level, seen.dosed_ml, seen.light)
-            run.progress.inked(seen.level)
+            context.recorder.ink(level, memory.dosed_ml, memory.light)
+            run.progress.inked(level)
         await context.guard.guarded(run.procedures.dip())
-        run.known.left_ink_ns = run.rig.clock.now_ns()
-    return seen
+        memory.left_ink_ns = run.rig.clock.now_ns()
+    return level
+
+
+async def set_light(run: RunContext) -> None:
+    """Set the light of the ink station, once per run. Raises `DeviceError`."""
+    config = run.rig.config.ink.device
+    light = config.light if isinstance(config, InkStationConfig) else None
+    if run.rig.ink is not None and light is not None and await run.rig.ink.light(light):
+        run.memory.light = light
+
+
+async def fill_well(run: RunContext) -> float | None:
+    """Dose ink where the gauge or the number of dips calls for it; returns the level, None without a gauge.
+
+    Raises `NeedsOperator` where a dose does not arrive, and `DeviceError`.
+    """
+    ink, config, memory = run.rig.ink, run.rig.config.ink.device, run.memory
+    match config:
+        case InkStationConfig():
+            assert ink is not None
+            level = await ink.level()
+            while level is not None and level < config.keep_level:
+                await _dose(run, config.dose_ml)
+                before, level = level, await ink.level()
+                if level is not None and level < before + LEVEL_RISES:
+                    raise NeedsOperator(
+                        f"a dose of {config.dose_ml:g} ml left the well at {level:.0%} of its capacity: "
+                        "look at the tube, the reservoir and the gauge"
+                    )
+            return level
+        case ModbusPumpConfig():
+            if memory.dips % config.every_dips == config.every_dips - 1:
+                await _dose(run, config.dose_ml)
+            memory.dips += 1
+        case None:
+            pass
+    return None
+
+
+async def _dose(run: RunContext, dose_ml: float) -> None:
+    assert run.rig.ink is not None
+    await run.rig.ink.dose(dose_ml)
+    run.memory.dosed_ml += dose_ml
+
+
+def must_dip(context: StepContext) -> bool:
+    """Whether the brush must dip before it may press: it has no known ink, or the ink waited too long."""
+    left_ns = context.run.memory.left_ink_ns
+    return left_ns is None or context.run.rig.clock.now_ns() - left_ns > STALE_INK_S * 1e9
+
+
+class DipToTouch:
+    """Times from dip to touch within one step: one of a press, one or more of a figure that dips between strokes."""
+
+    def __init__(self, context: StepContext) -> None:
+        self._context = context
+        self._left_ns: int | None = None
+        self._waits_s: list[float] = []
+
+    @property
+    def longest_s(self) -> float | None:
+        """The longest time; None where no pose showed the brush on the paper."""
+        return max(self._waits_s, default=None)
+
+    @contextmanager
+    def watching(self) -> Generator[DipToTouch]:
+        """Within the block, look at every pose."""
+        with self._context.recorder.also(self._pose):
+            yield self
+
+    async def begin(self, first: Move) -> None:
+        """Start timing a stroke that begins with the move `first`; wait above the cell where the protocol asks for a
+        fixed time after the dip."""
+        run = self._context.run
+        left_ns, run.memory.left_ink_ns = run.memory.left_ink_ns, None
+        assert left_ns is not None
+        if (wait_s := run.protocol.wait_after_dip_s) is not None:
+            await run.procedures.go(first)
+            left_s = wait_s - (run.rig.clock.now_ns() - left_ns) / 1e9
+            with run.progress.meanwhile(f"wait with the ink, {wait_s:g} s from the dip"):
+                await asyncio.sleep(max(left_s, 0.0))
+        self._left_ns = left_ns
+
+    def _pose(self, sample: PoseSample) -> None:
+        # The first pose on the paper counts; the step's moves come down nowhere else before it.
+        if self._left_ns is None:
+            return
+        procedures, paper = self._context.run.procedures, self._context.run.rig.config.paper
+        if procedures.plane.above_mm(paper, sample.pose) <= TOUCH_TOLERANCE_MM:
+            self._waits_s.append((sample.stamp.host_ns - self._left_ns) / 1e9)
+            self._left_ns = None

@@ -1,13 +1,12 @@
-"""Presses and drawn figures: what leaves ink on a cell."""
+"""The steps that leave ink on a cell: a press, and a drawn figure."""
 
 from __future__ import annotations
 
 import asyncio
 
+from collect.engine.steps.capture import look_at_sheet
 from collect.engine.steps.context import StepContext
-from collect.engine.steps.dip import fill_brush
-from collect.engine.steps.look import look_at_sheet
-from collect.engine.steps.waited import DipToTouch, stale
+from collect.engine.steps.dip import DipToTouch, fill_brush, must_dip
 from collect.motion.drawing import Drawn, check_drawn, draw_stroke, stroke_moves
 from collect.motion.procedures import press_moves
 from collect.protocols.steps import Result
@@ -21,26 +20,27 @@ async def press(context: StepContext) -> Result:
     cell, procedures = await _ready(context), context.run.procedures
     height_mm, tilt_deg = context.number("height_mm"), context.number("tilt_deg")
     down, _ = press_moves(context.run.rig.config, procedures.plane, cell, height_mm, tilt_deg)
-    with DipToTouch(context).watching() as waited:
-        await waited.begin(down[0])
-        depth_mm = await context.guard.guarded(procedures.press(cell, height_mm, tilt_deg, context.number("dwell_s")))
-    return _marked(context, depth_mm, waited)
+    with DipToTouch(context).watching() as timing:
+        await timing.begin(down[0])
+        pressing = procedures.press(cell, height_mm, tilt_deg, context.number("dwell_s"))
+        depth_mm = await context.guard.guarded(pressing)
+    return _marked(context, depth_mm, timing)
 
 
 async def draw(context: StepContext) -> Result:
-    """The DRAW step: every stroke of a figure, dipping between them where the protocol says so."""
+    """The DRAW step: every stroke of a figure, with dips in between where the protocol asks for them."""
     run, drawn = context.run, Drawn.of(context.step)
     cell = await _ready(context)
     plane = run.procedures.plane
     config = run.rig.config
     await asyncio.to_thread(check_drawn, config, plane, limits_of(config), [cell], drawn)
     depths_mm: list[float] = []
-    with DipToTouch(context).watching() as waited:
+    with DipToTouch(context).watching() as timing:
         for number, points in enumerate(drawn.strokes):
             if drawn.dips_before(number):
                 await fill_brush(context)
-            if run.known.left_ink_ns is not None:
-                await waited.begin(stroke_moves(config, plane, cell, points, drawn.speed_mm_s).down[0])
+            if run.memory.left_ink_ns is not None:
+                await timing.begin(stroke_moves(config, plane, cell, points, drawn.speed_mm_s).down[0])
             stroke = draw_stroke(
                 run.rig.robot,
                 run.rig.config,
@@ -51,21 +51,21 @@ async def draw(context: StepContext) -> Result:
                 blend_mm=drawn.blend_mm,
             )
             depths_mm.append(await context.guard.guarded(stroke))
-    return {**_marked(context, max(depths_mm), waited), "depths_mm": depths_mm}
+    return {**_marked(context, max(depths_mm), timing), "depths_mm": depths_mm}
 
 
 async def _ready(context: StepContext) -> Cell:
-    """Ink on the brush that has not waited, and a cell that is blank."""
+    """Fill the brush if its ink is old, and return the cell to press, which was seen to be blank."""
     assert context.cell is not None
     await look_at_sheet(context)
-    if stale(context):
+    if must_dip(context):
         # Resumed, paused, or the last press failed: the brush may have dried or lost its ink since its dip.
         context.recorder.log("dip again before the press")
         await fill_brush(context)
     return context.cell
 
 
-def _marked(context: StepContext, depth_mm: float, waited: DipToTouch) -> Result:
+def _marked(context: StepContext, depth_mm: float, timing: DipToTouch) -> Result:
     assert context.cell is not None
     result: Result = {
         "stroke_id": context.step.params["stroke_id"],
@@ -73,6 +73,6 @@ def _marked(context: StepContext, depth_mm: float, waited: DipToTouch) -> Result
         "cell": context.cell.index,
         "depth_mm": depth_mm,
     }
-    if waited.longest_s is not None:
-        result[WAIT] = round(waited.longest_s, 3)
+    if timing.longest_s is not None:
+        result[WAIT] = round(timing.longest_s, 3)
     return result if context.run.rig.force is None else {**result, "peak_force_n": context.guard.peak_n}

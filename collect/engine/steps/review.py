@@ -1,4 +1,4 @@
-"""Which captures a person has marked bad while the session was open."""
+"""Presses strokes again whose captures a person has marked bad while the session was open."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from sessions.remarks import remarks_of
 
 
 def marked_bad(run: RunContext) -> list[str]:
-    """Strokes that count, are marked bad, and have not been given to a REVIEW step yet; in the order in which they were
+    """Strokes that count, are marked bad, and were not listed by a REVIEW step yet, in the order in which they were
     made. Raises `SessionDamaged`."""
     remarks = remarks_of(run.store.folder)
     if not remarks:
@@ -22,7 +22,7 @@ def marked_bad(run: RunContext) -> list[str]:
 
 
 async def review(context: StepContext) -> Result:
-    """The REVIEW step: `again` holds [stroke_id, index of its steps] of what is to be made again."""
+    """The REVIEW step: `again` holds [stroke_id, index of its new steps] of each stroke to press again."""
     run = context.run
     lines = [line["result"]["again"] for line in run.store.state.segments if line["kind"] == StepKind.REVIEW]
     first = run.progress.first_free_index + sum(map(len, lines))

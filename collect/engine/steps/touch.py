@@ -1,4 +1,4 @@
-"""Finds the paper: what every run sets anew, zero touch, single touches of a calibration, and the self-check."""
+"""Steps that find the paper: zero touch, single touches of a calibration, and the self-check."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from collect.engine.steps.context import RunContext, StepContext
-from collect.engine.steps.dip import fill_brush
+from collect.engine.steps.dip import fill_brush, set_light
 from collect.errors import ConfigError, StepError
 from collect.motion.touches import visit_moves
 from collect.operator import Choice, Prompt
@@ -26,10 +26,11 @@ from sessions.recording.messages import Transform
 
 
 async def zero_touch(context: StepContext) -> Result:
-    """The ZERO_TOUCH step: light, force bias, the plane, and that every planned pose still lies within the limits."""
+    """The ZERO_TOUCH step: set the light, measure the force sensor's bias and the paper's plane, and check that every
+    planned pose still lies within the limits."""
     run = context.run
     rig = run.rig
-    await run.inking.begin()
+    await set_light(run)
     if rig.force is not None and rig.config.force is not None:
         await rig.force.bias(rig.config.force.bias_s)
     if context.step.params.get("method") == "kept":
@@ -55,21 +56,21 @@ async def zero_touch(context: StepContext) -> Result:
 
 
 def _moved_mm(found: PlaneResult, before: PaperPlane) -> float:
-    """How far the paper was found above where it was thought to lie, at the touched point where that is most."""
+    """How far the paper lies above where it was before, at the touched point where it moved most."""
     away = [point.mean[2] - before.touch_z_mm(point.mean[0], point.mean[1]) for point in found.points]
     return max(away, key=abs)
 
 
 async def _accepted(context: StepContext, moved_mm: float) -> None:
-    """A person looks before strokes are pressed from another height than those before. Raises `StepError`."""
-    words = f"The paper was found {moved_mm:+.2f} mm from where it was. Strokes from here on are pressed from there."
+    """Ask a person before strokes are pressed from another height than those before. Raises `StepError` for a no."""
+    text = f"The paper was found {moved_mm:+.2f} mm from where it was. Strokes from here on are pressed from there."
     choices = (Choice("g", "good, go on from the new height"), Choice("k", "keep the height as it was"))
-    if await context.run.asker.ask(Prompt(words, choices, "k")) != "g":
-        raise StepError("what was found was not taken.")
+    if await context.run.asker.ask(Prompt(text, choices, "k")) != "g":
+        raise StepError("the new height was not accepted.")
 
 
 async def touch(context: StepContext) -> Result:
-    """The TOUCH step: one point, by the method of the rig."""
+    """The TOUCH step: measure the height of one point, by the method of the rig."""
     run = context.run
     config = touch_of(run.rig.config, context.step)
     if config.method == "taught":
@@ -82,7 +83,7 @@ async def touch(context: StepContext) -> Result:
 
 
 async def _visited(run: RunContext, point: tuple[float, float]) -> float:
-    """The height at which the arm rests where the surface is thought to be."""
+    """Move to where the surface should be, and return the height at which the arm rests there."""
     *down, up = visit_moves(run.rig.config, run.procedures.plane, *point)
     for move in down:
         await run.procedures.go(move)
@@ -92,18 +93,18 @@ async def _visited(run: RunContext, point: tuple[float, float]) -> float:
 
 
 async def check_rig(context: StepContext) -> Result:
-    """The SELF_CHECK step: an uneven triangle on cells of its own tells a mirrored, turned or stretched rig."""
+    """The SELF_CHECK step: an uneven triangle of marks shows whether the rig is mirrored, turned or stretched."""
     run, cell = context.run, context.cell
     assert cell is not None
     cells = (cell, *context.more_cells)
     places_mm = triangle_on(cells, run.rig.config.self_check)
-    checked = await context.guard.guarded(self_check(run.rig, _Hands(context), places_mm, run.procedures.plane))
+    checked = await context.guard.guarded(self_check(run.rig, _Effector(context), places_mm, run.procedures.plane))
     marked = {"sheet": run.store.state.sheet, "cell": cell.index, "cells": [one.index for one in cells]}
     return {**checked.as_dict(), **marked}
 
 
-class _Hands:
-    """What touches and self-check ask of the rig's procedures; a dip keeps the well filled."""
+class _Effector:
+    """The rig's procedures as touches and the self-check use them; a dip keeps the well filled."""
 
     def __init__(self, context: StepContext) -> None:
         self._context = context
@@ -113,12 +114,12 @@ class _Hands:
         return await self._context.run.procedures.zero_touch()
 
     async def dip(self) -> None:
-        """Into the well and out again; the touch that follows takes ink, so no press may count on this dip."""
+        """Fill the brush. The touch that follows takes ink, so the next press must dip again."""
         await fill_brush(self._context)
-        self._context.run.known.left_ink_ns = None
+        self._context.run.memory.left_ink_ns = None
 
     async def capture(self) -> Frame:
-        """Park, and a fresh frame."""
+        """Park, and take a fresh frame."""
         return await self._context.run.procedures.capture()
 
 
@@ -128,15 +129,15 @@ async def _measured(context: StepContext, config: TouchConfig) -> PlaneResult:
     with context.guard.also(tap.take):
         jog = asked(run.asker, config.jog, _height(run))
 
-        def tell(words: str) -> None:
-            run.progress.doing(f"zero touch by {config.method}: {words}")
+        def tell(doing: str) -> None:
+            run.progress.doing(f"zero touch by {config.method}: {doing}")
 
-        measured = measure_plane(run.rig, _Hands(context), config, tap=tap, next_jog=jog, tell=tell)
+        measured = measure_plane(run.rig, _Effector(context), config, tap=tap, next_jog=jog, tell=tell)
         return await context.guard.guarded(measured)
 
 
 def _height(run: RunContext) -> str:
-    """The height that is known without a measurement, in words."""
+    """The height that is known without a new measurement, in words."""
     paper, plane = run.rig.config.paper, run.procedures.plane
     how = "taught height" if plane == PaperPlane(paper.touch_z_mm) else "height that was measured before"
     return f"the {how}, {plane.touch_z_mm(*paper.touch_point_mm):.2f} mm,"
@@ -144,7 +145,7 @@ def _height(run: RunContext) -> str:
 
 async def _check(check: Callable[..., None], where: str, *checked: object) -> None:
     try:
-        # Seconds for a long protocol: beside the loop, so that a stop is heard meanwhile.
+        # Takes seconds for a long protocol: in a thread, so that a stop takes effect meanwhile.
         await asyncio.to_thread(check, Path("rig.toml"), *checked)
     except ConfigError as error:
         raise StepError(f"{where}{error.what}") from None

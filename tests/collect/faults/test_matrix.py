@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from collect.engine.control import State
 from collect.engine.engine import Engine
-from collect.engine.states import State
 from drivers.arcs.codes import SafetyMode
 from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, MotionFailed, ProtocolViolation, RobotNotSafe
 from drivers.geometry import distance

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from collect.engine.states import State
+from collect.engine.control import State
 from drivers.sim.faults.phases import Phase
 from sessions.errors import SessionError
 from sessions.journal.journal import replay

@@ -9,12 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from collect.engine.control import State
 from collect.engine.last_capture import LastCapture, published_mark
-from collect.engine.set_up_steps import Fact, SetUpStep, Standing
-from collect.engine.snapshot import CellCount, Snapshot
-from collect.engine.states import State
-from collect.engine.tally import Mark, SheetMap
-from collect.engine.telemetry import Picture
+from collect.engine.snapshot import CellCount, Fact, Mark, Picture, SetUpStep, SheetMap, Snapshot, Standing
 from collect.errors import CollectAborted
 from collect.operator import Choice, OperatorRequest, Prompt
 from collect.protocols.steps import StepKind

@@ -12,7 +12,7 @@ from textual.geometry import Region
 from textual.pilot import Pilot
 from textual.widgets import Static
 
-from collect.engine.states import FINAL, State
+from collect.engine.control import FINAL, State
 from collect.tui.app import OperatorApp
 from collect.tui.keys import RUN_KEYS, HelpScreen
 from collect.tui.question_screens import Confirm

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from collect.engine.states import State
+from collect.engine.control import State
 from collect.operator import Choice, Prompt
 from collect.tui.app import OperatorApp
 from collect.tui.question_screens import AskScreen, Confirm

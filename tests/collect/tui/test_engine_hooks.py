@@ -7,11 +7,10 @@ from collections.abc import Callable
 
 import pytest
 
+from collect.engine.control import State
 from collect.engine.engine import Engine
 from collect.engine.opening import Opening, find_resumable, open_store
-from collect.engine.snapshot import Snapshot
-from collect.engine.states import State
-from collect.engine.tally import Mark
+from collect.engine.snapshot import Mark, Snapshot
 from collect.errors import CollectAborted, NeedsOperator, Parked
 from collect.operator import OperatorRequest, OperatorRequests
 from drivers.clock import HostClock
@@ -191,7 +190,7 @@ def test_a_height_that_is_not_taken_and_a_jog_that_is_given_up_leave_the_paper_w
     methods = [line["result"]["method"] for line in lines(lab, "done") if line["kind"] == "zero_touch"]  # type: ignore[index]
     assert methods == ["taught"]
     assert [str(line["why"]) for line in lines(lab, "void") if "void" in line["event"]][-2:] == [
-        "what was found was not taken.",
+        "the new height was not accepted.",
         "the operator gave up at touch 1 of 3",
     ]
 

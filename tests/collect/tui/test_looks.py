@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from textual.pilot import Pilot
 
-from collect.engine.states import State
+from collect.engine.control import State
 from collect.tui.app import OperatorApp
 from collect.tui.finish_screen import FinishScreen
 from sessions.repair.verify import Verdict

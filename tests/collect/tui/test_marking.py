@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from collect.engine.control import State
 from collect.engine.snapshot import Snapshot
-from collect.engine.states import State
 from collect.tui.app import OperatorApp
 from sessions.remarks import remarks_of
 from tests.collect.tui.fake import FakeEngine, full_picture

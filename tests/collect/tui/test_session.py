@@ -12,8 +12,8 @@ import pytest
 from textual.pilot import Pilot
 
 from bench.processes import Process, started
+from collect.engine.control import State
 from collect.engine.snapshot import Snapshot
-from collect.engine.states import State
 from collect.start import engine_for
 from collect.tui.app import OperatorApp
 from collect.tui.browser import Paths, SessionBrowser
