@@ -105,10 +105,8 @@ class Engine:
 
     def join(self) -> None:
         """Wait for the end of the run. Raises what ended it: `CollectAborted`, or a device, step or session error."""
-        try:
-            self._outcome.result()
-        finally:
-            self._thread.join()
+        self._thread.join()
+        self._outcome.result()
 
     def snapshot(self) -> Snapshot:
         """The state of the run; from any thread."""

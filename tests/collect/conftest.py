@@ -52,7 +52,8 @@ def serving(config: SimConfig) -> Iterator[LoopbackRig]:
         yield rig
     finally:
         loop.call_soon_threadsafe(over.set)
-        thread.join()
+        thread.join(timeout=30)
+        assert not thread.is_alive(), "waited 30 s for the loopback rig to end"
 
 
 @dataclass

@@ -23,6 +23,7 @@ from sessions.reader import Recording
 from sessions.recording import container
 from sessions.recording.schemas import Quality, Topic
 from tests.collect.sent import noting
+from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -43,7 +44,7 @@ def run(lab: Lab, protocol: str = "") -> Path:
         (lab.folder / "protocol.toml").write_text(protocol, encoding="utf-8")
     engine = lab.engine()
     engine.start()
-    engine.join()
+    wait_for_end(engine)
     [folder] = lab.sessions.iterdir()
     return folder
 
@@ -179,7 +180,7 @@ def test_a_stroke_that_waited_unlike_the_others_is_named_and_still_counts(
     lab.write_protocol("[11.0]", "[0.0]", repeats=4)
     engine = lab.engine()
     engine.start()
-    engine.join()
+    wait_for_end(engine)
     [folder] = lab.sessions.iterdir()
     assert engine.snapshot().strokes_done == 4
     named = {seen.stroke_id: seen.unlike for seen in Review(folder).captures if seen.unlike}

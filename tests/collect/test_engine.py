@@ -18,7 +18,7 @@ from drivers.samples import Identity
 from sessions.journal.journal import replay
 from sessions.journal.lines import read_lines
 from sessions.reader import Recording
-from tests.collect.until import until
+from tests.collect.until import until, wait_for_end
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 def run(engine: Engine) -> None:
     engine.start()
-    engine.join()
+    wait_for_end(engine)
 
 
 def run_and_stop(engine: Engine, when: Callable[[Snapshot], bool]) -> None:
@@ -34,7 +34,7 @@ def run_and_stop(engine: Engine, when: Callable[[Snapshot], bool]) -> None:
     until(engine, when)
     engine.stop()
     with pytest.raises(CollectAborted):
-        engine.join()
+        wait_for_end(engine)
 
 
 def test_a_whole_session_is_collected_merged_and_told(lab: Lab) -> None:
@@ -74,7 +74,7 @@ def test_stop_in_mid_press_voids_the_cell_and_the_same_command_goes_on(lab: Lab)
     engine.stop()
     engine.stop()
     with pytest.raises(CollectAborted):
-        engine.join()
+        wait_for_end(engine)
     assert engine.snapshot().state == State.STOPPED
     stopped_at = lab.rig.world.tool()
     time.sleep(0.1)
@@ -97,7 +97,7 @@ def test_stop_before_anything_has_moved(lab: Lab) -> None:
     engine.stop()
     engine.start()
     with pytest.raises(CollectAborted):
-        engine.join()
+        wait_for_end(engine)
     assert engine.snapshot().state == State.STOPPED
 
 
@@ -110,7 +110,7 @@ def test_pause_waits_between_steps_and_resume_goes_on(lab: Lab) -> None:
     time.sleep(0.2)
     assert engine.snapshot().strokes_done == paused.strokes_done
     engine.resume()
-    engine.join()
+    wait_for_end(engine)
     assert engine.snapshot().state == State.DONE
 
 
@@ -122,7 +122,7 @@ def test_stop_works_while_paused(lab: Lab) -> None:
     until(engine, lambda now: now.state == State.PAUSED)
     engine.stop()
     with pytest.raises(CollectAborted):
-        engine.join()
+        wait_for_end(engine)
 
 
 def test_a_protective_stop_ends_the_run_and_says_what_to_do(lab: Lab) -> None:
@@ -131,7 +131,7 @@ def test_a_protective_stop_ends_the_run_and_says_what_to_do(lab: Lab) -> None:
     until(engine, lambda now: now.step.startswith("press"))
     lab.rig.arcs.protective_stop(SafetyMode.PROTECTIVE_STOP)
     with pytest.raises(RobotNotSafe, match="pendant"):
-        engine.join()
+        wait_for_end(engine)
     now = engine.snapshot()
     assert now.state == State.FAILED
     assert "ProtectiveStop" in now.error

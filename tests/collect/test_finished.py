@@ -10,6 +10,7 @@ import pytest
 from collect.chains.commands import ending
 from collect.engine.opening import Opening
 from collect.start import start
+from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -28,7 +29,9 @@ def test_it_is_told_after_the_screen_too(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
-    monkeypatch.setattr("collect.tui.runner.run_screen", lambda engine, _preview: (engine.start(), engine.join()))
+    monkeypatch.setattr(
+        "collect.tui.runner.run_screen", lambda engine, _preview: (engine.start(), wait_for_end(engine))
+    )
     opening = Opening.load(lab.sessions, lab.folder / "rig.toml", lab.folder / "protocol.toml")
     assert start(opening, on_screen=True, preview="off") == 0
     [folder] = lab.sessions.iterdir()

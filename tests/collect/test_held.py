@@ -14,6 +14,7 @@ from collect.engine.opening import Opening
 from collect.errors import ConfigError
 from drivers.arcs.codes import SafetyMode
 from drivers.errors import RobotNotSafe
+from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -61,7 +62,7 @@ def test_a_safety_stop_holds_the_session_until_a_person_has_released_it(lab: Lab
     assert engine.snapshot().state is State.ASKING
     lab.rig.arcs.safety = SafetyMode.NORMAL  # a person, at the pendant
     assert engine.answer(prompt.number, "g")
-    engine.join()
+    wait_for_end(engine)
     now = engine.snapshot()
     assert (now.state, now.strokes_done, now.voids) == (State.DONE, 1, 1)
 
@@ -84,7 +85,7 @@ def test_an_answer_before_the_stop_is_released_is_asked_again_and_moves_nothing(
     assert lab.rig.world.tool() == where
     assert engine.answer(second.number, "x")
     with pytest.raises(RobotNotSafe):
-        engine.join()
+        wait_for_end(engine)
     assert lab.rig.world.tool() == where
 
 
@@ -101,7 +102,7 @@ def test_a_refilled_reservoir_lets_the_run_go_on(lab: Lab) -> None:
     assert lab.rig.world.tool().z_mm > 170.0  # a person is about to reach under the arm
     firmware.reservoir_ml = 100.0  # pyright: ignore[reportAttributeAccessIssue]
     assert engine.answer(prompt.number, "g")
-    engine.join()
+    wait_for_end(engine)
     assert engine.snapshot().strokes_done == 1
 
 

@@ -16,6 +16,7 @@ from drivers.ink.port import InkRefused
 from drivers.sim.instruments.force_board import Fault
 from sessions.journal.journal import replay
 from sessions.recording.schemas import Topic
+from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 def run(engine: Engine) -> None:
     engine.start()
-    engine.join()
+    wait_for_end(engine)
 
 
 def only_session(lab: Lab) -> Path:
@@ -106,7 +107,7 @@ def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_d
     while engine.snapshot().voids == 0 and not engine.finished:
         time.sleep(0.005)
     board._faults.clear()
-    engine.join()
+    wait_for_end(engine)
 
     now = engine.snapshot()
     assert (now.state, now.strokes_done, now.voids) == (State.DONE, 1, 1)

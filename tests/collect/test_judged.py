@@ -17,6 +17,7 @@ from collect.quality.verdict import Verdict
 from drivers.sim.brush.flaws import Flaw
 from sessions.journal.journal import replay
 from sessions.reader import Recording
+from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 def run(engine: Engine) -> None:
     engine.start()
-    engine.join()
+    wait_for_end(engine)
 
 
 def answered(engine: Engine, answer: str, *, over: Callable[[Snapshot], bool]) -> list[str]:
@@ -42,7 +43,7 @@ def answered(engine: Engine, answer: str, *, over: Callable[[Snapshot], bool]) -
             asked[now.prompt.number] = now.prompt.question
             assert engine.answer(now.prompt.number, answer)
         time.sleep(0.01)
-    engine.join()
+    wait_for_end(engine)
     return list(asked.values())
 
 
@@ -112,7 +113,7 @@ def test_a_full_sheet_is_changed_on_the_screen_and_the_run_goes_on(sharp_lab: La
     assert "Sheet 1 is full" in prompt.question
     sharp_lab.rig.world.fresh_sheet()
     assert engine.answer(prompt.number, "g")
-    engine.join()
+    wait_for_end(engine)
     assert engine.snapshot().strokes_done == 2
 
 

@@ -21,6 +21,7 @@ from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 from sessions.recording import container
 from sessions.recording.schemas import Topic
+from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -60,7 +61,7 @@ def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> No
     named(bent_lab, lens, "\n[self_check]\nenabled = true\n")
     engine = bent_lab.engine()
     engine.start()
-    engine.join()
+    wait_for_end(engine)
     assert engine.snapshot().state is State.DONE, engine.snapshot().messages
 
     [folder] = bent_lab.sessions.iterdir()
@@ -94,7 +95,7 @@ def test_without_the_lens_file_the_run_ends_before_ink_and_names_the_remedy(bent
     engine = bent_lab.engine()
     engine.start()
     with pytest.raises(StepError, match=r"the lens bends straight lines: .*camera\.lens_file"):
-        engine.join()
+        wait_for_end(engine)
     [folder] = bent_lab.sessions.iterdir()
     assert replay(folder / "journal.jsonl").used_cells == set()
 

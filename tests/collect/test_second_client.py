@@ -17,6 +17,7 @@ from drivers.errors import MotionFailed, SettingsChanged
 from drivers.geometry import brush_pose, from_wire, lean, to_wire
 from sessions.journal.lines import read_lines
 from tests.collect.until import until as waited_until
+from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -94,7 +95,7 @@ def test_an_arm_that_was_put_under_the_paper_in_a_pause_first_goes_up_along_its_
     second_client(lab, UNDER)
     sent = lines_sent(lab)
     engine.resume()
-    engine.join()
+    wait_for_end(engine)
     assert_up_along_the_tool_first(sent)
     now = engine.snapshot()
     assert now.strokes_done == 2
@@ -123,7 +124,7 @@ def test_an_arm_that_was_moved_at_a_question_first_goes_up_along_its_tool(lab: L
     assert_up_along_the_tool_first(sent)
     engine.stop()
     with pytest.raises(Exception, match="stopped"):
-        engine.join()
+        wait_for_end(engine)
 
 
 def test_an_arm_that_somebody_still_moves_is_asked_about_and_left_alone(lab: Lab) -> None:
@@ -141,7 +142,7 @@ def test_an_arm_that_somebody_still_moves_is_asked_about_and_left_alone(lab: Lab
     assert not sent
     assert lab.rig.world.tool().z_mm > here.z_mm, "it is not stopped either"
     engine.answer(prompt.number, "g")
-    engine.join()
+    wait_for_end(engine)
     assert engine.snapshot().strokes_done == 2
 
 
@@ -159,7 +160,7 @@ def test_an_arm_that_was_left_outside_its_limits_is_not_moved_until_it_is_jogged
     second_client(lab, UNDER)
     sent.clear()
     engine.answer(prompt.number, "g")
-    engine.join()
+    wait_for_end(engine)
     assert_up_along_the_tool_first(sent)
     assert engine.snapshot().strokes_done == 2
 
@@ -175,7 +176,7 @@ def test_with_another_tool_offset_nothing_is_pressed(lab: Lab) -> None:
     pressed = len(lab.rig.world.presses)
     engine.resume()
     with pytest.raises(SettingsChanged, match=r"tool offset is \(0, 0, 170\) mm, \(0, 0, 0\) deg, not \(0, 0, 180\)"):
-        engine.join()
+        wait_for_end(engine)
     assert len(lab.rig.world.presses) == pressed
     now = engine.snapshot()
     assert (now.state, now.strokes_done, now.rest_unknown) == (State.FAILED, 1, False)
@@ -196,7 +197,7 @@ def test_a_tool_offset_that_changes_after_the_last_look_leaves_a_void_and_no_str
     engine = lab.engine()
     engine.start()
     with pytest.raises((SettingsChanged, MotionFailed)):
-        engine.join()
+        wait_for_end(engine)
     [folder] = lab.sessions.iterdir()
     lines = list(read_lines(folder / "journal.jsonl"))
     pressed = {line["key"] for line in lines if line["event"] == "begin" and line["kind"] == "press"}
@@ -216,7 +217,7 @@ def test_whoever_watches_has_the_tool_set_anew_and_goes_on(lab: Lab) -> None:
     assert "tool offset is (0, 0, 170) mm" in prompt.question
     assert prompt.default == "x"
     engine.answer(prompt.number, "g")
-    engine.join()
+    wait_for_end(engine)
     assert engine.snapshot().strokes_done == 2
     assert lab.rig.arcs.tcp_offset[2] == 0.18
     assert max(press.depth_mm for press in lab.rig.world.presses) < 11.1, "none went deeper than asked"

@@ -9,6 +9,7 @@ import pytest
 from collect.errors import ConfigError
 from collect.motion.procedures import dip_moves, wash_moves
 from collect.rig.config import RigConfig, load_rig
+from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -52,7 +53,7 @@ def test_a_session_with_both_washes_before_every_second_dip(lab: Lab) -> None:
     lab.rig.world.motion._on_path = watch
     engine = lab.engine()
     engine.start()
-    engine.join()
+    wait_for_end(engine)
     assert engine.snapshot().strokes_done == 2
     assert len(over_the_pot) == 2  # once, two strokes deep
 

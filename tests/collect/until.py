@@ -1,19 +1,46 @@
-"""Waiting for what an engine's snapshot shows."""
+"""Waits on an engine. Each of them ends, and says what it waited for."""
 
 from __future__ import annotations
 
+import inspect
 import time
 from collections.abc import Callable
 
+import pytest
+
 from collect.engine.engine import Engine
 from collect.engine.snapshot import Snapshot
+
+END_S = 100.0
+"""Time for a run to end, on a busy machine: less than the time-out of a test, whose message would not say as much."""
 
 
 def until(engine: Engine, condition: Callable[[Snapshot], bool], timeout_s: float = 30.0) -> Snapshot:
     """The first snapshot that meets the condition; fails where it does not come in time, or the run is over."""
     deadline = time.monotonic() + timeout_s
     while not condition(now := engine.snapshot()):
-        assert time.monotonic() < deadline, f"waited in vain: {now}"
-        assert not engine.finished, f"over too early: {now}"
+        if time.monotonic() > deadline:
+            pytest.fail(f"waited {timeout_s:g} s for {_source(condition)}; the run is: {now}")
+        if engine.finished:
+            pytest.fail(f"the run ended while a test waited for {_source(condition)}: {now}")
         time.sleep(0.005)
     return now
+
+
+def wait_for_end(engine: Engine, timeout_s: float = END_S) -> None:
+    """Wait until the run is over, and raise what ended it; stops the run and fails where it does not end in time."""
+    deadline = time.monotonic() + timeout_s
+    while not engine.finished:
+        if time.monotonic() > deadline:
+            now = engine.snapshot()
+            engine.stop()
+            pytest.fail(f"waited {timeout_s:g} s for the end of the run; it is: {now}")
+        time.sleep(0.005)
+    engine.join()
+
+
+def _source(condition: Callable[[Snapshot], bool]) -> str:
+    try:
+        return inspect.getsource(condition).strip()
+    except OSError:
+        return repr(condition)

@@ -23,6 +23,7 @@ from model.fitted import FittedPress
 from sessions.journal.journal import JOURNAL_NAME, replay
 from sessions.journal.lines import read_lines
 from sessions.reader import Recording
+from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -160,7 +161,7 @@ def test_the_plan_of_a_rig_shows_the_worst_case(lab: Lab) -> None:
 def test_a_session_stops_when_enough_is_known_and_says_what_it_saved(lab: Lab) -> None:
     engine = adaptive_lab(lab, 45.0).engine()
     engine.start()
-    engine.join()
+    wait_for_end(engine)
     *made, last = choices(lab)
     assert last["stop"]
     assert len(made) == 3  # least_presses

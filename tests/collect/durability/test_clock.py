@@ -17,6 +17,7 @@ from sessions.reader import Recording
 from sessions.recording import container
 from sessions.repair.verify import verify_session
 from tests.collect.durability.conftest import the_session
+from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
     from tests.collect.conftest import Lab
@@ -62,7 +63,7 @@ def test_a_clock_that_is_set_within_a_step_and_between_two_moves_no_stamp(
     until(engine, lambda now: now.step == "paused")
     wall.ahead_s += jump_s
     engine.resume()
-    engine.join()
+    wait_for_end(engine)
 
     folder = the_session(lab)
     lines = list(read_lines(folder / JOURNAL_NAME))
@@ -83,12 +84,12 @@ def test_a_clock_that_was_set_back_between_two_processes_is_noted_and_reorders_n
     until(engine, lambda now: now.strokes_done == 2)
     engine.stop()
     with pytest.raises(CollectAborted):
-        engine.join()
+        wait_for_end(engine)
 
     wall.ahead_s -= HOUR_S
     again = lab.engine()
     again.start()
-    again.join()
+    wait_for_end(again)
     folder = the_session(lab)
     lines = list(read_lines(folder / JOURNAL_NAME))
     [noted] = [line for line in lines if line["event"] == "clock"]

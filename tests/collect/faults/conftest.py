@@ -110,4 +110,5 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
         patch.setitem(RpcConnection.__init__.__kwdefaults__, "timeout_s", RPC_TIMEOUT_S)
         yield Stage(rig, loop, gears, tmp_path)
     loop.call_soon_threadsafe(over.set)
-    thread.join()
+    thread.join(timeout=30)
+    assert not thread.is_alive(), "waited 30 s for the loopback rig to end"

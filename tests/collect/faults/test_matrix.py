@@ -25,6 +25,7 @@ from drivers.sim.faults.phases import Phase
 from sessions.journal.journal import replay
 from sessions.journal.lines import read_lines
 from sessions.store import SessionStore
+from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
     from conftest import Stage
@@ -203,12 +204,8 @@ def arm_the_fault(stage: Stage, engine: Engine, name: str, phase: str) -> list[P
 
 def over_within(engine: Engine, bound_s: float) -> BaseException | None:
     """What ended the run, once it is over."""
-    deadline = time.monotonic() + bound_s
-    while not engine.finished:
-        assert time.monotonic() < deadline, f"still runs: {engine.snapshot()}"
-        time.sleep(0.01)
     try:
-        engine.join()
+        wait_for_end(engine, bound_s)
     except Exception as error:
         return error
     return None

@@ -21,6 +21,7 @@ from sessions.journal.journal import replay
 from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 from sessions.recording.writer import ChannelTable
+from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
     from conftest import Stage
@@ -63,12 +64,8 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
 def run(stage: Stage) -> tuple[BaseException | None, State]:
     engine = stage.engine()
     engine.start()
-    deadline = time.monotonic() + BOUND_S
-    while not engine.finished:
-        assert time.monotonic() < deadline, engine.snapshot()
-        time.sleep(0.01)
     try:
-        engine.join()
+        wait_for_end(engine, BOUND_S)
     except Exception as error:
         return error, engine.snapshot().state
     return None, engine.snapshot().state

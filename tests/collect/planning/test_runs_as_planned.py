@@ -20,6 +20,7 @@ from collect.rig.paper import PaperPlane
 from drivers.samples import Pose
 from tests.collect.conftest import Lab
 from tests.collect.sent import not_checked, not_sent, noting
+from tests.collect.until import wait_for_end
 
 EXTRAS = """
 [ink.wipe]
@@ -93,7 +94,7 @@ def run(lab: Lab, protocol: str, extra: str = EXTRAS) -> None:
         if (prompt := engine.snapshot().prompt) is not None:
             engine.answer(prompt.number, "t")
         time.sleep(0.01)
-    engine.join()
+    wait_for_end(engine)
 
 
 def hold_against_the_plan(lab: Lab, made: list[Made]) -> None:

@@ -18,6 +18,7 @@ from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 from sessions.remarks import mark_bad_or_good
 from tests.collect.conftest import Lab
+from tests.collect.until import wait_for_end
 
 
 def engine_of(lab: Lab, *, guided: bool = False, preview: bool = False) -> Engine:
@@ -78,7 +79,7 @@ def test_a_stroke_is_pressed_again_on_a_new_cell_because_the_operator_asked(lab:
     engine.request(OperatorRequest.NEW_SHEET)
     engine.request(OperatorRequest.NEW_SHEET)
     engine.start()
-    engine.join()
+    wait_for_end(engine)
     now = engine.snapshot()
     assert (now.state, now.strokes_done, now.given_up, now.requests) == (State.DONE, 1, 0, ())
     assert now.sheet is not None
@@ -96,11 +97,11 @@ def test_a_stroke_is_left_out_before_it_is_pressed_and_stays_left_out_after_a_re
     until(first, lambda now: now.given_up == 1)
     first.park()
     with pytest.raises(Parked):
-        first.join()
+        wait_for_end(first)
     assert first.snapshot().strokes_done + first.snapshot().given_up < 3
     again = engine_of(lab)
     again.start()
-    again.join()
+    wait_for_end(again)
     now = again.snapshot()
     assert (now.state, now.strokes_done, now.given_up) == (State.DONE, 1, 1)
     assert len(lab.rig.world.presses) == 1
@@ -118,10 +119,10 @@ def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(l
     until(first, lambda now: now.stroke == f"{last.stroke_id}-again")
     first.park()
     with pytest.raises(Parked):
-        first.join()
+        wait_for_end(first)
     again = engine_of(lab)
     again.start()
-    again.join()
+    wait_for_end(again)
 
     now = again.snapshot()
     assert (now.state, now.strokes_done, now.strokes_planned) == (State.DONE, 2, 2)
@@ -141,7 +142,7 @@ def test_what_is_good_after_all_is_not_pressed_again(lab: Lab) -> None:
     assert last is not None
     [folder] = lab.sessions.iterdir()
     assert [mark_bad_or_good(folder, last.still, last.stroke_id, n) for n in range(2)] == [True, False]
-    engine.join()
+    wait_for_end(engine)
     assert len(list(Recording(folder).captures())) == 2
 
 
@@ -151,7 +152,7 @@ def test_a_new_sheet_is_asked_for_and_the_next_stroke_lies_on_it(lab: Lab) -> No
     engine.request(OperatorRequest.NEW_SHEET)
     engine.start()
     answer(engine, "Put a new sheet in for sheet 1", "g")
-    engine.join()
+    wait_for_end(engine)
     now = engine.snapshot()
     assert now.sheet is not None
     assert now.sheet.number == 2
@@ -167,7 +168,7 @@ def test_the_paper_is_found_again_by_jog_between_two_strokes(lab: Lab) -> None:
         answer(engine, "+2.00 mm", "1")
         answer(engine, "+1.00 mm", "t")
     answer(engine, "found +1.", "g")
-    engine.join()
+    wait_for_end(engine)
     assert engine.snapshot().strokes_done == 1
     assert any("the paper lies +1." in line for line in engine.snapshot().messages)
     methods = [line["result"]["method"] for line in lines(lab, "done") if line["kind"] == "zero_touch"]  # type: ignore[index]
@@ -184,7 +185,7 @@ def test_a_height_that_is_not_taken_and_a_jog_that_is_given_up_leave_the_paper_w
     answer(engine, "found +2.", "k")
     engine.request(OperatorRequest.JOG)
     answer(engine, "Touch 1 of 3.", "x")
-    engine.join()
+    wait_for_end(engine)
     now = engine.snapshot()
     assert now.strokes_done == 2
     methods = [line["result"]["method"] for line in lines(lab, "done") if line["kind"] == "zero_touch"]  # type: ignore[index]
@@ -213,7 +214,7 @@ def test_who_gives_the_jog_of_the_set_up_up_keeps_the_taught_height_and_the_run_
     answer(engine, "The taught height, 120.03 mm, can be kept", "k")
     if guided:
         answer(engine, "Zero touch and plane", "g")
-    engine.join()
+    wait_for_end(engine)
     assert engine.snapshot().strokes_done == 1
     assert any("given up: the taught height, 120.03 mm, is kept" in line for line in engine.snapshot().messages)
     [result] = [line["result"] for line in lines(lab, "done") if line["kind"] == "zero_touch"]
@@ -227,13 +228,13 @@ def test_park_ends_the_run_after_the_step_with_the_arm_at_its_place(lab: Lab) ->
     until(engine, lambda now: now.strokes_done == 1)
     engine.park()
     with pytest.raises(Parked):
-        engine.join()
+        wait_for_end(engine)
     now = engine.snapshot()
     assert (now.state, now.voids) == (State.STOPPED, 0)
     assert now.parked
     again = engine_of(lab)
     again.start()
-    again.join()
+    wait_for_end(again)
     assert again.snapshot().strokes_done == 2
     assert len({c.stroke.stroke_id for c in Recording(next(lab.sessions.iterdir())).captures()}) == 2
 
@@ -245,7 +246,7 @@ def test_park_while_paused_parks_too(lab: Lab) -> None:
     until(engine, lambda now: now.state is State.PAUSED)
     engine.park()
     with pytest.raises(Parked):
-        engine.join()
+        wait_for_end(engine)
     assert engine.snapshot().parked
 
 
@@ -255,7 +256,7 @@ def test_park_while_a_question_waits_asks_nobody_any_more(lab: Lab) -> None:
     until(engine, lambda now: now.prompt is not None)
     engine.park()
     with pytest.raises((NeedsOperator, CollectAborted)):
-        engine.join()
+        wait_for_end(engine)
     assert engine.snapshot().prompt is None
     assert engine.snapshot().parked
 
@@ -275,7 +276,7 @@ def test_a_guided_set_up_measures_again_when_it_is_asked_to_and_shows_the_camera
     answer(engine, "Camera, board, scale", "g")
     answer(engine, "Zero touch and plane", "g")
     until(engine, lambda now: not now.set_up)
-    engine.join()
+    wait_for_end(engine)
     now = engine.snapshot()
     assert (now.state, now.strokes_done) == (State.DONE, 1)
     assert sum(line["kind"] == "board" for line in lines(lab, "done")) == 2

@@ -27,6 +27,7 @@ from sessions.reader import Recording
 from sessions.remarks import remarks_of
 from sessions.repair.verify import verify_session
 from tests.collect.tui.screen_text import shown
+from tests.collect.until import wait_for_end
 
 STROKES = 6
 SPLIT = "split"
@@ -210,7 +211,7 @@ async def test_a_day_at_the_rig(day: Day) -> None:
         await operator.reads("closed")
         await operator.press("q")
     assert app.engine is not None
-    app.engine.join()
+    wait_for_end(app.engine)
 
     [folder] = day.sessions.iterdir()
     assert verify_session(folder).sound
