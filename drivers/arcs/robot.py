@@ -55,6 +55,7 @@ class AuboArcs:
         self._watchdog = Watchdog(self._state.connection, options.watchdog_s, on_notice)
         self._messages = Messages(self._motion)
         self._departure = Departure(self._motion)
+        self._tolerance = Tolerance(options.position_tolerance_mm, options.rotation_tolerance_deg)
         self._motion.on_notice = on_notice
 
     async def connect(self) -> Identity:
@@ -140,14 +141,14 @@ class AuboArcs:
             self.check(pose, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
         start = await self._depart("moveLine", poses)
         legs = legs_of(start, poses, self._limits, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=blend_mm)
-        stops, options = self._stops, self._options
+        stops = self._stops
         feeding = feed(
             self._motion,
             legs,
             acc_mm_s2,
             stopped=lambda: self._stops != stops,
-            tolerance=Tolerance(options.position_tolerance_mm, options.rotation_tolerance_deg),
-            poll_s=options.poll_s,
+            tolerance=self._tolerance,
+            poll_s=self._options.poll_s,
             notice=self._notice,
         )
         await self._carry_out(feeding, poses[-1], sum(leg.seconds for leg in legs))
@@ -160,8 +161,7 @@ class AuboArcs:
         for line in lines:
             self.check(line.target, speed_mm_s=line.speed_mm_s, acc_mm_s2=acc_mm_s2)
         start = await self._depart("sequence", [line.target for line in lines])
-        options = self._options
-        tolerance = Tolerance(options.position_tolerance_mm, options.rotation_tolerance_deg)
+        tolerance = self._tolerance
         if not lines or tolerance.holds(start, lines[-1].target):
             raise ValueError("sequence: it must end elsewhere than it begins")
         stops = self._stops
@@ -177,16 +177,11 @@ class AuboArcs:
             return [*seen]
 
     async def _carry_out(self, command: Coroutine[None, None, None], target: Pose, expected_s: float) -> None:
-        options = self._options
         self._unsettled, self._departure.left = True, None
         try:
             await command
             await until_settled(
-                self._motion,
-                target,
-                Tolerance(options.position_tolerance_mm, options.rotation_tolerance_deg),
-                planned_s=expected_s,
-                poll_s=options.poll_s,
+                self._motion, target, self._tolerance, planned_s=expected_s, poll_s=self._options.poll_s
             )
             self._unsettled, self._departure.left = False, target
         except BaseException as error:

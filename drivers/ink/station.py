@@ -171,14 +171,6 @@ class InkStation:
         await self._ask("light", f"{level:.3f}")
         return True
 
-    async def open_lid(self) -> None:
-        """Open the well. Raises `InkRefused`, `DeviceTimeout`, `ConnectionLost`."""
-        await self._ask("lid", "open")
-
-    async def close_lid(self) -> None:
-        """Cover the well; keep the brush out of it. Raises `InkRefused`, `DeviceTimeout`, `ConnectionLost`."""
-        await self._ask("lid", "close")
-
     async def level(self) -> float | None:
         """Fill level of the well, 0 to 1. Raises `InkRefused`, `DeviceError`."""
         level = self._number_in(await self._ask("level"), "level")

@@ -13,7 +13,7 @@ from drivers.sim.camera.mjpeg_server import MjpegServer
 from drivers.sim.camera.scene import Scene
 from drivers.sim.config import SimConfig
 from drivers.sim.faults.board import FaultBoard
-from drivers.sim.faults.kinds import Device, Fault
+from drivers.sim.faults.kinds import Device, Fault, ForceFault, InkFault
 from drivers.sim.faults.phases import Truth
 from drivers.sim.instruments.force_board import ForceBoard, SocketcandServer
 from drivers.sim.instruments.ink_station import Instrument, PtyLine, StationFirmware
@@ -21,12 +21,14 @@ from drivers.sim.instruments.modbus_pump import PumpFirmware
 from drivers.sim.rig_toml import PUMP_ML, Addresses, rig_toml
 from drivers.sim.world import World
 
+HOST = "127.0.0.1"
+"""Not configurable: nothing off this machine may ever drive or watch a simulated arm by mistake."""
 TICK_S = 0.002
 IDLE_TICK_S = 0.02
 
 
 class Failing(Protocol):
-    """A simulated instrument that keeps its own list of faults: `PtyLine`, `ForceBoard`, `SimForceSensor`."""
+    """A simulated instrument that keeps its own list of faults: `PtyLine`, `ForceBoard`."""
 
     def fail(self, *faults: Any) -> None:
         """Let the next requests or rounds meet these, one each."""
@@ -123,21 +125,8 @@ class Faults:
         if instrument is None:
             self._arcs.stop_as(fault.kind)
             return
-        instrument.fail(*[_name_of(fault)] * (fault.strikes or 1))
-
-
-def _name_of(fault: Fault) -> Any:
-    """The member of the instrument's own enumeration."""
-    # Here, because python-can takes a while to import, and a rig without a force sensor does not need it.
-    if fault.device is Device.INK:
-        from drivers.sim.instruments.ink_station import Fault as Names
-    else:
-        from drivers.sim.instruments.force_board import Fault as Names
-    return Names[fault.kind.upper().replace("-", "_")]
-
-
-HOST = "127.0.0.1"
-"""Not configurable: nothing off this machine may ever drive or watch a simulated arm by mistake."""
+        kind = InkFault(fault.kind) if fault.device is Device.INK else ForceFault(fault.kind)
+        instrument.fail(*[kind] * (fault.strikes or 1))
 
 
 class LoopbackRig:

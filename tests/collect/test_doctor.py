@@ -11,8 +11,7 @@ from collect.rig.config import load_rig
 from collect.rig.doctor import examine
 from drivers.arcs.codes import SafetyMode
 from drivers.clock import HostClock
-from drivers.sim.instruments.force_board import Fault
-from drivers.sim.instruments.ink_station import Fault as InkFault
+from drivers.sim.faults.kinds import ForceFault, InkFault
 from tests.command import brushloop
 
 if TYPE_CHECKING:
@@ -45,7 +44,7 @@ async def test_an_instrument_that_was_unplugged_is_told_and_the_others_are_still
     assert lab.rig.ink is not None
     assert lab.rig.force is not None
     lab.rig.ink.fail(*[InkFault.DEAF] * 100)
-    lab.rig.force.board.fail(*[Fault.NO_SECOND] * 10_000)
+    lab.rig.force.board.fail(*[ForceFault.NO_SECOND] * 10_000)
     camera, force, ink, robot = await examine(load_rig(lab.folder / "rig.toml"), HostClock())
     assert camera.well
     assert robot.well

@@ -13,7 +13,7 @@ from collect.engine.control import State
 from collect.errors import ForceTooHigh, NeedsOperator
 from drivers.errors import ConnectionLost, Stuck
 from drivers.ink.port import InkRefused
-from drivers.sim.instruments.force_board import Fault
+from drivers.sim.faults.kinds import ForceFault
 from sessions.journal.journal import replay
 from sessions.recording.schemas import Topic
 from tests.collect.until import wait_for_end
@@ -94,7 +94,7 @@ def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_d
     def silent_once(depth_mm: float, tilt_deg: float) -> float:
         if depth_mm > 4.0 and not silenced:
             silenced.append(depth_mm)
-            board.fail(*[Fault.SILENCE] * 4000)  # 20 s
+            board.fail(*[ForceFault.SILENCE] * 4000)  # 20 s
         return push_n(depth_mm, tilt_deg)
 
     monkeypatch.setattr(lab.rig.world.reaction, "push_n", silent_once)
@@ -124,7 +124,7 @@ def test_a_sensor_that_is_stuck_in_mid_press_stops_the_arm_and_ends_the_run_with
     def stick_once(depth_mm: float, tilt_deg: float) -> float:
         if depth_mm > 2.0 and not stuck:
             stuck.append(depth_mm)
-            board.fail(*[Fault.STUCK] * 400)  # 2 s
+            board.fail(*[ForceFault.STUCK] * 400)  # 2 s
         return push_n(depth_mm, tilt_deg)
 
     monkeypatch.setattr(lab.rig.world.reaction, "push_n", stick_once)
@@ -143,7 +143,7 @@ def test_a_bus_that_goes_off_ends_the_run_with_the_arm_parked(lab: Lab, monkeypa
 
     def off(depth_mm: float, tilt_deg: float) -> float:
         if depth_mm > 4.0:
-            board.fail(Fault.BUS_OFF)
+            board.fail(ForceFault.BUS_OFF)
         return push_n(depth_mm, tilt_deg)
 
     monkeypatch.setattr(lab.rig.world.reaction, "push_n", off)

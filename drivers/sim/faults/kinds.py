@@ -28,6 +28,54 @@ class Device(StrEnum):
     FORCE = "force"
 
 
+class InkFault(StrEnum):
+    """What happens to one request to the ink device, and to its reply."""
+
+    DEAF = "deaf"
+    """The request is lost: not carried out, not answered."""
+    MUTE = "mute"
+    """Carried out, but the reply is lost."""
+    GARBAGE = "garbage"
+    """Carried out, but noise comes instead of the reply."""
+    LATE = "late"
+    """Carried out, and the reply comes later."""
+    SPLIT = "split"
+    """The reply comes byte by byte."""
+    DAMAGED = "damaged"
+    """The reply has a wrong checksum."""
+    MISTAKEN = "mistaken"
+    """A sound reply to another request."""
+    ECHO = "echo"
+    """The request comes back and nothing else."""
+    UNPLUG = "unplug"
+    """The port disappears."""
+
+
+class ForceFault(StrEnum):
+    """What happens to one round of the force board."""
+
+    SILENCE = "silence"
+    """The round is left out."""
+    NO_FIRST = "no-first"
+    """Frame 0x291 is missing."""
+    NO_SECOND = "no-second"
+    """Frame 0x292 is missing."""
+    NO_THIRD = "no-third"
+    """Frame 0x293 is missing."""
+    SHORT = "short"
+    """Frame 0x292 carries four bytes."""
+    NAN = "nan"
+    """Fz is not a number."""
+    INF = "inf"
+    """Mx is infinite."""
+    BUS_ERROR = "bus-error"
+    """An error frame comes instead."""
+    BUS_OFF = "bus-off"
+    """The bus goes off."""
+    STUCK = "stuck"
+    """The round before comes once more."""
+
+
 LOST = frozenset({"deaf"})
 """The request never arrives: neither done nor answered."""
 REPLIES = frozenset({"mute", "late", "split", "duplicate", "wrong-id", "malformed", "garbage", "drop"})
@@ -39,12 +87,8 @@ KINDS: dict[Device, frozenset[str]] = {
     Device.ROBOT: LOST | REPLIES | STOPS,
     Device.TELEMETRY: frozenset({"mute", "malformed", "drop"}),
     Device.CAMERA: frozenset({"stale", "black", "frozen", "torn", "drop"}),
-    Device.INK: frozenset(
-        {"deaf", "mute", "garbage", "late", "split", "damaged", "mistaken", "echo", "unplug"}
-    ),  # the names of drivers.sim.instruments.ink_station.Fault
-    Device.FORCE: frozenset(
-        {"silence", "no-first", "no-second", "no-third", "short", "nan", "inf", "bus-error", "bus-off", "stuck"}
-    ),  # the names of drivers.sim.instruments.force_board.Fault
+    Device.INK: frozenset(kind.value for kind in InkFault),
+    Device.FORCE: frozenset(kind.value for kind in ForceFault),
 }
 HANDED_OVER = frozenset({Device.INK, Device.FORCE})
 """Their simulators keep their own list of faults, one for each of the next requests or rounds."""

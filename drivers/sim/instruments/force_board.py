@@ -18,32 +18,17 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from enum import StrEnum
 
 from drivers.errors import ProtocolViolation
 from drivers.force.rounds import COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, Wrench, encode_round
 from drivers.force.stream import BUS_OFF
 from drivers.sim.brush.reaction import Reaction
+from drivers.sim.faults.kinds import ForceFault
 from drivers.sim.server import LoopbackServer
 from drivers.sim.world import SimClock
 
 BUS_ERROR = 0x04
 """Class of an error frame: the controller has a problem but is on the bus."""
-
-
-class Fault(StrEnum):
-    """What happens to one round."""
-
-    SILENCE = "the round is left out"
-    NO_FIRST = "0x291 is missing"
-    NO_SECOND = "0x292 is missing"
-    NO_THIRD = "0x293 is missing"
-    SHORT = "0x292 carries four bytes"
-    NAN = "Fz is not a number"
-    INF = "Mx is infinite"
-    BUS_ERROR = "an error frame comes in between"
-    BUS_OFF = "the bus goes off"
-    STUCK = "the round is the one before once more"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,10 +52,10 @@ class ForceBoard:
         self._force = force
         self._noise = (noise_n,) * 3 + (noise_nm,) * 3
         self._random = random.Random(seed)
-        self._faults: deque[Fault] = deque()
+        self._faults: deque[ForceFault] = deque()
         self._before: Wrench | None = None
 
-    def fail(self, *faults: Fault) -> None:
+    def fail(self, *faults: ForceFault) -> None:
         """Let the next rounds meet these, one each."""
         self._faults.extend(faults)
 
@@ -86,22 +71,29 @@ class ForceBoard:
         if not self.streaming:
             return
         fault = self._faults.popleft() if self._faults else None
-        if fault is Fault.SILENCE:
+        if fault is ForceFault.SILENCE:
             return
-        if fault in (Fault.BUS_OFF, Fault.BUS_ERROR):
-            self.streaming = fault is not Fault.BUS_OFF
-            yield CanFrame(BUS_OFF if fault is Fault.BUS_OFF else BUS_ERROR, bytes(8), error=True)
+        if fault in (ForceFault.BUS_OFF, ForceFault.BUS_ERROR):
+            self.streaming = fault is not ForceFault.BUS_OFF
+            yield CanFrame(BUS_OFF if fault is ForceFault.BUS_OFF else BUS_ERROR, bytes(8), error=True)
             return
         values = self._force(t_s)
         fx, fy, fz, mx, my, mz = (v + self._random.gauss(0.0, s) for v, s in zip(values, self._noise, strict=True))
-        if fault is Fault.STUCK and self._before is not None:
+        if fault is ForceFault.STUCK and self._before is not None:
             fx, fy, fz, mx, my, mz = self._before
         self._before = (fx, fy, fz, mx, my, mz)
-        wrench = (fx, fy, math.nan if fault is Fault.NAN else fz, math.inf if fault is Fault.INF else mx, my, mz)
-        left_out = {Fault.NO_FIRST: 0, Fault.NO_SECOND: 1, Fault.NO_THIRD: 2}
+        wrench = (
+            fx,
+            fy,
+            math.nan if fault is ForceFault.NAN else fz,
+            math.inf if fault is ForceFault.INF else mx,
+            my,
+            mz,
+        )
+        left_out = {ForceFault.NO_FIRST: 0, ForceFault.NO_SECOND: 1, ForceFault.NO_THIRD: 2}
         for place, (can_id, data) in enumerate(encode_round(wrench)):
             if fault is None or left_out.get(fault) != place:
-                yield CanFrame(can_id, data[:4] if fault is Fault.SHORT and place == 1 else data)
+                yield CanFrame(can_id, data[:4] if fault is ForceFault.SHORT and place == 1 else data)
 
 
 MAX_LINE_BYTES = 256

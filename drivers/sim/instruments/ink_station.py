@@ -8,30 +8,16 @@ import select
 import threading
 import tty
 from collections import deque
-from enum import StrEnum
 from types import TracebackType
 from typing import Protocol, Self
 
 from drivers.errors import ProtocolViolation
 from drivers.ink.station import number_of, seal, unseal
+from drivers.sim.faults.kinds import InkFault
 from drivers.sim.world import Well
 
 GARBAGE = b"\xff\x00*\n\x86\x01ok 1*0000\n"
 BYTE_S = 0.001
-
-
-class Fault(StrEnum):
-    """What happens to one request and its reply."""
-
-    DEAF = "the request is lost: not done, not answered"
-    MUTE = "done, but the reply is lost"
-    GARBAGE = "done, but noise comes instead of the reply"
-    LATE = "done, and the reply comes `late_s` later"
-    SPLIT = "the reply comes byte by byte"
-    DAMAGED = "the reply has a wrong checksum"
-    MISTAKEN = "a sound reply to another request"
-    ECHO = "the request comes back and nothing else"
-    UNPLUG = "the port disappears"
 
 
 class Instrument(Protocol):
@@ -61,7 +47,7 @@ class PtyLine:
         self.instrument = instrument
         self.path = ""
         self._late_s = late_s
-        self._faults: deque[Fault] = deque()
+        self._faults: deque[InkFault] = deque()
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self._wake: tuple[int, int] = (-1, -1)
@@ -89,7 +75,7 @@ class PtyLine:
                 os.close(end)
         self._wake = (-1, -1)
 
-    def fail(self, *faults: Fault) -> None:
+    def fail(self, *faults: InkFault) -> None:
         """Let the next requests meet these, one each."""
         self._faults.extend(faults)
 
@@ -117,29 +103,29 @@ class PtyLine:
 
     def _meet(self, master: int, request: bytes) -> None:
         fault = self._faults.popleft() if self._faults else None
-        if fault is Fault.UNPLUG:
+        if fault is InkFault.UNPLUG:
             self._stopping.set()
             return
-        reply = None if fault is Fault.DEAF else self.instrument.answer(request)
+        reply = None if fault is InkFault.DEAF else self.instrument.answer(request)
         if reply is None:
             return
         match fault:
-            case Fault.MUTE:
+            case InkFault.MUTE:
                 reply = b""
-            case Fault.GARBAGE:
+            case InkFault.GARBAGE:
                 reply = GARBAGE
-            case Fault.LATE:
+            case InkFault.LATE:
                 self._stopping.wait(self._late_s)
-            case Fault.SPLIT:
+            case InkFault.SPLIT:
                 for index in range(len(reply) - 1):
                     os.write(master, reply[index : index + 1])
                     self._stopping.wait(BYTE_S)
                 reply = reply[-1:]
-            case Fault.DAMAGED:
+            case InkFault.DAMAGED:
                 reply = self.instrument.damage(reply)
-            case Fault.MISTAKEN:
+            case InkFault.MISTAKEN:
                 reply = self.instrument.mistake(reply)
-            case Fault.ECHO:
+            case InkFault.ECHO:
                 reply = request
             case _:
                 pass

@@ -21,7 +21,8 @@ from drivers.errors import (
 from drivers.ink.port import InkRefused
 from drivers.ink.pump import ModbusPump, PumpOptions
 from drivers.protocols import Ink
-from drivers.sim.instruments.ink_station import Fault, PtyLine
+from drivers.sim.faults.kinds import InkFault
+from drivers.sim.instruments.ink_station import PtyLine
 from drivers.sim.instruments.modbus_pump import PumpFirmware
 
 TIMEOUT_S = 0.08
@@ -149,7 +150,7 @@ async def test_a_cancelled_dose_stops_the_pump_however_often_it_is_cancelled(
     dosing = asyncio.create_task(pump.dose(2.0))
     while not firmware.running:
         await asyncio.sleep(0.01)
-    line.fail(Fault.LATE)
+    line.fail(InkFault.LATE)
     for _ in range(times):
         dosing.cancel()
         await asyncio.sleep(0.02)
@@ -174,13 +175,13 @@ async def test_a_cancelled_dose_whose_stop_fails_says_so(firmware: PumpFirmware,
         await pump.close()
 
 
-@pytest.mark.parametrize("fault", [Fault.DEAF, Fault.GARBAGE, Fault.LATE, Fault.MISTAKEN])
+@pytest.mark.parametrize("fault", [InkFault.DEAF, InkFault.GARBAGE, InkFault.LATE, InkFault.MISTAKEN])
 @pytest.mark.parametrize("at", ["start", "stop"])
 async def test_a_fault_anywhere_leaves_the_pump_stopped(
-    fault: Fault, at: str, firmware: PumpFirmware, line: PtyLine, pump: ModbusPump
+    fault: InkFault, at: str, firmware: PumpFirmware, line: PtyLine, pump: ModbusPump
 ):
     before = {"start": 1, "stop": 2}[at]
-    line.fail(*[Fault.SPLIT] * before, fault)
+    line.fail(*[InkFault.SPLIT] * before, fault)
     if at == "stop":
         await pump.dose(0.01)  # the second stop is confirmed
     else:
@@ -194,7 +195,7 @@ async def test_a_fault_anywhere_leaves_the_pump_stopped(
 async def test_closing_in_mid_dose_leaves_the_pump_stopped(firmware: PumpFirmware, line: PtyLine, wait_s: float):
     pump = pump_at(line.path)
     await pump.connect()
-    line.fail(*[Fault.SPLIT] * 3)
+    line.fail(*[InkFault.SPLIT] * 3)
     dosing = asyncio.create_task(pump.dose(0.01))
     await asyncio.sleep(wait_s)
     await pump.close()
@@ -206,7 +207,7 @@ async def test_closing_in_mid_dose_leaves_the_pump_stopped(firmware: PumpFirmwar
 async def test_a_pulled_cable_says_that_the_pump_may_run(line: PtyLine):
     pump = pump_at(line.path)
     await pump.connect()
-    line.fail(Fault.SPLIT, Fault.SPLIT, Fault.UNPLUG)
+    line.fail(InkFault.SPLIT, InkFault.SPLIT, InkFault.UNPLUG)
     with pytest.raises(ConnectionLost, match=r"stop: .*may still be running.*Check cable"):
         await pump.dose(0.01)
     with pytest.raises(ConnectionLost):
@@ -214,7 +215,7 @@ async def test_a_pulled_cable_says_that_the_pump_may_run(line: PtyLine):
 
 
 async def test_a_late_reply_does_not_pass_for_the_next(line: PtyLine, firmware: PumpFirmware, pump: ModbusPump):
-    line.fail(Fault.LATE)
+    line.fail(InkFault.LATE)
     with pytest.raises(DeviceTimeout, match="not started"):
         await pump.dose(0.01)
     await pump.dose(0.01)

@@ -6,6 +6,7 @@ import asyncio
 import math
 import time
 from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
 
 import pytest
 
@@ -19,9 +20,10 @@ from drivers.errors import (
     ProtocolViolation,
 )
 from drivers.ink.port import InkRefused
-from drivers.ink.station import InkStation, StationOptions
+from drivers.ink.station import InkStation, StationOptions, seal, unseal
 from drivers.protocols import Ink
-from drivers.sim.instruments.ink_station import Fault, PtyLine, StationFirmware
+from drivers.sim.faults.kinds import InkFault
+from drivers.sim.instruments.ink_station import PtyLine, StationFirmware
 
 TIMEOUT_S = 0.07
 HELLO = (b"000 identify*6A60\n", b"000 ok ink-station 1 1.0.0 real*8310\n")
@@ -62,26 +64,30 @@ async def station(line: PtyLine) -> AsyncIterator[InkStation]:
 async def test_a_session_reads_like_the_documented_one(expected_protocol):
     exchanges = [
         HELLO,
-        (b"001 lid open*52D3\n", b"001 ok*C626\n"),
-        (b"002 light 0.500*BB62\n", b"002 ok*8226\n"),
-        (b"003 dose 1.250*EC29\n", b"003 ok 1.250*DAEB\n"),
-        (b"004 level*246B\n", b"004 ok 0.730*6174\n"),
-        (b"005 lid close*45F8\n", b"005 ok*F627\n"),
-        (b"006 dose 0.500*B1AA\n", b"006 err 4 reservoir is empty*7BA6\n"),
+        (seal(1, "light 0.500"), seal(1, "ok")),
+        (seal(2, "dose 1.250"), seal(2, "ok 1.250")),
+        (seal(3, "level"), seal(3, "ok 0.730")),
+        (seal(4, "dose 0.500"), seal(4, "err 4 reservoir is empty")),
     ]
     with expected_protocol(exchanges) as path:
         station = station_at(path)
         identity = await station.connect()
         assert (identity.model, identity.firmware, identity.simulated) == ("ink-station", "1.0.0", False)
-        await station.open_lid()
         await station.light(0.5)
         await station.dose(1.25)
         assert await station.level() == 0.73
-        await station.close_lid()
         with pytest.raises(InkRefused, match=r"reservoir is empty.*Nothing was done.*Refill") as refusal:
             await station.dose(0.5)
         assert refusal.value.code == 4
         await station.close()
+
+
+def test_the_documented_transcript_has_the_checksums_of_its_lines():
+    text = (Path(__file__).parents[3] / "docs" / "ink-station.md").read_text()
+    lines = [line[6:] for line in text.splitlines() if line.startswith(("    > ", "    < "))]
+    assert len(lines) >= 10
+    for line in lines:
+        unseal(line.encode())
 
 
 async def test_a_lost_reply_is_asked_for_again_with_the_same_line(expected_protocol):
@@ -156,10 +162,20 @@ async def test_the_loopback_station_says_that_it_is_one(line: PtyLine):
 
 
 @pytest.mark.parametrize(
-    "fault", [Fault.DEAF, Fault.MUTE, Fault.GARBAGE, Fault.LATE, Fault.SPLIT, Fault.DAMAGED, Fault.MISTAKEN, Fault.ECHO]
+    "fault",
+    [
+        InkFault.DEAF,
+        InkFault.MUTE,
+        InkFault.GARBAGE,
+        InkFault.LATE,
+        InkFault.SPLIT,
+        InkFault.DAMAGED,
+        InkFault.MISTAKEN,
+        InkFault.ECHO,
+    ],
 )
 async def test_one_fault_of_any_kind_gives_the_dose_once(
-    fault: Fault, line: PtyLine, firmware: StationFirmware, station: InkStation
+    fault: InkFault, line: PtyLine, firmware: StationFirmware, station: InkStation
 ):
     line.fail(fault)
     await station.dose(1.0)
@@ -170,28 +186,28 @@ async def test_one_fault_of_any_kind_gives_the_dose_once(
 @pytest.mark.parametrize(
     ("fault", "error"),
     [
-        (Fault.DEAF, DeviceTimeout),
-        (Fault.MUTE, DeviceTimeout),
-        (Fault.GARBAGE, ProtocolViolation),
-        (Fault.DAMAGED, ProtocolViolation),
-        (Fault.MISTAKEN, ProtocolViolation),
-        (Fault.ECHO, ProtocolViolation),
+        (InkFault.DEAF, DeviceTimeout),
+        (InkFault.MUTE, DeviceTimeout),
+        (InkFault.GARBAGE, ProtocolViolation),
+        (InkFault.DAMAGED, ProtocolViolation),
+        (InkFault.MISTAKEN, ProtocolViolation),
+        (InkFault.ECHO, ProtocolViolation),
     ],
 )
 async def test_a_fault_that_lasts_is_an_error_in_time_and_the_next_request_works(
-    fault: Fault, error: type[DeviceError], line: PtyLine, firmware: StationFirmware, station: InkStation
+    fault: InkFault, error: type[DeviceError], line: PtyLine, firmware: StationFirmware, station: InkStation
 ):
     line.fail(fault, fault)
     began = time.monotonic()
     with pytest.raises(error, match="may be in the well"):
         await station.dose(1.0)
     assert time.monotonic() - began < 2 * TIMEOUT_S + 0.3
-    assert firmware.well.ml == (10.0 if fault is Fault.DEAF else 11.0)
+    assert firmware.well.ml == (10.0 if fault is InkFault.DEAF else 11.0)
     assert await station.level() == pytest.approx(firmware.well.ml / 20.0)
 
 
 async def test_a_pulled_cable_is_a_lost_connection_at_once_and_stays_one(line: PtyLine, station: InkStation):
-    line.fail(Fault.UNPLUG)
+    line.fail(InkFault.UNPLUG)
     began = time.monotonic()
     with pytest.raises(ConnectionLost, match=r"may be in the well.*Check cable") as lost:
         await station.dose(1.0)
@@ -219,7 +235,7 @@ async def test_a_port_that_somebody_else_holds_is_not_shared(line: PtyLine, stat
 
 
 async def test_closing_ends_an_exchange_that_waits(line: PtyLine, station: InkStation):
-    line.fail(Fault.MUTE, Fault.MUTE)
+    line.fail(InkFault.MUTE, InkFault.MUTE)
     slow = station_at(line.path, timeout_s=30.0)
     await station.close()
     waiting = asyncio.create_task(slow.connect())
@@ -232,7 +248,7 @@ async def test_closing_ends_an_exchange_that_waits(line: PtyLine, station: InkSt
 
 
 async def test_the_event_loop_runs_on_while_the_station_is_silent(line: PtyLine, station: InkStation):
-    line.fail(Fault.MUTE, Fault.MUTE)
+    line.fail(InkFault.MUTE, InkFault.MUTE)
     longest, last = 0.0, time.monotonic()
     asking = asyncio.create_task(station.level())
     while not asking.done():
@@ -245,7 +261,7 @@ async def test_the_event_loop_runs_on_while_the_station_is_silent(line: PtyLine,
 
 
 async def test_a_cancelled_request_does_not_disturb_the_next(line: PtyLine, station: InkStation):
-    line.fail(Fault.LATE)
+    line.fail(InkFault.LATE)
     with pytest.raises(TimeoutError):
         async with asyncio.timeout(0.03):
             await station.light(1.0)
@@ -279,7 +295,7 @@ async def test_the_limit_per_minute_slides_and_counts_what_was_not_confirmed(lin
     await station.connect()
     await station.dose(2.0)
     clock.ns = 30 * 10**9
-    line.fail(Fault.DEAF)
+    line.fail(InkFault.DEAF)
     with pytest.raises(DeviceTimeout):
         await station.dose(2.0)
     with pytest.raises(LimitExceeded, match=r"dose per minute = 5\.500"):
@@ -301,10 +317,10 @@ async def test_a_light_out_of_range_is_refused(firmware: StationFirmware, statio
 
 
 async def test_a_station_refuses_what_it_cannot_do(firmware: StationFirmware, station: InkStation):
-    await station.close_lid()
+    firmware.lid_open = False
     with pytest.raises(InkRefused, match="Open the lid"):
         await station.dose(1.0)
-    await station.open_lid()
+    firmware.lid_open = True
     firmware.well.ml = 19.5
     with pytest.raises(InkRefused, match="overflow"):
         await station.dose(1.0)

@@ -7,10 +7,8 @@ from dataclasses import dataclass, field
 import pytest
 
 from drivers.sim.faults.board import MOST, FaultBoard
-from drivers.sim.faults.kinds import HANDED_OVER, KINDS, REPLIES, STOPS, Device, Fault
+from drivers.sim.faults.kinds import KINDS, REPLIES, STOPS, Device, Fault
 from drivers.sim.faults.phases import Phase
-from drivers.sim.instruments.force_board import Fault as ForceFault
-from drivers.sim.instruments.ink_station import Fault as InkFault
 
 
 @dataclass
@@ -142,10 +140,3 @@ def test_a_board_is_not_filled_without_end(world: Scripted):
         world.board.hang(mute(after_s=1e6))
     with pytest.raises(ValueError, match="hang already"):
         world.board.hang(mute())
-
-
-def test_the_instruments_know_every_kind_that_is_handed_over():
-    names = {Device.INK: set(InkFault.__members__), Device.FORCE: set(ForceFault.__members__)}
-    assert set(names) == HANDED_OVER
-    for device, members in names.items():
-        assert {kind.upper().replace("-", "_") for kind in KINDS[device]} == members

@@ -10,89 +10,89 @@ import pytest
 
 from drivers.clock import HostClock
 from drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation, Stuck
+from drivers.force.rounds import LOOPBACK_CHANNEL
 from drivers.force.sri_m8123 import SriM8123, SriOptions
-from drivers.ink.station import InkStation, StationOptions
+from drivers.ink.station import InkStation, StationOptions, unseal
 from drivers.sim.faults.kinds import Device, Fault
-from drivers.sim.instruments.force_sensor import SimForceSensor
-from drivers.sim.instruments.ink_station import PtyLine, StationFirmware
-from drivers.sim.rig import Faults, LoopbackRig
+from drivers.sim.rig import HOST, Faults, LoopbackRig
 
 
-@pytest.fixture
-async def faults(rig: LoopbackRig) -> AsyncIterator[Faults]:
-    """The rig's servers with two instruments of this test's own."""
-    with (
-        PtyLine(StationFirmware()) as ink,
-        SimForceSensor("faulty board", lambda _: (0.0, 0.0, 1.0, 0.0, 0.0, 0.0), noise_n=0.002) as force,
-    ):
-        faults = Faults(rig.world, rig.arcs, rig.rtde, rig.camera, ink=ink, force=force)
-        faults.line = ink.path  # type: ignore[attr-defined]
-        faults.start()
-        yield faults
-        await faults.stop()
-
-
-async def begun(faults: Faults) -> None:
-    async with asyncio.timeout(2.0):
-        while faults.board.hanging:
+async def begun(rig: LoopbackRig) -> None:
+    async with asyncio.timeout(10.0):
+        while rig.faults.board.hanging:
             await asyncio.sleep(0.005)
 
 
 @pytest.fixture
-async def station(faults: Faults) -> AsyncIterator[InkStation]:
-    station = InkStation(StationOptions(faults.line, timeout_s=0.1), HostClock())  # type: ignore[attr-defined]
+async def station(rig: LoopbackRig) -> AsyncIterator[InkStation]:
+    assert rig.ink is not None
+    station = InkStation(StationOptions(rig.ink.path, timeout_s=0.1), HostClock())
     await station.connect()
     yield station
     await station.close()
 
 
-async def test_garbage_on_the_serial_line_is_asked_again_once(faults: Faults, station: InkStation):
-    faults.hang(Fault(device=Device.INK, kind="garbage"))
-    await begun(faults)
+@pytest.fixture
+async def sensor(rig: LoopbackRig) -> AsyncIterator[SriM8123]:
+    assert rig.force is not None
+    options = SriOptions(
+        "socketcand", LOOPBACK_CHANNEL, host=HOST, port=rig.force.port, stale_after_ms=5000.0, round_ms=500.0
+    )
+    sensor = SriM8123(options, HostClock())
+    await sensor.connect()
+    yield sensor
+    await sensor.close()
+
+
+async def test_garbage_on_the_serial_line_is_asked_again_once(rig: LoopbackRig, station: InkStation):
+    assert rig.ink is not None
+    firmware, asked = rig.ink.instrument, list[bytes]()
+    answer = firmware.answer
+    firmware.answer = lambda request: (asked.append(request), answer(request))[1]  # type: ignore[method-assign]
+    before_ml = rig.world.well.ml
+    rig.faults.hang(Fault(device=Device.INK, kind="garbage"))
+    await begun(rig)
     await station.dose(0.1)
+    assert [unseal(line).text for line in asked] == ["dose 0.100"] * 2
+    assert asked[0] == asked[1], "with the same number, so that the dose is given once"
+    assert rig.world.well.ml - before_ml == pytest.approx(0.1)
 
 
-async def test_garbage_again_ends_the_dose_and_says_what_may_be_in_the_well(faults: Faults, station: InkStation):
-    faults.hang(Fault(device=Device.INK, kind="garbage", count=2))
-    await begun(faults)
+async def test_garbage_again_ends_the_dose_and_says_what_may_be_in_the_well(rig: LoopbackRig, station: InkStation):
+    rig.faults.hang(Fault(device=Device.INK, kind="garbage", count=2))
+    await begun(rig)
     with pytest.raises(ProtocolViolation, match=r"Between 0 and 0\.100 ml may be in the well"):
         await station.dose(0.1)
 
 
 @pytest.mark.parametrize(("kind", "error"), [("mute", DeviceTimeout), ("unplug", ConnectionLost)])
 async def test_a_silent_and_an_unplugged_station_are_told_apart(
-    faults: Faults, station: InkStation, kind: str, error: type[Exception]
+    rig: LoopbackRig, station: InkStation, kind: str, error: type[Exception]
 ):
-    faults.hang(Fault(device=Device.INK, kind=kind, count=2))
-    await begun(faults)
+    rig.faults.hang(Fault(device=Device.INK, kind=kind, count=2))
+    await begun(rig)
     with pytest.raises(error):
         await station.level()
 
 
 async def until_it_fails(sensor: SriM8123) -> None:
-    async with asyncio.timeout(3.0):
+    async with asyncio.timeout(10.0):
         while True:
             sensor.latest()
             await asyncio.sleep(0.005)
 
 
-async def test_a_bus_that_goes_off_is_a_lost_connection_with_what_to_check(faults: Faults):
-    sensor = SriM8123(SriOptions("virtual", "faulty board"), HostClock())
-    await sensor.connect()
-    faults.hang(Fault(device=Device.FORCE, kind="bus-off"))
+async def test_a_bus_that_goes_off_is_a_lost_connection_with_what_to_check(rig: LoopbackRig, sensor: SriM8123):
+    rig.faults.hang(Fault(device=Device.FORCE, kind="bus-off"))
     with pytest.raises(ConnectionLost, match="off after too many errors") as caught:
         await until_it_fails(sensor)
     assert "termination" in caught.value.remedy
-    await sensor.close()
 
 
-async def test_a_sensor_can_be_stuck_for_a_while(faults: Faults):
-    sensor = SriM8123(SriOptions("virtual", "faulty board", stale_after_ms=1000.0), HostClock())
-    await sensor.connect()
-    faults.hang(Fault(device=Device.FORCE, kind="stuck", count=200))
+async def test_a_sensor_can_be_stuck_for_a_while(rig: LoopbackRig, sensor: SriM8123):
+    rig.faults.hang(Fault(device=Device.FORCE, kind="stuck", count=1000))
     with pytest.raises(Stuck, match="exactly alike"):
         await until_it_fails(sensor)
-    await sensor.close()
 
 
 async def test_a_rig_without_the_instrument_refuses_its_faults(rig: LoopbackRig):

@@ -1,4 +1,4 @@
-"""A force board on python-can's `virtual` bus, for tests within one process.
+"""A force board on python-can's `virtual` bus, which ends within this process.
 
 `virtual` only: it ends within this process. `udp_multicast` would leave the host by whichever network interface
 the system picks, and whoever is on that network could feed forces to a rig.
@@ -15,9 +15,8 @@ from typing import Self
 import can
 
 from drivers.force.rounds import Wrench
-from drivers.sim.instruments.force_board import CanFrame, Fault, ForceBoard
-
-__all__ = ["Fault", "SimForceSensor"]
+from drivers.sim.faults.kinds import ForceFault
+from drivers.sim.instruments.force_board import CanFrame, ForceBoard
 
 
 class SimForceSensor:
@@ -63,7 +62,7 @@ class SimForceSensor:
         if self._thread is not None:
             self._thread.join()
 
-    def fail(self, *faults: Fault) -> None:
+    def fail(self, *faults: ForceFault) -> None:
         """Let the next rounds meet these, one each."""
         self.board.fail(*faults)
 
