@@ -18,8 +18,6 @@ import calibrate.loop.cli
 import calibrate.validate.cli
 import calibrate.writing.cli
 import calibrate.writing.plan_cli
-import collect.chains.loop_cli
-import collect.chains.writing_cli
 import collect.cli
 import model.train.cli
 import sessions.cli
@@ -28,13 +26,13 @@ from sessions.terminal import plain, say
 
 
 class OptionRefused(Exception):
-    """A number given on the command line is none, or lies outside its range."""
+    """A number on the command line is not a number, or lies outside its range."""
 
     exit_code = 2
 
 
 class FrontDoor(TyperGroup):
-    """Says of such a number what was given and what is allowed; typer names one end of the range, also for `nan`."""
+    """Names the number given and both ends of its range; typer itself names one end, also for `nan`."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command. Raises `OptionRefused`."""
@@ -43,11 +41,11 @@ class FrontDoor(TyperGroup):
         except typer.BadParameter as error:
             param, cause = error.param, error.__cause__
             ends = {word: getattr(param, name, None) for word, name in (("from", "min"), ("to", "max"))}
-            words = " ".join(f"{word} {end:g}" for word, end in ends.items() if end is not None)
-            if param is None or cause is None or not words:
+            allowed = " ".join(f"{word} {end:g}" for word, end in ends.items() if end is not None)
+            if param is None or cause is None or not allowed:
                 raise
             given = cast("Any", cause).errors()[0]["input"]  # pydantic's, which typer asks
-            raise OptionRefused(f"{param.opts[-1]} is {given!r}, allowed: a number {words}") from None
+            raise OptionRefused(f"{param.opts[-1]} is {given!r}, allowed: a number {allowed}") from None
 
 
 app = typer.Typer(
@@ -67,7 +65,7 @@ loop = typer.Typer(
     cls=PathOrCommand,
     help="Recover the presses of a SESSION, press them again and compare (`brushloop loop SESSION`), or only compare.",
 )
-loop.command("session")(collect.chains.loop_cli.loop)
+loop.command("session")(collect.cli.loop)
 loop.command("compare")(calibrate.loop.cli.compare)
 app.add_typer(loop, name="loop")
 app.add_typer(sessions.cli.app, name="sessions")
@@ -75,7 +73,7 @@ write = typer.Typer(
     cls=PathOrCommand,
     help="Write characters on the rig and compare them (`brushloop write 字 --config ...`), or only plan or compare.",
 )
-write.command("characters")(collect.chains.writing_cli.write)
+write.command("characters")(collect.cli.write)
 write.command("plan")(calibrate.writing.plan_cli.plan)
 write.command("compare")(calibrate.writing.cli.compare)
 write.command("learn")(calibrate.writing.cli.learn)
@@ -90,7 +88,7 @@ def sim(
     seed: Annotated[int, typer.Option(min=0, help="Seed of brush, presses and noise.")] = 1,
     arcs_port: Annotated[int, typer.Option(min=0, max=65535, help="Controller port; 0: any.")] = 0,
     camera_port: Annotated[int, typer.Option(min=0, max=65535, help="Camera port; 0: any.")] = 0,
-    idle_exit: Annotated[float, typer.Option(min=0, help="End after so many seconds without clients; 0 never.")] = 0.0,
+    idle_exit: Annotated[float, typer.Option(min=0, help="End after so many seconds without clients; 0: never.")] = 0.0,
     faults: Annotated[Path | None, typer.Option(help="A script of faults, faults.toml.")] = None,
     control: Annotated[Path | None, typer.Option(help="Make a control socket here, for `brushloop fault`.")] = None,
 ) -> None:
@@ -109,19 +107,19 @@ def sim(
 @app.command()
 def fault(
     control: Annotated[Path, typer.Argument(help="Control socket of a rig: `brushloop sim --control PATH`.")],
-    what: Annotated[str, typer.Argument(help="A device to break, or list, clear, state, release, fresh-sheet.")],
+    what: Annotated[str, typer.Argument(help="Device to break, or list, clear, state, release, fresh-sheet.")],
     kind: Annotated[str | None, typer.Argument(help="How it breaks: mute, late, black, bus-off, ...")] = None,
     after_s: Annotated[float | None, typer.Option(help="Not before this simulated time.")] = None,
-    on: Annotated[str | None, typer.Option(help="Only on this method of the robot's, as moveLine.")] = None,
+    on: Annotated[str | None, typer.Option(help="Only on this method of the robot, such as moveLine.")] = None,
     nth: Annotated[int | None, typer.Option(help="From the n-th request, push or frame on.")] = None,
-    phase: Annotated[str | None, typer.Option(help="Begin while the arm does this, as descending.")] = None,
+    phase: Annotated[str | None, typer.Option(help="Begin while the arm does this, such as descending.")] = None,
     press: Annotated[int | None, typer.Option(help="Begin while so many presses lie on the paper.")] = None,
-    count: Annotated[int | None, typer.Option(help="Strike so often.")] = None,
-    for_s: Annotated[float | None, typer.Option(help="Strike for so many real seconds.")] = None,
-    late_s: Annotated[float | None, typer.Option(help="How late a late reply comes, in real seconds.")] = None,
-    ident: Annotated[int | None, typer.Option("--id", help="Which fault to clear; all without.")] = None,
+    count: Annotated[int | None, typer.Option(help="Occur so many times.")] = None,
+    for_s: Annotated[float | None, typer.Option(help="Last for so many real seconds.")] = None,
+    late_s: Annotated[float | None, typer.Option(help="Delay of a late reply, in real seconds.")] = None,
+    ident: Annotated[int | None, typer.Option("--id", help="Fault to clear; all of them by default.")] = None,
 ) -> None:
-    """Break a device of a loopback rig that runs, look at what hangs, or be the person at its pendant."""
+    """Break a device of a running loopback rig, list its faults, or act as the person at its pendant."""
     from json import dumps
 
     from drivers.sim.fault_client import ask, request_of
@@ -138,7 +136,7 @@ def demo(
     rate: Annotated[float, typer.Option(min=0.01, max=1000, help="Simulated seconds per real second.")] = 20.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the rig and of the order of presses.")] = 1,
 ) -> None:
-    """Collect, calibrate and validate a short session on the loopback rig; run again, it goes on where it stopped."""
+    """Collect, calibrate and validate a short session on the loopback rig. Run again, it goes on where it stopped."""
     from collect.chains.demo import run_demo
 
     if code := run_demo(out, repeats, rate, seed):
@@ -146,26 +144,26 @@ def demo(
 
 
 def main() -> None:
-    """Run the app; an error of ours is one line on stderr and its exit code, anything else a traceback."""
+    """Run the app; an error with an exit code becomes one line on stderr, any other a traceback."""
     try:
         if len(sys.argv) == 1 and sys.stdin.isatty() and sys.stdout.isatty():
             collect.cli.browse()
         else:
             app()
     except Exception as error:
-        code, said = getattr(error, "exit_code", None), str(error)
+        code, message = getattr(error, "exit_code", None), str(error)
         if code is None and isinstance(error, OSError) and error.filename:
-            # A path of the user's that cannot be read or written is no defect of ours.
-            code, said = 2, f"{error.filename}: {error.strerror}"
+            # A path given by the user that cannot be read or written is no defect.
+            code, message = 2, f"{error.filename}: {error.strerror}"
         if isinstance(code, int):
-            words = " ".join(["brushloop:", said, *getattr(error, "__notes__", [])])
+            words = " ".join(["brushloop:", message, *getattr(error, "__notes__", [])])
         else:
-            code, words = 1, format_exc().rstrip()  # a defect of ours
+            code, words = 1, format_exc().rstrip()  # a defect
         try:
-            # A configuration that changed is told line by line.
+            # A changed configuration is listed in several lines.
             sys.stderr.write(plain(words, keep="\n") + "\n")
         except OSError:
-            sys.stderr = None  # the terminal is gone; Python would try again at its exit, and change the code
+            sys.stderr = None  # the terminal is gone; Python would write again at its exit, and change the exit code
         sys.exit(code)
 
 

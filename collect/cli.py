@@ -1,4 +1,7 @@
-"""`brushloop collect`: runs a protocol, on the Textual screen or with a progress bar; `collect plan` only walks it."""
+"""The commands `collect`, `collect plan`, `doctor`, `loop` and `write`, and the start screen.
+
+Imports wait until a command runs, so that `--help` loads nothing heavy.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,12 @@ if TYPE_CHECKING:
 app = typer.Typer(invoke_without_command=True, pretty_exceptions_enable=False)
 
 
+Rig = Annotated[Path, typer.Option(help="The rig: addresses, frames, limits.")]
+Arm = Annotated[bool, typer.Option("--arm", help="Let real hardware move.")]
+Tui = Annotated[bool | None, typer.Option("--tui/--no-tui", help="Screen; by default where there is a terminal.")]
+NewSheet = Annotated[int | None, typer.Option(min=1, help="Sheet N of the new session is in, as for collect.")]
+
+
 @app.callback()
 def collect(
     ctx: typer.Context,
@@ -27,14 +36,12 @@ def collect(
         int | None,
         typer.Option(min=1, help="Sheet N of the session is in: confirms a fresh one. Repeating it is safe."),
     ] = None,
-    arm: Annotated[bool, typer.Option("--arm", help="Let real hardware move.")] = False,
+    arm: Arm = False,
     dry_run: Annotated[
         float | None,
         typer.Option(help="Only move, lifted by so many mm: nothing is pressed, dipped or kept."),
     ] = None,
-    tui: Annotated[
-        bool | None, typer.Option("--tui/--no-tui", help="Screen; by default where there is a terminal.")
-    ] = None,
+    tui: Tui = None,
     set_up: Annotated[
         bool, typer.Option("--set-up", help="On the screen: accept what each set-up step measured, or measure again.")
     ] = False,
@@ -43,7 +50,7 @@ def collect(
         typer.Option(help="Camera on the screen: half-cells; auto: pixels where the terminal has them."),
     ] = "cells",
     live: Annotated[bool, typer.Option("--live", help="Let a Foxglove viewer on this machine look on.")] = False,
-    live_port: Annotated[int, typer.Option(min=0, max=65535, help="Where it listens; 0: any.")] = 8765,
+    live_port: Annotated[int, typer.Option(min=0, max=65535, help="Port that it listens on; 0: any.")] = 8765,
 ) -> None:
     """Collect strokes. Ctrl-C stops the arm; the same command goes on where it stopped."""
     if ctx.invoked_subcommand is not None:
@@ -88,7 +95,7 @@ def browse() -> None:
 
 @app.command()
 def plan(
-    config: Annotated[Path, typer.Option(help="The rig: addresses, frames, limits.")],
+    config: Rig,
     protocol: Annotated[Path, typer.Option(help="What would be done.")],
     picture: Annotated[
         Path | None, typer.Option(help="Draw the sheets into this file: .png, .svg, .pdf or .jpg.")
@@ -140,8 +147,8 @@ def plan(
 
 
 def doctor(
-    config: Annotated[Path, typer.Option(help="The rig: addresses, frames, limits.")],
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object a device.")] = False,
+    config: Rig,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object per device.")] = False,
 ) -> None:
     """Ask every configured device who it is and what is wrong. Powers nothing and moves nothing."""
     import asyncio
@@ -160,3 +167,74 @@ def doctor(
         say(doctor_table(findings))
     if not all(finding.well for finding in findings):
         raise typer.Exit(4)
+
+
+def loop(
+    session: Annotated[Path, typer.Argument(help="The session whose presses are recovered and made again.")],
+    config: Rig,
+    out: Annotated[Path | None, typer.Option(help="Folder for what the loop makes; <session>/loop by default.")] = None,
+    fit: Annotated[Path | None, typer.Option(help="Brush fit; the one in use, or made, by default.")] = None,
+    repeats: Annotated[int, typer.Option(min=1, max=100, help="How often each is pressed again.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the order.")] = 1,
+    sheet: NewSheet = None,
+    arm: Arm = False,
+    tui: Tui = None,
+) -> None:
+    """Recover every press from its image, press it again, compare. The same command goes on where it stopped."""
+    from collect.chains.commands import CommandFailed
+    from collect.chains.loop import LoopRequest, run_loop
+    from sessions.reader import Recording
+
+    options = _collect_options(arm=arm, tui=tui)
+    options += [] if sheet is None else ["--sheet", str(sheet)]
+    folder = out if out is not None else Recording(session).path.parent / "loop"
+    try:
+        run_loop(LoopRequest(session, config, folder, fit, repeats, seed, tuple(options)), say)
+    except CommandFailed as error:
+        raise typer.Exit(error.exit_code) from None  # the command has printed why
+
+
+def write(
+    what: Annotated[str, typer.Argument(help="Characters (字 子 永 are shipped), or a .csv or .json trajectory.")],
+    config: Rig,
+    out: Annotated[Path, typer.Option(help="Folder for the plan and the report.")] = Path("written"),
+    sessions: Annotated[Path, typer.Option(help="Folder that holds sessions.")] = Path("sessions"),
+    count: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written.")] = 10,
+    learn: Annotated[int, typer.Option(min=0, max=20, help="Rounds of correcting the plan by its own ink first.")] = 0,
+    learn_count: Annotated[int, typer.Option(min=1, max=100, help="How often each is written in such a round.")] = 2,
+    data: Annotated[Path | None, typer.Option(help="hanzi-writer folder or makemeahanzi graphics.txt.")] = None,
+    reference: Annotated[list[str] | None, typer.Option(help="字=picture.png: compare with this picture.")] = None,
+    cell_mm: Annotated[float, typer.Option(min=10, max=500, help="Side of the character's paper cell.")] = 70.0,
+    speed_mm_s: Annotated[float, typer.Option(min=1, max=100, help="Speed of the tip.")] = 15.0,
+    sheet: NewSheet = None,
+    arm: Arm = False,
+    tui: Tui = None,
+) -> None:
+    """Plan characters, write them on the rig, compare with simulation and reference. The same command goes on."""
+    from collect.chains.commands import CommandFailed
+    from collect.chains.writing import Writing, WritingRequest
+
+    plan_options = ["--cell-mm", str(cell_mm), "--speed-mm-s", str(speed_mm_s)]
+    plan_options += [] if data is None else ["--data", str(data)]
+    request = WritingRequest(
+        what=what,
+        config=config,
+        out=out,
+        sessions=sessions,
+        count=count,
+        learn=learn,
+        learn_count=learn_count,
+        sheet=sheet,
+        plan_options=tuple(plan_options),
+        references=tuple(reference or ()),
+        collect_options=tuple(_collect_options(arm=arm, tui=tui)),
+    )
+    try:
+        Writing(request, say).run()
+    except CommandFailed as error:
+        raise typer.Exit(error.exit_code) from None  # the command has printed why
+
+
+def _collect_options(*, arm: bool, tui: bool | None) -> list[str]:
+    """Options of a chain that are passed on to `brushloop collect`."""
+    return ["--arm"] * arm + ([] if tui is None else ["--tui" if tui else "--no-tui"])

@@ -1,4 +1,4 @@
-"""The demo: the real commands, in order, against the loopback rig in a process of its own.
+"""`brushloop demo`: the real commands, in order, against a loopback rig in a process of its own.
 
 Everything lies under one folder. Killed anywhere and started again, it goes on where it stopped: the rig's process
 outlives the demo by a minute, as a real sheet of paper would.
@@ -25,10 +25,10 @@ IDLE_EXIT_S = 60.0
 
 
 def run_demo(out: Path, repeats: int, rate: float, seed: int) -> int:
-    """Collect, calibrate, fit, validate under `out`; prints the path of the report and of the MCAP at the end.
+    """Collect, calibrate, fit and validate under `out`; at the end print the paths of the report and of the MCAP.
 
-    Returns the exit code: 3 where the collection left strokes out. A session without its report is gone on with; only
-    after one that has it is a new one begun.
+    Returns the exit code: 3 where the collection left strokes out. A session without a report is continued; a new one
+    is begun only once the last one has its report.
     """
     out.mkdir(parents=True, exist_ok=True)
     rig_toml, protocol_toml, sessions = out / "rig.toml", out / "protocol.toml", out / "sessions"
@@ -69,7 +69,7 @@ def _report(session: Path) -> Path:
 
 
 def _serving(rig_toml: Path, rate: float, seed: int, *, fresh: bool) -> subprocess.Popen[bytes] | None:
-    """The rig of an earlier demo where it still serves and has a session to finish, else a new one."""
+    """Start a rig, unless that of an earlier demo still serves and has a session to finish: then None."""
     arcs_port, camera_port = _free_port(), _free_port()
     if rig_toml.exists() and not fresh:
         known = load_rig(rig_toml)
@@ -79,7 +79,7 @@ def _serving(rig_toml: Path, rate: float, seed: int, *, fresh: bool) -> subproce
     log = (rig_toml.parent / "rig.log").open("ab")
     command = [sys.executable, "-m", "brushloop", "sim", "--write-rig", str(rig_toml), "--rate", str(rate)]
     command += ["--seed", str(seed), "--arcs-port", str(arcs_port), "--camera-port", str(camera_port)]
-    # In a session of its own: Ctrl-C at the demo must not pull the paper away from under the arm.
+    # In a process session of its own: Ctrl-C at the demo must not end the rig under the arm.
     with log:
         process = subprocess.Popen(
             [*command, "--idle-exit", str(IDLE_EXIT_S)],
