@@ -46,7 +46,10 @@ def run_headless(engine: RunnableEngine) -> None:
             with contextlib.suppress(OSError, SystemExit):
                 _show(engine)
         finally:
-            _end(engine)
+            # Nobody watches any more.
+            if not engine.finished:
+                engine.stop()
+            engine.join()
 
 
 def _show(engine: RunnableEngine) -> None:
@@ -80,13 +83,6 @@ def _show(engine: RunnableEngine) -> None:
             if over:
                 return
             time.sleep(REFRESH_S)
-
-
-def _end(engine: RunnableEngine) -> None:
-    """Wait for the end; an engine that still runs is stopped first, as nobody watches it any more."""
-    if not engine.finished:
-        engine.stop()
-    engine.join()
 
 
 def eta_text(now: Snapshot) -> str:

@@ -1,12 +1,14 @@
-"""What chains of commands share: running another brushloop command, and finding the session that it finished."""
+"""What chains of commands share: running another brushloop command, and finding or making a finished session."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from calibrate.artefact import artefacts
+from collect.errors import ConfigError
 from collect.protocols.files import load_protocol
 from sessions.errors import SessionError
 from sessions.reader import Recording
@@ -59,6 +61,23 @@ def finished_session(root: Path, protocol: Path) -> Path | None:
         except SessionError:
             continue  # open, damaged, or no session
     return max(found, key=lambda path: (path / f"{path.name}.mcap").stat().st_mtime_ns, default=None)
+
+
+def collected_session(say: Say, config: Path, protocol: Path, root: Path, options: Sequence[str | Path]) -> Path:
+    """The finished and calibrated session of this protocol under `root`; collect and calibrate it where it is missing.
+
+    Raises `ConfigError`, `CommandFailed`.
+    """
+    session = finished_session(root, protocol)
+    if session is None:
+        files = ("--config", config, "--protocol", protocol, "--out", root)
+        run_command(say, "collect", *files, *options, accepts=(0, GIVEN_UP))
+        session = finished_session(root, protocol)
+    if session is None:
+        raise ConfigError(root, "", f"holds no finished session of {protocol}, though collection ended")
+    if not artefacts(session):
+        run_command(say, "calibrate", session)
+    return session
 
 
 def ending(folder: Path, kind: str) -> str:

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from calibrate.artefact import artefacts, current
 from calibrate.files import read_bounded, write_whole
-from collect.chains.commands import GIVEN_UP, Say, finished_session, run_command
+from collect.chains.commands import Say, collected_session, run_command
 from collect.errors import ConfigError
 from collect.rig.config import RigConfig, load_rig
 from sessions.reader import Recording
@@ -61,15 +61,7 @@ def run_loop(request: LoopRequest, say: Say) -> Path:
     )
     keep_settings(settings, request.out)
     protocol = _recover(request, folder, fit, settings, say)
-    again = finished_session(root, protocol)
-    if again is None:
-        options = ("--config", request.config, "--protocol", protocol, "--out", root, *request.collect_options)
-        run_command(say, "collect", *options, accepts=(0, GIVEN_UP))
-        again = finished_session(root, protocol)
-    if again is None:
-        raise ConfigError(root, "", "holds no finished session of the replay, though collection ended")
-    if not artefacts(again):
-        run_command(say, "calibrate", again)
+    again = collected_session(say, request.config, protocol, root, request.collect_options)
     run_command(say, "loop", "compare", folder, again, "--fit", fit, "--out", request.out)
     return request.out / PAGE
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibrate.artefact import artefacts
-from collect.chains.commands import GIVEN_UP, Say, finished_session, run_command
+from collect.chains.commands import Say, collected_session, finished_session, run_command
 from collect.errors import ConfigError
 from collect.protocols.config import WriteConfig
 from collect.protocols.files import load_protocol
@@ -90,22 +89,14 @@ class Writing:
 
     def _written(self, protocol: Path) -> Path:
         """The finished and calibrated session of a plan."""
-        request = self._request
-        session = finished_session(request.sessions, protocol)
-        if session is None:
-            options = ["--config", str(request.config), "--protocol", str(protocol), "--out", str(request.sessions)]
-            options += [] if self._sheet is None else ["--sheet", str(self._sheet)]
+        request, options = self._request, list(self._request.collect_options)
+        if self._sheet is not None and finished_session(request.sessions, protocol) is None:
+            options += ["--sheet", str(self._sheet)]
             self._sheet = None  # used up: the next session asks again
-            self._do("collect", *options, *request.collect_options, accepts=(0, GIVEN_UP))
-            session = finished_session(request.sessions, protocol)
-        if session is None:
-            raise ConfigError(request.sessions, "", "holds no finished session of the plan, though collection ended")
-        if not artefacts(session):
-            self._do("calibrate", session)
-        return session
+        return collected_session(self._say, request.config, protocol, request.sessions, options)
 
-    def _do(self, *arguments: str | Path, accepts: tuple[int, ...] = (0,)) -> None:
-        run_command(self._say, *arguments, accepts=accepts)
+    def _do(self, *arguments: str | Path) -> None:
+        run_command(self._say, *arguments)
 
 
 def _check_plan(path: Path, request: WritingRequest, repeats: int) -> None:
