@@ -16,11 +16,13 @@ import pytest
 
 from collect.engine.engine import Engine
 from collect.engine.opening import Opening, find_resumable, open_store
+from drivers.arcs.rpc import RpcConnection
 from drivers.clock import HostClock
 from drivers.sim.brush.flaws import Flaw
 from drivers.sim.config import SimConfig, Table, View
 from drivers.sim.rig import LoopbackRig
 
+OPTIONS = ("--out", "--config", "--protocol")
 SMALL_VIEW = View(width_px=512, height_px=384, px_per_mm=1.56, fps=50.0)
 SMALL_TABLE = Table(
     sheet_mm=(110.0, 80.0),
@@ -34,6 +36,15 @@ SHARP_VIEW = View(width_px=1024, height_px=832, px_per_mm=6.25, centre_mm=(55.0,
 """Of the small table, as sharp as the camera is by default: a quarter of its pixels."""
 
 
+RPC_TIMEOUT_S = 10.0
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The simulated cabinet may have to wait for its turn on a busy machine, and has ten times as long to answer."""
+    monkeypatch.setitem(RpcConnection.__init__.__kwdefaults__, "timeout_s", RPC_TIMEOUT_S)
+
+
 @contextmanager
 def serving(config: SimConfig) -> Iterator[LoopbackRig]:
     """The rig serves from another thread's event loop until the block ends."""
@@ -45,7 +56,7 @@ def serving(config: SimConfig) -> Iterator[LoopbackRig]:
             ready.set_result((rig, asyncio.get_running_loop(), over))
             await over.wait()
 
-    thread = threading.Thread(target=lambda: asyncio.run(serve()), name="loopback rig")
+    thread = threading.Thread(target=lambda: asyncio.run(serve()), name="loopback rig", daemon=True)
     thread.start()
     rig, loop, over = ready.result(timeout=30)
     try:
@@ -85,29 +96,66 @@ class Lab:
 
     def process(self) -> subprocess.Popen[str]:
         """`brushloop collect` as an operator starts it, without a screen."""
-        command = [sys.executable, "-m", "brushloop", "collect", "--no-tui", "--out", str(self.sessions)]
-        command += ["--config", str(self.folder / "rig.toml"), "--protocol", str(self.folder / "protocol.toml")]
+        command = [sys.executable, "-m", "brushloop", "collect", "--no-tui", *self.options]
         self.processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
         return self.processes[-1]
 
-    def write_protocol(self, heights: str = "[11.0, 15.0]", tilts: str = "[0.0, 10.0]", repeats: int = 1) -> None:
+    @property
+    def options(self) -> list[str]:
+        """Of `brushloop collect`: where its files lie."""
+        paths = (self.sessions, self.folder / "rig.toml", self.folder / "protocol.toml")
+        return [word for option, path in zip(OPTIONS, paths, strict=True) for word in (option, str(path))]
+
+    def write_protocol(self, heights: str = "[11.0, 15.0]", tilts: str = "[0.0]", repeats: int = 1) -> None:
+        """A grid; two strokes unless more are asked for."""
         text = f'kind = "grid"\nheights_mm = {heights}\ntilts_deg = {tilts}\nrepeats = {repeats}\ndwell_s = 0.0\n'
         (self.folder / "protocol.toml").write_text(text, encoding="utf-8")
 
 
-@pytest.fixture
-def lab(tmp_path: Path) -> Iterator[Lab]:
+@contextmanager
+def coarse(folder: Path) -> Iterator[Lab]:
+    """A camera too coarse to judge ink by, and two strokes."""
     with serving(SimConfig(rate=60.0, view=SMALL_VIEW)) as rig:
-        made = Lab(rig, tmp_path)
+        made = Lab(rig, folder)
         text = rig.toml().replace("latency_ms = 250.0", "latency_ms = 60.0")
-        # Its camera is too coarse to judge ink by.
         text += "\n[quality]\nenabled = false\n"
-        (tmp_path / "rig.toml").write_text(text.replace("[force]", "[force]\nbias_s = 0.25"), encoding="utf-8")
+        (folder / "rig.toml").write_text(text.replace("[force]", "[force]\nbias_s = 0.25"), encoding="utf-8")
         made.write_protocol()
         yield made
         for process in made.processes:
             process.kill()
             process.communicate()
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Iterator[Lab]:
+    with coarse(tmp_path) as made:
+        yield made
+
+
+@dataclass
+class Collected:
+    """A session of four strokes, from its beginning to its end."""
+
+    lab: Lab
+    """Its rig has ended; the world remembers what was pressed."""
+    engine: Engine
+
+    @property
+    def folder(self) -> Path:
+        [folder] = self.lab.sessions.iterdir()
+        return folder
+
+
+@pytest.fixture(scope="session")
+def collected(tmp_path_factory: pytest.TempPathFactory) -> Collected:
+    """For whoever only looks at what a run leaves; nobody writes into it."""
+    with coarse(tmp_path_factory.mktemp("collected")) as lab:
+        lab.write_protocol(tilts="[0.0, 10.0]")
+        engine = lab.engine()
+        engine.start()
+        engine.join()
+    return Collected(lab, engine)
 
 
 @pytest.fixture

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 from typing import TYPE_CHECKING
 
@@ -15,6 +13,7 @@ from collect.errors import ConfigError
 from drivers.arcs.codes import SafetyMode
 from drivers.errors import RobotNotSafe
 from tests.collect.until import wait_for_end
+from tests.command import brushloop
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -109,9 +108,7 @@ def test_a_refilled_reservoir_lets_the_run_go_on(lab: Lab) -> None:
 def test_a_dry_run_moves_all_the_way_and_leaves_neither_ink_nor_session(lab: Lab) -> None:
     lab.write_protocol("[11.0, 20.0]", "[0.0, 10.0]")
     well_ml = lab.rig.world.well.ml
-    command = [sys.executable, "-m", "brushloop", "collect", "--no-tui", "--out", str(lab.sessions), "--dry-run", "30"]
-    command += ["--config", str(lab.folder / "rig.toml"), "--protocol", str(lab.folder / "protocol.toml")]
-    ran = subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
+    ran = brushloop("collect", "--no-tui", "--dry-run", "30", *lab.options)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout == "dry run done; nothing was kept\n"
     assert "dry run: nothing is pressed, dipped or kept" in ran.stderr

@@ -21,7 +21,7 @@ from tests.collect.until import wait_for_end
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from conftest import Lab
+    from conftest import Collected, Lab
 
     from collect.engine.engine import Engine
 
@@ -54,15 +54,13 @@ def at_rest(lab: Lab) -> bool:
     return world.motion.steady(world.clock.now_s() + 1.0)
 
 
-def test_force_ink_and_their_cadence_are_recorded_beside_the_poses(lab: Lab) -> None:
-    run(lab.engine())
-
-    folder = only_session(lab)
+def test_force_ink_and_their_cadence_are_recorded_beside_the_poses(collected: Collected) -> None:
+    folder = collected.folder
     with (folder / f"{folder.name}.mcap").open("rb") as file:
         seen = Counter(channel.topic for _, channel, _ in make_reader(file, validate_crcs=True).iter_messages())
     assert min(seen[topic] for topic in (Topic.TCP, Topic.JOINTS, Topic.WRENCH, Topic.CADENCE)) > 10
     assert seen[Topic.INK] == 4
-    peaks_n = [line["result"]["peak_force_n"] for line in done(lab, "press")]
+    peaks_n = [line["result"]["peak_force_n"] for line in done(collected.lab, "press")]
     assert len(peaks_n) == 4
     assert all(0.02 < peak_n < 0.5 for peak_n in peaks_n)
 

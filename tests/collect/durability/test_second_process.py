@@ -33,14 +33,15 @@ def where(rig: LoopbackRig) -> dict[str, str]:
 
 def test_a_session_that_is_open_elsewhere_is_refused_before_anything_is_powered(lab: Lab) -> None:
     lab.write_protocol(repeats=4)
+    protocol = lab.folder / "protocol.toml"  # each press takes a second: the first run outlives the second's start
+    protocol.write_text(protocol.read_text().replace("dwell_s = 0.0", "dwell_s = 60.0"))
     first = lab.process()
     deadline = time.monotonic() + 60
     while len(lab.rig.world.presses) < 2:
         assert time.monotonic() < deadline
         time.sleep(0.01)
     with serving(SimConfig(rate=60.0, view=SMALL_VIEW)) as rig:
-        command = [sys.executable, "-m", "brushloop", "collect", "--no-tui", "--out", str(lab.sessions)]
-        command += ["--config", str(lab.folder / "rig.toml"), "--protocol", str(lab.folder / "protocol.toml")]
+        command = [sys.executable, "-m", "brushloop", "collect", "--no-tui", *lab.options]
         second = subprocess.run(
             command, env={**os.environ, **where(rig)}, capture_output=True, text=True, timeout=60, check=False
         )

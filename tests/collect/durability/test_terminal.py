@@ -72,7 +72,7 @@ def read_until(end: int, condition: Callable[[], bool]) -> None:
 def test_a_terminal_that_is_closed_stops_the_arm_and_the_same_command_goes_on(lab: Lab, option: str) -> None:
     with terminal() as (ours, theirs):
         process = in_terminal(lab, theirs, option)
-        read_until(ours, lambda: len(lab.rig.world.presses) >= 2)
+        read_until(ours, lambda: len(lab.rig.world.presses) >= 1)
         os.close(ours)
         assert process.wait(timeout=30) == 4
     still = lab.rig.world.tool()
@@ -84,5 +84,5 @@ def test_a_terminal_that_is_closed_stops_the_arm_and_the_same_command_goes_on(la
     again = lab.process()
     _, stderr = again.communicate(timeout=60)
     assert again.returncode == 0, stderr
-    assert len({capture.stroke.stroke_id for capture in Recording(folder).captures()}) == 4
+    assert len({capture.stroke.stroke_id for capture in Recording(folder).captures()}) == 2
     assert verify_session(folder).sound

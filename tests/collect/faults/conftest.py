@@ -98,7 +98,7 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
             ready.set_result((rig, asyncio.get_running_loop(), over))
             await over.wait()
 
-    thread = threading.Thread(target=lambda: asyncio.run(serve()), name="loopback rig")
+    thread = threading.Thread(target=lambda: asyncio.run(serve()), name="loopback rig", daemon=True)
     thread.start()
     rig, loop, over = ready.result(timeout=30)
     text = rig.toml().replace("latency_ms = 250.0", f"latency_ms = 60.0\ntimeout_s = {CAMERA_TIMEOUT_S}")

@@ -17,11 +17,13 @@ from drivers.sim.config import SimConfig, View
 from drivers.sim.rig import LoopbackRig
 
 MOST_PRESSES = 100
+VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125, fps=10.0)
+"""Half as sharp as the camera is by default: sharp enough to judge by."""
 
 
 async def serve(path: Path, rate: float) -> None:
     """Write rig.toml, say so, and serve until the input ends."""
-    async with LoopbackRig(SimConfig(rate=rate, view=View(fps=10.0))) as rig:
+    async with LoopbackRig(SimConfig(rate=rate, view=VIEW)) as rig:
         rig.world.flaws.update(dict.fromkeys(range(MOST_PRESSES), (Flaw.SPLIT, 0.0)))
         path.write_text(rig.toml(), encoding="utf-8")
         asked = await lines_of_input()
