@@ -18,10 +18,9 @@ from calibrate.compare.field import Field
 from calibrate.errors import CalibrationError
 from calibrate.files import read_gray, write_whole
 from calibrate.session import calibration_of
+from calibrate.stages import Trace, contact_sheet, trace_scaled, trace_seen
 from calibrate.stroke.difference import new_stroke
 from calibrate.stroke.params import Params
-from calibrate.stroke.picture import contact_sheet
-from calibrate.stroke.stages import Trace, trace_scaled, trace_seen
 from sessions.imports.sequence import SEQUENCE
 from sessions.reader import Capture, Recording
 from sessions.recording.messages import decode_gray

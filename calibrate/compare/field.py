@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from calibrate.compare.scales import MM_PER_PX
 from calibrate.errors import CaptureRefused
-from calibrate.stroke.preprocess import PX_PER_MM, Prepared
+from calibrate.stroke.params import PX_PER_MM
+from calibrate.stroke.preprocess import Prepared
 
 Image = NDArray[np.float32]
 SIZE_PX = 128
@@ -73,6 +74,12 @@ class Field:
         """Column and row on the 20 px/mm raster at which the field around an anchor there begins."""
         left, top = self.anchor_mm
         return round(anchor_px[0] - left * PX_PER_MM), round(anchor_px[1] - top * PX_PER_MM)
+
+    def corner_around_px(self, mask: NDArray[np.bool_]) -> tuple[int, int]:
+        """The same for a stroke without an anchor: the field lies around the middle of the stroke's box."""
+        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        side = round(self.side_mm * PX_PER_MM)
+        return int(columns[0] + columns[-1] + 1 - side) // 2, int(rows[0] + rows[-1] + 1 - side) // 2
 
 
 def crop(prepared: Prepared, corner_px: tuple[int, int], view: Field) -> Prepared:

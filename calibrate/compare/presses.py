@@ -5,8 +5,9 @@ from __future__ import annotations
 from calibrate.calibration import Calibration
 from calibrate.compare.field import Field, crop_at_anchor
 from calibrate.errors import CaptureRefused
-from calibrate.stroke.preprocess import PX_PER_MM, Params, Prepared, on_raster, on_window, prepare, rescale
-from calibrate.stroke.rectify import rectify_by
+from calibrate.stroke.params import PX_PER_MM, Params
+from calibrate.stroke.preprocess import Prepared, prepare
+from calibrate.stroke.rectify import on_raster, on_window, rectify_by, rescale
 from sessions.reader import Capture
 from sessions.recording.schemas import Stroke
 

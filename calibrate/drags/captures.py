@@ -22,8 +22,9 @@ from calibrate.calibration import Calibration
 from calibrate.drags.measure import DEPTH_NAMES, LENGTH_NAME
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.session import calibration_of
-from calibrate.stroke.preprocess import PX_PER_MM, Params, on_raster, prepare, rescale
-from calibrate.stroke.rectify import rectify_by
+from calibrate.stroke.params import PX_PER_MM, Params
+from calibrate.stroke.preprocess import prepare
+from calibrate.stroke.rectify import on_raster, rectify_by, rescale
 from sessions.errors import SessionDamaged
 from sessions.reader import Capture, Recording
 from sessions.recording.schemas import Header, Stroke

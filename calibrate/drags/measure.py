@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from calibrate.errors import CaptureRefused
 from calibrate.line import Line, fit_line
 from calibrate.stroke.measure import Measured, measure
-from calibrate.stroke.preprocess import Params, on_raster, prepare, rescale
+from calibrate.stroke.params import Params
+from calibrate.stroke.preprocess import prepare
+from calibrate.stroke.rectify import on_raster, rescale
 from sessions.errors import SessionDamaged
 from sessions.reader import Capture
 

@@ -15,7 +15,7 @@ from calibrate.compare.simulate import brush_of
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.fit.fit import Grid, Pressed
 from calibrate.session import calibration_of
-from calibrate.stroke.preprocess import Params
+from calibrate.stroke.params import Params
 from sessions.errors import SessionDamaged
 from sessions.reader import Recording
 from sessions.recording.schemas import Header

@@ -16,12 +16,14 @@ import cv2
 import numpy as np
 
 from calibrate.calibration import Calibration
-from calibrate.compare.field import SIZE_PX, Field, Image
+from calibrate.compare.field import SIZE_PX, Field, Image, crop
 from calibrate.compare.presses import prepare_press
 from calibrate.compare.simulate import brush_of
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.session import calibration_of
-from calibrate.stroke.preprocess import PX_PER_MM, Params, Prepared, prepare, rescale
+from calibrate.stroke.params import PX_PER_MM, Params
+from calibrate.stroke.preprocess import prepare
+from calibrate.stroke.rectify import rescale
 from model.ccdbsm import DomainError
 from model.inversion.noise import Noise
 from model.inversion.press import Flag, Inverter, Known, Range, Recovered
@@ -82,8 +84,8 @@ class Inversion:
 
 
 @dataclass(frozen=True, slots=True)
-class Laid:
-    """A stroke on its field: coverage, and the anchor's place as mm from the left and top edge, where it is known."""
+class AlignedStroke:
+    """A stroke on its field: coverage, and the anchor in mm from the left and top edge, where it is known."""
 
     stroke: Stroke
     image: Image
@@ -102,15 +104,15 @@ def invert_recording(session: Path, settings: Settings, calibration_path: Path |
     calibration = calibration_of(recording, strokes[0], digest, calibration_path)
     made = Inversion(recording.header, recording.path, digest, settings, [], [])
     anchored, loose = _inverters(recording.header, settings)
-    waiting: dict[bool, list[Laid]] = {True: [], False: []}
+    waiting: dict[bool, list[AlignedStroke]] = {True: [], False: []}
     for capture in recording.captures():
         try:
-            laid = lay(capture, calibration, settings.view)
+            aligned = align(capture, calibration, settings.view)
         except (CaptureRefused, SessionDamaged) as error:
             made.refused.append((capture.stroke.stroke_id, error.what))
             continue
-        known = laid.place_mm is not None
-        waiting[known].append(laid)
+        known = aligned.place_mm is not None
+        waiting[known].append(aligned)
         if len(waiting[known]) == BATCH:
             _invert(made, anchored if known else loose, waiting[known])
             waiting[known] = []
@@ -121,58 +123,45 @@ def invert_recording(session: Path, settings: Settings, calibration_path: Path |
     return made
 
 
-def lay(capture: Capture, calibration: Calibration | None, view: Field) -> Laid:
+def align(capture: Capture, calibration: Calibration | None, view: Field) -> AlignedStroke:
     """A capture on the field, by the calibration or by the import's own scale. Raises `CaptureRefused`."""
     stroke = capture.stroke
     params = Params(**calibration.preprocess) if calibration else Params()
     if stroke.px_per_mm is None or stroke.anchor_px is not None:
-        return _laid(stroke, prepare_press(capture, calibration, params, view), (0, 0), view)
-    # An import that tells no anchor: the field is laid around the stroke.
-    prepared = prepare(rescale(capture.image(), stroke.px_per_mm, capture.where), None, capture.where, params)
-    rows, columns = np.flatnonzero(prepared.mask.any(axis=1)), np.flatnonzero(prepared.mask.any(axis=0))
-    side = round(view.side_mm * PX_PER_MM)
-    corner = (int(columns[0] + columns[-1] + 1 - side) // 2, int(rows[0] + rows[-1] + 1 - side) // 2)
-    return _laid(stroke, prepared, corner, view)
-
-
-def _laid(stroke: Stroke, prepared: Prepared, corner: tuple[int, int], view: Field) -> Laid:
-    """The window of the field whose upper left corner is that pixel of the prepared raster."""
-    side = round(view.side_mm * PX_PER_MM)
-    whole = np.zeros((side, side), np.float32)
-    height, width = prepared.mask.shape
-    left, top = corner
-    columns, rows = slice(max(left, 0), min(left + side, width)), slice(max(top, 0), min(top + side, height))
-    part = prepared.mask[rows, columns]
-    if prepared.cut or np.count_nonzero(part) < np.count_nonzero(prepared.mask):
+        prepared = prepare_press(capture, calibration, params, view)
+    else:  # an import without an anchor
+        whole = prepare(rescale(capture.image(), stroke.px_per_mm, capture.where), None, capture.where, params)
+        prepared = crop(whole, view.corner_around_px(whole.mask), view)
+    if prepared.cut:
         raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph, cell or field")
-    whole[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = part
-    image = cast("Image", cv2.resize(whole, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA))
+    mask = prepared.mask.astype(np.float32)
+    image = cast("Image", cv2.resize(mask, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA))
     anchor = prepared.anchor_px
-    place = None if anchor is None else ((anchor[0] - left) / PX_PER_MM, (anchor[1] - top) / PX_PER_MM)
-    return Laid(stroke, image, place)
+    place_mm = None if anchor is None else (anchor[0] / PX_PER_MM, anchor[1] / PX_PER_MM)
+    return AlignedStroke(stroke, image, place_mm)
 
 
-def _invert(made: Inversion, inverter: Inverter, batch: list[Laid]) -> None:
+def _invert(made: Inversion, inverter: Inverter, batch: list[AlignedStroke]) -> None:
     """Invert a batch of one kind, and file each stroke where it belongs."""
     if not batch:
         return
-    images = np.stack([laid.image for laid in batch])
+    images = np.stack([aligned.image for aligned in batch])
     if inverter.known is Known.ANCHOR:
-        heading = np.array([laid.stroke.heading_deg for laid in batch])
-        found = inverter(images, np.array([laid.place_mm for laid in batch]), heading)
+        heading = np.array([aligned.stroke.heading_deg for aligned in batch])
+        found = inverter(images, np.array([aligned.place_mm for aligned in batch]), heading)
         _file(made, batch, found)
         return
-    for laid in batch:
+    for aligned in batch:
         # What was commanded is the better guess: without an anchor alpha stays what is assumed.
-        tilt = laid.stroke.tilt_deg
+        tilt = aligned.stroke.tilt_deg
         low, high = made.settings.within.tilt_deg
         assumed = made.settings.assumed_tilt_deg if tilt is None else min(max(tilt, low), high)
-        _file(made, [laid], inverter.assuming(assumed)(laid.image[None]))
+        _file(made, [aligned], inverter.assuming(assumed)(aligned.image[None]))
 
 
-def _file(made: Inversion, batch: list[Laid], found: Recovered) -> None:
-    for k, laid in enumerate(batch):
-        stroke, flags = laid.stroke, found.flags[k]
+def _file(made: Inversion, batch: list[AlignedStroke], found: Recovered) -> None:
+    for k, aligned in enumerate(batch):
+        stroke, flags = aligned.stroke, found.flags[k]
         ident = stroke.stroke_id
         if useless := sorted(flags & USELESS):
             made.refused.append((ident, ", ".join(useless)))

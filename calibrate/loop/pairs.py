@@ -11,7 +11,7 @@ from calibrate.compare.presses import prepare_press
 from calibrate.compare.simulate import simulated
 from calibrate.errors import CaptureRefused
 from calibrate.loop.images import KEYS, Key, Seen, seen
-from calibrate.stroke.preprocess import Params
+from calibrate.stroke.params import Params
 from model.ccdbsm import DomainError
 from model.protocol import StrokeModel
 from sessions.errors import SessionDamaged

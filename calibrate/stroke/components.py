@@ -19,12 +19,7 @@ class Chosen:
     parts: int
     specks: int
     others_mm2: tuple[float, ...]
-    """Areas of components that are no specks and belong to somebody else."""
-
-
-def choose(ink: Mask, anchor_px: tuple[float, float] | None, params: Params) -> Mask:
-    """The stroke among the components; see `components`."""
-    return components(ink, anchor_px, params).mask
+    """Areas of components that are no specks and belong to other strokes."""
 
 
 def components(ink: Mask, anchor_px: tuple[float, float] | None, params: Params) -> Chosen:

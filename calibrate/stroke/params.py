@@ -26,7 +26,7 @@ class Params:
     speck_share: float = 0.01
     """Components below this share of the main one are specks."""
     join_mm: float = 1.5
-    """Components farther than this from the main one belong to somebody else."""
+    """Components farther than this from the main one belong to other strokes."""
     hole_mm2: float = 0.0
     """Holes in the stroke up to this area are filled, as glare on wet ink leaves them; 0 keeps them: dry ink has
     holes too."""

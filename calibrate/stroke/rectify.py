@@ -1,4 +1,4 @@
-"""Straighten and rectify in one step: the photograph is interpolated once, not twice."""
+"""Photographs on the 20 px/mm raster: rectified by a plane and undistorted in one interpolation, or rescaled."""
 
 from __future__ import annotations
 
@@ -7,25 +7,55 @@ from typing import Protocol, cast
 import cv2
 import numpy as np
 
-from calibrate.board.lens import Floats, Gray
 from calibrate.calibration import Calibration
 from calibrate.errors import CaptureRefused
-from calibrate.stroke.preprocess import PX_PER_MM, rectify
+from calibrate.stroke.params import PX_PER_MM, Floats, Gray
 
+MAX_RASTER_PX = 8192
 KNOTS = 8
-"""The lens bends so little that its map is worked out at every eighth pixel and interpolated."""
+"""Distortion changes so slowly that its map is computed at every eighth pixel and interpolated."""
 
 
 class SeenPlane(Protocol):
-    """A plane of paper that a photograph shows."""
+    """Where places on the paper lie in a photograph."""
 
     def to_image(self, paper_mm: Floats) -> Floats:
         """(n, 2) mm in the paper frame -> (n, 2) pixels of the photograph as it was taken."""
         ...
 
 
+def rectify(image: Gray, image_to_paper: Floats, window_mm: tuple[float, float, float, float]) -> Gray:
+    """The window (x, y, width, height in the paper frame) at 20 px/mm, row 0 at its far edge (largest y).
+
+    `image_to_paper` has pixel centres on integers, as cv2 does; the result's pixel (i, j) covers [j, j+1) x [i, i+1).
+    """
+    x, y, width, height = window_mm
+    step = 1.0 / PX_PER_MM
+    raster_to_paper = np.array([[step, 0.0, x + 0.5 * step], [0.0, -step, y + height - 0.5 * step], [0.0, 0.0, 1.0]])
+    raster_to_image = np.linalg.inv(image_to_paper) @ raster_to_paper
+    size = (round(width * PX_PER_MM), round(height * PX_PER_MM))
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    warped = cv2.warpPerspective(image, raster_to_image, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return cast("Gray", warped)
+
+
+def rescale(image: Gray, px_per_mm: tuple[float, float], where: str) -> Gray:
+    """A photograph of known scale on the 20 px/mm raster. Raises `CaptureRefused` where that would be huge."""
+    height, width = image.shape
+    size = (round(width * PX_PER_MM / px_per_mm[0]), round(height * PX_PER_MM / px_per_mm[1]))
+    if not all(8 <= side <= MAX_RASTER_PX for side in size):
+        raise CaptureRefused(where, f"is {size[0]} x {size[1]} px at 20 px/mm, allowed 8 to {MAX_RASTER_PX}")
+    shrinks = size[0] < width
+    return cast("Gray", cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR))
+
+
+def on_raster(point_px: tuple[float, float], px_per_mm: tuple[float, float]) -> tuple[float, float]:
+    """A point of a photograph on the raster that `rescale` makes of it."""
+    return point_px[0] * PX_PER_MM / px_per_mm[0], point_px[1] * PX_PER_MM / px_per_mm[1]
+
+
 def rectify_by(image: Gray, calibration: Calibration, window_mm: tuple[float, float, float, float], where: str) -> Gray:
-    """The window of the paper frame at 20 px/mm, by a calibration: straightened where it names a lens.
+    """The window of the paper frame at 20 px/mm, by a calibration: undistorted where it names a lens.
 
     Raises `CaptureRefused` for a photograph of another size than the calibration's.
     """
@@ -39,9 +69,9 @@ def rectify_by(image: Gray, calibration: Calibration, window_mm: tuple[float, fl
 
 
 def rectify_distorted(image: Gray, plane: SeenPlane, window_mm: tuple[float, float, float, float]) -> Gray:
-    """The window (x, y, width, height in the paper frame) at 20 px/mm, as `preprocess.rectify` gives it.
+    """The window (x, y, width, height in the paper frame) at 20 px/mm, as `rectify` gives it.
 
-    The photograph is as it was taken: what the lens bends is undone here.
+    The photograph is as it was taken: the lens is undone here.
     """
     x, y, width, height = window_mm
     columns, rows = round(width * PX_PER_MM), round(height * PX_PER_MM)
@@ -54,3 +84,13 @@ def rectify_distorted(image: Gray, plane: SeenPlane, window_mm: tuple[float, flo
     places = cv2.warpAffine(knots, scale, (columns, rows), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     sampled = cv2.remap(image, places, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return cast("Gray", sampled)
+
+
+def on_window(
+    cell_mm: tuple[float, float, float, float], window_mm: tuple[float, float, float, float]
+) -> tuple[int, int, int, int]:
+    """A paper cell (x, y, width, height in mm) as pixels of the raster of a window: x, y, width, height."""
+    x, y, width, height = cell_mm
+    top = window_mm[1] + window_mm[3] - (y + height)
+    scaled = ((x - window_mm[0]) * PX_PER_MM, top * PX_PER_MM, width * PX_PER_MM, height * PX_PER_MM)
+    return round(scaled[0]), round(scaled[1]), round(scaled[2]), round(scaled[3])

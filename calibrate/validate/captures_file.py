@@ -16,7 +16,8 @@ from calibrate.compare.field import FINE, Field, Image
 from calibrate.compare.presses import prepare_press
 from calibrate.compare.simulate import axis_mm, brush_of
 from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.stroke.preprocess import PX_PER_MM, Params, Prepared
+from calibrate.stroke.params import PX_PER_MM, Params
+from calibrate.stroke.preprocess import Prepared
 from calibrate.validate.heldout import Cell
 from calibrate.validate.sources import Opened, one_source
 from model.ccdbsm import DomainError

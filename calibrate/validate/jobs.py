@@ -16,7 +16,7 @@ from calibrate.compare.images import pack, press_images, unpack
 from calibrate.compare.presses import prepare_press
 from calibrate.errors import CaptureRefused
 from calibrate.stroke.measure import Measured
-from calibrate.stroke.preprocess import Params
+from calibrate.stroke.params import Params
 from sessions.errors import SessionDamaged
 from sessions.reader import Capture
 

@@ -15,7 +15,7 @@ from calibrate.drags.measure import validate_drags
 from calibrate.drags.report import DragValidation, write_drags
 from calibrate.errors import CalibrationError
 from calibrate.files import check_folder, write_whole
-from calibrate.stroke.preprocess import Params
+from calibrate.stroke.params import Params
 from calibrate.validate import beside as extra
 from calibrate.validate.ablation import similarity_by_strokes
 from calibrate.validate.candidates import generator_file

@@ -16,7 +16,9 @@ from calibrate.compare.field import SIZE_PX, Alignment, Image, Tone, best_shift,
 from calibrate.compare.similarity import csim, ssim
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.files import read_gray
-from calibrate.stroke.preprocess import Params, Prepared, prepare, rectify
+from calibrate.stroke.params import Params
+from calibrate.stroke.preprocess import Prepared, prepare
+from calibrate.stroke.rectify import rectify
 from sessions.reader import Capture
 
 NORMAL_SIDE_PX = 100

@@ -10,7 +10,9 @@ import numpy as np
 from calibrate.compare.field import SIZE_PX, Field, Tone, captured_mm
 from calibrate.compare.similarity import csim
 from calibrate.errors import CaptureRefused
-from calibrate.stroke.preprocess import PX_PER_MM, Params, prepare, rectify
+from calibrate.stroke.params import PX_PER_MM, Params
+from calibrate.stroke.preprocess import prepare
+from calibrate.stroke.rectify import rectify
 from collect.quality.verdict import Verdict
 from collect.rig.paper import Cell
 from model.fitted import FittedPress
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from calibrate.board.plane import Plane
-    from calibrate.stroke.preprocess import Gray
+    from calibrate.stroke.params import Gray
 
 FIELD = Field()
 FINE = 8

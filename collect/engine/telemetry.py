@@ -14,7 +14,7 @@ from typing import Any, cast
 import cv2
 import numpy as np
 
-from calibrate.stroke.preprocess import Gray
+from calibrate.stroke.params import Gray
 from collect.engine.snapshot import Picture
 from collect.photograph.new_ink import gray
 from collect.quality.picture import blur_px

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from calibrate.board.lens import Floats
 from calibrate.board.plane import apply, local_scale
-from calibrate.stroke.preprocess import PX_PER_MM, rectify
+from calibrate.stroke.params import PX_PER_MM
+from calibrate.stroke.rectify import rectify
 
 Gray = NDArray[np.uint8]
 DARK_SHARE = 0.5

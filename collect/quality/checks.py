@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.board.plane import Plane
-from calibrate.stroke.preprocess import PX_PER_MM, Gray, Params, rectify
+from calibrate.stroke.params import PX_PER_MM, Gray, Params
+from calibrate.stroke.rectify import rectify
 from collect.quality import picture
 from collect.quality.ink import Ink, Point, Rect, around, mm2, take, tell_apart
 from collect.quality.mark import Mark, measure_mark

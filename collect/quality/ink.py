@@ -9,7 +9,9 @@ import numpy as np
 
 from calibrate.board.lens import Floats
 from calibrate.board.plane import apply
-from calibrate.stroke.preprocess import PX_PER_MM, Gray, Mask, Params, Soft, flatten, rectify
+from calibrate.stroke.light import flatten
+from calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params, Soft
+from calibrate.stroke.rectify import rectify
 
 Rect = tuple[float, float, float, float]
 """x, y, width, height in the paper frame, mm."""

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.stroke.preprocess import PX_PER_MM, Mask, Soft
+from calibrate.stroke.params import PX_PER_MM, Mask, Soft
 from collect.quality.ink import Ink, Point
 
 Bits = NDArray[np.uint8]

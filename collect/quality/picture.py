@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calibrate.board.lens import Floats
 from calibrate.board.plane import Plane, apply
-from calibrate.stroke.preprocess import PX_PER_MM, Gray, Mask
+from calibrate.stroke.params import PX_PER_MM, Gray, Mask
 
 FINE_PX, WIDE_PX = 1.0, 2.0
 """Two blurs put on top; how much the second weakens an edge more than the first tells the edge's own blur."""

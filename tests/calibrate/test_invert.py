@@ -13,7 +13,7 @@ import pytest
 from calibrate.compare.field import Field
 from calibrate.errors import CalibrationError
 from calibrate.invert.files import PROTOCOL, write_inversion
-from calibrate.invert.invert import Row, Settings, invert_recording, lay, off_command
+from calibrate.invert.invert import Row, Settings, align, invert_recording, off_command
 from collect.protocols.config import ReplayConfig
 from collect.protocols.files import load_protocol
 from model.ccdbsm import Brush, ccdbsm
@@ -111,7 +111,7 @@ def test_a_capture_without_any_scale_is_refused() -> None:
     stroke = Stroke(stroke_id="s", kind="press", still=0, anchor_mm=(3.0, 4.0))
     capture = Capture(stroke, encode_png(photograph(12.0, 3.0)), "s")
     with pytest.raises(CalibrationError, match="neither a calibration nor a scale"):
-        lay(capture, None, Field())
+        align(capture, None, Field())
 
 
 def test_a_name_that_no_protocol_can_hold_is_not_written(tmp_path: Path) -> None:

@@ -9,7 +9,9 @@ import pytest
 from calibrate.errors import CaptureRefused
 from calibrate.line import fit_line
 from calibrate.stroke.measure import measure
-from calibrate.stroke.preprocess import PX_PER_MM, Params, prepare, rectify, rescale
+from calibrate.stroke.params import PX_PER_MM, Params
+from calibrate.stroke.preprocess import prepare
+from calibrate.stroke.rectify import rectify, rescale
 
 PAGE = (800, 800)
 PARAMS = Params()

@@ -9,10 +9,10 @@ from bench.preprocess_rigs import BRUSHES, Shot, heading_free_window, sheet, tru
 from calibrate.board.plane import Plane
 from calibrate.board.view import see_board_and_lens
 from calibrate.compare.scales import MM_PER_PX
+from calibrate.stages import trace_seen
 from calibrate.stroke.params import PX_PER_MM, Params
 from calibrate.stroke.preprocess import prepare
 from calibrate.stroke.rectify import rectify_distorted
-from calibrate.stroke.stages import trace_seen
 
 
 def overlaps(shot: Shot, plane: Plane) -> list[float]:

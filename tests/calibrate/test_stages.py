@@ -14,8 +14,8 @@ from calibrate.cli import app
 from calibrate.compare.field import Field
 from calibrate.compare.scales import MM_PER_PX
 from calibrate.errors import CaptureRefused
+from calibrate.stages import trace_scaled
 from calibrate.stroke.params import Params
-from calibrate.stroke.stages import trace_scaled
 
 
 def photograph(*strokes: tuple[int, int], glare: tuple[int, int] | None = None, paper: int = 225) -> np.ndarray:

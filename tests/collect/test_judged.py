@@ -22,7 +22,7 @@ from tests.collect.until import wait_for_end
 if TYPE_CHECKING:
     from conftest import Lab
 
-    from calibrate.stroke.preprocess import Gray
+    from calibrate.stroke.params import Gray
     from collect.engine.engine import Engine
     from collect.engine.snapshot import Snapshot
 

@@ -10,7 +10,7 @@ import numpy as np
 from calibrate.board.plane import Plane
 from calibrate.board.view import see_board
 from calibrate.errors import CalibrationError
-from calibrate.stroke.preprocess import Gray
+from calibrate.stroke.params import Gray
 from collect.engine.last_capture import LastCapture, pictures_of, published_mark
 from collect.engine.steps.choose import measured
 from collect.engine.steps.context import RunContext, StepContext, uninterrupted

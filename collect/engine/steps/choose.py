@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from calibrate.errors import CaptureRefused
-from calibrate.stroke.preprocess import Gray, Params, prepare
+from calibrate.stroke.params import Gray, Params
+from calibrate.stroke.preprocess import prepare
 from collect.engine.last_capture import cell_raster
 from collect.engine.steps.context import RunContext, StepContext, uninterrupted
 from collect.protocols.adaptive import cells

@@ -24,7 +24,7 @@ from collect.touch.places import used_cells as touched_cells
 from sessions.store import Attempt, SessionStore
 
 if TYPE_CHECKING:
-    from calibrate.stroke.preprocess import Gray
+    from calibrate.stroke.params import Gray
 
 _R = TypeVar("_R")
 

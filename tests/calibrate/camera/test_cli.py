@@ -324,7 +324,7 @@ def test_intrinsics_says_of_every_photograph_why_none_was_of_use(tmp_path: Path)
     paths += [saved(tmp_path / "left" / "02.png", MIRRORED)] * 2
     ran = run("intrinsics", *paths, *BOARD, "--out", tmp_path / "out")
     refused(ran, "4 photographs: 0 usable views of the board, at least 4 needed; left/01.png, right/01.png: is blank")
-    assert "left/02.png, left/02.png (2): is mirrored" in str(ran.exception)
+    assert "left/02.png, left/02.png (2): the photograph is mirrored" in str(ran.exception)
 
 
 def test_intrinsics_counts_one_photograph_given_five_times_once(tmp_path: Path) -> None:

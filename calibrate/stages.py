@@ -1,4 +1,4 @@
-"""Every stage from a photograph to a 128 x 128 stroke, kept for looking at, with what was fitted in each."""
+"""Every stage from a photograph to a 128 x 128 stroke as a picture, with the numbers that were fitted in each."""
 
 from __future__ import annotations
 
@@ -7,31 +7,22 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from calibrate.board.lens import Gray
 from calibrate.board.plane import Plane
 from calibrate.compare.field import Field, Tone, captured_mm, crop, crop_at_anchor
-from calibrate.errors import CaptureRefused
-from calibrate.stroke.components import components, fill_holes
-from calibrate.stroke.light import flatten
-from calibrate.stroke.params import PX_PER_MM, Mask, Params, Soft
-from calibrate.stroke.preprocess import (
-    Prepared,
-    cell_window,
-    find_level,
-    on_raster,
-    on_window,
-    raise_flags,
-    rescale,
-    soft_ink,
-    to_levels,
-    touches_edge,
-)
-from calibrate.stroke.rectify import rectify_distorted
+from calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params, Soft
+from calibrate.stroke.preprocess import preprocess, to_levels
+from calibrate.stroke.rectify import on_raster, on_window, rectify_distorted, rescale
+
+TILE_PX = 300
+CAPTION_PX = 74
+COLUMNS = 4
+LINES = 3
+FONT, HEIGHT, STEP_PX = cv2.FONT_HERSHEY_SIMPLEX, 0.42, 16
 
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """One step: what it is called, what it made (gray, 0 = black) and the numbers that were fitted or counted."""
+    """One stage: its name, its image (gray, 0 = black) and the numbers that were fitted or counted in it."""
 
     name: str
     image: Gray
@@ -69,7 +60,7 @@ def trace_seen(
 ) -> Trace:
     """A photograph of a sheet whose plane is known; `window_mm` (x, y, width, height) holds the stroke.
 
-    What lies outside the paper cell is hidden, as `prepare` hides it. Raises `CaptureRefused` as `prepare` does.
+    Everything outside the paper cell is hidden. Raises `CaptureRefused` as `prepare` does.
     """
     k1, k2, p1, p2, k3 = (float(v) for v in plane.lens.distortion)
     lens = {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
@@ -89,7 +80,7 @@ def trace_seen(
 def trace_scaled(
     image: Gray, px_per_mm: tuple[float, float], anchor_px: tuple[float, float] | None, where: str, params: Params
 ) -> Trace:
-    """A photograph that is flat and of known scale, as an import brings it. Raises `CaptureRefused`."""
+    """A flat photograph of known scale, as imported. Raises `CaptureRefused`."""
     raster = rescale(image, px_per_mm, where)
     scale = {"from_px_per_mm_x": px_per_mm[0], "from_px_per_mm_y": px_per_mm[1], "px_per_mm": PX_PER_MM}
     stages = (
@@ -100,6 +91,23 @@ def trace_scaled(
     return _from_raster(raster, anchor, where, params, stages)
 
 
+def contact_sheet(trace: Trace) -> Gray:
+    """(h, w) gray: a tile for each stage with its name and numbers below, flags in the last line."""
+    rows = -(-len(trace.stages) // COLUMNS)
+    sheet = np.full(
+        (rows * (TILE_PX + CAPTION_PX) + 30 + STEP_PX * len(trace.flags), COLUMNS * (TILE_PX + 10)), 255, np.uint8
+    )
+    for number, stage in enumerate(trace.stages):
+        row, column = divmod(number, COLUMNS)
+        _tile(sheet, stage, number + 1, 5 + column * (TILE_PX + 10), 5 + row * (TILE_PX + CAPTION_PX))
+    below = rows * (TILE_PX + CAPTION_PX) + STEP_PX
+    for k, line in enumerate((trace.where, *trace.flags)):
+        cv2.putText(
+            sheet, line.encode("ascii", "replace").decode(), (8, below + STEP_PX * k), FONT, HEIGHT, 0, 1, cv2.LINE_AA
+        )
+    return sheet
+
+
 def _from_raster(
     raster: Gray,
     anchor_px: tuple[float, float] | None,
@@ -108,42 +116,32 @@ def _from_raster(
     before: tuple[Stage, ...],
     cell_px: tuple[int, int, int, int] | None = None,
 ) -> Trace:
-    window = cell_window(raster, cell_px, where)
-    reflectance = np.ones(raster.shape, np.float32)
-    reflectance[window] = flatten(raster[window], params)
-    level = find_level(reflectance[window], where, params)
-    levels = to_levels(reflectance)
-    ink = levels <= round(255.0 * level.threshold)
-    chosen = components(ink, anchor_px, params)
-    if not chosen.mask.any():
-        raise CaptureRefused(where, "holds no stroke after specks and neighbours were removed")
-    mask = fill_holes(chosen.mask, params)
-    soft = soft_ink(reflectance, chosen.mask)
-    flags = list(raise_flags(raster[window], mask[window], chosen))
-    whole, view = Prepared(mask, soft, anchor_px, level.threshold, touches_edge(mask[window])), Field()
+    steps, view = preprocess(raster, anchor_px, where, params, cell_px), Field()
+    whole, chosen = steps.prepared, steps.chosen
     if anchor_px is None:
-        corner = _about(mask, view)
+        corner = view.corner_around_px(whole.mask)
         cropped = crop(whole, corner, view)
     else:
         corner, cropped = view.corner_px(anchor_px), crop_at_anchor(whole, anchor_px, view)
-    if np.count_nonzero(cropped.mask) < np.count_nonzero(mask):
+    flags = list(whole.flags)
+    if np.count_nonzero(cropped.mask) < np.count_nonzero(whole.mask):
         flags.append(f"too long: the stroke does not fit {view.side_mm:g} mm, its ends are cut off")
     anchor, binary = cropped.anchor_px, captured_mm(cropped, Tone.BINARY) > 0.5
     shrink = view.mm_per_px * PX_PER_MM
     small_anchor = None if anchor is None else (anchor[0] / shrink, anchor[1] / shrink)
-    light = (raster / np.maximum(reflectance, 1e-3)).astype(np.float32)[window]
+    light = (raster / np.maximum(steps.reflectance, 1e-3)).astype(np.float32)[steps.window]
     after = (
         Stage("light", np.clip(light, 0, 255).astype(np.uint8), _range(light, "gray_level")),
-        Stage("flatten", levels, {"background_mm": params.background_mm}),
+        Stage("flatten", to_levels(steps.reflectance), {"background_mm": params.background_mm}),
         Stage(
             "gate",
-            _shade(reflectance < 1.0 - params.contrast_gate),
-            {"contrast": 1.0 - level.darkest, "gate": params.contrast_gate},
+            _shade(steps.reflectance < 1.0 - params.contrast_gate),
+            {"contrast": 1.0 - steps.level.darkest, "gate": params.contrast_gate},
         ),
-        Stage("threshold", _shade(ink), {"reflectance": level.threshold}),
+        Stage("threshold", _shade(steps.ink), {"reflectance": steps.level.threshold}),
         Stage(
             "components",
-            _shade(mask, ink),
+            _shade(whole.mask, steps.ink),
             {
                 "parts": float(chosen.parts),
                 "specks": float(chosen.specks),
@@ -170,13 +168,6 @@ def _from_raster(
     return Trace(where, (*before, *after), binary, captured_mm(cropped, Tone.GRAY), small_anchor, tuple(flags))
 
 
-def _about(mask: Mask, view: Field) -> tuple[int, int]:
-    """(column, row) of the field's corner where no anchor is known: around the middle of the stroke's box."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    side = round(view.side_mm * PX_PER_MM)
-    return int(columns[0] + columns[-1] + 1 - side) // 2, int(rows[0] + rows[-1] + 1 - side) // 2
-
-
 def _range(values: Soft, name: str) -> dict[str, float]:
     return {f"{name}_low": float(np.quantile(values, 0.01)), f"{name}_high": float(np.quantile(values, 0.99))}
 
@@ -201,3 +192,21 @@ def _cross(image: Gray, anchor: tuple[float, float] | None) -> Gray:
         cv2.drawMarker(drawn, place, 255, cv2.MARKER_CROSS, 40, 7)
         cv2.drawMarker(drawn, place, 0, cv2.MARKER_CROSS, 40, 3)
     return drawn
+
+
+def _tile(sheet: Gray, stage: Stage, number: int, left: int, top: int) -> None:
+    height, width = stage.image.shape
+    scale = min(TILE_PX / width, TILE_PX / height)
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    small = cv2.resize(stage.image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST)
+    sheet[top : top + size[1], left : left + size[0]] = small
+    cv2.rectangle(sheet, (left - 1, top - 1), (left + size[0], top + size[1]), 160, 1)
+    lines = [f"{number} {stage.name}"]
+    for name, value in stage.values.items():
+        word = f"{name} {value:.4g}"
+        if len(lines) > 1 and len(lines[-1]) + len(word) < 40:
+            lines[-1] += f", {word}"
+        else:
+            lines.append(word)
+    for k, line in enumerate(lines[: LINES + 1]):
+        cv2.putText(sheet, line, (left, top + TILE_PX + 14 + STEP_PX * k), FONT, HEIGHT, 0, 1, cv2.LINE_AA)
