@@ -61,7 +61,9 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     fit = load_artefact(path, BrushFit)
     assert fit.strokes == 5
     assert fit.csim_percent["fitted"] > fit.csim_percent["uncalibrated"] + 3.0
-    ran = CliRunner().invoke(app, ["validate", str(session), "--mm-per-px", "0.4"])
+    ran = CliRunner().invoke(
+        app, ["validate", str(session), "--mm-per-px", "0.4", "--model", "ccd-bsm", "--model", NAME]
+    )
     assert ran.exit_code == 0, ran.output
     report = load_report(session / "validation" / "report.json")
     [rival] = [one for one in report.rivals if one.name == NAME]

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +20,7 @@ import pytest
 from calibrate.validate.pool import ClusterError, Dask
 
 pytest.importorskip("distributed")
-pytestmark = pytest.mark.timeout(180)
+pytestmark = [pytest.mark.timeout(180), pytest.mark.xdist_group("cluster")]
 DEADLINE_S = 60.0
 FILES = ("scores.csv", "summary.csv", "failures.csv")
 
@@ -30,14 +31,14 @@ class Cluster:
     workers: list[subprocess.Popen[bytes]]
 
 
-@pytest.fixture
-def cluster(tmp_path: Path) -> Iterator[Cluster]:
-    told = tmp_path / "scheduler.json"
+@contextmanager
+def cluster_of_two(folder: Path) -> Iterator[Cluster]:
+    told = folder / "scheduler.json"
     started: list[subprocess.Popen[bytes]] = []
 
     def start(*words: str) -> subprocess.Popen[bytes]:
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        started.append(subprocess.Popen([sys.executable, "-m", *words], cwd=tmp_path, **quiet))
+        started.append(subprocess.Popen([sys.executable, "-m", *words], cwd=folder, **quiet))
         return started[-1]
 
     try:
@@ -45,7 +46,7 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
         start("distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", str(told), *here)
         deadline = time.monotonic() + DEADLINE_S
         while not told.is_file() or not told.read_text():
-            assert time.monotonic() < deadline
+            assert time.monotonic() < deadline, "waited for the scheduler to listen"
             time.sleep(0.05)
         address = json.loads(told.read_text())["address"]
         words = ("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny", *here)
@@ -56,41 +57,28 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
             process.wait()
 
 
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    """For all tests here, in their order: the last of them kills a worker."""
+    with cluster_of_two(tmp_path_factory.mktemp("cluster")) as made:
+        yield made
+
+
 def validate(session: Path, out: Path, *more: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "brushloop", "validate", str(session), "--out", str(out), "--no-held-out", *more]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, **quiet)
 
 
-def test_jobs_come_back_whole_and_alike_though_a_worker_dies(cluster: Cluster, session: Path) -> None:
-    program = f"""
-import os, signal
-from pathlib import Path
-from calibrate.compare.field import Field
-from calibrate.validate.jobs import PrepareJob, prepare_job
-from calibrate.validate.pool import Dask, Threads
-from sessions.reader import Recording
-captures = list(Recording(Path({str(session)!r})).captures()) * 3
-jobs = [(str(k), PrepareJob(one, None, Field())) for k, one in enumerate(captures)]
-there = {{}}
-with Dask({cluster.address!r}) as pool:
-    for name, press in pool.run(prepare_job, iter(jobs)):
-        there[name] = press
-        if len(there) == 5:
-            os.kill({cluster.workers[0].pid}, signal.SIGKILL)
-with Threads(1) as pool:
-    here = dict(pool.run(prepare_job, iter(jobs)))
-print(len(there), there == here)
-"""
-    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=120)
-    assert ran.stdout == "33 True\n", ran.stderr
-    assert cluster.workers[0].wait(10.0) != 0
-
-
 @pytest.mark.soak
 def test_two_workers_give_the_numbers_of_this_machine_also_when_one_is_lost(
-    cluster: Cluster, make_session: object, tmp_path: Path
+    make_session: object, tmp_path: Path
 ) -> None:
+    with cluster_of_two(tmp_path) as cluster:
+        two_workers_one_of_them_lost(cluster, make_session, tmp_path)
+
+
+def two_workers_one_of_them_lost(cluster: Cluster, make_session: object, tmp_path: Path) -> None:
     session = make_session(tmp_path, "many", repeats=5)  # pyright: ignore[reportCallIssue]
     here = validate(session, tmp_path / "here")
     _, told = here.communicate()
@@ -137,11 +125,36 @@ def test_a_worker_with_other_software_is_refused(cluster: Cluster) -> None:
     deadline = time.monotonic() + DEADLINE_S
     said = "has no worker"
     while "has no worker" in said:
-        assert time.monotonic() < deadline
+        assert time.monotonic() < deadline, said
         ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
         said = ran.stdout
     assert "has brushloop" in said
     assert "(work of tomorrow) is needed there" in said
+
+
+def test_jobs_come_back_whole_and_alike_though_a_worker_dies(cluster: Cluster, session: Path) -> None:
+    program = f"""
+import os, signal
+from pathlib import Path
+from calibrate.compare.field import Field
+from calibrate.validate.jobs import PrepareJob, prepare_job
+from calibrate.validate.pool import Dask, Threads
+from sessions.reader import Recording
+captures = list(Recording(Path({str(session)!r})).captures()) * 3
+jobs = [(str(k), PrepareJob(one, None, Field())) for k, one in enumerate(captures)]
+there = {{}}
+with Dask({cluster.address!r}) as pool:
+    for name, press in pool.run(prepare_job, iter(jobs)):
+        there[name] = press
+        if len(there) == 5:
+            os.kill({cluster.workers[0].pid}, signal.SIGKILL)
+with Threads(1) as pool:
+    here = dict(pool.run(prepare_job, iter(jobs)))
+print(len(there), there == here)
+"""
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=120)
+    assert ran.stdout == "33 True\n", ran.stderr
+    assert cluster.workers[0].wait(10.0) != 0
 
 
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

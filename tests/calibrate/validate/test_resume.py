@@ -12,13 +12,14 @@ from pathlib import Path
 import pytest
 
 from calibrate.validate.store import Store
+from tests.command import brushloop
 
 FILES = ("report.json", "report.html", "scores.csv", "summary.csv", "failures.csv", "scores.parquet")
 DEADLINE_S = 60.0
 
 
-def command(session: str) -> list[str]:
-    return [sys.executable, "-m", "brushloop", "validate", session, "--out", "out", "--workers", "1"]
+COMMAND = ("validate", "presses", "--out", "out", "--workers", "1", "--model", "ccd-bsm", "--model", "bezier-refitted")
+"""One model as it is, and one that is fitted anew for each cell."""
 
 
 def records(work: Path) -> set[str]:
@@ -30,12 +31,15 @@ def records(work: Path) -> set[str]:
 def test_after_kill_9_the_same_command_gives_the_same_bytes_and_repeats_nothing(session: Path, tmp_path: Path) -> None:
     for name in ("whole", "killed"):
         shutil.copytree(session, tmp_path / name / "presses")
-    ran = subprocess.run(command("presses"), cwd=tmp_path / "whole", capture_output=True, text=True, check=False)
+    ran = brushloop(*COMMAND, cwd=tmp_path / "whole")
     assert ran.returncode == 0, ran.stderr
 
     work = tmp_path / "killed" / "out" / "work" / "work.bin"
     first = subprocess.Popen(
-        command("presses"), cwd=tmp_path / "killed", stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [sys.executable, "-m", "brushloop", *COMMAND],
+        cwd=tmp_path / "killed",
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )
     deadline = time.monotonic() + DEADLINE_S
     while not (work.is_file() and work.stat().st_size > 10_000):
@@ -49,7 +53,7 @@ def test_after_kill_9_the_same_command_gives_the_same_bytes_and_repeats_nothing(
     before = records(tmp_path / "before.bin")
     assert before
 
-    ran = subprocess.run(command("presses"), cwd=tmp_path / "killed", capture_output=True, text=True, check=False)
+    ran = brushloop(*COMMAND, cwd=tmp_path / "killed")
     assert ran.returncode == 0, ran.stderr
     for name in FILES:
         whole, resumed = (tmp_path / which / "out" / name for which in ("whole", "killed"))
