@@ -29,7 +29,8 @@ import numpy as np
 from bench.harness import machine, percentile
 from bench.processes import ROOT, lines_of_input, started, tell
 from collect.errors import StepError
-from collect.motion.procedures import Procedures, press_moves
+from collect.motion.moves import press_moves
+from collect.motion.procedures import Procedures
 from collect.photograph import frames as frames_of
 from collect.rig.config import RigConfig
 from collect.rig.devices import connected

@@ -115,7 +115,7 @@ def plan(
     from collect.planning.limits import all_poses, check_protocol
     from collect.planning.plan_table import plan_table
     from collect.planning.summary import make_plan
-    from collect.protocols.files import load_protocol
+    from collect.protocols.config import load_protocol
     from collect.rig.config import load_rig
     from collect.rig.paper import PaperPlane
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from calibrate.artefact import artefacts
 from collect.errors import ConfigError
-from collect.protocols.files import load_protocol
+from collect.protocols.config import load_protocol
 from sessions.errors import SessionError
 from sessions.reader import Recording
 

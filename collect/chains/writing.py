@@ -10,8 +10,8 @@ from pathlib import Path
 
 from collect.chains.commands import Say, collected_session, finished_session, run_command
 from collect.errors import ConfigError
-from collect.protocols.config import WriteConfig
-from collect.protocols.files import load_protocol
+from collect.protocols.config import load_protocol
+from collect.protocols.write import WriteConfig
 from collect.rig.config import load_rig
 
 PROTOCOL, PAGE = "protocol-write.toml", "written.html"

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from collect.engine.dry_run import lifted
 from collect.errors import ConfigError
-from collect.protocols.config import ProtocolConfig
-from collect.protocols.files import load_protocol
+from collect.protocols.config import ProtocolConfig, load_protocol
 from collect.protocols.steps import StepKind
 from collect.rig.config import RigConfig, load_rig, overrides
 from collect.rig.devices import Rig

@@ -14,7 +14,7 @@ from collect.engine.snapshot import SET_UP, CellCount, Snapshot
 from collect.engine.tally import Place, Tally
 from collect.operator import Prompt
 from collect.protocols.adaptive import with_choice
-from collect.protocols.plans import ProtocolConfig, planned
+from collect.protocols.config import ProtocolConfig
 from collect.protocols.steps import MARKING, Result, Step, StepKind
 from collect.protocols.strokes import AGAIN, Planned, with_review
 from collect.rig.paper import Layout, Sheet
@@ -31,7 +31,7 @@ class Progress:
         """`layout` is that of the sheet; it determines the order of the strokes."""
         self._clock = clock
         self._lock = threading.Lock()
-        self._plan = planned(protocol, layout)
+        self._plan = protocol.planned(layout)
         self._by_index = {p.index: p for p in self._plan}
         self._first_free_index = 1 + max(self._by_index, default=0)
         self._tally = Tally()

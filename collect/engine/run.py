@@ -17,7 +17,6 @@ from collect.engine.steps.context import RunContext
 from collect.engine.steps.review import marked_bad
 from collect.errors import ForceTooHigh, Parked, SheetFull, StepError, describe
 from collect.operator import Choice, OperatorRequest, Prompt
-from collect.protocols.config import WriteConfig
 from collect.protocols.steps import Protocol, Result, Step, StepKind
 from collect.protocols.strokes import takes
 from drivers.errors import ArmMoved, DeviceError, LimitExceeded, MotionError, RpcError
@@ -45,14 +44,12 @@ class Run:
         await self._once_arm_is_free(self.context.rig.robot.enable)
         await self._once_arm_is_free(self._recover)
         await self._walk(protocol)
-        configured = self.context.protocol
-        write = configured if isinstance(configured, WriteConfig) else None
         for number in itertools.count():
             step = Step(StepKind.REVIEW, number)
             if step.key not in self.context.store.state.done and not marked_bad(self.context):
                 break
             for stroke_id, _ in (await self._result(step))["again"]:
-                await self._walk(takes(self.context.progress.made_again(str(stroke_id)), write=write))
+                await self._walk(takes(self.context.progress.made_again(str(stroke_id))))
 
     async def _walk(self, protocol: Protocol) -> None:
         step = next(protocol)

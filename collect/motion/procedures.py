@@ -2,45 +2,43 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 
 from collect.errors import StepVoid
+from collect.motion.moves import (
+    Move,
+    commanded,
+    inking_moves,
+    over_sheet_move,
+    park_moves,
+    press_moves,
+    retreat_moves,
+    stroke_moves,
+    zero_touch_moves,
+)
 from collect.photograph.photographer import Photographer, Ways
-from collect.rig.config import RigConfig, WashConfig
+from collect.protocols.strokes import Drawn, TrajectoryPoint
+from collect.rig.config import RigConfig
 from collect.rig.devices import Rig, limits_of
-from collect.rig.paper import Cell, PaperPlane, to_base, to_paper
-from drivers.geometry import brush_pose, interpolate, lean
-from drivers.samples import Frame, Pose, QueuedLine
+from collect.rig.paper import Cell, PaperPlane, to_paper
+from drivers.limits import Limits
+from drivers.protocols import Robot
+from drivers.samples import Frame, QueuedLine
 
-CLEARANCE_MM = 8.0
-"""Height above the paper at which the fast approach ends."""
 DEPTH_TOLERANCE_MM = 0.1
 """How far the depth at the end of the dwell may be from the one asked for."""
-DWELL_MM = 0.05
-"""Way of the dwell: the end of the descent, as slow as it has to last. ARCS cannot wait in its queue but by moving."""
 TOUCH_TOLERANCE_MM = 0.1
 """How far the arm may rest from the taught height at zero touch."""
 
 
-@dataclass(frozen=True, slots=True)
-class Move:
-    """A target and how fast to go there."""
-
-    target: Pose
-    speed_mm_s: float
-    least_s: float = 0.0
-    """How long it takes at least."""
-
-
 class Procedures:
-    """The moves of each step kind, from a rig's configuration; and their execution on its devices."""
+    """Carries out the moves of each step on the devices of a rig."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._config = rig.config
         self.plane = PaperPlane(rig.config.paper.touch_z_mm)
-        """The taught height, level, until touches say better."""
+        """At the taught height and level, until touches have measured it."""
         self._dips = 0
         over = over_sheet_move(rig.config)
         self.photographer = Photographer(
@@ -80,7 +78,7 @@ class Procedures:
         return rests_mm
 
     async def dip(self) -> None:
-        """Into the well and out again, wiped; washed before, where it is time for that."""
+        """Into the well and out again, with a wipe; after a wash, where it is time for one."""
         for move in inking_moves(self._config, self._dips):
             await self.go(move)
         self._dips += 1
@@ -90,7 +88,7 @@ class Procedures:
         before, pressing = press_moves(self._config, self.plane, cell, height_mm, tilt_deg, dwell_s)
         for move in before:
             await self.go(move)
-        # From here on the arm lifts by itself, whatever becomes of this program.
+        # From here on the arm lifts by itself, whatever happens to this program.
         lines = [QueuedLine(move.target, move.speed_mm_s, move.least_s) for move in pressing]
         seen = await self._rig.robot.sequence(lines, acc_mm_s2=self._config.motion.acc_mm_s2)
         depth_mm = max((-self.plane.above_mm(self._config.paper, pose) for pose in seen), default=0.0)
@@ -118,120 +116,36 @@ class Procedures:
         await self._rig.robot.move(move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=motion.acc_mm_s2)
 
 
-def retreat_moves(config: RigConfig, here: Pose) -> list[Move]:
-    """From anywhere: along the tool axis up to safe height if below it, upright, then to the park position."""
-    motion = config.motion
-    moves: list[Move] = []
-    x_mm, y_mm, z_mm = here.position_mm
-    if here.z_mm < motion.safe_z_mm:
-        tilt_deg, heading_deg = lean(here)
-        rise_mm = motion.safe_z_mm - here.z_mm
-        out_mm = rise_mm * math.tan(math.radians(tilt_deg))
-        x_mm += out_mm * math.cos(math.radians(heading_deg))
-        y_mm += out_mm * math.sin(math.radians(heading_deg))
-        qx, qy, qz, qw = here.quaternion
-        z_mm = motion.safe_z_mm
-        moves.append(Move(Pose(x_mm, y_mm, z_mm, qx, qy, qz, qw), motion.press_speed_mm_s))
-    # Upright in place before travelling: a turn and a long line at once sweep the ferrule around.
-    moves.append(Move(_upright(config, x_mm, y_mm, z_mm), motion.travel_speed_mm_s))
-    return moves + park_moves(config)
+def check_drawn(config: RigConfig, plane: PaperPlane, limits: Limits, cells: Iterable[Cell], drawn: Drawn) -> None:
+    """Check every pose of a figure on these cells. Raises `LimitExceeded`."""
+    for cell in cells:
+        for points in drawn.strokes:
+            for pose, speed_mm_s in commanded(stroke_moves(config, plane, cell, points, drawn.speed_mm_s).parts):
+                limits.check("robot", pose, speed_mm_s=speed_mm_s, acc_mm_s2=config.motion.acc_mm_s2)
 
 
-def park_moves(config: RigConfig) -> list[Move]:
-    """To the place where the arm waits, out of the camera's view."""
-    return [Move(_upright(config, *config.motion.park_mm), config.motion.travel_speed_mm_s)]
+async def draw_stroke(
+    robot: Robot,
+    config: RigConfig,
+    plane: PaperPlane,
+    cell: Cell,
+    points: Sequence[TrajectoryPoint],
+    *,
+    speed_mm_s: float,
+    blend_mm: float,
+) -> float:
+    """Draw one stroke; begins and ends at safe height. Returns the depth at which the brush landed, in mm.
 
-
-def over_sheet_move(config: RigConfig) -> Move:
-    """Over the middle of the sheet at travel height, where the camera must see the arm."""
-    width_mm, height_mm = config.paper.size_mm
-    x_mm, y_mm = to_base(config.paper, 0.5 * width_mm, 0.5 * height_mm)
-    return Move(_upright(config, x_mm, y_mm, config.motion.safe_z_mm), config.motion.travel_speed_mm_s)
-
-
-def photograph_moves(config: RigConfig) -> list[Move]:
-    """Over the sheet, unless the arm is there, and out of the camera's view."""
-    return [over_sheet_move(config), *park_moves(config)]
-
-
-def zero_touch_moves(config: RigConfig) -> list[Move]:
-    """Over the touch point, down to clearance, slowly to the taught height, and up."""
-    motion, touch_mm = config.motion, config.paper.touch_z_mm
-    x_mm, y_mm = to_base(config.paper, *config.paper.touch_point_mm)
-    return [
-        Move(_upright(config, x_mm, y_mm, motion.safe_z_mm), motion.travel_speed_mm_s),
-        Move(_upright(config, x_mm, y_mm, touch_mm + CLEARANCE_MM), motion.travel_speed_mm_s),
-        Move(_upright(config, x_mm, y_mm, touch_mm), motion.press_speed_mm_s / 4),
-        Move(_upright(config, x_mm, y_mm, motion.safe_z_mm), motion.travel_speed_mm_s),
-    ]
-
-
-def inking_moves(config: RigConfig, dips: int) -> list[Move]:
-    """A dip after so many others of the same process, and the wash before it where it is time for one."""
-    wash = config.ink.wash
-    washed = wash is not None and dips % wash.every_dips == wash.every_dips - 1
-    return [*(wash_moves(config, wash) if wash is not None and washed else ()), *dip_moves(config)]
-
-
-def dip_moves(config: RigConfig) -> list[Move]:
-    """Over the well, down into the ink, up slowly; with a wipe, across the rim on the way up."""
-    motion, wipe = config.motion, config.ink.wipe
-    at = to_base(config.paper, *config.ink.well_mm)
-    above = _upright(config, *at, motion.safe_z_mm)
-    moves = [
-        Move(above, motion.travel_speed_mm_s),
-        Move(_upright(config, *at, config.ink.dip_z_mm), motion.press_speed_mm_s),
-    ]
-    if wipe is not None:
-        rim = to_base(config.paper, *wipe.rim_mm)
-        moves += [
-            Move(_upright(config, *at, wipe.z_mm), motion.press_speed_mm_s),
-            Move(_upright(config, *rim, wipe.z_mm), motion.press_speed_mm_s),
-        ]
-        above = _upright(config, *rim, motion.safe_z_mm)
-    return [*moves, Move(above, motion.press_speed_mm_s)]
-
-
-def wash_moves(config: RigConfig, wash: WashConfig) -> list[Move]:
-    """Over the pot, down and up so many times, and up."""
-    motion = config.motion
-    at = to_base(config.paper, *wash.pot_mm)
-    above = _upright(config, *at, motion.safe_z_mm)
-    bottom = _upright(config, *at, wash.dip_z_mm)
-    half = _upright(config, *at, 0.5 * (wash.dip_z_mm + motion.safe_z_mm))
-    swirl = [Move(pose, motion.press_speed_mm_s) for _ in range(wash.strokes) for pose in (bottom, half)]
-    return [Move(above, motion.travel_speed_mm_s), *swirl, Move(above, motion.travel_speed_mm_s)]
-
-
-def press_moves(
-    config: RigConfig, plane: PaperPlane, cell: Cell, height_mm: float, tilt_deg: float, dwell_s: float = 0.0
-) -> tuple[list[Move], list[Move]]:
-    """(over the cell and tilted about the tip at clearance; touch height, descend H, dwell and up again).
-
-    The second list is one that the controller carries out by itself: it must end above the paper.
-    Tilting about the tip just above the paper instead of on it leaves the same pose at touch and no smear.
+    All of it is checked before the arm moves. Raises `LimitExceeded` and what `Robot.move` and `Robot.follow` raise.
     """
-    motion, paper = config.motion, config.paper
-    above = _upright(config, *to_base(paper, *cell.anchor_mm), motion.safe_z_mm)
-
-    def pose(above_mm: float, tilt: float) -> Pose:
-        return plane.pose(paper, *cell.anchor_mm, above_mm, tilt_deg=tilt)
-
-    touch, deep = pose(0.0, tilt_deg), pose(-height_mm, tilt_deg)
-    before = [
-        Move(above, motion.travel_speed_mm_s),
-        Move(pose(CLEARANCE_MM, 0.0), motion.travel_speed_mm_s),
-        Move(pose(CLEARANCE_MM, tilt_deg), motion.press_speed_mm_s),
-    ]
-    pressing = [
-        Move(touch, motion.press_speed_mm_s),
-        Move(interpolate(touch, deep, max(0.5, 1.0 - DWELL_MM / height_mm)), motion.press_speed_mm_s),
-        Move(deep, motion.press_speed_mm_s, max(dwell_s, motion.least_dwell_s)),
-        Move(pose(CLEARANCE_MM, tilt_deg), motion.press_speed_mm_s),
-        Move(above, motion.travel_speed_mm_s),
-    ]
-    return before, pressing
-
-
-def _upright(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Pose:
-    return brush_pose(x_mm, y_mm, z_mm, heading_deg=config.paper.yaw_deg)
+    acc_mm_s2 = config.motion.acc_mm_s2
+    moves = stroke_moves(config, plane, cell, points, speed_mm_s)
+    for pose, pace_mm_s in commanded(moves.parts):
+        robot.check(pose, speed_mm_s=pace_mm_s, acc_mm_s2=acc_mm_s2)
+    for move in moves.down:
+        await robot.move(move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=acc_mm_s2)
+    depth_mm = -plane.above_mm(config.paper, await robot.where())
+    await robot.follow(moves.way.poses, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=blend_mm)
+    for move in moves.up:
+        await robot.move(move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=acc_mm_s2)
+    return depth_mm

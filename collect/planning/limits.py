@@ -7,12 +7,14 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from collect.errors import ConfigError, StepError
-from collect.motion.procedures import park_moves
+from collect.motion.moves import park_moves
 from collect.planning.moves import moves_of
 from collect.planning.walk import sheet_of, steps_on
-from collect.protocols.config import CalibrationConfig, GridConfig, ProtocolConfig, WriteConfig
-from collect.protocols.plans import planned
+from collect.protocols.calibration import CalibrationConfig
+from collect.protocols.config import ProtocolConfig
+from collect.protocols.presses import GridConfig
 from collect.protocols.steps import MARKING, Result, Step, StepKind
+from collect.protocols.write import WriteConfig
 from collect.rig.config import RigConfig
 from collect.rig.devices import limits_of
 from collect.rig.paper import Cell, PaperPlane, Sheet
@@ -78,7 +80,7 @@ def _depths(protocol: ProtocolConfig) -> Iterator[tuple[float, float, str]]:
             for stroke in figure.strokes:
                 yield from ((point[2], point[3], f"{figure.name}: ") for point in stroke.points)
     else:
-        for stroke in planned(protocol):
+        for stroke in protocol.planned():
             yield stroke.height_mm, stroke.tilt_deg, "" if isinstance(protocol, GridConfig) else f"{stroke.stroke_id}: "
 
 

@@ -4,10 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from collect.motion.drawing import Drawn, stroke_moves
-from collect.motion.procedures import Move, inking_moves, photograph_moves, press_moves, zero_touch_moves
-from collect.motion.touches import Room, mark_moves, over, visit_moves
+from collect.motion.moves import (
+    Part,
+    Room,
+    commanded,
+    inking_moves,
+    mark_moves,
+    over,
+    photograph_moves,
+    press_moves,
+    stroke_moves,
+    visit_moves,
+    zero_touch_moves,
+)
 from collect.protocols.steps import Step, StepKind
+from collect.protocols.strokes import Drawn
 from collect.rig.config import RigConfig
 from collect.rig.config_touch import TouchConfig
 from collect.rig.paper import Cell, PaperPlane
@@ -18,18 +29,10 @@ from drivers.samples import Pose
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
-    """Poses that are passed without a halt."""
-
-    poses: list[Pose]
-    speed_mm_s: float
-
-
-@dataclass(frozen=True, slots=True)
 class StepMoves:
     """What a step does, in order, and what it takes besides moving."""
 
-    parts: list[Move | Way | Room] = field(default_factory=list["Move | Way | Room"])
+    parts: list[Part] = field(default_factory=list[Part])
     dwell_s: float = 0.0
     captures: int = 0
     dips: int = 0
@@ -37,14 +40,7 @@ class StepMoves:
     @property
     def poses(self) -> list[tuple[Pose, float]]:
         """Every pose that is commanded, with its speed; the outermost ones where a touch decides by itself."""
-        found: list[tuple[Pose, float]] = []
-        for part in self.parts:
-            match part:
-                case Move():
-                    found.append((part.target, part.speed_mm_s))
-                case Way() | Room():
-                    found += [(pose, part.speed_mm_s) for pose in part.poses]
-        return found
+        return commanded(self.parts)
 
 
 def moves_of(
@@ -95,7 +91,7 @@ def _touches(config: RigConfig, plane: PaperPlane, step: Step, dips: int) -> Ste
     if touch.method == "taught":
         [point] = touch.points_mm if step.kind is StepKind.TOUCH else [None]
         return StepMoves([*zero_touch_moves(config)] if point is None else [*visit_moves(config, plane, *point)])
-    parts: list[Move | Way | Room] = []
+    parts: list[Part] = []
     for rect_mm in touch_rects(config.paper, touch):
         x_mm, y_mm, *_ = rect_mm
         above = over(config, x_mm, y_mm)
@@ -111,14 +107,13 @@ def _touches(config: RigConfig, plane: PaperPlane, step: Step, dips: int) -> Ste
 
 
 def _figure(config: RigConfig, plane: PaperPlane, drawn: Drawn, cell: Cell, dips: int) -> StepMoves:
-    parts: list[Move | Way | Room] = []
+    parts: list[Part] = []
     made = 0
     for number, points in enumerate(drawn.strokes):
         if drawn.dips_before(number):
             parts += inking_moves(config, dips + made)
             made += 1
-        moves = stroke_moves(config, plane, cell, points, drawn.speed_mm_s)
-        parts += [*moves.down, Way(moves.way, moves.speed_mm_s), *moves.up]
+        parts += stroke_moves(config, plane, cell, points, drawn.speed_mm_s).parts
     return StepMoves(parts, dips=made)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ from collect.errors import ConfigError
 from collect.planning.summary import Placed, Plan
 from collect.planning.walk import sheet_of
 from collect.protocols.config import ProtocolConfig
-from collect.protocols.plans import planned
+from collect.protocols.strokes import Drawn
 from collect.rig.config import RigConfig
 from collect.rig.paper import Sheet, to_paper
 from collect.touch.selfcheck import partners
@@ -53,7 +54,7 @@ def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Pat
     axes: list[Axes] = list(picture.subplots(rows, columns, squeeze=False).flat)
     sheet = sheet_of(config, protocol)
     _place(axes[0], config, plan, sheet)
-    drawn = {p.stroke_id: p for p in planned(protocol) if p.figure is not None}
+    drawn = {p.stroke_id: p.drawn for p in protocol.planned() if p.drawn is not None}
     for number, panel in enumerate(axes[1 : shown + 1], 1):
         _sheet(panel, config, sheet, number, [p for p in plan.placed if p.sheet == number], plan, drawn)
     for panel in axes[shown + 1 :]:
@@ -109,7 +110,7 @@ def _sheet(
     number: int,
     placed: Sequence[Placed],
     plan: Plan,
-    drawn: dict[str, Any],
+    drawn: dict[str, Drawn],
 ) -> None:
     from matplotlib import colormaps
 
@@ -124,7 +125,7 @@ def _sheet(
         ink = "white" if not stroke.drawn and 0.25 + 0.75 * (1.0 - share) < 0.55 else "black"
         points = max(4.0, min(0.34 * cell.height_mm, 0.17 * cell.width_mm) * 498.0 / config.paper.size_mm[0])
         if stroke.drawn:
-            _figure(axes, cell.rect_mm, drawn[stroke.stroke_id].figure)
+            _figure(axes, cell.rect_mm, drawn[stroke.stroke_id])
             axes.text(cell.x_mm + 1.0, cell.y_mm + 1.0, f"#{stroke.order} {_plain(stroke.stroke_id)}", fontsize=8)
         else:
             axes.text(
@@ -153,14 +154,14 @@ def _sheet(
     _finish(axes, f"sheet {number}, {len(placed)} strokes{note}")
 
 
-def _figure(axes: Axes, rect_mm: tuple[float, float, float, float], figure: Any) -> None:
+def _figure(axes: Axes, rect_mm: tuple[float, float, float, float], figure: Drawn) -> None:
     """Trajectories, as thick as they are deep; a ring where each stroke begins."""
     x_mm, y_mm, *_ = rect_mm
     for number, stroke in enumerate(figure.strokes, 1):
-        for a, b in zip(stroke.points, stroke.points[1:], strict=False):
+        for a, b in itertools.pairwise(stroke):
             thick = 0.6 + 0.25 * max(0.0, 0.5 * (a[2] + b[2]))
             axes.plot([x_mm + a[0], x_mm + b[0]], [y_mm + a[1], y_mm + b[1]], color=BLUE, lw=thick, alpha=0.75)
-        first = stroke.points[0]
+        first = stroke[0]
         axes.plot(x_mm + first[0], y_mm + first[1], "o", mfc="white", mec=ORANGE, markersize=9)
         axes.text(x_mm + first[0], y_mm + first[1], str(number), fontsize=6, ha="center", va="center")
 

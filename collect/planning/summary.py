@@ -7,15 +7,17 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from collect.errors import StepError
-from collect.motion.procedures import park_moves
+from collect.motion.moves import park_moves
 from collect.planning.ink import InkNeed, ink_need
 from collect.planning.marks import reach_of
 from collect.planning.moves import StepMoves
 from collect.planning.timing import OMITTED, step_s
 from collect.planning.walk import Walked, sheet_of, walk
-from collect.protocols.config import AdaptiveConfig, ProtocolConfig, ReplayConfig, WriteConfig
-from collect.protocols.plans import planned
+from collect.protocols.adaptive import AdaptiveConfig
+from collect.protocols.config import ProtocolConfig
+from collect.protocols.presses import ReplayConfig
 from collect.protocols.steps import MARKING, StepKind
+from collect.protocols.write import WriteConfig
 from collect.rig.config import RigConfig
 from collect.rig.paper import Cell, Sheet
 from collect.touch.selfcheck import triangle_in
@@ -149,7 +151,7 @@ def _warnings(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list
 
 def _armed(config: RigConfig, protocol: ProtocolConfig) -> str | None:
     """What the self-check, which `--arm` switches on, takes beyond this plan."""
-    if config.self_check.enabled is not None or not planned(protocol):
+    if config.self_check.enabled is not None or not protocol.planned():
         return None
     armed = config.checking_itself(True)
     try:
@@ -186,7 +188,7 @@ def _overhangs(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> lis
         ]
     anchor_x, anchor_y = cell.anchor_mm[0] - cell.x_mm, cell.anchor_mm[1] - cell.y_mm
     found: dict[tuple[float, float], tuple[float, str]] = {}
-    for stroke in planned(protocol):
+    for stroke in protocol.planned():
         reach = reach_of(config.brush, stroke.height_mm, stroke.tilt_deg)
         beyond_mm = max(
             reach.behind_mm - anchor_x,

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 
-from collect.motion.procedures import Move
-from collect.motion.touches import Room
-from collect.planning.moves import StepMoves, Way
+from collect.motion.moves import Move, Room, Way
+from collect.planning.moves import StepMoves
 from collect.rig.config import RigConfig
 from collect.rig.devices import limits_of
 from drivers.limits import Limits

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 
 from collect.planning.moves import StepMoves, moves_of
 from collect.protocols.config import ProtocolConfig
-from collect.protocols.plans import cell_mm, steps
 from collect.protocols.steps import MARKING, Protocol, Result, Step, StepKind, with_self_check
 from collect.rig.config import RigConfig
 from collect.rig.paper import Cell, Layout, PaperPlane, Sheet
@@ -30,7 +29,7 @@ class Walked:
 
 def sheet_of(config: RigConfig, protocol: ProtocolConfig) -> Sheet:
     """The sheet as this protocol divides it."""
-    return Sheet(config.paper, cell_mm(protocol))
+    return Sheet(config.paper, protocol.own_cell_mm)
 
 
 def layout_of(config: RigConfig, protocol: ProtocolConfig) -> Layout:
@@ -44,7 +43,7 @@ def layout_of(config: RigConfig, protocol: ProtocolConfig) -> Layout:
 
 def steps_on(config: RigConfig, protocol: ProtocolConfig) -> Protocol:
     """The steps as they are run on this rig: balanced over its sheet, with the self-check where it is switched on."""
-    found = steps(protocol, layout_of(config, protocol))
+    found = protocol.steps(layout_of(config, protocol))
     return with_self_check(found) if config.self_check.enabled else found
 
 

@@ -1,1 +1,1 @@
-"""Protocols: what `protocol.toml` may ask for, one module a kind."""
+"""Protocols: what `protocol.toml` may ask for, and the steps that it becomes."""

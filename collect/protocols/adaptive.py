@@ -3,42 +3,94 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Annotated, ClassVar, Literal
 
-from collect.protocols.config import AdaptiveConfig
+from pydantic import Field, model_validator
+
+from collect.protocols.base import MAX_STROKES, DeepMm, DwellS, ProtocolBase, Repeats, check_count
 from collect.protocols.steps import Protocol, Result, Step, StepKind
-from collect.protocols.strokes import Planned, takes
+from collect.protocols.strokes import Planned, TiltDeg, takes
+from collect.rig.paper import Layout
 
 
-def cells(config: AdaptiveConfig) -> list[tuple[float, float]]:
-    """(H, alpha) that can be chosen, in the order of the grid."""
-    return [(h, a) for h in config.heights_mm for a in config.tilts_deg]
+class AdaptiveConfig(ProtocolBase):
+    """Presses chosen one by one, each where it tells most about the brush; stops where little is left to be won."""
 
+    depths_field: ClassVar[str] = "heights_mm"
 
-def planned(config: AdaptiveConfig) -> list[Planned]:
-    """The worst case: as many presses as there may be, the cells in turn."""
-    every = cells(config)
-    return [_stroke(config, number, *every[number % len(every)]) for number in range(config.most)]
+    kind: Literal["adaptive"]
+    heights_mm: Annotated[list[DeepMm], Field(min_length=1, max_length=100)]
+    """Depths H below the touch height."""
+    tilts_deg: Annotated[list[TiltDeg], Field(min_length=1, max_length=100)]
+    """Tilts alpha from the paper's normal."""
+    repeats: Repeats = 10
+    """Of the shuffled grid that it stands in for: what it saved is told against that grid's number of presses."""
+    most_presses: Annotated[int, Field(ge=1, le=MAX_STROKES)] | None = None
+    """Stop after so many at the latest; left out, as many as the grid has. No fewer than the cells: limits, ink and
+    sheets are planned for the worst case, and every cell may be chosen."""
+    least_presses: Annotated[int, Field(ge=3, le=1000)] = 5
+    """Do not stop before."""
+    enough_points: Annotated[float, Field(gt=0.0, le=50.0)] = 1.0
+    """Stop when fewer points of CSIM (percent), in the mean over all cells, are expected to be won by pressing on."""
+    dwell_s: DwellS = 0.2
+    """Time at full depth."""
 
+    @model_validator(mode="after")
+    def _whole(self) -> AdaptiveConfig:
+        for name in ("heights_mm", "tilts_deg"):
+            values = getattr(self, name)
+            if len(set(values)) != len(values):
+                raise ValueError(f"{name} has the same value twice: {values}")
+        check_count(self.whole_grid)
+        cells = len(self.heights_mm) * len(self.tilts_deg)
+        if self.most < cells:
+            raise ValueError(f"most_presses = {self.most}: at least the {cells} cells of the grid")
+        if self.least_presses > self.most:
+            raise ValueError(f"least_presses = {self.least_presses}: at most most_presses = {self.most}")
+        return self
 
-def steps(config: AdaptiveConfig) -> Protocol:
-    """Zero touch, board, then choose, dip, press, capture, until the choice is to stop.
+    @property
+    def whole_grid(self) -> int:
+        """Presses of the grid that it stands in for."""
+        return len(self.heights_mm) * len(self.tilts_deg) * self.repeats
 
-    A CHOOSE without an answer (a plan that is only walked) is the worst case.
-    """
-    yield Step(StepKind.ZERO_TOUCH, 0)
-    yield Step(StepKind.BOARD, 0)
-    for worst in planned(config):
-        number = worst.index
-        if config.board_every is not None and number > 0 and number % config.board_every == 0:
-            yield Step(StepKind.BOARD, number // config.board_every)
-        chosen = yield Step(StepKind.CHOOSE, number)
-        if chosen.get("stop"):
-            return
-        cell = (worst.height_mm, worst.tilt_deg)
-        if "height_mm" in chosen:
-            cell = (float(chosen["height_mm"]), float(chosen["tilt_deg"]))
-        yield from takes(_stroke(config, number, *cell), measured=True)
-    yield Step(StepKind.CHOOSE, config.most, {"last": True})
+    @property
+    def most(self) -> int:
+        """Presses in the worst case."""
+        return self.whole_grid if self.most_presses is None else self.most_presses
+
+    @property
+    def cells(self) -> list[tuple[float, float]]:
+        """(H, alpha) that can be chosen, in the order of the grid."""
+        return [(h, a) for h in self.heights_mm for a in self.tilts_deg]
+
+    def planned(self, layout: Layout | None = None) -> list[Planned]:
+        """The worst case: as many presses as there may be, the cells in turn."""
+        every = self.cells
+        return [self._stroke(number, *every[number % len(every)]) for number in range(self.most)]
+
+    def steps(self, layout: Layout | None = None) -> Protocol:
+        """Zero touch, board, then choose, dip, press, capture, until the choice is to stop.
+
+        A CHOOSE without an answer (a plan that is only walked) is the worst case.
+        """
+        yield Step(StepKind.ZERO_TOUCH, 0)
+        yield Step(StepKind.BOARD, 0)
+        for worst in self.planned():
+            number = worst.index
+            if self.board_every is not None and number > 0 and number % self.board_every == 0:
+                yield Step(StepKind.BOARD, number // self.board_every)
+            chosen = yield Step(StepKind.CHOOSE, number)
+            if chosen.get("stop"):
+                return
+            cell = (worst.height_mm, worst.tilt_deg)
+            if "height_mm" in chosen:
+                cell = (float(chosen["height_mm"]), float(chosen["tilt_deg"]))
+            yield from takes(self._stroke(number, *cell), measured=True)
+        yield Step(StepKind.CHOOSE, self.most, {"last": True})
+
+    def _stroke(self, number: int, height_mm: float, tilt_deg: float) -> Planned:
+        return Planned(_name(number, height_mm, tilt_deg), height_mm, tilt_deg, 1, number, dwell_s=self.dwell_s)
 
 
 def with_choice(plan: list[Planned], chosen: Result) -> list[Planned]:
@@ -50,10 +102,6 @@ def with_choice(plan: list[Planned], chosen: Result) -> list[Planned]:
     name = _name(number, height_mm, tilt_deg)
     made = replace(plan[number], stroke_id=name, height_mm=height_mm, tilt_deg=tilt_deg)
     return [*plan[:number], made, *plan[number + 1 :]]
-
-
-def _stroke(config: AdaptiveConfig, number: int, height_mm: float, tilt_deg: float) -> Planned:
-    return Planned(_name(number, height_mm, tilt_deg), height_mm, tilt_deg, 1, number, dwell_s=config.dwell_s)
 
 
 def _name(number: int, height_mm: float, tilt_deg: float) -> str:

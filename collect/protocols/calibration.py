@@ -2,18 +2,46 @@
 
 from __future__ import annotations
 
-from collect.protocols.config import CalibrationConfig
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from collect.protocols.base import ProtocolBase, check_count
 from collect.protocols.steps import Protocol, Step, StepKind
+from collect.rig.config_file import Finite
+from collect.rig.paper import Layout
 
 
-def steps(config: CalibrationConfig) -> Protocol:
-    """Zero touch, then in each round every touch and every view of the board."""
-    yield Step(StepKind.ZERO_TOUCH, 0)
-    touches = views = 0
-    for _ in range(config.rounds):
-        for x_mm, y_mm in config.touches_mm:
-            yield Step(StepKind.TOUCH, touches, {"x_mm": x_mm, "y_mm": y_mm})
-            touches += 1
-        for _ in range(config.board_views):
-            yield Step(StepKind.BOARD, views)
-            views += 1
+class CalibrationConfig(ProtocolBase):
+    """Touches and views of the board, nothing else: no ink, no mark."""
+
+    kind: Literal["calibration"]
+    touches_mm: Annotated[tuple[tuple[Finite, Finite], ...], Field(max_length=200)] = ()
+    """Points of the sheet to touch, x and y in the paper frame. Three that are no line give the sheet's lean."""
+    rounds: Annotated[int, Field(ge=1, le=100)] = 1
+    """How often all of them are touched: the spread of a point over the rounds tells how well a touch repeats."""
+    board_views: Annotated[int, Field(ge=1, le=1000)] = 1
+    """How often the board is looked at in each round."""
+
+    @model_validator(mode="after")
+    def _apart(self) -> CalibrationConfig:
+        if self.board_every is not None:
+            raise ValueError("board_every counts strokes, and this protocol has none: use board_views")
+        if self.wait_after_dip_s is not None:
+            raise ValueError("wait_after_dip_s: this protocol has no dips")
+        if len(set(self.touches_mm)) != len(self.touches_mm):
+            raise ValueError("touches_mm has the same point twice: use rounds")
+        check_count((len(self.touches_mm) + self.board_views) * self.rounds)
+        return self
+
+    def steps(self, layout: Layout | None = None) -> Protocol:
+        """Zero touch, then in each round every touch and every view of the board."""
+        yield Step(StepKind.ZERO_TOUCH, 0)
+        touches = views = 0
+        for _ in range(self.rounds):
+            for x_mm, y_mm in self.touches_mm:
+                yield Step(StepKind.TOUCH, touches, {"x_mm": x_mm, "y_mm": y_mm})
+                touches += 1
+            for _ in range(self.board_views):
+                yield Step(StepKind.BOARD, views)
+                views += 1

@@ -6,15 +6,65 @@ import itertools
 import json
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
-from collect.protocols.config import Figure, WriteConfig
-from collect.protocols.rows import TrajectoryPoint
+from pydantic import Field
+
 from collect.protocols.steps import Params, Protocol, Result, Step, StepKind
+
+InCellMm = Annotated[float, Field(ge=0.0, le=500.0)]
+PathDepthMm = Annotated[float, Field(ge=-20.0, le=100.0)]
+TiltDeg = Annotated[float, Field(ge=0.0, le=30.0)]
+HeadingDeg = Annotated[float, Field(ge=-720.0, le=720.0)]
+TrajectoryPoint = tuple[InCellMm, InCellMm, PathDepthMm, TiltDeg, HeadingDeg]
+"""x, y in the figure's cell; depth below the touch height, negative above the paper; tilt; where the ferrule leans to,
+counter-clockwise from the sheet's x."""
+AGAIN = "-again"
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """The figure that a DRAW step draws."""
+
+    strokes: list[list[TrajectoryPoint]]
+    cell_mm: tuple[float, float]
+    """Size of the figure's cell."""
+    speed_mm_s: float
+    blend_mm: float
+    dip_every_strokes: int
+
+    @classmethod
+    def of(cls, step: Step) -> Drawn:
+        """The figure in a step's parameters. Raises KeyError or ValueError for a step that draws nothing."""
+        params = step.params
+        return cls(
+            strokes_of(str(params["strokes"])),
+            (float(params["cell_w_mm"] or 0), float(params["cell_h_mm"] or 0)),
+            float(params["speed_mm_s"] or 0),
+            float(params["blend_mm"] or 0),
+            int(params["dip_every_strokes"] or 0),
+        )
+
+    @property
+    def params(self) -> Params:
+        """The figure as a step's parameters."""
+        return {
+            "strokes": strokes_text(self.strokes),
+            "cell_w_mm": self.cell_mm[0],
+            "cell_h_mm": self.cell_mm[1],
+            "speed_mm_s": self.speed_mm_s,
+            "blend_mm": self.blend_mm,
+            "dip_every_strokes": self.dip_every_strokes,
+        }
+
+    def dips_before(self, stroke: int) -> bool:
+        """Whether the brush dips again before that stroke, counted from 0: the DIP step has served the first."""
+        return stroke > 0 and self.dip_every_strokes > 0 and stroke % self.dip_every_strokes == 0
 
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """One stroke, or one figure of several."""
+    """One press, or one figure of several strokes."""
 
     stroke_id: str
     height_mm: float
@@ -24,18 +74,13 @@ class Planned:
     repeat: int
     """Round, from 1."""
     index: int = 0
-    """Number in the plan before it was balanced over the sheet: what its steps' keys are made with, so that they do not
-    depend on the sheet."""
+    """Number in the plan before it was balanced over the sheet. The keys of its steps are made with it, so that they do
+    not depend on the sheet."""
     dwell_s: float = 0.0
-    figure: Figure | None = None
-    """What is drawn; None is a press."""
-    cell_mm: tuple[float, float] | None = None
-    """Paper cell that it needs; None is the rig's own, `paper.cell_mm`."""
+    drawn: Drawn | None = None
+    """The figure; None is a press."""
     again_of: str | None = None
     """The stroke of another session that this one repeats."""
-
-
-AGAIN = "-again"
 
 
 def made_again(marked: Planned, index: int) -> Planned:
@@ -44,7 +89,7 @@ def made_again(marked: Planned, index: int) -> Planned:
 
 
 def with_review(plan: Iterable[Planned], reviewed: Result) -> list[Planned]:
-    """The plan after a REVIEW step: each marked stroke gives its place to the one that is made again.
+    """The plan after a REVIEW step: each stroke that was marked bad is replaced by the one that is pressed again.
 
     `reviewed` holds `again`: [stroke_id, index] of each.
     """
@@ -52,31 +97,29 @@ def with_review(plan: Iterable[Planned], reviewed: Result) -> list[Planned]:
     return [made_again(p, indices[p.stroke_id]) if p.stroke_id in indices else p for p in plan]
 
 
-def stroke_steps(plan: Iterable[Planned], *, board_every: int | None, write: WriteConfig | None = None) -> Protocol:
+def stroke_steps(plan: Iterable[Planned], *, board_every: int | None) -> Protocol:
     """Zero touch, board, then dip, press or draw, capture for each stroke of the plan."""
     yield Step(StepKind.ZERO_TOUCH, 0)
     yield Step(StepKind.BOARD, 0)
     for number, stroke in enumerate(plan):
         if board_every is not None and number > 0 and number % board_every == 0:
             yield Step(StepKind.BOARD, number // board_every)
-        yield from takes(stroke, write=write)
+        yield from takes(stroke)
 
 
-def takes(
-    stroke: Planned, *, write: WriteConfig | None = None, measured: bool = False
-) -> Generator[Step, Result, None]:
-    """Dip, press or draw, capture; again where the capture says so. `measured`: the capture also tells the ink."""
+def takes(stroke: Planned, *, measured: bool = False) -> Generator[Step, Result, None]:
+    """Dip, press or draw, capture; again where the capture asks for it.
+
+    `measured`: the capture's result also holds the ink.
+    """
     for take in itertools.count(1):
         # Only a second take has a number: the keys of first ones are those of older sessions.
         taken: Params = {} if take == 1 else {"take": take}
         dipped = yield Step(StepKind.DIP, stroke.index, taken)
         if dipped.get("skipped"):
             break
-        if stroke.figure is None:
-            marked = yield Step(StepKind.PRESS, stroke.index, _press_params(stroke) | taken)
-        else:
-            assert write is not None
-            marked = yield Step(StepKind.DRAW, stroke.index, _draw_params(stroke, write) | taken)
+        kind = StepKind.PRESS if stroke.drawn is None else StepKind.DRAW
+        marked = yield Step(kind, stroke.index, _mark_params(stroke) | taken)
         # A capture belongs to one cell: made again elsewhere, it is another step.
         place = _capture_params(stroke, int(marked["sheet"]), int(marked["cell"]))
         if measured:
@@ -102,29 +145,12 @@ def strokes_of(text: str) -> list[list[TrajectoryPoint]]:
         raise ValueError(f"no trajectories: {error}") from None
 
 
-def _press_params(stroke: Planned) -> Params:
-    params: Params = {
-        "stroke_id": stroke.stroke_id,
-        "height_mm": stroke.height_mm,
-        "tilt_deg": stroke.tilt_deg,
-        "dwell_s": stroke.dwell_s,
-    }
+def _mark_params(stroke: Planned) -> Params:
+    params: Params = {"stroke_id": stroke.stroke_id, "height_mm": stroke.height_mm, "tilt_deg": stroke.tilt_deg}
+    if stroke.drawn is not None:
+        return params | stroke.drawn.params
+    params["dwell_s"] = stroke.dwell_s
     return params if stroke.again_of is None else {**params, "again_of": stroke.again_of}
-
-
-def _draw_params(stroke: Planned, config: WriteConfig) -> Params:
-    assert stroke.figure is not None
-    return {
-        "stroke_id": stroke.stroke_id,
-        "height_mm": stroke.height_mm,
-        "tilt_deg": stroke.tilt_deg,
-        "strokes": strokes_text(drawn.points for drawn in stroke.figure.strokes),
-        "cell_w_mm": config.cell_mm[0],
-        "cell_h_mm": config.cell_mm[1],
-        "speed_mm_s": config.speed_mm_s,
-        "blend_mm": config.blend_mm,
-        "dip_every_strokes": config.dip_every_strokes,
-    }
 
 
 def _capture_params(stroke: Planned, sheet: int, cell: int) -> Params:
@@ -137,6 +163,6 @@ def _capture_params(stroke: Planned, sheet: int, cell: int) -> Params:
     }
     if stroke.again_of is not None:
         params["again_of"] = stroke.again_of
-    if stroke.figure is not None:
+    if stroke.drawn is not None:
         params["drawn"] = True
     return params

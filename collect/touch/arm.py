@@ -10,8 +10,8 @@ from collections.abc import AsyncGenerator, Sequence
 from typing import Protocol
 
 from collect.errors import ForceTooHigh, StepError
-from collect.motion import touches as moves
-from collect.motion.procedures import Move
+from collect.motion import moves
+from collect.motion.moves import Move
 from collect.rig.config_touch import ForceTouchConfig
 from collect.rig.devices import Rig
 from collect.touch.force import Reading
@@ -40,7 +40,7 @@ class TouchHands(Hands, Protocol):
 
 
 class TouchArm:
-    """A vertical brush over points of the paper frame; its targets are those of `touch.moves`."""
+    """A vertical brush over points of the paper frame; its targets are those of `motion.moves`."""
 
     def __init__(self, rig: Rig, slow_mm_s: float) -> None:
         self._rig = rig
@@ -56,13 +56,13 @@ class TouchArm:
 
     async def to(self, x_mm: float, y_mm: float, z_mm: float) -> float:
         """Slowly to a height; returns the one at which the arm rests."""
-        await self.go(Move(moves.upright(self._rig.config, x_mm, y_mm, z_mm), self._slow_mm_s))
+        await self.go(Move(moves.touching(self._rig.config, x_mm, y_mm, z_mm), self._slow_mm_s))
         return (await self._rig.robot.where()).z_mm
 
     async def press(self, x_mm: float, y_mm: float, z_mm: float) -> None:
         """Slowly down to a height and up to travel height; the arm lifts by itself even if this program dies."""
         config = self._rig.config
-        down = Move(moves.upright(config, x_mm, y_mm, z_mm), self._slow_mm_s)
+        down = Move(moves.touching(config, x_mm, y_mm, z_mm), self._slow_mm_s)
         await self.sequence([down, moves.up(config, x_mm, y_mm)])
 
     async def sequence(self, pressing: Sequence[Move]) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calibrate.board.view import see_board
 from calibrate.errors import CalibrationError
 from collect.errors import StepError
-from collect.motion.touches import CHECK_SPEED_MM_S, mark_moves
+from collect.motion.moves import CHECK_SPEED_MM_S, mark_moves
 from collect.photograph.new_ink import gray, new_marks
 from collect.rig.config_touch import SelfCheckConfig
 from collect.rig.devices import Rig

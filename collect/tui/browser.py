@@ -73,7 +73,7 @@ class SessionBrowser:
     def planned(self) -> str:
         """What the protocol would do, in one line. Raises `ConfigError`."""
         from collect.planning.summary import make_plan
-        from collect.protocols.files import load_protocol
+        from collect.protocols.config import load_protocol
         from collect.rig.config import load_rig
 
         plan = make_plan(load_rig(self.paths.config).settled(armed=False), load_protocol(self.paths.protocol))

@@ -14,8 +14,8 @@ from calibrate.compare.field import Field
 from calibrate.errors import CalibrationError
 from calibrate.invert.files import PROTOCOL, write_inversion
 from calibrate.invert.invert import Row, Settings, align, invert_recording, off_command
-from collect.protocols.config import ReplayConfig
-from collect.protocols.files import load_protocol
+from collect.protocols.config import load_protocol
+from collect.protocols.presses import ReplayConfig
 from model.ccdbsm import Brush, ccdbsm
 from model.coverage import coverage
 from model.inversion.press import Range

@@ -17,8 +17,8 @@ from calibrate.errors import CalibrationError
 from calibrate.writing.plan import Settings, plan, wanted_of
 from calibrate.writing.plan_files import PICTURE, PROTOCOL, write_plan
 from calibrate.writing.record import load_plan
-from collect.protocols.config import WriteConfig
-from collect.protocols.files import load_protocol
+from collect.protocols.config import load_protocol
+from collect.protocols.write import WriteConfig
 from model.ccdbsm import Brush
 from model.characters.brush import Reach
 from model.drag import DragModel

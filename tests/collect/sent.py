@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from collect.motion.procedures import Move, over_sheet_move, photograph_moves
-from collect.motion.touches import Room
-from collect.planning.moves import StepMoves, Way
+from collect.motion.moves import Move, Room, Way, over_sheet_move, photograph_moves
+from collect.planning.moves import StepMoves
 from collect.rig.config import RigConfig
 from collect.rig.paper import to_paper
 from drivers.geometry import distance

@@ -12,8 +12,7 @@ from collect.engine.steps import dip as dipping
 from collect.engine.steps import touch as touching
 from collect.engine.steps.context import RunMemory
 from collect.planning.summary import make_plan
-from collect.protocols.files import load_protocol
-from collect.protocols.plans import steps
+from collect.protocols.config import load_protocol
 from collect.protocols.steps import StepKind
 from collect.rig.config import load_rig
 from collect.tui.captures import Review
@@ -147,7 +146,7 @@ def test_a_wait_changes_no_key_and_a_protocol_without_one_reads_as_before(tmp_pa
 
 
 def keys(protocol: Any) -> list[str]:
-    generator, found = steps(protocol), list[str]()
+    generator, found = protocol.steps(), list[str]()
     step = next(generator)
     try:
         while True:

@@ -8,7 +8,7 @@ import pytest
 
 from collect.errors import ConfigError
 from collect.planning.limits import check_protocol
-from collect.protocols.files import load_protocol
+from collect.protocols.config import load_protocol
 from collect.rig.config import load_rig
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml

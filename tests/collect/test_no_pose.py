@@ -12,7 +12,7 @@ from collect import headless
 from collect.engine.control import State
 from collect.engine.engine import Engine
 from collect.engine.snapshot import Snapshot
-from collect.protocols.config import GridConfig
+from collect.protocols.presses import GridConfig
 from collect.rig.config import load_rig
 from collect.rig.devices import Rig, make_robot
 from collect.tui.app import OperatorApp

@@ -10,7 +10,8 @@ from typing import Any, cast
 import pytest
 
 from collect.errors import StepVoid
-from collect.motion.procedures import Procedures, press_moves
+from collect.motion.moves import press_moves
+from collect.motion.procedures import Procedures
 from collect.rig.config import load_rig
 from collect.rig.devices import Rig, limits_of
 from collect.rig.paper import Sheet

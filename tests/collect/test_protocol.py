@@ -9,8 +9,7 @@ from collections import Counter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from collect.protocols import grid
-from collect.protocols.config import GridConfig
+from collect.protocols.presses import GridConfig
 from collect.protocols.steps import Step, StepKind
 from collect.rig.config import PaperConfig
 from collect.rig.paper import Sheet, to_base
@@ -27,7 +26,7 @@ def config(heights_mm: list[float], tilts_deg: list[float], repeats: int, seed: 
 def test_every_cell_is_pressed_as_often_as_asked_and_once_a_round(
     heights_mm: list[float], tilts_deg: list[float], repeats: int, seed: int
 ) -> None:
-    planned = grid.planned(config(heights_mm, tilts_deg, repeats, seed))
+    planned = config(heights_mm, tilts_deg, repeats, seed).planned()
     cells = Counter((p.height_mm, p.tilt_deg) for p in planned)
     assert set(cells.values()) == {repeats}
     assert len(cells) == len(heights_mm) * len(tilts_deg)
@@ -36,7 +35,7 @@ def test_every_cell_is_pressed_as_often_as_asked_and_once_a_round(
 
 
 def test_steps_of_a_stroke_follow_each_other_and_a_capture_belongs_to_the_cell_that_was_pressed() -> None:
-    protocol = grid.steps(config([11.0], [0.0], 1))
+    protocol = config([11.0], [0.0], 1).steps()
     kinds: list[str] = []
     step = next(protocol)
     try:

@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.protocols.files import load_protocol
-from collect.protocols.plans import planned
+from collect.protocols.config import load_protocol
 from sessions.journal.journal import JOURNAL_NAME, is_open, replay
 from sessions.journal.lines import read_lines
 from sessions.reader import Recording
@@ -157,7 +156,7 @@ def events(lab: Lab) -> list[str]:
 
 
 def stroke_ids(lab: Lab) -> list[str]:
-    return sorted(press.stroke_id for press in planned(load_protocol(lab.folder / "protocol.toml")))
+    return sorted(press.stroke_id for press in load_protocol(lab.folder / "protocol.toml").planned())
 
 
 def strokes_left(lab: Lab) -> int:

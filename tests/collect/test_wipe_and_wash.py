@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from collect.errors import ConfigError
-from collect.motion.procedures import dip_moves, wash_moves
+from collect.motion.moves import dip_moves, wash_moves
 from collect.rig.config import RigConfig, load_rig
 from tests.collect.until import wait_for_end
 

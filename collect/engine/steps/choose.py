@@ -9,8 +9,7 @@ from calibrate.stroke.params import Gray, Params
 from calibrate.stroke.preprocess import prepare
 from collect.engine.last_capture import cell_raster
 from collect.engine.steps.context import RunContext, StepContext, uninterrupted
-from collect.protocols.adaptive import cells
-from collect.protocols.config import AdaptiveConfig
+from collect.protocols.adaptive import AdaptiveConfig
 from collect.protocols.steps import Result, StepKind
 from collect.rig.paper import Cell
 
@@ -79,7 +78,7 @@ def _fitted(run: RunContext, protocol: AdaptiveConfig, seen: list[Seen]) -> Next
     design = Design(
         brush.radius_mm,
         brush.length_mm,
-        tuple(cells(protocol)),
+        tuple(protocol.cells),
         protocol.enough_points,
         protocol.least_presses,
     )

@@ -9,7 +9,8 @@ from contextlib import contextmanager
 from collect.engine.steps.capture import look_at_sheet
 from collect.engine.steps.context import RunContext, StepContext
 from collect.errors import NeedsOperator
-from collect.motion.procedures import TOUCH_TOLERANCE_MM, Move
+from collect.motion.moves import Move
+from collect.motion.procedures import TOUCH_TOLERANCE_MM
 from collect.protocols.steps import Result
 from collect.rig.config_devices import InkStationConfig, ModbusPumpConfig
 from drivers.samples import PoseSample

@@ -9,7 +9,7 @@ from pathlib import Path
 from collect.engine.steps.context import RunContext, StepContext
 from collect.engine.steps.dip import fill_brush, set_light
 from collect.errors import ConfigError, StepError
-from collect.motion.touches import visit_moves
+from collect.motion.moves import visit_moves
 from collect.operator import Choice, Prompt
 from collect.planning.limits import check_poses, check_step
 from collect.planning.moves import touch_of

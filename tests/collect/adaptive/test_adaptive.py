@@ -14,9 +14,8 @@ from pydantic import ValidationError
 from calibrate.fit.stepwise import Design, Seen, field_grid, next_cell, packed, unpacked
 from collect.planning.limits import check_protocol
 from collect.planning.summary import make_plan
-from collect.protocols.adaptive import planned, steps
-from collect.protocols.config import AdaptiveConfig
-from collect.protocols.files import load_protocol
+from collect.protocols.adaptive import AdaptiveConfig
+from collect.protocols.config import load_protocol
 from collect.protocols.steps import Result, Step, StepKind
 from collect.rig.config import load_rig
 from model.fitted import FittedPress
@@ -43,7 +42,7 @@ def config(**changed: Any) -> AdaptiveConfig:
 def walked(made: AdaptiveConfig, choices: dict[int, Result]) -> list[Step]:
     """The steps when each CHOOSE is answered from `choices`, else with nothing, as a plan is walked."""
     seen: list[Step] = []
-    generator = steps(made)
+    generator = made.steps()
     answer: Result | None = None
     try:
         while True:
@@ -77,7 +76,7 @@ def test_what_is_pressed_is_what_was_chosen_and_a_stop_ends_it() -> None:
 def test_a_plan_is_the_worst_case_and_reaches_every_cell() -> None:
     made = config(most_presses=8)
     pressed = [step for step in walked(made, {}) if step.kind is StepKind.PRESS]
-    assert len(pressed) == len(planned(made)) == 8
+    assert len(pressed) == len(made.planned()) == 8
     assert {(s.params["height_mm"], s.params["tilt_deg"]) for s in pressed} == set(CELLS)
     assert len({step.key for step in walked(made, {})}) == len(walked(made, {}))
 

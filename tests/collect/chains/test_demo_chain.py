@@ -8,7 +8,7 @@ import pytest
 
 from collect.chains import demo
 from collect.chains.commands import GIVEN_UP, CommandFailed
-from collect.protocols.files import load_protocol
+from collect.protocols.config import load_protocol
 from sessions.store import SessionStore
 from tests.sessions.conftest import Make
 

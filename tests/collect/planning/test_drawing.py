@@ -8,10 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from collect.motion.drawing import Drawn, check_drawn, draw_stroke, stroke_moves
+from collect.motion.moves import stroke_moves
+from collect.motion.procedures import check_drawn, draw_stroke
 from collect.planning.walk import sheet_of, walk
-from collect.protocols.files import load_protocol
+from collect.protocols.config import load_protocol
 from collect.protocols.steps import StepKind
+from collect.protocols.strokes import Drawn
 from collect.rig.config import RigConfig, load_rig
 from collect.rig.devices import limits_of, make_robot
 from collect.rig.paper import PaperPlane
@@ -88,7 +90,7 @@ def test_a_stroke_may_come_down_on_its_way(config: RigConfig) -> None:
     points = [(10.0, 10.0, -4.0, 3.0, 0.0), (20.0, 10.0, 5.0, 3.0, 0.0), (30.0, 10.0, -4.0, 3.0, 0.0)]
     moves = stroke_moves(config, PLANE, cell, points, 15.0)
     assert [move.target.z_mm for move in moves.down] == pytest.approx([180.0, 132.0, 132.0, 124.0])
-    assert [pose.z_mm for pose in moves.way] == pytest.approx([115.0, 124.0])
+    assert [pose.z_mm for pose in moves.way.poses] == pytest.approx([115.0, 124.0])
 
 
 def test_the_wrist_turns_where_the_brush_is_upright_and_high(config: RigConfig) -> None:

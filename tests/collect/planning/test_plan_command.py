@@ -16,7 +16,7 @@ from collect.planning.asking import ask_reach
 from collect.planning.limits import all_poses
 from collect.planning.picture import draw_plan
 from collect.planning.summary import make_plan
-from collect.protocols.files import load_protocol
+from collect.protocols.config import load_protocol
 from collect.rig.config import RigConfig, load_rig
 from collect.rig.paper import PaperPlane
 from drivers.arcs.codes import RobotMode

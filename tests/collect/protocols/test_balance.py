@@ -6,8 +6,7 @@ from collections import defaultdict
 
 import pytest
 
-from collect.protocols.config import GridConfig
-from collect.protocols.plans import planned
+from collect.protocols.presses import GridConfig
 from collect.protocols.strokes import Planned
 from collect.rig.paper import Layout
 
@@ -31,7 +30,7 @@ def thirds(plan: list[Planned], layout: Layout) -> dict[tuple[float, float], lis
 @pytest.mark.parametrize("layout", [Layout(6, 7), Layout(5, 9), Layout(4, 4)], ids=str)
 def test_each_condition_is_within_one_or_two_strokes_of_its_share_of_every_third(seed: int, layout: Layout) -> None:
     config = GridConfig(kind="grid", **PAPER, repeats=10, seed=seed)
-    balanced, plain = thirds(planned(config, layout), layout), thirds(planned(config), layout)
+    balanced, plain = thirds(config.planned(layout), layout), thirds(config.planned(), layout)
     worst = max(abs(off) for offs in balanced.values() for off in offs)
     square = sum(off * off for offs in balanced.values() for off in offs)
     assert worst < 1.7
@@ -39,17 +38,17 @@ def test_each_condition_is_within_one_or_two_strokes_of_its_share_of_every_third
 
 
 def test_rounds_stay_whole() -> None:
-    plan = planned(GridConfig(kind="grid", **PAPER, repeats=4), Layout(6, 7))
+    plan = GridConfig(kind="grid", **PAPER, repeats=4).planned(Layout(6, 7))
     for first in range(0, len(plan), 15):
         assert len({(s.height_mm, s.tilt_deg) for s in plan[first : first + 15]}) == 15
 
 
 def test_another_seed_is_another_order() -> None:
-    plans = [planned(GridConfig(kind="grid", **PAPER, repeats=2, seed=seed), Layout(6, 7)) for seed in (1, 2)]
+    plans = [GridConfig(kind="grid", **PAPER, repeats=2, seed=seed).planned(Layout(6, 7)) for seed in (1, 2)]
     assert [s.stroke_id for s in plans[0]] != [s.stroke_id for s in plans[1]]
 
 
 @pytest.mark.parametrize("layout", [Layout(1, 1), Layout(0, 0), Layout(1, 50)], ids=str)
 def test_a_sheet_without_thirds_is_no_trouble(layout: Layout) -> None:
-    plan = planned(GridConfig(kind="grid", **PAPER, repeats=2), layout)
+    plan = GridConfig(kind="grid", **PAPER, repeats=2).planned(layout)
     assert len({s.stroke_id for s in plan}) == 30

@@ -11,9 +11,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from collect.errors import ConfigError
-from collect.protocols import files
-from collect.protocols.config import GridConfig, ListConfig, WriteConfig
-from collect.protocols.files import load_protocol
+from collect.protocols import config as protocol_config
+from collect.protocols.config import load_protocol
+from collect.protocols.presses import GridConfig, ListConfig
+from collect.protocols.write import WriteConfig
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 LIST = 'kind = "list"\nfile = "p.csv"\n'
@@ -112,10 +113,10 @@ def test_rows_become_part_of_the_protocol_and_an_empty_cell_is_left_out(tmp_path
 def test_rows_and_bytes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError, match=r"p.csv: line 10002: more than 10000 rows"):
         load(tmp_path, LIST, "height_mm\n" + "11\n" * 10_001)
-    monkeypatch.setattr(files, "MAX_TABLE_BYTES", 1000)
+    monkeypatch.setattr(protocol_config, "MAX_TABLE_BYTES", 1000)
     with pytest.raises(ConfigError, match=r"p.csv: is larger than 1000 bytes"):
         load(tmp_path, LIST, "height_mm\n" + "11\n" * 1000)
-    monkeypatch.setattr(files, "MAX_PROTOCOL_BYTES", 100)
+    monkeypatch.setattr(protocol_config, "MAX_PROTOCOL_BYTES", 100)
     with pytest.raises(ConfigError, match=r"protocol.toml: is larger than 100 bytes"):
         load(tmp_path, LIST + "#" * 200, "height_mm\n11\n")
 

@@ -12,20 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from collect.protocols.config import (
-    CalibrationConfig,
-    Figure,
-    GridConfig,
-    ListConfig,
-    ProtocolConfig,
-    ReplayConfig,
-    WriteConfig,
-)
-from collect.protocols.files import load_protocol
-from collect.protocols.plans import planned, steps
-from collect.protocols.rows import DrawnStroke, PressRow, ReplayRow
+from collect.protocols.calibration import CalibrationConfig
+from collect.protocols.config import ProtocolConfig, load_protocol
+from collect.protocols.presses import GridConfig, ListConfig, PressRow, ReplayConfig, ReplayRow
 from collect.protocols.steps import MARKING, Step, StepKind
 from collect.protocols.strokes import strokes_of, strokes_text
+from collect.protocols.write import DrawnStroke, Figure, WriteConfig
 from collect.rig.paper import Layout
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
@@ -82,7 +74,7 @@ protocols = st.one_of(grids, lists, replays, writes)
 
 def run(config: ProtocolConfig, layout: Layout | None = None, cell: int = 7) -> list[Step]:
     """All steps, every mark having gone to the same cell."""
-    generator, found = steps(config, layout), list[Step]()
+    generator, found = config.steps(layout), list[Step]()
     try:
         step = next(generator)
         while True:
@@ -97,7 +89,7 @@ def run(config: ProtocolConfig, layout: Layout | None = None, cell: int = 7) -> 
 def test_every_planned_stroke_is_dipped_for_marked_and_captured_exactly_once(
     config: ProtocolConfig, layout: Layout | None
 ) -> None:
-    plan, walked = planned(config, layout), run(config, layout)
+    plan, walked = config.planned(layout), run(config, layout)
     ids = [stroke.stroke_id for stroke in plan]
     assert len(set(ids)) == len(ids)
     assert [str(s.params["stroke_id"]) for s in walked if s.kind in MARKING] == ids
@@ -158,11 +150,11 @@ def test_board_views_come_after_every_so_many_strokes_and_not_at_the_end() -> No
 def test_a_list_keeps_its_order_and_names_and_shuffles_only_for_a_seed() -> None:
     listed = load_protocol(EXAMPLES / "protocol-list.toml")
     assert isinstance(listed, ListConfig)
-    as_written = planned(listed.model_copy(update={"seed": None}))
+    as_written = listed.model_copy(update={"seed": None}).planned()
     assert [s.stroke_id for s in as_written][:4] == ["light", "002-H13-a5-r01", "slow", "004-H17-a10-r01"]
     assert [s.stroke_id for s in as_written][5] == "light-r02"
     assert [s.dwell_s for s in as_written][:3] == [0.2, 0.2, 0.5]
-    assert [s.stroke_id for s in planned(listed)] != [s.stroke_id for s in as_written]
+    assert [s.stroke_id for s in listed.planned()] != [s.stroke_id for s in as_written]
 
 
 def test_a_replayed_stroke_is_found_by_the_one_that_it_repeats() -> None:
@@ -172,7 +164,7 @@ def test_a_replayed_stroke_is_found_by_the_one_that_it_repeats() -> None:
     for step in run(config):
         if step.kind in (StepKind.PRESS, StepKind.CAPTURE):
             assert str(step.params["stroke_id"]).rpartition("~")[0] == step.params["again_of"]
-    assert {s.again_of for s in planned(config)} == {"H11-a0-r01", "H13-a5-r01", "H20-a10-r01"}
+    assert {s.again_of for s in config.planned()} == {"H11-a0-r01", "H13-a5-r01", "H20-a10-r01"}
 
 
 def test_a_figure_is_one_step_that_holds_its_trajectories() -> None:
@@ -183,8 +175,8 @@ def test_a_figure_is_one_step_that_holds_its_trajectories() -> None:
     strokes = strokes_of(str(drawn[0].params["strokes"]))
     assert [len(stroke) for stroke in strokes] == [6, 6]
     assert tuple(strokes[0]) == config.figures[0].strokes[0].points
-    assert planned(config)[0].cell_mm == (80.0, 80.0)
-    assert planned(config)[0].height_mm == 9.0
+    assert config.own_cell_mm == (80.0, 80.0)
+    assert config.planned()[0].height_mm == 9.0
 
 
 @pytest.mark.parametrize("text", ["", "{}x", "[[1]]", "[[[1,2,3]]]", '[[[1,2,3,4,"x"]]]', "3"])
@@ -204,7 +196,7 @@ def test_a_calibration_touches_and_looks_and_leaves_no_mark() -> None:
     config = load_protocol(EXAMPLES / "protocol-calibration.toml")
     assert isinstance(config, CalibrationConfig)
     walked = run(config)
-    assert planned(config) == []
+    assert config.planned() == []
     assert Counter(step.kind for step in walked) == {StepKind.ZERO_TOUCH: 1, StepKind.TOUCH: 15, StepKind.BOARD: 6}
     assert len({step.key for step in walked}) == len(walked)
     assert walked[1].params == {"x_mm": 20.0, "y_mm": 20.0}

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from collect.motion.procedures import Procedures, photograph_moves
+from collect.motion.moves import photograph_moves
+from collect.motion.procedures import Procedures
 from collect.rig.config import load_rig
 from collect.rig.devices import Rig, limits_of
 from collect.touch.arm import ForceTap

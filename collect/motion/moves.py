@@ -1,0 +1,292 @@
+"""Every list of moves that the arm makes: a plan checks, times and draws the lists that a run carries out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from collect.protocols.strokes import TrajectoryPoint
+from collect.rig.config import RigConfig, WashConfig
+from collect.rig.paper import Cell, PaperPlane, to_base
+from drivers.geometry import brush_pose, interpolate, lean
+from drivers.samples import Pose
+
+CLEARANCE_MM = 8.0
+"""Height above the paper at which the fast approach ends."""
+DWELL_MM = 0.05
+"""Way of the dwell: the end of the descent, as slow as it has to last. ARCS cannot wait in its queue but by moving."""
+CHECK_APPROACH_MM = 4.0
+"""Height above the paper at which the slow approach of a self-check's mark begins."""
+CHECK_SPEED_MM_S = 5.0
+"""Speed of that approach."""
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """A straight line to a target, and how fast to go there."""
+
+    target: Pose
+    speed_mm_s: float
+    least_s: float = 0.0
+    """How long it takes at least."""
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """Poses that are passed without a halt."""
+
+    poses: list[Pose]
+    speed_mm_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """Where a touch that decides by itself may send the upright brush: any pose between these, its outermost ones."""
+
+    poses: tuple[Pose, ...]
+    """The lowest first."""
+    speed_mm_s: float
+    """No move within is faster."""
+
+    @classmethod
+    def over(
+        cls, config: RigConfig, rect_mm: tuple[float, float, float, float], lowest_z_mm: float, speed_mm_s: float
+    ) -> Room:
+        """Over a rectangle of the sheet (x, y, width, height), which may be a point, up to travel height."""
+        x_mm, y_mm, width_mm, height_mm = rect_mm
+        places = dict.fromkeys((x, y) for x in (x_mm, x_mm + width_mm) for y in (y_mm, y_mm + height_mm))
+        heights = (lowest_z_mm, config.motion.safe_z_mm)
+        return cls(tuple(touching(config, *place, z_mm) for z_mm in heights for place in places), speed_mm_s)
+
+
+Part = Move | Way | Room
+
+
+def commanded(parts: Iterable[Part]) -> list[tuple[Pose, float]]:
+    """Every pose with its speed in mm/s; the outermost ones where a touch decides by itself."""
+    found: list[tuple[Pose, float]] = []
+    for part in parts:
+        match part:
+            case Move():
+                found.append((part.target, part.speed_mm_s))
+            case Way() | Room():
+                found += [(pose, part.speed_mm_s) for pose in part.poses]
+    return found
+
+
+# Travel and photographs
+
+
+def retreat_moves(config: RigConfig, here: Pose) -> list[Move]:
+    """From anywhere: along the tool axis up to safe height if below it, upright, then to the park position."""
+    motion = config.motion
+    moves: list[Move] = []
+    x_mm, y_mm, z_mm = here.position_mm
+    if here.z_mm < motion.safe_z_mm:
+        tilt_deg, heading_deg = lean(here)
+        rise_mm = motion.safe_z_mm - here.z_mm
+        out_mm = rise_mm * math.tan(math.radians(tilt_deg))
+        x_mm += out_mm * math.cos(math.radians(heading_deg))
+        y_mm += out_mm * math.sin(math.radians(heading_deg))
+        qx, qy, qz, qw = here.quaternion
+        z_mm = motion.safe_z_mm
+        moves.append(Move(Pose(x_mm, y_mm, z_mm, qx, qy, qz, qw), motion.press_speed_mm_s))
+    # Upright in place before travelling: a turn and a long line at once sweep the ferrule around.
+    moves.append(Move(_upright_in_base(config, x_mm, y_mm, z_mm), motion.travel_speed_mm_s))
+    return moves + park_moves(config)
+
+
+def park_moves(config: RigConfig) -> list[Move]:
+    """To the place where the arm waits, out of the camera's view."""
+    return [Move(_upright_in_base(config, *config.motion.park_mm), config.motion.travel_speed_mm_s)]
+
+
+def over_sheet_move(config: RigConfig) -> Move:
+    """Over the middle of the sheet at travel height, where the camera must see the arm."""
+    width_mm, height_mm = config.paper.size_mm
+    return over(config, 0.5 * width_mm, 0.5 * height_mm)
+
+
+def photograph_moves(config: RigConfig) -> list[Move]:
+    """Over the sheet, unless the arm is there, and out of the camera's view."""
+    return [over_sheet_move(config), *park_moves(config)]
+
+
+# Ink
+
+
+def inking_moves(config: RigConfig, dips: int) -> list[Move]:
+    """The next dip after so many others of the same process, and the wash before it where it is time for one."""
+    wash = config.ink.wash
+    washed = wash is not None and dips % wash.every_dips == wash.every_dips - 1
+    return [*(wash_moves(config, wash) if wash is not None and washed else ()), *dip_moves(config)]
+
+
+def dip_moves(config: RigConfig) -> list[Move]:
+    """Over the well, down into the ink, up slowly; with a wipe, across the rim on the way up."""
+    motion, wipe, well = config.motion, config.ink.wipe, config.ink.well_mm
+    moves = [over(config, *well), Move(upright(config, *well, config.ink.dip_z_mm), motion.press_speed_mm_s)]
+    if wipe is None:
+        return [*moves, up(config, *well)]
+    across = [Move(upright(config, *place, wipe.z_mm), motion.press_speed_mm_s) for place in (well, wipe.rim_mm)]
+    return [*moves, *across, up(config, *wipe.rim_mm)]
+
+
+def wash_moves(config: RigConfig, wash: WashConfig) -> list[Move]:
+    """Over the pot, down and up so many times, and up."""
+    speed_mm_s = config.motion.press_speed_mm_s
+    bottom = Move(upright(config, *wash.pot_mm, wash.dip_z_mm), speed_mm_s)
+    half = Move(upright(config, *wash.pot_mm, 0.5 * (wash.dip_z_mm + config.motion.safe_z_mm)), speed_mm_s)
+    above = over(config, *wash.pot_mm)
+    return [above, *[bottom, half] * wash.strokes, above]
+
+
+# Strokes
+
+
+def press_moves(
+    config: RigConfig, plane: PaperPlane, cell: Cell, height_mm: float, tilt_deg: float, dwell_s: float = 0.0
+) -> tuple[list[Move], list[Move]]:
+    """(over the cell and tilted about the tip at clearance; touch height, descend H, dwell and up again).
+
+    The second list is one that the controller carries out by itself: it must end above the paper.
+    Tilting about the tip just above the paper instead of on it leaves the same pose at touch and no smear.
+    """
+    motion, paper = config.motion, config.paper
+    above = over(config, *cell.anchor_mm)
+
+    def pose(above_mm: float, tilt: float) -> Pose:
+        return plane.pose(paper, *cell.anchor_mm, above_mm, tilt_deg=tilt)
+
+    touch, deep = pose(0.0, tilt_deg), pose(-height_mm, tilt_deg)
+    before = [
+        above,
+        Move(pose(CLEARANCE_MM, 0.0), motion.travel_speed_mm_s),
+        Move(pose(CLEARANCE_MM, tilt_deg), motion.press_speed_mm_s),
+    ]
+    pressing = [
+        Move(touch, motion.press_speed_mm_s),
+        Move(interpolate(touch, deep, max(0.5, 1.0 - DWELL_MM / height_mm)), motion.press_speed_mm_s),
+        Move(deep, motion.press_speed_mm_s, max(dwell_s, motion.least_dwell_s)),
+        Move(pose(CLEARANCE_MM, tilt_deg), motion.press_speed_mm_s),
+        above,
+    ]
+    return before, pressing
+
+
+@dataclass(frozen=True, slots=True)
+class StrokeMoves:
+    """One drawn stroke: single moves to its first point, the way through the others, single moves up from the last."""
+
+    down: list[Move]
+    way: Way
+    up: list[Move]
+
+    @property
+    def parts(self) -> list[Part]:
+        """All of it, in order."""
+        return [*self.down, self.way, *self.up]
+
+
+def stroke_moves(
+    config: RigConfig, plane: PaperPlane, cell: Cell, points: Sequence[TrajectoryPoint], speed_mm_s: float
+) -> StrokeMoves:
+    """Over the first point with the wrist turned as the stroke begins, tilt just above the paper, land, follow, lift.
+
+    Points are in the cell's frame: origin at its lower left corner, axes along the sheet's.
+    """
+    motion, paper = config.motion, config.paper
+
+    def at(point: TrajectoryPoint, above_mm: float, tilt_deg: float) -> Pose:
+        x_mm, y_mm = cell.x_mm + point[0], cell.y_mm + point[1]
+        return plane.pose(paper, x_mm, y_mm, above_mm, tilt_deg=tilt_deg, turn_deg=point[4])
+
+    def high(point: TrajectoryPoint) -> Pose:
+        base = to_base(paper, cell.x_mm + point[0], cell.y_mm + point[1])
+        return brush_pose(*base, motion.safe_z_mm, heading_deg=paper.yaw_deg + point[4])
+
+    def clear(point: TrajectoryPoint) -> float:
+        return max(CLEARANCE_MM, CLEARANCE_MM - point[2])
+
+    first, *rest = points
+    last = points[-1]
+    down = [
+        # The wrist turns on the way there, where the brush is upright and turns about itself.
+        Move(high(first), motion.travel_speed_mm_s),
+        Move(at(first, clear(first), 0.0), motion.travel_speed_mm_s),
+        # A turn about the tip that stays where it is: ARCS reads mm/s as thousandths of rad/s.
+        Move(at(first, clear(first), first[3]), motion.travel_speed_mm_s),
+        Move(at(first, -first[2], first[3]), motion.press_speed_mm_s),
+    ]
+    lifted = [
+        Move(at(last, clear(last), last[3]), motion.press_speed_mm_s),
+        Move(high(last), motion.travel_speed_mm_s),
+    ]
+    return StrokeMoves(down, Way([at(point, -point[2], point[3]) for point in rest], speed_mm_s), lifted)
+
+
+# Touches
+
+
+def over(config: RigConfig, x_mm: float, y_mm: float) -> Move:
+    """To travel height over a point of the paper frame."""
+    return Move(upright(config, x_mm, y_mm, config.motion.safe_z_mm), config.motion.travel_speed_mm_s)
+
+
+def near(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Move:
+    """From travel height down to where a slow approach begins."""
+    return Move(touching(config, x_mm, y_mm, z_mm), config.motion.press_speed_mm_s)
+
+
+def up(config: RigConfig, x_mm: float, y_mm: float) -> Move:
+    """Slowly up to travel height over a point."""
+    return Move(upright(config, x_mm, y_mm, config.motion.safe_z_mm), config.motion.press_speed_mm_s)
+
+
+def lift(config: RigConfig, here: Pose) -> list[Move]:
+    """Straight up to travel height from wherever the tip is; nothing where it is there."""
+    high = Pose(here.x_mm, here.y_mm, config.motion.safe_z_mm, *here.quaternion)
+    return [Move(high, config.motion.press_speed_mm_s)] if here.z_mm < config.motion.safe_z_mm else []
+
+
+def zero_touch_moves(config: RigConfig) -> list[Move]:
+    """To the taught height at the touch point."""
+    return visit_moves(config, PaperPlane(config.paper.touch_z_mm), *config.paper.touch_point_mm)
+
+
+def visit_moves(config: RigConfig, plane: PaperPlane, x_mm: float, y_mm: float) -> list[Move]:
+    """Over a point of the sheet, down to clearance, slowly to where the surface is thought to be, and up."""
+    motion, paper = config.motion, config.paper
+    above = over(config, x_mm, y_mm)
+    return [
+        above,
+        Move(plane.pose(paper, x_mm, y_mm, CLEARANCE_MM), motion.travel_speed_mm_s),
+        Move(plane.pose(paper, x_mm, y_mm, 0.0), motion.press_speed_mm_s / 4),
+        above,
+    ]
+
+
+def mark_moves(config: RigConfig, plane: PaperPlane, x_mm: float, y_mm: float) -> list[Move]:
+    """A mark of the self-check: over the place, near; then, as one, slowly to its depth and up."""
+    surface_z_mm = plane.touch_z_mm(x_mm, y_mm)
+    down = near(config, x_mm, y_mm, surface_z_mm + CHECK_APPROACH_MM)
+    mark = Move(touching(config, x_mm, y_mm, surface_z_mm - config.self_check.depth_mm), CHECK_SPEED_MM_S)
+    return [over(config, x_mm, y_mm), down, mark, up(config, x_mm, y_mm)]
+
+
+# Poses
+
+
+def touching(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Pose:
+    """As `upright`, and no higher than travel height."""
+    return upright(config, x_mm, y_mm, min(z_mm, config.motion.safe_z_mm))
+
+
+def upright(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Pose:
+    """The upright brush over a point of the paper frame, its tip at a height of the base frame."""
+    return _upright_in_base(config, *to_base(config.paper, x_mm, y_mm), z_mm)
+
+
+def _upright_in_base(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Pose:
+    return brush_pose(x_mm, y_mm, z_mm, heading_deg=config.paper.yaw_deg)

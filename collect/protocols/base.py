@@ -1,0 +1,83 @@
+"""What every kind of protocol has: common fields, bounds, and the strokes and steps that it makes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated, ClassVar
+
+from pydantic import BaseModel, Field
+
+from collect.protocols.steps import Protocol
+from collect.protocols.strokes import Planned, stroke_steps
+from collect.rig.config_file import Config
+from collect.rig.paper import Layout
+
+MAX_STROKES = 10_000
+"""Of one protocol, repeats included: a month of pressing."""
+
+DeepMm = Annotated[float, Field(gt=0.0, le=100.0)]
+DwellS = Annotated[float, Field(ge=0.0, le=60.0)]
+Repeats = Annotated[int, Field(ge=1, le=1000)]
+Seed = Annotated[int, Field(ge=0)]
+FileName = Annotated[str, Field(min_length=1, max_length=200)]
+MAX_ID = 100
+
+
+class ProtocolBase(Config):
+    """Fields and methods of every kind. A kind adds its own fields, `kind` among them, and `planned`."""
+
+    depths_field: ClassVar[str] = "presses"
+    """The field that a refusal names where a depth is more than the brush bears."""
+    row: ClassVar[type[BaseModel] | None] = None
+    """A row of the CSV that `file` names; its rows become `presses`."""
+    ignores_columns: ClassVar[bool] = False
+    """Whether other columns of that CSV are noted in `ignored_columns` instead of refused."""
+
+    board_every: Annotated[int, Field(ge=1, le=MAX_STROKES)] | None = None
+    """Look at the board again after so many strokes, to see whether camera or sheet moved; left out, only at the
+    start."""
+    wait_after_dip_s: Annotated[float, Field(ge=0.0, le=600.0)] | None = Field(
+        default=None, exclude_if=lambda wait_s: wait_s is None
+    )
+    """Wait over the cell until so much time has passed since the brush left the ink. Left out, it presses at once, and
+    the field is left out of what is written: protocols written before it existed stay the same."""
+
+    @property
+    def own_cell_mm(self) -> tuple[float, float] | None:
+        """Size of the paper cell that each stroke needs; None is the rig's own, `paper.cell_mm`."""
+        return None
+
+    def planned(self, layout: Layout | None = None) -> list[Planned]:
+        """Every stroke exactly once, in order; none for a protocol that marks nothing.
+
+        With a `layout`, conditions of a design are spread over the sheet.
+        """
+        return []
+
+    def steps(self, layout: Layout | None = None) -> Protocol:
+        """The generator to run. The layout changes the order of the steps, never their keys."""
+        return stroke_steps(self.planned(layout), board_every=self.board_every)
+
+
+def check_count(strokes: int) -> None:
+    """Raise ValueError for more strokes than a protocol may have."""
+    if strokes > MAX_STROKES:
+        raise ValueError(f"{strokes} strokes with repeats, at most {MAX_STROKES}")
+
+
+def check_distinct(field: str, values: Iterable[object]) -> None:
+    """Raise ValueError where a value is there twice."""
+    seen: set[object] = set()
+    for value in values:
+        if value in seen:
+            raise ValueError(f"{field}: {value!r} is there twice")
+        seen.add(value)
+
+
+def stroke_id_problem(ident: str) -> str:
+    """Why this may not be a stroke's id, which names files and is shown on terminals; empty where it may."""
+    if not 1 <= len(ident) <= MAX_ID:
+        return f"a name has 1 to {MAX_ID} characters"
+    if not ident.isprintable() or any(c in ' /\\<>:"|?*' for c in ident) or ident[0] in ".-~":
+        return 'a name has no spaces, control characters, slashes or any of < > : " | ? *, and begins with no . - ~'
+    return ""

@@ -1,0 +1,214 @@
+"""`grid`, `list` and `replay`: presses that are known before the first one is made."""
+
+from __future__ import annotations
+
+import random
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import BaseModel, Field, field_validator, model_validator
+
+from collect.protocols.base import (
+    MAX_STROKES,
+    DeepMm,
+    DwellS,
+    FileName,
+    ProtocolBase,
+    Repeats,
+    Seed,
+    check_count,
+    check_distinct,
+    stroke_id_problem,
+)
+from collect.protocols.order import numbered, shuffled
+from collect.protocols.strokes import Planned, TiltDeg
+from collect.rig.config_file import Config
+from collect.rig.paper import Layout
+
+
+class GridConfig(ProtocolBase):
+    """The paper's grid: every depth at every tilt, `repeats` times, in an order shuffled by `seed`.
+
+    Where the layout of the sheet is known, the order also spreads each (H, alpha) over the sheet (`protocols.order`).
+    """
+
+    depths_field: ClassVar[str] = "heights_mm"
+
+    kind: Literal["grid"]
+    heights_mm: Annotated[list[DeepMm], Field(min_length=1, max_length=100)]
+    """Depths H below the touch height."""
+    tilts_deg: Annotated[list[TiltDeg], Field(min_length=1, max_length=100)]
+    """Tilts alpha from the paper's normal."""
+    repeats: Repeats = 10
+    """Rounds: each holds every (H, alpha) once."""
+    seed: Seed = 1
+    """Of the order."""
+    dwell_s: DwellS = 0.2
+    """Time at full depth."""
+
+    @model_validator(mode="after")
+    def _distinct(self) -> GridConfig:
+        for name in ("heights_mm", "tilts_deg"):
+            values = getattr(self, name)
+            if len(set(values)) != len(values):
+                raise ValueError(f"{name} has the same value twice: {values}")
+        check_count(len(self.heights_mm) * len(self.tilts_deg) * self.repeats)
+        return self
+
+    def planned(self, layout: Layout | None = None) -> list[Planned]:
+        """Every cell of the grid `repeats` times; each round holds all cells once, in its own shuffled order.
+
+        Rounds keep a drift of ink or paper from looking like an effect of H or alpha. With a layout, each (H, alpha) is
+        spread over the sheet as well, so that neither does unevenness of the paper or of the camera's view.
+        """
+        rng = random.Random(self.seed)
+        cells = [(h, a) for h in self.heights_mm for a in self.tilts_deg]
+        rounds: list[list[Planned]] = []
+        for repeat in range(1, self.repeats + 1):
+            rng.shuffle(cells)
+            rounds.append(
+                [Planned(f"H{h:g}-a{a:g}-r{repeat:02d}", h, a, repeat, dwell_s=self.dwell_s) for h, a in cells]
+            )
+        return numbered(rounds, self.seed, layout)
+
+
+class PressRow(Config):
+    """One press of a list."""
+
+    height_mm: DeepMm
+    tilt_deg: TiltDeg = 0.0
+    dwell_s: DwellS | None = None
+    """Left out, the protocol's."""
+    stroke_id: str | None = None
+    """Left out, it is made of the row's number, H and alpha."""
+
+    @field_validator("stroke_id")
+    @classmethod
+    def _name(cls, ident: str | None) -> str | None:
+        if ident is not None and (problem := stroke_id_problem(ident)):
+            raise ValueError(problem)
+        return ident
+
+
+class ListConfig(ProtocolBase):
+    """Presses one by one, from a CSV next to `protocol.toml` or written out in it."""
+
+    row: ClassVar[type[BaseModel] | None] = PressRow
+
+    kind: Literal["list"]
+    file: FileName | None = None
+    """CSV with a column `height_mm` and, as one likes, `tilt_deg`, `dwell_s` and `stroke_id`."""
+    presses: Annotated[tuple[PressRow, ...], Field(min_length=1, max_length=MAX_STROKES)]
+    """What is pressed. Read from `file` where one is named."""
+    repeats: Repeats = 1
+    """Rounds: each holds every press once."""
+    seed: Seed | None = None
+    """Shuffles each round; left out, the order is that of the list."""
+    dwell_s: DwellS = 0.2
+    """Time at full depth, where a press names none."""
+
+    @model_validator(mode="after")
+    def _named_apart(self) -> ListConfig:
+        check_count(len(self.presses) * self.repeats)
+        check_distinct("presses", [name for repeat in range(1, self.repeats + 1) for name in self.names(repeat)])
+        return self
+
+    def names(self, repeat: int) -> list[str]:
+        """Stroke ids of one round, from 1.
+
+        A press without an id is called by its number in the list, H and alpha, as `003-H15-a5-r01`. Where one was given
+        and there are several rounds, `-r02` and so on is added from the second round on.
+        """
+        ending = f"-r{repeat:02d}"
+        return [
+            row.stroke_id + (ending if repeat > 1 else "")
+            if row.stroke_id is not None
+            else f"{number:03d}-H{row.height_mm:g}-a{row.tilt_deg:g}{ending}"
+            for number, row in enumerate(self.presses, 1)
+        ]
+
+    def planned(self, layout: Layout | None = None) -> list[Planned]:
+        """Every press `repeats` times, in rounds; shuffled and balanced over the sheet where there is a seed."""
+        rounds = [
+            [
+                Planned(
+                    name,
+                    row.height_mm,
+                    row.tilt_deg,
+                    repeat,
+                    dwell_s=self.dwell_s if row.dwell_s is None else row.dwell_s,
+                )
+                for row, name in zip(self.presses, self.names(repeat), strict=True)
+            ]
+            for repeat in range(1, self.repeats + 1)
+        ]
+        return numbered(shuffled(rounds, self.seed), self.seed, layout)
+
+
+class ReplayRow(Config):
+    """What an inversion says of one stroke."""
+
+    stroke_id: str
+    """The id that it had."""
+    height_mm: DeepMm
+    tilt_deg: TiltDeg
+
+    @field_validator("stroke_id")
+    @classmethod
+    def _name(cls, ident: str) -> str:
+        if problem := stroke_id_problem(ident):
+            raise ValueError(problem)
+        return ident
+
+
+class ReplayConfig(ProtocolBase):
+    """Press again what an inversion recovered from the images of an earlier session, to compare mark with mark."""
+
+    row: ClassVar[type[BaseModel] | None] = ReplayRow
+    ignores_columns: ClassVar[bool] = True
+
+    kind: Literal["replay"]
+    of: Annotated[str, Field(min_length=1, max_length=100)]
+    """Id of the session whose strokes they were."""
+    file: FileName | None = None
+    """CSV with the columns `stroke_id`, `height_mm` and `tilt_deg`; any other column is ignored and named in
+    `ignored_columns`."""
+    presses: Annotated[tuple[ReplayRow, ...], Field(min_length=1, max_length=MAX_STROKES)]
+    """What is pressed again, by the id that the stroke had. Read from `file` where one is named."""
+    ignored_columns: tuple[str, ...] = ()
+    """Columns of `file` that nothing was done with."""
+    repeats: Repeats = 1
+    """How often each is pressed again; each round holds every stroke once."""
+    seed: Seed | None = None
+    """Shuffles each round; left out, the order is that of the list."""
+    dwell_s: DwellS = 0.2
+    """Time at full depth."""
+
+    @model_validator(mode="after")
+    def _named_apart(self) -> ReplayConfig:
+        if problem := stroke_id_problem(self.of):
+            raise ValueError(f"of = {self.of!r}: {problem}")
+        check_distinct("presses", [row.stroke_id for row in self.presses])
+        check_count(len(self.presses) * self.repeats)
+        return self
+
+    def planned(self, layout: Layout | None = None) -> list[Planned]:
+        """Every stroke `repeats` times. `H13-a5-r02` pressed again is `H13-a5-r02~1`, then `~2` and so on.
+
+        A given id begins with no `~` but may hold one; what stands before the last is always the original's id, and
+        `again_of` in the step's parameters says the same.
+        """
+        rounds = [
+            [
+                Planned(
+                    f"{row.stroke_id}~{repeat}",
+                    row.height_mm,
+                    row.tilt_deg,
+                    repeat,
+                    dwell_s=self.dwell_s,
+                    again_of=row.stroke_id,
+                )
+                for row in self.presses
+            ]
+            for repeat in range(1, self.repeats + 1)
+        ]
+        return numbered(shuffled(rounds, self.seed), self.seed, layout)
