@@ -113,8 +113,7 @@ def plan(
     import json
 
     from collect.planning.limits import all_poses, check_protocol
-    from collect.planning.plan_table import plan_table
-    from collect.planning.summary import make_plan
+    from collect.planning.summary import make_plan, plan_table
     from collect.protocols.config import load_protocol
     from collect.rig.config import load_rig
     from collect.rig.paper import PaperPlane
@@ -130,7 +129,7 @@ def plan(
     made = make_plan(rig, wanted)
     asked = None
     if ask:
-        from collect.planning.asking import ask_reach
+        from collect.planning.limits import ask_reach
 
         poses = all_poses(rig, wanted, PaperPlane(rig.paper.touch_z_mm), every_cell=True)
         asked = asyncio.run(ask_reach(config, rig, poses))

@@ -1,15 +1,20 @@
-"""Every pose that a protocol can command, against the limits: on every cell, since void presses move what follows."""
+"""The limit check before motion: every pose that a protocol can command, and what the controller says of its reach.
+
+Poses are checked on every cell, since a press that is voided moves all that follow to other cells.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
+
+from scipy.spatial.transform import Rotation
 
 from collect.errors import ConfigError, StepError
 from collect.motion.moves import park_moves
-from collect.planning.moves import moves_of
-from collect.planning.walk import sheet_of, steps_on
+from collect.planning.walk import moves_of, sheet_of, steps_on
 from collect.protocols.calibration import CalibrationConfig
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.presses import GridConfig
@@ -19,7 +24,11 @@ from collect.rig.config import RigConfig
 from collect.rig.devices import limits_of
 from collect.rig.paper import Cell, PaperPlane, Sheet
 from collect.touch.selfcheck import triangle_in
-from drivers.errors import LimitExceeded
+from drivers.arcs.controller import Controller
+from drivers.arcs.robot import AUBOPE_PORT
+from drivers.arcs.rpc import RpcConnection, open_arcs
+from drivers.errors import LimitExceeded, ProtocolViolation
+from drivers.geometry import to_wire
 from drivers.samples import Pose
 
 TOUCH_CLEAR_MM = 5.0
@@ -27,7 +36,7 @@ MARKED = {"sheet": 0, "cell": 0}
 
 
 def check_protocol(rig_path: Path, protocol_path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
-    """Raise `ConfigError` naming file, field and range for the first thing that cannot be done."""
+    """Raise `ConfigError` with file, field and range for the first thing that cannot be done."""
     _check_brush(protocol_path, rig, protocol)
     sheet = sheet_of(rig, protocol)
     if not isinstance(protocol, CalibrationConfig):
@@ -37,7 +46,7 @@ def check_protocol(rig_path: Path, protocol_path: Path, rig: RigConfig, protocol
 
 
 def distinct_steps(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Step]:
-    """The steps, each thing that they can ask for once."""
+    """The steps, leaving out those that ask for the same moves as one before."""
     generator = steps_on(config, protocol)
     seen: set[tuple[object, ...]] = set()
     try:
@@ -74,7 +83,7 @@ def _check_brush(path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
 
 
 def _depths(protocol: ProtocolConfig) -> Iterator[tuple[float, float, str]]:
-    """(depth, tilt, what to call it) of every press and every drawn point."""
+    """(depth in mm, tilt in deg, its name for a message) of every press and every drawn point."""
     if isinstance(protocol, WriteConfig):
         for figure in protocol.figures:
             for stroke in figure.strokes:
@@ -96,8 +105,8 @@ def _check_cells(rig_path: Path, path: Path, rig: RigConfig, protocol: ProtocolC
         try:
             triangle_in(sheet.cell(0), rig.self_check)
         except StepError as error:
-            told = f"{error}; `enabled = false` switches the self-check off, which --arm switches on"
-            raise ConfigError(rig_path, "self_check.legs_mm", told) from None
+            what = f"{error}; `enabled = false` switches the self-check off, which --arm switches on"
+            raise ConfigError(rig_path, "self_check.legs_mm", what) from None
     x_mm, y_mm = rig.paper.touch_point_mm
     for cell in map(sheet.cell, range(sheet.capacity)):
         for mark_x, mark_y in _marks(protocol, cell):
@@ -136,12 +145,12 @@ def _check_touches(path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None
 
 
 def check_poses(rig_path: Path, rig: RigConfig, protocol: ProtocolConfig, plane: PaperPlane) -> None:
-    """The same for poses over this plane: the taught one, or the one that was touched. Raises `ConfigError`."""
+    """Check every pose over this plane, which is the taught or the touched one. Raises `ConfigError`."""
     _check(rig_path, rig, all_poses(rig, protocol, plane))
 
 
 def check_step(rig_path: Path, rig: RigConfig, plane: PaperPlane, step: Step) -> None:
-    """The same for one step without a cell, which the operator asked for. Raises `ConfigError`."""
+    """Check the poses of one step without a cell, which the operator asked for. Raises `ConfigError`."""
     _check(rig_path, rig, ((*pose, step.kind) for pose in moves_of(rig, plane, step, None).poses))
 
 
@@ -159,12 +168,13 @@ def all_poses(
 ) -> Iterator[tuple[Pose, float, str]]:
     """(pose, speed in mm/s, what it belongs to) of everything that the protocol can ask for.
 
-    The box of the limits is convex, so what fits on the outermost cells fits on all of them; reach is not so simple.
+    The box of the limits is convex: what fits on the outermost cells fits on all. The arm's reach is not, and needs
+    `every_cell`.
     """
     yield from ((move.target, move.speed_mm_s, "park") for move in park_moves(rig))
     sheet = sheet_of(rig, protocol)
     cells = [sheet.cell(i) for i in range(sheet.capacity)] if every_cell else sheet.corners
-    # Each step as if it were time for a wash: when that is depends on where a process began.
+    # Every step as if a wash were due: when one is depends on the step at which the process began.
     dips = 0 if rig.ink.wash is None else rig.ink.wash.every_dips - 1
     for step in distinct_steps(rig, protocol):
         for cell, more in _places(step, cells):
@@ -175,7 +185,7 @@ def all_poses(
 
 
 def _places(step: Step, cells: list[Cell]) -> Iterator[tuple[Cell | None, tuple[Cell, ...]]]:
-    """Where a step may mark, as `moves_of` wants it: the self-check in one cell, or in the middle of each of three."""
+    """Cells that a step may mark, as arguments of `moves_of`; the self-check marks one cell, or three."""
     if step.kind not in MARKING:
         yield None, ()
         return
@@ -183,3 +193,77 @@ def _places(step: Step, cells: list[Cell]) -> Iterator[tuple[Cell | None, tuple[
         yield cell, ()
         if step.kind is StepKind.SELF_CHECK:
             yield cell, (cell, cell)
+
+
+DEVICE = "robot"
+
+
+async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[tuple[Pose, float, str]]) -> int:
+    """Ask the controller for joints for each pose, near those of the pose before; returns how many poses differ.
+
+    Powers, sets and moves nothing. The tool that is set on the controller stays: every pose is converted to that tool.
+    Raises `ConfigError` with the first pose that is out of reach, and `DeviceError`.
+    """
+    robot = config.robot
+    controller = Controller(RpcConnection(robot.host, robot.port, framing=robot.framing))
+    try:
+        await open_arcs(controller.connection, AUBOPE_PORT)
+        await controller.connection.login()
+        [controller.robot, *_] = await controller.robot_names()
+        offset = await _tool(controller)
+        near = await controller.joint_positions()
+        asked: set[Pose] = set()
+        for pose, _, where in poses:
+            if pose in asked:
+                continue
+            asked.add(pose)
+            wire = to_wire(_for_tool(pose, robot.tcp_offset_mm, offset))
+            found = await _joints(controller, wire, near)
+            if found is None:
+                raise ConfigError(
+                    rig_path,
+                    "paper",
+                    f"the controller finds no joints for {where}: "
+                    f"x = {pose.x_mm:.1f}, y = {pose.y_mm:.1f}, z = {pose.z_mm:.1f} mm, "
+                    "for robot.tcp_offset_mm. Move the paper nearer to the arm, or change its yaw",
+                )
+            near = found
+        return len(asked)
+    finally:
+        await controller.connection.close()
+
+
+async def _joints(controller: Controller, wire: list[float], near: list[float]) -> list[float] | None:
+    match await controller.ask("RobotAlgorithm.inverseKinematics", qnear=near, pose=wire):
+        case [list(joints), 0]:  # pyright: ignore[reportUnknownVariableType]
+            return _six("inverseKinematics", joints)
+        case [_, int()]:
+            return None
+        case other:
+            raise ProtocolViolation(DEVICE, "inverseKinematics", f"no return code: {other!r}")
+
+
+async def _tool(controller: Controller) -> list[float]:
+    """The tool offset that is set on the controller: x, y, z in m, rx, ry, rz in rad."""
+    return _six("getTcpOffset", await controller.ask("RobotConfig.getTcpOffset"))
+
+
+def _six(op: str, values: Any) -> list[float]:
+    try:
+        numbers = [float(v) for v in values]
+    except (TypeError, ValueError):
+        numbers = []
+    if len(numbers) != 6:
+        raise ProtocolViolation(DEVICE, op, f"expected six numbers, got {values!r}")
+    return numbers
+
+
+def _for_tool(tip: Pose, ours_mm: tuple[float, float, float], theirs: list[float]) -> Pose:
+    """Pose of the controller's tool while our tip is at `tip`: tip * ours^-1 * theirs."""
+    at = Rotation.from_quat(tip.quaternion)
+    x, y, z, rx, ry, rz = theirs
+    shift_mm = at.apply([1e3 * v - o for v, o in zip((x, y, z), ours_mm, strict=True)])
+    turned = at * Rotation.from_euler("ZYX", [rz, ry, rx])
+    qx, qy, qz, qw = (float(v) for v in turned.as_quat())
+    px, py, pz = (p + float(s) for p, s in zip(tip.position_mm, shift_mm, strict=True))
+    return Pose(px, py, pz, qx, qy, qz, qw)

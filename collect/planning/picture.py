@@ -18,16 +18,16 @@ from collect.rig.paper import Sheet, to_paper
 from collect.touch.selfcheck import partners
 
 Axes = Any
-"""matplotlib's, whose types are incomplete."""
+"""Axes of matplotlib, whose types are incomplete."""
 ENDINGS = (".png", ".svg", ".pdf", ".jpg")
 MOST_SHEETS = 11
-"""With the view of the whole place a picture of twelve panels."""
+"""With the view of the whole table, twelve panels."""
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
-"""Of the palette of Okabe and Ito, which people who see few colours can tell apart; the marks differ in shape too."""
+"""From the palette of Okabe and Ito, which colour-blind people can tell apart; the marks differ in shape too."""
 
 
 def check_picture(path: Path) -> None:
-    """Raise `ConfigError` where no picture can be made at this path: before a plan is worked out for nothing."""
+    """Raise `ConfigError` where no picture can be made at this path, before a plan is worked out in vain."""
     if path.suffix.lower() not in ENDINGS:
         raise ConfigError("--picture", "", f"{path} must end in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
     if not path.parent.is_dir():
@@ -37,7 +37,7 @@ def check_picture(path: Path) -> None:
 
 
 def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Path) -> None:
-    """Write the picture; its format is that of the file's name. `check_picture` must have passed.
+    """Write the picture, in the format of the file's ending. `check_picture` must have passed.
 
     Raises OSError where it cannot be written.
     """
@@ -81,24 +81,10 @@ def _place(axes: Axes, config: RigConfig, plan: Plan, sheet: Sheet) -> None:
     axes.plot(*park, "^", color=GREEN, markersize=11, label="park")
     axes.annotate("x", (0.0, 0.0), (40.0, 0.0), arrowprops={"arrowstyle": "<-", "color": "black"}, va="center")
     axes.annotate("y", (0.0, 0.0), (0.0, 40.0), arrowprops={"arrowstyle": "<-", "color": "black"}, ha="center")
-    xs = [
-        0.0,
-        config.paper.size_mm[0],
-        config.ink.well_mm[0],
-        park[0],
-        board.origin_mm[0],
-        board.origin_mm[0] + size[0],
-    ]
-    ys = [
-        0.0,
-        config.paper.size_mm[1],
-        config.ink.well_mm[1],
-        park[1],
-        board.origin_mm[1],
-        board.origin_mm[1] + size[1],
-    ]
-    axes.set_xlim(min(xs) - 15.0, max(xs) + 15.0)
-    axes.set_ylim(min(ys) - 15.0, max(ys) + 15.0)
+    far = (board.origin_mm[0] + size[0], board.origin_mm[1] + size[1])
+    shown = ((0.0, 0.0), config.paper.size_mm, config.ink.well_mm, park, board.origin_mm, far)
+    for limit, along in zip((axes.set_xlim, axes.set_ylim), zip(*shown, strict=True), strict=True):
+        limit(min(along) - 15.0, max(along) + 15.0)
     _finish(axes, "the place from above, paper frame")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5, frameon=False)
 
@@ -155,7 +141,7 @@ def _sheet(
 
 
 def _figure(axes: Axes, rect_mm: tuple[float, float, float, float], figure: Drawn) -> None:
-    """Trajectories, as thick as they are deep; a ring where each stroke begins."""
+    """Trajectories, thicker where deeper, with a ring where each stroke begins."""
     x_mm, y_mm, *_ = rect_mm
     for number, stroke in enumerate(figure.strokes, 1):
         for a, b in itertools.pairwise(stroke):
@@ -167,7 +153,7 @@ def _figure(axes: Axes, rect_mm: tuple[float, float, float, float], figure: Draw
 
 
 def _plain(name: str) -> str:
-    """A name as every font has it: characters beyond Latin by their code point, and nothing that is read as TeX."""
+    """A name that every font can show: characters beyond Latin as code points, and nothing that is read as TeX."""
     return "".join(c if ord(c) < 0x250 else f"U+{ord(c):04X}" for c in name).replace("$", r"\$")
 
 

@@ -1,4 +1,4 @@
-"""A whole plan: what is done where, in what order, and what it takes."""
+"""A whole plan: what is done where, in what order, and what it takes; and its tables."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ from collections import Counter
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
 from collect.errors import StepError
 from collect.motion.moves import park_moves
-from collect.planning.ink import InkNeed, ink_need
-from collect.planning.marks import reach_of
-from collect.planning.moves import StepMoves
-from collect.planning.timing import OMITTED, step_s
-from collect.planning.walk import Walked, sheet_of, walk
+from collect.planning.estimate import OMITTED, InkNeed, ink_need, reach_of, step_s
+from collect.planning.walk import StepMoves, Walked, sheet_of, walk
 from collect.protocols.adaptive import AdaptiveConfig
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.presses import ReplayConfig
@@ -42,7 +43,7 @@ class Placed:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """The walk in numbers."""
+    """A walk through a protocol in numbers."""
 
     kind: str
     steps: dict[str, int]
@@ -62,12 +63,12 @@ class Plan:
     warnings: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """Everything, for a file."""
+        """Every field, for a file."""
         return asdict(self) | {"seconds_omit": OMITTED}
 
 
 def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
-    """Walk it. `check_protocol` must have passed."""
+    """Walk the protocol and add up what it takes. `check_protocol` must have passed."""
     sheet = sheet_of(config, protocol)
     placed: list[Placed] = []
     changes: list[str] = []
@@ -122,7 +123,7 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
 
 
 def _wait_s(config: RigConfig, protocol: ProtocolConfig, here: Pose, walked: Walked) -> float:
-    """What a wait for the ink adds once the arm is over the cell; of a figure, before its first stroke."""
+    """Seconds that the arm waits over the cell for the ink; of a figure, before its first stroke."""
     if protocol.wait_after_dip_s is None or walked.step.kind not in STROKES:
         return 0.0
     over_s, _ = step_s(config, here, StepMoves(walked.moves.parts[:1]))
@@ -138,8 +139,8 @@ def _warnings(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list
             f"the presses are chosen while they are made: this is the worst case, {protocol.most} presses; it stops "
             f"after {protocol.least_presses} at the earliest"
         )
-    if (told := _armed(config, protocol)) is not None:
-        warnings.append(told)
+    if (added := _armed(config, protocol)) is not None:
+        warnings.append(added)
     over_mm, worst = max(_overhangs(config, protocol, sheet), default=(0.0, ""))
     if over_mm > 0.0:
         warnings.append(
@@ -200,7 +201,49 @@ def _overhangs(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> lis
 
 
 def _figure_overhang(config: RigConfig, cell: Cell, point: tuple[float, float, float, float, float]) -> float:
-    """Of one drawn point: its mark lies to either side of the line, by half its width."""
+    """How far half the width of the line at a drawn point reaches beyond the cell."""
     x_mm, y_mm, depth_mm, tilt_deg, _ = point
     side_mm = reach_of(config.brush, depth_mm, tilt_deg).side_mm
     return side_mm - min(x_mm, y_mm, cell.width_mm - x_mm, cell.height_mm - y_mm)
+
+
+MOST_ROWS = 40
+"""(H, alpha) in the table; more would not be read."""
+
+
+def plan_table(plan: Plan) -> Group:
+    """What the plan takes, what is pressed where, and its warnings."""
+    totals = Table(title=f"plan of {plan.kind}", show_header=False)
+    changes = f", a fresh one before {', '.join(plan.sheet_changes)}" if plan.sheet_changes else ""
+    totals.add_row("strokes", str(len(plan.placed)))
+    totals.add_row("sheets", f"{plan.sheets} of {plan.cells_per_sheet} cells{changes}" if plan.placed else "no marks")
+    totals.add_row("dips", str(plan.dips))
+    totals.add_row("ink", f"{plan.ink.ml:.1f} ml, {plan.ink.why}" if plan.dips else "none")
+    totals.add_row("steps", ", ".join(f"{count} {kind}" for kind, count in plan.steps.items()))
+    totals.add_row("time", f"{duration(plan.seconds)}, not counting {OMITTED}")
+    for kind, seconds in plan.seconds_by_kind.items():
+        totals.add_row(f"  {kind}", duration(seconds))
+    parts: list[Table | Text] = [totals]
+    if plan.placed:
+        parts.append(_conditions(plan))
+    parts += [Text(f"warning: {warning}", style="yellow") for warning in plan.warnings]
+    return Group(*parts)
+
+
+def duration(seconds: float) -> str:
+    """Hours and minutes, or minutes and seconds, as text."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"
+
+
+def _conditions(plan: Plan) -> Table:
+    table = Table("H mm", "alpha deg", "strokes", "on each sheet")
+    counts = Counter((p.height_mm, p.tilt_deg, p.sheet) for p in plan.placed)
+    cells = sorted({(p.height_mm, p.tilt_deg) for p in plan.placed})
+    for height_mm, tilt_deg in cells[:MOST_ROWS]:
+        by_sheet = [counts[height_mm, tilt_deg, sheet] for sheet in range(1, plan.sheets + 1)]
+        table.add_row(f"{height_mm:g}", f"{tilt_deg:g}", str(sum(by_sheet)), " ".join(map(str, by_sheet[:20])))
+    if len(cells) > MOST_ROWS:
+        table.add_row("...", "...", f"{len(cells) - MOST_ROWS} more", "")
+    return table

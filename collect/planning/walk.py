@@ -1,16 +1,131 @@
-"""Runs a protocol's generator with answers made up as if all went well; nothing is connected and nothing moves."""
+"""Walks a protocol as if all went well: each step, its cell and its moves. Nothing connects, nothing moves."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
-from collect.planning.moves import StepMoves, moves_of
+from collect.motion.moves import (
+    Part,
+    Room,
+    commanded,
+    inking_moves,
+    mark_moves,
+    over,
+    photograph_moves,
+    press_moves,
+    stroke_moves,
+    visit_moves,
+    zero_touch_moves,
+)
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.steps import MARKING, Protocol, Result, Step, StepKind, with_self_check
+from collect.protocols.strokes import Drawn
 from collect.rig.config import RigConfig
+from collect.rig.config_touch import TouchConfig
 from collect.rig.paper import Cell, Layout, PaperPlane, Sheet
-from collect.touch.selfcheck import partners
+from collect.touch.heights import lowest_z_mm
+from collect.touch.places import patch_spots, touch_rects
+from collect.touch.selfcheck import partners, triangle_on
+from drivers.samples import Pose
+
+
+@dataclass(frozen=True, slots=True)
+class StepMoves:
+    """What a step does, in order, and what takes time or ink in it apart from moving."""
+
+    parts: list[Part] = field(default_factory=list[Part])
+    dwell_s: float = 0.0
+    captures: int = 0
+    dips: int = 0
+
+    @property
+    def poses(self) -> list[tuple[Pose, float]]:
+        """Every pose that is commanded, with its speed; the outermost ones where a touch decides by itself."""
+        return commanded(self.parts)
+
+
+def moves_of(
+    config: RigConfig, plane: PaperPlane, step: Step, cell: Cell | None, more: tuple[Cell, ...] = (), *, dips: int = 0
+) -> StepMoves:
+    """The moves of a step, as the run makes them.
+
+    `cell` is where a press or a figure goes; `more` are the further cells of a self-check. `dips` is the number of dips
+    before the step, which decides when the brush is washed.
+    """
+    match step.kind:
+        case StepKind.ZERO_TOUCH | StepKind.TOUCH:
+            return _touches(config, plane, step, dips)
+        case StepKind.DIP:
+            return StepMoves([*inking_moves(config, dips)], dips=1)
+        case StepKind.CHOOSE | StepKind.REVIEW:
+            return StepMoves()
+        case StepKind.BOARD | StepKind.CAPTURE:
+            return StepMoves([*photograph_moves(config)], captures=1)
+        case StepKind.PRESS:
+            assert cell is not None
+            down, up = press_moves(config, plane, cell, _number(step, "height_mm"), _number(step, "tilt_deg"))
+            return StepMoves([*down, *up], dwell_s=_number(step, "dwell_s"))
+        case StepKind.SELF_CHECK:
+            assert cell is not None
+            moves = [
+                move
+                for number, place_mm in enumerate(triangle_on((cell, *more), config.self_check))
+                for move in (*inking_moves(config, dips + number), *mark_moves(config, plane, *place_mm))
+            ]
+            return StepMoves([*photograph_moves(config), *moves, *photograph_moves(config)], dips=3, captures=2)
+        case StepKind.DRAW:
+            assert cell is not None
+            return _figure(config, plane, Drawn.of(step), cell, dips)
+
+
+def touch_of(config: RigConfig, step: Step) -> TouchConfig:
+    """How and where a ZERO_TOUCH or TOUCH step touches. Raises ValueError for too few points for its method."""
+    asked: dict[str, object] = {}
+    if step.kind is StepKind.TOUCH:
+        asked["points_mm"] = [(_number(step, "x_mm"), _number(step, "y_mm"))]
+    if (method := step.params.get("method")) is not None:
+        # The operator may measure even where the taught height is configured.
+        asked["method"] = method
+    return TouchConfig.model_validate(config.touch.model_dump() | asked) if asked else config.touch
+
+
+def _touches(config: RigConfig, plane: PaperPlane, step: Step, dips: int) -> StepMoves:
+    """A touch by force or jog decides how deep it goes; one by camera also where its next spot lies."""
+    touch = touch_of(config, step)
+    if touch.method == "taught":
+        [point] = touch.points_mm if step.kind is StepKind.TOUCH else [None]
+        return StepMoves([*zero_touch_moves(config)] if point is None else [*visit_moves(config, plane, *point)])
+    parts: list[Part] = []
+    for rect_mm in touch_rects(config.paper, touch):
+        x_mm, y_mm, *_ = rect_mm
+        above = over(config, x_mm, y_mm)
+        extent_mm = touch.camera.extent_mm if touch.method == "camera" else 0.0
+        floor_mm = lowest_z_mm(config.paper, touch, x_mm, y_mm, extent_mm)
+        speed_mm_s = max(config.motion.travel_speed_mm_s, config.motion.press_speed_mm_s, touch.speed_mm_s)
+        parts += [above, Room.over(config, rect_mm, floor_mm, speed_mm_s), above]
+    if touch.method != "camera":
+        return StepMoves(parts)
+    count = sum(-(-spots // touch.camera.spots_per_dip) for spots in patch_spots(config.paper, touch))
+    inked = [move for number in range(count) for move in inking_moves(config, dips + number)]
+    return StepMoves([*photograph_moves(config), *inked, *parts, *photograph_moves(config)], dips=count)
+
+
+def _figure(config: RigConfig, plane: PaperPlane, drawn: Drawn, cell: Cell, dips: int) -> StepMoves:
+    parts: list[Part] = []
+    made = 0
+    for number, points in enumerate(drawn.strokes):
+        if drawn.dips_before(number):
+            parts += inking_moves(config, dips + made)
+            made += 1
+        parts += stroke_moves(config, plane, cell, points, drawn.speed_mm_s).parts
+    return StepMoves(parts, dips=made)
+
+
+def _number(step: Step, name: str) -> float:
+    value = step.params[name]
+    assert isinstance(value, float | int)
+    return float(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,10 +136,10 @@ class Walked:
     sheet: int
     """From 1."""
     cell: Cell | None
-    """That it marks or shows."""
+    """Cell that the step marks or photographs."""
     moves: StepMoves
     more_cells: list[Cell] = field(default_factory=list[Cell])
-    """That it marks besides."""
+    """Further cells that the step marks."""
 
 
 def sheet_of(config: RigConfig, protocol: ProtocolConfig) -> Sheet:
@@ -33,7 +148,7 @@ def sheet_of(config: RigConfig, protocol: ProtocolConfig) -> Sheet:
 
 
 def layout_of(config: RigConfig, protocol: ProtocolConfig) -> Layout:
-    """For `steps` and `planned`: the sheet's columns and rows, and what the self-check takes of the first."""
+    """The sheet's columns and rows, and the cells of the first sheet that the self-check takes."""
     sheet = sheet_of(config, protocol)
     if not config.self_check.enabled or not sheet.capacity:
         return sheet.layout
@@ -42,15 +157,15 @@ def layout_of(config: RigConfig, protocol: ProtocolConfig) -> Layout:
 
 
 def steps_on(config: RigConfig, protocol: ProtocolConfig) -> Protocol:
-    """The steps as they are run on this rig: balanced over its sheet, with the self-check where it is switched on."""
+    """The steps as this rig runs them: balanced over its sheet, with the self-check where it is on."""
     found = protocol.steps(layout_of(config, protocol))
     return with_self_check(found) if config.self_check.enabled else found
 
 
 def walk(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
-    """Every step in order, each mark on the next free cell, a fresh sheet whenever one is full.
+    """Every step in order, each mark on the next free cell, with a fresh sheet whenever one is full.
 
-    The sheet must have room for a cell.
+    The sheet must have room for at least one cell.
     """
     plane, sheet = PaperPlane(config.paper.touch_z_mm), sheet_of(config, protocol)
     number = dips = 0

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from collect.motion.moves import Move, Room, Way, over_sheet_move, photograph_moves
-from collect.planning.moves import StepMoves
+from collect.planning.walk import StepMoves
 from collect.rig.config import RigConfig
 from collect.rig.paper import to_paper
 from drivers.geometry import distance

@@ -10,13 +10,10 @@ import pytest
 
 from collect.errors import ConfigError
 from collect.motion.moves import Move, Way
-from collect.planning.ink import bundle_ml, ink_need
+from collect.planning.estimate import _apart, bundle_ml, ink_need, move_s, reach_of, trapezoid_s, way_s
 from collect.planning.limits import all_poses, check_poses, check_protocol
-from collect.planning.marks import reach_of
-from collect.planning.moves import moves_of
 from collect.planning.summary import Plan, make_plan
-from collect.planning.timing import _apart, move_s, trapezoid_s, way_s
-from collect.planning.walk import sheet_of, walk
+from collect.planning.walk import moves_of, sheet_of, walk
 from collect.protocols.config import ProtocolConfig, load_protocol
 from collect.protocols.steps import MARKING, StepKind
 from collect.protocols.strokes import Drawn

@@ -12,8 +12,7 @@ from typer.testing import CliRunner
 
 import collect.cli
 from collect.errors import ConfigError
-from collect.planning.asking import ask_reach
-from collect.planning.limits import all_poses
+from collect.planning.limits import all_poses, ask_reach
 from collect.planning.picture import draw_plan
 from collect.planning.summary import make_plan
 from collect.protocols.config import load_protocol

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from collect.motion.procedures import Procedures
-from collect.planning.moves import moves_of
+from collect.planning.walk import moves_of
 from collect.protocols.steps import Step, StepKind
 from collect.rig.config import load_rig
 from collect.rig.config_touch import TouchConfig

@@ -10,7 +10,7 @@ import pytest
 
 from collect.errors import ConfigError
 from collect.planning.limits import check_step
-from collect.planning.moves import moves_of
+from collect.planning.walk import moves_of
 from collect.protocols.steps import Step, StepKind
 from collect.rig.config import RigConfig
 from collect.rig.config_touch import TouchConfig
