@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from collect.photograph.delay import Seen
-from collect.photograph.new_ink import gray
+from collect.rig.optics import gray
 from drivers.protocols import Camera
 from drivers.samples import Frame, Stamp
 

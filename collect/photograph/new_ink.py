@@ -1,4 +1,8 @@
-"""Ink that came between two photographs: how much at given places, and which marks anywhere in view."""
+"""Ink that came between two photographs of a sheet: how much at given places, and which marks anywhere in view.
+
+Sums over an area are unbiased: nothing is clipped or thresholded before them, since zero touch rests on fractions of
+a square millimetre. `quality.ink` compares masks of ink instead, and `calibrate.stroke.difference` cuts out one stroke.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +14,46 @@ from numpy.typing import NDArray
 
 from calibrate.board.lens import Floats
 from calibrate.board.plane import apply, local_scale
+from calibrate.board.view import see_board
+from calibrate.errors import CalibrationError
 from calibrate.stroke.params import PX_PER_MM
 from calibrate.stroke.rectify import rectify
+from collect.errors import StepError
+from collect.rig.config import RigConfig
+from collect.rig.optics import Gray, undistorted
+from drivers.samples import Frame
 
-Gray = NDArray[np.uint8]
 DARK_SHARE = 0.5
 """Darker than this share of the paper is not paper: it does not count for how the light changed."""
+DARKER = 0.2
+"""Share of the paper's brightness that a pixel must have lost to belong to a mark."""
+JOIN_MM = 1.5
+"""Parts of a mark that lie closer are one."""
 
 
-def gray(image: NDArray[np.uint8]) -> Gray:
-    """(h, w) of a (h, w) or (h, w, 3) BGR image."""
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+def before_and_after(config: RigConfig, before: Frame, after: Frame) -> tuple[Gray, Gray, Floats]:
+    """Both photographs, gray and undistorted, and the (3, 3) map from the second one to the paper frame.
+
+    Raises `StepError` where the board is not seen.
+    """
+    first, second = (undistorted(config.camera, frame.image) for frame in (before, after))
+    try:
+        return first, second, see_board(second, config.board).image_to_paper
+    except CalibrationError as error:
+        raise StepError(f"the board is not seen: {error.what}") from None
+
+
+def _darkening(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[NDArray[np.float32], float] | None:
+    """(how many gray levels darker each pixel became, level of the paper), a change of the light taken out.
+
+    None for pictures that show no paper.
+    """
+    paper = float(np.quantile(first, 0.9))
+    clean = first > DARK_SHARE * paper
+    if paper < 1.0 or not clean.any():
+        return None
+    light = float(np.median(second[clean] / first[clean]))
+    return np.asarray(first - second / max(light, 1e-3), np.float32), paper
 
 
 def new_ink(
@@ -28,16 +61,14 @@ def new_ink(
 ) -> NDArray[np.float32]:
     """(h, w) at 20 px/mm over a window (x, y, width, height in the paper frame): how much darker it became.
 
-    In shares of the paper's brightness, 1 being paper turned black; a change of the light is taken out. Noise averages
-    to 0, so that a sum over an area is unbiased.
+    In shares of the paper's brightness: 1 is paper turned black. Noise averages to 0.
     """
     first, second = (rectify(image, image_to_paper, window_mm).astype(np.float32) for image in (before, after))
-    paper = float(np.quantile(first, 0.9))
-    clean = first > DARK_SHARE * paper
-    if paper < 1.0 or not clean.any():
+    found = _darkening(first, second)
+    if found is None:
         return np.zeros(first.shape, np.float32)
-    light = float(np.median(second[clean] / first[clean]))
-    return np.asarray((first - second / max(light, 1e-3)) / paper, np.float32)
+    darkening, paper = found
+    return np.asarray(darkening / paper, np.float32)
 
 
 def ink_at(
@@ -54,12 +85,6 @@ def ink_at(
     return np.array(amounts, np.float64)
 
 
-DARKER = 0.2
-"""Share of the paper's brightness that a pixel must have lost to belong to a mark."""
-JOIN_MM = 1.5
-"""Parts of a mark that lie closer are one."""
-
-
 @dataclass(frozen=True, slots=True)
 class Mark:
     """New ink: its centre of darkness in the paper frame, and mm2 of black."""
@@ -72,12 +97,11 @@ class Mark:
 def new_marks(before: Gray, after: Gray, image_to_paper: Floats, least_ink_mm2: float) -> list[Mark]:
     """Every new mark of at least so much ink, the largest first. The camera must not have moved in between."""
     first, second = before.astype(np.float32), after.astype(np.float32)
-    paper = float(np.quantile(first, 0.9))
-    clean = first > DARK_SHARE * paper
-    if paper < 1.0 or not clean.any():
+    found = _darkening(first, second)
+    if found is None:
         return []
-    light = float(np.median(second[clean] / first[clean]))
-    darker = np.asarray((first - second / max(light, 1e-3)) / np.maximum(first, DARK_SHARE * paper), np.float32)
+    darkening, paper = found
+    darker = np.asarray(darkening / np.maximum(first, DARK_SHARE * paper), np.float32)
     height, width = darker.shape
     middle = np.array([0.5 * width, 0.5 * height])
     reach_px = max(1, round(0.5 * JOIN_MM / local_scale(lambda at: apply(image_to_paper, at), middle)))

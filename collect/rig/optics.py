@@ -1,9 +1,10 @@
-"""The lens of the rig's camera: read beside `rig.toml`, and undone before anything is measured."""
+"""The lens of the rig's camera: read from beside `rig.toml`; its distortion is undone before anything is measured."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +18,7 @@ Gray = NDArray[np.uint8]
 
 
 def with_optics(rig_path: Path, camera: CameraConfig) -> CameraConfig:
-    """The same camera with what stands in its lens file, looked for beside `rig.toml`. Raises `ConfigError`."""
+    """The same camera with its lens, read from a file beside `rig.toml`. Raises `ConfigError`."""
     if camera.lens_file is None:
         return camera
     try:
@@ -28,15 +29,21 @@ def with_optics(rig_path: Path, camera: CameraConfig) -> CameraConfig:
 
 
 def lens_of(camera: CameraConfig) -> Lens | None:
-    """None for a camera whose lens is taken to be straight."""
+    """The calibrated lens; None for a camera without one, whose pictures are taken to be undistorted."""
     return None if camera.optics is None else camera.optics.lens()
 
 
-def straightened(camera: CameraConfig, image: Gray) -> Gray:
-    """An (h, w) photograph without what the lens bends; what is recorded stays as it was taken.
+def gray(image: NDArray[np.uint8]) -> Gray:
+    """(h, w) of an (h, w) or (h, w, 3) BGR image."""
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+def undistorted(camera: CameraConfig, photograph: NDArray[np.uint8]) -> Gray:
+    """An (h, w) or (h, w, 3) BGR photograph in gray, without the distortion of the lens; recordings keep it.
 
     Raises `StepError` where the camera no longer gives photographs of the size that its lens was calibrated at.
     """
+    image = gray(photograph)
     lens = lens_of(camera)
     if lens is None:
         return image

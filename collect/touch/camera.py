@@ -9,13 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.view import see_board
-from calibrate.errors import CalibrationError
 from collect.errors import StepError
-from collect.photograph.new_ink import gray, ink_at
+from collect.photograph.new_ink import before_and_after, ink_at
 from collect.rig.config_touch import TouchConfig
 from collect.rig.devices import Rig
-from collect.rig.optics import straightened
 from collect.rig.paper import PaperPlane, fit_plane
 from collect.touch.arm import Hands, TouchArm
 from collect.touch.force import Floats
@@ -156,14 +153,9 @@ class FirstInkTouch:
         return await asyncio.to_thread(self._measure_ink, before, after, spots)
 
     def _measure_ink(self, before: Frame, after: Frame, spots: list[Spot]) -> NDArray[np.float64]:
-        camera = self._rig.config.camera
-        first, second = (straightened(camera, gray(frame.image)) for frame in (before, after))
-        try:
-            plane = see_board(second, self._rig.config.board)
-        except CalibrationError as error:
-            raise StepError(f"the board is not seen: {error.what}") from None
+        first, second, image_to_paper = before_and_after(self._rig.config, before, after)
         side_mm = WINDOW_SHARE * self._config.camera.pitch_mm
-        return ink_at(first, second, plane.image_to_paper, [(x, y) for x, y, _ in spots], side_mm)
+        return ink_at(first, second, image_to_paper, [(x, y) for x, y, _ in spots], side_mm)
 
 
 def _plane(touches: list[Touch]) -> PaperPlane:

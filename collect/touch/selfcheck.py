@@ -14,14 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.view import see_board
-from calibrate.errors import CalibrationError
 from collect.errors import StepError
 from collect.motion.moves import CHECK_SPEED_MM_S, mark_moves
-from collect.photograph.new_ink import gray, new_marks
+from collect.photograph.new_ink import before_and_after, new_marks
 from collect.rig.config_touch import SelfCheckConfig
 from collect.rig.devices import Rig
-from collect.rig.optics import straightened
 from collect.rig.paper import Cell, PaperPlane, Sheet
 from collect.touch.arm import Hands, TouchArm
 from collect.touch.places import Triangle
@@ -141,14 +138,12 @@ async def self_check(rig: Rig, hands: Hands, places_mm: Triangle, plane: PaperPl
 
 
 def _find(rig: Rig, before: Frame, after: Frame, config: SelfCheckConfig) -> Floats:
-    camera = rig.config.camera
-    first, second = (straightened(camera, gray(frame.image)) for frame in (before, after))
     try:
-        plane = see_board(second, rig.config.board)
-    except CalibrationError as error:
-        # a board that is seen in a mirror is not seen
-        raise StepError(f"self-check: the board is not seen: {error.what}") from None
-    marks = new_marks(first, second, plane.image_to_paper, config.least_ink_mm2)
+        first, second, image_to_paper = before_and_after(rig.config, before, after)
+    except StepError as error:
+        # A board in a mirrored picture is not seen either.
+        raise StepError(f"self-check: {error}") from None
+    marks = new_marks(first, second, image_to_paper, config.least_ink_mm2)
     if marks and marks[0].ink_mm2 > MOST_MARK_MM2:
         large = marks[0]
         raise StepError(
