@@ -16,7 +16,7 @@ from collect.motion.moves import (
     stroke_moves,
     zero_touch_moves,
 )
-from collect.photograph.photographer import Photographer, Ways
+from collect.photograph.photographer import ArmTrips, Photographer
 from collect.protocols.strokes import Drawn, TrajectoryPoint
 from collect.rig.config import RigConfig
 from collect.rig.devices import Rig, limits_of
@@ -46,7 +46,7 @@ class Procedures:
             rig.camera,
             rig.config.camera,
             rig.clock,
-            Ways(
+            ArmTrips(
                 over_mm=over.target.position_mm,
                 park_mm=rig.config.motion.park_mm,
                 over=lambda: self.go(over),

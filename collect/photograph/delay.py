@@ -22,7 +22,7 @@ SLACK_S = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class FrameChange:
     """What one frame showed."""
 
     arrival_s: float
@@ -31,7 +31,7 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
+class ArmPlace:
     """Where the arm was at one time."""
 
     t_s: float
@@ -87,7 +87,7 @@ class CameraDelay:
         return f"{delay_ms:.0f} ms (to {resolution_ms:.0f}), varying by {spread_ms:.0f} ms over {len(self.looks)} looks"
 
 
-def look(seen: Sequence[Seen], placed: Sequence[Placed]) -> Look | None:
+def look(seen: Sequence[FrameChange], placed: Sequence[ArmPlace]) -> Look | None:
     """The delay by one trip; None where a silence, or a picture that does not fit the trip, tells nothing.
 
     `seen` begins and ends without the arm; `placed` goes from 0 to 1 and back.

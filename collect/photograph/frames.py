@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from collect.photograph.delay import Seen
+from collect.photograph.delay import FrameChange
 from collect.rig.optics import gray
 from drivers.protocols import Camera
 from drivers.samples import Frame, Stamp
@@ -66,12 +66,12 @@ class View:
         return self.moved < STILL_SHARE
 
 
-Wanted = Callable[[View], bool]
+Condition = Callable[[View], bool]
 
 
 @dataclass(frozen=True, slots=True)
 class _Waiting:
-    wanted: Wanted
+    condition: Condition
     until_s: float
     answer: asyncio.Future[View | None]
 
@@ -84,18 +84,18 @@ class Frames:
         self._before: Thumbnail | None = None
         self._waiting: list[_Waiting] = []
         self._failure: Exception | None = None
-        self.seen: list[Seen] = []
+        self.seen: list[FrameChange] = []
         """Every frame so far."""
 
-    async def first(self, wanted: Wanted, *, within_s: float) -> View | None:
-        """The first frame from now on that is `wanted`, or None where those of `within_s` are not.
+    async def first(self, condition: Condition, *, within_s: float) -> View | None:
+        """The first frame from now on that is `condition`, or None where those of `within_s` are not.
 
         Raises `DeviceError` where the camera shows nothing at all.
         """
         if self._failure is not None:
             raise self._failure
         loop = asyncio.get_running_loop()
-        waiting = _Waiting(wanted, loop.time() + within_s, loop.create_future())
+        waiting = _Waiting(condition, loop.time() + within_s, loop.create_future())
         self._waiting.append(waiting)
         try:
             return await waiting.answer
@@ -118,11 +118,11 @@ class Frames:
 
     def _show(self, view: View) -> None:
         self._before = view.small
-        self.seen.append(Seen(view.frame.stamp.host_ns / 1e9, view.changed))
+        self.seen.append(FrameChange(view.frame.stamp.host_ns / 1e9, view.changed))
         now_s = asyncio.get_running_loop().time()
         for waiting in self._waiting:
-            if not waiting.answer.done() and (waiting.wanted(view) or now_s > waiting.until_s):
-                waiting.answer.set_result(view if waiting.wanted(view) else None)
+            if not waiting.answer.done() and (waiting.condition(view) or now_s > waiting.until_s):
+                waiting.answer.set_result(view if waiting.condition(view) else None)
 
     def _view(self, frame: Frame) -> View:
         small = thumbnail(frame.image)

@@ -14,7 +14,7 @@ from collections.abc import AsyncGenerator, Awaitable, Callable
 from dataclasses import dataclass, replace
 
 from collect.errors import ArmInPicture, CameraLate
-from collect.photograph.delay import CameraDelay, Look, Placed, look
+from collect.photograph.delay import ArmPlace, CameraDelay, Look, look
 from collect.photograph.frames import ARM_SHARE, Frames, Thumbnail, View, watching
 from collect.rig.config_devices import CameraConfig
 from drivers.clock import Clock
@@ -33,7 +33,7 @@ POSE_PERIOD_S = 0.005
 
 
 @dataclass(frozen=True, slots=True)
-class Ways:
+class ArmTrips:
     """How the arm gets over the sheet, and away."""
 
     over_mm: tuple[float, float, float]
@@ -50,12 +50,12 @@ class Ways:
 class Photographer:
     """One camera over one sheet, for one run."""
 
-    def __init__(self, robot: Robot, camera: Camera, config: CameraConfig, clock: Clock, ways: Ways) -> None:
+    def __init__(self, robot: Robot, camera: Camera, config: CameraConfig, clock: Clock, trips: ArmTrips) -> None:
         self._robot = robot
         self._camera = camera
         self._config = config
         self._clock = clock
-        self._ways = ways
+        self._trips = trips
         self._reference: Thumbnail | None = None
         """The sheet without the arm, as it was seen last."""
         self.delay: CameraDelay | None = None
@@ -77,15 +77,15 @@ class Photographer:
             async with watching(self._camera, reference) as frames:
                 return await self._clear(frames, delay, self._clock.now_ns())
         async with watching(self._camera, reference) as frames:
-            if not await self._ways.over_sheet():
-                await self._ways.over()
+            if not await self._trips.over_sheet():
+                await self._trips.over()
             arrived_ns = self._clock.now_ns()
             shown = await frames.first(
                 lambda v: v.arm and v.frame.stamp.host_ns >= arrived_ns, within_s=self._patience_s
             )
             if shown is None:
                 raise self._not_shown()
-            await self._ways.park()
+            await self._trips.park()
             return await self._clear(frames, delay, self._clock.now_ns())
 
     async def _clear(self, frames: Frames, delay: CameraDelay, parked_ns: int) -> Frame:
@@ -151,17 +151,17 @@ class Photographer:
         async with watching(self._camera, without_arm) as frames, self._placed() as placed:
             if await frames.first(lambda v: not v.arm, within_s=within_s) is None:
                 return None
-            await self._ways.over()
+            await self._trips.over()
             if await frames.first(lambda v: v.arm and v.still, within_s=within_s) is None:
                 return None
             await asyncio.sleep(stay_s)
-            await self._ways.park()
+            await self._trips.park()
             clear = await frames.first(lambda v: not v.arm and v.still, within_s=within_s)
         return None if clear is None else (clear.small, look(frames.seen, placed))
 
     async def _view_without_arm(self, *, still_s: float) -> Thumbnail:
         """A view with the arm parked, once nothing has moved in it for `still_s`. Raises `ArmInPicture`."""
-        await self._ways.park()
+        await self._trips.park()
         moved_s = 0.0
 
         def settled(view: View) -> bool:
@@ -177,21 +177,21 @@ class Photographer:
         return view.small
 
     @contextlib.asynccontextmanager
-    async def _placed(self) -> AsyncGenerator[list[Placed]]:
+    async def _placed(self) -> AsyncGenerator[list[ArmPlace]]:
         """Within the block, note where the arm is on its way from park to the middle of the sheet."""
-        placed: list[Placed] = []
-        way_mm = [b - a for a, b in zip(self._ways.park_mm, self._ways.over_mm, strict=True)]
+        placed: list[ArmPlace] = []
+        way_mm = [b - a for a, b in zip(self._trips.park_mm, self._trips.over_mm, strict=True)]
         length_mm = math.hypot(*way_mm)
 
         async def note() -> None:
             while True:
                 with contextlib.suppress(DeviceError):
                     sample = self._robot.latest()
-                    gone_mm = [p - a for p, a in zip(sample.pose.position_mm, self._ways.park_mm, strict=True)]
+                    gone_mm = [p - a for p, a in zip(sample.pose.position_mm, self._trips.park_mm, strict=True)]
                     way = sum(g * w for g, w in zip(gone_mm, way_mm, strict=True)) / length_mm**2
                     t_s = sample.stamp.host_ns / 1e9
                     if not placed or t_s > placed[-1].t_s:
-                        placed.append(Placed(t_s, way))
+                        placed.append(ArmPlace(t_s, way))
                 await asyncio.sleep(POSE_PERIOD_S)
 
         task = asyncio.create_task(note(), name="note the arm's way")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from collect.errors import ConfigError
-from collect.planning.summary import Placed, Plan
+from collect.planning.summary import PlacedStroke, Plan
 from collect.planning.walk import sheet_of
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.strokes import Drawn
@@ -94,7 +94,7 @@ def _sheet(
     config: RigConfig,
     sheet: Sheet,
     number: int,
-    placed: Sequence[Placed],
+    placed: Sequence[PlacedStroke],
     plan: Plan,
     drawn: dict[str, Drawn],
 ) -> None:

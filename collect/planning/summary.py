@@ -28,7 +28,7 @@ STROKES = frozenset({StepKind.PRESS, StepKind.DRAW})
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
+class PlacedStroke:
     """One stroke and where it goes."""
 
     order: int
@@ -48,7 +48,7 @@ class Plan:
     kind: str
     steps: dict[str, int]
     """By kind."""
-    placed: tuple[Placed, ...]
+    placed: tuple[PlacedStroke, ...]
     cells_per_sheet: int
     sheets: int
     sheet_changes: tuple[str, ...]
@@ -70,7 +70,7 @@ class Plan:
 def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
     """Walk the protocol and add up what it takes. `check_protocol` must have passed."""
     sheet = sheet_of(config, protocol)
-    placed: list[Placed] = []
+    placed: list[PlacedStroke] = []
     changes: list[str] = []
     kinds: Counter[str] = Counter()
     seconds: dict[str, float] = {}
@@ -95,7 +95,7 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
             if placed and walked.sheet != placed[-1].sheet:
                 changes.append(stroke_id)
             placed.append(
-                Placed(
+                PlacedStroke(
                     len(placed) + 1,
                     stroke_id,
                     float(step.params["height_mm"] or 0.0),

@@ -19,7 +19,7 @@ from drivers.clock import Clock
 from drivers.samples import ForceSample, Frame, QueuedLine
 
 
-class Hands(Protocol):
+class Effector(Protocol):
     """What a rig's procedures do besides moving: both begin and end at travel height."""
 
     async def dip(self) -> None:
@@ -31,7 +31,7 @@ class Hands(Protocol):
         ...
 
 
-class TouchHands(Hands, Protocol):
+class TouchEffector(Effector, Protocol):
     """What a rig's procedures do for zero touch."""
 
     async def zero_touch(self) -> float:

@@ -14,9 +14,9 @@ from collect.photograph.new_ink import before_and_after, ink_at
 from collect.rig.config_touch import TouchConfig
 from collect.rig.devices import Rig
 from collect.rig.paper import PaperPlane, fit_plane
-from collect.touch.arm import Hands, TouchArm
+from collect.touch.arm import Effector, TouchArm
 from collect.touch.force import Floats
-from collect.touch.heights import Known, PointTouches, Reach, Touch, at_one_point, lowest_z_mm
+from collect.touch.heights import KnownHeights, PointTouches, Reach, Touch, at_one_point, lowest_z_mm
 from collect.touch.places import Patch, coarse_count, fine_count
 from drivers.samples import Frame
 
@@ -61,12 +61,12 @@ class FirstInkTouch:
     def __init__(
         self,
         rig: Rig,
-        hands: Hands,
+        effector: Effector,
         arm: TouchArm,
         config: TouchConfig,
     ) -> None:
         self._rig = rig
-        self._hands = hands
+        self._effector = effector
         self._arm = arm
         self._config = config
         self._since_dip: int | None = None
@@ -78,7 +78,7 @@ class FirstInkTouch:
         Along a row the sheet's lean would else pass for height. Raises `StepError`.
         """
         paper, extent_mm = self._rig.config.paper, self._config.camera.extent_mm
-        known = Known(paper, self._config)
+        known = KnownHeights(paper, self._config)
         patches = [
             Patch(point, self._config.camera, paper.size_mm, lowest_z_mm(paper, self._config, *point, extent_mm))
             for point in points_mm
@@ -134,7 +134,7 @@ class FirstInkTouch:
 
     async def _touch(self, spot: Spot) -> None:
         if self._since_dip is None or self._since_dip >= self._config.camera.spots_per_dip:
-            await self._hands.dip()
+            await self._effector.dip()
             self._since_dip = 0
         x, y, z = spot
         await self._arm.over(x, y)
@@ -145,7 +145,7 @@ class FirstInkTouch:
 
     async def _photograph(self) -> Frame:
         if self._last is None:
-            self._last = await self._hands.capture()
+            self._last = await self._effector.capture()
         return self._last
 
     async def _ink(self, before: Frame, spots: list[Spot]) -> NDArray[np.float64]:

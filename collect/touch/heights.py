@@ -30,7 +30,7 @@ def lowest_z_mm(paper: PaperConfig, config: TouchConfig, x_mm: float, y_mm: floa
     return paper.touch_z_mm - config.travel_mm - _unknown_mm(config, paper.touch_point_mm, x_mm, y_mm, extent_mm)
 
 
-class Known:
+class KnownHeights:
     """The heights that are known so far: at first the taught one, at the place where it was taught."""
 
     def __init__(self, paper: PaperConfig, config: TouchConfig) -> None:

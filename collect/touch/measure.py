@@ -8,16 +8,16 @@ from collect.errors import StepError
 from collect.rig.config_touch import TouchConfig
 from collect.rig.devices import Rig
 from collect.rig.paper import PaperPlane
-from collect.touch.arm import ForceTap, RigProbe, TouchArm, TouchHands
+from collect.touch.arm import ForceTap, RigProbe, TouchArm, TouchEffector
 from collect.touch.camera import FirstInkTouch
 from collect.touch.force import touch_by_force
-from collect.touch.heights import Known, PlaneResult, PointTouches, Touch, at_one_point, through
+from collect.touch.heights import KnownHeights, PlaneResult, PointTouches, Touch, at_one_point, through
 from collect.touch.jog import NextJog, touch_by_jog
 
 
 async def measure_plane(
     rig: Rig,
-    hands: TouchHands,
+    effector: TouchEffector,
     config: TouchConfig,
     *,
     tap: ForceTap | None = None,
@@ -32,13 +32,13 @@ async def measure_plane(
     the brush is lifted then too.
     """
     if config.method == "taught":
-        return await _taught(rig, hands)
+        return await _taught(rig, effector)
     arm = TouchArm(rig, config.speed_mm_s)
     points_mm = config.points_mm or [rig.config.paper.touch_point_mm]
     async with arm.lifted_after():
         match config.method:
             case "camera":
-                return through(await FirstInkTouch(rig, hands, arm, config).measure(points_mm), config)
+                return through(await FirstInkTouch(rig, effector, arm, config).measure(points_mm), config)
             case "force":
                 return through(await _by_force(rig, arm, config, points_mm, tap, tell), config)
             case "jog":
@@ -47,8 +47,8 @@ async def measure_plane(
                 return through(await _by_jog(rig, arm, config, points_mm, next_jog), config)
 
 
-async def _taught(rig: Rig, hands: TouchHands) -> PlaneResult:
-    touch = Touch(*rig.config.paper.touch_point_mm, await hands.zero_touch())
+async def _taught(rig: Rig, effector: TouchEffector) -> PlaneResult:
+    touch = Touch(*rig.config.paper.touch_point_mm, await effector.zero_touch())
     return PlaneResult(PaperPlane(rig.config.paper.touch_z_mm), "taught", (PointTouches((touch,), 0.0),), (0.0,))
 
 
@@ -66,7 +66,7 @@ async def _by_force(
     if tap is None:
         rig.force.listen(heard.take)
     try:
-        known, found = Known(rig.config.paper, config), list[PointTouches]()
+        known, found = KnownHeights(rig.config.paper, config), list[PointTouches]()
         for point in points_mm:
             reach, near_z_mm, touches = known.reach(*point), None, list[Touch]()
             await arm.over(*point)
@@ -89,7 +89,7 @@ async def _by_force(
 async def _by_jog(
     rig: Rig, arm: TouchArm, config: TouchConfig, points_mm: list[tuple[float, float]], next_jog: NextJog
 ) -> list[PointTouches]:
-    known, found = Known(rig.config.paper, config), list[PointTouches]()
+    known, found = KnownHeights(rig.config.paper, config), list[PointTouches]()
     for point in points_mm:
         reach = known.reach(*point)
         await arm.over(*point)

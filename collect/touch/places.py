@@ -8,7 +8,7 @@ from collect.errors import StepError
 from collect.rig.config import PaperConfig
 from collect.rig.config_touch import CameraTouchConfig, TouchConfig
 from collect.rig.paper import Sheet
-from collect.touch.heights import Known, Reach
+from collect.touch.heights import KnownHeights, Reach
 
 Triangle = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 SLACK_STEPS = 2
@@ -77,7 +77,7 @@ def touch_rects(paper: PaperConfig, config: TouchConfig) -> list[Rect]:
 
 def patch_spots(paper: PaperConfig, config: TouchConfig) -> list[int]:
     """Spots of each point's patch by camera, at most."""
-    known, camera = Known(paper, config), config.camera
+    known, camera = KnownHeights(paper, config), config.camera
     reaches = [known.reach(x, y, camera.extent_mm) for x, y in config.points_mm]
     return [coarse_count(camera, reach) + config.touches * fine_count(camera) for reach in reaches]
 

@@ -20,7 +20,7 @@ from collect.photograph.new_ink import before_and_after, new_marks
 from collect.rig.config_touch import SelfCheckConfig
 from collect.rig.devices import Rig
 from collect.rig.paper import Cell, PaperPlane, Sheet
-from collect.touch.arm import Hands, TouchArm
+from collect.touch.arm import Effector, TouchArm
 from collect.touch.places import Triangle
 from drivers.samples import Frame
 
@@ -115,7 +115,7 @@ def triangle_on(cells: Sequence[Cell], config: SelfCheckConfig) -> Triangle:
     return triangle_of(cells) if len(cells) == 3 else triangle_in(cells[0], config)
 
 
-async def self_check(rig: Rig, hands: Hands, places_mm: Triangle, plane: PaperPlane) -> SelfCheck:
+async def self_check(rig: Rig, effector: Effector, places_mm: Triangle, plane: PaperPlane) -> SelfCheck:
     """Press the marks, photograph them and judge. The arm begins and ends at travel height; the places are burnt.
 
     Raises `StepError` with the figures where the marks are not found, mirrored, turned, of another scale or displaced.
@@ -125,14 +125,14 @@ async def self_check(rig: Rig, hands: Hands, places_mm: Triangle, plane: PaperPl
         raise StepError("the self-check's triangle is too even, or too flat, to tell a mirror image")
     arm = TouchArm(rig, CHECK_SPEED_MM_S)
     async with arm.lifted_after():
-        before = await hands.capture()
+        before = await effector.capture()
         for x_mm, y_mm in places_mm:
-            await hands.dip()
+            await effector.dip()
             above, near, *pressing = mark_moves(rig.config, plane, x_mm, y_mm)
             await arm.go(above)
             await arm.go(near)
             await arm.sequence(pressing)
-        after = await hands.capture()
+        after = await effector.capture()
     found_mm = await asyncio.to_thread(_find, rig, before, after, config)
     return judge(commanded, found_mm, config)
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from collect.photograph.delay import CameraDelay, Look, Placed, Seen, look
+from collect.photograph.delay import ArmPlace, CameraDelay, FrameChange, Look, look
 
 ENTERS = 0.4
 """The share of its way at which the arm comes into the picture; nothing below is told of it."""
@@ -21,15 +21,15 @@ def way(t_s: float, trip_s: float, stay_s: float) -> float:
 
 def trip(
     delay_s: float, *, period_s: float, phase: float, trip_s: float, stay_s: float
-) -> tuple[list[Seen], list[Placed]]:
+) -> tuple[list[FrameChange], list[ArmPlace]]:
     end_s = 2.0 + 2.0 * trip_s + stay_s
     exposed = np.arange(phase * period_s, end_s, period_s)
-    ways = [way(t, trip_s, stay_s) for t in exposed]
+    trips = [way(t, trip_s, stay_s) for t in exposed]
     seen = [
-        Seen(float(t) + delay_s, 0.15 * min(max((w - ENTERS) / 0.3, 0.0), 1.0))
-        for t, w in zip(exposed, ways, strict=True)
+        FrameChange(float(t) + delay_s, 0.15 * min(max((w - ENTERS) / 0.3, 0.0), 1.0))
+        for t, w in zip(exposed, trips, strict=True)
     ]
-    return seen, [Placed(float(t), way(float(t), trip_s, stay_s)) for t in np.arange(0.0, end_s, 0.01)]
+    return seen, [ArmPlace(float(t), way(float(t), trip_s, stay_s)) for t in np.arange(0.0, end_s, 0.01)]
 
 
 @given(
@@ -64,7 +64,7 @@ def test_what_was_seen_for_longer_than_it_was_there_was_another_trip():
 
 def test_a_picture_that_does_not_change_tells_nothing():
     seen, placed = trip(0.1, period_s=0.05, phase=0.0, trip_s=0.1, stay_s=0.3)
-    assert look([Seen(one.arrival_s, 0.0) for one in seen], placed) is None
+    assert look([FrameChange(one.arrival_s, 0.0) for one in seen], placed) is None
 
 
 def test_a_long_silence_tells_nothing():

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from collect.photograph.photographer import Photographer, Ways
+from collect.photograph.photographer import ArmTrips, Photographer
 from collect.rig.config_devices import CameraConfig
 from drivers.clock import HostClock
 from drivers.samples import Frame, Pose, PoseSample, Stamp
@@ -41,8 +41,8 @@ class Theatre:
 
     def photographer(self, **limits: float) -> Photographer:
         config = CameraConfig.model_validate({"kind": "opencv", "source": "0", **limits})
-        ways = Ways(OVER_MM, PARK_MM, lambda: self.go(1.0), lambda: self.go(0.0), self._is_over)
-        return Photographer(self, self, config, self.clock, ways)  # pyright: ignore[reportArgumentType]
+        trips = ArmTrips(OVER_MM, PARK_MM, lambda: self.go(1.0), lambda: self.go(0.0), self._is_over)
+        return Photographer(self, self, config, self.clock, trips)  # pyright: ignore[reportArgumentType]
 
     def way(self, t_s: float) -> float:
         """Where the arm was: 0 parked, 1 over the sheet."""

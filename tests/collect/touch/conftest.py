@@ -79,7 +79,7 @@ class Bench:
         self.limits = limits_of(config)
         devices: Any = self
         self.rig = Rig(config, devices, devices, devices, IDENTITY, IDENTITY, force=devices)
-        self.hands = BenchHands(self)
+        self.effector = BenchHands(self)
         self.tap = BenchTap(self)
 
     def truth_mm(self, x_mm: float, y_mm: float) -> float:

@@ -86,7 +86,7 @@ def test_no_turn_passes_for_a_mirror_nor_a_mirror_for_a_turn(noise: int, turn_de
 
 
 async def checked(bench: Bench, places: Triangle = PLACES) -> SelfCheck:
-    return await self_check(bench.rig, bench.hands, places, PaperPlane(120.0))
+    return await self_check(bench.rig, bench.effector, places, PaperPlane(120.0))
 
 
 async def test_marks_on_the_loopback_sheet_are_found_and_pass(make_bench: MakeBench) -> None:
@@ -150,7 +150,7 @@ async def test_a_dry_brush_leaves_no_marks(make_bench: MakeBench) -> None:
     async def no_ink() -> None:
         return
 
-    bench.hands.dip = no_ink  # pyright: ignore[reportAttributeAccessIssue]
+    bench.effector.dip = no_ink  # pyright: ignore[reportAttributeAccessIssue]
     with pytest.raises(StepError, match="3 marks were pressed, 0 new ones are seen"):
         await checked(bench)
 
