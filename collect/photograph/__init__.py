@@ -1,1 +1,1 @@
-"""Photographs that are known to be fresh: the camera has shown the arm over the sheet, and then gone."""
+"""Photographs of the sheet that are known to be fresh, and the ink that came between two of them."""

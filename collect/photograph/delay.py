@@ -1,7 +1,7 @@
-"""The camera's delay, measured: the arm goes over the sheet and back, and the picture shows it later than it was.
+"""Measures the camera's delay: the arm goes over the sheet and back, and the picture shows it later than it was.
 
-Nobody knows at which point of its way the arm comes into the picture. But it enters and leaves at the same point, so
-the time for which it was seen, held against the way that it went, gives that point, and with it the delay.
+The point of its way at which the arm comes into the picture is not known. But it enters and leaves at the same point:
+how long it was seen, compared with where it was when, gives that point, and with it the delay.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 GOOD_SHARE, GOOD_S = 0.1, 0.03
-"""The delay is known well enough to a tenth of it, or to 30 ms."""
+"""The delay is known well enough within a tenth of its value, or within 30 ms."""
 MOST_GAP_S = 1.0
 """A longer silence of camera or arm hides when something happened."""
 SLACK_S = 0.05
-"""For what a busy computer does to the times of single poses and frames."""
+"""By so much a busy computer may shift the times of single poses and frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameChange:
-    """What one frame showed."""
+    """How far one frame differs from the view without the arm."""
 
     arrival_s: float
     changed: float
-    """Share of the picture that differs from the view without the arm."""
+    """Share of the picture, 0 to 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Look:
 
     delay_s: float
     resolution_s: float
-    """The delay may be off by so much, because camera and arm are only heard of once a period."""
+    """Uncertainty of the delay: camera and arm are only heard from once a period."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,17 +67,17 @@ class CameraDelay:
 
     @property
     def resolution_s(self) -> float:
-        """How well the delay is known by its looks."""
+        """Uncertainty of the mean delay."""
         return float(np.median([look.resolution_s for look in self.looks])) / len(self.looks) ** 0.5
 
     @property
     def bound_s(self) -> float:
-        """The longest that was seen, and what may have been missed between two frames."""
+        """The longest delay of a trip, with its uncertainty."""
         return max(look.delay_s + look.resolution_s for look in self.looks)
 
     @property
     def known(self) -> bool:
-        """Whether the looks differ by no more than the camera's period explains, and are enough to even that out."""
+        """Whether the trips differ by no more than the camera's period explains, and are enough to average that out."""
         good_s = max(GOOD_SHARE * self.delay_s, GOOD_S)
         coarsest_s = max(look.resolution_s for look in self.looks)
         return self.spread_s <= max(2.0 * coarsest_s, good_s) and self.resolution_s <= good_s
@@ -88,7 +88,7 @@ class CameraDelay:
 
 
 def look(seen: Sequence[FrameChange], placed: Sequence[ArmPlace]) -> Look | None:
-    """The delay by one trip; None where a silence, or a picture that does not fit the trip, tells nothing.
+    """The delay by one trip; None where a silence, or a picture that does not fit the trip, leaves it unknown.
 
     `seen` begins and ends without the arm; `placed` goes from 0 to 1 and back.
     """
@@ -108,11 +108,11 @@ def look(seen: Sequence[FrameChange], placed: Sequence[ArmPlace]) -> Look | None
     points = np.linspace(0.02, 0.98, 97)
     there_s = np.interp(points, np.maximum.accumulate(way[: turn + 1]), t_s[: turn + 1])
     back_s = np.interp(points, np.maximum.accumulate(way[turn:][::-1]), t_s[turn:][::-1])
-    # The farther the point, the shorter the arm is beyond it: the best is where that is as long as it was seen.
+    # The farther the point, the shorter the arm is beyond it: take the point where that is as long as it was seen.
     misfit_s = np.abs((back_s - there_s) - (left_s - entered_s))
     at = int(np.argmin(misfit_s))
     if float(misfit_s[at]) > coarse_in + coarse_out + SLACK_S:
-        return None  # it was seen for longer, or shorter, than it was there: that was another trip
+        return None  # seen for longer, or shorter, than it was there: the frames show another trip
     delay_s = 0.5 * float((entered_s - there_s[at]) + (left_s - back_s[at]))
     coarse_s = 0.5 * (coarse_in + coarse_out + _gap(t_s, there_s[at]) + _gap(t_s, back_s[at]))
     return Look(max(delay_s, 0.0), coarse_s)

@@ -18,9 +18,9 @@ from drivers.samples import Frame, Stamp
 
 Thumbnail = NDArray[np.float32]
 WIDTH_PX = 160
-"""A pixel then averages over some 2 mm of a sheet: noise is gone, and an arm is tens of pixels wide."""
+"""Each pixel averages over some 2 mm of a sheet: noise is gone, and an arm is tens of pixels wide."""
 CHANGED_LEVELS = 25.0
-"""Gray levels, the light taken out, from which a pixel counts as changed."""
+"""Difference in gray levels, the light taken out, from which a pixel counts as changed."""
 
 
 def thumbnail(image: NDArray[np.uint8]) -> Thumbnail:
@@ -31,7 +31,7 @@ def thumbnail(image: NDArray[np.uint8]) -> Thumbnail:
 
 
 def changed_share(now: Thumbnail, before: Thumbnail) -> float:
-    """Share of the pixels that differ, 0 to 1, whatever the light does as a whole; 1 for frames of another size."""
+    """Share of the pixels that differ, 0 to 1, apart from the light as a whole; 1 for frames of another size."""
     if now.shape != before.shape:
         return 1.0
     light = float(np.median((now + 1.0) / (before + 1.0)))
@@ -46,7 +46,7 @@ STILL_SHARE = 0.005
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One frame and what differs in it."""
+    """One frame, and how far it differs from others."""
 
     frame: Frame
     small: Thumbnail
@@ -77,7 +77,7 @@ class _Waiting:
 
 
 class Frames:
-    """What the camera shows from now on."""
+    """The camera's frames from now on."""
 
     def __init__(self, reference: Thumbnail | None) -> None:
         self._reference = reference
@@ -88,9 +88,9 @@ class Frames:
         """Every frame so far."""
 
     async def first(self, condition: Condition, *, within_s: float) -> View | None:
-        """The first frame from now on that is `condition`, or None where those of `within_s` are not.
+        """The first frame from now on that meets `condition`; None where none does within `within_s`.
 
-        Raises `DeviceError` where the camera shows nothing at all.
+        Raises `DeviceError` where no frame comes.
         """
         if self._failure is not None:
             raise self._failure
@@ -103,7 +103,7 @@ class Frames:
             self._waiting.remove(waiting)
 
     async def follow(self, camera: Camera) -> None:
-        """Look at frame after frame, until cancelled or the camera fails."""
+        """Take frame after frame, until cancelled or the camera fails."""
         after = Stamp(0)
         try:
             while True:
@@ -133,7 +133,7 @@ class Frames:
 
 @contextlib.asynccontextmanager
 async def watching(camera: Camera, reference: Thumbnail | None) -> AsyncGenerator[Frames]:
-    """Within the block, look at every frame; `reference` is the view without the arm."""
+    """Within the block, follow the frames; `reference` is the view without the arm."""
     frames = Frames(reference)
     task = asyncio.create_task(frames.follow(camera), name="camera frames")
     try:

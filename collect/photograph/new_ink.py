@@ -24,7 +24,7 @@ from collect.rig.optics import Gray, undistorted
 from drivers.samples import Frame
 
 DARK_SHARE = 0.5
-"""Darker than this share of the paper is not paper: it does not count for how the light changed."""
+"""Pixels darker than this share of the paper are not paper: they do not count for how the light changed."""
 DARKER = 0.2
 """Share of the paper's brightness that a pixel must have lost to belong to a mark."""
 JOIN_MM = 1.5
@@ -77,7 +77,7 @@ def ink_at(
     """(n,) mm2 of black that came in a square around each spot."""
     amounts: list[float] = []
     for x, y in spots_mm:
-        # one side more all round, so that the median sees paper
+        # One more side all around, so that the median sees paper.
         window = (x - 1.5 * side_mm, y - 1.5 * side_mm, 3.0 * side_mm, 3.0 * side_mm)
         darker = new_ink(before, after, image_to_paper, window)
         third = darker.shape[0] // 3
@@ -95,7 +95,7 @@ class Mark:
 
 
 def new_marks(before: Gray, after: Gray, image_to_paper: Floats, least_ink_mm2: float) -> list[Mark]:
-    """Every new mark of at least so much ink, the largest first. The camera must not have moved in between."""
+    """New marks of at least `least_ink_mm2`, the largest first. The camera must not have moved in between."""
     first, second = before.astype(np.float32), after.astype(np.float32)
     found = _darkening(first, second)
     if found is None:
@@ -118,7 +118,7 @@ def _mark(
 ) -> Mark:
     x, y, width, height = (int(v) for v in box[:4])
     part = (slice(y, y + height), slice(x, x + width))
-    # noise is as often brighter: without clipping, the halo that joining added weighs nothing
+    # Noise is brighter as often as darker: without clipping, the margin that joining added has no weight.
     weights = np.where(labels[part] == label, darker[part], 0.0).astype(np.float64)
     total = float(weights.sum())
     if total <= 0.0:

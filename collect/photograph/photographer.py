@@ -1,8 +1,8 @@
 """Takes photographs of the sheet that are known to show it as it is, without the arm.
 
-How late a camera's pictures come is not known from its data sheet, and changes with the load of the computer. So no
-photograph is believed because of when it came: first the camera must show the arm over the sheet, then the arm parks,
-and only what the camera shows after it has shown the arm gone is a photograph of what lies there now.
+A camera's delay is not in its data sheet, and changes with the load of the computer. So no frame is trusted for the
+time of its arrival: first the camera must show the arm over the sheet, then the arm parks, and only a frame after one
+that shows the arm gone is a photograph of what lies there now.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from drivers.samples import Frame
 
 FEWEST_LOOKS, MOST_LOOKS = 2, 6
 ATTEMPTS = 3
-"""How often the measurement begins anew where a stall, or a picture from before, has spoilt it."""
+"""Attempts at the measurement, each after one that a stall or an old picture has spoilt."""
 PATIENCE_S = 1.5
-"""Beyond the longest delay that is allowed, so that a camera that is too late is told from one that shows nothing."""
+"""Waiting time beyond the longest allowed delay: distinguishes a camera that is late from one that shows nothing."""
 STAY_S = 0.15
-"""By so much each trip over the sheet is longer than the one before."""
+"""How much longer each trip over the sheet is than the one before."""
 POSE_PERIOD_S = 0.005
 
 
 @dataclass(frozen=True, slots=True)
 class ArmTrips:
-    """How the arm gets over the sheet, and away."""
+    """How the arm gets over the sheet and away again."""
 
     over_mm: tuple[float, float, float]
     """Where the tip is over the middle of the sheet, in the base frame."""
@@ -59,10 +59,10 @@ class Photographer:
         self._reference: Thumbnail | None = None
         """The sheet without the arm, as it was seen last."""
         self.delay: CameraDelay | None = None
-        """What was measured in this process."""
+        """Measured in this process; None until then."""
 
     def forget(self) -> None:
-        """What was known of camera and view no longer holds: somebody has been at the rig."""
+        """Forget delay and view: somebody has been at the rig."""
         self._reference = self.delay = None
 
     async def photograph(self) -> Frame:
@@ -73,7 +73,7 @@ class Photographer:
         delay, reference = self.delay, self._reference
         if delay is None or reference is None:
             delay, reference = self.delay, self._reference = await self._measured()
-            # The arm has just been seen to go: nothing is left but to wait for a frame from after that.
+            # The arm has just been seen to go: only a frame from after that is missing.
             async with watching(self._camera, reference) as frames:
                 return await self._clear(frames, delay, self._clock.now_ns())
         async with watching(self._camera, reference) as frames:
@@ -102,7 +102,7 @@ class Photographer:
         return replace(clear.frame, exposed_after_ns=parked_ns)
 
     def _check_drift(self, frames: Frames, delay: CameraDelay, parked_s: float) -> None:
-        """A frame that shows the arm after it had parked is as old as that at least. Raises `CameraLate`."""
+        """A frame that shows the arm after it parked is at least that old. Raises `CameraLate` beyond the limit."""
         late_s = max((one.arrival_s for one in frames.seen if one.changed >= ARM_SHARE), default=parked_s) - parked_s
         if late_s > self._config.max_delay_ms / 1e3:
             self.forget()
@@ -117,11 +117,11 @@ class Photographer:
         """
         shown = False
         for attempt in range(ATTEMPTS):
-            # What the first view showed may have been gone long ago: from then on wait until all of that has passed.
+            # The first view may have been old: after a failed attempt, wait until every old frame has passed.
             view = await self._view_without_arm(still_s=self._patience_s if attempt else 0.0)
             looks: list[Look] = []
             for number in range(MOST_LOOKS):
-                # Trips of different lengths: one cannot be taken for the one before it.
+                # Trips of different lengths cannot be confused with each other.
                 seen = await self._trip(view, stay_s=number * STAY_S)
                 if seen is None:
                     break
@@ -143,7 +143,7 @@ class Photographer:
         return delay
 
     async def _trip(self, without_arm: Thumbnail, *, stay_s: float) -> tuple[Thumbnail, Look | None] | None:
-        """Over the sheet and back: the view after it, and the delay where no silence has spoilt it.
+        """Go over the sheet and back: (the view afterwards, the delay where no silence has spoilt it).
 
         None where the picture did not change when the arm came, or not back when it went.
         """

@@ -14,7 +14,7 @@ from collect.rig.paper import Layout
 
 
 class AdaptiveConfig(ProtocolBase):
-    """Presses chosen one by one, each where it tells most about the brush; stops where little is left to be won."""
+    """Presses chosen one by one, each where it tells most about the brush, until little more can be learned."""
 
     depths_field: ClassVar[str] = "heights_mm"
 
@@ -24,14 +24,14 @@ class AdaptiveConfig(ProtocolBase):
     tilts_deg: Annotated[list[TiltDeg], Field(min_length=1, max_length=100)]
     """Tilts alpha from the paper's normal."""
     repeats: Repeats = 10
-    """Of the shuffled grid that it stands in for: what it saved is told against that grid's number of presses."""
+    """Rounds of the grid that it replaces; the presses that it saved are counted against that grid."""
     most_presses: Annotated[int, Field(ge=1, le=MAX_STROKES)] | None = None
-    """Stop after so many at the latest; left out, as many as the grid has. No fewer than the cells: limits, ink and
-    sheets are planned for the worst case, and every cell may be chosen."""
+    """Stop after this many at the latest; left out, as many as the grid has. No fewer than the cells: limits, ink and
+    sheets are planned for the worst case, in which every cell is chosen."""
     least_presses: Annotated[int, Field(ge=3, le=1000)] = 5
-    """Do not stop before."""
+    """Do not stop before this many."""
     enough_points: Annotated[float, Field(gt=0.0, le=50.0)] = 1.0
-    """Stop when fewer points of CSIM (percent), in the mean over all cells, are expected to be won by pressing on."""
+    """Stop when further presses are expected to gain fewer CSIM points (percent, mean over all cells)."""
     dwell_s: DwellS = 0.2
     """Time at full depth."""
 
@@ -51,7 +51,7 @@ class AdaptiveConfig(ProtocolBase):
 
     @property
     def whole_grid(self) -> int:
-        """Presses of the grid that it stands in for."""
+        """Presses of the grid that it replaces."""
         return len(self.heights_mm) * len(self.tilts_deg) * self.repeats
 
     @property
@@ -65,14 +65,14 @@ class AdaptiveConfig(ProtocolBase):
         return [(h, a) for h in self.heights_mm for a in self.tilts_deg]
 
     def planned(self, layout: Layout | None = None) -> list[Planned]:
-        """The worst case: as many presses as there may be, the cells in turn."""
+        """The worst case: as many presses as allowed, the cells in turn."""
         every = self.cells
         return [self._stroke(number, *every[number % len(every)]) for number in range(self.most)]
 
     def steps(self, layout: Layout | None = None) -> Protocol:
         """Zero touch, board, then choose, dip, press, capture, until the choice is to stop.
 
-        A CHOOSE without an answer (a plan that is only walked) is the worst case.
+        A CHOOSE step without an answer, as when a plan is walked, stands for the worst case.
         """
         yield Step(StepKind.ZERO_TOUCH, 0)
         yield Step(StepKind.BOARD, 0)

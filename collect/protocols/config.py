@@ -55,7 +55,7 @@ def load_protocol(path: Path) -> ProtocolConfig:
 
 
 def _fill_strokes(path: Path, values: dict[str, Any]) -> None:
-    """Points from the files of a `write` protocol. Whatever has another shape is left for validation to refuse."""
+    """Read the points of a `write` protocol from its files. Values of another shape are left to validation."""
     left = MAX_POINTS
     for i, figure in enumerate(_tables(values.get("figures"))):
         for k, stroke in enumerate(_tables(figure.get("strokes"))):
@@ -83,7 +83,7 @@ _R = TypeVar("_R", bound=BaseModel)
 def read_rows(
     protocol: Path, field: str, name: object, row: type[_R], at_most: int, *, ignore_others: bool = False
 ) -> tuple[tuple[_R, ...], tuple[str, ...]]:
-    """(rows, names of the columns that were ignored) of the CSV called `name` beside `protocol`.
+    """(rows, names of the ignored columns) of the CSV called `name` beside `protocol`.
 
     The first line names the columns; an empty cell counts as left out. `field` is where the protocol names the file.
     Raises `ConfigError`.
@@ -114,7 +114,7 @@ def read_rows(
 
 
 def allowed(row: type[BaseModel], column: str) -> str:
-    """The range of a column, in words."""
+    """The range of a column as text."""
     words: list[str] = []
     for rule in _rules(row, column):
         match rule:

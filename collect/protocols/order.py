@@ -18,7 +18,7 @@ from collect.rig.paper import Layout
 
 
 def numbered(rounds: list[list[Planned]], seed: int | None, layout: Layout | None) -> list[Planned]:
-    """The rounds one after the other, every stroke numbered; then, for a seed and a layout, balanced over the sheet."""
+    """Put the rounds one after the other and number the strokes; with a seed and a layout, balance over the sheet."""
     index = 0
     for strokes in rounds:
         for k, stroke in enumerate(strokes):
@@ -32,7 +32,7 @@ def numbered(rounds: list[list[Planned]], seed: int | None, layout: Layout | Non
 
 
 def shuffled(rounds: list[list[Planned]], seed: int | None) -> list[list[Planned]]:
-    """Each round in an order of its own; as it is without a seed."""
+    """Shuffle each round; without a seed, leave it as it is."""
     if seed is not None:
         rng = random.Random(seed)
         for strokes in rounds:
@@ -46,7 +46,7 @@ TRIALS_PER_STROKE = 60
 
 
 def balanced(rounds: Sequence[Sequence[Hashable]], layout: Layout, seed: int) -> list[list[int]]:
-    """For each round, the order in which its entries are made, as indices into it.
+    """The order of each round, as indices into it.
 
     `rounds` holds the condition of every stroke. The same arguments give the same order in every process.
     """
@@ -76,7 +76,7 @@ def balanced(rounds: Sequence[Sequence[Hashable]], layout: Layout, seed: int) ->
 
 
 def _bands(layout: Layout, place: int) -> tuple[int, int]:
-    """(row band, column band) of the stroke with that number; the second counts on from the first."""
+    """(row band, column band) of the stroke with that number; column bands are numbered after the row bands."""
     row, column = divmod(place % layout.capacity, layout.columns)
     return BANDS * row // layout.rows, BANDS + BANDS * column // layout.columns
 
@@ -101,5 +101,5 @@ def _exchange(a: list[int], b: list[int], from_bands: tuple[int, int], to_bands:
 
 
 def _unevenness(counts: list[int], share: list[float]) -> float:
-    """Least where the counts are in proportion to the shares."""
+    """Smallest where the counts are in proportion to the shares."""
     return sum(count * count / part for count, part in zip(counts, share, strict=True))

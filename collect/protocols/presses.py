@@ -41,7 +41,7 @@ class GridConfig(ProtocolBase):
     repeats: Repeats = 10
     """Rounds: each holds every (H, alpha) once."""
     seed: Seed = 1
-    """Of the order."""
+    """Seed of the order."""
     dwell_s: DwellS = 0.2
     """Time at full depth."""
 
@@ -58,7 +58,7 @@ class GridConfig(ProtocolBase):
         """Every cell of the grid `repeats` times; each round holds all cells once, in its own shuffled order.
 
         Rounds keep a drift of ink or paper from looking like an effect of H or alpha. With a layout, each (H, alpha) is
-        spread over the sheet as well, so that neither does unevenness of the paper or of the camera's view.
+        also spread over the sheet, which does the same for unevenness of the paper or of the camera's view.
         """
         rng = random.Random(self.seed)
         cells = [(h, a) for h in self.heights_mm for a in self.tilts_deg]
@@ -79,7 +79,7 @@ class PressRow(Config):
     dwell_s: DwellS | None = None
     """Left out, the protocol's."""
     stroke_id: str | None = None
-    """Left out, it is made of the row's number, H and alpha."""
+    """Left out, it is made from the row's number, H and alpha."""
 
     @field_validator("stroke_id")
     @classmethod
@@ -96,15 +96,15 @@ class ListConfig(ProtocolBase):
 
     kind: Literal["list"]
     file: FileName | None = None
-    """CSV with a column `height_mm` and, as one likes, `tilt_deg`, `dwell_s` and `stroke_id`."""
+    """CSV with a column `height_mm` and optionally `tilt_deg`, `dwell_s` and `stroke_id`."""
     presses: Annotated[tuple[PressRow, ...], Field(min_length=1, max_length=MAX_STROKES)]
-    """What is pressed. Read from `file` where one is named."""
+    """The presses. Read from `file` where one is named."""
     repeats: Repeats = 1
     """Rounds: each holds every press once."""
     seed: Seed | None = None
     """Shuffles each round; left out, the order is that of the list."""
     dwell_s: DwellS = 0.2
-    """Time at full depth, where a press names none."""
+    """Time at full depth of presses without their own."""
 
     @model_validator(mode="after")
     def _named_apart(self) -> ListConfig:
@@ -115,8 +115,8 @@ class ListConfig(ProtocolBase):
     def names(self, repeat: int) -> list[str]:
         """Stroke ids of one round, from 1.
 
-        A press without an id is called by its number in the list, H and alpha, as `003-H15-a5-r01`. Where one was given
-        and there are several rounds, `-r02` and so on is added from the second round on.
+        A press without an id is named after its number in the list, H and alpha, as `003-H15-a5-r01`. A given id gets
+        `-r02` and so on from the second round on.
         """
         ending = f"-r{repeat:02d}"
         return [
@@ -145,10 +145,10 @@ class ListConfig(ProtocolBase):
 
 
 class ReplayRow(Config):
-    """What an inversion says of one stroke."""
+    """One stroke as an inversion recovered it."""
 
     stroke_id: str
-    """The id that it had."""
+    """Its id in the original session."""
     height_mm: DeepMm
     tilt_deg: TiltDeg
 
@@ -168,14 +168,14 @@ class ReplayConfig(ProtocolBase):
 
     kind: Literal["replay"]
     of: Annotated[str, Field(min_length=1, max_length=100)]
-    """Id of the session whose strokes they were."""
+    """Id of the session that the strokes are from."""
     file: FileName | None = None
     """CSV with the columns `stroke_id`, `height_mm` and `tilt_deg`; any other column is ignored and named in
     `ignored_columns`."""
     presses: Annotated[tuple[ReplayRow, ...], Field(min_length=1, max_length=MAX_STROKES)]
-    """What is pressed again, by the id that the stroke had. Read from `file` where one is named."""
+    """The presses, under the ids that the strokes had. Read from `file` where one is named."""
     ignored_columns: tuple[str, ...] = ()
-    """Columns of `file` that nothing was done with."""
+    """Columns of `file` that are not used."""
     repeats: Repeats = 1
     """How often each is pressed again; each round holds every stroke once."""
     seed: Seed | None = None
@@ -194,8 +194,8 @@ class ReplayConfig(ProtocolBase):
     def planned(self, layout: Layout | None = None) -> list[Planned]:
         """Every stroke `repeats` times. `H13-a5-r02` pressed again is `H13-a5-r02~1`, then `~2` and so on.
 
-        A given id begins with no `~` but may hold one; what stands before the last is always the original's id, and
-        `again_of` in the step's parameters says the same.
+        An id may hold a `~` but not begin with one: everything before the last `~` is the original's id, which is also
+        `again_of` in the step's parameters.
         """
         rounds = [
             [

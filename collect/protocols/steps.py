@@ -26,25 +26,25 @@ class StepKind(StrEnum):
     DRAW = "draw"
     """A figure: all strokes of one character, on one cell. Cut anywhere, the whole of it is done again."""
     TOUCH = "touch"
-    """Bring the tip down on a named point of the sheet and tell how high it lies there."""
+    """Bring the tip down on a given point of the sheet and measure its height."""
     CAPTURE = "capture"
     CHOOSE = "choose"
-    """Fit the brush to what is captured, and choose the next press or to stop; nothing moves."""
+    """Fit the brush to the captures so far, and choose the next press or the end; nothing moves."""
     REVIEW = "review"
-    """Read which captures a person has marked bad since the strokes were made; nothing moves."""
+    """Read which captures a person has marked bad; nothing moves."""
     SELF_CHECK = "self_check"
-    """An uneven triangle of marks that a mirrored, turned or stretched rig does not reproduce."""
+    """Press an uneven triangle of marks, which a mirrored, turned or stretched rig does not reproduce."""
 
 
 MARKING = frozenset({StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK})
-"""They leave ink on a paper cell of their own."""
+"""Steps that leave ink on a paper cell of their own."""
 RUN_SCOPED = frozenset({StepKind.ZERO_TOUCH})
-"""Done again in every process: what they establish does not outlive it."""
+"""Steps that are done again in every process, since what they establish does not outlive it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One step. `index` tells equal steps of one protocol apart."""
+    """One step. `index` distinguishes equal steps of one protocol."""
 
     kind: StepKind
     index: int
@@ -58,18 +58,18 @@ class Step:
 
     @property
     def run_scoped(self) -> bool:
-        """True where a stored result must not stand in for doing it."""
+        """Whether it must be done again even where a stored result exists."""
         return self.kind in RUN_SCOPED
 
 
 Protocol = Generator[Step, Result, None]
 """Yields steps and is sent their results, so that later steps can depend on earlier ones."""
 KNOWING = frozenset({StepKind.ZERO_TOUCH, StepKind.TOUCH, StepKind.BOARD})
-"""Paper and board must be known before it."""
+"""Steps that come before the self-check, which needs paper and board."""
 
 
 def with_self_check(protocol: Protocol) -> Protocol:
-    """The same protocol, with a SELF_CHECK step before the first that is for a mark."""
+    """The same protocol, with a SELF_CHECK step before the first one that prepares a mark."""
     step = next(protocol)
     checked = False
     with contextlib.suppress(StopIteration):

@@ -40,9 +40,9 @@ class DrawnStroke(Config):
     """One stroke: down at the first point, along the others without a halt, up at the last."""
 
     file: FileName | None = None
-    """CSV with the columns `x_mm`, `y_mm`, `height_mm` and, as one likes, `tilt_deg` and `heading_deg`."""
+    """CSV with the columns `x_mm`, `y_mm`, `height_mm` and optionally `tilt_deg` and `heading_deg`."""
     points: Annotated[tuple[TrajectoryPoint, ...], Field(min_length=2, max_length=1000)]
-    """[x_mm, y_mm, height_mm, tilt_deg, heading_deg] each. Read from `file` where one is named."""
+    """Points [x_mm, y_mm, height_mm, tilt_deg, heading_deg]. Read from `file` where one is named."""
 
     @model_validator(mode="after")
     def _drawn(self) -> DrawnStroke:
@@ -63,7 +63,7 @@ class Figure(Config):
     """A character or a single drawn line: strokes that share one paper cell."""
 
     name: Annotated[str, Field(min_length=1, max_length=60)]
-    """Its stroke id is this and the number of the repeat."""
+    """The stroke id is this name and the number of the repeat."""
     strokes: Annotated[tuple[DrawnStroke, ...], Field(min_length=1, max_length=100)]
     """In the order of writing."""
 
@@ -77,13 +77,13 @@ class WriteConfig(ProtocolBase):
     cell_mm: tuple[CellMm, CellMm]
     """Width and height of the patch for one figure. Its lower left corner is the origin, x along the sheet's x."""
     figures: Annotated[tuple[Figure, ...], Field(min_length=1, max_length=1000)]
-    """What is written."""
+    """The figures, in the order of writing."""
     repeats: Repeats = 1
     """Rounds: each holds every figure once."""
     seed: Seed | None = None
     """Shuffles each round; left out, the order is that of the list."""
     speed_mm_s: Annotated[float, Field(ge=1.0, le=100.0)] = 20.0
-    """Of the tip along the trajectory."""
+    """Speed of the tip along the trajectory."""
     blend_mm: Annotated[float, Field(ge=1.0, le=20.0)] = 1.0
     """How near to a point the tip may leave it for the next, so that the arm does not halt there. ARCS takes no less
     than 1 mm."""

@@ -1,1 +1,1 @@
-"""What is wrong with a capture, seconds after it: measured, compared with a threshold, and told in words."""
+"""Quality checks of a capture: measured, compared with a limit, and explained in a sentence."""

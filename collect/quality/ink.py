@@ -26,7 +26,7 @@ class Patch:
 
     window_mm: Rect
     raster: Gray
-    """(h, w) as photographed; beyond the frame its border, repeated."""
+    """(h, w) as photographed; beyond the frame, its border repeated."""
     dark: Soft
     """(h, w) 0 = paper, 1 = reflects nothing; 0 beyond the frame."""
     in_view: Mask
@@ -64,7 +64,7 @@ def take(image: Gray, image_to_paper: Floats, window_mm: Rect, params: Params) -
 
 
 def around(rect_mm: Rect, margin_mm: float, sheet_mm: tuple[float, float] | None) -> Rect:
-    """A rectangle with a margin, no farther than the sheet: the table beyond it is no paper."""
+    """A rectangle with a margin, clipped to the sheet: the table beyond it is not paper."""
     left, bottom = rect_mm[0] - margin_mm, rect_mm[1] - margin_mm
     right, top = rect_mm[0] + rect_mm[2] + margin_mm, rect_mm[1] + rect_mm[3] + margin_mm
     if sheet_mm is not None:
@@ -84,7 +84,7 @@ def _in_view(image: Gray, image_to_paper: Floats, window_mm: Rect, raster: Gray)
     seen = apply(np.asarray(np.linalg.inv(image_to_paper), np.float64), corners(window_mm))
     if seen.min() >= 0.0 and bool((seen <= np.array(image.shape[::-1]) - 1.0).all()):
         return np.ones(raster.shape, np.bool_)
-    # `rectify` repeats the frame's outermost pixels: make them tell that they are.
+    # `rectify` repeats the frame's outermost pixels: mark them, to see where it did.
     shown = np.full(image.shape, 255, np.uint8)
     shown[[0, -1]] = 0
     shown[:, [0, -1]] = 0
@@ -96,24 +96,24 @@ COARSE = 4
 JOIN_MM = 2.5
 """Spots of ink closer than this belong together: hairs of a dry brush, the halves of a split tuft."""
 NEAR_MM = 3.0
-"""What comes so close to the zero-touch point is taken for the stroke, if it is not small beside something else."""
+"""Ink this close to the zero-touch point is taken for the stroke, unless it is small compared with another piece."""
 NEAR_SHARE = 0.2
 HOME_SHARE = 0.3
 SMALLEST_MM2 = 0.2
 """Spots below this are specks of the paper."""
 SEAM_MM = 0.3
-"""Ink seen before is grown by this: the same edge never falls on the same place to a pixel."""
+"""Old ink is grown by this: an edge never falls on exactly the same pixel twice."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ink:
-    """The ink of a press, told from everything else in its window."""
+    """The ink of a press, distinguished from everything else in its window."""
 
     patch: Patch
     own: Mask
     """(h, w) the press's own ink, every spot of it above the gate."""
     before_mm2: float
-    """Ink in the cell that was there before the press; 0 where nobody had looked."""
+    """Ink in the cell from before the press; 0 without a photograph from before."""
     beside_mm2: float
     """Other ink in the cell that lies apart from the press's own."""
 
@@ -124,7 +124,7 @@ class Ink:
 
 
 def tell_apart(now: Patch, before: Patch | None, cell_mm: Rect, anchor_mm: Point, gate: float) -> Ink:
-    """Which ink is the press's own: new since `before` where that is given, in one piece, and by the anchor."""
+    """Find the press's own ink: new since `before` where that is given, in one piece, and near the anchor."""
     ink = now.inked(gate)
     cell = now.inside(cell_mm)
     before_mm2 = 0.0
@@ -133,7 +133,7 @@ def tell_apart(now: Patch, before: Patch | None, cell_mm: Rect, anchor_mm: Point
         before_mm2 = mm2(old[cell])
         side = round(SEAM_MM * PX_PER_MM) | 1
         ink &= cv2.dilate(old.astype(np.uint8), np.ones((side, side), np.uint8)) == 0
-    # Where nobody knows what is new, what lies mostly next door is taken to be next door's.
+    # Without a photograph from before, a piece that lies mostly in the next cell is taken to belong there.
     least_share = HOME_SHARE if before is None else 0.0
     own, beside_mm2 = _own_piece(ink, now.to_px(anchor_mm), cell, least_share)
     return Ink(now, own, before_mm2, beside_mm2)
@@ -145,7 +145,7 @@ def mm2(mask: Mask) -> float:
 
 
 def _own_piece(ink: Mask, anchor_px: Point, cell: tuple[slice, slice], least_share: float) -> tuple[Mask, float]:
-    """The piece that is the stroke, `least_share` of it in the cell, and the mm^2 of the others within the cell."""
+    """(the piece that is the stroke, with `least_share` of it in the cell; mm^2 of the other pieces in the cell)."""
     height, width = ink.shape
     pieces, count = _pieces(ink)
     areas = np.bincount(pieces.ravel(), minlength=count) / PX_PER_MM**2

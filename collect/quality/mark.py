@@ -1,4 +1,4 @@
-"""The stroke itself, cut out and turned so that it runs from its tip at the left to its head at the right."""
+"""Measures the stroke of a press, cut out and turned so that its tip lies at the left and its head at the right."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Bits = NDArray[np.uint8]
 OUTLINE_MM = 1.5
 """Bare streaks narrower than this lie inside a stroke."""
 CLEFT_MM = 0.5
-"""A gap wider than this is no streak but a place where the tuft has parted."""
+"""A gap wider than this is not a streak: the tuft has parted there."""
 RIM_MM = 0.5
 """The edge of a stroke is never as dark as its middle."""
 HEAD_SHARE = 0.4
-"""Share of the length, from the head, that tells where the stroke begins and how it is set down."""
+"""Share of the length, from the head, that shows where the stroke begins and in what direction."""
 TIP_SHARE = 0.1
 GAP_SHARE = 0.6
 """Share of the length, from the tip, in which hairs may part."""
@@ -33,11 +33,11 @@ class Mark:
     """One press's stroke, measured."""
 
     tone: float
-    """Darkness of its ink, 1 = reflects nothing: that of the quarter of it that is darkest or darker."""
+    """Upper quartile of the darkness of its ink; 1 reflects nothing."""
     uneven: float
-    """Standard deviation of darkness over mean, within its outline but for rim and cleft."""
+    """Standard deviation of darkness over mean, within its outline without rim and cleft."""
     head_mm: Point
-    """Where it begins, from the zero-touch point: along the heading away from the tip, and to the left of it."""
+    """Where it begins, from the zero-touch point: along the heading, away from the tip, and to the left."""
     gap_mm: float
     """Widest gap between two groups of hairs, averaged over 2 mm of length."""
     bent_deg: float
@@ -53,7 +53,7 @@ def measure_mark(ink: Ink, anchor_mm: Point) -> Mark | None:
     own, dark = ink.own[box], ink.patch.dark[box]
     x, y = ink.patch.to_px(anchor_mm)
     right_mm, left_mm = (columns[-1] + 1 - x) / PX_PER_MM, (x - columns[0]) / PX_PER_MM
-    # The head is the end by the zero-touch point, whichever way this brush lies down.
+    # The head is the end near the zero-touch point, whichever way this brush lies down.
     flip = abs(left_mm) < abs(right_mm)
     if flip:
         own, dark = own[:, ::-1], dark[:, ::-1]
@@ -77,7 +77,7 @@ def measure_mark(ink: Ink, anchor_mm: Point) -> Mark | None:
 
 
 def _spine(hairs: Mask) -> NDArray[np.float64]:
-    """(w,) row of the middle of each column, carried on over bare columns."""
+    """(w,) row of the middle of each column; bare columns repeat the one before."""
     full = hairs.any(axis=0)
     top, bottom = hairs.argmax(axis=0), hairs.shape[0] - hairs[::-1].argmax(axis=0)
     at = np.flatnonzero(full)

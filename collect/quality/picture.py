@@ -1,4 +1,4 @@
-"""Is the photograph itself sound? Exposure, blur and glare need no ink; a cut stroke does."""
+"""Measures the photograph itself: exposure, blur, glare, and how near a stroke lies to the edge of the frame."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from calibrate.board.plane import Plane, apply
 from calibrate.stroke.params import PX_PER_MM, Gray, Mask
 
 FINE_PX, WIDE_PX = 1.0, 2.0
-"""Two blurs put on top; how much the second weakens an edge more than the first tells the edge's own blur."""
+"""Two blurs that are added; how much more the second weakens an edge than the first gives the edge's own blur."""
 EDGE_SHARE = 0.02
-"""Share of the pixels of the frame, the steepest, that are taken for edges."""
+"""Share of the frame's pixels, the steepest ones, that are taken for edges."""
 LEAST_EDGE = 3.0
 """Gray levels per pixel below which nothing is an edge."""
 FEWEST_EDGES = 50
 SLOPE_PX2 = 1.0 / 3.0
-"""Variance of the blur that a difference over two pixels is itself."""
+"""Variance of the blur that a difference over two pixels adds."""
 BRIGHT_PX_PER_MM = 2.5
-"""Glare is looked for on a raster as coarse as this."""
+"""Raster on which glare is looked for."""
 INK_WIDTH_MM = 12.0
-"""Strokes are thinner than this: closing fills them with the paper beside them."""
+"""Strokes are narrower than this: closing fills them with the paper beside them."""
 SPOT_MM = 36.0
-"""Brightness that is wider than this is the light and no glare."""
+"""A bright area wider than this is the light, not glare."""
 SATURATED = 252
 
 
@@ -49,7 +49,7 @@ def blur_px(image: Gray) -> float | None:
 
 def _blur_along(image: Gray, dx: int, dy: int) -> float | None:
     fine = _slope(image, FINE_PX, dx, dy)
-    # a line's own thickness does not matter at the crest of its edge, only its blur
+    # At the crest of an edge only its blur matters, not the thickness of the line.
     crest = fine == cv2.dilate(fine, np.ones((1, 7) if dx else (7, 1), np.uint8))
     steep = fine[crest & (fine > LEAST_EDGE)]
     if steep.size < FEWEST_EDGES:
@@ -79,7 +79,7 @@ def edge_mm(points_mm: Floats, plane: Plane, shape: tuple[int, ...]) -> float:
 def glare(raster: Gray, share: float) -> Mask:
     """Where a rectified window at 20 px/mm glares, at 2.5 px/mm: saturated, or a spot brighter than its surroundings.
 
-    A spot is what a morphological opening takes away; slopes and steps of the light, such as a shadow's edge, stay.
+    A spot is what a morphological opening removes; slopes and steps of the light, such as the edge of a shadow, stay.
     """
     height, width = (round(side * BRIGHT_PX_PER_MM / PX_PER_MM) for side in raster.shape)
     small = np.asarray(cv2.resize(raster, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
@@ -93,7 +93,7 @@ def glare(raster: Gray, share: float) -> Mask:
 
 def _morph(image: NDArray[np.uint8], operation: int, width_mm: float) -> NDArray[np.uint8]:
     side = round(width_mm * BRIGHT_PX_PER_MM) | 1
-    # Really padded: a border rule acts on each half of the operation alone, and a bright strip by the border would go.
+    # Padded: a border rule acts on each half of the operation alone, and would remove a bright strip at the border.
     padded = cv2.copyMakeBorder(image, side, side, side, side, cv2.BORDER_REPLICATE)
     changed = cv2.morphologyEx(padded, operation, np.ones((side, side), np.uint8))
     return np.asarray(changed[side:-side, side:-side], np.uint8)

@@ -1,4 +1,4 @@
-"""What a quality check says: a number, its limit, and what an operator should do."""
+"""The result of a quality check: a number, its limit, and what an operator should do."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ from enum import StrEnum
 
 
 class Family(StrEnum):
-    """What a failure spoils, and so what must be done again."""
+    """What a failure spoils, and therefore what must be done again."""
 
     PICTURE = "picture"
-    """The photograph, not the stroke: mend the cause and photograph again, the stroke on the paper may be sound."""
+    """The photograph, not the stroke: remove the cause and photograph again; the stroke on paper may be sound."""
     PLACE = "place"
-    """The ink is not where it belongs: the cell is lost, press on a new one."""
+    """The ink is not where it belongs: press on a new cell."""
     INK = "ink"
     """Too little ink: dip again and press on a new cell."""
     SHAPE = "shape"
-    """The hairs lay wrong: comb or wipe the brush, dip, and press on a new cell."""
+    """The hairs lay badly: comb or wipe the brush, dip, and press on a new cell."""
 
 
 class Failure(StrEnum):
     """The failures in the order in which they are judged; the first that is found is the cause.
 
-    What a picture shows can only be judged as far as the picture is sound, a stroke only where it is told from other
-    ink, its place and tone only where hairs carried ink, and its shape last.
+    A stroke can only be judged in a sound picture, and where it is distinguished from other ink; its place and tone
+    only where the hairs carried ink; its shape last.
     """
 
     family: Family
@@ -59,7 +59,7 @@ class Check:
     threshold: float
     passed: bool
     reason: str
-    """What was seen and what to do about it; empty where it passed."""
+    """What is wrong and what to do about it; empty where it passed."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,1 +1,1 @@
-"""The rig: its configuration, its devices, the paper on its table, and a check that all of it answers."""
+"""The rig: its configuration, its devices, the paper on its table, and a check that every device answers."""

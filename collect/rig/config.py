@@ -32,7 +32,7 @@ PREFIX, DELIMITER = "BRUSHLOOP_", "__"
 def overrides(settings: type[BaseSettings]) -> dict[tuple[str, ...], str]:
     """Variable by the path that it sets: `("robot", "port")` -> `BRUSHLOOP_ROBOT__PORT`.
 
-    Raises `ConfigError` for a variable whose table or top field is not there: pydantic would pass it over in silence.
+    Raises `ConfigError` for a variable whose table or top field does not exist: pydantic would ignore it silently.
     """
     found: dict[tuple[str, ...], str] = {}
     for name in sorted(os.environ):
@@ -40,7 +40,7 @@ def overrides(settings: type[BaseSettings]) -> dict[tuple[str, ...], str]:
             continue
         path = tuple(name[len(PREFIX) :].lower().split(DELIMITER))
         if path[0] not in settings.model_fields or (len(path) > 1 and not models_at(settings, path[:1])):
-            # Compared without the prefix, which would make all of them alike.
+            # Compared without the prefix, which would make all of them similar.
             meant = nearest(DELIMITER.join(path), [DELIMITER.join(known) for known in paths([settings])])
             hint = f"; did you mean {PREFIX}{meant.upper()}?" if meant else f": {PREFIX}TABLE{DELIMITER}FIELD would"
             raise ConfigError(place(name), "", f"sets nothing of rig.toml{hint}")
@@ -49,7 +49,7 @@ def overrides(settings: type[BaseSettings]) -> dict[tuple[str, ...], str]:
 
 
 def unreadable(settings: type[BaseSettings], error: SettingsError) -> ConfigError:
-    """The refusal of a variable whose text is not what a list or a table is written as."""
+    """The refusal of a variable whose text should be a list or a table and is not JSON."""
     for path, name in overrides(settings).items():
         source = EnvSettingsSource(settings)
         source.env_vars = {name.lower(): os.environ[name]}
@@ -64,7 +64,7 @@ def unreadable(settings: type[BaseSettings], error: SettingsError) -> ConfigErro
 
 MAX_CONFIG_BYTES = 1024 * 1024
 TRAVEL_CLEARANCE_MM = 15.0
-"""Least height of travel above the paper: more than a drop at the tip."""
+"""Least height of travel above the paper: more than a drop at the tip hangs down."""
 
 
 class BrushConfig(Config):
@@ -74,7 +74,7 @@ class BrushConfig(Config):
     radius_mm: Annotated[float, Field(gt=0.0, le=50.0)] = 6.0
     length_mm: Annotated[float, Field(gt=0.0, le=200.0)] = 48.0
     max_depth_mm: Annotated[float, Field(gt=0.0, le=100.0)] = 22.0
-    """Deepest press that this brush survives."""
+    """Deepest press that this brush bears."""
 
 
 class PaperConfig(Config):
@@ -141,11 +141,11 @@ class MotionConfig(Config):
     press_speed_mm_s: Annotated[float, Field(gt=0.0, le=100.0)] = 20.0
     acc_mm_s2: Annotated[float, Field(gt=0.0, le=5000.0)] = 500.0
     least_dwell_s: Annotated[float, Field(ge=0.05, le=60.0)] = 0.1
-    """Time at depth, however short a dwell is asked for: the depth must be seen."""
+    """Least time at depth, however short a dwell is configured: the depth must be observed."""
 
 
 class RigConfig(BaseSettings):
-    """Everything about the rig: `rig.toml`, with the environment on top."""
+    """`rig.toml`, with the overrides of the environment."""
 
     model_config = SettingsConfigDict(frozen=True, extra="forbid", env_prefix=PREFIX, env_nested_delimiter=DELIMITER)
 
@@ -163,7 +163,7 @@ class RigConfig(BaseSettings):
     quality: QualityConfig = QualityConfig()
 
     def settled(self, armed: bool) -> RigConfig:
-        """The same with the self-check decided, where it was left out: on wherever real hardware may come to move."""
+        """The same with the self-check decided where it was left out: on wherever real hardware may move."""
         if self.self_check.enabled is not None:
             return self
         return self.checking_itself(armed or not self.robot.on_this_machine)

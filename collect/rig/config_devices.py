@@ -12,7 +12,7 @@ from collect.rig.config_file import Config, Finite, Positive, Range
 from drivers.force.rounds import LOOPBACK_CHANNEL
 
 MOST_STALE_MS = 100.0
-"""At 20 mm/s a brush goes down 2 mm meanwhile, unfelt."""
+"""At 20 mm/s a brush goes down 2 mm in this time without being felt."""
 MOST_STALE_LOOPBACK_MS = 2000.0
 """On the loopback rig's bus, where simulated time may run faster than the sensor's rounds come."""
 
@@ -50,13 +50,13 @@ class RobotConfig(Config):
     rtde_port: int | None = Field(None, ge=1, le=65535)
     """Where poses are pushed from (30010); left out, they are polled for."""
     watchdog_s: Annotated[float, Field(ge=0.5, le=60.0)] | None = None
-    """Dead-man on the controller: without a sign of life for so long it goes into a protective stop, which only a
-    person releases, and which leaves the brush where it is. Left out, none is armed, and a press lifts by itself."""
+    """Dead-man switch on the controller: after this long without a sign of life it makes a protective stop, which only
+    a person releases and which leaves the brush where it is. Left out, none is armed, and a press lifts by itself."""
     speed_fraction: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
     collision_level: Annotated[int, Field(ge=1, le=9)] | None = None
-    """1 to 9, most sensitive; left out, what the pendant has stays."""
+    """1 to 9, the most sensitive; left out, the pendant's setting stays."""
     payload_kg: Annotated[float, Field(ge=0.0, le=5.0)] | None = None
-    """Mass of sensor, holder and brush; an i5 carries 5 kg. Left out, what the pendant has stays."""
+    """Mass of sensor, holder and brush; an i5 carries 5 kg. Left out, the pendant's setting stays."""
     payload_cog_mm: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
     """Its centre, from the flange."""
     limits: LimitsConfig
@@ -97,9 +97,9 @@ class CameraConfig(Config):
     lens: str = ""
     """Its name, for the record."""
     lens_file: Path | None = None
-    """Of `brushloop camera intrinsics`, beside rig.toml: what the lens bends is undone before anything is measured."""
+    """Written by `brushloop camera intrinsics`, beside rig.toml: distortion is undone before anything is measured."""
     optics: LensUsed | None = None
-    """What stands in that file; filled in when rig.toml is read, so that the session holds it."""
+    """Contents of that file; filled in when rig.toml is read, so that the session holds them."""
     locked: LockedConfig = LockedConfig()
 
 
@@ -120,7 +120,7 @@ class InkStationConfig(Config):
 
 
 class ModbusPumpConfig(Config):
-    """A peristaltic pump without a gauge: what dips take is given back unseen."""
+    """A peristaltic pump without a gauge: replaces what dips take without measuring it."""
 
     kind: Literal["modbus-pump"]
     port: str = Field(min_length=1)
@@ -151,7 +151,7 @@ class ForceConfig(Config):
     """Of a CAN gateway, for the interface socketcand."""
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
     rate_hz: Annotated[float, Field(gt=0.0, le=2000.0)] = 200.0
-    """What the board is set to; gaps are counted against it."""
+    """Rate that the sensor's board is set to; gaps are counted by it."""
     max_n: Positive = 5.0
     """Ceiling while the brush is down: above it the arm is stopped and the press is void."""
     stale_ms: Annotated[float, Field(ge=20.0)] = 100.0

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 MOST = 1e6
-"""Of any number: a length of a kilometre is a slip of the pen, to be told as one."""
+"""Largest number: a length of a kilometre is a slip of the pen, and refused as one."""
 Positive = Annotated[float, Field(gt=0.0, le=MOST, allow_inf_nan=False)]
 Finite = Annotated[float, Field(ge=-MOST, le=MOST, allow_inf_nan=False)]
 Range = tuple[Finite, Finite]
@@ -31,7 +31,7 @@ class Config(BaseModel):
 
 
 def place(name: str) -> str:
-    """A variable as refusals name it."""
+    """How a refusal names an environment variable."""
     return f"environment variable {name}"
 
 
@@ -70,20 +70,21 @@ def refusal(
     tagged: bool = False,
     environment: Mapping[tuple[str, ...], str] | None = None,
 ) -> ConfigError:
-    """The first thing that is wrong, in one line; an unknown key first: it is often the misspelt name of another.
+    """The first error in one line; an unknown key comes first: it is often the misspelt name of a missing one.
 
-    `of`: the model, or the union of models. `tagged`: it is a union, whose tag pydantic puts in front of each field's
-    name. `environment`: the variable that sets each path; it is named where the value came from there.
+    `of` is the model, or the union of models; `tagged` says that it is a union, whose tag pydantic puts in front of
+    each field's name. `environment` holds the variable that sets each path: a value from there is refused by its
+    variable's name.
     """
     errors = error.errors()
     first = min(errors, key=lambda e: e["type"] != "extra_forbidden")
-    what, told = _what(first, errors, of)
+    what, covered = _what(first, errors, of)
     key = first["loc"][-1:] if first["type"] == "extra_forbidden" else ()
     within = first["loc"][1 if tagged else 0 : len(first["loc"]) - len(key)]
     loc = [*(part for part in within if not _is_tag(part)), *key]
     if first["type"].startswith("union_tag"):
         loc.append("kind")
-    more = f"; and {len(errors) - told} more" if len(errors) > told else ""
+    more = f"; and {len(errors) - covered} more" if len(errors) > covered else ""
     where: Path | str = path
     for set_at, variable in (environment or {}).items():
         if tuple(loc[: len(set_at)]) == set_at and all(isinstance(part, int) for part in loc[len(set_at) :]):
@@ -94,7 +95,7 @@ def refusal(
 
 
 def _what(first: ErrorDetails, errors: list[ErrorDetails], of: object) -> tuple[str, int]:
-    """What is wrong, in words, and how many of the errors they tell."""
+    """(what is wrong, how many of the errors that covers)."""
     loc = first["loc"]
     match first["type"]:
         case "extra_forbidden":
@@ -120,7 +121,7 @@ def _what(first: ErrorDetails, errors: list[ErrorDetails], of: object) -> tuple[
 
 
 def _is_tag(part: str | int) -> bool:
-    """Whether this is the tag of a union within the file, and no field's name: those tags have a hyphen."""
+    """Whether this is the tag of a union within the file rather than a field: those tags have a hyphen."""
     return isinstance(part, str) and "-" in part
 
 
@@ -128,9 +129,9 @@ HOLDERS = (Annotated, Union, UnionType, list, tuple)
 
 
 def models_at(of: object, loc: Sequence[str | int]) -> list[type[BaseModel]]:
-    """The models of the table at `loc`: pydantic's place of an error, tags of unions and numbers of items included.
+    """The models of the table at `loc`, which is where pydantic places an error: with tags of unions and item numbers.
 
-    `of` is a model, or a union of some.
+    `of` is a model, or a union of models.
     """
     models = list(_models(of))
     for part in loc:
@@ -145,18 +146,18 @@ def models_at(of: object, loc: Sequence[str | int]) -> list[type[BaseModel]]:
 
 
 def fields(models: Sequence[type[BaseModel]]) -> list[str]:
-    """Names that any of these tables may have, in their order."""
+    """Names that any of these tables may have, in order."""
     return list(dict.fromkeys(name for model in models for name in model.model_fields))
 
 
 def kinds(models: Sequence[type[BaseModel]]) -> list[str]:
-    """What `kind` may be in these tables."""
+    """Values that `kind` may have in these tables."""
     tags = (model.model_fields["kind"].annotation for model in models if "kind" in model.model_fields)
     return [str(kind) for tag in tags if get_origin(tag) is Literal for kind in get_args(tag)]
 
 
 def nearest(name: str, known: Sequence[str]) -> str | None:
-    """The known name that is most like it, if any is."""
+    """The known name that is most similar, if any is."""
     return next(iter(difflib.get_close_matches(name, known, n=1)), None)
 
 

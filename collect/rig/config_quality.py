@@ -13,22 +13,22 @@ Area = Annotated[float, Field(gt=0.0, le=1e6)]
 
 
 class QualityConfig(BaseModel):
-    """From where on a capture is not sound."""
+    """Limits beyond which a capture is not sound."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     enabled: bool = True
-    """False records what comes, unseen."""
+    """False records captures without judging them."""
     retakes: Annotated[int, Field(ge=0, le=10)] = 2
     """How often a stroke that failed is pressed again on a new cell before a person is asked."""
     dark_level: Level = 80.0
     """Gray level of the paper below which the picture is underexposed."""
     bright_level: Annotated[float, Field(ge=0.0, le=256.0)] = 250.0
-    """Gray level of the paper from which the picture is overexposed: a saturated pixel tells nothing. 256 = never."""
+    """Gray level of the paper from which the picture is overexposed, its pixels saturated. 256 = never."""
     blur_mm: Length = 0.25
     """Standard deviation of the blur on the paper, measured at the picture's steepest edges."""
     edge_mm: Length = 1.0
-    """Ink must stay so far from the edge of the frame, or it may go on beyond it."""
+    """Least distance of ink from the edge of the frame: nearer ink may go on beyond it."""
     glare_share: Share = 0.1
     """How much brighter than the paper around it a spot must be to count as glare."""
     glare_mm2: Area = 6.0
@@ -36,7 +36,7 @@ class QualityConfig(BaseModel):
     ink_gate: Share = 0.1
     """How far below the paper a spot must lie to count as ink, as a share of the paper's brightness."""
     foreign_mm2: Area = 1.5
-    """Ink in the cell that is not the stroke's own; a cell that holds so much before a press is not blank."""
+    """Ink in the cell that is not the stroke's own; a cell that holds this much before a press is not blank."""
     blank_mm2_per_mm: Area = 0.1
     """A press that leaves less ink for each mm of its depth is blank."""
     uneven: Share = 0.125

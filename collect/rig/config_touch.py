@@ -1,4 +1,4 @@
-"""The tables `[touch]` and `[self_check]` of `rig.toml`: how zero touch is found, and when a rig is refused."""
+"""The tables `[touch]` and `[self_check]` of `rig.toml`: how the paper is found, and when a rig is refused."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class ForceTouchConfig(Config):
     """Zero touch by force: fast steps until something is felt, then slow ones around where it was."""
 
     threshold_n: Positive = 0.0012
-    """Force that ends the fast approach. A soft brush pushes with a few mN in its first millimetre."""
+    """Force in N that ends the fast approach. A soft brush pushes with a few mN in its first millimetre."""
     fast_step_mm: Step = 0.5
     fast_samples: Annotated[int, Field(ge=4, le=10_000)] = 60
     """Averaged at each rest of the fast approach."""
@@ -27,13 +27,13 @@ class ForceTouchConfig(Config):
     sigma_mm: Annotated[float, Field(ge=0.001, le=0.5)] = 0.0135
     """Slow descents are repeated until the contact is known to this standard error."""
     max_samples: Annotated[int, Field(ge=100, le=1_000_000)] = 60_000
-    """No touch takes more: where they do not suffice, the sensor is too noisy for the brush."""
+    """Most samples of a touch: where they are not enough, the sensor is too noisy for the brush."""
     linear_mm: Annotated[float, Field(ge=0.05, le=5.0)] = 0.45
-    """Depth to which the brush counts as a straight spring; below it nothing is averaged."""
+    """Depth to which the brush counts as a linear spring; readings below it are left out."""
     push_axis: tuple[Finite, Finite, Finite] = (0.0, 0.0, -1.0)
     """Where the paper pushes, in the sensor's frame: against its z axis, if that points along the tool to the tip."""
     clear_mm: Annotated[float, Field(ge=0.0, le=20.0)] = 1.0
-    """A rest above the one before is reached from so much higher still: every rest is met on the way down."""
+    """A rest above the one before is approached from this much higher: every rest is reached on the way down."""
     settle_s: Annotated[float, Field(ge=0.0, le=10.0)] = 0.05
     """From the arm at rest to the first sample that counts."""
 
@@ -49,16 +49,16 @@ class CameraTouchConfig(Config):
 
     coarse_step_mm: Step = 0.5
     fine_step_mm: Step = 0.08
-    """Half of it, about, is the error of a touch."""
+    """About half of it is the error of a touch."""
     pitch_mm: Annotated[float, Field(ge=2.0, le=20.0)] = 4.0
     """Between spots; a shallow touch leaves a mark of one to three millimetres. Camera and arm must agree on the place
     within a quarter of it."""
     columns: Annotated[int, Field(ge=2, le=50)] = 9
     """Spots in a row of a point's patch."""
     spots_per_dip: Annotated[int, Field(ge=1, le=20)] = 2
-    """Touches after which the brush is dipped again: a dry tip leaves nothing at first."""
+    """Touches after which the brush is dipped again: a tip that dries leaves no ink at first."""
     spots_per_photo: Annotated[int, Field(ge=1, le=20)] = 2
-    """Of the coarse row, which ends at the photograph that shows ink: few, so that no spot gets deep and large."""
+    """In the coarse row, which ends at the photograph that shows ink: few, so that no spot gets deep and large."""
     least_ink_mm2: Annotated[float, Field(gt=0.0, le=10.0)] = 0.25
     """Darkening that counts as ink: area times how much darker it became, 1 being black."""
 
@@ -80,26 +80,26 @@ class TouchConfig(Config):
     method: Method = "taught"
     """`taught` visits the height of `[paper]` and confirms it; the others measure."""
     touches: Annotated[int, Field(ge=1, le=50)] = 3
-    """At each point."""
+    """Number of touches at each point."""
     repeatability_mm: Positive = 0.15
-    """The touches of one point may span so much; more, and the run stops with the heights."""
+    """How much the touches of one point may span; beyond it the run stops and names the heights."""
     residual_mm: Positive = 0.2
-    """A point may lie so far from the plane through all of them; three points have no residuals."""
+    """How far a point may lie from the plane through all of them; three points have no residuals."""
     above_mm: Annotated[float, Field(gt=0.0, le=20.0)] = 2.0
-    """The approach begins so far above the expected height: more than its error."""
+    """How far above the expected height the approach begins: more than the error of that height."""
     travel_mm: Annotated[float, Field(gt=0.0, le=20.0)] = 2.0
-    """The approach ends so far below it: nothing was touched."""
+    """How far below the expected height the approach ends, with nothing touched."""
     moved_mm: Positive = 0.5
-    """A height that is measured so far from the one before is doubtful: whoever sets up is told."""
+    """A height measured this far from the one before is doubtful, and is pointed out in the set-up."""
     lean_deg: Annotated[float, Field(ge=0.0, le=3.0)] = 1.0
-    """The sheet may lean so much: what is not known of a height far from the last touch widens the approach."""
+    """How much the sheet may lean: far from the last touch, the approach is widened accordingly."""
     points_mm: Annotated[list[tuple[Finite, Finite]], Field(max_length=25)] = Field(
         default_factory=list[tuple[float, float]]
     )
     """Where to touch, in the paper frame; empty means `[paper] touch_point_mm`. Three or more give a plane, fewer a
     level sheet. By camera each point is the lower left of a patch that gets inked, and three are needed."""
     speed_mm_s: Annotated[float, Field(ge=0.5, le=50.0)] = 5.0
-    """Of every move at or below the start of the approach."""
+    """Speed of every move at or below the start of the approach."""
     force: ForceTouchConfig = ForceTouchConfig()
     camera: CameraTouchConfig = CameraTouchConfig()
     jog: JogTouchConfig = JogTouchConfig()
@@ -113,7 +113,7 @@ class TouchConfig(Config):
     @model_validator(mode="after")
     def _points(self) -> TouchConfig:
         if self.method == "camera" and len(self.points_mm) < 3:
-            # over the length of a row, a sheet that leans by 1 deg changes its height by more than a fine step
+            # Over the length of a row, a sheet that leans by 1 deg changes its height by more than a fine step.
             raise ValueError(f"points_mm has {len(self.points_mm)} points: by camera three are needed")
         return self
 
@@ -127,15 +127,15 @@ class SelfCheckConfig(Config):
     depth_mm: Annotated[float, Field(ge=0.5, le=10.0)] = 2.0
     legs_mm: tuple[Annotated[float, Field(ge=8.0, le=200.0)], Annotated[float, Field(ge=8.0, le=200.0)]] = (24.0, 15.0)
     """Along paper x and y from the corner of the triangle, on sheets without room for one over three cells; uneven, so
-    that it tells which is which."""
+    that no corner is mistaken for another."""
     offset_mm: Positive = 3.0
-    """The marks may lie so far from where they were commanded, all together; a soft tip lands beside its axis."""
+    """How far all marks together may lie from where they were commanded; a soft tip lands beside its axis."""
     turn_deg: Positive = 1.0
     scale: Annotated[float, Field(gt=0.0, le=0.2)] = 0.01
     """Relative error of a length that is refused, once `mark_mm` is taken off the triangle's extent."""
     mark_mm: Positive = 0.3
-    """How far one mark's centre may lie from where the others put it: no two presses bend the hairs alike. A triangle
-    that is to tell 2 % from 1 % must extend over more than 50 mm along both axes."""
+    """How far one mark's centre may lie from where the others imply: no two presses bend the hairs alike. To
+    distinguish 2 % from 1 %, a triangle must extend over more than 50 mm along both axes."""
     least_ink_mm2: Annotated[float, Field(gt=0.0, le=100.0)] = 1.0
 
     @model_validator(mode="after")

@@ -23,12 +23,12 @@ from drivers.samples import Identity
 from drivers.sole import Claimed, claimed
 
 FORCE_CONNECT_S = 10.0
-"""To open the bus, through a gateway as well, and get a first round."""
+"""Time to open the bus, even through a gateway, and get a first round."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """Connected devices and who they say they are."""
+    """Connected devices and their identities."""
 
     config: RigConfig
     clock: Clock
@@ -43,13 +43,13 @@ class Rig:
 
     @property
     def simulated(self) -> bool:
-        """True where any device says that it is the loopback rig, or shows a recording."""
+        """Whether any device belongs to the loopback rig, or replays a recording."""
         known = (self.robot_identity, self.camera_identity, self.force_identity, self.ink_identity)
         return any(identity.simulated for identity in known if identity is not None)
 
 
 def limits_of(config: RigConfig) -> Limits:
-    """The limits of `rig.toml`; the floor is never below what the brush survives."""
+    """The limits of `rig.toml`; the floor is never lower than the deepest press that the brush bears."""
     box = config.robot.limits
     floor = max(box.z_mm[0], config.paper.touch_z_mm - config.brush.max_depth_mm)
     return Limits(box.x_mm, box.y_mm, (floor, box.z_mm[1]), box.tilt_deg, box.speed_mm_s, box.acc_mm_s2)
@@ -120,7 +120,7 @@ def make_ink(config: InkDeviceConfig, clock: Clock) -> InkStation | ModbusPump:
 
 
 def _resolved(host: str) -> str:
-    """One arm under two names is one arm."""
+    """The address of a host, so that one arm under two names is one arm."""
     try:
         return socket.gethostbyname(host)
     except OSError:
@@ -142,10 +142,10 @@ def sole_driver(config: RigConfig) -> Generator[None]:
 
 @contextlib.asynccontextmanager
 async def connected(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> AsyncGenerator[Rig]:
-    """Connect camera, force sensor, ink device, then the robot; on the way out stop the arm first, come what may.
+    """Connect camera, force sensor, ink device, then the robot; on the way out always stop the arm first.
 
-    `on_notice` is told what a device says unasked, from any thread. Raises `ConfigError` where another brushloop on
-    this machine has the arm: closing would stop its motion.
+    `on_notice` gets what a device reports without being asked, from any thread. Raises `ConfigError` where another
+    brushloop on this machine drives the arm: closing ours would stop its motion.
     """
     async with contextlib.AsyncExitStack() as stack:
         stack.enter_context(sole_driver(config))

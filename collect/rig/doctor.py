@@ -1,4 +1,4 @@
-"""Asks every configured device who it is, and says in one table what answers and what is wrong. Powers nothing."""
+"""Asks every configured device for its identity and state, and reports in one table what is wrong. Powers nothing."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from drivers.samples import Identity, Stamp
 CALLS = 20
 FRAMES = 5
 LISTEN_S = 0.5
-"""To a force sensor: a hundred rounds tell the rate."""
+"""How long a force sensor is listened to: a hundred rounds give the rate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class Finding:
 
     @property
     def well(self) -> bool:
-        """True where nothing needs mending."""
+        """Whether nothing is wrong."""
         return self.answers and not self.problem
 
     def as_json(self) -> dict[str, Any]:
@@ -129,13 +129,13 @@ async def _force(config: ForceConfig, clock: Clock) -> Finding:
         remedy = "Check wiring, shielding and termination."
     elif force_n > config.max_n:
         problem = f"{force_n:.2f} N with nothing pressing, above the ceiling force.max_n = {config.max_n:g} N"
-        remedy = "Take off what touches the brush; the weight of the holder is taken off by the bias at each start."
+        remedy = "Remove what touches the brush; the bias at each start takes off the weight of the holder."
     return Finding(
         "force",
         _bus(config),
         answers=True,
         identity=identity.model,
-        firmware=identity.firmware or "not told",
+        firmware=identity.firmware or "unknown",
         latency_ms=age_ms,
         notes=f"{health.rate_hz:.0f} rounds/s, {force_n:.3f} N before bias" + _simulated(identity),
         problem=problem,
@@ -160,7 +160,7 @@ async def _ink(config: InkDeviceConfig, clock: Clock) -> Finding:
         config.port,
         answers=True,
         identity=identity.model,
-        firmware=identity.firmware or "not told",
+        firmware=identity.firmware or "unknown",
         latency_ms=None if level is None else statistics.median(waits_ms),
         notes=("no gauge" if level is None else f"well {level:.0%} full") + _simulated(identity),
     )
@@ -198,10 +198,8 @@ async def _robot(config: RigConfig, clock: Clock, address: str) -> Finding:
 
 
 def doctor_table(findings: list[Finding]) -> Table:
-    """One row a device: the verdict in words, not by colour alone."""
-    table = Table(
-        "device", "verdict", "who answers", "latency", "notes, what is wrong, how to mend it", show_lines=True
-    )
+    """One row per device, with the verdict as a word as well as a colour."""
+    table = Table("device", "verdict", "who answers", "latency", "notes, what is wrong, what to do", show_lines=True)
     for finding in findings:
         verdict = Text("well", "green") if finding.well else Text("trouble" if finding.answers else "no answer", "red")
         who = " ".join(part for part in (finding.identity or finding.address, finding.firmware) if part)

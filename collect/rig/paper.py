@@ -31,7 +31,7 @@ class Layout:
 
 
 ANCHOR_SHARE = 0.75
-"""The zero-touch point's place along a cell: the mark reaches mostly toward -x, where the tip lies."""
+"""Where the zero-touch point lies along a cell: the mark reaches mostly toward -x, where the tip lies."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class Sheet:
     """The cells of one sheet, row by row from the far edge, so that the arm never reaches across wet ink."""
 
     def __init__(self, paper: PaperConfig, cell_mm: tuple[float, float] | None = None) -> None:
-        """`cell_mm` is what the protocol needs; None is `paper.cell_mm`."""
+        """`cell_mm` is the size that the protocol needs; None is `paper.cell_mm`."""
         self.cell_mm = paper.cell_mm if cell_mm is None else cell_mm
         width, height = paper.size_mm
         cell_w, cell_h = self.cell_mm
@@ -80,7 +80,7 @@ class Sheet:
 
     @property
     def corners(self) -> list[Cell]:
-        """The outermost cells: what fits there within a convex box fits on all of them. None on an empty sheet."""
+        """The outermost cells: poses within a convex box on these are within it on every cell."""
         if not self.capacity:
             return []
         last_row = self.capacity - self.columns
@@ -96,7 +96,7 @@ class Sheet:
         return Cell(index, self._left + column * cell_w, y_mm, cell_w, cell_h)
 
     def free(self, used: set[int], sheet: int = 1) -> Cell:
-        """The first cell of that sheet that no press has ever been begun on. Raises `SheetFull`."""
+        """The first cell that is not used; `sheet` is the sheet's number for the error. Raises `SheetFull`."""
         for index in range(self.capacity):
             if index not in used:
                 return self.cell(index)
@@ -113,9 +113,9 @@ def to_base(paper: PaperConfig, x_mm: float, y_mm: float) -> tuple[float, float]
 
 
 MAX_SLOPE_DEG = 3.0
-"""A sheet that leans more is not lying: something else was touched."""
+"""A sheet cannot lean more than this: something else was touched."""
 LEAST_SPREAD_MM = 20.0
-"""Touched points must span at least this much in their narrowest direction to tell a slope."""
+"""Touched points must span at least this much in their narrowest direction to give a slope."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,14 +213,14 @@ def fit_plane(points_mm: list[tuple[float, float, float]]) -> PlaneFit:
     spread_mm = float(np.linalg.svd(centred, compute_uv=False)[1]) / math.sqrt(len(points_mm)) * 2.0
     if spread_mm < LEAST_SPREAD_MM:
         raise StepError(
-            f"the touched points lie within {spread_mm:.1f} mm of a line: they cannot tell how the sheet leans"
+            f"the touched points lie within {spread_mm:.1f} mm of a line: they do not show how the sheet leans"
         )
     ones = np.column_stack((np.ones(len(points_mm)), at[:, :2]))
     z0, slope_x, slope_y = (float(v) for v in np.linalg.lstsq(ones, at[:, 2], rcond=None)[0])
     plane = PaperPlane(z0, slope_x, slope_y)
     if plane.slope_deg > MAX_SLOPE_DEG:
         raise StepError(
-            f"the sheet would lean by {plane.slope_deg:.1f} deg, limit {MAX_SLOPE_DEG:g}: look what was touched"
+            f"the sheet would lean by {plane.slope_deg:.1f} deg, limit {MAX_SLOPE_DEG:g}: check what was touched"
         )
     return PlaneFit(plane, tuple(float(z - plane.touch_z_mm(x, y)) for x, y, z in points_mm))
 

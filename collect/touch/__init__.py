@@ -1,1 +1,1 @@
-"""Zero touch that is measured, the plane of the paper, and the self-check before a session."""
+"""Measured zero touch and the self-check: where the paper really lies, and whether the rig is set up right."""

@@ -20,7 +20,7 @@ from drivers.samples import ForceSample, Frame, QueuedLine
 
 
 class Effector(Protocol):
-    """What a rig's procedures do besides moving: both begin and end at travel height."""
+    """What touches need done on the rig apart from moving the brush; begins and ends at travel height."""
 
     async def dip(self) -> None:
         """Fill the brush."""
@@ -32,7 +32,7 @@ class Effector(Protocol):
 
 
 class TouchEffector(Effector, Protocol):
-    """What a rig's procedures do for zero touch."""
+    """What zero touch needs done on the rig."""
 
     async def zero_touch(self) -> float:
         """Visit the taught height; returns where the arm rests."""
@@ -40,7 +40,7 @@ class TouchEffector(Effector, Protocol):
 
 
 class TouchArm:
-    """A vertical brush over points of the paper frame; its targets are those of `motion.moves`."""
+    """A vertical brush over points of the paper frame; makes the moves of `motion.moves`."""
 
     def __init__(self, rig: Rig, slow_mm_s: float) -> None:
         self._rig = rig
@@ -60,13 +60,13 @@ class TouchArm:
         return (await self._rig.robot.where()).z_mm
 
     async def press(self, x_mm: float, y_mm: float, z_mm: float) -> None:
-        """Slowly down to a height and up to travel height; the arm lifts by itself even if this program dies."""
+        """Go slowly down to a height and up to travel height; the arm lifts even if this program dies."""
         config = self._rig.config
         down = Move(moves.touching(config, x_mm, y_mm, z_mm), self._slow_mm_s)
         await self.sequence([down, moves.up(config, x_mm, y_mm)])
 
     async def sequence(self, pressing: Sequence[Move]) -> None:
-        """Moves that the controller has all of before the first begins."""
+        """Send several moves to the controller before the first begins."""
         lines = [QueuedLine(move.target, move.speed_mm_s) for move in pressing]
         await self._rig.robot.sequence(lines, acc_mm_s2=self._rig.config.motion.acc_mm_s2)
 
@@ -82,7 +82,7 @@ class TouchArm:
 
     @contextlib.asynccontextmanager
     async def lifted_after(self) -> AsyncGenerator[None]:
-        """Lift at the end and after any error but a stop: who stopped the arm wants it to stay."""
+        """Lift at the end and after any error but a stop: a person who stopped the arm wants it to stay."""
         try:
             yield
         except (asyncio.CancelledError, ForceTooHigh):
@@ -97,11 +97,11 @@ class TouchArm:
 
 
 SILENT_S = 1.0
-"""A sensor that sends nothing for so long has stopped."""
+"""A sensor that sends nothing for this long has stopped."""
 
 
 class ForceTap:
-    """Collects samples while an average is wanted. Hand `take` every sample, in the event loop."""
+    """Collects force samples while an average is asked for. Hand every sample to `take`, in the event loop."""
 
     def __init__(self) -> None:
         self._after_ns = 0
@@ -151,7 +151,7 @@ class RigProbe:
         self._last_z_mm: float | None = None
 
     async def rest(self, z_mm: float, samples: int) -> Reading:
-        """Go to the height, from above, come to rest, average so many samples."""
+        """Go to the height from above, come to rest, and average this many samples."""
         if self._last_z_mm is not None and z_mm > self._last_z_mm and self._config.clear_mm > 0.0:
             await self._arm.to(*self._at_mm, z_mm + self._config.clear_mm)
         rests_z_mm = await self._arm.to(*self._at_mm, z_mm)

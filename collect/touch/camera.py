@@ -34,8 +34,8 @@ class FirstInk:
 def first_ink(ink_mm2: Floats, least_mm2: float) -> FirstInk:
     """Where the ink begins in a row of spots, (m,) from the highest to the lowest.
 
-    Raises `StepError` where the first spot has ink, where none has, and where ink ends again further down: a brush
-    that ran dry would else pass for one that did not touch.
+    Raises `StepError` where the first spot has ink, where none has, and where ink ends again further down: otherwise a
+    brush that ran dry would be taken for one that did not touch.
     """
     seen = np.asarray(ink_mm2) >= least_mm2
     if not seen.any():
@@ -52,7 +52,7 @@ def first_ink(ink_mm2: Floats, least_mm2: float) -> FirstInk:
 Spot = tuple[float, float, float]
 """x and y in the paper frame, z of the tip in the base frame."""
 WINDOW_SHARE = 0.75
-"""Of the pitch: how much of a spot's surroundings counts for it."""
+"""Side of the window that counts for a spot, as a share of the pitch."""
 
 
 class FirstInkTouch:
@@ -73,9 +73,9 @@ class FirstInkTouch:
         self._last: Frame | None = None
 
     async def measure(self, points_mm: list[tuple[float, float]]) -> list[PointTouches]:
-        """Every point coarsely, then finely in rounds, each along the plane through the round before.
+        """Touch every point coarsely, then finely in rounds, each along the plane through the round before.
 
-        Along a row the sheet's lean would else pass for height. Raises `StepError`.
+        Without that plane, the sheet's lean along a row would be taken for height. Raises `StepError`.
         """
         paper, extent_mm = self._rig.config.paper, self._config.camera.extent_mm
         known = KnownHeights(paper, self._config)
@@ -90,7 +90,7 @@ class FirstInkTouch:
         rounds = [rough]
         for k in range(self._config.touches):
             lean = _plane(rounds[-1])
-            # staggered by parts of a step: equal heights would only repeat the same answer
+            # Staggered by parts of a step: equal heights would only repeat the same result.
             lower_mm = k / self._config.touches * self._config.camera.fine_step_mm
             rounds.append(
                 [await self._fine(p, around, lean, lower_mm) for p, around in zip(patches, rough, strict=True)]
@@ -100,7 +100,7 @@ class FirstInkTouch:
         return [at_one_point(point, self._config, lean) for point in touches]
 
     async def _coarse(self, patch: Patch, reach: Reach) -> Touch:
-        """Down until a photograph shows ink."""
+        """Touch lower and lower until a photograph shows ink."""
         camera = self._config.camera
         count = coarse_count(camera, reach)
         before = await self._photograph()
@@ -127,7 +127,7 @@ class FirstInkTouch:
         return self._between(spots, await self._ink(before, spots), camera.fine_step_mm)
 
     def _between(self, spots: list[Spot], ink_mm2: NDArray[np.float64], step_mm: float) -> Touch:
-        """Half way between the last clean spot and the first inked one; any height between them is as likely."""
+        """Half way between the last clean spot and the first inked one; every height between them is equally likely."""
         edge = first_ink(ink_mm2, self._config.camera.least_ink_mm2)
         x, y, z = (0.5 * (a + b) for a, b in zip(spots[edge.clean], spots[edge.inked], strict=True))
         return Touch(x, y, z, step_mm / math.sqrt(12.0))

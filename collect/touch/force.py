@@ -1,4 +1,4 @@
-"""One touch by force: fast down to a threshold, slowly around it, and a hinge through the means at rest."""
+"""One touch by force: fast down to a threshold, slowly around it, and a hinge fitted to the means at rest."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class Contact:
 
     z_mm: float
     sigma_mm: float
-    """Standard error, from the noise of a sample; it holds nothing of what a hinge is not."""
+    """Standard error from the noise of the samples alone: how far a brush differs from a hinge is not in it."""
     stiffness_n_mm: float
     misfit: float
-    """Chi-square per degree of freedom: about 1 where the brush is a straight spring so near to the paper."""
+    """Chi-square per degree of freedom: about 1 where the brush is a linear spring this near to the paper."""
     samples: int
 
 
@@ -34,11 +34,11 @@ def find_contact(
 ) -> Contact:
     """Least squares of force = offset + stiffness * max(0, contact - z) through means at rest.
 
-    All arrays are (m,): height, mean force, how many samples it is the mean of, and which descent (0, 1, ...) it
-    belongs to; each descent has an offset of its own, so that a slow drift of the sensor is no force. `sample_sd_n` is
-    the standard deviation of one sample. The join is solved exactly between each two heights (D. J. Hudson, Fitting
+    All arrays are (m,): height, mean force, number of samples in the mean, and descent (0, 1, ...) that it belongs to.
+    Each descent has its own offset, so that a slow drift of the sensor is not taken for force. `sample_sd_n` is the
+    standard deviation of one sample. The join is solved exactly between each two heights (D. J. Hudson, Fitting
     segmented curves whose join points have to be estimated, J. Am. Stat. Assoc. 61, 1966).
-    Raises `StepError` where the force does not rise over two heights at least.
+    Raises `StepError` where the force does not rise over at least two heights.
     """
     heights = np.unique(z_mm)
     if len(heights) < 3 or sample_sd_n <= 0.0:
@@ -48,7 +48,7 @@ def find_contact(
     descents = np.unique(runs)[:, None] == runs[None, :]
 
     def free_of_offsets(rows: Floats) -> Floats:
-        """(..., m) less each descent's weighted mean: what is left of a column once the offsets have been fitted."""
+        """(..., m) less each descent's weighted mean: what is left once the offsets have been fitted."""
         of = descents * weights
         means = rows @ of.T / of.sum(axis=1)
         return np.asarray(rows - means @ descents, np.float64)
@@ -57,7 +57,7 @@ def find_contact(
     # Each height but the highest as the upper end of what lies below the join: (j, m).
     below = z_mm[None, :] <= heights[:-1, None]
     step, ramp = free_of_offsets(below.astype(np.float64)), free_of_offsets(np.where(below, -z_mm, 0.0))
-    # force = offset + (stiffness * contact) below - stiffness * z below is linear in both: 2 x 2 normal equations
+    # Below the join, force = offset + stiffness * contact - stiffness * z, linear in both: 2 x 2 normal equations.
     ss, sr, rr = ((a * b) @ weights for a, b in ((step, step), (step, ramp), (ramp, ramp)))
     sf, rf = step @ (weights * force), ramp @ (weights * force)
     determinant = ss * rr - sr**2
@@ -67,7 +67,7 @@ def find_contact(
     joins = np.concatenate((inside[solvable], heights[1:]))
     springs = free_of_offsets(np.maximum(0.0, joins[:, None] - z_mm[None, :]))
     stretch, pull = (springs**2) @ weights, springs @ (weights * force)
-    # a force that falls on the way down is no contact, and one height below the join does not tell a stiffness
+    # A force that falls on the way down is no contact, and one height below the join does not give a stiffness.
     rises = (pull > 0.0) & (stretch > 1e-12) & ((heights[None, :] < joins[:, None]).sum(axis=1) >= 2)
     if not rises.any():
         raise StepError("no contact: the force does not rise over two of these heights")
@@ -88,11 +88,11 @@ SLOW_MM = (-0.15, 0.08, 0.4)
 steps needs more than twice the samples for the same error."""
 SLOW_SHARES = (0.38, 0.42, 0.2)
 FELT_SIGMAS = 4.0
-"""A mean force that far out of its noise is a push."""
+"""A mean force this many standard errors from zero is a push."""
 LATE_STEPS = 2
-"""A soft brush is felt by the fast approach up to so many steps too late."""
+"""Steps by which the fast approach may feel a soft brush too late."""
 CLEAR_STEPS = 4
-"""The medium approach begins with so many rests in the air."""
+"""Rests in the air with which the medium approach begins."""
 ROUGH_RUN = 0
 
 
@@ -112,7 +112,7 @@ class Probe(Protocol):
     """A vertical brush over one point of the sheet."""
 
     async def rest(self, z_mm: float, samples: int) -> Reading:
-        """Go to the height, come to rest, average so many samples."""
+        """Go to the height, come to rest, and average this many samples."""
         ...
 
 
@@ -127,7 +127,7 @@ class _Log:
         return sum(reading.samples for reading, _ in self.readings)
 
     def contact(self, config: ForceTouchConfig) -> Contact:
-        """The hinge through what lies no deeper than the straight part; which part that is, depends on the hinge."""
+        """The hinge through the readings of the linear part, iterated: which those are depends on the hinge."""
         found = self._fit(-math.inf)
         for _ in range(3):
             found = self._fit(found.z_mm - config.linear_mm)
@@ -151,8 +151,8 @@ async def touch_by_force(
 ) -> Contact:
     """One touch; the probe is left down.
 
-    `near_z_mm` is where it touched last time, and spares the fast approach. Raises `StepError` where nothing is felt
-    over the whole travel, where something is felt at its start, and where the noise leaves the contact unknown.
+    `near_z_mm` is where it touched last time, and makes the fast approach unnecessary. Raises `StepError` where nothing
+    is felt over the whole travel, where something is felt at its start, and where the noise leaves the contact unknown.
     """
     lowest_z_mm = reach.lowest_z_mm
     if near_z_mm is None:

@@ -15,7 +15,7 @@ from collect.rig.paper import PaperPlane, fit_plane
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """Where a slow approach begins, what is expected, and where it ends: heights in the base frame."""
+    """An approach: where it begins, where the paper is expected, and where it ends; heights in the base frame."""
 
     start_z_mm: float
     expected_z_mm: float
@@ -23,15 +23,15 @@ class Reach:
 
 
 def lowest_z_mm(paper: PaperConfig, config: TouchConfig, x_mm: float, y_mm: float, extent_mm: float = 0.0) -> float:
-    """No touch goes below this, whatever those before it found: the end of an approach from the taught height.
+    """The height below which no touch goes: the end of an approach from the taught height.
 
-    A plan can only be checked against heights that are known before anything was touched.
+    It does not depend on earlier touches, so that a plan can be checked against it before anything is touched.
     """
     return paper.touch_z_mm - config.travel_mm - _unknown_mm(config, paper.touch_point_mm, x_mm, y_mm, extent_mm)
 
 
 class KnownHeights:
-    """The heights that are known so far: at first the taught one, at the place where it was taught."""
+    """Heights of the paper that are known so far; at first the taught one, at the place where it was taught."""
 
     def __init__(self, paper: PaperConfig, config: TouchConfig) -> None:
         self._paper = paper
@@ -39,11 +39,11 @@ class KnownHeights:
         self._heights = [(paper.touch_point_mm, paper.touch_z_mm)]
 
     def add(self, x_mm: float, y_mm: float, z_mm: float) -> None:
-        """A touch."""
+        """Add a touch."""
         self._heights.append(((x_mm, y_mm), z_mm))
 
     def reach(self, x_mm: float, y_mm: float, extent_mm: float = 0.0) -> Reach:
-        """Around the height that is known nearest, by as much more as the sheet may lean on the way from there.
+        """The approach at a point: around the nearest known height, wider by what the sheet may lean on the way there.
 
         `extent_mm` is how far from the point the touches of its approach may lie.
         """
@@ -60,7 +60,7 @@ class KnownHeights:
 def _unknown_mm(
     config: TouchConfig, known_mm: tuple[float, float], x_mm: float, y_mm: float, extent_mm: float
 ) -> float:
-    """How much the sheet may rise or fall from a place where its height is known."""
+    """How far the sheet may rise or fall from the place of a known height."""
     return math.tan(math.radians(config.lean_deg)) * (math.dist((x_mm, y_mm), known_mm) + extent_mm)
 
 
@@ -94,11 +94,11 @@ class PointTouches:
 
 @dataclass(frozen=True, slots=True)
 class PlaneResult:
-    """The plane from which H is counted, and everything that it was made of."""
+    """The plane from which H is counted, and the touches that it was fitted to."""
 
     plane: PaperPlane
     method: Method | Literal["kept"]
-    """`kept`: nothing was touched, the plane is the one that was known before."""
+    """`kept`: nothing was touched, the plane known before still holds."""
     points: tuple[PointTouches, ...]
     residuals_mm: tuple[float, ...]
     """Point less plane, in the order of the points; zeros where three points leave no freedom."""
@@ -127,9 +127,9 @@ class PlaneResult:
 
 
 def at_one_point(touches: list[Touch], config: TouchConfig, guide: PaperPlane | None = None) -> PointTouches:
-    """Hold the touches of one point against each other. Raises `StepError` where they span too much.
+    """Compare the touches of one point. Raises `StepError` where they span too much.
 
-    `guide` is what is known of the sheet's lean, for touches that lie some millimetres apart.
+    `guide` is the sheet's lean as far as it is known, for touches that lie some millimetres apart.
     """
     lean = guide or PaperPlane(0.0)
     heights = [t.z_mm - lean.touch_z_mm(t.x_mm, t.y_mm) for t in touches]
@@ -144,13 +144,13 @@ def at_one_point(touches: list[Touch], config: TouchConfig, guide: PaperPlane | 
 
 
 def kept(plane: PaperPlane, at_mm: tuple[float, float]) -> PlaneResult:
-    """The plane that was known before, for whoever gave up touching; told by its height at one point."""
+    """The plane known before as a result, after touching was given up; `at_mm` is where its height is stated."""
     point = PointTouches((Touch(*at_mm, plane.touch_z_mm(*at_mm)),), 0.0)
     return PlaneResult(plane, "kept", (point,), (0.0,))
 
 
 def through(points: list[PointTouches], config: TouchConfig) -> PlaneResult:
-    """The plane through the points. Raises `StepError` where one lies too far from it, or it is no plane of a sheet."""
+    """The plane through the points. Raises `StepError` where one lies too far from it, or it leans too much."""
     fit = fit_plane([point.mean for point in points])
     if fit.worst_mm > config.residual_mm:
         listed = ", ".join(f"{r:+.3f}" for r in fit.residuals_mm)

@@ -1,4 +1,4 @@
-"""Zero touch by the operator's eye and hand: steps up and down until the tip just touches."""
+"""Zero touch by jog: the operator steps the brush up and down until the tip just touches."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class Jogged:
     above_mm: float
     """Above the expected height."""
     lowest: bool
-    """At the end of the travel: nothing lower is allowed."""
+    """Whether it is at the end of the travel: nothing lower is allowed."""
     number: int
-    """Of the touch, from 1."""
+    """Number of the touch, from 1."""
     of: int
     """Touches of this point and of all others."""
 
 
 NextJog = Callable[[Jogged], Awaitable[float | None]]
-"""The step to make, up being positive, or None: it touches."""
+"""The next step in mm, positive up; None where the tip touches."""
 ROUNDING_MM = 1e-6
 
 
@@ -42,8 +42,8 @@ async def touch_by_jog(
 ) -> Touch:
     """Touch `number` of `of`; the brush is left where the operator stopped.
 
-    A step that would go below the travel limit, or above where the jog began, is shortened to it. Raises `StepError`
-    for a step of a size that the configuration does not have.
+    A step that would go below the end of the travel, or above where the jog began, is shortened. Raises `StepError` for
+    a step of a size that the configuration does not have.
     """
     z_mm = reach.start_z_mm
     while True:
@@ -58,9 +58,9 @@ async def touch_by_jog(
 
 
 def asked(asker: Asker, config: JogTouchConfig, height: str = "the height") -> NextJog:
-    """Jogs that are asked for on the screen, one prompt a step. `height` names what is known without a jog.
+    """Ask for each jog on the screen. `height` names the height that holds without a jog.
 
-    An asker that nobody watches raises `NeedsOperator`; giving up raises `JogGivenUp`.
+    What it returns raises `NeedsOperator` where nobody watches, and `JogGivenUp` where the operator gives up.
     """
     small, middle, large = config.steps_mm
     keys = {"1": -large, "2": -middle, "3": -small, "8": small, "9": middle, "0": large}
@@ -76,7 +76,9 @@ def asked(asker: Asker, config: JogTouchConfig, height: str = "the height") -> N
             f"It is {at.above_mm:+.2f} mm from the expected height."
         )
         if at.lowest:
-            question += " This is the end of the travel: if nothing touches, give up, and mend touch_z_mm in rig.toml."
+            question += (
+                " This is the end of the travel: if nothing touches, give up, and correct touch_z_mm in rig.toml."
+            )
         key = await asker.ask(Prompt(question, choices, "x"))
         if key == "x":
             raise JogGivenUp(at.number, at.of, height)

@@ -26,10 +26,10 @@ async def measure_plane(
 ) -> PlaneResult:
     """Touch as configured and fit the plane. The arm begins and ends at travel height.
 
-    `tap` must be handed every sample of the force sensor; without one it listens to the sensor itself. `next_jog` is
-    the operator, `tell` says how far it is. The force must have been set to zero with nothing touching. Raises
+    `tap` must be handed every sample of the force sensor; without one, the sensor is listened to here. `next_jog` asks
+    the operator, `tell` reports progress. The force must have been set to zero with nothing touching. Raises
     `StepError`, with the figures, where nothing is touched, touches do not repeat, or the points do not lie in a plane;
-    the brush is lifted then too.
+    the brush is lifted in that case too.
     """
     if config.method == "taught":
         return await _taught(rig, effector)

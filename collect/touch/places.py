@@ -12,11 +12,11 @@ from collect.touch.heights import KnownHeights, Reach
 
 Triangle = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 SLACK_STEPS = 2
-"""Fine steps beyond the coarse one, on either side: the coarse answer is no better than its step."""
+"""Fine steps beyond the coarse one, on either side: a coarse touch is only as good as its step."""
 
 
 class Patch:
-    """The places of one point's spots, from its lower left: to and fro, so that neighbours in time are neighbours."""
+    """The spots around one point, from its lower left, to and fro: one touch after the other lies beside it."""
 
     def __init__(
         self, at_mm: tuple[float, float], config: CameraTouchConfig, sheet_mm: tuple[float, float], lowest_z_mm: float
@@ -29,7 +29,7 @@ class Patch:
         self._next = 0
 
     def take(self) -> tuple[float, float]:
-        """The next fresh place. Raises `StepError` where the patch has outgrown the sheet."""
+        """The next fresh spot. Raises `StepError` where it does not lie on the sheet."""
         row, column = divmod(self._next, self._config.columns)
         self._next += 1
         column = self._config.columns - 1 - column if row % 2 else column
@@ -49,7 +49,7 @@ def fine_count(config: CameraTouchConfig) -> int:
 
 
 def coarse_count(config: CameraTouchConfig, reach: Reach) -> int:
-    """Spots of a whole coarse row; it ends where ink is seen."""
+    """Spots of a whole coarse row, which ends early where ink is seen."""
     return math.ceil((reach.start_z_mm - reach.lowest_z_mm) / config.coarse_step_mm) + 1
 
 
@@ -60,7 +60,7 @@ Rect = tuple[float, float, float, float]
 
 
 def touch_rects(paper: PaperConfig, config: TouchConfig) -> list[Rect]:
-    """Where a measured zero touch lets the tip down: at points, by camera within a patch for each point."""
+    """Where a measured zero touch lowers the tip: at points, or by camera within a patch for each point."""
     match config.method:
         case "taught":
             return []
@@ -76,7 +76,7 @@ def touch_rects(paper: PaperConfig, config: TouchConfig) -> list[Rect]:
 
 
 def patch_spots(paper: PaperConfig, config: TouchConfig) -> list[int]:
-    """Spots of each point's patch by camera, at most."""
+    """The most spots that each point's patch may take."""
     known, camera = KnownHeights(paper, config), config.camera
     reaches = [known.reach(x, y, camera.extent_mm) for x, y in config.points_mm]
     return [coarse_count(camera, reach) + config.touches * fine_count(camera) for reach in reaches]

@@ -1,6 +1,6 @@
-"""Before a session: press three marks at an uneven triangle, find them, refuse a rig that is mirrored, turned or off.
+"""The self-check before a session: press an uneven triangle of marks, find them, refuse a mirrored or turned rig.
 
-A stroke library can be flipped for months before anybody sees it; three marks show it in a minute.
+A stroke library can be flipped for months before anybody notices; three marks show it in a minute.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from drivers.samples import Frame
 Floats = NDArray[np.float64]
 
 UNEVEN = 0.2
-"""How badly the second best order of the marks must fit, or a mirror image could pass for a turn."""
+"""How badly the second best order of the marks must fit; otherwise a mirror image could be taken for a turn."""
 LEAST_SPAN_MM = 60.0
-"""Of a wide triangle along either axis."""
+"""Least extent of a wide triangle along either axis."""
 MOST_OF_SHEET = 0.25
-"""Share of a sheet's cells that a check may take; smaller sheets are checked in one cell."""
+"""Largest share of a sheet's cells that a check may take; smaller sheets are checked in one cell."""
 MOST_MARK_MM2 = 400.0
-"""Of ink: a brush that is pressed 10 mm deep leaves less."""
+"""More ink than any mark has: a brush that is pressed 10 mm deep leaves less."""
 MIRRORS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "mirrored in x": ((-1.0, 0.0), (0.0, 1.0)),
     "mirrored in y": ((1.0, 0.0), (0.0, -1.0)),
@@ -44,7 +44,7 @@ MIRRORS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
 
 @dataclass(frozen=True, slots=True)
 class SelfCheck:
-    """What the three marks say of arm, camera and configuration together."""
+    """What the three marks show about arm, camera and configuration together."""
 
     commanded_mm: Floats
     """(3, 2) in the paper frame."""
@@ -56,7 +56,7 @@ class SelfCheck:
     scale: tuple[float, float]
     """Found over commanded length, along paper x and y."""
     residuals_mm: tuple[float, float, float]
-    """What is left at each mark once offset and turn are taken out."""
+    """Distance that remains at each mark once offset and turn are taken out."""
 
     def as_dict(self) -> dict[str, object]:
         """For the journal: plain numbers and lists."""
@@ -71,7 +71,7 @@ class SelfCheck:
 
 
 def triangle_in(cell: Cell, config: SelfCheckConfig) -> Triangle:
-    """The three places in the middle of one spare cell: quick, but a scale is known only as well as a mark's place."""
+    """Three places in the middle of one spare cell; too close together to show a small error of scale."""
     x_mm, y_mm = config.legs_mm
     if x_mm > cell.width_mm or y_mm > cell.height_mm:
         raise StepError(f"a triangle of {x_mm:g} by {y_mm:g} mm does not fit into cell {cell.index}")
@@ -80,7 +80,7 @@ def triangle_in(cell: Cell, config: SelfCheckConfig) -> Triangle:
 
 
 def triangle_of(cells: Sequence[Cell]) -> Triangle:
-    """One place in each of three spare cells far apart, as at three corners of the sheet: the longer, the surer."""
+    """One place in each of three spare cells, as far apart as the corners of the sheet."""
     a, b, c = (cell.anchor_mm for cell in cells)
     return a, b, c
 
@@ -88,7 +88,7 @@ def triangle_of(cells: Sequence[Cell]) -> Triangle:
 def partners(sheet: Sheet, cell: Cell, used: Set[int]) -> tuple[Cell, ...]:
     """Two free cells that make a wide triangle with this one, along its row and its column; none without room.
 
-    Wide enough, a triangle tells 2 % from 1 % by marks whose places are known to some tenths of a millimetre.
+    A wide triangle distinguishes an error of 2 % from one of 1 % by marks known to a few tenths of a millimetre.
     """
     if sheet.capacity * MOST_OF_SHEET < 3:
         return ()
@@ -111,14 +111,14 @@ def partners(sheet: Sheet, cell: Cell, used: Set[int]) -> tuple[Cell, ...]:
 
 
 def triangle_on(cells: Sequence[Cell], config: SelfCheckConfig) -> Triangle:
-    """Over three cells where there are three, else in the one."""
+    """The triangle over three cells, or within the only one."""
     return triangle_of(cells) if len(cells) == 3 else triangle_in(cells[0], config)
 
 
 async def self_check(rig: Rig, effector: Effector, places_mm: Triangle, plane: PaperPlane) -> SelfCheck:
-    """Press the marks, photograph them and judge. The arm begins and ends at travel height; the places are burnt.
+    """Press the marks, photograph them and judge. The arm begins and ends at travel height; the cells are used up.
 
-    Raises `StepError` with the figures where the marks are not found, mirrored, turned, of another scale or displaced.
+    Raises `StepError` with the figures where the marks are not found, mirrored, turned, stretched or displaced.
     """
     config, commanded = rig.config.self_check, np.array(places_mm, np.float64)
     if abs(float(np.linalg.det(commanded[1:] - commanded[0]))) < 1.0 or _second_best(commanded) < UNEVEN:
@@ -160,10 +160,10 @@ def _find(rig: Rig, before: Frame, after: Frame, config: SelfCheckConfig) -> Flo
 
 
 def judge(commanded_mm: Floats, found_mm: Floats, config: SelfCheckConfig) -> SelfCheck:
-    """Hold three found marks, in any order, against the commanded ones, (3, 2) both.
+    """Compare three found marks, in any order, with the commanded ones; both are (3, 2).
 
-    Three points have one affine map for each order; the order is right whose map keeps angles best. Raises `StepError`
-    with words and figures where the map is a mirror, or turns, stretches or displaces by more than the limits.
+    There is one affine map for each order of three points; the right order is the one whose map keeps angles best.
+    Raises `StepError` with the figures where the map mirrors, or turns, stretches or displaces beyond the limits.
     """
     orders = [found_mm[list(order)] for order in itertools.permutations(range(3))]
     found, linear = min(((f, _linear(commanded_mm, f)) for f in orders), key=lambda pair: _unlike(pair[1]))
