@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from collect.protocols.base import MAX_STROKES, DeepMm, DwellS, ProtocolBase, Repeats, check_count
+from collect.protocols.base import MAX_STROKES, DeepMm, DwellS, ProtocolBase, Repeats, check_axes, check_count
 from collect.protocols.steps import Protocol, Result, Step, StepKind
 from collect.protocols.strokes import Planned, TiltDeg, takes
 from collect.rig.paper import Layout
@@ -37,10 +37,7 @@ class AdaptiveConfig(ProtocolBase):
 
     @model_validator(mode="after")
     def _whole(self) -> AdaptiveConfig:
-        for name in ("heights_mm", "tilts_deg"):
-            values = getattr(self, name)
-            if len(set(values)) != len(values):
-                raise ValueError(f"{name} has the same value twice: {values}")
+        check_axes(self.heights_mm, self.tilts_deg)
         check_count(self.whole_grid)
         cells = len(self.heights_mm) * len(self.tilts_deg)
         if self.most < cells:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Annotated, ClassVar
 
-from pydantic import BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field
 
 from collect.protocols.steps import Protocol
 from collect.protocols.strokes import Planned, stroke_steps
@@ -65,6 +65,13 @@ def check_count(strokes: int) -> None:
         raise ValueError(f"{strokes} strokes with repeats, at most {MAX_STROKES}")
 
 
+def check_axes(heights_mm: list[float], tilts_deg: list[float]) -> None:
+    """Raise ValueError where an axis of a grid has a value twice."""
+    for name, values in (("heights_mm", heights_mm), ("tilts_deg", tilts_deg)):
+        if len(set(values)) != len(values):
+            raise ValueError(f"{name} has the same value twice: {values}")
+
+
 def check_distinct(field: str, values: Iterable[object]) -> None:
     """Raise ValueError where a value is there twice."""
     seen: set[object] = set()
@@ -81,3 +88,12 @@ def stroke_id_problem(ident: str) -> str:
     if not ident.isprintable() or any(c in ' /\\<>:"|?*' for c in ident) or ident[0] in ".-~":
         return 'a name has no spaces, control characters, slashes or any of < > : " | ? *, and begins with no . - ~'
     return ""
+
+
+def _stroke_id(ident: str) -> str:
+    if problem := stroke_id_problem(ident):
+        raise ValueError(problem)
+    return ident
+
+
+StrokeId = Annotated[str, AfterValidator(_stroke_id)]

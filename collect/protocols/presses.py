@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import BaseModel, Field, field_validator, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from collect.protocols.base import (
     MAX_STROKES,
@@ -15,6 +15,8 @@ from collect.protocols.base import (
     ProtocolBase,
     Repeats,
     Seed,
+    StrokeId,
+    check_axes,
     check_count,
     check_distinct,
     stroke_id_problem,
@@ -47,10 +49,7 @@ class GridConfig(ProtocolBase):
 
     @model_validator(mode="after")
     def _distinct(self) -> GridConfig:
-        for name in ("heights_mm", "tilts_deg"):
-            values = getattr(self, name)
-            if len(set(values)) != len(values):
-                raise ValueError(f"{name} has the same value twice: {values}")
+        check_axes(self.heights_mm, self.tilts_deg)
         check_count(len(self.heights_mm) * len(self.tilts_deg) * self.repeats)
         return self
 
@@ -78,15 +77,8 @@ class PressRow(Config):
     tilt_deg: TiltDeg = 0.0
     dwell_s: DwellS | None = None
     """Left out, the protocol's."""
-    stroke_id: str | None = None
+    stroke_id: StrokeId | None = None
     """Left out, it is made from the row's number, H and alpha."""
-
-    @field_validator("stroke_id")
-    @classmethod
-    def _name(cls, ident: str | None) -> str | None:
-        if ident is not None and (problem := stroke_id_problem(ident)):
-            raise ValueError(problem)
-        return ident
 
 
 class ListConfig(ProtocolBase):
@@ -147,17 +139,10 @@ class ListConfig(ProtocolBase):
 class ReplayRow(Config):
     """One stroke as an inversion recovered it."""
 
-    stroke_id: str
+    stroke_id: StrokeId
     """Its id in the original session."""
     height_mm: DeepMm
     tilt_deg: TiltDeg
-
-    @field_validator("stroke_id")
-    @classmethod
-    def _name(cls, ident: str) -> str:
-        if problem := stroke_id_problem(ident):
-            raise ValueError(problem)
-        return ident
 
 
 class ReplayConfig(ProtocolBase):

@@ -86,7 +86,3 @@ class Verdict:
             return ""
         others = f" Also: {', '.join(check.name for check in failed[1:])}." if failed[1:] else ""
         return failed[0].reason + others
-
-    def check(self, name: Failure) -> Check | None:
-        """The check of that name; None where it could not be measured."""
-        return next((check for check in self.checks if check.name is name), None)

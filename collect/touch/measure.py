@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 
 from collect.errors import StepError
 from collect.rig.config_touch import TouchConfig
@@ -11,7 +11,7 @@ from collect.rig.paper import PaperPlane
 from collect.touch.arm import ForceTap, RigProbe, TouchArm, TouchEffector
 from collect.touch.camera import FirstInkTouch
 from collect.touch.force import touch_by_force
-from collect.touch.heights import KnownHeights, PlaneResult, PointTouches, Touch, at_one_point, through
+from collect.touch.heights import KnownHeights, PlaneResult, PointTouches, Reach, Touch, at_one_point, through
 from collect.touch.jog import NextJog, touch_by_jog
 
 
@@ -26,10 +26,9 @@ async def measure_plane(
 ) -> PlaneResult:
     """Touch as configured and fit the plane. The arm begins and ends at travel height.
 
-    `tap` must be handed every sample of the force sensor; without one, the sensor is listened to here. `next_jog` asks
-    the operator, `tell` reports progress. The force must have been set to zero with nothing touching. Raises
-    `StepError`, with the figures, where nothing is touched, touches do not repeat, or the points do not lie in a plane;
-    the brush is lifted in that case too.
+    `tap` is handed every sample of the force sensor, which must have been set to zero with nothing touching. `next_jog`
+    asks the operator, `tell` reports progress. Raises `StepError`, with the figures, where nothing is touched, touches
+    do not repeat, or the points do not lie in a plane; the brush is lifted in that case too.
     """
     if config.method == "taught":
         return await _taught(rig, effector)
@@ -38,13 +37,12 @@ async def measure_plane(
     async with arm.lifted_after():
         match config.method:
             case "camera":
-                return through(await FirstInkTouch(rig, effector, arm, config).measure(points_mm), config)
+                found = await FirstInkTouch(rig, effector, arm, config).measure(points_mm)
             case "force":
-                return through(await _by_force(rig, arm, config, points_mm, tap, tell), config)
+                found = await _at_points(rig, arm, config, points_mm, _by_force(rig, arm, config, tap, tell))
             case "jog":
-                if next_jog is None:
-                    raise StepError("zero touch by jog needs an operator at a screen")
-                return through(await _by_jog(rig, arm, config, points_mm, next_jog), config)
+                found = await _at_points(rig, arm, config, points_mm, _by_jog(arm, config, len(points_mm), next_jog))
+    return through(found, config)
 
 
 async def _taught(rig: Rig, effector: TouchEffector) -> PlaneResult:
@@ -52,54 +50,54 @@ async def _taught(rig: Rig, effector: TouchEffector) -> PlaneResult:
     return PlaneResult(PaperPlane(rig.config.paper.touch_z_mm), "taught", (PointTouches((touch,), 0.0),), (0.0,))
 
 
-async def _by_force(
-    rig: Rig,
-    arm: TouchArm,
-    config: TouchConfig,
-    points_mm: list[tuple[float, float]],
-    tap: ForceTap | None,
-    tell: Callable[[str], None],
-) -> list[PointTouches]:
-    if rig.force is None:
-        raise StepError("zero touch by force needs a force sensor: [force] is missing")
-    heard = tap or ForceTap()
-    if tap is None:
-        rig.force.listen(heard.take)
-    try:
-        known, found = KnownHeights(rig.config.paper, config), list[PointTouches]()
-        for point in points_mm:
-            reach, near_z_mm, touches = known.reach(*point), None, list[Touch]()
-            await arm.over(*point)
-            await arm.near(*point, reach.start_z_mm)
-            probe = RigProbe(arm, heard, rig.clock, point, config.force)
-            for number in range(config.touches):
-                tell(f"point {len(found) + 1} of {len(points_mm)}, touch {number + 1} of {config.touches}")
-                contact = await touch_by_force(probe, reach, config.force, near_z_mm)
-                near_z_mm = contact.z_mm
-                touches.append(Touch(*point, contact.z_mm, contact.sigma_mm))
-            await arm.lift()
-            found.append(at_one_point(touches, config))
-            known.add(*found[-1].mean)
-        return found
-    finally:
-        if tap is None:
-            rig.force.listen(None)
+Point = tuple[float, float]
+TouchPoint = Callable[[int, Point, Reach], Awaitable[list[Touch]]]
+"""Touches one point several times: its number from 0, its place, and the approach."""
 
 
-async def _by_jog(
-    rig: Rig, arm: TouchArm, config: TouchConfig, points_mm: list[tuple[float, float]], next_jog: NextJog
+async def _at_points(
+    rig: Rig, arm: TouchArm, config: TouchConfig, points_mm: list[Point], touch: TouchPoint
 ) -> list[PointTouches]:
     known, found = KnownHeights(rig.config.paper, config), list[PointTouches]()
-    for point in points_mm:
+    for number, point in enumerate(points_mm):
         reach = known.reach(*point)
         await arm.over(*point)
         await arm.near(*point, reach.start_z_mm)
-        touches = list[Touch]()
-        for _ in range(config.touches):
-            number = len(found) * config.touches + len(touches) + 1
-            of = len(points_mm) * config.touches
-            touches.append(await touch_by_jog(arm, point, reach, config.jog, next_jog, number, of))
+        touches = await touch(number, point, reach)
         await arm.lift()
         found.append(at_one_point(touches, config))
         known.add(*found[-1].mean)
     return found
+
+
+def _by_force(
+    rig: Rig, arm: TouchArm, config: TouchConfig, tap: ForceTap | None, tell: Callable[[str], None]
+) -> TouchPoint:
+    if rig.force is None or tap is None:
+        raise StepError("zero touch by force needs a force sensor: [force] is missing")
+
+    async def touch(number: int, point: Point, reach: Reach) -> list[Touch]:
+        probe = RigProbe(arm, tap, rig.clock, point, config.force)
+        near_z_mm, touches = None, list[Touch]()
+        for k in range(config.touches):
+            tell(f"point {number + 1} of {max(len(config.points_mm), 1)}, touch {k + 1} of {config.touches}")
+            contact = await touch_by_force(probe, reach, config.force, near_z_mm)
+            near_z_mm = contact.z_mm
+            touches.append(Touch(*point, contact.z_mm, contact.sigma_mm))
+        return touches
+
+    return touch
+
+
+def _by_jog(arm: TouchArm, config: TouchConfig, points: int, next_jog: NextJog | None) -> TouchPoint:
+    if next_jog is None:
+        raise StepError("zero touch by jog needs an operator at a screen")
+
+    async def touch(number: int, point: Point, reach: Reach) -> list[Touch]:
+        first = number * config.touches + 1
+        return [
+            await touch_by_jog(arm, point, reach, config.jog, next_jog, first + k, points * config.touches)
+            for k in range(config.touches)
+        ]
+
+    return touch

@@ -84,10 +84,9 @@ def test_a_verdict_tells_the_operator_what_was_seen_and_what_to_do(drawn: list[S
     assert verdict.cause.score > verdict.cause.threshold == LIMITS.split_mm
     assert "mm" in verdict.reason
     assert "Comb the brush" in verdict.reason
-    told = verdict.check(Failure.FAINT)
-    assert told is not None
-    assert told.passed
-    assert told.reason == ""
+    [faint] = [check for check in verdict.checks if check.name is Failure.FAINT]
+    assert faint.passed
+    assert faint.reason == ""
 
 
 def test_limits_come_from_the_configuration(drawn: list[Sample | Patch]) -> None:

@@ -14,6 +14,7 @@ from collect.rig.config import load_rig
 from collect.rig.config_touch import TouchConfig
 from collect.rig.devices import connected
 from collect.rig.paper import PaperPlane
+from collect.touch.arm import ForceTap
 from collect.touch.measure import measure_plane
 from drivers.clock import HostClock
 from drivers.samples import Pose
@@ -40,7 +41,9 @@ async def test_a_sheet_that_lies_lower_than_taught_is_found_and_the_brush_is_lif
             noting(loopback.world.motion, sent.append)
             await rig.force.bias(0.5)
             touch = TouchConfig(method="force", touches=2, force=QUICK)  # pyright: ignore[reportArgumentType]
-            result = await measure_plane(rig, Procedures(rig), touch)
+            tap = ForceTap()
+            rig.force.listen(tap.take)
+            result = await measure_plane(rig, Procedures(rig), touch, tap=tap)
             at_mm = (await rig.robot.where()).position_mm
 
     asked = config.model_copy(update={"touch": touch})
