@@ -16,8 +16,8 @@ import numpy as np
 
 from calibrate.stroke.params import Gray
 from collect.engine.snapshot import Picture
-from collect.photograph.new_ink import gray
 from collect.quality.picture import blur_px
+from collect.rig.optics import gray
 from drivers.errors import DeviceError
 from drivers.protocols import Camera, Robot
 from drivers.samples import ForceSample, Frame, Pose, QueuedLine, Stamp

@@ -16,11 +16,10 @@ from collect.engine.steps.choose import measured
 from collect.engine.steps.context import RunContext, StepContext, uninterrupted
 from collect.errors import BadPicture, NeedsOperator, StepError
 from collect.operator import Choice, OperatorRequest, Prompt
-from collect.photograph.new_ink import gray
 from collect.protocols.steps import Result
 from collect.quality.checks import cell_is_blank, check_capture, check_drawing, check_frame
 from collect.quality.verdict import Check, Family, Verdict
-from collect.rig.optics import straightened
+from collect.rig.optics import undistorted
 from collect.rig.paper import Cell
 from sessions.history import limit_s, unlike, waits_of
 from sessions.recording import schemas
@@ -101,7 +100,7 @@ async def photograph(context: StepContext) -> Gray:
         run.progress.log(f"camera delay: {photographer.delay}")
     with context.recorder.sections.timed("encode still"):
         await uninterrupted(context.recorder.still, frame, context.attempt.serial)
-    return await uninterrupted(straightened, run.rig.config.camera, gray(frame.image))
+    return await uninterrupted(undistorted, run.rig.config.camera, frame.image)
 
 
 def _camera_delay(context: StepContext) -> Result:
