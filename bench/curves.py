@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from bench.harness import Result, machine
-from model.generator.presets import PRESETS
+from model.generator.targets import PRESETS
 from model.train.checkpoint import State
 from model.train.config import LayerConfig, TrainConfig, preset
 from model.train.data import exact_sets

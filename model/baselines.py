@@ -1,5 +1,4 @@
-"""The simple shapes that CCD-BSM is compared with: ellipse, circle and line, each derived from the CCD-BSM
-mark.
+"""The simple shapes that CCD-BSM is compared with: ellipse, circle and line, each derived from the CCD-BSM mark.
 
 Every baseline takes its sizes from the mark of the same (H, alpha) and stands on the mark's bounding box in
 the frame of `model.raster.frame`, so a score between two models shows their shape and not a shift. The sources do
@@ -11,16 +10,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from model.ccdbsm import CcdBsm
-from model.outline import Outline, loop
-from model.profile import column, disc_integral, safe_sqrt
-
-Diameter = Literal["length", "width", "area"]
+from model.outline import Outline, column, disc_integral, loop, safe_sqrt
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,20 +145,12 @@ def ellipse(mark: CcdBsm) -> Ellipse:
     return Ellipse(centre_mm=_centre(mark), semi_x_mm=0.5 * mark.length_mm, semi_y_mm=0.5 * mark.width_mm)
 
 
-def circle(mark: CcdBsm, diameter: Diameter = "length") -> Ellipse:
+def circle(mark: CcdBsm) -> Ellipse:
     """The circle whose diameter is the mark's length, centred on its bounding box.
 
-    `diameter` offers the alternatives: "width" (the mark's width) and "area" (the mark's area). Raises
-    ValueError for another word.
+    Alternatives not taken: the mark's width as the diameter, and the circle of the mark's area.
     """
-    if diameter == "length":
-        radius = 0.5 * mark.length_mm
-    elif diameter == "width":
-        radius = 0.5 * mark.width_mm
-    elif diameter == "area":
-        radius = (mark.area_mm2 / math.pi).sqrt()
-    else:
-        raise ValueError(f"diameter = {diameter!r}: expected 'length', 'width' or 'area'")
+    radius = 0.5 * mark.length_mm
     return Ellipse(centre_mm=_centre(mark), semi_x_mm=radius, semi_y_mm=radius)
 
 

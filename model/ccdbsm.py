@@ -22,8 +22,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from model.outline import Outline, loop
-from model.profile import column, disc_integral, safe_sqrt
+from model.outline import Outline, column, disc_integral, loop, safe_sqrt
 
 
 class DomainError(ValueError):

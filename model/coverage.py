@@ -16,7 +16,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from model.profile import Profile, Shape, column
+from model.outline import Profile, Shape, column
 from model.raster.exact import coverage_at
 from model.raster.frame import PX_MM, SIZE_PX, Place, check_raster, place
 

@@ -14,7 +14,7 @@ from typing import Protocol
 from torch import Tensor
 
 from model.ccdbsm import Brush, CcdBsm, DomainError, as_batch, ccdbsm
-from model.profile import Shape
+from model.outline import Shape
 
 Number = float | Tensor
 Values = dict[str, Tensor]

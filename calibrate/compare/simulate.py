@@ -10,7 +10,7 @@ from calibrate.compare.field import KEYS, NORMAL_LENGTH_PX, SIZE_PX, Alignment, 
 from calibrate.compare.images import Pixels, to_pixels
 from model.ccdbsm import Brush
 from model.coverage import centred_origin, coverage
-from model.profile import Shape
+from model.outline import Shape
 from model.registry import StrokeModel
 from sessions.recording.schemas import Header
 

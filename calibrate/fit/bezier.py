@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.fit.fit import Grid, Pressed
-from model.profile import Shape
+from model.outline import Shape
 from model.raster.compiled import coverage_numpy
 from model.regression import Plane, fit_plane
 from model.strokes.bezier import bezier

@@ -73,7 +73,7 @@ def closed_forms(session: Opened, view: Field, *, ablations: bool) -> list[Conte
 
 def generators(session: Opened, files: Sequence[Generator], view: Field) -> list[Contender]:
     """Trained generators, drawn as their traced outlines. Raises what `load_generator` does."""
-    from model.train.load import load_generator
+    from model.train.checkpoint import load_generator
 
     made: list[Contender] = []
     for number, file in enumerate(files):
@@ -116,7 +116,7 @@ def held_out(made: dict[Cell, dict[str, Any]], brush: Brush, view: Field, *, fit
 
 def tuned(files: dict[Cell, Path], brush: Brush, view: Field, number: int) -> Contender:
     """A generator tuned on all cells but the one that it predicts."""
-    from model.train.load import load_generator
+    from model.train.checkpoint import load_generator
 
     loaded: dict[Path, StrokeModel] = {}
 

@@ -46,7 +46,7 @@ class Laid:
 
 def lay_captures(sessions: list[Opened], generator: Path) -> Laid:
     """Every press of some sessions as the generator's own images. Raises what `load_generator` does."""
-    from model.train.load import load_generator
+    from model.train.checkpoint import load_generator
 
     target = load_generator(generator).target
     laid = Laid(target.px_mm, str(target.placement), str(one_source(sessions)), [], [], [], [])
@@ -85,7 +85,7 @@ def write_captures(laid: Laid, out: Path, leave_out: Sequence[Cell] = ()) -> int
     """
     import torch
 
-    from model.train.captures import save_captures
+    from model.train.data import save_captures
 
     chosen = [k for k, cell in enumerate(laid.cells) if cell not in leave_out]
     if len(chosen) < 2:

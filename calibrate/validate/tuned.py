@@ -124,7 +124,7 @@ def _with_images(laid: Laid, session: Opened, fit: dict[str, Any] | None, genera
 
     from model.fitted_shape import fitted_model
     from model.generator.targets import Placement, Target
-    from model.train.load import load_generator
+    from model.train.checkpoint import load_generator
 
     brush = brush_of(session.header)
     target = load_generator(generator.path, brush).target

@@ -4,7 +4,7 @@ A field is expanded in products of Chebyshev polynomials of the inputs, one imag
 the coverage is clamp(1/2 + field, 0, 1) as in the network. Nothing is learned by descent: samples are taken at the
 zeros of Chebyshev polynomials, where a fit of that degree is best conditioned; the first field is the signed distance
 to the stroke; then the residual of the coverage is fitted and added, again and again. Each such step lowers a convex
-bound of the misfit (see `model.generator.loss`). The number of terms is the product over the inputs, so this
+bound of the misfit (see `model.generator.network`). The number of terms is the product over the inputs, so this
 is for one to three inputs; a network is for more.
 """
 
@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from model.generator.features import Inputs, chebyshev, nodes
-from model.generator.network import covered
+from model.generator.network import Inputs, chebyshev, covered, nodes
 from model.generator.targets import Target
 from model.protocol import ParameterSpec
 

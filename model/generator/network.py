@@ -9,12 +9,53 @@ network spends nothing on them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from model.generator.features import Inputs, chebyshev
 from model.protocol import ParameterSpec
+
+
+class Inputs(nn.Module):
+    """P named inputs with ranges: (B, P) in their own units to (B, P) in [-1, 1].
+
+    The ranges are buffers, so that they follow the network to a device and into an exported file. An input whose
+    range is one point becomes 0.
+    """
+
+    low: Tensor
+    span: Tensor
+
+    def __init__(self, specs: tuple[ParameterSpec, ...]) -> None:
+        super().__init__()
+        self.specs = specs
+        self.register_buffer("low", torch.tensor([spec.low for spec in specs]), persistent=False)
+        widths = [spec.high - spec.low or 1.0 for spec in specs]
+        self.register_buffer("span", torch.tensor(widths), persistent=False)
+
+    def forward(self, values: Tensor) -> Tensor:
+        """To [-1, 1]; nothing is clamped, so whoever asks outside the ranges gets what the polynomials say."""
+        return 2 * (values - self.low) / self.span - 1
+
+    def check(self, values: Tensor) -> None:
+        """Raise DomainError for the first value of (B, P) outside its range."""
+        for k, spec in enumerate(self.specs):
+            spec.check(values[:, k].detach())
+
+
+def chebyshev(unit: Tensor, degree: int) -> Tensor:
+    """T_0 to T_degree of numbers in [-1, 1], (...) -> (..., degree + 1), by T_k+1 = 2 x T_k - T_k-1."""
+    terms = [torch.ones_like(unit), unit]
+    for _ in range(degree - 1):
+        terms.append(2 * unit * terms[-1] - terms[-2])
+    return torch.stack(terms[: degree + 1], dim=-1)
+
+
+def nodes(degree: int) -> Tensor:
+    """The zeros of T_(degree + 1): where polynomials of that degree are best sampled, (degree + 1,) in (-1, 1)."""
+    k = torch.arange(degree + 1, dtype=torch.float64)
+    return torch.cos(torch.pi * (k + 0.5) / (degree + 1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,3 +124,36 @@ def covered(field: Tensor) -> Tensor:
 def parameter_count(module: nn.Module) -> int:
     """How many numbers are trained."""
     return sum(parameter.numel() for parameter in module.parameters())
+
+
+class _WeightedError(torch.autograd.Function):
+    """Sum of w (clamp(1/2 + field) - target)^2, with a gradient that also passes where the clamp is flat.
+
+    A field that is far on the wrong side of the boundary has no gradient through clamp(1/2 + field). The gradient used
+    here is w (clamp(1/2 + field) - target), the residual itself: that of the convex function whose derivative the
+    clamp is, as cross-entropy is to the sigmoid. It is zero exactly where Eq. 6 is, and equals Eq. 6's own between 0
+    and 1. One pass over the images each way.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, field: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        error = field.add(0.5).clamp_(0, 1).sub_(target)
+        weighted = error if weights is None else error * weights
+        ctx.save_for_backward(weighted)
+        return (error * weighted).sum()
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        (weighted,) = ctx.saved_tensors
+        return weighted * (2 * grad), None, None
+
+
+def squared_error(field: Tensor, target: Tensor, ink_weight: float = 1.0) -> Tensor:
+    """Eq. 6 of the paper: the sum over all pixels of w (coverage - target)^2, w = 1 + (ink_weight - 1) target.
+
+    `field` and `target` are (B, N, N). Divide by the number of pixels of the whole batch for Eq. 6.
+    """
+    weights = None if ink_weight == 1.0 else 1 + (ink_weight - 1) * target
+    total = _WeightedError.apply(field, target, weights)
+    assert isinstance(total, Tensor)
+    return total

@@ -1,1 +1,1 @@
-"""Outlines to images: exact and compiled, exact and differentiable, and soft."""
+"""Rasters: outlines to images of exact coverage, compiled for speed, or in torch with gradients."""

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.profile import Shape
+from model.outline import Shape
 from model.raster.frame import PX_MM, SIZE_PX, Place, check_raster, to_pixels
 
 _PER_THREAD = 64  # fewer images than this are not worth a thread

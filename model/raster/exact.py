@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from model.outline import Outline, evaluate
-from model.profile import Shape
+from model.outline import Outline, Shape, evaluate
 from model.raster.frame import PX_MM, SIZE_PX, Place, check_raster, to_pixels
 
 _CHUNK = 16  # images at a time: some 2,500 pieces each, a dozen numbers a piece

@@ -1,32 +1,36 @@
-"""The ellipse of Wong and Ip, sized by the CCD-BSM mark: see `model.baselines.ellipse`."""
+"""The ellipse of Wong and Ip and the circle, each sized by the CCD-BSM mark: see `model.baselines`."""
 
 from __future__ import annotations
 
 from model import baselines
 from model.protocol import Basis, Number, ParameterSpec, Parametric, StrokeModel, Values
 
-PARAMETERS = (
-    ParameterSpec("centre_mm", "mm", -200, 200, -10, "x of the centre, on the stroke axis"),
+CENTRE = ParameterSpec("centre_mm", "mm", -200, 200, -10, "x of the centre, on the stroke axis")
+ELLIPSE = (
+    CENTRE,
     ParameterSpec("semi_x_mm", "mm", 0.001, 400, 12, "half the length"),
     ParameterSpec("semi_y_mm", "mm", 0.001, 400, 6, "half the width"),
 )
+CIRCLE = (CENTRE, ParameterSpec("radius_mm", "mm", 0.001, 400, 12, "the radius"))
 
 
 def models(basis: Basis) -> tuple[StrokeModel, ...]:
-    """The bounding ellipse of the CCD-BSM mark."""
+    """The bounding ellipse of the CCD-BSM mark, and the circle over its length."""
 
     def press(height_mm: Number, tilt_deg: Number) -> Values:
         shape = baselines.ellipse(basis.mark(height_mm, tilt_deg))
         return {"centre_mm": shape.centre_mm, "semi_x_mm": shape.semi_x_mm, "semi_y_mm": shape.semi_y_mm}
 
+    def press_circle(height_mm: Number, tilt_deg: Number) -> Values:
+        shape = baselines.circle(basis.mark(height_mm, tilt_deg))
+        return {"centre_mm": shape.centre_mm, "radius_mm": shape.semi_x_mm}
+
+    def build_circle(values: Values) -> baselines.Ellipse:
+        return baselines.Ellipse(values["centre_mm"], values["radius_mm"], values["radius_mm"])
+
+    bounding = "The bounding ellipse of the CCD-BSM mark: same length and width."
+    of_circle = "The circle whose diameter is the length of the CCD-BSM mark."
     return (
-        Parametric(
-            name="ellipse",
-            label="ellipse",
-            definition="The bounding ellipse of the CCD-BSM mark: same length and width.",
-            parameters=PARAMETERS,
-            build=lambda values: baselines.Ellipse(**values),
-            press=press,
-            fitted=basis.fitted,
-        ),
+        Parametric("ellipse", "ellipse", bounding, ELLIPSE, lambda v: baselines.Ellipse(**v), press, basis.fitted),
+        Parametric("circle", "circle", of_circle, CIRCLE, build_circle, press_circle, basis.fitted),
     )

@@ -28,7 +28,7 @@ def train(
     if context.invoked_subcommand is not None:
         return
     from model.train import config as configs
-    from model.train.console import run
+    from model.train.run import train_with_bar
 
     changes = {"steps": steps, "seed": seed, "threads": threads, "device": device}
     changes = {name: value for name, value in changes.items() if value is not None}
@@ -36,7 +36,7 @@ def train(
         chosen = configs.preset(target, **changes)
     else:
         chosen = configs.checked(config, configs.load_config(config).model_dump() | changes)
-    run(chosen, out, None, tensorboard)
+    train_with_bar(chosen, out, None, tensorboard)
 
 
 @app.command()
@@ -51,11 +51,10 @@ def tune(
     tensorboard: Annotated[bool, typer.Option(help="Write TensorBoard's event files too.")] = False,
 ) -> None:
     """Fine-tune a generator on captured strokes; some are held out to validate on."""
-    from model.train.captures import load_captures
     from model.train.checkpoint import load_weights, sha256
     from model.train.config import checked
-    from model.train.console import run
-    from model.train.run import Tuning
+    from model.train.data import load_captures
+    from model.train.run import Tuning, train_with_bar
 
     before = load_weights(generator)[0]
     _, source = load_captures(captures, before)
@@ -71,7 +70,7 @@ def tune(
             "held_out": held_out,
         },
     }
-    run(checked("tune", fields), out, Tuning(generator, captures), tensorboard)
+    train_with_bar(checked("tune", fields), out, Tuning(generator, captures), tensorboard)
 
 
 @app.command()
@@ -98,6 +97,6 @@ def basis(
     """Fit the field basis, an interpolator beside the network, by least squares in seconds, and say how close it is."""
     import rich
 
-    from model.train.basis_file import fit_and_compare
+    from model.train.export import fit_and_compare
 
     rich.print(fit_and_compare(target, validation_images, out))

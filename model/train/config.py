@@ -12,8 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from model.ccdbsm import Brush, DomainError
 from model.generator.network import Generator, Layers
-from model.generator.presets import PRESETS
-from model.generator.targets import Placement, Target
+from model.generator.targets import PRESETS, Placement, Target
 from model.registry import UnknownModelError, stroke_model
 from model.train.errors import TrainError
 

@@ -1,9 +1,11 @@
-"""A generator for other programs: ONNX, and torch.export's own format; each is checked against the network itself."""
+"""Exports of a generator (ONNX, torch.export), each checked against the network, and of the fitted field basis."""
 
 from __future__ import annotations
 
 import importlib.util
+import json
 import logging
+import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,13 +13,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors.torch import save
 from torch import Tensor
 
+from model.generator.basis import fit_basis
+from model.generator.metrics import quality
 from model.generator.network import Generator
-from model.train.card import write_card
-from model.train.checkpoint import load_weights
-from model.train.config import TrainConfig
+from model.train.checkpoint import load_weights, write_whole
+from model.train.config import TrainConfig, preset
+from model.train.data import exact_sets
 from model.train.errors import MissingExtra, TrainError
+from model.train.report import write_card
 
 TOLERANCE = 1e-4
 """The most that any pixel of a check may differ; float32 sums in another order differ by less."""
@@ -105,3 +111,28 @@ def _quiet(name: str) -> Iterator[None]:
         yield
     finally:
         logger.setLevel(before)
+
+
+def fit_and_compare(target: str, images: int, out: Path | None) -> str:
+    """A sentence with the figures. Raises TrainError for a target that has not two inputs."""
+    config = preset(target, validation_images=images, training_images=1)
+    strokes = config.build_target()
+    if len(strokes.inputs) != 2:
+        raise TrainError(target, f"has {len(strokes.inputs)} inputs; the field basis is for press and anchored")
+    torch.set_num_threads(config.threads)
+    began = time.process_time()
+    basis = fit_basis(strokes)
+    cpu_s = time.process_time() - began
+    exact = exact_sets(config)[1]
+    with torch.no_grad():
+        parts = (exact.pick(numbers) for numbers in torch.arange(len(exact)).split(config.batch))
+        found = quality((basis(inputs), image) for inputs, image in parts)
+    if out is not None:
+        metadata = {"format": "brushloop-field-basis-1", "degrees": json.dumps(basis.degrees)}
+        metadata["target"] = config.target.model_dump_json()
+        write_whole(out, save({"coefficients": basis.coefficients.contiguous()}, metadata))
+    return (
+        f"Field basis (a least-squares interpolator, no network), {basis.coefficients.numel():,} numbers, "
+        f"fitted in {cpu_s:.1f} s of CPU time: MSE {found.mse:.3g}, PSNR {found.psnr_db:.1f} dB, IoU {found.iou:.5f}, "
+        f"CSIM {found.csim:.5f} over {found.images} images"
+    )

@@ -10,8 +10,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from model.generator.loss import squared_error
-from model.generator.network import Generator
+from model.generator.network import Generator, squared_error
 from model.train.checkpoint import State, put_weights
 from model.train.config import TrainConfig
 from model.train.data import Images, batch_numbers

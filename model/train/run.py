@@ -6,19 +6,21 @@ end, `loss.png`, `loss.csv`, `validation.csv`, `pictures/`, and `tensorboard/` w
 
 from __future__ import annotations
 
+import signal
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 from filelock import FileLock, Timeout
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as ProgressBar
 from torch import Tensor
 
 from model.generator.metrics import SSIM_SETTINGS, quality
-from model.train.captures import load_captures
-from model.train.card import write_card
 from model.train.checkpoint import (
     State,
     load_checkpoint,
@@ -29,11 +31,11 @@ from model.train.checkpoint import (
     sha256,
 )
 from model.train.config import TrainConfig, differences
-from model.train.curves import Events, write_curves, write_pictures
-from model.train.data import Images, exact_sets, split
-from model.train.distributed import Group
+from model.train.data import Images, exact_sets, load_captures, split
+from model.train.distributed import Group, joined
 from model.train.errors import TrainError
 from model.train.loop import Validation, converged, new_state, train
+from model.train.report import Events, write_card, write_curves, write_pictures
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,3 +183,49 @@ def _finish(config: TrainConfig, folder: Path, state: State, images: Images, cpu
     path = folder / "generator.safetensors"
     save_generator(path, config, state.weights, report)
     write_card(path, config, report)
+
+
+class Bar:
+    """The bar, with the last losses beside it."""
+
+    def __init__(self, progress: ProgressBar, steps: int) -> None:
+        self._progress = progress
+        self._task: TaskID = progress.add_task("training", total=steps, loss="", validation="")
+
+    def stepped(self, step: int, loss: float) -> None:
+        """See `Watcher.stepped`."""
+        self._progress.update(self._task, completed=step, loss=f"left, MSE {loss:.1e}")
+
+    def validated(self, validation: Validation) -> None:
+        """See `Watcher.validated`."""
+        self._progress.update(self._task, validation=f"held out {validation.mse:.1e}")
+        if validation.blank:
+            self._progress.console.print(
+                f"step {validation.step}: the generator draws {validation.ink_share:.2%} ink where the targets hold "
+                f"{validation.target_share:.2%}; training ends if that stays"
+            )
+
+
+def train_with_bar(config: TrainConfig, folder: Path, tuning: Tuning | None, events: bool) -> None:
+    """Train with a bar in the first process. Raises as `run_training`."""
+    with joined(config.device) as group, _asked_to_stop() as stopping:
+        console = Console(quiet=not group.first)
+        words = TextColumn("{task.fields[loss]} {task.fields[validation]}")
+        columns = (BarColumn(bar_width=16), MofNCompleteColumn(), TimeRemainingColumn(compact=True), words)
+        with ProgressBar(*columns, console=console, disable=not group.first) as progress:
+            bar = Bar(progress, config.steps)
+            path = run_training(config, folder, group, bar, stopping, tuning=tuning, events=events)
+        console.print(f"Generator: {path}, its card: {path.with_suffix('.md')}", markup=False, soft_wrap=True)
+
+
+@contextmanager
+def _asked_to_stop() -> Iterator[Callable[[], bool]]:
+    """Turn SIGINT and SIGTERM into a request that the loop sees after the current step."""
+    requests: list[int] = []
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, lambda number, _: requests.append(number)) for number in signals}
+    try:
+        yield lambda: bool(requests)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

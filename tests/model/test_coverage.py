@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from model.baselines import circle, ellipse, line
 from model.ccdbsm import Brush, CcdBsm, ccdbsm
 from model.coverage import PX_MM, SIZE_PX, centred_origin, coverage
-from model.profile import Profile
+from model.outline import Profile
 
 Array = NDArray[np.floating[Any]]
 Curve = Callable[[Array], Array]

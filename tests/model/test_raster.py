@@ -1,4 +1,4 @@
-"""Coverage at any heading and place: exact, compiled and soft, against quadrature, supersampling and each other."""
+"""Coverage at any heading and place, in torch and compiled, against quadrature, supersampling and each other."""
 
 import math
 from collections.abc import Callable
@@ -10,14 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import quad
-from scipy.ndimage import gaussian_filter
 
 from model.ccdbsm import Brush, CcdBsm, ccdbsm
 from model.coverage import centred_origin, coverage
 from model.raster.compiled import coverage_numpy
 from model.raster.exact import coverage_at
 from model.raster.frame import to_pixels
-from model.raster.soft import soft_coverage
 from model.registry import stroke_models
 
 Array = NDArray[np.floating]
@@ -181,12 +179,9 @@ def parameters() -> list[torch.Tensor]:
 
 # torch itself compiles its forward-mode rules with torch.jit.script on first use, and warns about it.
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
-@pytest.mark.parametrize("soft", [False, True])
-def test_gradients_are_exact_in_every_parameter(soft: bool) -> None:
+def test_gradients_are_exact_in_every_parameter() -> None:
     def image(h, tilt, radius, length, lam, origin, heading) -> torch.Tensor:
         mark = ccdbsm(Brush(radius, length), h, tilt, lam)
-        if soft:
-            return soft_coverage(mark, origin, heading, softness_px=0.7, size_px=9, px_mm=2.0)
         return coverage_at(mark, origin, heading, size_px=9, px_mm=2.0)
 
     assert torch.autograd.gradcheck(image, parameters(), check_forward_ad=True)
@@ -208,31 +203,6 @@ def test_every_model_has_exact_gradients_in_its_own_parameters(name: str) -> Non
     assert torch.autograd.gradcheck(image, [start[key].clone().requires_grad_() for key in names])
 
 
-def test_softness_is_a_gaussian_over_the_exact_image() -> None:
-    mark = ccdbsm(Brush(), 15.0, 5.0)
-    soft = soft_coverage(mark, (20.0, 12.8), 10.0, softness_px=1.5)[0].numpy()
-    exact = coverage_at(mark, (20.0, 12.8), 10.0)[0].numpy()
-    inner = (slice(8, -8), slice(8, -8))
-    assert abs(soft - gaussian_filter(exact, 1.5, truncate=4.0, mode="constant"))[inner].max() < 1e-6
-    sharp = soft_coverage(mark, (20.0, 12.8), 10.0, softness_px=0.05)[0].numpy()
-    assert abs(sharp - exact).max() < 1e-6
-    # Ink beyond the edge still shines in: here the mark lies just outside on the left.
-    assert soft_coverage(mark, (-2.0, 12.8), softness_px=1.5)[0, 64, 0].item() > 0.01
-
-
-def test_a_soft_gradient_reaches_pixels_that_the_exact_one_does_not() -> None:
-    height_mm = torch.tensor([15.0], **DOUBLE)
-
-    def image(draw: Callable[..., torch.Tensor], **extra: float) -> torch.Tensor:
-        return torch.func.jvp(
-            lambda h: draw(ccdbsm(Brush(), h, 5.0), (20.0, 12.8), **extra), (height_mm,), (torch.ones_like(height_mm),)
-        )[1]
-
-    exact, soft = image(coverage_at), image(soft_coverage, softness_px=2.0)
-    assert ((soft != 0).sum() > 4 * (exact != 0).sum()).item()
-    assert soft.sum().item() == pytest.approx(exact.sum().item(), rel=1e-6)
-
-
 def test_large_batches_run_on_threads_and_come_out_the_same() -> None:
     heights_mm = torch.linspace(11, 20, 150, **DOUBLE)
     mark = ccdbsm(Brush(), heights_mm, 5.0)
@@ -245,14 +215,12 @@ def test_large_batches_run_on_threads_and_come_out_the_same() -> None:
 
 def test_what_makes_no_image_is_refused() -> None:
     mark = ccdbsm(Brush(), torch.tensor([11.0, 13.0, 15.0]), 5.0)
-    for draw in (coverage_at, coverage_numpy, soft_coverage):
+    for draw in (coverage_at, coverage_numpy):
         with pytest.raises(ValueError, match="size_px = 0"):
             draw(mark, (1.0, 1.0), size_px=0)
         with pytest.raises(ValueError, match=r"heading_deg has shape \(2,\)"):
             draw(mark, (1.0, 1.0), torch.zeros(2))
         with pytest.raises(ValueError, match=r"origin_mm has shape \(2, 2\)"):
             draw(mark, torch.zeros(2, 2))
-    with pytest.raises(ValueError, match=r"softness_px = 0 is outside \(0, inf\)"):
-        soft_coverage(mark, (1.0, 1.0), softness_px=0.0)
     with pytest.raises(ValueError, match=r"out is int64 \(3, 128, 128\)"):
         coverage_numpy(mark, (1.0, 1.0), out=np.zeros((3, 128, 128), np.int64))

@@ -13,10 +13,9 @@ from brushloop import app
 from calibrate.compare.field import Alignment, Tone
 from calibrate.validate.report.data import load_report
 from model.ccdbsm import Brush
-from model.train.captures import load_captures
-from model.train.checkpoint import load_weights
+from model.train.checkpoint import load_generator, load_weights
+from model.train.data import load_captures
 from model.train.errors import TrainError
-from model.train.load import load_generator
 
 # One word a line, as the file's owner would write it.
 TRAINING = """

@@ -10,13 +10,10 @@ import torch
 from model.ccdbsm import Brush, DomainError, ccdbsm
 from model.coverage import centred_origin, coverage
 from model.generator.basis import FieldBasis, fit_basis, signed_distance
-from model.generator.features import Inputs, chebyshev
-from model.generator.loss import squared_error
 from model.generator.metrics import quality
-from model.generator.network import Generator, Layers, covered
-from model.generator.presets import PRESETS
+from model.generator.network import Generator, Inputs, Layers, chebyshev, covered, squared_error
 from model.generator.stroke import generator_model, traced
-from model.generator.targets import Placement, Target
+from model.generator.targets import PRESETS, Placement, Target
 from model.registry import stroke_model
 
 SMALL = Layers(width=16, channels=4, side=8, size_px=32)

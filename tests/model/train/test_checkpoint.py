@@ -15,9 +15,9 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from model.train import checkpoint
-from model.train.captures import load_captures, save_captures
 from model.train.checkpoint import load_checkpoint, load_weights, save_checkpoint, save_generator
 from model.train.config import TrainConfig
+from model.train.data import load_captures, save_captures
 from model.train.errors import TrainError
 from model.train.loop import new_state
 

@@ -14,11 +14,11 @@ import torch
 from typer.testing import CliRunner
 
 from model.train import export as exporting
-from model.train.captures import save_captures
+from model.train.checkpoint import load_generator
 from model.train.cli import app
+from model.train.data import save_captures
 from model.train.errors import MissingExtra, TrainError
 from model.train.export import export
-from model.train.load import load_generator
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def test_what_is_missing_is_named(trained: Path, monkeypatch: pytest.MonkeyPatch
     with pytest.raises(TrainError, match="form 'exe' is not known; known: onnx, pt2"):
         export(trained, "exe")
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    from model.train.curves import Events
+    from model.train.report import Events
 
     with pytest.raises(MissingExtra, match="tensorboard"):
         Events(tmp_path, 0)
