@@ -163,4 +163,11 @@ class Paper:
             (columns, rows),
             flags=cv2.INTER_LINEAR if scale >= 0.5 else cv2.INTER_AREA,
         )
-        self._density = (1.0 - (1.0 - self._density) * (1.0 - np.clip(laid, 0.0, 1.0))).astype(np.float32)
+        height, width = footprint.density.shape
+        corners = offset + np.array([(-1, -1), (width, -1), (width, height), (-1, height)]) @ linear.T
+        left, top = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 1, 0)
+        right, bottom = np.maximum(np.ceil(corners.max(axis=0)).astype(int) + 2, 0)
+        inked = np.s_[top:bottom, left:right]
+        density = self._density.copy()  # other threads may hold the old array
+        density[inked] = 1.0 - (1.0 - density[inked]) * (1.0 - np.clip(laid[inked], 0.0, 1.0))
+        self._density = density
