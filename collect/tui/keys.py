@@ -20,7 +20,6 @@ from collect.tui.text import SOFTWARE_STOP
 from collect.tui.widgets import Key
 
 STOP_KEYS = frozenset({"s", "ctrl+c"})
-STOP_LABEL: Key = ("s", "STOP")
 
 
 def is_stop_key(event: events.Event) -> bool:
@@ -30,30 +29,30 @@ def is_stop_key(event: events.Event) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class RunKey:
-    """One key of a run, as the line of keys and the command palette show it."""
+    """One key of a run, as the line of keys, the command palette and the help page show it."""
 
     key: str
     label: str
+    what: str
     action: str = ""
     """Action of `OperatorApp`; empty where a screen or textual itself handles the key."""
     title: str = ""
     """Its name in the command palette; empty where it is not listed."""
-    what: str = ""
 
 
 RUN_KEYS = (
-    RunKey("s", "STOP", "stop", "Stop the arm now", "A software stop; the red button is the emergency stop"),
-    RunKey("space", "pause", "pause", "Pause or go on", "Before the next step"),
-    RunKey("q", "leave", "quit", "Leave", "Finish the step, park, leave"),
-    RunKey("?", "help", "help"),
-    RunKey("tab", "pane"),
-    RunKey("v", "review", "review", "Review", "Look through the captures"),
-    RunKey("r", "retake", "request('RETAKE')", "Retake", "Press the stroke in hand again"),
-    RunKey("k", "skip", "request('SKIP')", "Skip", "Leave the stroke in hand out"),
-    RunKey("n", "new sheet", "request('NEW_SHEET')", "New sheet", "Put a new sheet in before the next stroke"),
-    RunKey("j", "jog", "request('JOG')", "Jog", "Find the paper again by jog before the next stroke"),
-    RunKey("b", "bad", "mark_last", "Last capture bad", "It does not count, and is pressed again at the end"),
-    RunKey("ctrl-p", "commands"),
+    RunKey("s", "STOP", "Stop the arm at once, on every screen and over every question", "stop", "Stop the arm now"),
+    RunKey("space", "pause", "Pause before the next step, or go on", "pause", "Pause or go on"),
+    RunKey("q", "leave", "Finish the step, park the arm, then leave", "quit", "Leave"),
+    RunKey("?", "help", "This page", "help"),
+    RunKey("tab", "pane", "On a narrow screen: overview, last capture, camera"),
+    RunKey("v", "review", "Look through the captures: mark, note, how alike they are", "review", "Review"),
+    RunKey("r", "retake", "Press the stroke in hand again, once photographed", "request('RETAKE')", "Retake"),
+    RunKey("k", "skip", "Leave the stroke in hand out", "request('SKIP')", "Skip"),
+    RunKey("n", "new sheet", "Put a new sheet in, before the next stroke", "request('NEW_SHEET')", "New sheet"),
+    RunKey("j", "jog", "Find the paper again by jog, before the next stroke", "request('JOG')", "Jog"),
+    RunKey("b", "bad", "The last capture is bad: pressed again at the end", "mark_last", "Last capture bad"),
+    RunKey("ctrl-p", "commands", "All commands by name, light and dark among them"),
 )
 """The most needed first: a narrow screen shows only as many as fit."""
 RUN_BINDINGS: tuple[Binding, ...] = (
@@ -65,15 +64,9 @@ RUN_BINDINGS: tuple[Binding, ...] = (
 CAN_PAUSE = frozenset({State.IDLE, State.RECOVERING, State.RUNNING})
 CAN_RESUME = frozenset({State.PAUSING, State.PAUSED})
 RUN_BAR: tuple[Key, ...] = tuple((k.key, k.label) for k in RUN_KEYS)
-SET_UP_BAR: tuple[Key, ...] = (
-    STOP_LABEL,
-    ("space", "pause"),
-    ("q", "leave"),
-    ("?", "help"),
-    ("ctrl-p", "commands"),
-    ("tab", "camera"),
-)
-OVER_BAR: tuple[Key, ...] = (("q", "leave"), ("v", "review"), ("?", "help"), ("tab", "pane"), ("ctrl-p", "commands"))
+LABELS = dict(RUN_BAR)
+OVER_BAR: tuple[Key, ...] = tuple((key, LABELS[key]) for key in ("q", "v", "?", "tab", "ctrl-p"))
+SET_UP_BAR: tuple[Key, ...] = (*((key, LABELS[key]) for key in ("s", "space", "q", "?", "ctrl-p")), ("tab", "camera"))
 
 
 def keys_in(state: State, bar: tuple[Key, ...]) -> tuple[Key, ...]:
@@ -84,20 +77,9 @@ def keys_in(state: State, bar: tuple[Key, ...]) -> tuple[Key, ...]:
     return tuple((key, space if key == "space" else label) for key, label in bar if key != "space" or space)
 
 
-HELP = f"""\
-s, ctrl-c   STOP the arm now, on every screen and over every question
-            {SOFTWARE_STOP}
-space       pause before the next step, and go on
-q           leave: finishes the step, parks the arm, then leaves
-r           retake: press the stroke in hand again, once photographed
-b           the last capture is bad: pressed again once the plan is through
-k           leave the stroke in hand out
-n           put a new sheet in, before the next stroke
-j           find the paper again by jog, before the next stroke
-            (r, b, k, n, j: the same key again takes it back)
-v           look through the captures: mark, note, how alike they are
-tab         on a narrow screen: overview, last capture, camera
-ctrl-p, ?   all commands by name, light and dark among them; this page
+SIGNS = f"""\
+{SOFTWARE_STOP}
+r, k, n, j and b: the same key again takes it back.
 
 Grid     ✓ complete   ▶ now   › next   ! had bad takes   × left out
 Sheet    · blank   ● counts   ! does not count   × burnt   △ self-check
@@ -122,7 +104,8 @@ class HelpScreen(ModalScreen[None]):
         """Lay out the page."""
         with VerticalScroll() as page:
             page.border_title = "Help, escape closes"
-            yield Static(HELP, markup=False)
+            lines = [f"{'s, ctrl-c' if key.key == 's' else key.key:<11} {key.what}" for key in RUN_KEYS]
+            yield Static("\n".join([*lines, "", SIGNS]), markup=False)
 
     def action_close(self) -> None:
         """Close the page."""

@@ -18,7 +18,7 @@ from textual.widgets import Input, OptionList
 
 from collect.tui.captures import CapturePictures, Review, ReviewCapture
 from collect.tui.finish_screen import FinishScreen
-from collect.tui.keys import STOP_LABEL
+from collect.tui.keys import LABELS
 from collect.tui.pictures import Pictures, binary_picture
 from collect.tui.text import SOFTWARE_STOP, one_line, plain
 from collect.tui.widgets import KeyBar, Line, Rows, app_of
@@ -33,6 +33,7 @@ KEYS = (
     ("f", "finish"),
     ("?", "help"),
 )
+KEYS_AT_WORK = (("s", LABELS["s"]), *(pair for pair in KEYS if pair[0] not in ("o", "f")))
 KEYS_S = 0.5
 """How often the line of keys is made anew, as a run may begin or end."""
 
@@ -115,7 +116,7 @@ class ReviewScreen(Screen[None]):
     def _show_keys(self) -> None:
         """Show the keys; while a run is on, how to stop it, and neither note nor finish."""
         at_work = self._at_work()
-        self._keys.show((STOP_LABEL, *(pair for pair in KEYS if pair[0] not in ("o", "f"))) if at_work else KEYS)
+        self._keys.show(KEYS_AT_WORK if at_work else KEYS)
         self._stop_note.show(f"The arm is at work. {SOFTWARE_STOP}" if at_work else "")
         self.set_class(at_work, "-at-work")
 
