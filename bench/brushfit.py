@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from bench.brushfit_brushes import DEVELOPMENT, FROZEN
 from bench.harness import Result, machine
-from calibrate.fit.adaptive import next_press
-from calibrate.fit.bezier import RefittedBezier, refit_bezier
 from calibrate.fit.fit import Grid, Pressed, fit_presses
-from calibrate.fit.heldout import predictor
+from calibrate.fit.heldout import RefittedBezier, predictor, refit_bezier
+from calibrate.fit.stepwise import next_press
 from drivers.sim.brush.brush import Brush, BrushSpec
 from drivers.sim.brush.paper import Footprint
 from model.fitted import FittedPress

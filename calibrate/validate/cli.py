@@ -55,7 +55,7 @@ def validate(
     import sys
 
     from calibrate.compare.field import Field
-    from calibrate.drags.terminal import summary as drag_summary
+    from calibrate.drags.report import summary as drag_summary
     from calibrate.validate.beside import Given
     from calibrate.validate.main import Request, check
     from calibrate.validate.main import validate as run

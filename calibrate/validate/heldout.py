@@ -16,9 +16,9 @@ from calibrate.compare.field import SIZE_PX, Field
 from calibrate.compare.images import Pixels, unpack
 from calibrate.compare.simulate import shape_pixels
 from calibrate.fit.artefact import BrushFit
-from calibrate.fit.bezier import RefittedBezier, refit_bezier
 from calibrate.fit.captures import MARGIN_MM, grid_of
 from calibrate.fit.fit import Fit, Grid, Pressed, refit
+from calibrate.fit.heldout import RefittedBezier, refit_bezier
 from calibrate.validate.jobs import VERSION
 from model.fitted import MODES, NAMES, TERMS, FittedPress
 

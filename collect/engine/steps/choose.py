@@ -14,7 +14,7 @@ from collect.protocols.steps import Result, StepKind
 from collect.rig.paper import Cell
 
 if TYPE_CHECKING:
-    from calibrate.fit.stepwise import Next, Seen
+    from calibrate.fit.stepwise import CapturedPress, Next
 
 
 async def choose(context: StepContext) -> Result:
@@ -59,19 +59,19 @@ async def measured(context: StepContext, image: Gray, cell: Cell) -> Result:
     return {"ink": ink}
 
 
-def _seen(run: RunContext) -> list[Seen]:
+def _seen(run: RunContext) -> list[CapturedPress]:
     """Ink of the captures so far, in the order in which they were made, without those that were retaken."""
-    from calibrate.fit.stepwise import Seen
+    from calibrate.fit.stepwise import CapturedPress
 
     results = [line["result"] for line in run.store.state.segments if line["kind"] == StepKind.CAPTURE]
     return [
-        Seen(float(r["height_mm"]), float(r["tilt_deg"]), str(r.get("ink", "")) if r["kept"] else "")
+        CapturedPress(float(r["height_mm"]), float(r["tilt_deg"]), str(r.get("ink", "")) if r["kept"] else "")
         for r in results
         if not r["retake"]
     ]
 
 
-def _fitted(run: RunContext, protocol: AdaptiveConfig, seen: list[Seen]) -> Next:
+def _fitted(run: RunContext, protocol: AdaptiveConfig, seen: list[CapturedPress]) -> Next:
     from calibrate.fit.stepwise import Design, next_cell
 
     brush = run.rig.config.brush

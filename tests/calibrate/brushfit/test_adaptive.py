@@ -4,8 +4,8 @@ import sys
 import numpy as np
 import pytest
 
-from calibrate.fit.adaptive import next_press
 from calibrate.fit.fit import Grid
+from calibrate.fit.stepwise import next_press
 from model.fitted import FittedPress
 
 GRID = Grid((np.arange(80) + 0.5) * 0.5 - 31.0, 8.0 - (np.arange(32) + 0.5) * 0.5)
@@ -45,5 +45,5 @@ def test_no_candidates_is_an_error() -> None:
 
 
 def test_a_rig_needs_no_torch_for_it() -> None:
-    code = "import sys, calibrate.fit.adaptive; sys.exit('torch' in sys.modules)"
+    code = "import sys, calibrate.fit.stepwise; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0

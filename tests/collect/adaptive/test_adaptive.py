@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from calibrate.fit.stepwise import Design, Seen, field_grid, next_cell, packed, unpacked
+from calibrate.fit.stepwise import CapturedPress, Design, field_grid, next_cell, packed, unpacked
 from collect.planning.limits import check_protocol
 from collect.planning.summary import make_plan
 from collect.protocols.adaptive import AdaptiveConfig
@@ -110,10 +110,10 @@ def test_ink_comes_back_from_text_and_nothing_else_is_taken_for_it() -> None:
 def test_a_choice_depends_on_the_ink_and_on_nothing_else() -> None:
     design = Design(6.0, 48.0, CELLS, 1.0, 3)
     brush = FittedPress(6.0, 48.0)
-    seen = [Seen(h, a, ink_of(brush, h, a)) for h, a in CELLS[:2]]
+    seen = [CapturedPress(h, a, ink_of(brush, h, a)) for h, a in CELLS[:2]]
     assert next_cell(design, seen) == next_cell(design, seen)
     fat = FittedPress(6.0, 48.0, brush.values * np.where(np.arange(len(brush.values)) == 0, 1.5, 1.0))
-    other = [Seen(h, a, ink_of(fat, h, a)) for h, a in CELLS[:2]]
+    other = [CapturedPress(h, a, ink_of(fat, h, a)) for h, a in CELLS[:2]]
     assert next_cell(design, other).points_after != next_cell(design, seen).points_after
     assert next_cell(design, other).ink_sha256 != next_cell(design, seen).ink_sha256
 
@@ -122,10 +122,10 @@ def test_a_cell_that_shows_no_stroke_twice_is_not_chosen_again() -> None:
     design = Design(6.0, 48.0, CELLS, 1.0, 3)
     first = next_cell(design, []).cell
     assert first is not None
-    failed = [Seen(*first, "")] * 2
+    failed = [CapturedPress(*first, "")] * 2
     assert next_cell(design, failed[:1]).cell == first
     assert next_cell(design, failed).cell != first
-    everywhere = [Seen(h, a, "") for h, a in CELLS for _ in range(2)]
+    everywhere = [CapturedPress(h, a, "") for h, a in CELLS for _ in range(2)]
     stopped = next_cell(design, everywhere)
     assert stopped.cell is None
     assert "no cell is left" in stopped.why
