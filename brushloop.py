@@ -17,7 +17,6 @@ import calibrate.invert.cli
 import calibrate.loop.cli
 import calibrate.validate.cli
 import calibrate.writing.cli
-import calibrate.writing.plan_cli
 import collect.cli
 import model.train.cli
 import sessions.cli
@@ -74,7 +73,7 @@ write = typer.Typer(
     help="Write characters on the rig and compare them (`brushloop write 字 --config ...`), or only plan or compare.",
 )
 write.command("characters")(collect.cli.write)
-write.command("plan")(calibrate.writing.plan_cli.plan)
+write.command("plan")(calibrate.writing.cli.plan)
 write.command("compare")(calibrate.writing.cli.compare)
 write.command("learn")(calibrate.writing.cli.learn)
 app.add_typer(write, name="write")

@@ -28,9 +28,8 @@ from numpy.typing import NDArray
 
 from bench.harness import BenchError, Result, interleave, machine
 from calibrate.compare.field import BEST_SHIFT_PX, KEYS, SIZE_PX, Alignment, Field
-from calibrate.compare.images import Pixels, pack, unpack
+from calibrate.compare.images import Pixels, pack, simulated_pixels, unpack
 from calibrate.compare.similarity import csim, ssim
-from calibrate.compare.simulate import simulated_pixels
 from calibrate.validate.jobs import ABSENT, PrepareJob, Press, ScoreJob, prepare_job, score_job
 from calibrate.validate.pool import Dask, Threads
 from drivers.sim.brush.brush import Brush, BrushSpec
@@ -100,7 +99,7 @@ def plain_scores(job: ScoreJob) -> NDArray[np.float64]:
         for k, (alignment, _tone) in enumerate(KEYS):
             for m, images in enumerate(predictions):
                 out[n, m, k] = plain_score(captured[k], images[k], alignment)
-            foretold = [plain_score(captured[k], others[o][k], alignment) for o in job.foretell[n]]
+            foretold = [plain_score(captured[k], others[o][k], alignment) for o in job.predicted_by[n]]
             out[n, -2, k] = np.mean(foretold, axis=0)
     return out
 

@@ -17,9 +17,8 @@ from bench.brushfit_brushes import FROZEN
 from bench.harness import BenchError, Result, machine
 from bench.processes import ROOT, Process, started
 from calibrate.compare.field import Alignment, Tone
-from calibrate.writing.images import Polarity
-from calibrate.writing.scores import ANOTHER, REFERENCE, SIMULATED
-from calibrate.writing.table import Table3Row, read_table_3
+from calibrate.compare.similarity import Polarity
+from calibrate.writing.scores import ANOTHER, REFERENCE, SIMULATED, Table3Row, read_written
 
 CHARACTER, WRITINGS, ROUNDS = "字", 10, 3
 RATE = 20.0
@@ -44,7 +43,7 @@ def run(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
     for brush in range(brushes):
         with tempfile.TemporaryDirectory() as scratch:
             out = write_characters(Path(scratch), brush, seed)
-            before, after = read_table_3(out / "round-1"), read_table_3(out)
+            before, after = (list(read_written(place).table_3) for place in (out / "round-1", out))
         results += [_result(brush, pair, before, after, seed) for pair in (REFERENCE, SIMULATED)]
     return results
 

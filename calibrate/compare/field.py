@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.scales import MM_PER_PX
+from calibrate.compare import MM_PER_PX
 from calibrate.errors import CaptureRefused
 from calibrate.stroke.params import PX_PER_MM
 from calibrate.stroke.preprocess import Prepared

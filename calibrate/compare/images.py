@@ -1,58 +1,141 @@
-"""A captured press as it is compared: laid on 128 x 128 pixels in every alignment and tone."""
+"""Images of a press for every alignment and tone: as it was captured, and as a model predicts it.
+
+The modules of `model` load torch, which workers that only prepare captures do without: they are imported late.
+"""
 
 from __future__ import annotations
 
+import math
 import zlib
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.field import KEYS, SIZE_PX, Alignment, Image, captured_mm, captured_normalised
+from calibrate.calibration import Calibration
+from calibrate.compare.field import (
+    KEYS,
+    NORMAL_LENGTH_PX,
+    SIZE_PX,
+    Alignment,
+    Field,
+    Image,
+    Key,
+    Tone,
+    captured_mm,
+    captured_normalised,
+    crop_at_anchor,
+    to_tone,
+)
 from calibrate.errors import CaptureRefused
-from calibrate.stroke.measure import Measured, measure
-from calibrate.stroke.preprocess import Prepared
+from calibrate.stroke.params import PX_PER_MM, Params
+from calibrate.stroke.preprocess import Prepared, prepare
+from calibrate.stroke.rectify import on_raster, on_window, rectify_by, rescale
+from sessions.reader import Capture
+from sessions.recording.schemas import Header, Stroke
+
+if TYPE_CHECKING:
+    from model.ccdbsm import Brush
+    from model.outline import Shape
+    from model.registry import StrokeModel
 
 Pixels = NDArray[np.uint8]
 """Ink from 0 to 255."""
-MOST_BYTES = 4 * (len(KEYS) + 1) * SIZE_PX**2
+MAX_UNPACKED_BYTES = 256 * (len(KEYS) + 1) * SIZE_PX**2
 
 
-@dataclass(frozen=True, slots=True)
-class PressImages:
-    """A captured press, ready to be compared."""
+def prepare_press(capture: Capture, calibration: Calibration | None, params: Params, view: Field) -> Prepared:
+    """The stroke on the millimetre field, rectified by the calibration or by the import's own scale.
 
-    measured: Measured
-    cut: bool
-    flags: tuple[str, ...]
-    images: Pixels
-    """(len(KEYS), 128, 128)."""
-    coverage: Pixels
-    """(128, 128) share of each pixel of the millimetre field that is ink: what fits are made of."""
+    Raises `CaptureRefused` for a capture that cannot be used, `SessionDamaged` for a picture that cannot be read.
+    """
+    stroke = capture.stroke
+    if capture.bad:
+        raise CaptureRefused(stroke.stroke_id, capture.bad)
+    image = capture.image()
+    left, top = (v * PX_PER_MM for v in view.anchor_mm)
+    if stroke.anchor_mm is not None and calibration is not None:
+        window = view.window_mm(stroke.anchor_mm)
+        raster = rectify_by(image, calibration, window, capture.where)
+        return prepare(raster, (left, top), capture.where, params, _cell_px(stroke, window))
+    if stroke.px_per_mm is None:
+        raise CaptureRefused(stroke.stroke_id, "has neither a calibration nor a scale of its own")
+    raster = rescale(image, stroke.px_per_mm, capture.where)
+    if stroke.anchor_px is None:
+        raise CaptureRefused(stroke.stroke_id, "has no anchor (start_x_px, start_y_px): it cannot be laid on a model")
+    anchor = on_raster(stroke.anchor_px, stroke.px_per_mm)
+    return crop_at_anchor(prepare(raster, anchor, capture.where, params), anchor, view)
+
+
+def _cell_px(stroke: Stroke, window: tuple[float, float, float, float]) -> tuple[int, int, int, int] | None:
+    return None if stroke.cell_mm is None else on_window(stroke.cell_mm, window)
+
+
+def captured_images(stroke_id: str, prepared: Prepared) -> dict[Key, Image]:
+    """A prepared press in every alignment and tone, (128, 128) each. Raises `CaptureRefused` if one would be blank."""
+    images: dict[Key, Image] = {}
+    for alignment, tone in KEYS:
+        image = (captured_mm if alignment is Alignment.MM else captured_normalised)(prepared, tone)
+        if not to_pixels(image).any():
+            raise CaptureRefused(stroke_id, f"is too thin to be seen at the scale of {alignment} ({tone})")
+        images[alignment, tone] = image
+    return images
+
+
+def simulated(
+    model: StrokeModel, height_mm: float, tilt_deg: float, alignment: Alignment, tone: Tone, field: Field
+) -> Image:
+    """(128, 128) prediction of a press. May raise `model.ccdbsm.DomainError`."""
+    return to_tone(_drawn(model.profile(height_mm, tilt_deg), axis_mm(height_mm, tilt_deg), alignment, field), tone)
+
+
+def simulated_pixels(model: StrokeModel, height_mm: float, tilt_deg: float, field: Field) -> Pixels:
+    """(len(KEYS), 128, 128) predictions of a press. May raise `model.ccdbsm.DomainError`."""
+    return shape_pixels(model.profile(height_mm, tilt_deg), axis_mm(height_mm, tilt_deg), field)
+
+
+def shape_pixels(profile: Shape, origin_x_mm: float, field: Field) -> Pixels:
+    """(len(KEYS), 128, 128) of a shape whose origin lies `origin_x_mm` from the zero-touch point."""
+    gray = {alignment: _drawn(profile, origin_x_mm, alignment, field) for alignment in Alignment}
+    return np.stack([to_pixels(to_tone(gray[alignment], tone)) for alignment, tone in KEYS])
+
+
+def axis_mm(height_mm: float, tilt_deg: float) -> float:
+    """Where the brush axis meets the paper, from the zero-touch point toward the side that the ferrule leans to.
+
+    The press tilts about the tip, then descends.
+    """
+    return height_mm * math.tan(math.radians(tilt_deg))
+
+
+def _drawn(profile: Shape, origin_x_mm: float, alignment: Alignment, field: Field) -> Image:
+    """(128, 128) coverage by one shape; `origin_x_mm` places it on the millimetre field."""
+    from model.coverage import centred_origin, coverage
+
+    if alignment is Alignment.MM:
+        left, top = field.anchor_mm
+        covered = coverage(profile, (left + origin_x_mm, top), size_px=SIZE_PX, px_mm=field.mm_per_px)
+    else:
+        length_mm = float(profile.x_max_mm[0] - profile.x_min_mm[0])
+        px_mm = length_mm / NORMAL_LENGTH_PX
+        origin_mm = centred_origin(profile, size_px=SIZE_PX, px_mm=px_mm)
+        covered = coverage(profile, origin_mm, size_px=SIZE_PX, px_mm=px_mm)
+    return covered[0].numpy().astype(np.float32)
+
+
+def brush_of(header: Header) -> Brush:
+    """The brush that a recording names; sizes that it does not name are those of the published brush."""
+    from model.ccdbsm import Brush
+
+    nominal = Brush()
+    return Brush(
+        radius_mm=header.brush_radius_mm or nominal.radius_mm, length_mm=header.brush_length_mm or nominal.length_mm
+    )
 
 
 def to_pixels(image: Image) -> Pixels:
-    """Ink in [0, 1] on 256 levels, as the camera has it."""
+    """Ink in [0, 1] on 256 levels, like the camera's."""
     return np.rint(255.0 * image).astype(np.uint8)
-
-
-def press_images(stroke_id: str, prepared: Prepared) -> PressImages:
-    """Lay a found stroke on pixels for each of `KEYS`. Raises `CaptureRefused` where one would show nothing."""
-    images: list[Pixels] = []
-    for alignment, tone in KEYS:
-        image = to_pixels((captured_mm if alignment is Alignment.MM else captured_normalised)(prepared, tone))
-        if not image.any():
-            raise CaptureRefused(stroke_id, f"is too thin to be seen at the scale of {alignment} ({tone})")
-        images.append(image)
-    coverage = cv2.resize(prepared.mask.astype(np.float32), (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA)
-    return PressImages(
-        measure(prepared.mask),
-        prepared.cut,
-        prepared.flags,
-        np.stack(images),
-        to_pixels(np.asarray(coverage, np.float32)),
-    )
 
 
 def pack(images: Pixels) -> bytes:
@@ -64,7 +147,7 @@ def unpack(packed: bytes) -> Pixels:
     """(n, 128, 128) images that `pack` made. Raises ValueError for anything else."""
     try:
         inflater = zlib.decompressobj()
-        raw = inflater.decompress(packed, 64 * MOST_BYTES)
+        raw = inflater.decompress(packed, MAX_UNPACKED_BYTES)
     except zlib.error as error:
         raise ValueError(f"not packed images: {error}") from None
     if not inflater.eof or len(raw) % SIZE_PX**2:

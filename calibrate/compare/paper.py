@@ -1,4 +1,4 @@
-"""The tables of the CCD-BSMG paper, to stand beside ours: percent, of its own brush, ink and preprocessing."""
+"""The tables of the CCD-BSMG paper, shown beside ours: percent, of its own brush, ink and preprocessing."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ class Printed:
     ssim: Triple
 
 
+ROBOT_WRITING = "robot writing"
 TABLE_1: dict[str, Printed] = {
     "ccd-bsm": Printed("CCD-BSM", (94.25, 88.33, 91.84), (90.13, 85.16, 87.71)),
     "ccd-bsmg": Printed("CCD-BSMG", (97.29, 89.22, 92.65), (90.58, 85.49, 88.16)),
-    "robot writing": Printed("robot writing", (98.21, 89.42, 93.31), (95.62, 85.85, 90.12)),
+    ROBOT_WRITING: Printed("robot writing", (98.21, 89.42, 93.31), (95.62, 85.85, 90.12)),
 }
 """Generated strokes, and strokes pressed again with the recovered (H, alpha), against real strokes."""
 TABLE_2: dict[str, Printed] = {
@@ -34,8 +35,9 @@ TABLE_2: dict[str, Printed] = {
 """Every model against real strokes."""
 TABLE_3: dict[str, Printed] = {
     "ccd-bsmg": Printed("CCD-BSMG", (97.71, 91.45, 94.58), (79.26, 72.56, 75.91)),
-    "robot writing": Printed("robot writing", (95.82, 91.36, 93.59), (78.78, 70.42, 74.60)),
+    ROBOT_WRITING: Printed("robot writing", (95.82, 91.36, 93.59), (78.78, 70.42, 74.60)),
 }
-"""The character zi; `brushloop write` makes ours."""
+"""The character zi. The paper does not say what each row was compared with, nor whether it wrote 字 or 子, nor its
+polarity: which of its rows stands beside which of ours is our reading."""
 ORDER = ("ccd-bsmg", "ccd-bsm", "bezier", "ellipse", "line", "circle")
 """By average CSIM and SSIM, best first, as the paper words it."""

@@ -1,11 +1,17 @@
-"""CSIM and SSIM of two aligned images. Ink is 1 on 0: with paper as 1, a blank page would score .94."""
+"""CSIM and SSIM of two images, and how images are laid over each other before.
+
+Ink is 1 on paper of 0: with paper as 1, a blank page would score .94.
+"""
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from calibrate.compare.field import Alignment, best_shift
 
 Image = NDArray[Any]
 
@@ -13,6 +19,29 @@ SSIM_SIGMA = 1.5
 SSIM_SETTINGS = (
     f"scikit-image structural_similarity, data_range 1, gaussian weights, sigma {SSIM_SIGMA}, population covariance"
 )
+
+
+class Polarity(StrEnum):
+    """Which of ink and paper is 1."""
+
+    INK = "ink = 1"
+    PAPER = "paper = 1"
+
+
+def similarity(
+    captured: Image, other: Image, alignment: Alignment, polarity: Polarity = Polarity.INK
+) -> tuple[float, float]:
+    """(CSIM, SSIM) of two (128, 128) images of one alignment; size-normalised, the other takes its best shift first.
+
+    Raises ValueError for a blank image. `compiled.py` does the same for one capture and many predictions.
+    """
+    if alignment is Alignment.SIZE_NORMALISED:
+        other = best_shift(other, captured)
+    if not captured.any() or not other.any():
+        raise ValueError("a blank image")
+    if polarity is Polarity.PAPER:
+        captured, other = 1.0 - captured, 1.0 - other
+    return csim(captured, other), ssim(captured, other)
 
 
 def csim(a: Image, b: Image) -> float:
@@ -44,4 +73,4 @@ def ssim(a: Image, b: Image) -> float:
 
 def _check(a: Image, b: Image) -> None:
     if a.shape != b.shape or a.ndim != 2:
-        raise ValueError(f"images must be (h, w) and alike, got {a.shape} and {b.shape}")
+        raise ValueError(f"images must be (h, w) and of one shape, got {a.shape} and {b.shape}")

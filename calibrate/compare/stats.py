@@ -2,55 +2,64 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Interval = tuple[float, float]
+"""95 %."""
 SEED = 0
-MOST_DRAWS, LEAST_DRAWS, WORK = 2000, 200, 4_000_000
-"""Draws of a bootstrap: as many as `WORK` strokes allow, between the two."""
-LEAST_CELLS, LEAST_PRESSES, MANY_PRESSES = 3, 3, 5
+MAX_DRAWS, MIN_DRAWS, MAX_VALUES_DRAWN = 2000, 200, 4_000_000
+"""Draws of a bootstrap: as many as `MAX_VALUES_DRAWN` allow, between the first two."""
+MIN_CELLS, MIN_PRESSES, MANY_PRESSES = 3, 3, 5
 FLIPS = 10_000
-EXACT = 13
-"""With so many differences or fewer every flip of signs is tried."""
-PIECE = 1_000_000
+"""Random flips of signs; where there are no more different flips than that (up to 13 pairs), every one is tried."""
+BATCH_VALUES = 1_000_000
+"""Values held in memory at a time."""
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Of some scores; intervals are 95 %, None for fewer than two."""
+    """Of some scores; intervals are None where there are too few."""
 
     n: int
     max: float
     min: float
     avg: float
     median: float
-    avg_interval: tuple[float, float] | None
-    median_interval: tuple[float, float] | None
+    avg_interval: Interval | None = None
+    median_interval: Interval | None = None
+
+    @property
+    def range_and_avg(self) -> tuple[float, float, float]:
+        """Max, min and avg, as the paper's tables have them."""
+        return self.max, self.min, self.avg
 
 
-def summarise(values: Floats, strata: NDArray[np.int64]) -> Summary | None:
-    """Of (n,) scores, NaN left out; None where none is left.
+def summarise(values: Floats, strata: NDArray[np.int64] | None = None) -> Summary | None:
+    """Summary of (n,) scores, NaN left out; None where none is left. Intervals only with strata, (n,) numbers.
 
     Strokes are drawn again with replacement within their stratum (a cell of a session), so that the share of each cell
     stays what it is. With fewer than five presses in a typical cell that would be too sure of itself: then whole cells
     are drawn. No interval for one cell with fewer than three presses.
     """
     known = np.isfinite(values)
-    values, strata = values[known], strata[known]
+    values = values[known]
     if not len(values):
         return None
-    intervals: tuple[tuple[float, float] | None, tuple[float, float] | None] = (None, None)
-    _, counts = np.unique(strata, return_counts=True)
-    by_cell = len(counts) >= LEAST_CELLS and float(np.median(counts)) < MANY_PRESSES
-    if by_cell or len(values) >= LEAST_PRESSES * len(counts):
-        draws = _cell_draws(values, strata) if by_cell else _draws(values, strata)
-        means, medians = (np.concatenate(part) for part in zip(*draws, strict=True))
-        intervals = _interval(means), _interval(medians)
+    intervals: tuple[Interval | None, Interval | None] = (None, None)
+    if strata is not None:
+        strata = strata[known]
+        _, counts = np.unique(strata, return_counts=True)
+        by_cell = len(counts) >= MIN_CELLS and float(np.median(counts)) < MANY_PRESSES
+        if by_cell or len(values) >= MIN_PRESSES * len(counts):
+            draws = _cell_draws(values, strata) if by_cell else _draws(values, strata)
+            means, medians = (np.concatenate(part) for part in zip(*draws, strict=True))
+            intervals = _interval(means), _interval(medians)
     return Summary(
         len(values),
         float(values.max()),
@@ -61,6 +70,15 @@ def summarise(values: Floats, strata: NDArray[np.int64]) -> Summary | None:
     )
 
 
+def interval_over_groups(groups: Sequence[Sequence[float]]) -> Interval | None:
+    """Interval of the mean of all values, whole groups drawn with replacement; None for fewer than three groups."""
+    if len(groups) < MIN_CELLS:
+        return None
+    sums, counts = np.array([sum(group) for group in groups]), np.array([len(group) for group in groups])
+    drawn = np.random.default_rng(SEED).integers(len(groups), size=(MAX_DRAWS, len(groups)))
+    return _interval(sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1))
+
+
 def _draws(values: Floats, strata: NDArray[np.int64]) -> Iterator[tuple[Floats, Floats]]:
     """Means and medians of redrawn samples, some at a time: memory stays flat."""
     order = np.argsort(strata, kind="stable")
@@ -68,7 +86,7 @@ def _draws(values: Floats, strata: NDArray[np.int64]) -> Iterator[tuple[Floats, 
     _, first, inverse, counts = np.unique(strata[order], return_index=True, return_inverse=True, return_counts=True)
     start, size = first[inverse], counts[inverse]
     rng = np.random.default_rng(SEED)
-    for some in _pieces(len(values)):
+    for some in _batches(len(values)):
         drawn = ordered[start + (rng.random((some, len(values))) * size).astype(np.int64)]
         yield drawn.mean(axis=1), np.median(drawn, axis=1)
 
@@ -80,7 +98,7 @@ def _cell_draws(values: Floats, strata: NDArray[np.int64]) -> Iterator[tuple[Flo
     _, inverse = np.unique(strata[order], return_inverse=True)
     many = int(inverse.max()) + 1
     rng = np.random.default_rng(SEED)
-    for some in _pieces(len(values)):
+    for some in _batches(len(values)):
         times = rng.multinomial(many, np.full(many, 1.0 / many), some)[:, inverse]
         total = times.cumsum(axis=1)
         half = 0.5 * total[:, -1:]
@@ -88,21 +106,21 @@ def _cell_draws(values: Floats, strata: NDArray[np.int64]) -> Iterator[tuple[Flo
         yield (times @ ordered) / total[:, -1], middle
 
 
-def _pieces(size: int) -> Iterator[int]:
-    left = min(MOST_DRAWS, max(LEAST_DRAWS, WORK // size))
+def _batches(size: int) -> Iterator[int]:
+    left = min(MAX_DRAWS, max(MIN_DRAWS, MAX_VALUES_DRAWN // size))
     while left:
-        some = min(left, max(1, PIECE // size))
+        some = min(left, max(1, BATCH_VALUES // size))
         yield some
         left -= some
 
 
 @dataclass(frozen=True, slots=True)
 class Paired:
-    """What became better: the mean of paired differences, its 95 % interval, and how easily chance makes it."""
+    """What became better: the mean of paired differences, its 95 % interval, and its p-value."""
 
     n: int
     mean: float
-    interval: tuple[float, float] | None
+    interval: Interval | None
     p: float
     """Two-sided, by flipping the signs of differences: exact up to 13 of them, else by 10,000 random flips."""
 
@@ -114,25 +132,37 @@ def paired(before: Floats, after: Floats) -> Paired | None:
     n = len(difference)
     if not n:
         return None
-    mean = float(difference.mean())
     interval = None
     if n > 1:
         interval = _interval(np.concatenate([means for means, _ in _draws(difference, np.zeros(n, np.int64))]))
     # Below a millionth of a point nothing is a difference: reports keep six digits.
-    if np.all(np.abs(difference) < 1e-6):
-        return Paired(n, mean, interval, 1.0)
-    reach = abs(mean) - 1e-12
-    if n <= EXACT:
-        signs = np.array(list(itertools.product((1.0, -1.0), repeat=n)))
-        return Paired(n, mean, interval, float((np.abs(signs @ difference / n) >= reach).mean()))
-    rng = np.random.default_rng(SEED)
-    beyond, left = 0, FLIPS
-    while left:
-        some = min(left, max(1, PIECE // n))
-        signs = rng.choice(np.array([-1.0, 1.0]), (some, n))
-        beyond += int((np.abs(signs @ difference / n) >= reach).sum())
-        left -= some
-    return Paired(n, mean, interval, (beyond + 1) / (FLIPS + 1))
+    equal = bool(np.all(np.abs(difference) < 1e-6))
+    p = 1.0 if equal or n == 1 else _sign_flip_p(difference)
+    return Paired(n, float(difference.mean()), interval, p)
+
+
+def _sign_flip_p(difference: Floats) -> float:
+    """Share of sign flips whose mean is at least as far from 0 as that of two differences or more, two-sided."""
+    import scipy.stats  # slow to import
+
+    untyped: Any = scipy.stats
+    n = len(difference)
+
+    def distance(sample: Floats, axis: int) -> Floats:
+        return np.abs(sample.mean(axis=axis))
+
+    options: dict[str, Any] = {"alternative": "greater", "vectorized": True, "batch": max(1, BATCH_VALUES // n)}
+    if 2**n <= FLIPS:
+        found = untyped.permutation_test((difference,), distance, permutation_type="samples", **options)
+    else:
+        # `permutation_test` would draw whole permutations: twenty times slower for a large session.
+        rng = np.random.default_rng(SEED)
+
+        def flipped(size: tuple[int, int]) -> Floats:
+            return rng.choice(np.array([-1.0, 1.0]), size) * difference
+
+        found = untyped.monte_carlo_test(difference, flipped, distance, n_resamples=FLIPS, **options)
+    return float(found.pvalue)
 
 
 def holm(p_values: list[float]) -> list[float]:
@@ -146,6 +176,6 @@ def holm(p_values: list[float]) -> list[float]:
     return out
 
 
-def _interval(draws: Floats) -> tuple[float, float]:
+def _interval(draws: Floats) -> Interval:
     low, high = np.quantile(draws, [0.025, 0.975])
     return float(low), float(high)

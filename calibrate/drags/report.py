@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-import io
+import math
 import platform
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 from rich.table import Table
 
 from calibrate.drags.measure import DEPTH_NAMES, LENGTH_NAME, DragResults
-from calibrate.files import write_whole
-from calibrate.report import pictures
-from calibrate.report.pages import render
-from calibrate.report.wording import DRAG_LIMITS, fit_sentences, source_note
-from sessions.cells import CsvWriter
+from calibrate.report import csv_text, image_uri, plot, plot_uri, render, source_note, write_files
 from sessions.recording.schemas import Header
 
 MAX_THUMBNAILS = 60
+LIMITS = (
+    "These are strokes that travel along the paper, by a brush whose radius and bundle length are not known. "
+    "CCD-BSM describes one vertical press: its length, outline, CSIM and SSIM cannot be compared with a drag, and are "
+    "not given. What can be compared is how width grows with depth."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,35 +45,83 @@ def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
         refused=results.refused,
         provenance=_provenance(validation, command),
         strokes=len(results.strokes),
-        limits=DRAG_LIMITS,
+        limits=LIMITS,
         sentences=list(fit_sentences(results)),
-        plot=pictures.drag_plot(results) if results.strokes else "",
+        plot=_plot(results) if results.strokes else "",
         drags=results.strokes,
         names=sorted({name for drag in results.strokes for name in drag.commanded}),
-        thumbnails=[(d.stroke_id, pictures.data_uri(d.thumbnail)) for d in results.strokes[::step]],
+        thumbnails=[(d.stroke_id, image_uri(d.thumbnail)) for d in results.strokes[::step]],
         cut=[d.stroke_id for d in results.strokes if d.cut],
     )
-    folder.mkdir(parents=True, exist_ok=True)
-    write_whole(folder / "measured.csv", drags_csv(results, validation.header.source))
-    report = folder / "report.html"
-    write_whole(report, page)
-    return report
+    write_files(folder, {"measured.csv": drags_csv(results, validation.header.source), "report.html": page})
+    return folder / "report.html"
 
 
 def drags_csv(results: DragResults, source: str) -> str:
     """Commanded beside measured, one row a stroke."""
     names = sorted({name for drag in results.strokes for name in drag.commanded})
-    out = io.StringIO()
-    writer = CsvWriter(out)
-    columns = ["measured_length_mm", "measured_width_mm", "measured_mid_width_mm", "measured_area_mm2", "cut", "source"]
-    writer.writerow(["stroke_id", *(f"commanded_{name}" for name in names), *columns])
+    sizes = ["measured_length_mm", "measured_width_mm", "measured_mid_width_mm", "measured_area_mm2", "cut", "source"]
+    head = ["stroke_id", *(f"commanded_{name}" for name in names), *sizes]
+    rows: list[list[object]] = []
     for drag in results.strokes:
         m = drag.measured
-        sizes = [f"{v:.3f}" for v in (m.length_mm, m.width_mm, m.mid_width_mm, m.area_mm2)]
-        writer.writerow(
-            [drag.stroke_id, *(drag.commanded.get(name, "") for name in names), *sizes, int(drag.cut), source]
+        measured = [f"{v:.3f}" for v in (m.length_mm, m.width_mm, m.mid_width_mm, m.area_mm2)]
+        commanded = [drag.commanded.get(name, "") for name in names]
+        rows.append([drag.stroke_id, *commanded, *measured, int(drag.cut), source])
+    return csv_text(head, rows)
+
+
+def fit_sentences(results: DragResults) -> Iterator[str]:
+    """The fits of an imported session, and what CCD-BSM has to do with them."""
+    width, length = results.width_on_depth, results.length_on_commanded
+    if width is None:
+        yield "Width against depth: no fit (fewer than 3 whole strokes, or one depth only)."
+    else:
+        low, high = width.interval
+        yield (
+            f"Width at the middle against commanded depth: {width.slope:.3f} mm/mm (95 % {low:.3f} to {high:.3f}), "
+            f"{width.intercept:+.2f} mm at depth 0, r = {width.r:.2f}, n = {width.n}."
         )
-    return out.getvalue()
+        if low <= 0.0:
+            yield "The slope's interval reaches 0: these strokes do not tell how the brush opens with depth."
+        else:
+            ratio = width.slope / (2.0 * math.pi)
+            yield (
+                "CCD-BSM opens linearly with depth from zero, 2 λ R/L per mm. With λ = π this slope would be that of a "
+                f"brush with R/L = {ratio:.4f} (the paper's brush: 6/48 = {6 / 48:.4f}); a width at depth 0 is an "
+                "error of the zero touch, or ink that spreads, which CCD-BSM does not have."
+            )
+    if length is not None:
+        yield (
+            f"Measured length against commanded length: slope {length.slope:.3f}, {length.intercept:+.2f} mm, "
+            f"r = {length.r:.2f}, n = {length.n}."
+        )
+
+
+def _plot(results: DragResults) -> str:
+    """Width against depth and length against commanded length, with the fitted lines."""
+    figure, axes = plot(1, 2, (10.0, 3.4))
+    whole = [drag for drag in results.strokes if not drag.cut]
+    pairs = (
+        ([(d.depth_mm, d.measured.mid_width_mm) for d in whole if d.depth_mm is not None], results.width_on_depth),
+        (
+            [(d.commanded["length_mm"], d.measured.length_mm) for d in whole if "length_mm" in d.commanded],
+            results.length_on_commanded,
+        ),
+    )
+    titles = (
+        ("commanded depth, mm", "measured width at the middle, mm"),
+        ("commanded length, mm", "measured length, mm"),
+    )
+    for axis, (points, line), (x_title, y_title) in zip(axes, pairs, titles, strict=True):
+        axis.plot([x for x, _ in points], [y for _, y in points], ".", ms=5, alpha=0.6, color="#0072B2")
+        if line is not None:
+            ends = np.array([min(x for x, _ in points), max(x for x, _ in points)])
+            axis.plot(ends, line.slope * ends + line.intercept, color="#D55E00", lw=1.5)
+        axis.set_xlabel(x_title)
+        axis.set_ylabel(y_title)
+        axis.grid(alpha=0.3)
+    return plot_uri(figure)
 
 
 def _provenance(validation: DragValidation, command: str) -> list[tuple[str, str]]:

@@ -10,8 +10,7 @@ import numpy as np
 
 from calibrate.calibration import Calibration
 from calibrate.compare.field import SIZE_PX, Field
-from calibrate.compare.presses import prepare_press
-from calibrate.compare.simulate import brush_of
+from calibrate.compare.images import brush_of, prepare_press
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.fit.fit import Grid, Pressed
 from calibrate.session import calibration_of

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibrate.compare.scales import DRAG_MM_PER_PX, MM_PER_PX
+from calibrate.compare import MM_PER_PX
 from sessions.terminal import say
 
 if TYPE_CHECKING:
@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
     from calibrate.fit.captures import Captures
     from calibrate.fit.run import Correction, Fitted
+
+DRAG_MM_PER_PX = 0.6
+"""Scale of the images that strokes that travel are fitted to."""
 
 
 def fit(
@@ -61,7 +64,7 @@ def _fit_drags(session: Path, mm_per_px: float, calibration: Path | None) -> Non
 
     from calibrate.drags.captures import read_drags
     from calibrate.drags.run import fit_drawn, save
-    from calibrate.report.wording import source_note
+    from calibrate.report import source_note
     from sessions.reader import Recording
 
     drawn = read_drags(session, mm_per_px, calibration)
@@ -92,7 +95,7 @@ def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
 
     from calibrate.fit.fit import WORST_CONDITION
     from calibrate.fit.run import NAMES
-    from calibrate.report.wording import source_note
+    from calibrate.report import source_note
     from model.fitted import PARAMETERS
 
     artefact = fitted.artefact

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calibrate.artefact import FittedValue, put_to_use
 from calibrate.compare.field import Alignment, Field, Tone
-from calibrate.compare.simulate import simulated
+from calibrate.compare.images import simulated
 from calibrate.errors import CalibrationError
 from calibrate.fit.artefact import FOLDER, BrushFit, FittedStage
 from calibrate.fit.captures import Captures

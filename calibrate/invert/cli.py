@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calibrate.compare.scales import MM_PER_PX
+from calibrate.compare import MM_PER_PX
 from sessions.terminal import say
 
 

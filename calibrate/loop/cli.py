@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calibrate.compare.scales import MM_PER_PX
+from calibrate.compare import MM_PER_PX
 from sessions.terminal import say
 
 
@@ -29,8 +29,8 @@ def compare(
     from calibrate.loop.report import PICTURE, summary, write_loop
 
     check_folder(out)
-    closed = compare_sessions(original, again, fit, Field(mm_per_px=mm_per_px))
-    report = write_loop(closed, out, " ".join(["brushloop", *sys.argv[1:]]))
-    for line in summary(closed):
+    loop = compare_sessions(original, again, fit, Field(mm_per_px=mm_per_px))
+    report = write_loop(loop, out, " ".join(["brushloop", *sys.argv[1:]]))
+    for line in summary(loop):
         say(line)
     say(f"Picture: {out / PICTURE}", f"Report:  {report}")

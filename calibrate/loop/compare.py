@@ -1,32 +1,45 @@
-"""A session and the session that pressed its strokes again, from their recordings to the verdict."""
+"""A session and the session that pressed its strokes again: paired by name, laid on the same fields, and scored."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from calibrate.artefact import load_artefact
 from calibrate.calibration import Calibration
-from calibrate.compare.field import Field
-from calibrate.compare.simulate import brush_of
-from calibrate.errors import CalibrationError
+from calibrate.compare.field import KEYS, Field
+from calibrate.compare.images import brush_of, captured_images, prepare_press, simulated
+from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.fit.artefact import BrushFit
-from calibrate.loop.pairs import Paired, Side, pair_up
-from calibrate.loop.scores import PairScore, Verdict, score_pairs, verdicts
-from calibrate.loop.table import Table1Row, table_1
+from calibrate.loop.scores import CapturedPress, Pair, PairScore, Table1Row, Verdict, score_pairs, table_1, verdicts
 from calibrate.session import calibration_of
+from calibrate.stroke.measure import measure
+from calibrate.stroke.params import Params
+from model.ccdbsm import DomainError
 from model.fitted_shape import fitted_model
 from model.protocol import StrokeModel
 from model.registry import stroke_model
-from sessions.reader import Recording
+from sessions.errors import SessionDamaged
+from sessions.reader import Capture, Recording
 from sessions.recording.schemas import Header, Source
 
 
 @dataclass(frozen=True, slots=True)
-class Half:
+class Pairs:
+    """Every pair, every original, and what could not be used."""
+
+    pairs: list[Pair] = field(default_factory=list[Pair])
+    originals: dict[str, CapturedPress] = field(default_factory=dict[str, CapturedPress])
+    refused: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    """(stroke, why), never dropped in silence."""
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedSession:
     """One of the two sessions."""
 
     header: Header
@@ -36,42 +49,40 @@ class Half:
 
 
 @dataclass(frozen=True, slots=True)
-class Closed:
-    """The loop, closed."""
+class LoopComparison:
+    """What came of pressing a session's strokes again."""
 
-    original: Half
-    again: Half
+    original: ComparedSession
+    again: ComparedSession
     model: str
     """What recovered, or is taken to have recovered, depth and tilt, and drew the images between."""
     in_sample: bool
     """Whether that model was fitted to the original presses themselves."""
     field: Field
-    paired: Paired
+    paired: Pairs
     scores: list[PairScore]
     table: list[Table1Row]
     verdicts: list[Verdict]
     software: str
 
 
-def compare_sessions(original: Path, again: Path, fit: Path | None, view: Field) -> Closed:
+def compare_sessions(original: Path, again: Path, fit: Path | None, view: Field) -> LoopComparison:
     """Compare pair by pair. Raises `CalibrationError` where the two do not belong together."""
     first, second = Recording(original), Recording(again)
     loopback = [one.header.source == Source.LOOPBACK for one in (first, second)]
     if loopback[0] != loopback[1]:
         raise CalibrationError(str(second.path), f"is {second.header.source}, the original {first.header.source}")
-    of = _replayed(second.header)
-    if of != first.header.session_id:
-        told = "is no replay" if of is None else f"repeats {of}"
-        raise CalibrationError(str(second.path), f"{told}, not {first.header.session_id}")
+    repeated = _replayed(second.header)
+    if repeated != first.header.session_id:
+        what = "is no replay" if repeated is None else f"repeats {repeated}"
+        raise CalibrationError(str(second.path), f"{what}, not {first.header.session_id}")
     model, fitted_to = _model(first.header, fit)
-    (one, captured), (other, repeated) = _half(first), _half(second)
-    paired = pair_up(captured, repeated, model, view)
+    one, other = _opened(first), _opened(second)
+    paired = pair_up(first.captures(), one.calibration, second.captures(), other.calibration, model, view)
     if not paired.pairs:
         why = f": {paired.refused[0][0]}: {paired.refused[0][1]}" if paired.refused else ""
         raise CalibrationError(str(second.path), f"not one pair can be compared{why}")
-    scores = score_pairs(paired)
-    software = f"brushloop {version('brushloop')}"
-    in_sample = fitted_to == one.sha256
+    scores = score_pairs(paired.pairs, paired.originals.values())
     table = table_1(
         scores,
         source=other.header.source,
@@ -79,23 +90,85 @@ def compare_sessions(original: Path, again: Path, fit: Path | None, view: Field)
         again=other.header.session_id,
         model=model.label,
     )
-    return Closed(one, other, model.label, in_sample, view, paired, scores, table, verdicts(scores), software)
+    return LoopComparison(
+        one,
+        other,
+        model.label,
+        fitted_to == one.sha256,
+        view,
+        paired,
+        scores,
+        table,
+        verdicts(scores),
+        f"brushloop {version('brushloop')}",
+    )
 
 
-def _half(recording: Recording) -> tuple[Half, Side]:
-    digest = recording.sha256
+def pair_up(
+    original: Iterator[Capture],
+    original_calibration: Calibration | None,
+    again: Iterator[Capture],
+    again_calibration: Calibration | None,
+    model: StrokeModel,
+    view: Field,
+) -> Pairs:
+    """Pair captures by `again_of`. Originals that were not pressed again are listed as refused."""
+    found = Pairs()
+    for press, _ in _presses(original, original_calibration, view, found.refused):
+        if press.stroke_id in found.originals:
+            found.refused.append((press.stroke_id, "its name stands for two strokes: the first is used"))
+        else:
+            found.originals[press.stroke_id] = press
+    repeated: set[str] = set()
+    for press, of in _presses(again, again_calibration, view, found.refused):
+        if of is None or of not in found.originals:
+            why = "repeats no stroke" if of is None else f"repeats {of}, which is not there or cannot be used"
+            found.refused.append((press.stroke_id, why))
+            continue
+        try:
+            images = {key: simulated(model, press.height_mm, press.tilt_deg, *key, view) for key in KEYS}
+        except DomainError as error:
+            found.refused.append((press.stroke_id, f"the model does not predict it: {error}"))
+            continue
+        repeated.add(of)
+        found.pairs.append(Pair(found.originals[of], press, images))
+    found.refused.extend((name, "was not pressed again") for name in found.originals if name not in repeated)
+    return found
+
+
+def _presses(
+    captures: Iterator[Capture], calibration: Calibration | None, view: Field, refused: list[tuple[str, str]]
+) -> Iterator[tuple[CapturedPress, str | None]]:
+    """(press, the stroke it repeats) of every capture that can be used; the others go to `refused`."""
+    params = Params(**calibration.preprocess) if calibration else Params()
+    for capture in captures:
+        stroke = capture.stroke
+        if stroke.height_mm is None or stroke.tilt_deg is None:
+            refused.append((stroke.stroke_id, "has no depth or tilt"))
+            continue
+        try:
+            prepared = prepare_press(capture, calibration, params, view)
+            images = captured_images(stroke.stroke_id, prepared)
+        except (CaptureRefused, SessionDamaged) as error:
+            refused.append((stroke.stroke_id, error.what))
+            continue
+        measured = measure(prepared.mask)
+        yield CapturedPress(stroke.stroke_id, stroke.height_mm, stroke.tilt_deg, measured, images), stroke.again_of
+
+
+def _opened(recording: Recording) -> ComparedSession:
     strokes = list(recording.stroke_records())
     if not strokes or any(stroke.kind != "press" for stroke in strokes):
         raise CalibrationError(str(recording.path), "holds no presses, or drags too: only presses are compared")
-    calibration = calibration_of(recording, strokes[0], digest, None)
-    return Half(recording.header, recording.path, digest, calibration), Side(recording.captures(), calibration)
+    calibration = calibration_of(recording, strokes[0], recording.sha256, None)
+    return ComparedSession(recording.header, recording.path, recording.sha256, calibration)
 
 
 def _replayed(header: Header) -> str | None:
     """The session that a replay protocol repeats; None for any other."""
     try:
-        told: Any = json.loads(header.protocol)
-        return str(told["of"]) if told["kind"] == "replay" else None
+        protocol: Any = json.loads(header.protocol)
+        return str(protocol["of"]) if protocol["kind"] == "replay" else None
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
 
@@ -104,5 +177,5 @@ def _model(header: Header, fit: Path | None) -> tuple[StrokeModel, str]:
     """The model and the digest of the recording that it was fitted to, empty for none."""
     if fit is None:
         return stroke_model("ccd-bsm", brush_of(header)), ""
-    made = load_artefact(fit, BrushFit)
-    return fitted_model(made.press(), f"CCD-BSM fitted on {made.session_id}"), made.recording_sha256
+    artefact = load_artefact(fit, BrushFit)
+    return fitted_model(artefact.press(), f"CCD-BSM fitted on {artefact.session_id}"), artefact.recording_sha256

@@ -2,170 +2,220 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import platform
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from calibrate.compare.field import Alignment, Tone
-from calibrate.compare.similarity import SSIM_SETTINGS
-from calibrate.files import write_whole
-from calibrate.loop.compare import Closed, Half
-from calibrate.loop.images import KEYS
-from calibrate.loop.picture import draw
-from calibrate.loop.scores import AGAIN, GOAL_POINTS, PairScore
-from calibrate.loop.table import FILE as NUMBERS
-from calibrate.loop.table import PAPER_ROBOT, LoopRecord, Table1Row
-from calibrate.report.pages import render
-from calibrate.report.pictures import difference, ink
-from calibrate.report.wording import source_note
-from sessions.cells import CsvWriter
+import numpy as np
 
-HEADLINE = (Alignment.MM, Tone.BINARY)
+from calibrate.compare.field import KEYS, Alignment, Tone
+from calibrate.compare.paper import ROBOT_WRITING, TABLE_1
+from calibrate.compare.similarity import SSIM_SETTINGS
+from calibrate.loop.compare import ComparedSession, LoopComparison
+from calibrate.loop.scores import AGAIN, GOAL_POINTS, LoopRecord, Pair, PairScore, Table1Row
+from calibrate.loop.scores import FILE as NUMBERS
+from calibrate.report import (
+    csv_text,
+    ink_uri,
+    overlay,
+    overlay_uri,
+    picture_grid,
+    png_uri,
+    render,
+    save_picture,
+    show_picture,
+    source_note,
+    write_files,
+)
+
+HEADLINE, GRAY = (Alignment.MM, Tone.BINARY), (Alignment.MM, Tone.GRAY)
 PICTURE, PAGE, TABLE = "loop.png", "loop.html", "loop.csv"
 SHEET_ROWS = slice(32, 96)
+"""The middle half: a press is at most half as thick as the field is high."""
+MAX_PICTURE_ROWS = 12
 MAX_PAIRS_SHOWN = 150
 
 
-def write_loop(closed: Closed, folder: Path, command: str) -> Path:
+def write_loop(loop: LoopComparison, folder: Path, command: str) -> Path:
     """Write the report's files into `folder`; returns the page's path. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
-    draw(closed, folder / PICTURE)
+    draw(loop, folder / PICTURE)
+    header, source = loop.original.header, loop.again.header.source
+    paper = TABLE_1[ROBOT_WRITING]
     page = render(
         "loop.html.j2",
-        header=closed.original.header,
-        again=closed.again.header,
-        source=closed.again.header.source,
-        note=source_note(closed.again.header.source),
-        model=closed.model,
-        in_sample=closed.in_sample,
+        header=header,
+        again=loop.again.header,
+        source=source,
+        note=source_note(source),
+        model=loop.model,
+        in_sample=loop.in_sample,
         goal=f"{GOAL_POINTS:g}",
-        pairs=len(closed.paired.pairs),
-        answer=answer(closed),
-        verdicts=closed.verdicts,
-        tables=_tables(closed.table),
-        paper=PAPER_ROBOT,
-        rows=_rows(closed),
-        refused=closed.paired.refused,
-        field=closed.field,
+        pairs=len(loop.paired.pairs),
+        answer=answer(loop),
+        verdicts=loop.verdicts,
+        tables=_tables(loop.table),
+        paper=(paper.csim, paper.ssim),
+        rows=_rows(loop),
+        refused=loop.paired.refused,
+        field=loop.field,
         ssim_settings=SSIM_SETTINGS,
-        picture="data:image/png;base64," + base64.b64encode((folder / PICTURE).read_bytes()).decode(),
-        provenance=list(_provenance(closed, command)),
+        picture=png_uri((folder / PICTURE).read_bytes()),
+        provenance=list(_provenance(loop, command)),
     )
-    write_whole(folder / TABLE, loop_csv(closed.scores, closed.again.header.source))
-    write_whole(folder / NUMBERS, record_of(closed, command).to_json())
-    write_whole(folder / PAGE, page)
+    record = record_of(loop, command)
+    write_files(folder, {TABLE: loop_csv(loop.scores, source), NUMBERS: record.to_json(), PAGE: page})
     return folder / PAGE
 
 
-def answer(closed: Closed) -> str:
+def answer(loop: LoopComparison) -> str:
     """What came out, in one sentence."""
-    if not closed.verdicts:
+    if not loop.verdicts:
         return "No cell of the original session was pressed twice, so its repeatability is not known."
-    failed = [v for v in closed.verdicts if not v.holds]
-    least = min(closed.verdicts, key=lambda v: v.difference)
+    failed = [v for v in loop.verdicts if not v.holds]
+    least = min(loop.verdicts, key=lambda v: v.difference)
     where = f"{least.measure.upper()}, {least.alignment}, {least.tone}"
     if not failed:
         return (
             f"The re-pressed strokes are as like their originals as the brush's own presses are to each other, or less "
-            f"than {GOAL_POINTS:g} point behind, in all {len(closed.verdicts)} comparisons "
+            f"than {GOAL_POINTS:g} point behind, in all {len(loop.verdicts)} comparisons "
             f"(least: {least.difference:+.2f} points, {where})."
         )
     return (
-        f"In {len(failed)} of {len(closed.verdicts)} comparisons the re-pressed strokes are more than {GOAL_POINTS:g} "
+        f"In {len(failed)} of {len(loop.verdicts)} comparisons the re-pressed strokes are more than {GOAL_POINTS:g} "
         f"point less like their originals than other presses of the same cell are (least: {least.difference:+.2f} "
         f"points, {where})."
     )
 
 
-def summary(closed: Closed) -> Iterator[str]:
+def summary(loop: LoopComparison) -> Iterator[str]:
     """Lines for the terminal."""
-    source = closed.again.header.source
-    yield f"{len(closed.paired.pairs)} presses made again, {len(closed.paired.refused)} not compared ({source})"
+    source = loop.again.header.source
+    yield f"{len(loop.paired.pairs)} presses made again, {len(loop.paired.refused)} not compared ({source})"
     for alignment, tone in KEYS:
-        rows = [row for row in closed.table if (row.alignment, row.tone) == (alignment, tone)]
+        rows = [row for row in loop.table if (row.alignment, row.tone) == (alignment, tone)]
         parts = "; ".join(f"{row.what} {row.csim[2]:.2f} / {row.ssim[2]:.2f}" for row in rows)
         yield f"{alignment}, {tone}, CSIM / SSIM: {parts}"
-    yield answer(closed)
+    yield answer(loop)
 
 
 def loop_csv(scores: list[PairScore], source: str) -> str:
-    """A row for every contestant against every original."""
-    out = io.StringIO()
-    writer = CsvWriter(out)
-    columns = ["original", "again", "height_mm", "tilt_deg", "what", "alignment", "tone", "csim", "ssim", "source"]
-    writer.writerow(columns)
-    for s in scores:
-        values = (f"{s.csim:.6f}", f"{s.ssim:.6f}", source)
-        writer.writerow([s.original, s.again, *s.cell, s.what, s.alignment, s.tone, *values])
-    return out.getvalue()
+    """A row for every comparison with every original."""
+    head = ["original", "again", "height_mm", "tilt_deg", "what", "alignment", "tone", "csim", "ssim", "source"]
+    rows = (
+        (s.original, s.again, *s.cell, s.what, s.alignment, s.tone, f"{s.csim:.6f}", f"{s.ssim:.6f}", source)
+        for s in scores
+    )
+    return csv_text(head, rows)
 
 
-def record_of(closed: Closed, command: str) -> LoopRecord:
+def record_of(loop: LoopComparison, command: str) -> LoopRecord:
     """Everything but the images and the single scores, with its digest."""
     return LoopRecord(
-        source=closed.again.header.source,
-        original=closed.original.header.session_id,
-        original_sha256=closed.original.sha256,
-        again=closed.again.header.session_id,
-        again_sha256=closed.again.sha256,
-        model=closed.model,
-        in_sample=closed.in_sample,
-        mm_per_px=closed.field.mm_per_px,
-        pairs=len(closed.paired.pairs),
+        source=loop.again.header.source,
+        original=loop.original.header.session_id,
+        original_sha256=loop.original.sha256,
+        again=loop.again.header.session_id,
+        again_sha256=loop.again.sha256,
+        model=loop.model,
+        in_sample=loop.in_sample,
+        mm_per_px=loop.field.mm_per_px,
+        pairs=len(loop.paired.pairs),
         goal_points=GOAL_POINTS,
-        table_1=tuple(closed.table),
-        verdicts=tuple(closed.verdicts),
-        refused=tuple(closed.paired.refused),
-        software=closed.software,
+        table_1=tuple(loop.table),
+        verdicts=tuple(loop.verdicts),
+        refused=tuple(loop.paired.refused),
+        software=loop.software,
         command=command,
     ).sealed()
 
 
+def draw(loop: LoopComparison, path: Path) -> None:
+    """A row a pair: original, recovered and simulated, re-pressed, and original under re-pressed. Raises OSError."""
+    pairs = _in_picture(loop)
+    scores = _again_scores(loop)
+    title = f"{loop.original.header.session_id}, pressed again ({loop.again.header.source})"
+    figure, rows = picture_grid(len(pairs), 4, (10.0, 0.6 + 1.35 * len(pairs)), title)
+    side = loop.field.side_mm
+    extent = (0.0, side, 0.25 * side, 0.75 * side)
+    for pair, axes in zip(pairs, rows, strict=True):
+        original, again = pair.original, pair.again
+        score = scores[again.stroke_id]
+        titles = (
+            f"{original.stroke_id}: H {original.height_mm:g} mm, alpha {original.tilt_deg:g} deg",
+            f"recovered: H {again.height_mm:.2f} mm, alpha {again.tilt_deg:.1f} deg",
+            f"re-pressed: CSIM {score.csim:.3f}, SSIM {score.ssim:.3f}",
+            "gray both, orange original only, blue again only",
+        )
+        images = _gray_images(pair)
+        images.append(overlay(images[0], images[2]))
+        for axis, image, text in zip(axes, images, titles, strict=True):
+            show_picture(axis, image, text, fontsize=7, extent=extent)
+    save_picture(figure, path)
+
+
+def _in_picture(loop: LoopComparison) -> list[Pair]:
+    """At most `MAX_PICTURE_ROWS` pairs by depth and tilt, evenly over all of them, the worst among them."""
+    pairs = sorted(loop.paired.pairs, key=lambda p: (*p.original.cell, p.again.stroke_id))
+    if len(pairs) <= MAX_PICTURE_ROWS:
+        return pairs
+    worst = min((s for s in loop.scores if (s.what, s.alignment, s.tone) == (AGAIN, *GRAY)), key=lambda s: s.csim)
+    chosen = {round(k) for k in np.linspace(0, len(pairs) - 1, MAX_PICTURE_ROWS - 1)}
+    chosen |= {k for k, pair in enumerate(pairs) if pair.again.stroke_id == worst.again}
+    return [pairs[k] for k in sorted(chosen)]
+
+
+def _again_scores(loop: LoopComparison) -> dict[str, PairScore]:
+    """Score of each repetition, strictly compared, by its name."""
+    return {s.again: s for s in loop.scores if (s.what, s.alignment, s.tone) == (AGAIN, *HEADLINE)}
+
+
+def _gray_images(pair: Pair) -> list[Any]:
+    """Original, simulated and re-pressed, the middle of each field."""
+    return [image[GRAY][SHEET_ROWS] for image in (pair.original.images, pair.simulated, pair.again.images)]
+
+
 def _tables(rows: list[Table1Row]) -> list[dict[str, Any]]:
-    """A table an alignment and tone."""
+    """A table for each alignment and tone."""
     return [
         {"alignment": key[0], "tone": key[1], "rows": [row for row in rows if (row.alignment, row.tone) == key]}
         for key in KEYS
     ]
 
 
-def _rows(closed: Closed) -> list[dict[str, Any]]:
-    gray = (Alignment.MM, Tone.GRAY)
-    chosen = {s.again: s for s in closed.scores if (s.what, s.alignment, s.tone) == (AGAIN, *HEADLINE)}
-    pairs = sorted(closed.paired.pairs, key=lambda p: chosen[p.again.stroke_id].csim)
-    out: list[dict[str, Any]] = []
+def _rows(loop: LoopComparison) -> list[dict[str, Any]]:
+    scores = _again_scores(loop)
+    pairs = sorted(loop.paired.pairs, key=lambda p: scores[p.again.stroke_id].csim)
+    rows: list[dict[str, Any]] = []
     for pair in pairs[:MAX_PAIRS_SHOWN]:
-        images = [
-            image[SHEET_ROWS] for image in (pair.original.images[gray], pair.simulated[gray], pair.again.images[gray])
-        ]
-        out.append(
+        images = _gray_images(pair)
+        rows.append(
             {
                 "original": pair.original,
                 "again": pair.again,
-                "score": chosen[pair.again.stroke_id],
-                "images": [ink(image) for image in images],
-                "difference": difference(images[0], images[2]),
+                "score": scores[pair.again.stroke_id],
+                "images": [ink_uri(image) for image in images],
+                "difference": overlay_uri(images[0], images[2]),
             }
         )
-    return out
+    return rows
 
 
-def _provenance(closed: Closed, command: str) -> Iterator[tuple[str, str]]:
-    for name, half in (("original", closed.original), ("re-pressed", closed.again)):
-        yield from _of_half(name, half)
-    header = closed.again.header
+def _provenance(loop: LoopComparison, command: str) -> Iterator[tuple[str, str]]:
+    for name, session in (("original", loop.original), ("re-pressed", loop.again)):
+        yield from _of_session(name, session)
+    header = loop.again.header
     yield "robot", f"{header.robot} {header.robot_firmware}".strip()
     yield "brush, ink, paper", ", ".join(part for part in (header.brush, header.ink, header.paper) if part)
-    yield "recovered by", closed.model
-    yield "compared with", f"{closed.software}, Python {platform.python_version()}"
+    yield "recovered by", loop.model
+    yield "compared with", f"{loop.software}, Python {platform.python_version()}"
     yield "command", command
 
 
-def _of_half(name: str, half: Half) -> Iterator[tuple[str, str]]:
-    yield f"{name}, source", str(half.header.source)
-    yield f"{name}, recording", f"{half.recording.name}, sha256 {half.sha256}"
-    if half.calibration is not None:
-        yield f"{name}, calibration", f"{half.calibration.named}, pix2len {half.calibration.mm_per_px:.5f} mm/px"
+def _of_session(name: str, session: ComparedSession) -> Iterator[tuple[str, str]]:
+    yield f"{name}, source", str(session.header.source)
+    yield f"{name}, recording", f"{session.recording.name}, sha256 {session.sha256}"
+    if session.calibration is not None:
+        calibration = session.calibration
+        yield f"{name}, calibration", f"{calibration.named}, pix2len {calibration.mm_per_px:.5f} mm/px"

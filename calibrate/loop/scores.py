@@ -1,27 +1,62 @@
-"""How alike a press and its repetition are, beside how alike the brush makes any two presses of one (H, alpha)."""
+"""How alike a press and its repetition are, beside any two presses of one (H, alpha): Table 1's third row as data."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
-from calibrate.compare.field import Alignment, Image, Tone
-from calibrate.loop.images import KEYS, Seen, similarity
-from calibrate.loop.pairs import Pair, Paired
+from calibrate.compare.field import KEYS, Alignment, Image, Key, Tone
+from calibrate.compare.paper import ROBOT_WRITING, TABLE_1, Triple
+from calibrate.compare.similarity import similarity
+from calibrate.compare.stats import Summary, interval_over_groups, summarise
+from calibrate.report import Sealed, load_sealed
+from calibrate.stroke.measure import Measured
+from sessions.recording.schemas import Source
 
+FILE = "loop.json"
+FORMAT = "brushloop-loop-1"
+MAX_BYTES = 8 * 1024 * 1024
 AGAIN, SIMULATED, ANOTHER = "re-pressed", "recovered, simulated", "another press"
-"""The contestants: the repetition, the model's image of it, and each other original of the same commanded cell."""
+"""What is compared with an original: its repetition, the model's image of it, other originals of the same cell."""
 GOAL_POINTS = 1.0
 """By how much the re-pressed strokes may score less than the originals' own repeatability."""
-DRAWS, SEED = 2000, 0
-LEAST_CELLS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class CapturedPress:
+    """A press that can be compared; depth and tilt as commanded."""
+
+    stroke_id: str
+    height_mm: float
+    tilt_deg: float
+    measured: Measured
+    images: dict[Key, Image]
+    """(128, 128) each."""
+
+    @property
+    def cell(self) -> tuple[float, float]:
+        """H and alpha as commanded."""
+        return self.height_mm, self.tilt_deg
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """One stroke twice. Depth and tilt of `original` are as commanded, those of `again` as recovered."""
+
+    original: CapturedPress
+    again: CapturedPress
+    simulated: dict[Key, Image]
+    """The model's press at the recovered depth and tilt, (128, 128) each."""
 
 
 @dataclass(frozen=True, slots=True)
 class PairScore:
-    """One contestant against one original."""
+    """One comparison with one original."""
 
     original: str
     again: str
@@ -32,17 +67,6 @@ class PairScore:
     tone: Tone
     csim: float
     ssim: float
-
-
-@dataclass(frozen=True, slots=True)
-class Statistics:
-    """In percent."""
-
-    n: int
-    max: float
-    min: float
-    avg: float
-    median: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,69 +94,156 @@ class Verdict:
         return bound is not None and (bound >= -GOAL_POINTS) == self.holds
 
 
-def score_pairs(paired: Paired) -> list[PairScore]:
-    """Every contestant against every original that was pressed again, in each alignment and tone."""
-    cells: dict[tuple[float, float], list[Seen]] = {}
-    for stroke in paired.originals.values():
-        cells.setdefault((stroke.height_mm, stroke.tilt_deg), []).append(stroke)
-    out: list[PairScore] = []
-    for pair in paired.pairs:
-        cell = (pair.original.height_mm, pair.original.tilt_deg)
-        others = [one for one in cells[cell] if one is not pair.original]
+class Table1Row(BaseModel):
+    """Over the presses that were made again, in percent."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    source: Source
+    """`loopback rig` or `real capture`."""
+    original: str
+    again: str
+    """Session ids."""
+    model: str
+    """What recovered depth and tilt."""
+    what: str
+    """`re-pressed`, `another press` or `recovered, simulated`."""
+    alignment: Alignment
+    tone: Tone
+    n: Annotated[int, Field(ge=1)]
+    csim: Triple
+    ssim: Triple
+    csim_median: float
+    ssim_median: float
+    paper_csim: Triple | None = None
+    paper_ssim: Triple | None = None
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """Max, min, avg and median of CSIM, then of SSIM."""
+        return (*self.csim, self.csim_median, *self.ssim, self.ssim_median)
+
+
+class LoopRecord(Sealed):
+    """A closed loop as its `loop.json` holds it: everything but the images and the single scores."""
+
+    FORMAT: ClassVar[str] = FORMAT
+    MADE_BY: ClassVar[str] = "brushloop loop compare"
+
+    format: str = FORMAT
+    source: Source
+    """Of the session that pressed again."""
+    original: str
+    original_sha256: str
+    again: str
+    again_sha256: str
+    """Session ids, and of their recordings."""
+    model: str
+    in_sample: bool
+    """Whether that model was fitted to the original presses themselves."""
+    mm_per_px: float
+    """Scale of the millimetre field."""
+    pairs: int
+    goal_points: float
+    table_1: tuple[Table1Row, ...]
+    verdicts: tuple[Verdict, ...]
+    refused: tuple[tuple[str, str], ...]
+    """(stroke, why)."""
+    software: str
+    command: str
+
+    def row(self, what: str, alignment: Alignment, tone: Tone) -> Table1Row | None:
+        """One row of the table, or None if nothing was compared in this way."""
+        for one in self.table_1:
+            if (one.what, one.alignment, one.tone) == (what, alignment, tone):
+                return one
+        return None
+
+
+def read_loop(path: Path) -> LoopRecord:
+    """A `loop.json`, or the one in a loop's folder. Raises `CalibrationError` if it is not one, or was edited."""
+    return load_sealed(path / FILE if path.is_dir() else path, LoopRecord, MAX_BYTES)
+
+
+def score_pairs(pairs: Sequence[Pair], originals: Iterable[CapturedPress]) -> list[PairScore]:
+    """Score repetition, simulation and other presses of the cell against each original that was pressed again."""
+    cells: dict[tuple[float, float], list[CapturedPress]] = {}
+    for press in originals:
+        cells.setdefault(press.cell, []).append(press)
+    scores: list[PairScore] = []
+    for pair in pairs:
+        others = [one for one in cells[pair.original.cell] if one is not pair.original]
         for key in KEYS:
             against = {AGAIN: [pair.again.images[key]], SIMULATED: [pair.simulated[key]]}
             against[ANOTHER] = [one.images[key] for one in others]
-            out += [_score(pair, cell, what, key, images) for what, images in against.items() if images]
-    return out
+            scores += [_score(pair, what, key, images) for what, images in against.items() if images]
+    return scores
 
 
-def statistics(scores: Sequence[PairScore], what: str, alignment: Alignment, tone: Tone, of: str) -> Statistics | None:
-    """Of `csim` or `ssim`; None where there is no such score."""
-    found = [getattr(s, of) for s in scores if (s.what, s.alignment, s.tone) == (what, alignment, tone)]
-    if not found:
-        return None
-    percent = 100.0 * np.asarray(found)
-    most, least, mean = float(percent.max()), float(percent.min()), float(percent.mean())
-    return Statistics(len(found), most, least, mean, float(np.median(percent)))
+def _score(pair: Pair, what: str, key: Key, images: list[Image]) -> PairScore:
+    alignment, tone = key
+    original = pair.original
+    csim, ssim = np.mean([similarity(original.images[key], image, alignment) for image in images], axis=0)
+    return PairScore(
+        original.stroke_id, pair.again.stroke_id, original.cell, what, alignment, tone, float(csim), float(ssim)
+    )
+
+
+def summary_of(scores: Sequence[PairScore], what: str, key: Key, measure: str) -> Summary | None:
+    """Of `csim` or `ssim` in percent; None where there is no such score."""
+    found = [getattr(s, measure) for s in scores if (s.what, s.alignment, s.tone) == (what, *key)]
+    return summarise(100.0 * np.asarray(found))
+
+
+def table_1(scores: Sequence[PairScore], *, source: Source, original: str, again: str, model: str) -> list[Table1Row]:
+    """The rows in the order of `KEYS`; the paper's numbers stand beside the re-pressed ones."""
+    paper = TABLE_1[ROBOT_WRITING]
+    rows: list[Table1Row] = []
+    for key in KEYS:
+        for what in (AGAIN, ANOTHER, SIMULATED):
+            csim, ssim = (summary_of(scores, what, key, measure) for measure in ("csim", "ssim"))
+            if csim is None or ssim is None:
+                continue
+            rows.append(
+                Table1Row(
+                    source=source,
+                    original=original,
+                    again=again,
+                    model=model,
+                    what=what,
+                    alignment=key[0],
+                    tone=key[1],
+                    n=csim.n,
+                    csim=csim.range_and_avg,
+                    ssim=ssim.range_and_avg,
+                    csim_median=csim.median,
+                    ssim_median=ssim.median,
+                    paper_csim=paper.csim if what == AGAIN else None,
+                    paper_ssim=paper.ssim if what == AGAIN else None,
+                )
+            )
+    return rows
 
 
 def verdicts(scores: Sequence[PairScore]) -> list[Verdict]:
     """One for each alignment, tone and measure; none where no cell was pressed twice."""
-    return [made for key in KEYS for of in ("csim", "ssim") if (made := _verdict(scores, *key, of)) is not None]
+    return [found for key in KEYS for of in ("csim", "ssim") if (found := _verdict(scores, key, of)) is not None]
 
 
-def _score(
-    pair: Pair, cell: tuple[float, float], what: str, key: tuple[Alignment, Tone], images: list[Image]
-) -> PairScore:
-    found = np.mean([similarity(pair.original.images[key], image, key[0]) for image in images], axis=0)
-    alignment, tone = key
-    original, again = pair.original.stroke_id, pair.again.stroke_id
-    return PairScore(original, again, cell, what, alignment, tone, float(found[0]), float(found[1]))
+def _verdict(scores: Sequence[PairScore], key: Key, measure: str) -> Verdict | None:
+    def percent(what: str) -> dict[str, float]:
+        chosen = (s for s in scores if (s.what, s.alignment, s.tone) == (what, *key))
+        return {s.again: 100.0 * getattr(s, measure) for s in chosen}
 
-
-def _verdict(scores: Sequence[PairScore], alignment: Alignment, tone: Tone, of: str) -> Verdict | None:
-    def values(what: str) -> dict[str, tuple[tuple[float, float], float]]:
-        chosen = (s for s in scores if (s.what, s.alignment, s.tone) == (what, alignment, tone))
-        return {s.again: (s.cell, 100.0 * getattr(s, of)) for s in chosen}
-
-    again, another = values(AGAIN), values(ANOTHER)
+    again, another = percent(AGAIN), percent(ANOTHER)
     both = [name for name in again if name in another]
     if not both:
         return None
+    cell_of = {s.again: s.cell for s in scores}
     cells: dict[tuple[float, float], list[float]] = {}
     for name in both:
-        cells.setdefault(again[name][0], []).append(again[name][1] - another[name][1])
+        cells.setdefault(cell_of[name], []).append(again[name] - another[name])
     difference = float(np.mean([value for cell in cells.values() for value in cell]))
-    low, high = bootstrap(list(cells.values()))
-    ours, theirs = (float(np.mean([table[name][1] for name in both])) for table in (again, another))
-    return Verdict(alignment, tone, of, ours, theirs, difference, low, high, len(both), difference >= -GOAL_POINTS)
-
-
-def bootstrap(groups: Sequence[Sequence[float]]) -> tuple[float | None, float | None]:
-    """95 % interval of the mean of all values, whole groups drawn with replacement; (None, None) for too few groups."""
-    if len(groups) < LEAST_CELLS:
-        return None, None
-    sums, counts = np.array([sum(group) for group in groups]), np.array([len(group) for group in groups])
-    drawn = np.random.default_rng(SEED).integers(len(groups), size=(DRAWS, len(groups)))
-    low, high = np.percentile(sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1), [2.5, 97.5])
-    return float(low), float(high)
+    low, high = interval_over_groups(list(cells.values())) or (None, None)
+    ours, theirs = (float(np.mean([values[name] for name in both])) for values in (again, another))
+    return Verdict(*key, measure, ours, theirs, difference, low, high, len(both), difference >= -GOAL_POINTS)

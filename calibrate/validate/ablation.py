@@ -10,22 +10,20 @@ from typing import Any
 import numpy as np
 
 from calibrate.compare.field import KEYS, Alignment, Tone
-from calibrate.compare.images import pack
-from calibrate.compare.simulate import brush_of, simulated_pixels
+from calibrate.compare.images import brush_of, pack, simulated_pixels
 from calibrate.fit.fit import fit_presses
 from calibrate.validate.heldout import RefitJob, bezier_body, bezier_pixels, cropped, fitted_press, press_body
 from calibrate.validate.jobs import ABSENT, VERSION, ScoreJob, score_job
-from calibrate.validate.pool import Scheduler
+from calibrate.validate.pool import Progress, Scheduler
 from calibrate.validate.report.data import Step
 from calibrate.validate.run import CHUNK, Outcome
-from calibrate.validate.steps import Progress
 from model.fitted_shape import fitted_model
 
 COUNTS = (1, 2, 3, 5, 9, 15, 30, 60)
 DRAWS = 2
-"""A fit from few presses depends on which they are; the average of two draws is shown."""
-MOST_SCORED = 200
-LEAST_LEFT = 5
+"""A fit from few presses depends on which they are: the average of two draws is shown."""
+MAX_SCORED = 200
+MIN_LEFT = 5
 JUDGED = KEYS.index((Alignment.MM, Tone.BINARY))
 
 
@@ -68,7 +66,7 @@ def similarity_by_strokes(outcome: Outcome, scheduler: Scheduler, progress: Prog
 
 
 def fit_job(job: RefitJob) -> dict[str, Any]:
-    """As `refit_job`, but from the start: with few strokes the fit itself finds what it can tell."""
+    """Fit as `refit_job` does, but from the start: the fit itself finds what few strokes can determine."""
     strokes, grid = cropped(job)
     press = fit_presses(strokes, grid, job.radius_mm, job.length_mm).press
     return {"fitted": press_body(press), "bezier": bezier_body(strokes, grid)}
@@ -89,8 +87,8 @@ def _trials(outcome: Outcome) -> Iterator[Trial]:
             order = [group[depth] for depth in range(deepest) for group in groups if depth < len(group)]
             for count in COUNTS:
                 left = order[count:]
-                if len(left) >= LEAST_LEFT:
-                    step = max(1, -(-len(left) // MOST_SCORED))
+                if len(left) >= MIN_LEFT:
+                    step = max(1, -(-len(left) // MAX_SCORED))
                     yield Trial(session, count, tuple(order[:count]), tuple(sorted(left[::step])))
 
 

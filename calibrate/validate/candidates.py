@@ -10,25 +10,25 @@ from pathlib import Path
 from typing import Any
 
 from calibrate.compare.field import Field
-from calibrate.compare.images import Pixels
-from calibrate.compare.simulate import brush_of, simulated_pixels
+from calibrate.compare.images import Pixels, brush_of, simulated_pixels
 from calibrate.validate.heldout import Cell, bezier_pixels, fitted_press
-from calibrate.validate.sources import Opened
+from calibrate.validate.sources import LoadedSession
 from model.ccdbsm import Brush, DomainError
-from model.fitted_shape import NAME as FITTED
-from model.fitted_shape import fitted_model
+from model.fitted_shape import NAME, fitted_model
 from model.registry import StrokeModel, stroke_model, stroke_models
 
+FITTED = NAME
 PUBLISHED = "as published"
 HELD_OUT = "fitted, held-out cells"
 FITTED_HELD_OUT, BEZIER_REFITTED = "ccd-bsm-heldout", "bezier-refitted"
 GENERATOR_HELD_OUT = "ccd-bsmg-heldout"
+HELD_OUT_NAMES = (FITTED_HELD_OUT, BEZIER_REFITTED, GENERATOR_HELD_OUT)
 LAMBDAS = {"ccd-bsm-lambda-1": 1.0, "ccd-bsm-lambda-pi/2": 0.5 * math.pi}
-"""Beside lambda = pi, which is CCD-BSM itself: the paper's figure 3."""
+"""Extras lambda = pi, which is CCD-BSM itself: the paper's figure 3."""
 
 
 @dataclass(frozen=True, slots=True)
-class Contender:
+class Candidate:
     """One row of the tables, for one session."""
 
     name: str
@@ -56,7 +56,7 @@ def generator_file(path: Path) -> Generator:
         return Generator(path, hashlib.file_digest(file, "sha256").hexdigest())
 
 
-def closed_forms(session: Opened, view: Field, *, ablations: bool) -> list[Contender]:
+def closed_forms(session: LoadedSession, view: Field, *, ablations: bool) -> list[Candidate]:
     """The registered models of the session's brush, the fitted one, and CCD-BSM at other lambdas."""
     brush = brush_of(session.header)
     made = [_of_model(model, PUBLISHED, view) for model in stroke_models(brush).values()]
@@ -71,11 +71,11 @@ def closed_forms(session: Opened, view: Field, *, ablations: bool) -> list[Conte
     return made
 
 
-def generators(session: Opened, files: Sequence[Generator], view: Field) -> list[Contender]:
+def generators(session: LoadedSession, files: Sequence[Generator], view: Field) -> list[Candidate]:
     """Trained generators, drawn as their traced outlines. Raises what `load_generator` does."""
     from model.train.checkpoint import load_generator
 
-    made: list[Contender] = []
+    made: list[Candidate] = []
     for number, file in enumerate(files):
         model = load_generator(file.path, brush_of(session.header))
         name = (
@@ -86,7 +86,7 @@ def generators(session: Opened, files: Sequence[Generator], view: Field) -> list
     return made
 
 
-def held_out(made: dict[Cell, dict[str, Any]], brush: Brush, view: Field, *, fitted: bool) -> list[Contender]:
+def held_out(made: dict[Cell, dict[str, Any]], brush: Brush, view: Field, *, fitted: bool) -> list[Candidate]:
     """Fits that left out the very cell that they predict; `made` has a finished `refit_job` for each cell."""
 
     def predict_fitted(height_mm: float, tilt_deg: float) -> Pixels:
@@ -97,14 +97,14 @@ def held_out(made: dict[Cell, dict[str, Any]], brush: Brush, view: Field, *, fit
     def predict_bezier(height_mm: float, tilt_deg: float) -> Pixels:
         return bezier_pixels(_of_cell(made, height_mm, tilt_deg, "bezier"), height_mm, tilt_deg, view)
 
-    bezier = Contender(
+    bezier = Candidate(
         BEZIER_REFITTED,
         "Bezier refitted",
         "Two mirrored cubic Bezier curves; ends, belly and shoulder regressed on the captures of all other cells.",
         HELD_OUT,
         predict_bezier,
     )
-    ours = Contender(
+    ours = Candidate(
         FITTED_HELD_OUT,
         "CCD-BSM calibrated",
         "CCD-BSM's lengths with gains, powers, profile and edges fitted to the captures of all other cells.",
@@ -114,7 +114,7 @@ def held_out(made: dict[Cell, dict[str, Any]], brush: Brush, view: Field, *, fit
     return [ours, bezier] if fitted else [bezier]
 
 
-def tuned(files: dict[Cell, Path], brush: Brush, view: Field, number: int) -> Contender:
+def tuned(files: dict[Cell, Path], brush: Brush, view: Field, number: int) -> Candidate:
     """A generator tuned on all cells but the one that it predicts."""
     from model.train.checkpoint import load_generator
 
@@ -126,7 +126,7 @@ def tuned(files: dict[Cell, Path], brush: Brush, view: Field, number: int) -> Co
             loaded[file] = load_generator(file, brush)
         return simulated_pixels(loaded[file], height_mm, tilt_deg, view)
 
-    return Contender(
+    return Candidate(
         GENERATOR_HELD_OUT if number == 0 else f"{GENERATOR_HELD_OUT}-{number + 1}",
         "CCD-BSMG calibrated",
         "The generator, fine-tuned on captures of other cells (left out by fifths) and on images of the CCD-BSM that "
@@ -136,8 +136,8 @@ def tuned(files: dict[Cell, Path], brush: Brush, view: Field, number: int) -> Co
     )
 
 
-def _of_model(model: StrokeModel, basis: str, view: Field, name: str = "", label: str = "") -> Contender:
-    return Contender(
+def _of_model(model: StrokeModel, basis: str, view: Field, name: str = "", label: str = "") -> Candidate:
+    return Candidate(
         name or model.name,
         label or model.label,
         model.definition,
@@ -149,23 +149,5 @@ def _of_model(model: StrokeModel, basis: str, view: Field, name: str = "", label
 def _of_cell(made: dict[Cell, dict[str, Any]], height_mm: float, tilt_deg: float, what: str) -> Any:
     found = made.get((height_mm, tilt_deg), {}).get(what)
     if found is None:
-        raise DomainError("height_mm", height_mm, "other cells", "the other cells do not tell it")
+        raise DomainError("height_mm", height_mm, "other cells", "the other cells do not determine it")
     return found
-
-
-__all__ = [
-    "BEZIER_REFITTED",
-    "FITTED",
-    "FITTED_HELD_OUT",
-    "GENERATOR_HELD_OUT",
-    "HELD_OUT",
-    "LAMBDAS",
-    "PUBLISHED",
-    "Contender",
-    "Generator",
-    "closed_forms",
-    "generator_file",
-    "generators",
-    "held_out",
-    "tuned",
-]

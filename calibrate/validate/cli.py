@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calibrate.compare.scales import MM_PER_PX
+from calibrate.compare import MM_PER_PX
 from calibrate.path_or_command import PathOrCommand
 from sessions.terminal import plain_console, say
 
 if TYPE_CHECKING:
     from calibrate.validate.diff import Difference
-    from calibrate.validate.steps import Progress
-
-MUCH = 10
-"""Lines that tell of progress where there is no terminal: one a tenth."""
+    from calibrate.validate.pool import Progress
 
 
 app = typer.Typer(
@@ -34,7 +33,9 @@ def validate(
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
     fit: Annotated[Path | None, typer.Option(help="Brush fit; the one in use by default.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the report; <session>/validation by default.")] = None,
-    gate: Annotated[list[str] | None, typer.Option(help="As 'csim_avg>=0.90', quoted; exit code 5 if missed.")] = None,
+    gate: Annotated[
+        list[str] | None, typer.Option(help="Like 'csim_avg>=0.90', quoted; exit code 5 if missed.")
+    ] = None,
     ablations: Annotated[bool, typer.Option("--ablations", help="Lambdas, and similarity by number of fits.")] = False,
     curves: Annotated[list[str] | None, typer.Option(help="NAME=FOLDER of a training, for figures 9 and 12.")] = None,
     held_out: Annotated[bool, typer.Option(help="Fit to other cells, each cell left out in turn.")] = True,
@@ -45,7 +46,7 @@ def validate(
     written: Annotated[
         list[Path] | None, typer.Option(help="written.json of characters; that beside the sessions by default.")
     ] = None,
-    beside: Annotated[bool, typer.Option(help="Take up loop and characters that lie beside the session.")] = True,
+    beside: Annotated[bool, typer.Option(help="Include loop and characters found beside the session.")] = True,
     parquet: Annotated[bool | None, typer.Option(help="scores.parquet; by default where pyarrow is there.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
     scheduler: Annotated[str, typer.Option(help="An existing Dask cluster, as tcp://host:8786.")] = "",
@@ -56,10 +57,10 @@ def validate(
 
     from calibrate.compare.field import Field
     from calibrate.drags.report import summary as drag_summary
-    from calibrate.validate.beside import Given
+    from calibrate.validate.extras import ExtrasRequest
     from calibrate.validate.main import Request, check
     from calibrate.validate.main import validate as run
-    from calibrate.validate.report.terminal import summary
+    from calibrate.validate.report.outputs import summary
 
     request = Request(
         places=tuple(session),
@@ -75,24 +76,24 @@ def validate(
         held_out=held_out,
         tune_steps=tune,
         parquet=parquet,
-        beside=Given(tuple(loop or ()), tuple(written or ()), beside),
+        extras=ExtrasRequest(tuple(loop or ()), tuple(written or ()), beside),
         out=out,
         scheduler=scheduler,
         workers=workers,
     )
-    with _shown() as progress:
-        made = run(request, progress)
-    if json and made.report is not None:
-        say(*made.report.to_json().rstrip("\n").split("\n"))
+    with _progress_shown() as progress:
+        output = run(request, progress)
+    if json and output.report is not None:
+        say(*output.report.to_json().rstrip("\n").split("\n"))
     else:
-        for drags in made.drags:
+        for drags in output.drags:
             say(*drag_summary(drags))
-        if made.report is not None:
-            say(*summary(made.report))
-        for note in made.notes:
+        if output.report is not None:
+            say(*summary(output.report))
+        for note in output.notes:
             say(note)
-        say(f"Report: {made.folder / 'report.html'}")
-    check(made, request)
+        say(f"Report: {output.folder / 'report.html'}")
+    check(output, request)
 
 
 @app.command()
@@ -125,11 +126,10 @@ def captures(
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
 ) -> None:
     """Write captured presses as `brushloop train tune` reads them."""
-
     from calibrate.errors import CalibrationError
     from calibrate.files import check_target
-    from calibrate.validate.captures_file import lay_captures, write_captures
     from calibrate.validate.sources import open_session
+    from calibrate.validate.tuning import align_captures, write_captures
 
     cells: list[tuple[float, float]] = []
     for text in leave_out or ():
@@ -140,13 +140,13 @@ def captures(
         cells.append((height, tilt))
     check_target(out, ".safetensors", generator)
     opened = [open_session(place, out.parent / "work", calibration, None) for place in session]
-    laid = lay_captures(opened, generator)
-    count = write_captures(laid, out, cells)
-    for name, why in laid.left_out:
+    aligned = align_captures(opened, generator)
+    count = write_captures(aligned, out, cells)
+    for name, why in aligned.left_out:
         say(f"left out: {name}: {why}")
     if cells:
-        say(f"left out, as asked: {len(laid.cells) - count} presses of {len(cells)} cells")
-    say(f"{count} presses ({laid.source}): {out}")
+        say(f"left out, as asked: {len(aligned.cells) - count} presses of {len(cells)} cells")
+    say(f"{count} presses ({aligned.source}): {out}")
 
 
 def _print_difference(found: Difference) -> None:
@@ -174,33 +174,38 @@ def _print_difference(found: Difference) -> None:
     say(out)
 
 
-class _shown:  # noqa: N801 - used as a function
+@contextmanager
+def _progress_shown() -> Generator[Progress]:
     """Progress on stderr: a bar on a terminal, a line a tenth elsewhere."""
+    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
 
-    def __enter__(self) -> Progress:
-        from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
-        from rich.progress import Progress as Bar
+    console = plain_console(stderr=True)
+    if not console.is_terminal:
+        yield _tenths_said()
+        return
+    description = TextColumn("{task.description}", markup=False)
+    with Bar(
+        description, BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), console=console, transient=True
+    ) as bar:
+        tasks: dict[str, Any] = {}
 
-        self._console = plain_console(stderr=True)
-        words = TextColumn("{task.description}", markup=False)
-        columns = (words, BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-        self._bar = Bar(*columns, console=self._console, transient=True) if self._console.is_terminal else None
-        self._tasks: dict[str, Any] = {}
-        if self._bar is not None:
-            self._bar.start()
-        return self._show
+        def update(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what] = bar.add_task(what, total=total)
+            bar.update(tasks[what], completed=done)
 
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
+        yield update
 
-    def _show(self, what: str, done: int, total: int) -> None:
-        if self._bar is not None:
-            if what not in self._tasks:
-                self._tasks[what] = self._bar.add_task(what, total=total)
-            self._bar.update(self._tasks[what], completed=done)
-            return
-        tenth = done * MUCH // max(total, 1)
-        if tenth > self._tasks.get(what, 0):
-            self._tasks[what] = tenth
+
+def _tenths_said() -> Progress:
+    """Progress as one line for each tenth of the work."""
+    said: dict[str, int] = {}
+
+    def update(what: str, done: int, total: int) -> None:
+        tenth = done * 10 // max(total, 1)
+        if tenth > said.get(what, 0):
+            said[what] = tenth
             say(f"{what}: {done} of {total}", err=True)
+
+    return update

@@ -40,9 +40,9 @@ class Change:
 
     @property
     def verdict(self) -> str:
-        """better, worse, or no difference that chance does not make."""
+        """`better`, `worse` or `no significant difference`, by `p_holm`."""
         if self.p_holm > SIGNIFICANT:
-            return "no clear difference"
+            return "no significant difference"
         return "better" if self.test.mean > 0 else "worse"
 
 
@@ -91,7 +91,7 @@ def compare(before: Path, after: Path) -> Difference:
 def report_path(given: Path) -> Path:
     """A report.json, by itself, in a report's or a session's folder, or beside a recording.
 
-    Raises `CalibrationError` where there is none, and tells the command that makes one.
+    Raises `CalibrationError` that names the command to run where there is none.
     """
     if not given.exists():
         raise CalibrationError(str(given), "is not there: give a report.json, or a session that was validated")
@@ -102,8 +102,8 @@ def report_path(given: Path) -> Path:
     for place in (folder / "report.json", folder / "validation" / "report.json"):
         if place.is_file():
             return place
-    told = f"was not validated: run `brushloop validate {shlex.quote(str(given))}` first, or give a report.json"
-    raise CalibrationError(str(given), told)
+    why = f"was not validated: run `brushloop validate {shlex.quote(str(given))}` first, or give a report.json"
+    raise CalibrationError(str(given), why)
 
 
 def read_scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, Strokes]:

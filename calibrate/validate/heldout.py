@@ -13,21 +13,23 @@ from typing import Any
 import numpy as np
 
 from calibrate.compare.field import SIZE_PX, Field
-from calibrate.compare.images import Pixels, unpack
-from calibrate.compare.simulate import shape_pixels
+from calibrate.compare.images import Pixels, brush_of, shape_pixels, unpack
 from calibrate.fit.artefact import BrushFit
 from calibrate.fit.captures import MARGIN_MM, grid_of
 from calibrate.fit.fit import Fit, Grid, Pressed, refit
 from calibrate.fit.heldout import RefittedBezier, refit_bezier
-from calibrate.validate.jobs import VERSION
+from calibrate.validate.jobs import VERSION, Row, pixels_of
+from calibrate.validate.pool import Progress, Scheduler
+from calibrate.validate.sources import LoadedSession
+from calibrate.validate.store import Store
 from model.fitted import MODES, NAMES, TERMS, FittedPress
 
 Cell = tuple[float, float]
-MOST_FOLDS = 15
+MAX_FOLDS = 15
 """The paper's grid leaves out one cell at a time; with more cells, as many as make so many folds."""
 PER_CELL = 3
 """Presses of each other cell that a fit is made of: more did not change it."""
-MOST_STROKES = 60
+MAX_STROKES = 60
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +61,7 @@ def start_of(fit: BrushFit) -> tuple[tuple[float, ...], tuple[str, ...]]:
     return values, tuple(name for name in NAMES if fit.parameters[name].low is not None)
 
 
-def folds(cells: Sequence[Cell], most: int = MOST_FOLDS) -> list[list[Cell]]:
+def folds(cells: Sequence[Cell], most: int = MAX_FOLDS) -> list[list[Cell]]:
     """Cells that are left out together; none where there is one cell only."""
     ordered = sorted(set(cells))
     count = min(len(ordered), most)
@@ -118,3 +120,46 @@ def bezier_pixels(coefficients: Sequence[float], height_mm: float, tilt_deg: flo
 
     plane = Plane(("left_mm", "right_mm", "belly_mm", "shoulder"), torch.tensor(coefficients).double().reshape(4, 3))
     return shape_pixels(*RefittedBezier(plane).mark(height_mm, tilt_deg), view)
+
+
+def refits_by_cell(
+    session: LoadedSession,
+    rows: Sequence[Row],
+    view: Field,
+    scheduler: Scheduler,
+    store: Store,
+    progress: Progress,
+    most_folds: int = MAX_FOLDS,
+) -> dict[Cell, dict[str, Any]]:
+    """A finished refit for each cell, made of whole presses of other cells."""
+    cells: dict[Cell, list[Row]] = {}
+    for row in rows:
+        cells.setdefault(row.cell, []).append(row)
+    brush = brush_of(session.header)
+    start = start_of(session.fit) if session.fit is not None else None
+    made: dict[Cell, dict[str, Any]] = {}
+    left = folds(list(cells), most_folds)
+    jobs: list[tuple[str, RefitJob]] = []
+    of_key: dict[str, list[Cell]] = {}
+    for fold in left:
+        others = [row for cell, group in sorted(cells.items()) if cell not in fold for row in _uncut(group)[:PER_CELL]]
+        others = others[:: max(1, -(-len(others) // MAX_STROKES))]
+        if not others:
+            continue
+        strokes = tuple((*row.cell, pixels_of(store, row.key)) for row in others)
+        job = RefitJob(strokes, float(brush.radius_mm), float(brush.length_mm), start, view)
+        of_key[job.key] = fold
+        if job.key not in store:
+            jobs.append((job.key, job))
+    done = len(of_key) - len(jobs)
+    for key, found in scheduler.run(refit_job, iter(jobs)):
+        store.put(key, found)
+        done += 1
+        progress(f"{session.header.session_id}: cells left out in turn", done, len(of_key))
+    for key, fold in of_key.items():
+        made |= dict.fromkeys(fold, store.get(key))
+    return made
+
+
+def _uncut(group: list[Row]) -> list[Row]:
+    return [row for row in group if not row.press.cut]

@@ -1,29 +1,37 @@
-"""What workers do: pure functions of picklable jobs, here or on another machine. No torch, and no files."""
+"""What workers do: pure functions of picklable jobs, here or on another machine; and the rows that preparing gives.
+
+Nothing here loads torch: a worker that prepares or scores does without it.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.calibration import Calibration
-from calibrate.compare.field import BEST_SHIFT_PX, KEYS, Alignment, Field
-from calibrate.compare.images import pack, press_images, unpack
-from calibrate.compare.presses import prepare_press
+from calibrate.compare.field import BEST_SHIFT_PX, KEYS, SIZE_PX, Alignment, Field
+from calibrate.compare.images import captured_images, pack, prepare_press, to_pixels, unpack
 from calibrate.errors import CaptureRefused
-from calibrate.stroke.measure import Measured
+from calibrate.stroke.measure import Measured, measure
 from calibrate.stroke.params import Params
 from sessions.errors import SessionDamaged
 from sessions.reader import Capture
 
+if TYPE_CHECKING:
+    from calibrate.validate.pool import Progress, Scheduler
+    from calibrate.validate.sources import LoadedSession
+    from calibrate.validate.store import Store
+
 VERSION = "1"
-"""Of what a job makes of the same input: raise it whenever that changes, and finished work is done again."""
+"""Raise it whenever a job gives another result for the same input: finished work is then done again."""
 ABSENT = b""
-"""Stands for the images of a model that does not predict this press."""
+"""In place of the images of a model that does not predict this press."""
 Values = NDArray[np.float64]
 
 
@@ -73,15 +81,65 @@ def prepare_job(job: PrepareJob) -> Press:
         return Press(stroke.stroke_id, depth, lean, stroke.again_of or "", b"", None, False, (), why)
 
     if height is None or tilt is None:
-        return refused("tells no depth or tilt")
+        return refused("has no depth or tilt")
     params = Params(**job.calibration.preprocess) if job.calibration else Params()
     try:
-        found = press_images(stroke.stroke_id, prepare_press(job.capture, job.calibration, params, job.view))
+        prepared = prepare_press(job.capture, job.calibration, params, job.view)
+        images = captured_images(stroke.stroke_id, prepared)
     except (CaptureRefused, SessionDamaged) as error:
         return refused(error.what)
-    pixels = pack(np.concatenate([found.images, found.coverage[None]]))
-    again = stroke.again_of or ""
-    return Press(stroke.stroke_id, height, tilt, again, pixels, found.measured, found.cut, found.flags, "")
+    coverage = cv2.resize(prepared.mask.astype(np.float32), (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA)
+    pixels = pack(np.stack([to_pixels(image) for image in (*images.values(), np.asarray(coverage, np.float32))]))
+    measured, again = measure(prepared.mask), stroke.again_of or ""
+    return Press(stroke.stroke_id, height, tilt, again, pixels, measured, prepared.cut, prepared.flags, "")
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A captured stroke without its pixels; `key` finds them in the store."""
+
+    session: int
+    number: int
+    press: Press
+    key: str
+
+    @property
+    def cell(self) -> tuple[float, float]:
+        """(H, alpha) as commanded."""
+        return self.press.height_mm, self.press.tilt_deg
+
+
+def prepared_rows(
+    number: int, session: LoadedSession, view: Field, scheduler: Scheduler, store: Store, progress: Progress
+) -> Iterator[Row]:
+    """Every stroke of a session, in order of capture; what is not in the store yet is prepared first."""
+    calibration = session.calibration.digest if session.calibration is not None else ""
+    bad = sorted(session.recording.marked_bad().items())
+    base = hashlib.sha256(f"prepare {VERSION} {session.sha256} {calibration} {view} {bad}".encode()).hexdigest()
+    keys = [f"{base}:{k}" for k in range(session.count)]
+    what = f"{session.header.session_id}: found"
+    missing = [key for key in keys if key not in store]
+    done = len(keys) - len(missing)
+    if missing:
+        waiting = set(missing)
+
+        def jobs() -> Iterator[tuple[str, PrepareJob]]:
+            for key, capture in zip(keys, session.recording.captures(), strict=True):
+                if key in waiting:
+                    yield key, PrepareJob(capture, session.calibration, view)
+
+        for key, press in scheduler.run(prepare_job, jobs()):
+            store.put(key, press.to_body())
+            done += 1
+            progress(what, done, len(keys))
+    for k, key in enumerate(keys):
+        body = store.get(key)
+        yield Row(number, k, press_of(body | {"pixels": b""}), key)
+
+
+def pixels_of(store: Store, key: str) -> bytes:
+    """`Press.pixels` of a stroke that was prepared."""
+    return store.get(key)["pixels"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,16 +151,16 @@ class ScoreJob:
     predictions: tuple[bytes, ...]
     """One a model, `pack` of (len(KEYS), 128, 128), or ABSENT."""
     others: tuple[bytes, ...]
-    """Presses of the same cell that foretell: `Press.pixels`."""
-    foretell: tuple[tuple[int, ...], ...]
-    """For each press, which of `others` do; empty where there is none."""
+    """Presses of the same cell that predict others: `Press.pixels`."""
+    predicted_by: tuple[tuple[int, ...], ...]
+    """For each press, which of `others` predict it; empty where none does."""
     originals: tuple[bytes, ...]
     """For each press, the one that it repeats, or ABSENT."""
 
     @property
     def key(self) -> str:
         """A hash of all that the scores follow from."""
-        digest = hashlib.sha256(f"score {VERSION} {self.foretell}".encode())
+        digest = hashlib.sha256(f"score {VERSION} {self.predicted_by}".encode())
         for group in (self.presses, self.predictions, self.others, self.originals):
             for item in group:
                 digest.update(hashlib.sha256(item).digest())
@@ -123,8 +181,8 @@ def score_job(job: ScoreJob) -> Values:
         captured = unpack(packed)
         if present:
             out[n, present] = scores(captured, predicted)
-        if job.foretell[n]:
-            out[n, -2] = scores(captured, [others[k] for k in job.foretell[n]]).mean(axis=0)
+        if job.predicted_by[n]:
+            out[n, -2] = scores(captured, [others[k] for k in job.predicted_by[n]]).mean(axis=0)
         if job.originals[n] != ABSENT:
             out[n, -1] = scores(captured, [unpack(job.originals[n])])[0]
     return out

@@ -1,4 +1,4 @@
-"""`brushloop validate` from places to files."""
+"""`brushloop validate`: from the places of sessions to the files of a report."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from calibrate.compare.field import Field
 from calibrate.drags.measure import validate_drags
 from calibrate.drags.report import DragValidation, write_drags
 from calibrate.errors import CalibrationError
-from calibrate.files import check_folder, write_whole
+from calibrate.files import check_folder
+from calibrate.report import csv_text, write_files
 from calibrate.stroke.params import Params
-from calibrate.validate import beside as extra
 from calibrate.validate.ablation import similarity_by_strokes
 from calibrate.validate.candidates import generator_file
+from calibrate.validate.extras import Extras, ExtrasRequest, find_extras
 from calibrate.validate.gates import check_gates, parse_gate
-from calibrate.validate.pool import Dask, Threads
+from calibrate.validate.pool import Dask, Progress, Threads
 from calibrate.validate.report.data import Report
 from calibrate.validate.report.figures import read_curve
-from calibrate.validate.report.outputs import csv_of, summary_csv, table_3_csv, write_csv, write_parquet
+from calibrate.validate.report.outputs import summary_csv, table_3_csv, write_csv, write_parquet
 from calibrate.validate.report.page import page_of
 from calibrate.validate.report.summary import report_of
 from calibrate.validate.run import Options, Outcome, validate_presses
-from calibrate.validate.sources import URL, Opened, one_source, open_session
-from calibrate.validate.steps import Progress
+from calibrate.validate.sources import URL, LoadedSession, one_source, open_session
 
 FOLDER = "validation"
 WORK = "work"
@@ -37,7 +37,7 @@ TABLE_3 = "table3.csv"
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What was asked for on the command line."""
+    """What the command line asked for."""
 
     places: tuple[str, ...]
     command: str
@@ -53,14 +53,14 @@ class Request:
     tune_steps: int = 0
     parquet: bool | None = None
     """None writes it where pyarrow is there."""
-    beside: extra.Given = field(default_factory=extra.Given)
+    extras: ExtrasRequest = field(default_factory=ExtrasRequest)
     out: Path | None = None
     scheduler: str = ""
     workers: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class ValidationOutput:
     """What was written: a report of presses, or one of each session of drags."""
 
     folder: Path
@@ -69,7 +69,7 @@ class Made:
     notes: tuple[str, ...] = ()
 
 
-def validate(request: Request, progress: Progress) -> Made:
+def validate(request: Request, progress: Progress) -> ValidationOutput:
     """Validate and write every file of the report; gates are checked by `check`.
 
     Raises `CalibrationError`, `ClusterError`, and what reading a recording does; whatever is finished is kept in the
@@ -82,14 +82,14 @@ def validate(request: Request, progress: Progress) -> Made:
     curves = [read_curve(text) for text in request.curves]
     folder = _folder(request)
     check_folder(folder)
-    made_before = folder.exists()
+    existed = folder.exists()
     try:
         sessions = [open_session(p, folder / WORK, request.calibration, request.fit) for p in request.places]
         one_source(sessions)
         kind = _kind(sessions, request)
-        beside = extra.take_up(sessions, request.beside) if kind == "press" else extra.Beside()
+        extras = find_extras(sessions, request.extras) if kind == "press" else Extras()
     except BaseException:
-        if not made_before:
+        if not existed:
             _drop_empty(folder)
         raise
     if kind == "drag":
@@ -103,36 +103,36 @@ def validate(request: Request, progress: Progress) -> Made:
         request.tune_steps,
     )
     (folder / WORK).mkdir(parents=True, exist_ok=True)
-    with _alone(folder), _scheduler(request) as scheduler:
+    with _locked(folder), _scheduler(request) as scheduler:
         outcome = validate_presses(sessions, options, scheduler, folder / WORK, progress)
         with outcome.store:
             steps = similarity_by_strokes(outcome, scheduler, progress) if request.ablations else ()
-            report, notes = _write(outcome, folder, request, steps, curves, beside)
-            return Made(folder, report, notes=(*beside.notes, *notes))
+            report, notes = _write(outcome, folder, request, steps, curves, extras)
+            return ValidationOutput(folder, report, notes=(*extras.notes, *notes))
 
 
-def check(made: Made, request: Request) -> None:
-    """Raises `GateMissed` where a gate is."""
-    if request.gates and made.report is None:
+def check(output: ValidationOutput, request: Request) -> None:
+    """Raises `GateMissed` where a gate is missed."""
+    if request.gates and output.report is None:
         raise CalibrationError("--gate", "is about presses; these strokes travel")
-    if made.report is not None:
-        check_gates(made.report, [parse_gate(text) for text in request.gates])
+    if output.report is not None:
+        check_gates(output.report, [parse_gate(text) for text in request.gates])
 
 
 def _drop_empty(folder: Path) -> None:
-    """Remove folders that hold no file; what was fetched and can be believed stays."""
+    """Remove folders that hold no file; verified downloads stay."""
     for path in sorted([folder, *folder.rglob("*")], reverse=True):
         if path.is_dir() and not any(path.iterdir()):
             path.rmdir()
 
 
-def _kind(sessions: list[Opened], request: Request) -> str:
+def _kind(sessions: list[LoadedSession], request: Request) -> str:
     """`press` or `drag`."""
     kinds = {kind for session in sessions for kind in session.kinds}
     if len(kinds) > 1:
-        raise CalibrationError(str(sessions[-1].recording.path), "mixes presses and drags: validate them apart")
+        raise CalibrationError(str(sessions[-1].recording.path), "mixes presses and drags: validate them separately")
     [kind] = kinds
-    for option, paths in (("--loop", request.beside.loops), ("--written", request.beside.written)):
+    for option, paths in (("--loop", request.extras.loops), ("--written", request.extras.written)):
         if paths and kind == "drag":
             raise CalibrationError(option, "goes into a report of presses; these strokes travel")
     return kind
@@ -144,7 +144,7 @@ def _write(
     request: Request,
     steps: tuple[Any, ...],
     curves: Sequence[Any],
-    beside: extra.Beside,
+    extras: Extras,
 ) -> tuple[Report, tuple[str, ...]]:
     digest = write_csv(outcome, folder / "scores.csv")
     notes: list[str] = []
@@ -155,29 +155,30 @@ def _write(
             if request.parquet:
                 raise
             notes.append(f"no scores.parquet: {error.what}")
-    report = report_of(outcome, request.command, digest, steps, beside)
-    write_whole(folder / "summary.csv", summary_csv(report))
+    report = report_of(outcome, request.command, digest, steps, extras)
+    files = {"summary.csv": summary_csv(report)}
     if report.written:
-        write_whole(folder / TABLE_3, table_3_csv(report))
+        files[TABLE_3] = table_3_csv(report)
     else:
         (folder / TABLE_3).unlink(missing_ok=True)  # of an earlier run that had characters
-    rows = [(r.session_id, r.stroke_id, r.why) for r in report.refused]
-    write_whole(folder / "failures.csv", csv_of(("session_id", "stroke_id", "why"), rows))
-    write_whole(folder / "report.html", page_of(outcome, report, curves, beside.figures))
-    write_whole(folder / "report.json", report.to_json())
+    refused = [(r.session_id, r.stroke_id, r.why) for r in report.refused]
+    files["failures.csv"] = csv_text(("session_id", "stroke_id", "why"), refused)
+    files["report.html"] = page_of(outcome, report, curves, extras.figures)
+    files["report.json"] = report.to_json()
+    write_files(folder, files)
     return report, tuple(notes)
 
 
-def _drags(request: Request, sessions: list[Opened], folder: Path) -> Made:
-    made: list[DragValidation] = []
+def _drags(request: Request, sessions: list[LoadedSession], folder: Path) -> ValidationOutput:
+    validated: list[DragValidation] = []
     for one in sessions:
         params = Params(**one.calibration.preprocess) if one.calibration is not None else Params()
         results = validate_drags(one.recording.captures(), params)
         validation = DragValidation(one.header, one.recording.path, one.sha256, results)
         target = folder / one.header.session_id if len(sessions) > 1 else folder
         write_drags(validation, target, request.command)
-        made.append(validation)
-    return Made(folder, drags=tuple(made))
+        validated.append(validation)
+    return ValidationOutput(folder, drags=tuple(validated))
 
 
 def _folder(request: Request) -> Path:
@@ -190,7 +191,7 @@ def _folder(request: Request) -> Path:
 
 
 @contextmanager
-def _alone(folder: Path) -> Generator[None]:
+def _locked(folder: Path) -> Generator[None]:
     lock = FileLock(folder / WORK / "lock")
     try:
         lock.acquire(timeout=0)

@@ -15,6 +15,8 @@ from importlib.metadata import version
 from types import TracebackType
 from typing import Any, ClassVar, Protocol, TypeVar
 
+Progress = Callable[[str, int, int], None]
+"""What is being done, how much of it is done, of how much."""
 J = TypeVar("J")
 R = TypeVar("R")
 AHEAD = 2

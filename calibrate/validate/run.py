@@ -15,32 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.compare.field import KEYS, Field
-from calibrate.compare.images import pack
-from calibrate.compare.simulate import brush_of
+from calibrate.compare.images import brush_of, pack
+from calibrate.compare.paper import ROBOT_WRITING
 from calibrate.errors import CalibrationError
 from calibrate.validate import candidates as who
-from calibrate.validate.candidates import Contender, Generator
-from calibrate.validate.heldout import Cell
-from calibrate.validate.jobs import (
-    ABSENT,
-    Press,
-    ScoreJob,
-    press_of,
-    score_job,
-)
-from calibrate.validate.pool import Scheduler
-from calibrate.validate.sources import Opened
-from calibrate.validate.steps import Progress, Row, pixels_of, prepared_rows, refits_by_cell
+from calibrate.validate.candidates import Candidate, Generator
+from calibrate.validate.heldout import Cell, refits_by_cell
+from calibrate.validate.jobs import ABSENT, Press, Row, ScoreJob, pixels_of, prepared_rows, press_of, score_job
+from calibrate.validate.pool import Progress, Scheduler
+from calibrate.validate.sources import LoadedSession
 from calibrate.validate.store import Store
-from calibrate.validate.tuned import FOLDS, tuned_by_cell
+from calibrate.validate.tuning import FOLDS, tuned_by_cell
 from model.ccdbsm import DomainError
 
 CEILING = "another press"
-"""A capture foretold by other captures of its cell, averaged: how well one press foretells another."""
-REPEATED = "robot writing"
+"""A capture predicted by other captures of its cell, averaged: how well one press predicts another."""
+REPEATED = ROBOT_WRITING
 """A press that repeats another session's stroke, against that stroke: the third row of the paper's Table 1."""
-MOST_OTHERS = 9
-"""Presses that foretell one: all others of a cell with ten, as the paper has; the next nine where there are more."""
+MAX_OTHERS = 9
+"""Presses that predict one: all others of a cell with ten, as the paper has; the next nine where there are more."""
 CHUNK = 16
 
 
@@ -61,12 +54,12 @@ class Options:
 class Outcome:
     """Every score of a run."""
 
-    sessions: list[Opened]
+    sessions: list[LoadedSession]
     options: Options
-    contenders: list[list[Contender]]
+    candidates: list[list[Candidate]]
     """Of each session."""
     names: list[str]
-    """Columns: every contender of any session, then the presses themselves."""
+    """Columns: every candidate of any session, then the presses themselves."""
     rows: list[Row]
     """Strokes that are compared, by session and order of capture."""
     values: NDArray[np.float64]
@@ -81,9 +74,9 @@ class Outcome:
 
 
 def validate_presses(
-    sessions: list[Opened], options: Options, scheduler: Scheduler, work: Path, progress: Progress
+    sessions: list[LoadedSession], options: Options, scheduler: Scheduler, work: Path, progress: Progress
 ) -> Outcome:
-    """Compare every contender with every press. The caller closes `Outcome.store`.
+    """Compare every candidate with every press. The caller closes `Outcome.store`.
 
     Raises `CalibrationError` for a model that is not known, or where a name of a session stands for two.
     """
@@ -91,7 +84,7 @@ def validate_presses(
     for k, ident in enumerate(idents):
         if ident in idents[:k]:
             raise CalibrationError(str(sessions[k].recording.path), f"{ident} is given twice")
-    store = Store(work / "work.bin")
+    store = Store(work / "work.sqlite")
     try:
         return _validate(sessions, options, scheduler, store, work, progress)
     except BaseException:
@@ -100,15 +93,14 @@ def validate_presses(
 
 
 def _validate(
-    sessions: list[Opened], options: Options, scheduler: Scheduler, store: Store, work: Path, progress: Progress
+    sessions: list[LoadedSession], options: Options, scheduler: Scheduler, store: Store, work: Path, progress: Progress
 ) -> Outcome:
     # All that can be refused is refused before hours of work.
     known = [_known(session, options) for session in sessions]
-    every = list(dict.fromkeys(one.name for made in known for one in made))
-    held = (who.FITTED_HELD_OUT, who.BEZIER_REFITTED, who.GENERATOR_HELD_OUT)
+    every = (*dict.fromkeys(one.name for group in known for one in group), *who.HELD_OUT_NAMES)
     for name in options.models:
-        if name not in (*every, *held):
-            raise CalibrationError("--model", f"{name!r} is not one of: {', '.join((*every, *held))}")
+        if name not in every:
+            raise CalibrationError("--model", f"{name!r} is not one of: {', '.join(every)}")
     rows: list[Row] = []
     refused: list[tuple[str, str, str]] = []
     for number, session in enumerate(sessions):
@@ -117,17 +109,17 @@ def _validate(
                 refused.append((session.header.session_id, row.press.stroke_id, row.press.refused))
             else:
                 rows.append(row)
-    contenders: list[list[Contender]] = []
+    candidates: list[list[Candidate]] = []
     for number, session in enumerate(sessions):
         mine = [row for row in rows if row.session == number]
         made = [*known[number], *_held_out(session, mine, options, scheduler, store, work, progress)]
-        contenders.append([one for one in _ordered(made) if not options.models or one.name in options.models])
+        candidates.append([one for one in _ordered(made) if not options.models or one.name in options.models])
     for name in options.models:
-        if not any(one.name == name for made in contenders for one in made):
+        if not any(one.name == name for made in candidates for one in made):
             raise CalibrationError(
                 "--model", f"{name} needs a fit, or --tune: see `brushloop validate sessions --help`"
             )
-    names = [*_ordered_names(contenders), CEILING, REPEATED]
+    names = [*_ordered_names(candidates), CEILING, REPEATED]
     values = np.full((len(rows), len(names), len(KEYS), 2), np.nan)
     jobs: dict[str, tuple[list[int], list[int]]] = {}
     total = len(rows)
@@ -135,8 +127,8 @@ def _validate(
 
     def waiting() -> Iterator[tuple[str, ScoreJob]]:
         nonlocal done
-        for chunk, job in _score_jobs(sessions, contenders, rows, store, refused):
-            columns = [names.index(one.name) for one in contenders[rows[chunk[0]].session]] + [-2, -1]
+        for chunk, job in _score_jobs(sessions, candidates, rows, store, refused):
+            columns = [names.index(one.name) for one in candidates[rows[chunk[0]].session]] + [-2, -1]
             key = job.key
             if key in store:
                 _put(values, chunk, columns, store.get(key))
@@ -154,31 +146,31 @@ def _validate(
         _put(values, chunk, columns, body)
         done += len(chunk)
         progress("compared", done, total)
-    return Outcome(sessions, options, contenders, names, rows, values, refused, store)
+    return Outcome(sessions, options, candidates, names, rows, values, refused, store)
 
 
-def _known(session: Opened, options: Options) -> list[Contender]:
+def _known(session: LoadedSession, options: Options) -> list[Candidate]:
     made = who.closed_forms(session, options.view, ablations=options.ablations)
     return _ordered([*who.generators(session, options.generators, options.view), *made])
 
 
 def _held_out(
-    session: Opened,
+    session: LoadedSession,
     rows: list[Row],
     options: Options,
     scheduler: Scheduler,
     store: Store,
     work: Path,
     progress: Progress,
-) -> Iterator[Contender]:
+) -> Iterator[Candidate]:
     """Whatever is fitted to the session without the cells that it then predicts."""
-    wanted = options.models or (who.FITTED_HELD_OUT, who.BEZIER_REFITTED, who.GENERATOR_HELD_OUT)
+    names = options.models or who.HELD_OUT_NAMES
     brush, view = brush_of(session.header), options.view
-    if options.held_out and (who.FITTED_HELD_OUT in wanted or who.BEZIER_REFITTED in wanted):
+    if options.held_out and (who.FITTED_HELD_OUT in names or who.BEZIER_REFITTED in names):
         fits = refits_by_cell(session, rows, view, scheduler, store, progress)
         if fits:
             yield from who.held_out(fits, brush, view, fitted=session.fit is not None)
-    if options.tune_steps and who.GENERATOR_HELD_OUT in wanted:
+    if options.tune_steps and who.GENERATOR_HELD_OUT in names:
         fits = refits_by_cell(session, rows, view, scheduler, store, progress, FOLDS)
         for number, generator in enumerate(options.generators):
             files = tuned_by_cell(session, fits, generator, options.tune_steps, work, progress)
@@ -187,8 +179,8 @@ def _held_out(
 
 
 def _score_jobs(
-    sessions: list[Opened],
-    contenders: list[list[Contender]],
+    sessions: list[LoadedSession],
+    candidates: list[list[Candidate]],
     rows: list[Row],
     store: Store,
     refused: list[tuple[str, str, str]],
@@ -200,16 +192,16 @@ def _score_jobs(
     originals = _originals(rows)
     for (session, cell), group in sorted(cells.items()):
         predictions: list[bytes] = []
-        for one in contenders[session]:
+        for one in candidates[session]:
             try:
                 predictions.append(pack(one.predict(*cell)))
             except DomainError as error:
                 predictions.append(ABSENT)
-                told = f"{one.name} does not predict it: {error}"
-                refused.extend((sessions[session].header.session_id, rows[k].press.stroke_id, told) for k in group)
+                why = f"{one.name} does not predict it: {error}"
+                refused.extend((sessions[session].header.session_id, rows[k].press.stroke_id, why) for k in group)
         for start in range(0, len(group), CHUNK):
             chunk = group[start : start + CHUNK]
-            reach = min(MOST_OTHERS, len(group) - 1)
+            reach = min(MAX_OTHERS, len(group) - 1)
             theirs = [
                 [group[(start + n + step) % len(group)] for step in range(1, reach + 1)] for n in range(len(chunk))
             ]
@@ -242,12 +234,12 @@ def _put(values: NDArray[np.float64], chunk: list[int], columns: list[int], body
     values[np.ix_(chunk, [c % values.shape[1] for c in columns])] = found
 
 
-def _ordered_names(contenders: list[list[Contender]]) -> list[str]:
-    return list(dict.fromkeys(one.name for one in _ordered([one for made in contenders for one in made])))
+def _ordered_names(candidates: list[list[Candidate]]) -> list[str]:
+    return list(dict.fromkeys(one.name for one in _ordered([one for made in candidates for one in made])))
 
 
-def _ordered(made: list[Contender]) -> list[Contender]:
-    """As the paper's tables go, calibrated beside uncalibrated; whatever is new comes after."""
+def _ordered(made: list[Candidate]) -> list[Candidate]:
+    """In the order of the paper's tables, calibrated beside uncalibrated; everything else comes after."""
     first = [
         "ccd-bsmg",
         who.GENERATOR_HELD_OUT,
@@ -259,7 +251,7 @@ def _ordered(made: list[Contender]) -> list[Contender]:
     ]
     first += ["ellipse", "line", "circle"]
 
-    def place(one: Contender) -> tuple[int, int]:
+    def place(one: Candidate) -> tuple[int, int]:
         stem = one.name if one.name in first else "ccd-bsmg" if one.name.startswith("ccd-bsmg-") else ""
         return (first.index(stem), 0) if stem else (len(first), 0)
 

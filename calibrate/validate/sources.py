@@ -50,7 +50,7 @@ SHA256 = re.compile(r"\b[0-9a-f]{64}\b")
 
 
 @dataclass(frozen=True, slots=True)
-class Opened:
+class LoadedSession:
     """One session, checked, with what belongs to it."""
 
     recording: Recording
@@ -66,7 +66,7 @@ class Opened:
         return self.recording.header
 
 
-def open_session(place: str, work: Path, calibration: Path | None, fit: Path | None) -> Opened:
+def open_session(place: str, work: Path, calibration: Path | None, fit: Path | None) -> LoadedSession:
     """A session by path or URL. Raises `CalibrationError`, `InputError` or `SessionDamaged`, each naming it."""
     path = fetched(place, work / "remote") if URL.match(place) else Path(place)
     recording = Recording(path)
@@ -79,7 +79,7 @@ def open_session(place: str, work: Path, calibration: Path | None, fit: Path | N
     if len(kinds) > 1:
         raise CalibrationError(str(recording.path), "mixes presses and drags; validate them as two sessions")
     found = fit or current(recording.path.parent, FITS)
-    return Opened(
+    return LoadedSession(
         recording,
         digest,
         calibration_of(recording, strokes[0], digest, calibration),
@@ -89,7 +89,7 @@ def open_session(place: str, work: Path, calibration: Path | None, fit: Path | N
     )
 
 
-def one_source(sessions: list[Opened]) -> Source:
+def one_source(sessions: list[LoadedSession]) -> Source:
     """The kind of ink of all of them, as the recordings say. Raises `CalibrationError` where they differ."""
     first = sessions[0]
     for other in sessions[1:]:

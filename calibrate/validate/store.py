@@ -1,91 +1,101 @@
-"""Finished work on disk: an append-only file of records, so that a killed run goes on where it was.
+"""Finished work on disk, so that a killed run goes on where it was: one SQLite file of records by key.
 
-Each record is a length and a CRC, a key (a hash of everything that the record follows from) and a CBOR body. What a
-crash cut off, or what does not match its CRC, is dropped and done again.
+A key is a hash of everything that its record follows from; the body is CBOR with a CRC-32. A record is written whole or
+not at all; one that does not match its CRC is dropped and done again.
 """
 
 from __future__ import annotations
 
-import struct
+import errno
+import sqlite3
 import zlib
+from collections.abc import Generator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO
+from typing import Any
 
 import cbor2
 
-MAGIC = b"brushloop-work-1\n"
-FRAME = struct.Struct("<IIH")
-"""Bytes of key and body, their CRC-32, bytes of the key."""
-MAX_RECORD_BYTES = 64 * 1024 * 1024
+TABLE = "CREATE TABLE IF NOT EXISTS work (number INTEGER PRIMARY KEY, key TEXT UNIQUE, crc INTEGER, body BLOB)"
+DAMAGED = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 Body = dict[str, Any]
 
 
-class Store:
-    """The records of one file by key; only where they lie is held in memory. Raises OSError."""
+class Store(AbstractContextManager["Store"]):
+    """The records of one file by key; they stay on disk. Raises OSError."""
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._file: BinaryIO = path.open("r+b" if path.exists() else "w+b")
-        self._where: dict[str, tuple[int, int]] = {}
-        self._end = self._scan()
-        self._file.truncate(self._end)
+        with self._as_os_error():
+            try:
+                self._database = self._opened()
+            except sqlite3.DatabaseError as error:
+                if error.sqlite_errorcode & 0xFF not in DAMAGED:
+                    raise
+                path.unlink()  # what is lost is only done again
+                path.with_name(path.name + "-journal").unlink(missing_ok=True)
+                self._database = self._opened()
 
     def __contains__(self, key: str) -> bool:
-        return key in self._where
+        return self._database.execute("SELECT 1 FROM work WHERE key = ?", (key,)).fetchone() is not None
 
     def __len__(self) -> int:
-        return len(self._where)
+        return self._database.execute("SELECT count(*) FROM work").fetchone()[0]
 
     def keys(self) -> list[str]:
         """Of every record, in the order in which they were finished."""
-        return list(self._where)
+        return [key for (key,) in self._database.execute("SELECT key FROM work ORDER BY number")]
 
     def put(self, key: str, body: Body) -> None:
-        """Append a record; after this returns a kill of the process does not lose it."""
-        name, packed = key.encode(), cbor2.dumps(body)
-        payload = name + packed
-        self._file.seek(self._end)
-        self._file.write(FRAME.pack(len(payload), zlib.crc32(payload), len(name)) + payload)
-        self._file.flush()
-        self._where[key] = (self._end + FRAME.size + len(name), len(packed))
-        self._end += FRAME.size + len(payload)
+        """Add a record; after this returns a kill of the process does not lose it."""
+        packed = cbor2.dumps(body)
+        with self._as_os_error(), self._database:
+            row = (key, _crc(key, packed), packed)
+            self._database.execute("INSERT OR REPLACE INTO work (key, crc, body) VALUES (?, ?, ?)", row)
 
     def get(self, key: str) -> Body:
         """The body of a record. Raises KeyError where there is none."""
-        at, size = self._where[key]
-        self._file.seek(at)
-        return cbor2.loads(self._file.read(size))
+        found = self._database.execute("SELECT body FROM work WHERE key = ?", (key,)).fetchone()
+        if found is None:
+            raise KeyError(key)
+        return cbor2.loads(found[0])
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
-
-    def __enter__(self) -> Store:
-        return self
+        self._database.close()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
 
-    def _scan(self) -> int:
-        """Note every whole record; returns where the next goes."""
-        if self._file.read(len(MAGIC)) != MAGIC:
-            self._file.seek(0)
-            self._file.truncate()
-            self._file.write(MAGIC)
-            self._file.flush()
-            return len(MAGIC)
-        at = len(MAGIC)
-        while len(frame := self._file.read(FRAME.size)) == FRAME.size:
-            size, crc, key_size = FRAME.unpack(frame)
-            if key_size > size or size > MAX_RECORD_BYTES:
-                break
-            payload = self._file.read(size)
-            if len(payload) < size or zlib.crc32(payload) != crc:
-                break
-            key = payload[:key_size].decode("utf-8", "replace")
-            self._where[key] = (at + FRAME.size + key_size, size - key_size)
-            at += FRAME.size + size
-        return at
+    def _opened(self) -> sqlite3.Connection:
+        """The database, without the records that do not match their CRC."""
+        database = sqlite3.connect(self._path)
+        try:
+            # A killed process loses nothing without waiting for the disk; a power cut may, and then it is done again.
+            database.execute("PRAGMA synchronous = OFF")
+            database.execute("PRAGMA journal_mode = TRUNCATE")
+            database.execute(TABLE)
+            rows = database.execute("SELECT number, key, crc, body FROM work")
+            bad = [(number,) for number, key, crc, body in rows if _crc(key, body) != crc]
+            with database:
+                database.executemany("DELETE FROM work WHERE number = ?", bad)
+        except BaseException:
+            database.close()
+            raise
+        return database
+
+    @contextmanager
+    def _as_os_error(self) -> Generator[None]:
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise OSError(errno.EIO, str(error), str(self._path)) from error
+
+
+def _crc(key: object, body: object) -> int | None:
+    """Of a record; None for values of other types, which only damage leaves behind."""
+    return zlib.crc32(key.encode() + body) if isinstance(key, str) and isinstance(body, bytes) else None

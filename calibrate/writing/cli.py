@@ -1,4 +1,4 @@
-"""`brushloop write compare`. Heavy imports wait until the command runs."""
+"""`brushloop write plan`, `compare` and `learn`. Heavy imports wait until a command runs."""
 
 from __future__ import annotations
 
@@ -8,6 +8,81 @@ from typing import Annotated
 import typer
 
 from sessions.terminal import say
+
+
+def plan(
+    what: Annotated[str, typer.Argument(help="Characters (字 子 永 are shipped), or a .csv or .json trajectory.")],
+    out: Annotated[Path, typer.Option(help="Folder for protocol-write.toml and plan.png.")] = Path("write-plan"),
+    data: Annotated[Path | None, typer.Option(help="hanzi-writer folder or makemeahanzi graphics.txt.")] = None,
+    model: Annotated[str, typer.Option(help="The stroke model that plans and draws.")] = "ccd-bsm",
+    radius_mm: Annotated[float, typer.Option(min=0.5, max=50, help="R of the brush.")] = 6.0,
+    length_mm: Annotated[float, typer.Option(min=5, max=200, help="L of the brush.")] = 48.0,
+    drag: Annotated[
+        Path | None, typer.Option(help="Artefact of `fit --drags`: strokes that travel are drawn with its bristle lag.")
+    ] = None,
+    lam: Annotated[float | None, typer.Option(min=0.1, max=10, help="lambda of CCD-BSM; pi when left out.")] = None,
+    cell_mm: Annotated[float, typer.Option(min=10, max=500, help="Side of the character's paper cell.")] = 70.0,
+    margin_mm: Annotated[float, typer.Option(min=0, max=200, help="Margin around the font's square.")] = 6.0,
+    height_range: Annotated[tuple[float, float], typer.Option(help="Feasible depths, mm.")] = (0.5, 20.0),
+    tilt_range: Annotated[tuple[float, float], typer.Option(help="Feasible tilts, deg; at most 30.")] = (0.0, 10.0),
+    tilt: Annotated[float, typer.Option(min=0, max=30, help="Tilt to start from, deg.")] = 5.0,
+    speed_mm_s: Annotated[float, typer.Option(min=1, max=100, help="Of the tip.")] = 15.0,
+    wrist_deg_s: Annotated[float, typer.Option(min=1, max=720, help="How fast the wrist may turn.")] = 180.0,
+    steps: Annotated[int, typer.Option(min=0, max=1000, help="Of refinement; 0 keeps the first plan.")] = 60,
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written.")] = 1,
+) -> None:
+    """Plan characters: depth from the stroke's width, heading along it, refined through the model's image."""
+    import math
+
+    from calibrate.artefact import load_artefact
+    from calibrate.drags.run import DragArtefact
+    from calibrate.errors import CalibrationError
+    from calibrate.files import check_folder
+    from calibrate.writing.plan import Settings
+    from calibrate.writing.plan import plan as planned
+    from calibrate.writing.plan_files import PICTURE, PlannedBy, write_plan
+    from model.ccdbsm import Brush, DomainError
+    from model.characters.brush import Reach
+    from model.characters.plan import Cell
+    from model.registry import UnknownModelError, stroke_model
+
+    check_folder(out)
+    lagging = load_artefact(drag, DragArtefact) if drag is not None else None
+    try:
+        if tilt_range[1] > 30 or height_range[0] <= 0:
+            raise ValueError("tilts end at 30 deg, depths begin above 0 mm")
+        reach = Reach(height_range, tilt_range, turn_deg_mm=wrist_deg_s / speed_mm_s)
+        seen = lagging.model() if lagging is not None else None
+        settings = Settings(Cell(cell_mm, margin_mm), reach, tilt, steps=steps, drag=seen)
+        of = stroke_model(model, Brush(radius_mm, length_mm), math.pi if lam is None else lam)
+        of.profile(height_range[1], tilt_range[1])
+    except (ValueError, UnknownModelError, DomainError) as error:
+        raise CalibrationError("write plan", str(error)) from None
+    figures = planned(what, data, of, settings)
+    by = PlannedBy(
+        model=model,
+        radius_mm=radius_mm,
+        length_mm=length_mm,
+        lam=lam,
+        height_range_mm=height_range,
+        tilt_range_deg=tilt_range,
+        turn_deg_mm=reach.turn_deg_mm,
+        speed_mm_s=speed_mm_s,
+        drag_fit=lagging.digest if lagging is not None else "",
+    )
+    protocol = write_plan(figures, settings, by, of.label, repeats, out)
+    if lagging is None:
+        say(f"simulated by {model}, marks laid over each other along the way: not ink")
+    else:
+        say(f"simulated with the bristle lag of {lagging.session_id}, {lagging.source}: not ink")
+    for figure in figures:
+        first_csim, first_ssim, last_csim, last_ssim = figure.scores()
+        points = sum(len(stroke) for stroke in figure.strokes)
+        say(
+            f"{figure.request.name}: {len(figure.strokes)} strokes, {points} points, ink = 1: "
+            f"CSIM {first_csim:.4f} -> {last_csim:.4f}, SSIM {first_ssim:.4f} -> {last_ssim:.4f}"
+        )
+    say(str(protocol), str(out / PICTURE))
 
 
 def compare(
@@ -26,9 +101,8 @@ def compare(
     from calibrate.compare.field import Image
     from calibrate.errors import CalibrationError
     from calibrate.files import check_folder
-    from calibrate.writing.compare import compare_written
-    from calibrate.writing.images import read_reference
-    from calibrate.writing.record import load_plan
+    from calibrate.writing.compare import compare_written, read_reference
+    from calibrate.writing.plan_files import load_plan
     from calibrate.writing.report import PICTURE, summary, write_written
 
     check_folder(out)
@@ -49,15 +123,14 @@ def learn(
     session: Annotated[Path, typer.Argument(help="The session in which a plan was written.")],
     plan: Annotated[Path, typer.Option(help="The plan's folder, or its plan.json.")],
     out: Annotated[Path, typer.Option(help="Folder for the next plan.")],
-    gain: Annotated[float, typer.Option(min=0.05, max=1.5, help="Share of what was off that is put right.")] = 0.8,
+    gain: Annotated[float, typer.Option(min=0.05, max=1.5, help="Share of the deviation that is corrected.")] = 0.8,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written next.")] = 1,
 ) -> None:
-    """Move a plan's trajectories by what their ink was off, for the next writing."""
+    """Correct a plan's trajectories by how far off their ink was, for the next writing."""
     from calibrate.files import check_folder
     from calibrate.writing.compare import compare_written
     from calibrate.writing.learn import learned
-    from calibrate.writing.plan_files import write_record
-    from calibrate.writing.record import load_plan
+    from calibrate.writing.plan_files import load_plan, write_record
 
     check_folder(out)
     made, lessons = learned(compare_written(session, load_plan(plan), {}), gain)

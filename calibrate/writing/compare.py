@@ -3,27 +3,36 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+
+import cv2
+import numpy as np
 
 from calibrate.calibration import Calibration
-from calibrate.compare.field import Image
+from calibrate.compare.field import SIZE_PX, Image, Tone
 from calibrate.errors import CalibrationError, CaptureRefused
+from calibrate.files import read_gray
 from calibrate.session import calibration_of
-from calibrate.writing.images import Ink, captured, drawn
-from calibrate.writing.record import FigureRecord, PlanRecord, points_digest
-from calibrate.writing.scores import Character, WrittenScore, score_character
-from calibrate.writing.table import Table3Row, table_3
+from calibrate.stroke.params import Params
+from calibrate.stroke.preprocess import Prepared, prepare
+from calibrate.stroke.rectify import rectify
+from calibrate.writing.plan_files import FigureRecord, PlanRecord, points_digest
+from calibrate.writing.scores import Character, Ink, Table3Row, WrittenScore, score_character, table_3
 from sessions.errors import SessionDamaged
-from sessions.reader import Recording
+from sessions.reader import Capture, Recording
 from sessions.recording.schemas import Header
+
+SPECK_SHARE = 0.002
+"""A dot of a dense character is smaller against its longest stroke than a drop against a press."""
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
-    """What came out."""
+class WritingComparison:
+    """Written characters, compared with their plan."""
 
     header: Header
     recording: Path
@@ -38,7 +47,7 @@ class Written:
     software: str = ""
 
 
-def compare_written(session: Path, plan: PlanRecord, references: dict[str, tuple[str, Image]]) -> Written:
+def compare_written(session: Path, plan: PlanRecord, references: dict[str, tuple[str, Image]]) -> WritingComparison:
     """Compare a session with its plan. `references` (character -> name, image) stand for the plan's own.
 
     Raises `CalibrationError` where the two do not belong together or nothing can be compared.
@@ -52,7 +61,7 @@ def compare_written(session: Path, plan: PlanRecord, references: dict[str, tuple
     _check_points(recording, plan)
     if unknown := sorted(set(references) - {figure.name for figure in plan.figures}):
         raise CalibrationError("--reference", f"{unknown[0]!r} is not in the plan")
-    found, cut, refused = _captured(recording, plan, calibration)
+    found, cut, refused = _writings(recording, plan, calibration)
     characters = [_character(figure, found, cut, references) for figure in plan.figures if figure.name in found]
     if not characters:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
@@ -67,10 +76,12 @@ def compare_written(session: Path, plan: PlanRecord, references: dict[str, tuple
         references={one.name: one.reference_name for one in characters},
     )
     software = f"brushloop {version('brushloop')}"
-    return Written(header, recording.path, digest, calibration, plan, characters, scores, table, refused, software)
+    return WritingComparison(
+        header, recording.path, digest, calibration, plan, characters, scores, table, refused, software
+    )
 
 
-def _captured(
+def _writings(
     recording: Recording, plan: PlanRecord, calibration: Calibration
 ) -> tuple[dict[str, dict[str, Ink]], set[str], list[tuple[str, str]]]:
     """(character -> stroke -> ink, strokes that are cut, refused)."""
@@ -99,15 +110,15 @@ def _character(
     name, image = references.get(figure.name) or (figure.source, figure.wanted())
     writings = found[figure.name]
     edge = tuple(stroke_id for stroke_id in writings if stroke_id in cut)
-    return Character(figure.name, name, drawn(image), drawn(figure.simulated()), writings, edge)
+    return Character(figure.name, name, as_ink(image), as_ink(figure.simulated()), writings, edge)
 
 
 def _check_points(recording: Recording, plan: PlanRecord) -> None:
     """The session's protocol must have drawn what the plan has planned."""
     try:
-        told: Any = json.loads(recording.header.protocol)
-        points = {f["name"]: points_digest([s["points"] for s in f["strokes"]]) for f in told["figures"]}
-        cell_mm = [float(side) for side in told["cell_mm"]]
+        protocol: Any = json.loads(recording.header.protocol)
+        points = {f["name"]: points_digest([s["points"] for s in f["strokes"]]) for f in protocol["figures"]}
+        cell_mm = [float(side) for side in protocol["cell_mm"]]
     except (ValueError, KeyError, TypeError, RecursionError):
         raise CalibrationError(str(recording.path), "was not collected by a `write` protocol") from None
     if cell_mm != [plan.cell_mm, plan.cell_mm]:
@@ -116,3 +127,44 @@ def _check_points(recording: Recording, plan: PlanRecord) -> None:
         figure = plan.figure(name)
         if figure is None or figure.points_sha256 != digest:
             raise CalibrationError(str(recording.path), f"{name!r} was not drawn from this plan")
+
+
+def captured(capture: Capture, calibration: Calibration) -> tuple[Ink, bool]:
+    """The ink on the character's paper cell, and whether it reaches the edge. Raises `CaptureRefused`."""
+    stroke = capture.stroke
+    if stroke.cell_mm is None:
+        raise CaptureRefused(stroke.stroke_id, "has no paper cell")
+    _, _, width_mm, height_mm = stroke.cell_mm
+    if not math.isclose(width_mm, height_mm):
+        raise CaptureRefused(stroke.stroke_id, f"its cell is {width_mm:g} x {height_mm:g} mm, a square is needed")
+    raster = rectify(capture.image(), calibration.homography(), stroke.cell_mm)
+    prepared = _whole_cell(raster, capture.where, calibration, math.hypot(width_mm, height_mm))
+    return {Tone.BINARY: _small(prepared.mask.astype(np.float32)), Tone.GRAY: _small(prepared.soft)}, prepared.cut
+
+
+def _small(image: Image) -> Image:
+    return cast("Image", cv2.resize(image, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA))
+
+
+def _whole_cell(raster: np.ndarray, where: str, calibration: Calibration, reach_mm: float) -> Prepared:
+    """All ink of the cell is the character's, however far its strokes lie apart."""
+    params = calibration.preprocess | {"join_mm": reach_mm, "speck_share": SPECK_SHARE}
+    return prepare(raster.astype(np.uint8), None, where, Params(**params))
+
+
+def read_reference(path: Path) -> Image:
+    """(128, 128) ink of a picture of a character, dark on light, padded to a square. Raises `CalibrationError`."""
+    gray = read_gray(path)
+    ink = 1.0 - gray.astype(np.float32) / 255.0
+    if float(ink.mean()) > 0.5:
+        raise CalibrationError(str(path), "is mostly dark: a reference is dark ink on light paper")
+    height, width = ink.shape
+    side = max(height, width)
+    top, left = (side - height) // 2, (side - width) // 2
+    square = np.pad(ink, ((top, side - height - top), (left, side - width - left)))
+    return _small(square)
+
+
+def as_ink(image: Image) -> Ink:
+    """The ink of an image that was not photographed: as dark as covered."""
+    return dict.fromkeys(Tone, image)

@@ -1,4 +1,4 @@
-"""The next plan of characters, from how the last one came out: what the model takes the ink for is put right.
+"""The next plan of characters, corrected by how the ink of the last one came out.
 
 The ink of a drag is not what presses along its way would leave. What is seen is therefore inverted as if it were: the
 intended trajectory is refined until its image is the mean of the captures. By how much that differs from the intention,
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from calibrate.compare.field import Image
 from calibrate.errors import CalibrationError
-from calibrate.writing.compare import Written
-from calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, arrays, figure_record
+from calibrate.writing.compare import WritingComparison
+from calibrate.writing.plan_files import FigureRecord, PlannedBy, PlanRecord, arrays, figure_record
 from model.ccdbsm import Brush, DomainError
 from model.characters.brush import Reach
 from model.characters.refine import refine
@@ -39,7 +39,7 @@ class Lesson:
     depth_mm: float
 
 
-def learned(written: Written, gain: float = 0.8) -> tuple[PlanRecord, list[Lesson]]:
+def learned(written: WritingComparison, gain: float = 0.8) -> tuple[PlanRecord, list[Lesson]]:
     """The next plan of the characters that were captured, and how far each was off. Raises `CalibrationError`."""
     plan = written.plan
     reach, model = reach_of(plan.planned_by), model_of(plan.planned_by)

@@ -40,16 +40,16 @@ class Settings:
     reach: Reach = field(default_factory=Reach)
     tilt_deg: float = 5.0
     step_mm: float = 2.0
-    """Distance of neighbouring points, about."""
+    """Approximate distance of neighbouring points."""
     steps: int = 60
-    """Of refinement; 0 keeps the first plan."""
+    """Steps of refinement; 0 keeps the first plan."""
     drag: DragModel | None = None
     """Draws strokes that travel, with bristle lag; None lays presses over each other."""
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
-    """What is to be written: a name, its ways with half widths, and the image that they should give."""
+class FigureRequest:
+    """A figure to write: a name, its ways with half widths, and the image that they should give."""
 
     name: str
     source: str
@@ -58,17 +58,17 @@ class Wanted:
 
 
 @dataclass(frozen=True, slots=True)
-class Planned:
+class PlannedFigure:
     """One figure: trajectories (N, 5) in order, the wanted image, and the model's image before and after refinement."""
 
-    wanted: Wanted
+    request: FigureRequest
     strokes: list[Floats]
     first: Image
     simulated: Image
 
     def scores(self) -> tuple[float, float, float, float]:
         """CSIM and SSIM of the first plan, then of the refined one, against the wanted image."""
-        image = self.wanted.image
+        image = self.request.image
         return (
             csim(image, self.first),
             ssim(image, self.first),
@@ -77,42 +77,44 @@ class Planned:
         )
 
 
-def plan(what: str, data: Path | None, model: StrokeModel, settings: Settings) -> list[Planned]:
+def plan(what: str, data: Path | None, model: StrokeModel, settings: Settings) -> list[PlannedFigure]:
     """Plan each character of a text, or a trajectory file (.csv, .json). Raises `CalibrationError`."""
-    return [_planned(wanted, model, settings) for wanted in wanted_of(what, data, settings)]
+    return [_planned(request, model, settings) for request in read_requests(what, data, settings)]
 
 
-def wanted_of(what: str, data: Path | None, settings: Settings) -> list[Wanted]:
-    """Read what is to be written. Raises `CalibrationError` that names file and field."""
+def read_requests(what: str, data: Path | None, settings: Settings) -> list[FigureRequest]:
+    """Read the figures to write. Raises `CalibrationError` that names file and field."""
     if what.lower().endswith((".csv", ".json")) and len(what) > len(".csv"):
         return [_hand(Path(what), settings)]
     if not 1 <= len(what) <= MAX_FIGURES or not what.isprintable() or any(c.isspace() for c in what):
         raise CalibrationError("character", f"expected 1 to {MAX_FIGURES} characters, or a .csv or .json trajectory")
     if len(set(what)) != len(what):
         raise CalibrationError("character", "the same character twice: the protocol's `repeats` writes it again")
-    out: list[Wanted] = []
+    out: list[FigureRequest] = []
     for name in what:
         glyph = _shipped(name) if data is None else _from(data, name)
         ways = paths_of(glyph, settings.cell, settings.step_mm)
-        out.append(Wanted(name, SHIPPED_SOURCE if data is None else data.name, ways, reference(glyph, settings.cell)))
+        out.append(
+            FigureRequest(name, SHIPPED_SOURCE if data is None else data.name, ways, reference(glyph, settings.cell))
+        )
     return out
 
 
-def _planned(wanted: Wanted, model: StrokeModel, settings: Settings) -> Planned:
+def _planned(request: FigureRequest, model: StrokeModel, settings: Settings) -> PlannedFigure:
     reach, cell = settings.reach, settings.cell
     low, high = reach.tilt_deg
     if not low <= settings.tilt_deg <= high:
         raise CalibrationError("--tilt", f"{settings.tilt_deg:g} deg is outside {low:g} to {high:g}")
-    first = [trajectory(way, model, reach, cell, settings.tilt_deg, settings.drag) for way in wanted.ways]
-    if not wanted.image.any():
-        raise CalibrationError(wanted.name, "has no width anywhere: nothing would be written")
-    better = refine(model, first, wanted.image, cell.side_mm, reach, settings.steps, drag=settings.drag)
+    first = [trajectory(way, model, reach, cell, settings.tilt_deg, settings.drag) for way in request.ways]
+    if not request.image.any():
+        raise CalibrationError(request.name, "has no width anywhere: nothing would be written")
+    better = refine(model, first, request.image, cell.side_mm, reach, settings.steps, drag=settings.drag)
     strokes = [reach.spaced(np.round(reach.within(stroke, cell.side_mm), 3)) for stroke in better.strokes]
     before, after = (written(model, one, cell.side_mm, drag=settings.drag) for one in (first, strokes))
-    return Planned(wanted, strokes, before, after)
+    return PlannedFigure(request, strokes, before, after)
 
 
-def _hand(path: Path, settings: Settings) -> Wanted:
+def _hand(path: Path, settings: Settings) -> FigureRequest:
     text = _text(path, MAX_FILE_BYTES)
     parse: Callable[[str, Cell, float], list[Way]] = parse_csv if path.suffix.lower() == ".csv" else parse_json
     try:
@@ -120,7 +122,7 @@ def _hand(path: Path, settings: Settings) -> Wanted:
     except GlyphError as error:
         raise CalibrationError(str(path), str(error)) from None
     name = "".join(c if c.isalnum() or c in "-_" else "-" for c in path.stem)[:50].strip("-") or "figure"
-    return Wanted(name, path.name, ways, swept(ways, settings.cell.side_mm))
+    return FigureRequest(name, path.name, ways, swept(ways, settings.cell.side_mm))
 
 
 def _shipped(name: str) -> Glyph:

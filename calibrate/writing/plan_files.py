@@ -1,35 +1,157 @@
-"""The files of a plan: the protocol that draws it, its images as data, and a picture of wanted and simulated."""
+"""The files of a plan: plan.json, with its images, for a later comparison with ink; the protocol; and a picture."""
 
 from __future__ import annotations
 
+import base64
+import binascii
+import hashlib
 import json
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from calibrate.files import write_whole
-from calibrate.writing.plan import Planned, Settings
-from calibrate.writing.record import FILE as RECORD
-from calibrate.writing.record import PlannedBy, PlanRecord, figure_record
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-PROTOCOL, PICTURE = "protocol-write.toml", "plan.png"
-PAPER, WANTED, DRAWN = "#fbf9f4", "#2d72ff", "#d1341f"
+from calibrate.compare.field import SIZE_PX, Image
+from calibrate.errors import CalibrationError, invalid
+from calibrate.files import read_bounded
+from calibrate.report import picture_grid, save_picture, write_files
+from sessions.errors import SessionDamaged
+from sessions.recording.messages import decode_gray, encode_png
+
+if TYPE_CHECKING:
+    from calibrate.writing.plan import PlannedFigure, Settings
+
+FILE, PROTOCOL, PICTURE = "plan.json", "protocol-write.toml", "plan.png"
+BLUE, RED = "#2d72ff", "#d1341f"
+MAX_PLAN_BYTES = 4 * 1024 * 1024
+Text = Annotated[str, Field(max_length=64 * 1024)]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Points = tuple[tuple[tuple[Number, Number, Number, Number, Number], ...], ...]
+"""[stroke][point] of x, y, height, tilt, heading, as in the protocol."""
+Floats = NDArray[np.float64]
 
 
-def write_plan(figures: list[Planned], settings: Settings, by: PlannedBy, label: str, repeats: int, out: Path) -> Path:
+class PlannedBy(BaseModel):
+    """The model and the brush's reach that a plan was made with."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    model: str
+    """Name of the stroke model."""
+    radius_mm: Number
+    length_mm: Number
+    lam: Number | None
+    """None is pi."""
+    height_range_mm: tuple[Number, Number]
+    tilt_range_deg: tuple[Number, Number]
+    turn_deg_mm: Number
+    speed_mm_s: Number
+    drag_fit: Annotated[str, Field(max_length=64)] = ""
+    """Digest of the drag fit that images were drawn with; empty: presses laid over each other."""
+
+
+class FigureRecord(BaseModel):
+    """One planned figure."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: Annotated[str, Field(min_length=1, max_length=60)]
+    source: Text
+    """Font or file that the wanted image comes from."""
+    commanded: Points
+    """Where the arm goes."""
+    intended: Points
+    """The presses whose marks the ink should look like; differs from `commanded`, point by point, once a plan has
+    learned from ink."""
+    wanted_png: Text
+    """128 x 128 gray in base64, ink black, row 0 at the cell's far edge."""
+    simulated_png: Text
+
+    @property
+    def points_sha256(self) -> str:
+        """Digest of the commanded points: a session drawn from other points belongs to another plan."""
+        return points_digest(self.commanded)
+
+    def wanted(self) -> Image:
+        """(128, 128) ink from 0 to 1. Raises `CalibrationError`."""
+        return _decoded(self.wanted_png, f"{self.name}: wanted_png")
+
+    def simulated(self) -> Image:
+        """(128, 128) ink from 0 to 1 as the planning model draws it. Raises `CalibrationError`."""
+        return _decoded(self.simulated_png, f"{self.name}: simulated_png")
+
+
+class PlanRecord(BaseModel):
+    """A plan."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    model: str
+    """Label of the stroke model that planned and drew."""
+    planned_by: PlannedBy
+    cell_mm: float
+    software: str
+    figures: Annotated[tuple[FigureRecord, ...], Field(min_length=1, max_length=1000)]
+
+    def figure(self, name: str) -> FigureRecord | None:
+        """The figure of that name."""
+        return next((figure for figure in self.figures if figure.name == name), None)
+
+
+def figure_record(
+    name: str,
+    source: str,
+    commanded: Sequence[Floats],
+    intended: Sequence[Floats],
+    *,
+    wanted: Image,
+    simulated: Image,
+) -> FigureRecord:
+    """Of a planned figure: trajectories (N, 5), images (128, 128)."""
+    return FigureRecord(
+        name=name,
+        source=source,
+        commanded=_points(commanded),
+        intended=_points(intended),
+        wanted_png=_encoded(wanted),
+        simulated_png=_encoded(simulated),
+    )
+
+
+def arrays(points: Points) -> list[Floats]:
+    """Trajectories (N, 5)."""
+    return [np.array(stroke, np.float64) for stroke in points]
+
+
+def load_plan(path: Path) -> PlanRecord:
+    """Read plan.json, or the one in a plan's folder. Raises `CalibrationError`."""
+    path = path / FILE if path.is_dir() else path
+    try:
+        return PlanRecord.model_validate_json(read_bounded(path, MAX_PLAN_BYTES))
+    except ValidationError as error:
+        raise invalid(str(path), error) from None
+
+
+def write_plan(
+    figures: list[PlannedFigure], settings: Settings, by: PlannedBy, label: str, repeats: int, out: Path
+) -> Path:
     """Write picture, plan.json and protocol into a folder; returns the protocol's path. Raises OSError.
 
-    `label` names the model that planned for people. The protocol is written last: where it is, the rest is.
+    `label` is the planning model's name for people. The protocol is written last: where it is, the rest is.
     """
     out.mkdir(parents=True, exist_ok=True)
     draw(figures, settings, out / PICTURE)
     records = tuple(
         figure_record(
-            one.wanted.name,
-            one.wanted.source,
+            one.request.name,
+            one.request.source,
             one.strokes,
             one.strokes,
-            wanted=one.wanted.image,
+            wanted=one.request.image,
             simulated=one.simulated,
         )
         for one in figures
@@ -46,10 +168,8 @@ def write_plan(figures: list[Planned], settings: Settings, by: PlannedBy, label:
 
 def write_record(record: PlanRecord, repeats: int, out: Path) -> Path:
     """Write plan.json, then the protocol that draws it; returns the protocol's path. Raises OSError."""
-    protocol = out / PROTOCOL
-    write_whole(out / RECORD, record.model_dump_json(indent=2) + "\n")
-    write_whole(protocol, write_toml(record, repeats))
-    return protocol
+    write_files(out, {FILE: record.model_dump_json(indent=2) + "\n", PROTOCOL: write_toml(record, repeats)})
+    return out / PROTOCOL
 
 
 def write_toml(record: PlanRecord, repeats: int) -> str:
@@ -73,34 +193,57 @@ def write_toml(record: PlanRecord, repeats: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def draw(figures: list[Planned], settings: Settings, path: Path) -> None:
+def draw(figures: list[PlannedFigure], settings: Settings, path: Path) -> None:
     """A row a figure: wanted, first plan, refined plan, and the axis of the brush over the wanted strokes."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     side = settings.cell.side_mm
-    made = Figure((12.0, 3.4 * len(figures)), dpi=100, facecolor=PAPER, layout="constrained")
-    FigureCanvasAgg(made)
-    rows = made.subplots(len(figures), 4, squeeze=False)
+    picture, rows = picture_grid(len(figures), 4, (12.0, 3.4 * len(figures)))
     extent = (0.0, side, 0.0, side)
     for figure, axes in zip(figures, rows, strict=True):
         first_csim, first_ssim, last_csim, last_ssim = figure.scores()
-        # Code points, not the characters: most machines have no font of theirs for the picture.
-        name = " ".join(f"U+{ord(c):04X}" if ord(c) > 0x2E7F else c for c in figure.wanted.name)
+        wanted = figure.request.image
         titles = (
-            f"wanted: {name}",
+            f"wanted: {code_points(figure.request.name)}",
             f"first plan, simulated: CSIM {first_csim:.4f}, SSIM {first_ssim:.4f}",
             f"refined, simulated: CSIM {last_csim:.4f}, SSIM {last_ssim:.4f}",
             "points of the trajectory",
         )
-        images = (figure.wanted.image, figure.first, figure.simulated, 0.25 * figure.wanted.image)
+        images = (wanted, figure.first, figure.simulated, 0.25 * wanted)
         for axis, image, title in zip(axes, images, titles, strict=True):
             axis.imshow(1 - image, cmap="gray", vmin=0, vmax=1, extent=extent, interpolation="nearest")
             axis.set_title(title, fontsize=8)
             axis.tick_params(labelsize=7)
         for stroke in figure.strokes:
-            axes[3].plot(stroke[:, 0], stroke[:, 1], "-", color=WANTED, lw=0.8)
-            axes[3].scatter(stroke[:, 0], stroke[:, 1], s=2 * stroke[:, 2], color=DRAWN, zorder=3)
+            axes[3].plot(stroke[:, 0], stroke[:, 1], "-", color=BLUE, lw=0.8)
+            axes[3].scatter(stroke[:, 0], stroke[:, 1], s=2 * stroke[:, 2], color=RED, zorder=3)
         axes[0].set_ylabel("mm", fontsize=7)
-    untyped: Any = made
-    untyped.savefig(path, format="png", metadata={"Software": None})
+    save_picture(picture, path)
+
+
+def code_points(name: str) -> str:
+    """A name that any font can show: most machines have none with Chinese characters for a picture."""
+    return " ".join(f"U+{ord(c):04X}" if ord(c) > 0x2E7F else c for c in name)
+
+
+def points_digest(strokes: Sequence[Any]) -> str:
+    """SHA-256 of trajectories [stroke][point][x, y, height, tilt, heading], to the micrometre of the protocol."""
+    rounded = [[[round(float(value), 3) + 0.0 for value in point] for point in stroke] for stroke in strokes]
+    return hashlib.sha256(json.dumps(rounded, separators=(",", ":")).encode()).hexdigest()
+
+
+def _points(strokes: Sequence[Floats]) -> Points:
+    rounded = (np.round(stroke, 3).tolist() for stroke in strokes)
+    return tuple(tuple((x, y, height, tilt, heading) for x, y, height, tilt, heading in stroke) for stroke in rounded)
+
+
+def _encoded(ink: Image) -> str:
+    return base64.b64encode(encode_png(np.rint(255.0 * (1.0 - ink)).astype(np.uint8))).decode()
+
+
+def _decoded(text: str, where: str) -> Image:
+    try:
+        gray = decode_gray(base64.b64decode(text, validate=True), where)
+    except (binascii.Error, ValueError, SessionDamaged):
+        raise CalibrationError(FILE, f"{where} is not a picture") from None
+    if gray.shape != (SIZE_PX, SIZE_PX):
+        raise CalibrationError(FILE, f"{where} is {gray.shape[1]} x {gray.shape[0]} px, not {SIZE_PX} x {SIZE_PX}")
+    return (1.0 - gray.astype(np.float32) / 255.0).astype(np.float32)

@@ -2,32 +2,37 @@
 
 from __future__ import annotations
 
-import base64
 import hashlib
-import io
 import platform
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from calibrate.compare.field import Alignment, Tone
-from calibrate.compare.similarity import SSIM_SETTINGS
-from calibrate.files import write_whole
-from calibrate.report.pages import render
-from calibrate.report.pictures import difference, ink
-from calibrate.report.wording import source_note
-from calibrate.writing.compare import Written
-from calibrate.writing.images import Polarity
-from calibrate.writing.picture import draw, ranked
-from calibrate.writing.scores import PAIRS, WrittenScore
-from calibrate.writing.table import FILE as NUMBERS
-from calibrate.writing.table import PICTURE, Table3Row, WrittenRecord
-from sessions.cells import CsvWriter
+from calibrate.compare.field import Alignment, Image, Tone
+from calibrate.compare.similarity import SSIM_SETTINGS, Polarity
+from calibrate.report import (
+    csv_text,
+    ink_uri,
+    overlay,
+    overlay_uri,
+    picture_grid,
+    png_uri,
+    render,
+    save_picture,
+    show_picture,
+    source_note,
+    write_files,
+)
+from calibrate.writing.compare import WritingComparison
+from calibrate.writing.plan_files import code_points
+from calibrate.writing.scores import FILE as NUMBERS
+from calibrate.writing.scores import PAIRS, PICTURE, REFERENCE, Character, Table3Row, WrittenRecord, WrittenScore
 
+HEADLINE = (Alignment.MM, Tone.BINARY, Polarity.INK)
 PAGE, TABLE = "written.html", "written.csv"
 
 
-def write_written(written: Written, folder: Path, command: str) -> Path:
+def write_written(written: WritingComparison, folder: Path, command: str) -> Path:
     """Write the report's files into `folder`; returns the page's path. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     draw(written, folder / PICTURE)
@@ -45,16 +50,16 @@ def write_written(written: Written, folder: Path, command: str) -> Path:
         refused=written.refused,
         cut=[stroke_id for one in written.characters for stroke_id in one.cut],
         ssim_settings=SSIM_SETTINGS,
-        picture="data:image/png;base64," + base64.b64encode(picture).decode(),
+        picture=png_uri(picture),
         provenance=list(_provenance(written, command)),
     )
-    write_whole(folder / TABLE, written_csv(written.scores, str(written.header.source)))
-    write_whole(folder / NUMBERS, record_of(written, command, picture).to_json())
-    write_whole(folder / PAGE, page)
+    csv = written_csv(written.scores, str(written.header.source))
+    record = record_of(written, command, picture)
+    write_files(folder, {TABLE: csv, NUMBERS: record.to_json(), PAGE: page})
     return folder / PAGE
 
 
-def summary(written: Written) -> Iterator[str]:
+def summary(written: WritingComparison) -> Iterator[str]:
     """Lines for the terminal: the strict and the lenient comparison, ink = 1."""
     count = sum(len(one.captured) for one in written.characters)
     yield f"{count} characters written, {len(written.refused)} not compared ({written.header.source})"
@@ -65,17 +70,16 @@ def summary(written: Written) -> Iterator[str]:
 
 
 def written_csv(scores: list[WrittenScore], source: str) -> str:
-    """A row a comparison."""
-    out = io.StringIO()
-    writer = CsvWriter(out)
-    writer.writerow(["character", "stroke_id", "pair", "alignment", "tone", "polarity", "csim", "ssim", "source"])
-    for s in scores:
-        numbers = (f"{s.csim:.6f}", f"{s.ssim:.6f}", source)
-        writer.writerow([s.character, s.stroke_id, s.pair, s.alignment, s.tone, s.polarity, *numbers])
-    return out.getvalue()
+    """A row for every comparison."""
+    head = ["character", "stroke_id", "pair", "alignment", "tone", "polarity", "csim", "ssim", "source"]
+    rows = (
+        (s.character, s.stroke_id, s.pair, s.alignment, s.tone, s.polarity, f"{s.csim:.6f}", f"{s.ssim:.6f}", source)
+        for s in scores
+    )
+    return csv_text(head, rows)
 
 
-def record_of(written: Written, command: str, picture: bytes) -> WrittenRecord:
+def record_of(written: WritingComparison, command: str, picture: bytes) -> WrittenRecord:
     """Everything but the images and the single scores, with its digest and that of Figure 13."""
     return WrittenRecord(
         source=written.header.source,
@@ -92,8 +96,41 @@ def record_of(written: Written, command: str, picture: bytes) -> WrittenRecord:
     ).sealed()
 
 
+def draw(written: WritingComparison, path: Path) -> None:
+    """Figure 13, a row a character: reference, simulated, best and worst writing, and all of them over the reference.
+
+    Raises OSError.
+    """
+    title = f"{written.header.session_id} ({written.header.source})"
+    count = len(written.characters)
+    figure, rows = picture_grid(count, 5, (13.0, 0.5 + 2.9 * count), title)
+    for one, axes in zip(written.characters, rows, strict=True):
+        names = ranked(written, one)
+        reference = one.reference[Tone.GRAY]
+        parts: tuple[tuple[str, Image], ...] = (
+            (f"reference {code_points(one.name)}", reference),
+            ("simulated", one.simulated[Tone.GRAY]),
+            (f"captured, best of {len(one.captured)}", one.captured[names[0]][Tone.GRAY]),
+            ("captured, worst", one.captured[names[-1]][Tone.GRAY]),
+            ("blue: mean of all captured; orange: reference", overlay(reference, one.mean_ink())),
+        )
+        for axis, (text, image) in zip(axes, parts, strict=True):
+            show_picture(axis, image, text, fontsize=8)
+    save_picture(figure, path)
+
+
+def ranked(written: WritingComparison, one: Character) -> list[str]:
+    """Stroke ids by CSIM against the reference (mm, binary, ink = 1), best first."""
+    found = {
+        s.stroke_id: s.csim
+        for s in written.scores
+        if s.character == one.name and s.pair == REFERENCE and (s.alignment, s.tone, s.polarity) == HEADLINE
+    }
+    return sorted(found, key=lambda stroke_id: -found[stroke_id])
+
+
 def _tables(table: list[Table3Row]) -> list[dict[str, Any]]:
-    """A table an alignment and tone, both polarities in it."""
+    """A table for each alignment and tone, both polarities in it."""
     out: list[dict[str, Any]] = []
     for tone in (Tone.BINARY, Tone.GRAY):
         for alignment in (Alignment.SIZE_NORMALISED, Alignment.MM):
@@ -103,20 +140,22 @@ def _tables(table: list[Table3Row]) -> list[dict[str, Any]]:
     return out
 
 
-def _characters(written: Written) -> Iterator[dict[str, Any]]:
+def _characters(written: WritingComparison) -> Iterator[dict[str, Any]]:
     for one in written.characters:
         reference = one.reference[Tone.GRAY]
         yield {
             "name": one.name,
             "reference_name": one.reference_name,
-            "reference": ink(reference),
-            "simulated": ink(one.simulated[Tone.GRAY]),
-            "mean": difference(one.mean_ink(), reference),
-            "captured": [(stroke_id, ink(one.captured[stroke_id][Tone.GRAY])) for stroke_id in ranked(written, one)],
+            "reference": ink_uri(reference),
+            "simulated": ink_uri(one.simulated[Tone.GRAY]),
+            "mean": overlay_uri(one.mean_ink(), reference),
+            "captured": [
+                (stroke_id, ink_uri(one.captured[stroke_id][Tone.GRAY])) for stroke_id in ranked(written, one)
+            ],
         }
 
 
-def _provenance(written: Written, command: str) -> Iterator[tuple[str, str]]:
+def _provenance(written: WritingComparison, command: str) -> Iterator[tuple[str, str]]:
     header, calibration = written.header, written.calibration
     yield "source", str(header.source)
     yield "recording", f"{written.recording.name}, sha256 {written.recording_sha256}"

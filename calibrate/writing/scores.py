@@ -1,26 +1,45 @@
-"""How alike a written character is to its simulated image, to its reference, and to its own other writings."""
+"""How alike a written character is to its simulated image, to its reference, and to its own other writings: Table 3."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar, cast
 
+import cv2
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
-from calibrate.compare.field import Alignment, Image, Tone
-from calibrate.writing.images import KEYS, Ink, Key, Polarity, similarity
+from calibrate.compare.field import SIZE_PX, Alignment, Image, Tone, to_tone
+from calibrate.compare.paper import ROBOT_WRITING, TABLE_3, Triple
+from calibrate.compare.similarity import Polarity, similarity
+from calibrate.compare.stats import Summary, summarise
+from calibrate.report import Sealed, load_sealed
+from sessions.recording.schemas import Source
 
+FILE, PICTURE = "written.json", "figure-13.png"
+FORMAT = "brushloop-written-1"
+MAX_BYTES = 8 * 1024 * 1024
+Key = tuple[Alignment, Tone, Polarity]
+KEYS: tuple[Key, ...] = tuple(itertools.product(Alignment, Tone, Polarity))
+Ink = dict[Tone, Image]
+"""(128, 128) ink of a cell from 0 to 1 by tone: coverage of what counts as ink, and how dark it is."""
 SIMULATED, REFERENCE = "captured, simulated", "captured, reference"
 PLANNED, ANOTHER = "simulated, reference", "captured, another writing"
 PAIRS = (SIMULATED, REFERENCE, PLANNED, ANOTHER)
 """What is compared with what."""
-MOST_OTHERS = 12
+PAPER_ROWS = {SIMULATED: TABLE_3["ccd-bsmg"], REFERENCE: TABLE_3[ROBOT_WRITING]}
+"""The paper's row that stands beside a comparison: our reading, see `TABLE_3`."""
+NORMAL_SIDE_PX = 100
+MAX_OTHERS = 12
 """Other writings that one is compared with: a hundred writings would make ten thousand pairs."""
 
 
 @dataclass(frozen=True, slots=True)
 class Character:
-    """One character: what was wanted, what the model makes of the plan, and what was written."""
+    """One character: the image asked for, the model's image of the plan, and what was written."""
 
     name: str
     reference_name: str
@@ -50,8 +69,68 @@ class WrittenScore:
     ssim: float
 
 
+class Table3Row(BaseModel):
+    """Max, min, avg and median over the writings of one character, in percent."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    source: Source
+    """`loopback rig` or `real capture`."""
+    session_id: str
+    character: str
+    reference: str
+    """The font, or the user's picture."""
+    model: str
+    pair: str
+    """What was compared with what."""
+    alignment: Alignment
+    tone: Tone
+    polarity: Polarity
+    n: Annotated[int, Field(ge=1)]
+    csim: Triple
+    ssim: Triple
+    csim_median: float
+    ssim_median: float
+    paper_row: str | None = None
+    paper_csim: Triple | None = None
+    paper_ssim: Triple | None = None
+
+
+class WrittenRecord(Sealed):
+    """Written characters as their `written.json` holds them: everything but the images and the single scores."""
+
+    FORMAT: ClassVar[str] = FORMAT
+    MADE_BY: ClassVar[str] = "brushloop write compare"
+
+    format: str = FORMAT
+    source: Source
+    session: str
+    recording_sha256: str
+    brush: str
+    """Name in the recording."""
+    model: str
+    cell_mm: float
+    table_3: tuple[Table3Row, ...]
+    refused: tuple[tuple[str, str], ...]
+    """(stroke, why)."""
+    figure_13_sha256: str
+    """Of Figure 13 in the same folder."""
+    software: str
+    command: str
+
+    @property
+    def characters(self) -> tuple[str, ...]:
+        """Their names, in the table's order."""
+        return tuple(dict.fromkeys(row.character for row in self.table_3))
+
+
+def read_written(path: Path) -> WrittenRecord:
+    """A `written.json`, or the one in a report's folder. Raises `CalibrationError` if it is not one, or was edited."""
+    return load_sealed(path / FILE if path.is_dir() else path, WrittenRecord, MAX_BYTES)
+
+
 def score_character(one: Character) -> Iterator[WrittenScore]:
-    """Every writing in every alignment, tone and polarity; another writing is the mean over the others."""
+    """Score every writing in every alignment, tone and polarity; another writing is the mean over the others."""
     for key in KEYS:
         yield _score(one, "", PLANNED, key, one.reference, [one.simulated])
         for stroke_id, ink in one.captured.items():
@@ -61,15 +140,81 @@ def score_character(one: Character) -> Iterator[WrittenScore]:
                 yield _score(one, stroke_id, ANOTHER, key, ink, others)
 
 
+def compare_ink(fixed: Ink, moving: Ink, key: Key) -> tuple[float, float]:
+    """(CSIM, SSIM) of the ink of two cells. Raises ValueError for a blank one."""
+    alignment, tone, polarity = key
+    one, other = (to_tone(aligned(ink[tone], alignment), tone) for ink in (fixed, moving))
+    return similarity(one, other, alignment, polarity)
+
+
+def aligned(ink: Image, alignment: Alignment) -> Image:
+    """(128, 128) as it is, or with the longer side of its ink scaled to 100 px and its bounding box in the middle."""
+    if alignment is Alignment.MM:
+        return ink
+    rows, columns = np.flatnonzero((ink > 0.5).any(axis=1)), np.flatnonzero((ink > 0.5).any(axis=0))
+    if not rows.size:
+        raise ValueError("holds no ink")
+    scale = NORMAL_SIDE_PX / (1 + max(rows[-1] - rows[0], columns[-1] - columns[0]))
+    x, y = 0.5 * (columns[0] + columns[-1] + 1), 0.5 * (rows[0] + rows[-1] + 1)
+    middle = 0.5 * SIZE_PX
+    # cv2 puts pixel centres on integers, a pixel here covers [j, j + 1).
+    move = np.array([[scale, 0.0, middle - 0.5 - scale * (x - 0.5)], [0.0, scale, middle - 0.5 - scale * (y - 0.5)]])
+    return cast("Image", cv2.warpAffine(ink, move, (SIZE_PX, SIZE_PX), flags=cv2.INTER_LINEAR).clip(0.0, 1.0))
+
+
 def _others(one: Character, stroke_id: str) -> list[Ink]:
-    """The next `MOST_OTHERS` writings, the last followed by the first."""
+    """The next `MAX_OTHERS` writings, the last followed by the first."""
     names = list(one.captured)
     place = names.index(stroke_id)
-    following = (names[place + 1 :] + names[:place])[:MOST_OTHERS]
+    following = (names[place + 1 :] + names[:place])[:MAX_OTHERS]
     return [one.captured[name] for name in following]
 
 
 def _score(one: Character, stroke_id: str, pair: str, key: Key, fixed: Ink, others: Sequence[Ink]) -> WrittenScore:
-    found = np.mean([similarity(fixed, other, key) for other in others], axis=0)
-    alignment, tone, polarity = key
-    return WrittenScore(one.name, stroke_id, pair, alignment, tone, polarity, float(found[0]), float(found[1]))
+    csim, ssim = np.mean([compare_ink(fixed, other, key) for other in others], axis=0)
+    return WrittenScore(one.name, stroke_id, pair, *key, float(csim), float(ssim))
+
+
+def table_3(
+    scores: Iterable[WrittenScore], *, source: Source, session_id: str, model: str, references: dict[str, str]
+) -> list[Table3Row]:
+    """The rows, by character, then in the order of `KEYS` and `PAIRS`; `references` name each character's reference."""
+    grouped: dict[tuple[str, Alignment, Tone, Polarity, str], list[WrittenScore]] = {}
+    for s in scores:
+        grouped.setdefault((s.character, s.alignment, s.tone, s.polarity, s.pair), []).append(s)
+    rows: list[Table3Row] = []
+    for (character, reference), key, pair in itertools.product(references.items(), KEYS, PAIRS):
+        found = grouped.get((character, *key, pair))
+        if not found:
+            continue
+        csim, ssim = (_summary([getattr(s, measure) for s in found]) for measure in ("csim", "ssim"))
+        paper = PAPER_ROWS.get(pair)
+        rows.append(
+            Table3Row(
+                source=source,
+                session_id=session_id,
+                character=character,
+                reference=reference,
+                model=model,
+                pair=pair,
+                alignment=key[0],
+                tone=key[1],
+                polarity=key[2],
+                n=len(found),
+                csim=csim.range_and_avg,
+                ssim=ssim.range_and_avg,
+                csim_median=csim.median,
+                ssim_median=ssim.median,
+                paper_row=paper.label if paper else None,
+                paper_csim=paper.csim if paper else None,
+                paper_ssim=paper.ssim if paper else None,
+            )
+        )
+    return rows
+
+
+def _summary(values: list[float]) -> Summary:
+    """In percent."""
+    found = summarise(100.0 * np.array(values))
+    assert found is not None, "only called with scores, which are finite"
+    return found

@@ -5,12 +5,10 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
-from calibrate.loop.images import KEYS
-from calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, verdicts
-from calibrate.loop.table import LoopRecord, table_1
-from calibrate.writing.images import KEYS as WRITTEN_KEYS
-from calibrate.writing.scores import PAIRS, PLANNED, WrittenScore
-from calibrate.writing.table import Table3Row, WrittenRecord, table_3
+from calibrate.compare.field import KEYS
+from calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, LoopRecord, PairScore, table_1, verdicts
+from calibrate.writing.scores import KEYS as WRITTEN_KEYS
+from calibrate.writing.scores import PAIRS, PLANNED, Table3Row, WrittenRecord, WrittenScore, table_3
 from sessions.recording.schemas import Source
 
 LEVELS = {AGAIN: 0.94, ANOTHER: 0.95, SIMULATED: 0.9}

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from calibrate.compare.field import KEYS, Alignment, Field, Tone, best_shift
-from calibrate.compare.images import pack
-from calibrate.compare.simulate import simulated, simulated_pixels
+from calibrate.compare.images import pack, simulated, simulated_pixels
 from calibrate.validate.jobs import ABSENT, PrepareJob, Press, ScoreJob, prepare_job, score_job
 from model.ccdbsm import Brush
 from model.coverage import coverage

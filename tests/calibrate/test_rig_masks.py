@@ -8,7 +8,7 @@ import pytest
 from bench.preprocess_rigs import BRUSHES, Shot, heading_free_window, sheet, true_mask
 from calibrate.board.plane import Plane
 from calibrate.board.view import see_board_and_lens
-from calibrate.compare.scales import MM_PER_PX
+from calibrate.compare import MM_PER_PX
 from calibrate.stages import trace_seen
 from calibrate.stroke.params import PX_PER_MM, Params
 from calibrate.stroke.preprocess import prepare

@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from calibrate.cli import app
+from calibrate.compare import MM_PER_PX
 from calibrate.compare.field import Field
-from calibrate.compare.scales import MM_PER_PX
 from calibrate.errors import CaptureRefused
 from calibrate.stages import trace_scaled
 from calibrate.stroke.params import Params

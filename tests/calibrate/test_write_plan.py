@@ -14,9 +14,8 @@ from brushloop import app
 from calibrate.artefact import FittedValue
 from calibrate.drags.run import DragArtefact
 from calibrate.errors import CalibrationError
-from calibrate.writing.plan import Settings, plan, wanted_of
-from calibrate.writing.plan_files import PICTURE, PROTOCOL, write_plan
-from calibrate.writing.record import load_plan
+from calibrate.writing.plan import Settings, plan, read_requests
+from calibrate.writing.plan_files import PICTURE, PROTOCOL, load_plan, write_plan
 from collect.protocols.config import load_protocol
 from collect.protocols.write import WriteConfig
 from model.ccdbsm import Brush
@@ -75,7 +74,7 @@ def test_a_whole_data_set_is_read_from_a_folder_or_a_file_of_lines(tmp_path: Pat
     ]
     (tmp_path / "graphics.txt").write_text("\n".join(lines), encoding="utf-8")
     for data in (tmp_path, tmp_path / "graphics.txt", tmp_path / "一.json"):
-        (wanted,) = wanted_of("一", data, QUICK)
+        (wanted,) = read_requests("一", data, QUICK)
         assert len(wanted.ways) == 1
         assert wanted.image.max() == 1.0
 
@@ -163,5 +162,5 @@ def test_the_front_door_tells_it_in_one_line_and_exits_with_2(tmp_path: Path) ->
 def test_bad_data_names_its_file(tmp_path: Path, name: str, content: bytes, words: str) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(CalibrationError, match=name) as caught:
-        wanted_of("一", tmp_path / name, QUICK)
+        read_requests("一", tmp_path / name, QUICK)
     assert words in str(caught.value)

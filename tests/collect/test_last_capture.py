@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibrate.compare.field import Alignment, Field, Tone
-from calibrate.compare.simulate import simulated
+from calibrate.compare.images import simulated
 from collect.engine.last_capture import LastCapture, published_mark
 from model.registry import stroke_model
 

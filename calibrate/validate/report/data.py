@@ -10,9 +10,9 @@ from typing import ClassVar
 from pydantic import BaseModel, ConfigDict
 
 from calibrate.compare.field import Alignment, Tone
-from calibrate.loop.table import LoopRecord
-from calibrate.report.sealed import Sealed, load_sealed
-from calibrate.writing.table import WrittenRecord
+from calibrate.loop.scores import LoopRecord
+from calibrate.report import Sealed, load_sealed
+from calibrate.writing.scores import WrittenRecord
 from sessions.recording.schemas import Source
 
 FORMAT = "brushloop-validation-1"
@@ -49,7 +49,7 @@ class Stat(_Frozen):
     median_interval: Interval | None
 
 
-class Rival(_Frozen):
+class CandidateInfo(_Frozen):
     """What a row of the tables is, and what it knew of the strokes."""
 
     name: str
@@ -152,7 +152,7 @@ class Report(Sealed):
     mm_per_px: float
     ssim_settings: str
     sessions: tuple[Session, ...]
-    rivals: tuple[Rival, ...]
+    rivals: tuple[CandidateInfo, ...]
     shown: str
     """The model of the pictures: the best calibrated one that has not seen what it predicts, if there is one."""
     stats: tuple[Stat, ...]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 import io
 from collections.abc import Sequence
@@ -13,20 +12,20 @@ from typing import Any
 import numpy as np
 
 from calibrate.compare.field import KEYS, Alignment, Tone
-from calibrate.compare.images import Pixels
+from calibrate.compare.images import Pixels, unpack
 from calibrate.errors import CalibrationError
 from calibrate.files import read_bounded
-from calibrate.report import pictures
+from calibrate.report import ink_uri, overlay_uri, plot, plot_uri
 from calibrate.validate.report.data import Report
 from calibrate.validate.run import Outcome
 from model.ccdbsm import DomainError
 
 ROWS = slice(32, 96)
 """The middle half of a field: a press is at most half as thick as the field is high."""
-MOST_POINTS = 200
-MOST_SAMPLES, MOST_CELLS = 15, 5
+MAX_POINTS = 200
+MAX_SAMPLES, MAX_CELLS = 15, 5
 GRAY_MM = KEYS.index((Alignment.MM, Tone.GRAY))
-MOST_CURVE_BYTES = 64 * 1024 * 1024
+MAX_CURVE_BYTES = 64 * 1024 * 1024
 BLUE, RED = "#0072B2", "#D55E00"
 
 
@@ -34,7 +33,7 @@ def distributions(outcome: Outcome, report: Report) -> str:
     """CSIM of every stroke by model in both alignments, with the average and its interval."""
     labels = {rival.name: rival.label for rival in report.rivals}
     names = [name for name in outcome.names if name in labels]
-    figure, axes = _figure(1, 2, (11.0, 0.9 + 0.36 * len(names)))
+    figure, axes = plot(1, 2, (11.0, 0.9 + 0.36 * len(names)))
     for axis, alignment in zip(axes, (Alignment.MM, Alignment.SIZE_NORMALISED), strict=True):
         key = KEYS.index((alignment, Tone.BINARY))
         rng = np.random.default_rng(0)  # jitter only, so that points do not hide each other
@@ -48,7 +47,7 @@ def distributions(outcome: Outcome, report: Report) -> str:
                 parts: Any = axis.violinplot([values], [place], orientation="horizontal", widths=0.8, showextrema=False)
                 for body in parts["bodies"]:
                     body.set(facecolor=BLUE, alpha=0.18)
-            some = values[:: max(1, -(-len(values) // MOST_POINTS))]
+            some = values[:: max(1, -(-len(values) // MAX_POINTS))]
             axis.plot(some, place + 0.14 * rng.uniform(-1, 1, len(some)), ".", ms=3, alpha=0.5, color=BLUE)
             if stat.avg_interval is not None:
                 span = stat.avg_interval
@@ -59,12 +58,12 @@ def distributions(outcome: Outcome, report: Report) -> str:
         axis.set_title(f"{alignment}, binary ({report.label})", fontsize=10)
         axis.grid(axis="x", alpha=0.3)
     axes[1].set_yticklabels([])
-    return _png(figure)
+    return plot_uri(figure)
 
 
 def by_strokes(report: Report) -> str:
     """CSIM on presses that were not fitted, against the number of presses that were."""
-    figure, axis = _figure(1, 1, (6.4, 3.2))
+    figure, axis = plot(1, 1, (6.4, 3.2))
     for name, colour in (("CCD-BSM", RED), ("Bézier", BLUE)):
         counts = sorted({step.strokes for step in report.by_strokes if step.model == name})
         means = [np.mean([s.csim for s in report.by_strokes if (s.model, s.strokes) == (name, n)]) for n in counts]
@@ -79,7 +78,7 @@ def by_strokes(report: Report) -> str:
     axis.set_title(f"mm, binary ({report.label})", fontsize=10)
     axis.grid(alpha=0.3)
     axis.legend()
-    return _png(figure)
+    return plot_uri(figure)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +97,7 @@ def read_curve(text: str) -> Curve:
         raise CalibrationError(f"--curves {text}", "expected NAME=FOLDER")
     path = Path(folder) / "validation.csv"
     try:
-        rows = list(csv.DictReader(io.StringIO(read_bounded(path, MOST_CURVE_BYTES).decode())))
+        rows = list(csv.DictReader(io.StringIO(read_bounded(path, MAX_CURVE_BYTES).decode())))
         steps = tuple(int(row["step"]) for row in rows)
         losses = tuple(float(row["mse"]) for row in rows)
     except (KeyError, TypeError, ValueError):
@@ -110,7 +109,7 @@ def read_curve(text: str) -> Curve:
 
 def curves(given: Sequence[Curve]) -> str:
     """Validation losses of trained generators: the paper's figures 9 and 12."""
-    figure, axis = _figure(1, 1, (6.4, 3.2))
+    figure, axis = plot(1, 1, (6.4, 3.2))
     for one in given:
         axis.semilogy(one.steps, one.losses, ".-", ms=4, label=one.name)
     axis.set_xlabel("step")
@@ -118,13 +117,13 @@ def curves(given: Sequence[Curve]) -> str:
     axis.set_title("networks trained on exact images of stroke models", fontsize=10)
     axis.grid(alpha=0.3)
     axis.legend()
-    return _png(figure)
+    return plot_uri(figure)
 
 
 def samples(outcome: Outcome, shown: str) -> list[dict[str, Any]]:
     """The first capture of each cell above what one model predicts: the paper's figures 7 and 8."""
     made: list[dict[str, Any]] = []
-    for k in _first_of_cells(outcome, MOST_SAMPLES):
+    for k in _first_of_cells(outcome, MAX_SAMPLES):
         row = outcome.rows[k]
         image, measured = predicted(outcome, k, shown), row.press.measured
         size = "" if measured is None else f"{measured.length_mm:.1f} × {measured.breadth_mm:.1f} mm"
@@ -135,8 +134,8 @@ def samples(outcome: Outcome, shown: str) -> list[dict[str, Any]]:
 
 def side_by_side(outcome: Outcome, leave_out: Sequence[str]) -> dict[str, Any]:
     """Some captures beside what every contender predicts: the paper's figures 10 and 11."""
-    chosen = _first_of_cells(outcome, MOST_CELLS)
-    known = {one.name: one.label for made in outcome.contenders for one in made if one.name not in leave_out}
+    chosen = _first_of_cells(outcome, MAX_CELLS)
+    known = {one.name: one.label for made in outcome.candidates for one in made if one.name not in leave_out}
     lines: list[dict[str, Any]] = []
     for k in chosen:
         images = [predicted(outcome, k, name) for name in known]
@@ -146,12 +145,12 @@ def side_by_side(outcome: Outcome, leave_out: Sequence[str]) -> dict[str, Any]:
 
 
 def of_one_cell(outcome: Outcome, names: Sequence[str]) -> list[tuple[str, str]]:
-    """(label, image) of a capture in the middle of the cells, and of these contenders for it."""
-    chosen = _first_of_cells(outcome, MOST_SAMPLES)
+    """(label, image) of a capture in the middle of the cells, and of these candidates for it."""
+    chosen = _first_of_cells(outcome, MAX_SAMPLES)
     if not chosen:
         return []
     k = chosen[len(chosen) // 2]
-    labels = {one.name: one.label for one in outcome.contenders[outcome.rows[k].session]}
+    labels = {one.name: one.label for one in outcome.candidates[outcome.rows[k].session]}
     made = [("captured", _ink(captured_image(outcome, k)))]
     for name in names:
         image = predicted(outcome, k, name)
@@ -180,13 +179,13 @@ def extreme(outcome: Outcome, session_id: str, stroke_id: str, model: str) -> di
     captured, image = captured_image(outcome, k), predicted(outcome, k, model)
     assert image is not None, "a stroke that was scored was predicted"
     a, b = (np.asarray(one[ROWS] / 255.0, np.float32) for one in (captured, image))
-    return {"captured": pictures.ink(a), "predicted": pictures.ink(b), "difference": pictures.difference(a, b)}
+    return {"captured": ink_uri(a), "predicted": ink_uri(b), "difference": overlay_uri(a, b)}
 
 
 def predicted(outcome: Outcome, k: int, name: str) -> Pixels | None:
     """(128, 128) gray on the millimetre field, or None where the model does not predict this press."""
     row = outcome.rows[k]
-    found = next((one for one in outcome.contenders[row.session] if one.name == name), None)
+    found = next((one for one in outcome.candidates[row.session] if one.name == name), None)
     if found is None:
         return None
     try:
@@ -197,24 +196,8 @@ def predicted(outcome: Outcome, k: int, name: str) -> Pixels | None:
 
 def captured_image(outcome: Outcome, k: int) -> Pixels:
     """(128, 128) gray on the millimetre field."""
-    from calibrate.compare.images import unpack
-
     return unpack(outcome.press(k).pixels)[GRAY_MM]
 
 
 def _ink(image: Pixels) -> str:
-    return pictures.ink(np.asarray(image[ROWS] / 255.0, np.float32))
-
-
-def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
-    # The object interface: pyplot would keep every figure alive and look for a display.
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    return figure, figure.subplots(rows, columns)
-
-
-def _png(figure: Any) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+    return ink_uri(np.asarray(image[ROWS] / 255.0, np.float32))

@@ -8,17 +8,16 @@ from dataclasses import dataclass
 
 from calibrate.compare.field import Alignment, Tone
 from calibrate.compare.paper import ORDER
-from calibrate.loop.scores import AGAIN, ANOTHER
-from calibrate.loop.table import LoopRecord
+from calibrate.compare.similarity import Polarity
+from calibrate.loop.scores import AGAIN, ANOTHER, LoopRecord
 from calibrate.validate import candidates as who
 from calibrate.validate.report.data import Report, Session, Stat
 from calibrate.validate.run import CEILING
-from calibrate.writing.images import Polarity
 from calibrate.writing.scores import REFERENCE
 from sessions.recording.schemas import Source
 
 CLOSE = 0.5
-"""Points below which two models are not told apart."""
+"""Points below which two models count as equal."""
 NEAR_CEILING = 1.5
 """Points of average CSIM."""
 FEW_REPEATS = 3
@@ -27,7 +26,7 @@ WIDE_SCALE = 0.005
 MUCH_REFUSED = 0.05
 MOVED_MM = 0.3
 """Between two zero touches of one session: more than their repeatability together."""
-MOST_NAMED = 6
+MAX_NAMED = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,26 +61,26 @@ def findings(report: Report) -> Iterator[str]:
     top = _avg(report, CEILING)
     if top is not None:
         yield (
-            f"How repeatable the brush is: one press foretells another of the same H and α with a CSIM of "
-            f"{_told(top)}. No model can be expected to do much better; this is the ceiling."
+            f"How repeatable the brush is: one press predicts another of the same H and α with a CSIM of "
+            f"{_interval(top)}. No model can be expected to do much better; this is the ceiling."
         )
     held, bezier = _avg(report, who.FITTED_HELD_OUT), _avg(report, who.BEZIER_REFITTED)
     if held is not None:
         gap = "" if top is None else f", {top.avg - held.avg:.1f} points below the ceiling"
-        yield f"Calibrated to this brush, CCD-BSM reaches {_told(held)}{gap}, on cells that the fit had not seen."
+        yield f"Calibrated to this brush, CCD-BSM reaches {_interval(held)}{gap}, on cells that the fit had not seen."
     tuned = _avg(report, who.GENERATOR_HELD_OUT)
     if tuned is not None:
         gap = "" if top is None else f", {top.avg - tuned.avg:.1f} points below the ceiling"
-        yield f"Tuned to this brush, CCD-BSMG reaches {_told(tuned)}{gap}, on cells that it had not seen."
+        yield f"Tuned to this brush, CCD-BSMG reaches {_interval(tuned)}{gap}, on cells that it had not seen."
     if bezier is not None:
-        beside = "" if held is None else f": {abs(held.avg - bezier.avg):.1f} points {_less(bezier.avg, held.avg)}"
-        yield f"A Bézier stroke fitted to the same captures reaches {_told(bezier)}{beside}."
+        peer = "" if held is None else f": {abs(held.avg - bezier.avg):.1f} points {_less(bezier.avg, held.avg)}"
+        yield f"A Bézier stroke fitted to the same captures reaches {_interval(bezier)}{peer}."
     yield from _pressed_again(report)
     yield from _characters(report)
     published = [(name, stat) for name in ("ccd-bsmg", "ccd-bsm") if (stat := _avg(report, name)) is not None]
     for name, stat in published:
         label = _label(report, name)
-        yield f"{label} as published, told nothing but the brush's size, H and α, reaches {_told(stat)}."
+        yield f"{label} as published, given only the brush's size, H and α, reaches {_interval(stat)}."
     if published:
         yield from _sizes(report)
     if held is None and report.source != Source.IMPORT:
@@ -93,10 +92,10 @@ def _pressed_again(report: Report) -> Iterator[str]:
         again, other = (loop.row(what, Alignment.MM, Tone.BINARY) for what in (AGAIN, ANOTHER))
         if again is None:
             continue
-        beside = "" if other is None else f", other presses of the same H and α {other.csim[2]:.1f} %"
+        others = "" if other is None else f", other presses of the same H and α {other.csim[2]:.1f} %"
         yield (
-            f"Pressed again from what their photographs told ({loop.again}), {again.n} strokes are like their "
-            f"originals with a CSIM of {again.csim[2]:.1f} %{beside}."
+            f"Pressed again from their photographs alone ({loop.again}), {again.n} strokes are like their "
+            f"originals with a CSIM of {again.csim[2]:.1f} %{others}."
         )
 
 
@@ -140,7 +139,7 @@ def order(report: Report) -> str:
         for a, b in itertools.pairwise(ours)
         if found[a] - found[b] < CLOSE
     ]
-    near = f" Too close to tell apart: {'; '.join(close)}." if close else ""
+    near = f" Too close to separate: {'; '.join(close)}." if close else ""
     if ours == wanted:
         return f"By average CSIM in the size-normalised alignment the models stand in the paper's order: {words}.{near}"
     swapped = [
@@ -164,7 +163,7 @@ def trust(report: Report) -> Iterator[Point]:
         case Source.REAL:
             yield Point(True, "Real capture: the recording says so itself, and its hash is below.")
         case Source.IMPORT:
-            yield Point(None, "Imported photographs: scale and commands are as their table tells them, not measured.")
+            yield Point(None, "Imported photographs: scale and commands come from their table, not measured.")
     strokes = sum(s.strokes for s in report.sessions)
     lost = len({(r.session_id, r.stroke_id) for r in report.refused if "does not predict it" not in r.why})
     if lost:
@@ -185,9 +184,7 @@ def trust(report: Report) -> Iterator[Point]:
         yield Point(width <= WIDE_SCALE, words)
     repeats = [s.n for s in report.stats if s.cell is not None and s.model == CEILING]
     if not repeats:
-        yield Point(
-            False, "No cell was pressed twice: how repeatable the brush is cannot be told, there is no ceiling."
-        )
+        yield Point(False, "No cell was pressed twice: how repeatable the brush is stays unknown, there is no ceiling.")
     elif min(repeats) < FEW_REPEATS:
         words = f"Some cells were pressed only {min(repeats)} times: the ceiling is rough. The paper has ten."
         yield Point(None, words)
@@ -207,19 +204,19 @@ def trust(report: Report) -> Iterator[Point]:
 
 def _collection(one: Session) -> Iterator[Point]:
     """What the recording alone does not show: what was planned and never counted, and paper that moved."""
-    told = one.collected
-    if told is None:
+    collected = one.collected
+    if collected is None:
         return
-    if told.left_out:
-        of = "" if told.planned is None else f" of {told.planned} planned"
-        some = ", ".join(told.left_out[:MOST_NAMED]) + (", ..." if len(told.left_out) > MOST_NAMED else "")
-        words = f"{one.session_id}: {len(told.left_out)}{of} strokes were left out while it was collected: {some}."
+    if collected.left_out:
+        of = "" if collected.planned is None else f" of {collected.planned} planned"
+        some = ", ".join(collected.left_out[:MAX_NAMED]) + (", ..." if len(collected.left_out) > MAX_NAMED else "")
+        words = f"{one.session_id}: {len(collected.left_out)}{of} strokes were left out while it was collected: {some}."
         yield Point(False, words)
-    if told.pressed_again:
-        takes = f"{len(told.pressed_again)} of {told.photographed} takes"
+    if collected.pressed_again:
+        takes = f"{len(collected.pressed_again)} of {collected.photographed} takes"
         yield Point(None, f"{one.session_id}: {takes} did not count and were pressed again: what is left was selected.")
-    if told.moved_mm > MOVED_MM:
-        words = f"the paper was found {told.moved_mm:.2f} mm apart ({', '.join(told.touches[:MOST_NAMED])})"
+    if collected.moved_mm > MOVED_MM:
+        words = f"the paper was found {collected.moved_mm:.2f} mm apart ({', '.join(collected.touches[:MAX_NAMED])})"
         yield Point(False, f"{one.session_id}: {words}: presses of one H are not of one depth.")
 
 
@@ -242,7 +239,7 @@ def _avg(report: Report, model: str) -> Stat | None:
     return report.stat(model, Alignment.MM, Tone.BINARY, "csim")
 
 
-def _told(stat: Stat) -> str:
+def _interval(stat: Stat) -> str:
     span = stat.avg_interval
     return f"{stat.avg:.1f} %" + ("" if span is None else f" (95 % {span.low:.1f} to {span.high:.1f})")
 

@@ -1,19 +1,23 @@
-"""Every score on disk, as CSV and as Parquet, written as it is read: never whole in memory. And the report's tables."""
+"""A report besides its page: every score as CSV and Parquet, its tables as CSV, and its summary on the terminal."""
 
 from __future__ import annotations
 
 import hashlib
 import importlib
 import io
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.table import Column, Table
 
-from calibrate.compare.field import KEYS
+from calibrate.compare.field import KEYS, Alignment, Tone
 from calibrate.errors import CalibrationError
 from calibrate.loop.scores import AGAIN
+from calibrate.report import csv_text, source_note
+from calibrate.validate.report import findings, tables
 from calibrate.validate.report.data import Report, Stat
 from calibrate.validate.run import REPEATED, Outcome
 from sessions.cells import CsvWriter
@@ -21,6 +25,10 @@ from sessions.cells import CsvWriter
 COLUMNS = ("session_id", "stroke_id", "height_mm", "tilt_deg", "model", "alignment", "tone", "csim", "ssim", "source")
 GROUP = 2000
 """Strokes of one row group of the Parquet file."""
+MAX_REFUSED = 20
+"""Lines on the terminal."""
+SHORT = {"fitted, held-out cells": ", held out", "fitted, in sample": ", in sample"}
+"""What a candidate knows of the strokes, as the terminal has room for it."""
 Cells = tuple[str, str, float, float, str, str, str, float, float, str]
 
 
@@ -103,7 +111,7 @@ def summary_csv(report: Report) -> str:
     head = ("model", "alignment", "tone", "measure", "height_mm", "tilt_deg", "n", "max", "min", "avg")
     ends = ("avg_low", "avg_high", "median", "median_low", "median_high", "source")
     rows = [(*_stat_row(stat), report.label) for stat in report.stats]
-    return csv_of((*head, *ends), [*rows, *_loop_rows(report)])
+    return csv_text((*head, *ends), [*rows, *_loop_rows(report)])
 
 
 def _stat_row(stat: Stat) -> tuple[object, ...]:
@@ -140,16 +148,7 @@ def table_3_csv(report: Report) -> str:
         for record in report.written
         for row in record.table_3
     ]
-    return csv_of((*head, "source"), rows)
-
-
-def csv_of(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """A small table as text."""
-    out = io.StringIO()
-    writer = CsvWriter(out)
-    writer.writerow(head)
-    writer.writerows(rows)
-    return out.getvalue()
+    return csv_text((*head, "source"), rows)
 
 
 def _groups(outcome: Outcome) -> Iterator[list[Cells]]:
@@ -162,3 +161,73 @@ def _groups(outcome: Outcome) -> Iterator[list[Cells]]:
             group = []
     if group:
         yield group
+
+
+def summary(report: Report) -> Iterator[Table | str]:
+    """Renderables for the terminal."""
+    names = ", ".join(session.session_id for session in report.sessions[:4])
+    yield f"{names}: {source_note(report.source)}"
+    yield findings.measured(report)
+    for alignment in (Alignment.SIZE_NORMALISED, Alignment.MM):
+        yield _scores(report, alignment)
+    for one in tables.table_3(report):
+        yield from _character(report, one)
+    yield from findings.findings(report)
+    for point in findings.trust(report):
+        yield f"{'•' if point.good is None else '✓' if point.good else '✗'} {point.text}"
+    for one in report.refused[:MAX_REFUSED]:
+        yield f"not used: {one.session_id} {one.stroke_id}: {one.why}"
+    if len(report.refused) > MAX_REFUSED:
+        yield f"and {len(report.refused) - MAX_REFUSED} more, in the report"
+
+
+def _scores(report: Report, alignment: Alignment) -> Table:
+    # The paper's numbers stand beside the table that is made like its own, as far as it says how.
+    with_paper = alignment is Alignment.SIZE_NORMALISED
+    columns = [
+        "model",
+        "n",
+        "CSIM max",
+        "min",
+        "avg",
+        "SSIM max",
+        "min",
+        "avg",
+        *(["paper's avg"] if with_paper else []),
+    ]
+    title = f"{alignment}, binary, ink = 1, percent ({report.label})"
+    out = Table(*columns, title=title)
+    others = tables.robot_writing(report, alignment, Tone.BINARY)
+    for row in (*tables.table_2(report, alignment, Tone.BINARY), *others):
+        if row.ours is None:
+            continue
+        paper = f"{row.paper[2]:.2f} / {row.paper[5]:.2f}" if row.paper is not None else ""
+        cells = [row.label + SHORT.get(row.basis, ""), str(row.n), *(f"{v:.2f}" for v in row.ours)]
+        out.add_row(*cells, *([paper] if with_paper else []))
+    return out
+
+
+def _character(report: Report, one: tables.CharacterTables) -> Iterator[Table]:
+    """A table for each alignment and polarity."""
+    for alignment, rows in ((Alignment.SIZE_NORMALISED, one.paper_like), (Alignment.MM, one.strict)):
+        for polarity, group in itertools.groupby(rows, key=lambda row: row.basis.partition(";")[0]):
+            with_paper = alignment is Alignment.SIZE_NORMALISED
+            columns = [
+                "n",
+                "CSIM\nmax",
+                "min",
+                "avg",
+                "SSIM\nmax",
+                "min",
+                "avg",
+                *(["paper's avg"] if with_paper else []),
+            ]
+            title = f"Table 3: {one.character}, {alignment}, binary, {polarity}, percent ({report.label})"
+            paper_column = ["paper's avg"] if with_paper else []
+            out = Table(Column("", min_width=len("simulated")), *columns, *paper_column, title=title)
+            for row in group:
+                assert row.ours is not None, "rows of Table 3 are rows of ours"
+                paper = f"{row.paper[2]:.2f} / {row.paper[5]:.2f}" if row.paper is not None else ""
+                cells = [row.label, str(row.n), *(f"{value:.2f}" for value in row.ours)]
+                out.add_row(*cells, *([paper] if with_paper else []))
+            yield out

@@ -8,22 +8,20 @@ from typing import Any
 
 from calibrate.compare.field import Alignment, Tone
 from calibrate.compare.paper import TABLE_3
-from calibrate.report.pages import render
-from calibrate.report.wording import source_note
+from calibrate.report import render, source_note
 from calibrate.validate import candidates as who
-from calibrate.validate.report import figures, tables
-from calibrate.validate.report import findings as words
+from calibrate.validate.report import figures, findings, tables
 from calibrate.validate.report.data import Report, Session
 from calibrate.validate.report.figures import Curve
 from calibrate.validate.run import CEILING, Outcome
 
 CELL_COLUMNS = ("ccd-bsmg", who.GENERATOR_HELD_OUT, "ccd-bsm", who.FITTED_HELD_OUT, who.BEZIER_REFITTED, CEILING)
-MOST_REFUSED = 200
+MAX_REFUSED = 200
 
 
 def page_of(outcome: Outcome, report: Report, curves: Sequence[Curve], figures_13: Sequence[str] = ()) -> str:
     """The whole page. `figures_13` are the pictures of written characters, data URIs, empty where there is none."""
-    shown = tables.rival(report, report.shown)
+    shown = tables.candidate(report, report.shown)
     normal, strict = (Alignment.SIZE_NORMALISED, Tone.BINARY), (Alignment.MM, Tone.BINARY)
     return render(
         "presses.html.j2",
@@ -31,10 +29,10 @@ def page_of(outcome: Outcome, report: Report, curves: Sequence[Curve], figures_1
         name=", ".join(session.session_id for session in report.sessions[:4])
         + (f" and {len(report.sessions) - 4} more" if len(report.sessions) > 4 else ""),
         note=source_note(report.source),
-        measured=words.measured(report),
-        findings=list(words.findings(report)),
-        trust=list(words.trust(report)),
-        order=words.order(report),
+        measured=findings.measured(report),
+        findings=list(findings.findings(report)),
+        trust=list(findings.trust(report)),
+        order=findings.order(report),
         tables={
             "one": tables.table_1(report, *normal),
             "two": tables.table_2(report, *normal),
@@ -55,8 +53,8 @@ def page_of(outcome: Outcome, report: Report, curves: Sequence[Curve], figures_1
         best=[(one, _extreme(outcome, one)) for one in report.best],
         worst=[(one, _extreme(outcome, one)) for one in report.worst],
         ablations=_ablations(outcome, report, curves),
-        refused=report.refused[:MOST_REFUSED],
-        more_refused=max(0, len(report.refused) - MOST_REFUSED),
+        refused=report.refused[:MAX_REFUSED],
+        more_refused=max(0, len(report.refused) - MAX_REFUSED),
         provenance=[*(_of_session(one) for one in report.sessions), *_of_others(report), _of_run(report)],
     )
 
@@ -66,13 +64,13 @@ def _extreme(outcome: Outcome, one: Any) -> dict[str, str]:
 
 
 def _cells(report: Report) -> dict[str, Any]:
-    columns = [name for name in CELL_COLUMNS if tables.rival(report, name) is not None]
+    columns = [name for name in CELL_COLUMNS if tables.candidate(report, name) is not None]
     cells = sorted({stat.cell for stat in report.stats if stat.cell is not None})
     rows: list[dict[str, Any]] = []
     for cell in cells:
         stats = [report.stat(name, Alignment.MM, Tone.BINARY, "csim", cell) for name in columns]
         rows.append({"cell": cell, "n": max((s.n for s in stats if s is not None), default=0), "stats": stats})
-    labels = [found.label for name in columns if (found := tables.rival(report, name)) is not None]
+    labels = [found.label for name in columns if (found := tables.candidate(report, name)) is not None]
     return {"labels": labels, "rows": rows}
 
 
@@ -80,7 +78,7 @@ def _ablations(outcome: Outcome, report: Report, curves: Sequence[Curve]) -> dic
     made: dict[str, Any] = {}
 
     def rows(names: Sequence[str]) -> list[dict[str, str]]:
-        known = [found for name in names if (found := tables.rival(report, name)) is not None]
+        known = [found for name in names if (found := tables.candidate(report, name)) is not None]
         return [
             {
                 "label": one.label,
@@ -91,10 +89,10 @@ def _ablations(outcome: Outcome, report: Report, curves: Sequence[Curve]) -> dic
             for one in known
         ]
 
-    if any(tables.rival(report, name) is not None for name in who.LAMBDAS):
+    if any(tables.candidate(report, name) is not None for name in who.LAMBDAS):
         made["lambdas"] = rows((*who.LAMBDAS, "ccd-bsm"))
         made["lambda_images"] = figures.of_one_cell(outcome, (*who.LAMBDAS, "ccd-bsm"))
-    if tables.rival(report, who.FITTED_HELD_OUT) is not None or tables.rival(report, who.FITTED) is not None:
+    if tables.candidate(report, who.FITTED_HELD_OUT) is not None or tables.candidate(report, who.FITTED) is not None:
         made["calibrated"] = rows(
             (
                 "ccd-bsmg",

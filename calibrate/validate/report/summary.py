@@ -5,39 +5,39 @@ from __future__ import annotations
 import numpy as np
 
 from calibrate.compare.field import KEYS, Alignment, Key, Tone
+from calibrate.compare.images import brush_of
 from calibrate.compare.similarity import SSIM_SETTINGS
-from calibrate.compare.simulate import brush_of
 from calibrate.compare.stats import summarise
 from calibrate.validate import candidates as who
-from calibrate.validate.beside import Beside
+from calibrate.validate.extras import Extras
+from calibrate.validate.jobs import Row
 from calibrate.validate.report.data import (
+    CandidateInfo,
     Collected,
     Extreme,
     Interval,
     Refused,
     Report,
-    Rival,
     Session,
     Stat,
     Step,
     software,
 )
 from calibrate.validate.run import CEILING, REPEATED, Outcome
-from calibrate.validate.sources import Opened, one_source
-from calibrate.validate.steps import Row
+from calibrate.validate.sources import LoadedSession, one_source
 from model.ccdbsm import DomainError, ccdbsm
 from sessions.history import history_of
 from sessions.show import details
 
 MEASURES = ("csim", "ssim")
-MOST_CELLS = 60
+MAX_CELLS = 60
 EXTREMES = 6
 JUDGED: Key = (Alignment.MM, Tone.BINARY)
-"""Best and worst are told in millimetres: where and how large a stroke is counts."""
+"""Best and worst are judged in millimetres: where a stroke lies and how large it is counts."""
 PRESSES = {
     CEILING: (
         "another press",
-        "A capture foretold by other captures of its cell, averaged: what a perfect model of this brush could reach, "
+        "A capture predicted by other captures of its cell, averaged: what a perfect model of this brush could reach, "
         "about.",
     ),
     REPEATED: ("robot writing", "A stroke pressed again with what was recovered from it, against the original."),
@@ -45,11 +45,11 @@ PRESSES = {
 
 
 def report_of(
-    outcome: Outcome, command: str, scores_sha256: str, by_strokes: tuple[Step, ...], beside: Beside
+    outcome: Outcome, command: str, scores_sha256: str, by_strokes: tuple[Step, ...], extras: Extras
 ) -> Report:
     """Everything of a run as one frozen report."""
     cells = sorted({row.cell for row in outcome.rows})
-    told = len(cells) <= MOST_CELLS
+    each_cell = len(cells) <= MAX_CELLS
     shown = _shown(outcome)
     best, worst = _extremes(outcome, shown)
     return Report(
@@ -59,17 +59,17 @@ def report_of(
         mm_per_px=outcome.options.view.mm_per_px,
         ssim_settings=SSIM_SETTINGS,
         sessions=tuple(_session(outcome, k, one) for k, one in enumerate(outcome.sessions)),
-        rivals=_rivals(outcome),
+        rivals=_candidates(outcome),
         shown=shown,
-        stats=tuple(_stats(outcome, cells if told else [])),
-        cells_told=told,
+        stats=tuple(_stats(outcome, cells if each_cell else [])),
+        cells_told=each_cell,
         best=best,
         worst=worst,
         refused=tuple(Refused(session_id=s, stroke_id=n, why=why) for s, n, why in outcome.refused),
         by_strokes=by_strokes,
         scores_sha256=scores_sha256,
-        loops=beside.loops,
-        written=beside.written,
+        loops=extras.loops,
+        written=extras.written,
     ).sealed()
 
 
@@ -138,17 +138,17 @@ def _extremes(outcome: Outcome, model: str) -> tuple[tuple[Extreme, ...], tuple[
     return tuple(extreme(int(k)) for k in order[::-1][:count]), tuple(extreme(int(k)) for k in order[:count])
 
 
-def _rivals(outcome: Outcome) -> tuple[Rival, ...]:
+def _candidates(outcome: Outcome) -> tuple[CandidateInfo, ...]:
     files = {one.path: one.sha256 for one in outcome.options.generators}
-    by_name = {one.name: one for made in outcome.contenders for one in made}
+    by_name = {one.name: one for made in outcome.candidates for one in made}
     bases: dict[str, list[str]] = {}
-    for made in outcome.contenders:
+    for made in outcome.candidates:
         for one in made:
             bases.setdefault(one.name, [])
             if one.basis not in bases[one.name]:
                 bases[one.name].append(one.basis)
-    rivals = [
-        Rival(
+    infos = [
+        CandidateInfo(
             name=name,
             label=by_name[name].label,
             definition=by_name[name].definition,
@@ -160,11 +160,12 @@ def _rivals(outcome: Outcome) -> tuple[Rival, ...]:
     ]
     for name, (label, definition) in PRESSES.items():
         if np.isfinite(outcome.values[:, outcome.names.index(name)]).any():
-            rivals.append(Rival(name=name, label=label, definition=definition, basis="captured presses", sha256=""))
-    return tuple(rivals)
+            basis = "captured presses"
+            infos.append(CandidateInfo(name=name, label=label, definition=definition, basis=basis, sha256=""))
+    return tuple(infos)
 
 
-def _session(outcome: Outcome, number: int, one: Opened) -> Session:
+def _session(outcome: Outcome, number: int, one: LoadedSession) -> Session:
     header, calibration = one.header, one.calibration
     mine = [row for row in outcome.rows if row.session == number]
     length, width = _ratios(one, mine)
@@ -202,7 +203,7 @@ def _session(outcome: Outcome, number: int, one: Opened) -> Session:
     )
 
 
-def _collected(one: Opened) -> Collected | None:
+def _collected(one: LoadedSession) -> Collected | None:
     folder = one.recording.path.parent
     history = history_of(folder)
     if history is None:
@@ -217,7 +218,7 @@ def _collected(one: Opened) -> Collected | None:
     )
 
 
-def _ratios(one: Opened, mine: list[Row]) -> tuple[float | None, float | None]:
+def _ratios(one: LoadedSession, mine: list[Row]) -> tuple[float | None, float | None]:
     """How much longer and wider whole marks are than CCD-BSM draws them for a brush of this size."""
     brush = brush_of(one.header)
     drawn: dict[tuple[float, float], tuple[float, float]] = {}

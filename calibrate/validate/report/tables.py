@@ -6,14 +6,12 @@ from dataclasses import dataclass
 
 from calibrate.compare.field import Alignment, Tone
 from calibrate.compare.paper import TABLE_1, TABLE_2, Printed
-from calibrate.loop.scores import AGAIN
-from calibrate.loop.table import LoopRecord
+from calibrate.compare.similarity import Polarity
+from calibrate.loop.scores import AGAIN, LoopRecord
 from calibrate.validate import candidates as who
-from calibrate.validate.report.data import Report, Rival, Stat
+from calibrate.validate.report.data import CandidateInfo, Report, Stat
 from calibrate.validate.run import CEILING, REPEATED
-from calibrate.writing.images import Polarity
-from calibrate.writing.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED
-from calibrate.writing.table import Table3Row, WrittenRecord
+from calibrate.writing.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED, Table3Row, WrittenRecord
 
 CALIBRATED = (who.FITTED_HELD_OUT, who.FITTED, who.BEZIER_REFITTED)
 MISSING = {
@@ -44,7 +42,7 @@ class PaperRow:
 
 @dataclass(frozen=True, slots=True)
 class FullRow:
-    """CSIM and SSIM of one model with everything that is told of them."""
+    """CSIM and SSIM of one model with all their statistics."""
 
     label: str
     csim: Stat
@@ -93,21 +91,21 @@ def table_2(report: Report, alignment: Alignment, tone: Tone) -> list[PaperRow]:
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
+class CharacterTables:
     """One character of Table 3."""
 
     character: str
     title: str
-    """What was written, and where."""
+    """Character, session, brush and cell."""
     paper_like: list[PaperRow]
     """Size-normalised and binary, in both polarities, the paper's rows beside."""
     strict: list[PaperRow]
     """In millimetres, binary, ink = 1."""
 
 
-def table_3(report: Report) -> list[Written]:
+def table_3(report: Report) -> list[CharacterTables]:
     """Every character of every session of characters."""
-    made: list[Written] = []
+    found: list[CharacterTables] = []
     for record in report.written:
         for name in record.characters:
             rows = [row for row in record.table_3 if (row.character, row.tone) == (name, Tone.BINARY)]
@@ -118,19 +116,19 @@ def table_3(report: Report) -> list[Written]:
             like = [normal.get((Polarity.INK, pair)) for pair in WRITTEN_ROWS]
             like += [normal.get((Polarity.PAPER, pair)) for pair in (SIMULATED, REFERENCE)]
             own = [strict.get((Polarity.INK, pair)) for pair in WRITTEN_ROWS]
-            made.append(
-                Written(
+            found.append(
+                CharacterTables(
                     name,
                     _written_title(name, record),
                     [_written_row(row, beside=True) for row in like if row is not None],
                     [_written_row(row, beside=False) for row in own if row is not None],
                 )
             )
-    return made
+    return found
 
 
 def _written_title(name: str, record: WrittenRecord) -> str:
-    brush = record.brush or "a brush that is not named"
+    brush = record.brush or "an unnamed brush"
     return f"{name}, written in {record.session} with {brush} on paper cells of {record.cell_mm:g} mm"
 
 
@@ -162,18 +160,18 @@ def pair(report: Report, name: str, alignment: Alignment) -> str:
     return " / ".join(f"{stat.avg:.2f}" for stat in found if stat is not None)
 
 
-def rival(report: Report, name: str) -> Rival | None:
+def candidate(report: Report, name: str) -> CandidateInfo | None:
     """What a name stands for."""
     return next((one for one in report.rivals if one.name == name), None)
 
 
 def _present(report: Report, names: tuple[str, ...]) -> list[str]:
-    return [name for name in names if rival(report, name) is not None]
+    return [name for name in names if candidate(report, name) is not None]
 
 
 def _row(report: Report, name: str, printed: Printed | None, alignment: Alignment, tone: Tone) -> PaperRow:
     csim, ssim = (report.stat(name, alignment, tone, measure) for measure in ("csim", "ssim"))
-    known = rival(report, name)
+    known = candidate(report, name)
     ours = None
     if csim is not None and ssim is not None:
         ours = (csim.max, csim.min, csim.avg, ssim.max, ssim.min, ssim.avg)

@@ -23,7 +23,7 @@ from calibrate.board.lens import LensUsed
 from calibrate.board.view import see_board
 from calibrate.calibration import Calibration
 from calibrate.compare.field import Field, Tone, captured_mm
-from calibrate.compare.presses import prepare_press
+from calibrate.compare.images import prepare_press
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.session import FITTED, calibrate_session
 from calibrate.stroke.params import PX_PER_MM, Params

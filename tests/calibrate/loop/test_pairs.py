@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from calibrate.compare.field import Alignment, Field, Tone
-from calibrate.loop.pairs import Paired, Side, pair_up
-from calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, bootstrap, score_pairs, statistics, verdicts
+from calibrate.compare.stats import interval_over_groups
+from calibrate.loop.compare import Pairs, pair_up
+from calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, score_pairs, summary_of, verdicts
 from model.ccdbsm import Brush
 from model.coverage import coverage
 from model.registry import stroke_model
@@ -45,8 +46,12 @@ def capture(name: str, shown: tuple[float, float], asked: tuple[float, float], o
     return Capture(stroke, encode_png(photograph(*shown)), f"test {name}")
 
 
-def paired(originals: Iterable[Capture], again: Iterable[Capture]) -> Paired:
-    return pair_up(Side(iter(originals), CALIBRATION), Side(iter(again), CALIBRATION), MODEL, Field())
+def paired(originals: Iterable[Capture], again: Iterable[Capture]) -> Pairs:
+    return pair_up(iter(originals), CALIBRATION, iter(again), CALIBRATION, MODEL, Field())
+
+
+def scored(found: Pairs) -> list[PairScore]:
+    return score_pairs(found.pairs, found.originals.values())
 
 
 ORIGINALS = [
@@ -67,10 +72,10 @@ def test_a_press_made_again_as_it_was_beats_the_other_press_of_its_cell() -> Non
         ("a-r02", "a-r02~1"),
     ]
     assert made.refused == [("b-r01", "was not pressed again")]
-    scores = score_pairs(made)
-    same = statistics(scores, AGAIN, *STRICT, "csim")
-    other = statistics(scores, ANOTHER, *STRICT, "csim")
-    simulated = statistics(scores, SIMULATED, *STRICT, "csim")
+    scores = scored(made)
+    same = summary_of(scores, AGAIN, STRICT, "csim")
+    other = summary_of(scores, ANOTHER, STRICT, "csim")
+    simulated = summary_of(scores, SIMULATED, STRICT, "csim")
     assert same is not None
     assert other is not None
     assert simulated is not None
@@ -88,9 +93,7 @@ def test_a_press_made_again_as_it_was_beats_the_other_press_of_its_cell() -> Non
 def test_a_press_made_again_too_deep_fails_and_says_so() -> None:
     again = [capture("a-r01~1", (18.0, 5.0), (18.0, 5.0), "a-r01")]
     [strict] = [
-        v
-        for v in verdicts(score_pairs(paired(ORIGINALS, again)))
-        if (v.alignment, v.tone, v.measure) == (*STRICT, "csim")
+        v for v in verdicts(scored(paired(ORIGINALS, again))) if (v.alignment, v.tone, v.measure) == (*STRICT, "csim")
     ]
     assert strict.difference < -2.0
     assert not strict.holds
@@ -115,16 +118,15 @@ def test_what_repeats_nothing_is_named() -> None:
 
 def test_an_original_alone_in_its_cell_has_no_repeatability() -> None:
     again = [capture("b-r01~1", (19.0, 0.0), (19.0, 0.0), "b-r01")]
-    scores: list[PairScore] = score_pairs(paired(ORIGINALS, again))
-    assert statistics(scores, ANOTHER, *STRICT, "ssim") is None
+    scores: list[PairScore] = scored(paired(ORIGINALS, again))
+    assert summary_of(scores, ANOTHER, STRICT, "ssim") is None
     assert verdicts(scores) == []
 
 
 def test_the_interval_draws_whole_groups() -> None:
     # Three cells, each of which agrees with itself: ten presses a cell tell no more than three numbers do.
-    low, high = bootstrap([[0.0] * 10, [1.0] * 10, [2.0] * 10])
-    assert low is not None
-    assert high is not None
-    assert low < 0.4
-    assert high > 1.6
-    assert bootstrap([[0.0], [1.0]]) == (None, None)
+    found = interval_over_groups([[0.0] * 10, [1.0] * 10, [2.0] * 10])
+    assert found is not None
+    assert found[0] < 0.4
+    assert found[1] > 1.6
+    assert interval_over_groups([[0.0], [1.0]]) is None

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from brushloop import app
 from calibrate.compare.field import Alignment, Tone
 from calibrate.errors import CalibrationError
-from calibrate.loop.table import LoopRecord
+from calibrate.loop.scores import LoopRecord
 from calibrate.validate.report import tables
 from calibrate.validate.report.data import load_report
 from calibrate.validate.run import REPEATED
@@ -269,8 +269,8 @@ def test_an_edited_table_3_or_another_picture_is_refused(lab: Path, place: Path)
     figure = lab / "w" / "figure-13.png"
     for data, words in (
         (picture(50), "is not the picture of written.json beside it: its SHA-256 differs"),
-        (b"<svg onload='alert(1)'/>", "is no PNG"),
-        (b"", "is no PNG"),
+        (b"<svg onload='alert(1)'/>", "is not a PNG"),
+        (b"", "is not a PNG"),
         (picture()[:18] + b"\x7f" + picture()[19:], "at most 20000 a side are shown"),
         (picture() + bytes(17_000_000), "is larger than"),
     ):

@@ -33,7 +33,7 @@ def test_a_report_does_not_differ_from_itself(before: Path) -> None:
     found = compare(before, before / "report.json")
     assert found.paired_by == "stroke"
     assert len(found.changes) == 3 * 4 * 2
-    assert {change.verdict for change in found.changes} == {"no clear difference"}
+    assert {change.verdict for change in found.changes} == {"no significant difference"}
     assert all(change.test.mean == 0.0 and change.test.n == 10 for change in found.changes)
 
 
@@ -43,7 +43,7 @@ def test_another_scale_of_the_field_is_told_stroke_by_stroke(session: Path, befo
     # A coarser field: more blank paper in every window of SSIM.
     assert found[("line", "mm", "binary", "ssim")].verdict == "better"
     assert found[("line", "mm", "binary", "ssim")].test.n == 10
-    assert found[("line", "size-normalised", "binary", "ssim")].verdict == "no clear difference"
+    assert found[("line", "size-normalised", "binary", "ssim")].verdict == "no significant difference"
     said = json.loads(invoke("validate", "diff", before, tmp_path, "--json"))
     assert said["paired_by"] == "stroke"
     assert said["source"] == "imported photographs"
@@ -58,7 +58,7 @@ def test_two_sessions_are_compared_cell_by_cell(make_session: object, before: Pa
     found = compare(before, other)  # the session's own folder
     assert found.paired_by == "cell"
     assert all(change.test.n == 5 for change in found.changes)
-    assert {change.verdict for change in found.changes} == {"no clear difference"}
+    assert {change.verdict for change in found.changes} == {"no significant difference"}
 
 
 def test_a_session_that_was_never_validated_is_refused_with_the_command_that_does_it(

@@ -9,8 +9,8 @@ import pytest
 
 from bench.validate import scoring
 from calibrate.compare.field import Field
+from calibrate.validate import jobs
 from calibrate.validate import run as running
-from calibrate.validate import steps
 from calibrate.validate.jobs import PrepareJob, Press, prepare_job
 from calibrate.validate.pool import Threads
 from calibrate.validate.run import CEILING, REPEATED, Options, validate_presses
@@ -32,7 +32,7 @@ def test_the_repetition_is_scored_against_its_original_only(
             job = PrepareJob(type(job.capture)(stroke, job.capture.still_png, job.capture.where), None, job.view)
         return prepare_job(job)
 
-    monkeypatch.setattr(steps, "prepare_job", repeating)
+    monkeypatch.setattr(jobs, "prepare_job", repeating)
     sessions = [open_session(str(place), tmp_path, None, None) for place in (session, again)]
     with Threads(1) as pool:
         outcome = validate_presses(sessions, Options(held_out=False), pool, tmp_path, lambda *_: None)
@@ -44,7 +44,7 @@ def test_the_repetition_is_scored_against_its_original_only(
         # Two presses of one command by one brush: about as alike as the originals among themselves.
         ceiling = outcome.values[:10, outcome.names.index(CEILING), :, 0]
         assert np.nanmean(found) == pytest.approx(np.nanmean(ceiling), abs=0.05)
-    assert running.MOST_OTHERS == 9
+    assert running.MAX_OTHERS == 9
 
 
 def test_the_bench_holds_its_scores_to_scikit_image() -> None:

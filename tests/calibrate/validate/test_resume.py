@@ -22,9 +22,10 @@ COMMAND = ("validate", "presses", "--out", "out", "--workers", "1", "--model", "
 """One model as it is, and one that is fitted anew for each cell."""
 
 
-def records(work: Path) -> set[str]:
+def records(work: Path) -> list[str]:
+    """Keys in the order in which they were finished."""
     with Store(work) as store:
-        return set(store.keys())
+        return store.keys()
 
 
 @pytest.mark.timeout(240)
@@ -34,7 +35,7 @@ def test_after_kill_9_the_same_command_gives_the_same_bytes_and_repeats_nothing(
     ran = brushloop(*COMMAND, cwd=tmp_path / "whole")
     assert ran.returncode == 0, ran.stderr
 
-    work = tmp_path / "killed" / "out" / "work" / "work.bin"
+    work = tmp_path / "killed" / "out" / "work" / "work.sqlite"
     first = subprocess.Popen(
         [sys.executable, "-m", "brushloop", *COMMAND],
         cwd=tmp_path / "killed",
@@ -49,8 +50,7 @@ def test_after_kill_9_the_same_command_gives_the_same_bytes_and_repeats_nothing(
     first.send_signal(signal.SIGKILL)
     first.wait()
     assert not (work.parent.parent / "report.json").exists()
-    shutil.copy(work, tmp_path / "before.bin")
-    before = records(tmp_path / "before.bin")
+    before = records(work)
     assert before
 
     ran = brushloop(*COMMAND, cwd=tmp_path / "killed")
@@ -61,15 +61,15 @@ def test_after_kill_9_the_same_command_gives_the_same_bytes_and_repeats_nothing(
     # What was finished stands where it stood: nothing was written twice.
     data, kept = work.read_bytes(), (tmp_path / "before.bin").read_bytes()
     assert data.startswith(kept)
-    assert records(work) == records(tmp_path / "whole" / "out" / "work" / "work.bin") >= before
-    assert len(data) == (tmp_path / "whole" / "out" / "work" / "work.bin").stat().st_size
+    assert records(work) == records(tmp_path / "whole" / "out" / "work" / "work.sqlite") >= before
+    assert len(data) == (tmp_path / "whole" / "out" / "work" / "work.sqlite").stat().st_size
 
 
 def test_a_second_run_does_no_work_again(session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from typer.testing import CliRunner
 
     from brushloop import app
-    from calibrate.validate import run, steps
+    from calibrate.validate import heldout, jobs, run
 
     arguments = ["validate", str(session), "--out", str(tmp_path)]
     assert CliRunner().invoke(app, arguments).exit_code == 0
@@ -78,8 +78,8 @@ def test_a_second_run_does_no_work_again(session: Path, tmp_path: Path, monkeypa
     def never(_job: object) -> None:
         raise AssertionError("finished work was done again")
 
-    for name in ("prepare_job", "refit_job", "score_job"):
-        monkeypatch.setattr(run if name == "score_job" else steps, name, never)
+    for module, name in ((jobs, "prepare_job"), (heldout, "refit_job"), (run, "score_job")):
+        monkeypatch.setattr(module, name, never)
     ran = CliRunner().invoke(app, arguments)
     assert ran.exit_code == 0, ran.exception
     assert (tmp_path / "scores.csv").read_bytes() == first

@@ -9,8 +9,7 @@ import pytest
 
 from bench import written
 from bench.harness import BenchError
-from calibrate.writing.scores import REFERENCE
-from calibrate.writing.table import Table3Row
+from calibrate.writing.scores import REFERENCE, Table3Row
 from tests.calibrate.records import table_of
 
 

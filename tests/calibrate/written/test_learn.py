@@ -10,10 +10,9 @@ import pytest
 from calibrate.calibration import Calibration
 from calibrate.compare.field import Tone
 from calibrate.errors import CalibrationError
-from calibrate.writing.compare import Written
-from calibrate.writing.images import drawn
+from calibrate.writing.compare import WritingComparison, as_ink
 from calibrate.writing.learn import MOST_MM, learned, model_of, reach_of, smoothed
-from calibrate.writing.record import PlanRecord, arrays, figure_record
+from calibrate.writing.plan_files import PlanRecord, arrays, figure_record
 from calibrate.writing.scores import Character
 from model.characters.ink import written as ink_of
 from sessions.recording.schemas import Header, Source
@@ -34,13 +33,13 @@ def came_out(command: np.ndarray) -> np.ndarray:
     return ink_of(model_of(BY), [off], SIDE_MM)
 
 
-def session(plan: PlanRecord, name: str = "bar") -> Written:
+def session(plan: PlanRecord, name: str = "bar") -> WritingComparison:
     [command] = arrays(plan.figures[0].commanded)
     image = plan.figures[0].wanted()
-    one = Character(name, "test", drawn(image), drawn(image), {f"{name}-r01": drawn(came_out(command))})
+    one = Character(name, "test", as_ink(image), as_ink(image), {f"{name}-r01": as_ink(came_out(command))})
     header = Header(session_id="s", source=Source.LOOPBACK, software="test")
     calibration = Calibration.model_construct()
-    return Written(header, Path("s.mcap"), "", calibration, plan, [one], [], [])
+    return WritingComparison(header, Path("s.mcap"), "", calibration, plan, [one], [], [])
 
 
 @pytest.fixture

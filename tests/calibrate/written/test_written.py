@@ -10,11 +10,23 @@ import numpy as np
 import pytest
 
 from calibrate.compare.field import Alignment, Tone
+from calibrate.compare.similarity import Polarity
 from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.writing.images import KEYS, Polarity, captured, drawn, laid, read_reference, similarity
-from calibrate.writing.record import PlanRecord, figure_record, load_plan, points_digest
-from calibrate.writing.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED, Character, score_character
-from calibrate.writing.table import read_table_3, table_3
+from calibrate.writing.compare import as_ink, captured, read_reference
+from calibrate.writing.plan_files import PlanRecord, figure_record, load_plan, points_digest
+from calibrate.writing.scores import (
+    ANOTHER,
+    KEYS,
+    PLANNED,
+    REFERENCE,
+    SIMULATED,
+    Character,
+    aligned,
+    compare_ink,
+    read_written,
+    score_character,
+    table_3,
+)
 from sessions.reader import Capture
 from sessions.recording.messages import encode_png
 from sessions.recording.schemas import Source, Stroke
@@ -73,26 +85,26 @@ def test_size_normalised_forgives_place_and_size_and_mm_does_not() -> None:
     moved = np.zeros((128, 128), np.float32)
     moved[5:69, 50:114] = small
     for tone in Tone:
-        near = similarity(drawn(cross()), drawn(moved), (Alignment.SIZE_NORMALISED, tone, Polarity.INK))
-        far = similarity(drawn(cross()), drawn(moved), (Alignment.MM, tone, Polarity.INK))
+        near = compare_ink(as_ink(cross()), as_ink(moved), (Alignment.SIZE_NORMALISED, tone, Polarity.INK))
+        far = compare_ink(as_ink(cross()), as_ink(moved), (Alignment.MM, tone, Polarity.INK))
         assert near[0] > 0.93
         assert far[0] < 0.5
-    whole = laid(cross(), Alignment.SIZE_NORMALISED) > 0.5
+    whole = aligned(cross(), Alignment.SIZE_NORMALISED) > 0.5
     assert np.ptp(np.flatnonzero(whole.any(axis=1))) + 1 == pytest.approx(100, abs=2)
 
 
 def test_a_blank_page_scores_high_where_paper_is_one_and_cannot_be_scored_where_ink_is() -> None:
     dot = np.zeros((128, 128), np.float32)
     dot[0:2, 0:2] = 1.0
-    assert similarity(drawn(cross()), drawn(dot), (Alignment.MM, Tone.BINARY, Polarity.PAPER))[0] > 0.9
-    assert similarity(drawn(cross()), drawn(dot), STRICT)[0] == 0.0
+    assert compare_ink(as_ink(cross()), as_ink(dot), (Alignment.MM, Tone.BINARY, Polarity.PAPER))[0] > 0.9
+    assert compare_ink(as_ink(cross()), as_ink(dot), STRICT)[0] == 0.0
     with pytest.raises(ValueError, match="blank"):
-        similarity(drawn(cross()), drawn(np.zeros((128, 128), np.float32)), STRICT)
+        compare_ink(as_ink(cross()), as_ink(np.zeros((128, 128), np.float32)), STRICT)
 
 
 def character() -> Character:
-    writings = {f"x-r{k:02d}": drawn(cross(dx)) for k, dx in enumerate((0, 1, 2), 1)}
-    return Character("x", "font of the test", drawn(cross()), drawn(cross(width=10)), writings)
+    writings = {f"x-r{k:02d}": as_ink(cross(dx)) for k, dx in enumerate((0, 1, 2), 1)}
+    return Character("x", "font of the test", as_ink(cross()), as_ink(cross(width=10)), writings)
 
 
 def test_table_3_has_a_row_for_each_comparison_and_survives_the_disk(tmp_path: Path) -> None:
@@ -113,13 +125,13 @@ def test_table_3_has_a_row_for_each_comparison_and_survives_the_disk(tmp_path: P
 
     path = tmp_path / "written.json"
     path.write_text(written_record(tuple(rows)).to_json())
-    assert read_table_3(tmp_path) == rows
+    assert list(read_written(tmp_path).table_3) == rows
     path.write_text(path.read_text().replace("loopback rig", "real capture"))
     with pytest.raises(CalibrationError, match=r"written\.json: was edited"):
-        read_table_3(path)
+        read_written(path)
     path.write_text("{}")
     with pytest.raises(CalibrationError, match="is no report with a digest: write it with `brushloop write compare`"):
-        read_table_3(path)
+        read_written(path)
 
 
 def test_a_writing_alone_has_no_other() -> None:
@@ -140,7 +152,7 @@ def test_a_plan_keeps_its_images_and_knows_its_points(tmp_path: Path) -> None:
     assert figure.points_sha256 == points_digest([[[1, 2, 3, 4, 0.0], [5.5, 6.25, 7.125, 8, 9]]])
     assert figure.points_sha256 != points_digest([[[1, 2, 3, 4, 0.0], [5.5, 6.25, 7.126, 8, 9]]])
     (tmp_path / "plan.json").write_text(plan.model_dump_json().replace(figure.wanted_png, "AAAA"))
-    with pytest.raises(CalibrationError, match="x: wanted_png is no picture"):
+    with pytest.raises(CalibrationError, match="x: wanted_png is not a picture"):
         load_plan(tmp_path).figures[0].wanted()
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from calibrate.loop.table import read_table_1
+from calibrate.loop.scores import read_loop
 from sessions.journal.journal import JOURNAL_NAME
 from sessions.reader import Recording
 
@@ -73,7 +73,7 @@ def test_the_loop_is_closed_and_goes_on_after_kill_nine(bench: Bench) -> None:
     assert told["pairs"] == 6
     assert told["refused"] == []
     assert told["in_sample"]
-    rows = read_table_1(session / "loop")
+    rows = read_loop(session / "loop").table_1
     assert {row.what for row in rows} == {"re-pressed", "recovered, simulated"}
     assert all(row.n == 6 and row.source == "loopback rig" for row in rows)
     # No cell was pressed twice: the brush's repeatability is not known, and nothing is claimed.

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from calibrate.writing.scores import ANOTHER, REFERENCE, SIMULATED
-from calibrate.writing.table import Table3Row, read_table_3
+from calibrate.writing.scores import ANOTHER, REFERENCE, SIMULATED, Table3Row, read_written
 
 if TYPE_CHECKING:
     from tests.collect.chains.conftest import Bench
@@ -45,7 +44,7 @@ def test_three_characters_ten_times_each(bench: Bench) -> None:
     assert ran.returncode == 0, ran.stderr
 
     def avg(where: Path, pair: str) -> dict[str, float]:
-        rows: list[Table3Row] = read_table_3(where)
+        rows: list[Table3Row] = list(read_written(where).table_3)
         chosen = [r for r in rows if (r.pair, r.alignment, r.tone, r.polarity) == (pair, "mm", "binary", "ink = 1")]
         return {row.character: row.csim[2] for row in chosen}
 
@@ -57,5 +56,5 @@ def test_three_characters_ten_times_each(bench: Bench) -> None:
     assert min(avg(bench.folder / "written", ANOTHER).values()) > 93.0
     assert set(avg(bench.folder / "written", SIMULATED)) == set(CHARACTERS)
     sys.stdout.write(ran.stdout)
-    for row in read_table_3(bench.folder / "written"):
+    for row in read_written(bench.folder / "written").table_3:
         sys.stdout.write(f"{row.model_dump_json(exclude={'model', 'reference', 'session_id'})}\n")

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from calibrate.writing.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED
-from calibrate.writing.table import Table3Row, read_table_3
+from calibrate.writing.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED, Table3Row, read_written
 from sessions.reader import Recording
 
 if TYPE_CHECKING:
@@ -39,7 +38,7 @@ def test_a_character_is_written_twice_and_compared(bench: Bench) -> None:
     [session] = bench.sessions.iterdir()
     assert [stroke.stroke_id for stroke in Recording(session).stroke_records()] == ["cross-r01", "cross-r02"]
 
-    rows = read_table_3(bench.folder / "written")
+    rows = read_written(bench.folder / "written").table_3
     assert {row.source for row in rows} == {"loopback rig"}
     assert strict(rows, REFERENCE).n == 2
     assert strict(rows, REFERENCE).reference == "cross.json"

@@ -1,36 +1,37 @@
-"""What lies beside the sessions: strokes that were pressed again (Table 1), characters that were written (Table 3).
+"""Reports of `brushloop loop` and `brushloop write` that go into the tables: strokes pressed again, characters written.
 
-Files that say of themselves what they are of. They are taken up only where that is these recordings, or at least the
-same kind of ink; whatever is damaged, edited or of something else is refused by name, before hours of work.
+Each file names the recordings it was made from. It is used only where those are these sessions, or at least the same
+kind of ink; whatever is damaged, edited or of something else is refused by name, before hours of work.
 """
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from calibrate.errors import CalibrationError
 from calibrate.files import read_bounded
-from calibrate.loop.table import FILE as LOOP_FILE
-from calibrate.loop.table import LoopRecord, read_loop
-from calibrate.validate.sources import Opened, one_source
-from calibrate.writing.table import FILE as WRITTEN_FILE
-from calibrate.writing.table import PICTURE, WrittenRecord, read_written
+from calibrate.loop.scores import FILE as LOOP_FILE
+from calibrate.loop.scores import LoopRecord, read_loop
+from calibrate.report import png_uri
+from calibrate.validate.sources import LoadedSession, one_source
+from calibrate.writing.scores import FILE as WRITTEN_FILE
+from calibrate.writing.scores import PICTURE, WrittenRecord, read_written
 
 LOOP_FOLDER, WRITTEN_FOLDER = "loop", "written"
-"""Where `brushloop loop` and `brushloop write` put theirs: in the session, and beside the folder of sessions."""
+"""Where those commands write by default: in the session, and beside the folder of sessions."""
 MAX_PICTURE_BYTES = 16 * 1024 * 1024
 MAX_SIDE_PX = 20_000
 PNG_HEAD = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
-    """What was asked for: these files or folders; where none are named, whatever lies beside the sessions."""
+class ExtrasRequest:
+    """These files or folders; where none are named, and with `look`, whatever lies beside the sessions."""
 
     loops: tuple[Path, ...] = ()
     written: tuple[Path, ...] = ()
@@ -38,32 +39,32 @@ class Given:
 
 
 @dataclass(frozen=True, slots=True)
-class Beside:
-    """What was taken up."""
+class Extras:
+    """The loops and characters that go into a report."""
 
     loops: tuple[LoopRecord, ...] = ()
     written: tuple[WrittenRecord, ...] = ()
     figures: tuple[str, ...] = ()
     """Figure 13 of each of `written` as a data URI; empty where the picture is not there."""
     notes: tuple[str, ...] = ()
-    """What was found and left out, or is not there, and why."""
+    """What was found and left out, or is missing, and why."""
 
 
-def take_up(sessions: Sequence[Opened], given: Given) -> Beside:
-    """Read and check everything. Raises `CalibrationError` that names the file which cannot be believed."""
+def find_extras(sessions: Sequence[LoadedSession], request: ExtrasRequest) -> Extras:
+    """Read and check everything. Raises `CalibrationError` that names the file that cannot be used."""
     notes: list[str] = []
     loops: dict[str, LoopRecord] = {}
-    for path in _files(given.loops, LOOP_FILE) or (_loops_beside(sessions) if given.look else ()):
-        with _told_how_to_go_on(asked_for=bool(given.loops)):
+    for path in _files(request.loops, LOOP_FILE) or (_loops_beside(sessions) if request.look else ()):
+        with _naming_no_beside(requested=bool(request.loops)):
             record = read_loop(path)
             _check_loop(path, record, sessions)
         loops[record.digest] = record
     written: dict[str, tuple[WrittenRecord, str]] = {}
-    for path in _files(given.written, WRITTEN_FILE) or (_written_beside(sessions) if given.look else ()):
-        with _told_how_to_go_on(asked_for=bool(given.written)):
+    for path in _files(request.written, WRITTEN_FILE) or (_written_beside(sessions) if request.look else ()):
+        with _naming_no_beside(requested=bool(request.written)):
             found = read_written(path)
-            if not given.written and (why := _foreign(path, found, sessions)):
-                notes.append(f"{path} is left out: {why}; --written takes it up")
+            if not request.written and (why := _foreign(path, found, sessions)):
+                notes.append(f"{path} is left out: {why}; --written uses it")
                 continue
             _check_written(path, found, sessions)
             picture = path.parent / PICTURE
@@ -71,34 +72,34 @@ def take_up(sessions: Sequence[Opened], given: Given) -> Beside:
         if not written[found.digest][1]:
             notes.append(f"{picture} is not there: the report has no Figure 13 of {found.session}")
     records, figures = tuple(one for one, _ in written.values()), tuple(uri for _, uri in written.values())
-    return Beside(tuple(loops.values()), records, figures, tuple(notes))
+    return Extras(tuple(loops.values()), records, figures, tuple(notes))
 
 
 def figure_13(path: Path, record: WrittenRecord) -> str:
     """The picture as a data URI. Raises `CalibrationError` unless it is the PNG that the record was written with."""
     data = read_bounded(path, MAX_PICTURE_BYTES)
     if not data.startswith(PNG_HEAD) or len(data) < len(PNG_HEAD) + 8:
-        raise CalibrationError(str(path), "is no PNG")
+        raise CalibrationError(str(path), "is not a PNG")
     sides: tuple[int, int] = struct.unpack_from(">II", data, len(PNG_HEAD))
     if not all(1 <= side <= MAX_SIDE_PX for side in sides):
         raise CalibrationError(str(path), f"has {sides[0]} x {sides[1]} px, at most {MAX_SIDE_PX} a side are shown")
     if hashlib.sha256(data).hexdigest() != record.figure_13_sha256:
         raise CalibrationError(str(path), f"is not the picture of {WRITTEN_FILE} beside it: its SHA-256 differs")
-    return "data:image/png;base64," + base64.b64encode(data).decode()
+    return png_uri(data)
 
 
-def _files(given: Sequence[Path], name: str) -> list[Path]:
-    return [path / name if path.is_dir() else path for path in given]
+def _files(paths: Sequence[Path], name: str) -> list[Path]:
+    return [path / name if path.is_dir() else path for path in paths]
 
 
-def _loops_beside(sessions: Sequence[Opened]) -> Iterator[Path]:
+def _loops_beside(sessions: Sequence[LoadedSession]) -> Iterator[Path]:
     for one in sessions:
         path = one.recording.path.parent / LOOP_FOLDER / LOOP_FILE
         if path.is_file():
             yield path
 
 
-def _written_beside(sessions: Sequence[Opened]) -> Iterator[Path]:
+def _written_beside(sessions: Sequence[LoadedSession]) -> Iterator[Path]:
     """In the session itself, or beside the folder of sessions; the same only once."""
     seen: set[Path] = set()
     for one in sessions:
@@ -110,7 +111,7 @@ def _written_beside(sessions: Sequence[Opened]) -> Iterator[Path]:
                 yield path
 
 
-def _foreign(path: Path, record: WrittenRecord, sessions: Sequence[Opened]) -> str:
+def _foreign(path: Path, record: WrittenRecord, sessions: Sequence[LoadedSession]) -> str:
     """Why characters found beside the sessions are not these sessions' own; empty where they are."""
     folders = [one.recording.path.resolve().parent for one in sessions]
     if path.parent.parent in folders:
@@ -125,7 +126,7 @@ def _foreign(path: Path, record: WrittenRecord, sessions: Sequence[Opened]) -> s
     return "" if brushes == {record.brush} else f"it was written with another brush, {record.brush or 'not named'}"
 
 
-def _check_loop(path: Path, record: LoopRecord, sessions: Sequence[Opened]) -> None:
+def _check_loop(path: Path, record: LoopRecord, sessions: Sequence[LoadedSession]) -> None:
     _check_source(path, record.source, [row.source for row in record.table_1], sessions)
     if any((row.original, row.again) != (record.original, record.again) for row in record.table_1):
         raise CalibrationError(str(path), "table_1: has rows of other sessions than its own")
@@ -133,33 +134,31 @@ def _check_loop(path: Path, record: LoopRecord, sessions: Sequence[Opened]) -> N
         return
     names = ", ".join(one.header.session_id for one in sessions)
     if any(one.header.session_id == record.original for one in sessions):
-        told = f"is of another recording of {record.original}: its SHA-256 differs; `{record.MADE_BY}` compares again"
-        raise CalibrationError(str(path), told)
+        why = f"is of another recording of {record.original}: its SHA-256 differs; `{record.MADE_BY}` compares again"
+        raise CalibrationError(str(path), why)
     raise CalibrationError(str(path), f"repeats {record.original}, not {names}")
 
 
-def _check_written(path: Path, record: WrittenRecord, sessions: Sequence[Opened]) -> None:
+def _check_written(path: Path, record: WrittenRecord, sessions: Sequence[LoadedSession]) -> None:
     _check_source(path, record.source, [row.source for row in record.table_3], sessions)
     if any(row.session_id != record.session for row in record.table_3):
         raise CalibrationError(str(path), "table_3: has rows of another session than its own")
 
 
-def _check_source(path: Path, told: str, rows: Sequence[str], sessions: Sequence[Opened]) -> None:
+def _check_source(path: Path, named: str, rows: Sequence[str], sessions: Sequence[LoadedSession]) -> None:
     source = one_source(list(sessions))
-    for one in (told, *rows):
+    for one in (named, *rows):
         if one != source:
-            named = sessions[0].recording.path.name
-            raise CalibrationError(str(path), f"is of {one}, {named} of {source}: they do not go into one report")
+            recording = sessions[0].recording.path.name
+            raise CalibrationError(str(path), f"is of {one}, {recording} of {source}: they do not go into one report")
 
 
-class _told_how_to_go_on:  # noqa: N801 - used as a function
-    """Whoever did not ask for a file is told how to go without it."""
-
-    def __init__(self, *, asked_for: bool) -> None:
-        self._asked_for = asked_for
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, CalibrationError) and not self._asked_for:
+@contextmanager
+def _naming_no_beside(*, requested: bool) -> Generator[None]:
+    """Add to an error about a file that was found, not requested, how to go without it."""
+    try:
+        yield
+    except CalibrationError as error:
+        if not requested:
             error.add_note("(found beside the session; --no-beside goes without)")
+        raise

@@ -1,0 +1,208 @@
+"""What every report is written with: pages from templates, pictures as data URIs, CSV, and JSON sealed by a digest."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Self, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from calibrate.errors import CalibrationError, invalid
+from calibrate.files import read_bounded, write_whole
+from sessions.cells import CsvWriter
+from sessions.recording.schemas import Source
+
+Image = NDArray[np.float32]
+PAPER = "#fbf9f4"
+"""Background of pictures that are files of their own."""
+
+
+def render(template: str, **values: Any) -> str:
+    """The page of `calibrate/templates/<template>`; an undefined name is an error.
+
+    Names, licences and origins come from other people's files, so everything is escaped.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("calibrate"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(**values)
+
+
+def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table as CSV."""
+    out = io.StringIO()
+    writer = CsvWriter(out)
+    writer.writerow(head)
+    writer.writerows(rows)
+    return out.getvalue()
+
+
+def write_files(folder: Path, texts: Mapping[str, str]) -> None:
+    """Write a report's files, each whole or not at all, in this order. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        write_whole(folder / name, text)
+
+
+def source_note(source: Source) -> str:
+    """What kind of ink this is, in one sentence."""
+    match source:
+        case Source.LOOPBACK:
+            return "loopback rig: simulated brush, ink and camera; not a result on paper"
+        case Source.REAL:
+            return "real capture: ink on paper, pressed by the arm named below"
+        case Source.IMPORT:
+            return "imported photographs: not collected by brushloop; scale and commands come from their table"
+
+
+def png_uri(data: bytes) -> str:
+    """An encoded PNG as a data URI: no report ever fetches anything."""
+    return "data:image/png;base64," + base64.b64encode(data).decode()
+
+
+def image_uri(image: NDArray[np.uint8]) -> str:
+    """An (h, w) gray or (h, w, 3) BGR image as a PNG data URI."""
+    import cv2
+
+    return png_uri(cv2.imencode(".png", image)[1].tobytes())
+
+
+def ink_uri(ink: Image) -> str:
+    """(h, w) ink in [0, 1] as black on white."""
+    return image_uri(np.rint(255.0 * (1.0 - ink)).astype(np.uint8))
+
+
+def overlay_uri(first: Image, second: Image) -> str:
+    """`overlay` as a data URI."""
+    return image_uri(np.rint(255.0 * overlay(first, second)[..., ::-1]).astype(np.uint8))
+
+
+def overlay(first: Image, second: Image) -> Image:
+    """(h, w, 3) RGB of two (h, w) images of ink: gray where both have it, orange the first alone, blue the second."""
+    both = np.minimum(first, second)
+    # The colours of Okabe and Ito, which colour-blind readers tell apart, as distances from white.
+    darker = (
+        both[..., None] * np.array([0.35, 0.35, 0.35])
+        + (first - both)[..., None] * np.array([0.165, 0.631, 1.0])
+        + (second - both)[..., None] * np.array([1.0, 0.553, 0.302])
+    )
+    return np.clip(1.0 - darker, 0.0, 1.0).astype(np.float32)
+
+
+def plot(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
+    """A figure for a page, and its axes; size in inches."""
+    # The object interface: pyplot would keep every figure alive and look for a display.
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns)
+
+
+def plot_uri(figure: Any) -> str:
+    """A figure of `plot` as a data URI."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
+    return png_uri(buffer.getvalue())
+
+
+def picture_grid(rows: int, columns: int, size: tuple[float, float], title: str = "") -> tuple[Any, Any]:
+    """A figure for a picture file and its (rows, columns) axes; size in inches at 100 dpi."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure: Any = Figure(size, dpi=100, facecolor=PAPER, layout="constrained")
+    FigureCanvasAgg(figure)
+    if title:
+        figure.suptitle(title, fontsize=10)
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def show_picture(axis: Any, image: Image, title: str, *, fontsize: int, **options: Any) -> None:
+    """Draw (h, w) ink in black, or (h, w, 3) RGB, without ticks."""
+    axis.set_title(title, fontsize=fontsize, pad=2)
+    axis.set_xticks([])
+    axis.set_yticks([])
+    shown: dict[str, Any] = {"cmap": "gray", "vmin": 0, "vmax": 1} if image.ndim == 2 else {}
+    axis.imshow(1 - image if image.ndim == 2 else image, interpolation="nearest", **shown, **options)
+
+
+def save_picture(figure: Any, path: Path) -> None:
+    """Write a figure of `picture_grid` as PNG. Raises OSError."""
+    figure.savefig(path, format="png", metadata={"Software": None})
+
+
+class Sealed(BaseModel):
+    """A report as data that carries the digest of its own contents, so that an edited one is recognised.
+
+    The digest is no signature: it guards what was measured, and on what kind of ink, against edits by accident.
+    Frozen, without unknown fields. A subclass gives `format` its FORMAT as default.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    FORMAT: ClassVar[str]
+    MADE_BY: ClassVar[str]
+    """The command that writes such a file."""
+
+    format: str
+    digest: str = ""
+    """SHA-256 of everything else."""
+
+    def sealed(self) -> Self:
+        """A copy with its digest."""
+        return self.model_copy(update={"digest": _digest(self.model_dump(mode="json"))})
+
+    @property
+    def intact(self) -> bool:
+        """Whether the digest is that of the contents."""
+        return self.digest == _digest(self.model_dump(mode="json"))
+
+    def to_json(self) -> str:
+        """The text that is written to disk."""
+        return json.dumps(self.model_dump(mode="json"), indent=1, ensure_ascii=False) + "\n"
+
+
+S = TypeVar("S", bound=Sealed)
+
+
+def load_sealed(path: Path, kind: type[S], most_bytes: int) -> S:
+    """Read a report as data. Raises `CalibrationError`, naming the file, if it is not one, is too new or was edited."""
+    data = read_bounded(path, most_bytes)
+    fields: dict[str, Any] = {}
+    digest = ""
+    try:
+        parsed: Any = json.loads(data)
+        if isinstance(parsed, dict):
+            fields = cast("dict[str, Any]", parsed)
+            # Of the file, not of the model: a field added since the file was written is no edit.
+            digest = _digest(fields)
+    except (ValueError, RecursionError):  # no JSON, or text that is no Unicode: reported below
+        fields = {}
+    if "format" not in fields or "digest" not in fields:
+        raise CalibrationError(str(path), f"is no report with a digest: write it with `{kind.MADE_BY}`")
+    if fields["format"] != kind.FORMAT:
+        raise CalibrationError(str(path), f"format is {str(fields['format'])[:40]!r}, expected {kind.FORMAT!r}")
+    try:
+        record = kind.model_validate(fields)
+    except ValidationError as error:
+        raise invalid(str(path), error) from None
+    if fields["digest"] != digest:
+        raise CalibrationError(str(path), "was edited: its digest is not that of its contents")
+    return record
+
+
+def _digest(contents: dict[str, Any]) -> str:
+    text = json.dumps(contents | {"digest": ""}, sort_keys=True, ensure_ascii=False)
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,1 +1,0 @@
-"""What every report page needs: templates, pictures as data, sealed JSON, shared sentences."""

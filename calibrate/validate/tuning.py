@@ -1,0 +1,278 @@
+"""Captured presses as a generator draws them, for `brushloop train tune`, and a generator judged on unseen cells.
+
+It is judged on cells that it was not tuned on: the tuning sees the captures of all other cells and, where the session
+was fitted, images of the CCD-BSM that was fitted to those same captures, as the paper's generator learns from CCD-BSM.
+Each fold of cells has a tuning of its own, in a folder named after everything that it follows from; a killed one goes
+on from its checkpoint.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.compare.field import FINE, Field, Image
+from calibrate.compare.images import axis_mm, brush_of, prepare_press
+from calibrate.errors import CalibrationError, CaptureRefused
+from calibrate.stroke.params import PX_PER_MM, Params
+from calibrate.stroke.preprocess import Prepared
+from calibrate.validate.candidates import Generator
+from calibrate.validate.heldout import Cell, fitted_press, folds
+from calibrate.validate.jobs import VERSION
+from calibrate.validate.sources import LoadedSession, one_source
+from model.ccdbsm import DomainError
+from sessions.errors import SessionDamaged
+
+if TYPE_CHECKING:
+    from calibrate.validate.pool import Progress
+    from model.generator.stroke import GeneratorModel
+    from model.train.loop import Validation
+
+MAX_STROKES = 100_000
+FOLDS = 5
+"""A tuning takes a minute, so cells are left out by fifths."""
+LEARNING_RATE = 2e-3
+NO_CELL: Cell = (-1.0, -1.0)
+"""Of an image that is no capture, so that it is never left out."""
+IMAGES = 400
+"""Images of the fitted CCD-BSM, beside the captures; drawn evenly from the generator's ranges."""
+HELD_OUT = 0.1
+"""Share of the captures that is not tuned on; only the curve of the training needs it."""
+
+
+@dataclass(frozen=True, slots=True)
+class AlignedStrokes:
+    """Captured presses as a generator draws them."""
+
+    px_mm: float
+    placement: str
+    source: str
+    images: list[Image]
+    """(N, N) each."""
+    inputs: list[dict[str, float]]
+    cells: list[Cell]
+    left_out: list[tuple[str, str]]
+    """(stroke, why): what the generator does not draw, or cannot be used."""
+
+
+def align_captures(sessions: list[LoadedSession], generator: Path) -> AlignedStrokes:
+    """Every press of some sessions as the generator's own images. Raises what `load_generator` does."""
+    from model.train.checkpoint import load_generator
+
+    target = load_generator(generator).target
+    aligned = AlignedStrokes(target.px_mm, str(target.placement), str(one_source(sessions)), [], [], [], [])
+    for session in sessions:
+        model = load_generator(generator, brush_of(session.header))
+        params = Params(**session.calibration.preprocess) if session.calibration is not None else Params()
+        for capture in session.recording.captures():
+            stroke = capture.stroke
+            if stroke.height_mm is None or stroke.tilt_deg is None:
+                aligned.left_out.append((stroke.stroke_id, "has no depth or tilt"))
+                continue
+            try:
+                values = _inputs_of(model, stroke.height_mm, stroke.tilt_deg)
+                prepared = prepare_press(capture, session.calibration, params, Field())
+                if prepared.cut:
+                    raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph or cell")
+                aligned.images.append(_placed(prepared, model, values, stroke.height_mm, stroke.tilt_deg))
+            except (CaptureRefused, SessionDamaged) as error:
+                aligned.left_out.append((stroke.stroke_id, error.what))
+                continue
+            except DomainError as error:
+                aligned.left_out.append((stroke.stroke_id, f"the generator does not draw it: {error}"))
+                continue
+            aligned.inputs.append(values)
+            aligned.cells.append((stroke.height_mm, stroke.tilt_deg))
+            if len(aligned.cells) > MAX_STROKES:
+                raise CalibrationError(str(session.recording.path), f"more than {MAX_STROKES} strokes to tune on")
+    return aligned
+
+
+def write_captures(aligned: AlignedStrokes, out: Path, leave_out: Sequence[Cell] = ()) -> int:
+    """Write the file for `brushloop train tune`, without some cells; returns how many presses are in it.
+
+    Raises `CalibrationError` where fewer than two are left.
+    """
+    import torch
+
+    from model.train.data import save_captures
+
+    chosen = [k for k, cell in enumerate(aligned.cells) if cell not in leave_out]
+    if len(chosen) < 2:
+        raise CalibrationError(str(out), f"{len(chosen)} strokes are left, at least 2 are needed to tune on")
+    columns = {name: torch.tensor([aligned.inputs[k][name] for k in chosen]) for name in aligned.inputs[0]}
+    stack = torch.as_tensor(np.stack([aligned.images[k] for k in chosen]))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    save_captures(out, columns, stack, aligned.px_mm, aligned.placement, aligned.source)
+    return len(chosen)
+
+
+def tuned_by_cell(
+    session: LoadedSession,
+    fits: dict[Cell, dict[str, Any]],
+    generator: Generator,
+    steps: int,
+    work: Path,
+    progress: Progress,
+) -> dict[Cell, Path]:
+    """The generator's file for each cell, tuned without it; empty for fewer than two cells.
+
+    `fits` has for each cell a finished `refit_job` that left out the same `FOLDS`. Raises what `load_generator` and a
+    training do.
+    """
+    left_out = folds(list(fits), FOLDS)
+    calibration = session.calibration.digest if session.calibration is not None else ""
+    files: dict[Cell, Path] = {}
+    aligned: AlignedStrokes | None = None
+    for number, fold in enumerate(left_out):
+        fit = fits[fold[0]]["fitted"]
+        inputs = f"tune {VERSION} {session.sha256} {calibration} {generator.sha256} {steps} {LEARNING_RATE} {fold} "
+        inputs += f"{IMAGES} {fit}"
+        folder = work / "tuned" / hashlib.sha256(inputs.encode()).hexdigest()[:32]
+        path = folder / "generator.safetensors"
+        if not path.exists():
+            captures = folder / "captures.safetensors"
+            if not captures.exists():
+                aligned = aligned or align_captures([session], generator.path)
+                write_captures(_with_images(aligned, session, fit, generator), captures, fold)
+            what = f"{session.header.session_id}: generator tuned, cells left out by fifths"
+            steps_done = _TrainingProgress(progress, what, number * steps, len(left_out) * steps)
+            _tune(folder, captures, generator, str(session.header.source), steps, steps_done)
+        files |= dict.fromkeys(fold, path)
+    return files
+
+
+@dataclass(slots=True)
+class _TrainingProgress:
+    """Passes the steps of a training on; see `model.train.run.Progress`."""
+
+    progress: Progress
+    what: str
+    before: int
+    total: int
+
+    def stepped(self, step: int, loss: float) -> None:
+        self.progress(self.what, self.before + step, self.total)
+
+    def validated(self, validation: Validation) -> None: ...
+
+
+def _tune(
+    folder: Path, captures: Path, generator: Generator, source: str, steps: int, progress: _TrainingProgress
+) -> None:
+    from model.train.checkpoint import load_weights, sha256
+    from model.train.config import checked
+    from model.train.distributed import joined
+    from model.train.run import Tuning, run_training
+
+    config, _, _ = load_weights(generator.path)
+    tuning: dict[str, Any] = {
+        "start_sha256": generator.sha256,
+        "captures_sha256": sha256(captures),
+        "source": source,
+        "held_out": HELD_OUT,
+    }
+    fields: dict[str, Any] = config.model_dump() | {
+        "steps": steps,
+        "learning_rate": LEARNING_RATE,
+        "seed": 0,
+        "validate_every": steps,
+        "picture_every": steps,
+        "checkpoint_every": max(1, steps // 4),
+        "tuning": tuning,
+    }
+    files = Tuning(generator.path, captures)
+    with joined(config.device) as group:
+        run_training(checked("tune", fields), folder, group, progress, lambda: False, tuning=files)
+
+
+def _with_images(
+    aligned: AlignedStrokes, session: LoadedSession, fit: dict[str, Any] | None, generator: Generator
+) -> AlignedStrokes:
+    """Add images of the fitted brush, if the generator's inputs are depth and tilt alone."""
+    import torch
+
+    from model.fitted_shape import fitted_model
+    from model.generator.targets import Placement, Target
+    from model.train.checkpoint import load_generator
+
+    brush = brush_of(session.header)
+    target = load_generator(generator.path, brush).target
+    ranges = {spec.name: (spec.low, spec.high) for spec in target.inputs}
+    if fit is None or set(ranges) != {"height_mm", "tilt_deg"} or target.placement is Placement.BASE:
+        return aligned
+    fitted = fitted_model(fitted_press(fit, float(brush.radius_mm), float(brush.length_mm)))
+    drawn = Target(fitted, ranges, {}, target.placement, target.px_mm, target.size_px)
+    inputs = drawn.draw(IMAGES, torch.Generator().manual_seed(0))
+    names = [spec.name for spec in drawn.inputs]
+    return replace(
+        aligned,
+        images=[*aligned.images, *(np.asarray(image, np.float32) for image in drawn.images(inputs).numpy())],
+        inputs=[*aligned.inputs, *({name: float(row[k]) for k, name in enumerate(names)} for row in inputs)],
+        cells=[*aligned.cells, *[NO_CELL] * IMAGES],
+    )
+
+
+def _inputs_of(model: GeneratorModel, height_mm: float, tilt_deg: float) -> dict[str, float]:
+    """The generator's inputs for a press of its brush. Raises DomainError for one outside its training."""
+    values = {name: float(value[0]) for name, value in model.of_press(height_mm, tilt_deg).items()}
+    out: dict[str, float] = {}
+    for spec in model.target.inputs:
+        value = values.get(spec.name, spec.default)
+        if not spec.low <= value <= spec.high:
+            raise DomainError(spec.name, value, f"[{spec.low:g}, {spec.high:g}]", "what the generator was trained for")
+        out[spec.name] = value
+    return out
+
+
+def _placed(
+    prepared: Prepared, model: GeneratorModel, values: dict[str, float], height_mm: float, tilt_deg: float
+) -> Image:
+    """(N, N) share of each of the generator's pixels that is ink. Raises `CaptureRefused` where it does not fit."""
+    from model.generator.targets import ANCHOR_SHARE, Placement
+
+    target = model.target
+    side_mm = target.size_px * target.px_mm
+    assert prepared.anchor_px is not None  # prepare_press lays every press on its point of touch
+    anchor = (prepared.anchor_px[0] / PX_PER_MM, prepared.anchor_px[1] / PX_PER_MM)
+    match target.placement:
+        case Placement.CENTRED:
+            rows, columns = (np.flatnonzero(prepared.mask.any(axis=axis)) for axis in (1, 0))
+            middle = (columns[0] + columns[-1] + 1) / 2 / PX_PER_MM, (rows[0] + rows[-1] + 1) / 2 / PX_PER_MM
+            corner = middle[0] - side_mm / 2, middle[1] - side_mm / 2
+        case Placement.ZERO_TOUCH:
+            corner = anchor[0] - ANCHOR_SHARE[0] * side_mm, anchor[1] - ANCHOR_SHARE[1] * side_mm
+        case Placement.BASE:
+            fixed = target.fixed
+            base = tuple(values.get(name, fixed.get(name, 0.0)) for name in ("base_x_mm", "base_y_mm"))
+            corner = anchor[0] + axis_mm(height_mm, tilt_deg) - base[0], anchor[1] - base[1]
+    image = _resampled(prepared.mask, corner, target.px_mm, target.size_px)
+    inked = float(np.count_nonzero(prepared.mask)) / PX_PER_MM**2
+    if abs(float(image.sum()) * target.px_mm**2 - inked) > 0.01 * inked:
+        raise CaptureRefused("capture", "is larger than the generator's image")
+    return image
+
+
+def _resampled(mask: NDArray[np.bool_], corner_mm: tuple[float, float], px_mm: float, size_px: int) -> Image:
+    """The window of the mask with this upper left corner, averaged over the pixels of a coarser raster."""
+    # At least as fine as the mask itself, else thin ink would fall between the samples.
+    fine_px = max(FINE, math.ceil(px_mm * PX_PER_MM))
+    scale = fine_px / (px_mm * PX_PER_MM)
+    # cv2 puts pixel centres on integers, a pixel here covers [j, j + 1).
+    move = np.array(
+        [
+            [scale, 0.0, scale * (0.5 - corner_mm[0] * PX_PER_MM) - 0.5],
+            [0.0, scale, scale * (0.5 - corner_mm[1] * PX_PER_MM) - 0.5],
+        ]
+    )
+    fine = cv2.warpAffine(mask.astype(np.float32), move, (fine_px * size_px, fine_px * size_px), flags=cv2.INTER_LINEAR)
+    small = cv2.resize(fine, (size_px, size_px), interpolation=cv2.INTER_AREA)
+    return np.clip(cast("Image", small), 0.0, 1.0)
