@@ -1,0 +1,22 @@
+"""A quality check: a stroke whose ink is unusually dark.
+
+Put such a function into `collect/quality/checks.py` and its name into `MARK_CHECKS` there. A finding of its own needs a
+name in `Failure` (`collect/quality/verdict.py`), with the family that says what is done about it, and its limit belongs
+in `QualityConfig` (`collect/rig/config_quality.py`), so that a rig can set it. `docs/quality.md` says what it measures.
+"""
+
+from __future__ import annotations
+
+from collect.quality.mark import Mark
+from collect.quality.verdict import Check, Failure
+from collect.rig.config_quality import QualityConfig
+
+DARKEST_TONE = 0.97
+
+
+def flooded(mark: Mark, limits: QualityConfig) -> Check:
+    """Fail where the darkest quarter of the stroke reflects next to nothing: the ink stands on the paper."""
+    del limits  # a real check reads its threshold from here
+    passed = mark.tone < DARKEST_TONE
+    reason = "" if passed else f"The ink stands on the paper (darkness {mark.tone:.2f}). Wipe the brush on the rim."
+    return Check(Failure.FAINT, mark.tone, "1", DARKEST_TONE, passed, reason)
