@@ -5,26 +5,40 @@ from __future__ import annotations
 import asyncio
 import importlib.util
 import sys
+import time
+import tomllib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 
+from collect.planning.walk import walk
 from collect.protocols.steps import StepKind
 from collect.quality.mark import Mark
+from collect.rig.config import RigConfig
 from collect.rig.config_quality import QualityConfig
+from drivers.camera import CameraOptions, OpenCvCamera
 from drivers.clock import HostClock
 from drivers.errors import LimitExceeded
 from drivers.protocols import Ink
+from drivers.samples import Stamp
+from drivers.sim.camera import mjpeg_server
+from drivers.sim.config import SimConfig, View
+from drivers.sim.faults.kinds import ALWAYS, KINDS, Device, Fault
+from drivers.sim.rig import LoopbackRig
+from drivers.sim.rig_toml import Addresses, rig_toml
 from model import strokes
 from model.ccdbsm import Brush
 from model.coverage import coverage
 from model.registry import stroke_models
 
 RECIPES = Path(__file__).resolve().parent.parent / "examples" / "recipes"
+
+SMALL = View(width_px=512, height_px=384, px_per_mm=1.56)
 
 
 def recipe(name: str) -> ModuleType:
@@ -56,19 +70,25 @@ def test_a_stroke_model_is_a_file_in_the_folder(tmp_path: Path, monkeypatch: pyt
         sys.modules.pop("model.strokes.drop", None)
 
 
-def test_a_protocol_kind_is_its_values_and_two_functions() -> None:
-    stairs = recipe("protocol_kind")
-    config = stairs.StairsConfig(kind="stairs", from_mm=10.0, to_mm=14.0, count=3, repeats=2)
-    assert [stroke.height_mm for stroke in stairs.planned(config)] == [10.0, 12.0, 14.0, 10.0, 12.0, 14.0]
-    generator = stairs.steps(config)
-    seen = [next(generator)]
-    try:
-        while True:
-            seen.append(generator.send({"sheet": 0, "cell": len(seen)}))
-    except StopIteration:
-        pass
-    assert [step.kind for step in seen[2:5]] == [StepKind.DIP, StepKind.PRESS, StepKind.CAPTURE]
-    assert len({step.key for step in seen}) == len(seen) == 2 + 3 * 6
+def test_a_protocol_kind_is_one_class() -> None:
+    stairs = recipe("protocol_kind").StairsConfig(kind="stairs", from_mm=10.0, to_mm=14.0, count=3, repeats=2)
+    assert [stroke.height_mm for stroke in stairs.planned()] == [10.0, 12.0, 14.0, 10.0, 12.0, 14.0]
+    steps = [
+        walked.step
+        for walked in walk(
+            RigConfig(
+                **tomllib.loads(
+                    rig_toml(
+                        SimConfig(force_sensor=False, ink_device="none"), Addresses("127.0.0.1", 1, 2, 3, None, None)
+                    )
+                )
+            ),
+            stairs,
+        )
+    ]
+    presses = [step for step in steps if step.kind == StepKind.PRESS]
+    assert [step.params["height_mm"] for step in presses] == [10.0, 12.0, 14.0, 10.0, 12.0, 14.0]
+    assert len({step.key for step in steps}) == len(steps)
 
 
 def test_a_quality_check_is_a_function_of_the_mark() -> None:
@@ -103,3 +123,19 @@ async def test_a_driver_has_the_methods_of_its_protocol() -> None:
         await pump.close()
         await asyncio.sleep(0)
     assert heard == ["WHO", "DOSE 0.500"]
+
+
+async def test_a_fault_is_a_kind_and_what_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mjpeg_server, "SPOILED", spoiled := dict(mjpeg_server.SPOILED))
+    monkeypatch.setitem(KINDS, Device.CAMERA, KINDS[Device.CAMERA])
+    recipe("fault").add()
+    async with LoopbackRig(SimConfig(force_sensor=False, ink_device="none", view=SMALL)) as rig:
+        camera = OpenCvCamera(CameraOptions(f"http://127.0.0.1:{rig.camera.port}/stream.mjpg"), HostClock())
+        await camera.connect()
+        sound = (await camera.fresh(Stamp(time.time_ns()))).image
+        rig.faults.hang(Fault(device=Device.CAMERA, kind="upside-down", count=ALWAYS))
+        await camera.fresh(Stamp(time.time_ns()))  # one may be on its way
+        turned = (await camera.fresh(Stamp(time.time_ns()))).image
+        await camera.close()
+    assert "upside-down" in spoiled
+    assert np.abs(turned[::-1, ::-1].astype(float) - sound).mean() < 5.0 < np.abs(turned.astype(float) - sound).mean()

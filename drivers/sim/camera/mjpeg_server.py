@@ -6,6 +6,7 @@ import asyncio
 import random
 import time
 from collections import deque
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -40,6 +41,8 @@ def torn(jpeg: bytes) -> bytes:
     return jpeg[: len(jpeg) // 2] + b"\xff\xd9"
 
 
+SPOILED: dict[str, Callable[[bytes], bytes]] = {"torn": torn}
+"""Faults of a single picture: JPEG in, JPEG out."""
 BOUNDARY = "brushloop"
 BACKLOG = 64
 """Images that a stalled stream keeps, as the buffers of a real one do."""
@@ -117,8 +120,8 @@ class MjpegServer(LoopbackServer):
                 case "frozen":
                     held.append(retold(shown or await self._jpeg(), time.time_ns()))
                     shown = await self._send(held, line)
-                case "torn":
-                    held.append(torn(await self._jpeg()))
+                case kind if kind in SPOILED:
+                    held.append(SPOILED[kind](await self._jpeg()))
                     await self._send(held, line)
                 case _:
                     held.append(await self._jpeg())
