@@ -24,7 +24,10 @@ from bench.photographs import EACH, Case, busy, cases, serve, stop
 from bench.processes import ROOT, started, tell
 
 MOST_STARTS = 4
-BETWEEN_STOPS_S = (4.0, 12.0)
+"""A camera that is refused so often stays refused."""
+MOST_STARTS_WITH_STOPS = 40
+"""A rig that is silent for longer than its driver waits ends a run; the same command goes on."""
+BETWEEN_STOPS_S = (8.0, 20.0)
 LONGEST_S = 1200.0
 PROTOCOL = """kind = "grid"
 heights_mm = [11.0, 13.0, 15.0, 17.0, 20.0]
@@ -46,7 +49,7 @@ def collect(folder: Path, rig_pid: int, stops: str, seed: int) -> list[str]:
     command += ["--protocol", str(folder / "protocol.toml"), "--out", str(folder / "sessions")]
     ended: list[str] = []
     rng = random.Random(seed)
-    for _ in range(MOST_STARTS):
+    for _ in range(MOST_STARTS_WITH_STOPS if stops else MOST_STARTS):
         log = folder / "stderr.txt"
         with log.open("w") as err, subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=err) as run:
             pid = {"rig": rig_pid, "collect": run.pid}.get(stops)
@@ -84,7 +87,7 @@ def measure(number: int, case: Case, seed: int) -> tuple[str, int, int]:
     wrong = verdicts["misplaced"] + verdicts["blank"]
     told = sorted({f"{result['camera_delay_ms']:.0f}" for result in done})
     others = ", ".join(f"{count} {name}" for name, count in verdicts.items() if name) or "none"
-    refusals = "; ".join(ended) or "none"
+    refusals = "; ".join(f"{count} x {text}" for text, count in Counter(ended).most_common()) or "none"
     line = f"| {case.name} | {len(done)} | {wrong} | {others} | {', '.join(told)} | {took_s:.0f} | {refusals} |"
     return line, len(done), wrong
 
