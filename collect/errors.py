@@ -1,17 +1,17 @@
 """Errors of a collection.
 
-ConfigError            a file of the user cannot be used: file, field, allowed range
-StepError              a step failed in a way that is understood; says what it leaves and what comes next
- +-- StepVoid          the press was cut: its paper cell is burnt, do it again on a new one
+ConfigError            a user's file or option cannot be used: file, field, allowed range
+StepError              a step failed in a defined way; says what state it leaves and what must come next
+ +-- StepVoid          the press was cut short: its paper cell stays used, press again on a new one
  +-- BadPicture        the photograph cannot be used: take it again
- |    +-- ArmInPicture something hides the sheet: it says nothing about ink
+ |    +-- ArmInPicture something hides the sheet: the photograph says nothing about ink
  +-- ForceTooHigh      the press met more force than allowed: the arm was stopped where it was
- +-- NeedsOperator     something that only a person can put right
+ +-- NeedsOperator     a person must act first
  |    +-- CameraLate   the camera's delay is too long, not steady, or cannot be measured
- +-- JogGivenUp        the operator did not find the paper by jog: its height is what it was
+ +-- JogGivenUp        the operator did not find the paper by jog: its known height stays
  +-- SheetFull         no free cell is left on the sheet
 CollectAborted         the session stopped before its protocol was finished; it can be resumed
- +-- Parked            between two steps, as was asked for, with the arm parked
+ +-- Parked            ended between two steps on request, with the arm parked
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ class ConfigError(Exception):
 
 
 class StepError(Exception):
-    """A step failed in a defined way. The arm is at safe height, or stopped and said so."""
+    """A step failed in a defined way. The arm is at safe height, or the message says that it was stopped."""
 
     exit_code: ClassVar[int] = 4
 
 
 class StepVoid(StepError):
-    """A press did not go as asked. Leaves ink where it should not count: never press that cell again."""
+    """A press did not go as planned. Leaves ink that must not count: never press that cell again."""
 
 
 class BadPicture(StepError):
@@ -57,7 +57,7 @@ class BadPicture(StepError):
 
 
 class ArmInPicture(BadPicture):
-    """Something stays in the picture that should not be there. Leaves the arm parked and the stroke as it is."""
+    """Something that should not be in the picture stays there. Leaves the arm parked and the stroke as it is."""
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
@@ -80,15 +80,15 @@ class ForceTooHigh(StepError):
 
 
 class NeedsOperator(StepError):
-    """Leaves the arm where the step began, at safe height; says what a person must put right."""
+    """A person must act first; the message says how. Leaves the arm where the step began, at safe height."""
 
 
 class CameraLate(NeedsOperator):
-    """Photographs could be older than they seem. Leaves the arm parked; nothing was pressed meanwhile."""
+    """Photographs may be older than they seem. Leaves the arm parked; nothing was pressed meanwhile."""
 
 
 class JogGivenUp(StepError):
-    """Leaves the brush lifted; the height that was known before can be kept."""
+    """The operator gave up finding the paper. Leaves the brush lifted; the height known before can be kept."""
 
     def __init__(self, number: int, of: int, height: str) -> None:
         self.height = height
@@ -96,7 +96,7 @@ class JogGivenUp(StepError):
 
 
 class SheetFull(StepError):
-    """No free cell on this sheet. Leaves the arm parked; a fresh sheet must go in before the next press."""
+    """No free cell is left. Leaves the arm parked; a fresh sheet must be put in before the next press."""
 
     def __init__(self, capacity: int, sheet: int) -> None:
         self.capacity = capacity
@@ -108,17 +108,18 @@ class SheetFull(StepError):
 
 
 class CollectAborted(Exception):
-    """Stopped before the end; the same command goes on from here."""
+    """The run stopped before its end; the same command resumes it."""
 
     exit_code: ClassVar[int] = 4
 
 
 class Parked(CollectAborted):
-    """Ended between two steps because that was asked for, with the arm lifted and parked."""
+    """The run ended between two steps on request, with the arm lifted and parked."""
 
 
 def rest_is_unknown(error: BaseException | None) -> bool:
-    """Whether after this error nobody knows that the arm rests: it was lost, or did not answer the stop."""
+    """Whether it is not known that the arm rests after this error: the connection was lost, or it did not answer the
+    stop."""
     if isinstance(error, ArmMoved):
         return error.moving
     known = RobotNotSafe | LimitExceeded | MotionRefused | NotConnected | SettingsChanged
@@ -126,5 +127,5 @@ def rest_is_unknown(error: BaseException | None) -> bool:
 
 
 def describe(error: BaseException) -> str:
-    """An error with the notes that were added on its way: one of them may say that the arm still moves."""
+    """The message of an error with its notes: one of them may say that the arm still moves."""
     return " ".join([str(error) or type(error).__name__, *getattr(error, "__notes__", [])])
