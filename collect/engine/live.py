@@ -46,8 +46,6 @@ class LiveView:
 
     def __init__(self, port: int = PORT) -> None:
         self.port = port
-        self.sent = 0
-        """Messages that went to at least one viewer."""
         self.dropped = 0
         """Messages that found no room in the queue; of pictures, only those that were due."""
         self._queue: queue.Queue[Outgoing | Frame | None] = queue.Queue(QUEUE_LIMIT)
@@ -128,7 +126,6 @@ class LiveView:
             if channels.watched(Topic.PREVIEW if picture else cast("Outgoing", item).topic):
                 with contextlib.suppress(SessionDamaged):
                     table.add(_preview(item) if picture else cast("Outgoing", item))
-        self.sent = channels.sent
 
 
 @contextlib.asynccontextmanager
@@ -154,7 +151,6 @@ class _Channels:
         self._schemas: list[Any] = []
         self._channels: list[Channel] = []
         self._topics: dict[str, int] = {}
-        self.sent = 0
 
     def register_schema(self, *, name: str, encoding: str, data: bytes) -> int:
         from foxglove import Schema
@@ -176,7 +172,6 @@ class _Channels:
         channel = self._channels[channel_id]
         if channel.has_sinks():
             channel.log(data, log_time=log_time)
-            self.sent += 1
 
     def flush(self) -> None:
         """Do nothing: no message waits here."""
