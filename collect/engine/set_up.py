@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import replace
 
 from calibrate.board.plane import WORST_RMS_PX
@@ -56,10 +55,7 @@ def board_first(protocol: Protocol) -> Protocol:
     """The same steps, but the board is looked at before the brush comes down. The step has the key of the later board
     step, which is then already done."""
     yield Step(StepKind.BOARD, 0)
-    step = next(protocol)
-    with contextlib.suppress(StopIteration):
-        while True:
-            step = protocol.send((yield step))
+    yield from protocol
 
 
 def _listed(kind: StepKind, result: Result | None, config: RigConfig, now: bool) -> SetUpStep:
