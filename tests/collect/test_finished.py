@@ -1,4 +1,4 @@
-"""What is told when a session is finished: where its recording lies, and the next command."""
+"""What is printed when a session is finished: where its recording lies, and the next command."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_the_recording_and_what_comes_next(tmp_path: Path) -> None:
     assert ending(folder, "calibration") == recorded
 
 
-def test_it_is_told_after_the_screen_too(
+def test_it_is_printed_after_the_screen_too(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lab.write_protocol("[11.0]", "[0.0]")

@@ -68,16 +68,16 @@ def test_the_loop_is_closed_and_goes_on_after_kill_nine(bench: Bench) -> None:
     repeated = [stroke.again_of for stroke in Recording(replay).stroke_records()]
     assert sorted(map(str, repeated)) == originals
 
-    told: dict[str, Any] = json.loads((session / "loop" / "loop.json").read_text(encoding="utf-8"))
-    assert told["source"] == "loopback rig"
-    assert told["pairs"] == 6
-    assert told["refused"] == []
-    assert told["in_sample"]
+    report: dict[str, Any] = json.loads((session / "loop" / "loop.json").read_text(encoding="utf-8"))
+    assert report["source"] == "loopback rig"
+    assert report["pairs"] == 6
+    assert report["refused"] == []
+    assert report["in_sample"]
     rows = read_loop(session / "loop").table_1
     assert {row.what for row in rows} == {"re-pressed", "recovered, simulated"}
     assert all(row.n == 6 and row.source == "loopback rig" for row in rows)
     # No cell was pressed twice: the brush's repeatability is not known, and nothing is claimed.
-    assert told["verdicts"] == []
+    assert report["verdicts"] == []
     with (session / "loop" / "loop.csv").open(encoding="utf-8") as file:
         single = [row for row in csv.DictReader(file) if row["what"] == "re-pressed" and row["tone"] == "binary"]
     assert len(single) == 12

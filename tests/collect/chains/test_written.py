@@ -59,8 +59,8 @@ def test_a_character_is_written_twice_and_compared(bench: Bench) -> None:
     other = write(bench, what, "--count", "3")
     assert other.returncode == 2
     assert "repeats: plans 2 writings, not 3: use another --out" in other.stderr
-    told: dict[str, Any] = json.loads((bench.folder / "written" / "written.json").read_text(encoding="utf-8"))
-    assert told["refused"] == []
+    report: dict[str, Any] = json.loads((bench.folder / "written" / "written.json").read_text(encoding="utf-8"))
+    assert report["refused"] == []
 
     # A session is compared with the plan that it was drawn from, and with no other.
     plan = bench.folder / "plan"

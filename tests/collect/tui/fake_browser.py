@@ -63,12 +63,12 @@ class FakeBrowser(SessionBrowser):
         ]
 
     def standing(self, session_id: str) -> Details:
-        told = Details(
+        details = Details(
             session_id, "open", "loopback rig", {}, "brushloop 0.1", 1, {"capture": 13}, strokes=13, planned=30
         )
-        told.void = ["press H15-a5-r01, attempt 1: the process ended during it"]
-        told.next, told.sheets = "press H15-a5-r01", [Sheet(1, [1, 2])]
-        return told
+        details.void = ["press H15-a5-r01, attempt 1: the process ended during it"]
+        details.next, details.sheets = "press H15-a5-r01", [Sheet(1, [1, 2])]
+        return details
 
     def health(self) -> list[Finding]:
         return FINDINGS

@@ -1,4 +1,4 @@
-"""What the app asks of an engine besides pause and stop, on the loopback rig: requests, park, guided set-up."""
+"""What the app asks of an engine, other than pause and stop, on the loopback rig: requests, park, guided set-up."""
 
 from __future__ import annotations
 

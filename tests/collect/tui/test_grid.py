@@ -26,7 +26,7 @@ def test_before_the_width_is_known_and_where_nothing_fits_tilts_go_down() -> Non
         assert len(grid_content(grid_of(5), room).plain.splitlines()) == 4
 
 
-def test_every_state_has_a_sign_of_its_own_besides_its_colour() -> None:
+def test_every_state_has_a_sign_as_well_as_a_colour() -> None:
     text = grid_content(marked_grid(), 78).plain
     for sign in (COMPLETE, NOW, NEXT, BAD, LEFT_OUT):
         assert text.count(sign) == (text.count("2/2") - 1 if sign is COMPLETE else 1), sign
