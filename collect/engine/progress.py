@@ -15,8 +15,8 @@ from collect.engine.tally import Place, Tally
 from collect.operator import Prompt
 from collect.protocols.adaptive import with_choice
 from collect.protocols.config import ProtocolConfig
+from collect.protocols.plan import AGAIN, Planned, with_review
 from collect.protocols.steps import MARKING, Result, Step, StepKind
-from collect.protocols.strokes import AGAIN, Planned, with_review
 from collect.rig.paper import Layout, Sheet
 from drivers.clock import Clock
 from sessions.store import SessionStore

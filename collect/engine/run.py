@@ -17,8 +17,8 @@ from collect.engine.steps.context import RunContext
 from collect.engine.steps.review import marked_bad
 from collect.errors import ForceTooHigh, Parked, SheetFull, StepError, describe
 from collect.operator import Choice, OperatorRequest, Prompt
+from collect.protocols.plan import takes
 from collect.protocols.steps import Protocol, Result, Step, StepKind
-from collect.protocols.strokes import takes
 from drivers.errors import ArmMoved, DeviceError, LimitExceeded, MotionError, RpcError
 from sessions.errors import SessionError
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from calibrate.stroke.params import Gray
 from collect.engine.snapshot import Picture
-from collect.quality.picture import blur_px
+from collect.quality.measure import blur_px
 from collect.rig.optics import gray
 from drivers.errors import DeviceError
 from drivers.protocols import Camera, Robot

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from collect.protocols.strokes import TrajectoryPoint
+from collect.protocols.plan import TrajectoryPoint
 from collect.rig.config import RigConfig, WashConfig
 from collect.rig.paper import Cell, PaperPlane, to_base
 from drivers.geometry import brush_pose, interpolate, lean

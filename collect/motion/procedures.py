@@ -17,7 +17,7 @@ from collect.motion.moves import (
     zero_touch_moves,
 )
 from collect.photograph.photographer import ArmTrips, Photographer
-from collect.protocols.strokes import Drawn, TrajectoryPoint
+from collect.protocols.plan import Drawn, TrajectoryPoint
 from collect.rig.config import RigConfig
 from collect.rig.devices import Rig, limits_of
 from collect.rig.paper import Cell, PaperPlane, to_paper

@@ -12,7 +12,7 @@ from collect.errors import ConfigError
 from collect.planning.summary import PlacedStroke, Plan
 from collect.planning.walk import sheet_of
 from collect.protocols.config import ProtocolConfig
-from collect.protocols.strokes import Drawn
+from collect.protocols.plan import Drawn
 from collect.rig.config import RigConfig
 from collect.rig.paper import Sheet, to_paper
 from collect.touch.selfcheck import partners

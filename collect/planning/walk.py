@@ -19,8 +19,8 @@ from collect.motion.moves import (
     zero_touch_moves,
 )
 from collect.protocols.config import ProtocolConfig
+from collect.protocols.plan import Drawn
 from collect.protocols.steps import MARKING, Protocol, Result, Step, StepKind, with_self_check
-from collect.protocols.strokes import Drawn
 from collect.rig.config import RigConfig
 from collect.rig.config_touch import TouchConfig
 from collect.rig.paper import Cell, Layout, PaperPlane, Sheet

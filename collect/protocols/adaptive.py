@@ -8,8 +8,8 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from collect.protocols.base import MAX_STROKES, DeepMm, DwellS, ProtocolBase, Repeats, check_axes, check_count
+from collect.protocols.plan import Planned, TiltDeg, takes
 from collect.protocols.steps import Protocol, Result, Step, StepKind
-from collect.protocols.strokes import Planned, TiltDeg, takes
 from collect.rig.paper import Layout
 
 

@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, BaseModel, Field
 
+from collect.protocols.plan import Planned, stroke_steps
 from collect.protocols.steps import Protocol
-from collect.protocols.strokes import Planned, stroke_steps
 from collect.rig.config_file import Config
 from collect.rig.paper import Layout
 

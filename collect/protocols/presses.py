@@ -21,8 +21,7 @@ from collect.protocols.base import (
     check_distinct,
     stroke_id_problem,
 )
-from collect.protocols.order import numbered, shuffled
-from collect.protocols.strokes import Planned, TiltDeg
+from collect.protocols.plan import Planned, TiltDeg, numbered, shuffled
 from collect.rig.config_file import Config
 from collect.rig.paper import Layout
 
@@ -30,7 +29,7 @@ from collect.rig.paper import Layout
 class GridConfig(ProtocolBase):
     """The paper's grid: every depth at every tilt, `repeats` times, in an order shuffled by `seed`.
 
-    Where the layout of the sheet is known, the order also spreads each (H, alpha) over the sheet (`protocols.order`).
+    Where the layout of the sheet is known, the order also spreads each (H, alpha) over the sheet (`protocols.plan`).
     """
 
     depths_field: ClassVar[str] = "heights_mm"

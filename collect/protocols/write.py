@@ -8,8 +8,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from collect.protocols.base import FileName, ProtocolBase, Repeats, Seed, check_count, check_distinct, stroke_id_problem
-from collect.protocols.order import shuffled
-from collect.protocols.strokes import Drawn, HeadingDeg, InCellMm, PathDepthMm, Planned, TiltDeg, TrajectoryPoint
+from collect.protocols.plan import Drawn, HeadingDeg, InCellMm, PathDepthMm, Planned, TiltDeg, TrajectoryPoint, shuffled
 from collect.rig.config_file import Config
 from collect.rig.paper import Layout
 

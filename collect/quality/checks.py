@@ -14,9 +14,9 @@ import numpy as np
 from calibrate.board.plane import Plane
 from calibrate.stroke.params import PX_PER_MM, Gray, Params
 from calibrate.stroke.rectify import rectify
-from collect.quality import picture
+from collect.quality import measure
 from collect.quality.ink import Ink, Point, Rect, around, mm2, take, tell_apart
-from collect.quality.mark import Mark, measure_mark
+from collect.quality.measure import Mark, measure_mark
 from collect.quality.verdict import Check, Failure, Verdict
 from collect.rig.config_quality import QualityConfig
 from collect.rig.paper import Cell
@@ -165,7 +165,7 @@ def _at_least(name: Failure, score: float, unit: str, limit: float, reason: str)
 
 def exposure(image: Gray, limits: QualityConfig) -> Check:
     """Paper neither dark nor saturated."""
-    level = picture.paper_level(image)
+    level = measure.paper_level(image)
     reason = ""
     if level < limits.dark_level:
         reason = f"The picture is too dark: paper at {level:.0f} of 255. Turn the light on or expose longer."
@@ -177,7 +177,7 @@ def exposure(image: Gray, limits: QualityConfig) -> Check:
 
 def blurred(image: Gray, plane: Plane, limits: QualityConfig) -> tuple[Check, ...]:
     """Sharp edges; none where the picture has no edge to measure, as with a bare sheet that fills it."""
-    sigma_px = picture.blur_px(image)
+    sigma_px = measure.blur_px(image)
     if sigma_px is None:
         return ()
     sigma_mm = sigma_px * plane.mm_per_px
@@ -188,15 +188,15 @@ def blurred(image: Gray, plane: Plane, limits: QualityConfig) -> tuple[Check, ..
 def cut(ink: Ink, plane: Plane, shape: tuple[int, ...], anchor_mm: Point, limits: QualityConfig) -> Check:
     """The stroke, or where there is none the zero-touch point, wholly in the frame."""
     points = ink.patch.points_mm(ink.own) if ink.own.any() else np.array([anchor_mm])
-    gap_mm = picture.edge_mm(points, plane, shape)
+    gap_mm = measure.edge_mm(points, plane, shape)
     reason = f"The stroke ends {max(gap_mm, 0.0):.1f} mm from the edge of the picture. Move the camera or the sheet."
     return _at_least(Failure.CUT, gap_mm, "mm", limits.edge_mm, reason)
 
 
 def glare(image: Gray, plane: Plane, window: Rect, cell_mm: Rect, limits: QualityConfig) -> Check:
     """No reflection in the cell; `window` holds enough of the paper around it to know the light."""
-    spots = picture.glare(rectify(image, plane.image_to_paper, window), limits.glare_share)
-    scale = picture.BRIGHT_PX_PER_MM
+    spots = measure.glare(rectify(image, plane.image_to_paper, window), limits.glare_share)
+    scale = measure.BRIGHT_PX_PER_MM
     left, top = cell_mm[0] - window[0], window[1] + window[3] - cell_mm[1] - cell_mm[3]
     rows = slice(round(top * scale), round((top + cell_mm[3]) * scale))
     columns = slice(round(left * scale), round((left + cell_mm[2]) * scale))

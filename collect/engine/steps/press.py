@@ -9,8 +9,8 @@ from collect.engine.steps.context import StepContext
 from collect.engine.steps.dip import DipToTouch, fill_brush, must_dip
 from collect.motion.moves import press_moves, stroke_moves
 from collect.motion.procedures import check_drawn, draw_stroke
+from collect.protocols.plan import Drawn
 from collect.protocols.steps import Result
-from collect.protocols.strokes import Drawn
 from collect.rig.devices import limits_of
 from collect.rig.paper import Cell
 from sessions.history import WAIT

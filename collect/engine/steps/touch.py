@@ -18,8 +18,7 @@ from collect.rig.config_touch import TouchConfig
 from collect.rig.paper import PaperPlane
 from collect.touch.arm import ForceTap
 from collect.touch.heights import PlaneResult, kept
-from collect.touch.jog import asked
-from collect.touch.measure import measure_plane
+from collect.touch.measure import asked, measure_plane
 from collect.touch.selfcheck import self_check, triangle_on
 from drivers.samples import Frame
 from sessions.recording.messages import Transform

@@ -12,8 +12,8 @@ from collect.motion.moves import stroke_moves
 from collect.motion.procedures import check_drawn, draw_stroke
 from collect.planning.walk import sheet_of, walk
 from collect.protocols.config import load_protocol
+from collect.protocols.plan import Drawn
 from collect.protocols.steps import StepKind
-from collect.protocols.strokes import Drawn
 from collect.rig.config import RigConfig, load_rig
 from collect.rig.devices import limits_of, make_robot
 from collect.rig.paper import PaperPlane

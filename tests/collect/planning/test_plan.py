@@ -15,8 +15,8 @@ from collect.planning.limits import all_poses, check_poses, check_protocol
 from collect.planning.summary import Plan, make_plan
 from collect.planning.walk import moves_of, sheet_of, walk
 from collect.protocols.config import ProtocolConfig, load_protocol
+from collect.protocols.plan import Drawn
 from collect.protocols.steps import MARKING, StepKind
-from collect.protocols.strokes import Drawn
 from collect.rig.config import RigConfig, load_rig
 from collect.rig.devices import limits_of
 from collect.rig.paper import PaperPlane

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from collect.protocols.calibration import CalibrationConfig
 from collect.protocols.config import ProtocolConfig, load_protocol
+from collect.protocols.plan import strokes_of, strokes_text
 from collect.protocols.presses import GridConfig, ListConfig, PressRow, ReplayConfig, ReplayRow
 from collect.protocols.steps import MARKING, Step, StepKind
-from collect.protocols.strokes import strokes_of, strokes_text
 from collect.protocols.write import DrawnStroke, Figure, WriteConfig
 from collect.rig.paper import Layout
 

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from calibrate.board.lens import unknown_lens
 from calibrate.board.plane import Plane
 from collect.quality.checks import cell_is_blank, check_capture, check_drawing, check_frame
-from collect.quality.picture import blur_px, glare, paper_level
+from collect.quality.measure import blur_px, glare, paper_level
 from collect.quality.verdict import Failure, Family
 from collect.rig.config_quality import QualityConfig
 from collect.rig.paper import Cell

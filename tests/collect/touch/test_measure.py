@@ -16,8 +16,7 @@ from collect.errors import NeedsOperator, StepError
 from collect.operator import Asker
 from collect.rig.config_touch import TouchConfig
 from collect.touch.heights import PlaneResult
-from collect.touch.jog import Jogged, asked
-from collect.touch.measure import measure_plane
+from collect.touch.measure import Jogged, asked, measure_plane
 from drivers.samples import Pose
 
 if TYPE_CHECKING:

@@ -15,8 +15,7 @@ from collect.protocols.steps import Step, StepKind
 from collect.rig.config import RigConfig
 from collect.rig.config_touch import TouchConfig
 from collect.rig.paper import PaperPlane, Sheet
-from collect.touch.jog import Jogged
-from collect.touch.measure import measure_plane
+from collect.touch.measure import Jogged, measure_plane
 from collect.touch.selfcheck import partners, self_check, triangle_on
 from drivers.samples import Pose
 from tests.collect.sent import lowest_mm, not_checked, not_sent
