@@ -18,7 +18,7 @@ import pytest
 
 from collect.planning.walk import walk
 from collect.protocols.steps import StepKind
-from collect.quality.mark import Mark
+from collect.quality.measure import Mark
 from collect.rig.config import RigConfig
 from collect.rig.config_quality import QualityConfig
 from drivers.camera import CameraOptions, OpenCvCamera

@@ -11,7 +11,7 @@ from typing import ClassVar, Literal
 from pydantic import Field, model_validator
 
 from collect.protocols.base import DeepMm, ProtocolBase, Repeats, check_count
-from collect.protocols.strokes import Planned
+from collect.protocols.plan import Planned
 from collect.rig.paper import Layout
 
 

@@ -7,7 +7,7 @@ in `QualityConfig` (`collect/rig/config_quality.py`), so that a rig can set it. 
 
 from __future__ import annotations
 
-from collect.quality.mark import Mark
+from collect.quality.measure import Mark
 from collect.quality.verdict import Check, Failure
 from collect.rig.config_quality import QualityConfig
 
