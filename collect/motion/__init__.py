@@ -1,1 +1,1 @@
-"""Where the arm goes: lists of moves for the plan and the run, and what carries them out."""
+"""Where the arm goes: the lists of moves that a plan checks, and the procedures that carry them out."""

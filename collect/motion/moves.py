@@ -15,7 +15,7 @@ from drivers.samples import Pose
 CLEARANCE_MM = 8.0
 """Height above the paper at which the fast approach ends."""
 DWELL_MM = 0.05
-"""Way of the dwell: the end of the descent, as slow as it has to last. ARCS cannot wait in its queue but by moving."""
+"""Length of the dwell: the last part of the descent, made slow. ARCS can only wait in its queue by moving."""
 CHECK_APPROACH_MM = 4.0
 """Height above the paper at which the slow approach of a self-check's mark begins."""
 CHECK_SPEED_MM_S = 5.0
@@ -45,7 +45,7 @@ class Room:
     """Where a touch that decides by itself may send the upright brush: any pose between these, its outermost ones."""
 
     poses: tuple[Pose, ...]
-    """The lowest first."""
+    """The lowest ones come first."""
     speed_mm_s: float
     """No move within is faster."""
 
@@ -79,7 +79,7 @@ def commanded(parts: Iterable[Part]) -> list[tuple[Pose, float]]:
 
 
 def retreat_moves(config: RigConfig, here: Pose) -> list[Move]:
-    """From anywhere: along the tool axis up to safe height if below it, upright, then to the park position."""
+    """From any pose: up along the tool axis to safe height if below it, upright, then to the park position."""
     motion = config.motion
     moves: list[Move] = []
     x_mm, y_mm, z_mm = here.position_mm
@@ -117,7 +117,7 @@ def photograph_moves(config: RigConfig) -> list[Move]:
 
 
 def inking_moves(config: RigConfig, dips: int) -> list[Move]:
-    """The next dip after so many others of the same process, and the wash before it where it is time for one."""
+    """The dip after `dips` others of this process, and the wash before it where one is due."""
     wash = config.ink.wash
     washed = wash is not None and dips % wash.every_dips == wash.every_dips - 1
     return [*(wash_moves(config, wash) if wash is not None and washed else ()), *dip_moves(config)]
@@ -134,7 +134,7 @@ def dip_moves(config: RigConfig) -> list[Move]:
 
 
 def wash_moves(config: RigConfig, wash: WashConfig) -> list[Move]:
-    """Over the pot, down and up so many times, and up."""
+    """Over the pot, down and up `wash.strokes` times, and out."""
     speed_mm_s = config.motion.press_speed_mm_s
     bottom = Move(upright(config, *wash.pot_mm, wash.dip_z_mm), speed_mm_s)
     half = Move(upright(config, *wash.pot_mm, 0.5 * (wash.dip_z_mm + config.motion.safe_z_mm)), speed_mm_s)
@@ -148,9 +148,9 @@ def wash_moves(config: RigConfig, wash: WashConfig) -> list[Move]:
 def press_moves(
     config: RigConfig, plane: PaperPlane, cell: Cell, height_mm: float, tilt_deg: float, dwell_s: float = 0.0
 ) -> tuple[list[Move], list[Move]]:
-    """(over the cell and tilted about the tip at clearance; touch height, descend H, dwell and up again).
+    """(over the cell and tilted about the tip at clearance; down to touch height and by H, dwell, and up again).
 
-    The second list is one that the controller carries out by itself: it must end above the paper.
+    The controller carries out the second list by itself, so that list must end above the paper.
     Tilting about the tip just above the paper instead of on it leaves the same pose at touch and no smear.
     """
     motion, paper = config.motion, config.paper
@@ -245,7 +245,7 @@ def up(config: RigConfig, x_mm: float, y_mm: float) -> Move:
 
 
 def lift(config: RigConfig, here: Pose) -> list[Move]:
-    """Straight up to travel height from wherever the tip is; nothing where it is there."""
+    """Straight up to travel height from wherever the tip is; no move where it is there already."""
     high = Pose(here.x_mm, here.y_mm, config.motion.safe_z_mm, *here.quaternion)
     return [Move(high, config.motion.press_speed_mm_s)] if here.z_mm < config.motion.safe_z_mm else []
 
@@ -279,7 +279,7 @@ def mark_moves(config: RigConfig, plane: PaperPlane, x_mm: float, y_mm: float) -
 
 
 def touching(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Pose:
-    """As `upright`, and no higher than travel height."""
+    """The pose of `upright`, no higher than travel height."""
     return upright(config, x_mm, y_mm, min(z_mm, config.motion.safe_z_mm))
 
 

@@ -78,7 +78,7 @@ class Procedures:
         return rests_mm
 
     async def dip(self) -> None:
-        """Into the well and out again, with a wipe; after a wash, where it is time for one."""
+        """Dip into the well and wipe, after a wash where one is due."""
         for move in inking_moves(self._config, self._dips):
             await self.go(move)
         self._dips += 1
@@ -97,7 +97,7 @@ class Procedures:
         return depth_mm
 
     async def capture(self) -> Frame:
-        """Park, then the first frame exposed after the camera has shown the arm gone."""
+        """Park, and return the first frame exposed after the camera has shown the arm gone."""
         return await self.photographer.photograph()
 
     async def _park(self) -> None:
@@ -111,7 +111,7 @@ class Procedures:
         return 0.0 <= x_mm <= width_mm and 0.0 <= y_mm <= height_mm
 
     async def go(self, move: Move) -> None:
-        """One move, to its end."""
+        """Make one move, to its end."""
         motion = self._config.motion
         await self._rig.robot.move(move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=motion.acc_mm_s2)
 

@@ -119,7 +119,7 @@ class Reach:
 
 
 def reach_of(brush: BrushConfig, depth_mm: float, tilt_deg: float) -> Reach:
-    """By the closed-form stroke model (CCD-BSM), Eq. 1-5, with lambda = pi: a warning's worth, not a measurement.
+    """By the closed-form stroke model (CCD-BSM), Eq. 1-5, with lambda = pi: good for a warning, not a measurement.
 
     theta = atan(R / L), O3A = H (tan a - tan(a - theta)), O4O3 = H / cos(a - theta) + O3A, O3C = H R / (L cos a).
     The mark lies from -O4O3 to O3A, pi O3C to each side.

@@ -151,7 +151,7 @@ def _warnings(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list
 
 
 def _armed(config: RigConfig, protocol: ProtocolConfig) -> str | None:
-    """What the self-check, which `--arm` switches on, takes beyond this plan."""
+    """Warning of what the self-check, which `--arm` switches on, adds to this plan; None where it adds nothing."""
     if config.self_check.enabled is not None or not protocol.planned():
         return None
     armed = config.checking_itself(True)
@@ -208,7 +208,7 @@ def _figure_overhang(config: RigConfig, cell: Cell, point: tuple[float, float, f
 
 
 MOST_ROWS = 40
-"""(H, alpha) in the table; more would not be read."""
+"""Most rows of (H, alpha); nobody would read more."""
 
 
 def plan_table(plan: Plan) -> Group:

@@ -98,7 +98,7 @@ class WipeConfig(Config):
     """Wiping off a drop at the rim of the well, after each dip."""
 
     rim_mm: tuple[Finite, Finite]
-    """Where the tip goes from the middle of the well: past the rim, in the paper frame; off the sheet."""
+    """Where the tip is drawn to from the middle of the well, past its rim; in the paper frame, off the sheet."""
     z_mm: Finite
     """Height of the tip on the way, in the base frame: a little below the rim."""
 
@@ -111,9 +111,9 @@ class WashConfig(Config):
     dip_z_mm: Finite
     """Height of the tip at the bottom, in the base frame."""
     every_dips: Annotated[int, Field(ge=1, le=1000)] = 30
-    """Washed before every so many dips into the ink."""
+    """The brush is washed before each dip whose number, from 1, is a multiple of this."""
     strokes: Annotated[int, Field(ge=1, le=20)] = 3
-    """How often down and up."""
+    """How often the brush goes down and up."""
 
 
 class InkConfig(Config):

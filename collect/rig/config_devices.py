@@ -1,4 +1,4 @@
-"""The devices' tables of `rig.toml`: where each one is, and what it may do."""
+"""The tables of `rig.toml` for the devices: the address of each, and what it may do."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class RobotConfig(Config):
     tcp_offset_mm: tuple[Finite, Finite, Finite]
     """Flange to brush tip."""
     framing: Literal["sof", "bare"] = "sof"
-    """`sof` as the maker's client speaks, `bare` as the maker documents."""
+    """`sof` as in the maker's client, `bare` as in the maker's documentation."""
     rtde_port: int | None = Field(None, ge=1, le=65535)
     """Where poses are pushed from (30010); left out, they are polled for."""
     watchdog_s: Annotated[float, Field(ge=0.5, le=60.0)] | None = None
@@ -104,7 +104,7 @@ class CameraConfig(Config):
 
 
 class InkStationConfig(Config):
-    """A station that doses, lights and knows the level (docs/ink-station.md)."""
+    """A station that doses ink, lights the sheet and measures the level (docs/ink-station.md)."""
 
     kind: Literal["ink-station"]
     port: str = Field(min_length=1)
@@ -113,7 +113,7 @@ class InkStationConfig(Config):
     keep_level: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
     """Before a dip the well is filled up to this share of its capacity."""
     dose_ml: Annotated[float, Field(gt=0.0, le=2.0)] = 0.5
-    """Given at once, and again until the level holds."""
+    """Size of one dose, repeated until the level is reached."""
     max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
     light: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
     """Set at the start of a run; left out, the light stays as it is."""
@@ -155,7 +155,7 @@ class ForceConfig(Config):
     max_n: Positive = 5.0
     """Ceiling while the brush is down: above it the arm is stopped and the press is void."""
     stale_ms: Annotated[float, Field(ge=20.0)] = 100.0
-    """While the brush goes down, silence of this length stops the arm: 100 at most, save on the loopback rig's bus."""
+    """While the brush goes down, silence of this length stops the arm; at most 100, except on the loopback bus."""
     bias_s: Annotated[float, Field(ge=0.05, le=60.0)] = 0.5
     """How long to average with nothing touching, before each zero touch."""
 

@@ -120,7 +120,7 @@ LEAST_SPREAD_MM = 20.0
 
 @dataclass(frozen=True, slots=True)
 class PaperPlane:
-    """The height at which the vertical brush's tip just touches, over the sheet: z = z0 + a x + b y, in mm.
+    """The height at which the tip of the vertical brush just touches the sheet: z = z0 + a x + b y, in mm.
 
     x and y are in the paper frame, z in the base frame.
     """

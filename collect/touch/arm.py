@@ -47,15 +47,15 @@ class TouchArm:
         self._slow_mm_s = slow_mm_s
 
     async def over(self, x_mm: float, y_mm: float) -> None:
-        """To travel height over a point."""
+        """Go to travel height over a point."""
         await self.go(moves.over(self._rig.config, x_mm, y_mm))
 
     async def near(self, x_mm: float, y_mm: float, z_mm: float) -> None:
-        """From travel height down to where the slow approach begins."""
+        """Go from travel height down to where the slow approach begins."""
         await self.go(moves.near(self._rig.config, x_mm, y_mm, z_mm))
 
     async def to(self, x_mm: float, y_mm: float, z_mm: float) -> float:
-        """Slowly to a height; returns the one at which the arm rests."""
+        """Go slowly to a height; returns the height at which the arm rests."""
         await self.go(Move(moves.touching(self._rig.config, x_mm, y_mm, z_mm), self._slow_mm_s))
         return (await self._rig.robot.where()).z_mm
 
@@ -71,12 +71,12 @@ class TouchArm:
         await self._rig.robot.sequence(lines, acc_mm_s2=self._rig.config.motion.acc_mm_s2)
 
     async def lift(self) -> None:
-        """Straight up to travel height from wherever the tip is."""
+        """Go straight up to travel height from wherever the tip is."""
         for move in moves.lift(self._rig.config, await self._rig.robot.where()):
             await self.go(move)
 
     async def go(self, move: Move) -> None:
-        """One move, to its end."""
+        """Make one move, to its end."""
         acc_mm_s2 = self._rig.config.motion.acc_mm_s2
         await self._rig.robot.move(move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=acc_mm_s2)
 
@@ -109,7 +109,7 @@ class ForceTap:
         self._came = asyncio.Event()
 
     def take(self, sample: ForceSample) -> None:
-        """One sample of the sensor."""
+        """Accept one sample of the sensor."""
         if self._wanted is not None and sample.stamp.host_ns > self._after_ns:
             self._wanted.append(sample)
         self._came.set()
