@@ -93,7 +93,7 @@ def overlay_uri(first: Image, second: Image) -> str:
 def overlay(first: Image, second: Image) -> Image:
     """(h, w, 3) RGB of two (h, w) images of ink: gray where both have it, orange the first alone, blue the second."""
     both = np.minimum(first, second)
-    # The colours of Okabe and Ito, which colour-blind readers tell apart, as distances from white.
+    # The colours of Okabe and Ito, which colour-blind readers can distinguish, as distances from white.
     darker = (
         both[..., None] * np.array([0.35, 0.35, 0.35])
         + (first - both)[..., None] * np.array([0.165, 0.631, 1.0])
@@ -145,7 +145,7 @@ def save_picture(figure: Any, path: Path) -> None:
 
 
 class Sealed(BaseModel):
-    """A report as data that carries the digest of its own contents, so that an edited one is recognised.
+    """A report as data that carries a digest of its contents, so that an edited one is recognised.
 
     The digest is no signature: it guards what was measured, and on what kind of ink, against edits by accident.
     Frozen, without unknown fields. A subclass gives `format` its FORMAT as default.

@@ -1,9 +1,9 @@
 # pyright: basic
 """CSIM and SSIM of one captured image against many predicted ones, compiled (numba).
 
-The numbers are those of `similarity.py` on the images over 255. What makes it quick: filters and overlaps are
-reckoned only around ink (where both windows are blank SSIM is 1), what belongs to the capture is filtered once for all
-models, and the best shift is found on whole numbers, so that ties are always broken alike.
+The numbers are those of `similarity.py` on the images over 255. It is fast because filters and overlaps are computed
+only around ink (where both windows are blank SSIM is 1), and because the capture is filtered once for all models. The
+best shift is found on whole numbers, so that ties are always broken in the same way.
 """
 
 import math

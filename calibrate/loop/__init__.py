@@ -1,1 +1,1 @@
-"""Strokes pressed again from what their images told, beside the originals."""
+"""Strokes recovered from their images and pressed again, compared with the originals."""

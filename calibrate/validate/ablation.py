@@ -13,10 +13,11 @@ from calibrate.compare.field import KEYS, Alignment, Tone
 from calibrate.compare.images import brush_of, pack, simulated_pixels
 from calibrate.fit.fit import fit_presses
 from calibrate.validate.heldout import RefitJob, bezier_body, bezier_pixels, cropped, fitted_press, press_body
-from calibrate.validate.jobs import ABSENT, VERSION, ScoreJob, score_job
+from calibrate.validate.jobs import ABSENT, ScoreJob, score_job
 from calibrate.validate.pool import Progress, Scheduler
 from calibrate.validate.report.data import Step
 from calibrate.validate.run import CHUNK, Outcome
+from calibrate.validate.store import VERSION
 from model.fitted_shape import fitted_model
 
 COUNTS = (1, 2, 3, 5, 9, 15, 30, 60)
@@ -29,7 +30,7 @@ JUDGED = KEYS.index((Alignment.MM, Tone.BINARY))
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One fit: which rows it is made of, and which it is scored on."""
+    """One fit: the rows it is made of, and those it is scored on."""
 
     session: int
     count: int
@@ -52,8 +53,8 @@ def similarity_by_strokes(outcome: Outcome, scheduler: Scheduler, progress: Prog
         progress("fits from few strokes", done, len(jobs))
     sums: dict[tuple[int, int, str], list[np.ndarray]] = {}
     for name, (trial, _) in jobs.items():
-        made = outcome.store.get(name.partition(":")[0])
-        for model, scores in _scored(outcome, trial, made, scheduler):
+        fit = outcome.store.get(name.partition(":")[0])
+        for model, scores in _scored(outcome, trial, fit, scheduler):
             sums.setdefault((trial.session, trial.count, model), []).append(scores)
     steps: list[Step] = []
     for (session, count, model), found in sorted(sums.items()):
@@ -93,11 +94,11 @@ def _trials(outcome: Outcome) -> Iterator[Trial]:
 
 
 def _scored(
-    outcome: Outcome, trial: Trial, made: dict[str, Any], scheduler: Scheduler
+    outcome: Outcome, trial: Trial, fit: dict[str, Any], scheduler: Scheduler
 ) -> Iterator[tuple[str, np.ndarray]]:
     """(model, (n, 2) CSIM and SSIM) in millimetres, binary."""
     brush, view = brush_of(outcome.sessions[trial.session].header), outcome.options.view
-    press = fitted_press(made["fitted"], float(brush.radius_mm), float(brush.length_mm))
+    press = fitted_press(fit["fitted"], float(brush.radius_mm), float(brush.length_mm))
     model = fitted_model(press)
     cells: dict[tuple[float, float], list[int]] = {}
     for k in trial.scored:
@@ -105,7 +106,7 @@ def _scored(
 
     def jobs() -> Iterator[tuple[str, ScoreJob]]:
         for cell, group in cells.items():
-            bezier = ABSENT if made["bezier"] is None else pack(bezier_pixels(made["bezier"], *cell, view))
+            bezier = ABSENT if fit["bezier"] is None else pack(bezier_pixels(fit["bezier"], *cell, view))
             predictions = (pack(simulated_pixels(model, *cell, view)), bezier)
             for start in range(0, len(group), CHUNK):
                 chunk = group[start : start + CHUNK]
@@ -116,5 +117,5 @@ def _scored(
     found = dict(scheduler.run(score_job, jobs()))
     values = np.concatenate([found[name] for name in sorted(found, key=int)])[:, :, JUDGED]
     yield "CCD-BSM", values[:, 0]
-    if made["bezier"] is not None:
+    if fit["bezier"] is not None:
         yield "Bézier", values[:, 1]

@@ -1,4 +1,4 @@
-"""What is compared with the captures: every registered model, the fitted brush, refits to other cells, generators."""
+"""The models compared with captures: every registered one, the fitted brush, refits to other cells, generators."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FITTED_HELD_OUT, BEZIER_REFITTED = "ccd-bsm-heldout", "bezier-refitted"
 GENERATOR_HELD_OUT = "ccd-bsmg-heldout"
 HELD_OUT_NAMES = (FITTED_HELD_OUT, BEZIER_REFITTED, GENERATOR_HELD_OUT)
 LAMBDAS = {"ccd-bsm-lambda-1": 1.0, "ccd-bsm-lambda-pi/2": 0.5 * math.pi}
-"""Extras lambda = pi, which is CCD-BSM itself: the paper's figure 3."""
+"""In addition to lambda = pi, which is CCD-BSM itself: the paper's figure 3."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,14 +44,14 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Generator:
-    """A trained generator's file, and its content."""
+    """A trained generator's file, and the hash of its contents."""
 
     path: Path
     sha256: str
 
 
 def generator_file(path: Path) -> Generator:
-    """Raises OSError where there is no such file."""
+    """A generator's file with its hash. Raises OSError."""
     with path.open("rb") as file:
         return Generator(path, hashlib.file_digest(file, "sha256").hexdigest())
 
@@ -59,43 +59,43 @@ def generator_file(path: Path) -> Generator:
 def closed_forms(session: LoadedSession, view: Field, *, ablations: bool) -> list[Candidate]:
     """The registered models of the session's brush, the fitted one, and CCD-BSM at other lambdas."""
     brush = brush_of(session.header)
-    made = [_of_model(model, PUBLISHED, view) for model in stroke_models(brush).values()]
+    found = [_of_model(model, PUBLISHED, view) for model in stroke_models(brush).values()]
     if session.fit is not None:
         fit = session.fit
         basis = "fitted, in sample" if fit.recording_sha256 == session.sha256 else f"fitted on {fit.session_id}"
-        made.insert(1, _of_model(fitted_model(fit.press(), "CCD-BSM fitted"), basis, view))
+        found.insert(1, _of_model(fitted_model(fit.press(), "CCD-BSM fitted"), basis, view))
     if ablations:
         for name, lam in LAMBDAS.items():
             label = f"CCD-BSM, λ = {name.rpartition('-')[2].replace('pi', 'π')}"
-            made.append(_of_model(stroke_model("ccd-bsm", brush, lam), PUBLISHED, view, name, label))
-    return made
+            found.append(_of_model(stroke_model("ccd-bsm", brush, lam), PUBLISHED, view, name, label))
+    return found
 
 
 def generators(session: LoadedSession, files: Sequence[Generator], view: Field) -> list[Candidate]:
     """Trained generators, drawn as their traced outlines. Raises what `load_generator` does."""
     from model.train.checkpoint import load_generator
 
-    made: list[Candidate] = []
+    found: list[Candidate] = []
     for number, file in enumerate(files):
         model = load_generator(file.path, brush_of(session.header))
         name = (
-            model.name if number == 0 or model.name not in {one.name for one in made} else f"{model.name}-{number + 1}"
+            model.name if number == 0 or model.name not in {one.name for one in found} else f"{model.name}-{number + 1}"
         )
         basis = "trained, then tuned on captures" if model.fitted else "trained on exact images"
-        made.append(replace(_of_model(model, basis, view, name, model.label), file=file.path))
-    return made
+        found.append(replace(_of_model(model, basis, view, name, model.label), file=file.path))
+    return found
 
 
-def held_out(made: dict[Cell, dict[str, Any]], brush: Brush, view: Field, *, fitted: bool) -> list[Candidate]:
-    """Fits that left out the very cell that they predict; `made` has a finished `refit_job` for each cell."""
+def held_out(fits: dict[Cell, dict[str, Any]], brush: Brush, view: Field, *, fitted: bool) -> list[Candidate]:
+    """Fits that left out the cell that they predict; `fits` has a finished `refit_job` for each cell."""
 
     def predict_fitted(height_mm: float, tilt_deg: float) -> Pixels:
-        found = _of_cell(made, height_mm, tilt_deg, "fitted")
+        found = _of_cell(fits, height_mm, tilt_deg, "fitted")
         press = fitted_press(found, float(brush.radius_mm), float(brush.length_mm))
         return simulated_pixels(fitted_model(press), height_mm, tilt_deg, view)
 
     def predict_bezier(height_mm: float, tilt_deg: float) -> Pixels:
-        return bezier_pixels(_of_cell(made, height_mm, tilt_deg, "bezier"), height_mm, tilt_deg, view)
+        return bezier_pixels(_of_cell(fits, height_mm, tilt_deg, "bezier"), height_mm, tilt_deg, view)
 
     bezier = Candidate(
         BEZIER_REFITTED,
@@ -146,8 +146,8 @@ def _of_model(model: StrokeModel, basis: str, view: Field, name: str = "", label
     )
 
 
-def _of_cell(made: dict[Cell, dict[str, Any]], height_mm: float, tilt_deg: float, what: str) -> Any:
-    found = made.get((height_mm, tilt_deg), {}).get(what)
+def _of_cell(fits: dict[Cell, dict[str, Any]], height_mm: float, tilt_deg: float, what: str) -> Any:
+    found = fits.get((height_mm, tilt_deg), {}).get(what)
     if found is None:
         raise DomainError("height_mm", height_mm, "other cells", "the other cells do not determine it")
     return found

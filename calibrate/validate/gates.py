@@ -1,5 +1,4 @@
-"""Gates: what a score must reach, for scripts. `csim_avg>=0.90`, or with all of it told:
-`ccd-bsm-heldout:mm:binary:csim_avg>=0.93`."""
+"""Gates for scripts: what a score must reach, as `csim_avg>=0.90` or `ccd-bsm-heldout:mm:binary:csim_avg>=0.93`."""
 
 from __future__ import annotations
 
@@ -26,7 +25,7 @@ FORM = re.compile(
 
 
 class GateMissed(Exception):
-    """A score is not what a gate asks for; the report is written all the same."""
+    """A score does not reach its gate; the report is written all the same."""
 
     exit_code: ClassVar[int] = 5
 
@@ -37,7 +36,7 @@ class GateMissed(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """One condition. Without a model it is about the report's calibrated one, else about the first."""
+    """One condition; without a model it applies to the report's calibrated one, else to the first."""
 
     text: str
     model: str
@@ -50,7 +49,7 @@ class Gate:
 
 
 def parse_gate(text: str) -> Gate:
-    """Raises `CalibrationError` for what is no gate."""
+    """Parse a gate. Raises `CalibrationError`."""
     found = FORM.match(text.strip())
     if found is None:
         raise _bad(text, "expected [MODEL:][ALIGNMENT:][TONE:]csim_avg>=0.90")

@@ -1,6 +1,6 @@
-"""Fits that have not seen what they predict: each cell left out in turn, a fitted CCD-BSM and a Bezier refitted.
+"""Fits that have not seen what they predict: each cell left out in turn, CCD-BSM and a Bezier refitted to the others.
 
-A job carries its strokes and returns numbers, so that it runs anywhere and is kept as finished work.
+A job carries its strokes and returns numbers, so that it runs anywhere and can be stored.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from calibrate.fit.artefact import BrushFit
 from calibrate.fit.captures import MARGIN_MM, grid_of
 from calibrate.fit.fit import Fit, Grid, Pressed, refit
 from calibrate.fit.heldout import RefittedBezier, refit_bezier
-from calibrate.validate.jobs import VERSION, Row, pixels_of
+from calibrate.validate.jobs import Row, pixels_of
 from calibrate.validate.pool import Progress, Scheduler
 from calibrate.validate.sources import LoadedSession
-from calibrate.validate.store import Store
+from calibrate.validate.store import VERSION, Store
 from model.fitted import MODES, NAMES, TERMS, FittedPress
 
 Cell = tuple[float, float]
@@ -41,12 +41,12 @@ class RefitJob:
     radius_mm: float
     length_mm: float
     start: tuple[tuple[float, ...], tuple[str, ...]] | None
-    """Values and the parameters that the strokes tell, from the session's fit; None fits no CCD-BSM."""
+    """Values, and the parameters that are free, from the session's fit; None fits no CCD-BSM."""
     view: Field
 
     @property
     def key(self) -> str:
-        """A hash of all that the result follows from."""
+        """A hash of everything that the result follows from."""
         digest = hashlib.sha256(
             f"refit {VERSION} {self.radius_mm} {self.length_mm} {self.start} {self.view} {len(self.strokes)}".encode()
         )
@@ -56,20 +56,20 @@ class RefitJob:
 
 
 def start_of(fit: BrushFit) -> tuple[tuple[float, ...], tuple[str, ...]]:
-    """Where a refit begins, and what it frees: what the whole session told apart."""
+    """Where a refit begins, and the parameters it frees: those which the whole session determines."""
     values = tuple(fit.parameters[name].value for name in NAMES)
     return values, tuple(name for name in NAMES if fit.parameters[name].low is not None)
 
 
 def folds(cells: Sequence[Cell], most: int = MAX_FOLDS) -> list[list[Cell]]:
-    """Cells that are left out together; none where there is one cell only."""
+    """Groups of cells that are left out together; none if there is only one cell."""
     ordered = sorted(set(cells))
     count = min(len(ordered), most)
     return [ordered[k::count] for k in range(count)] if len(ordered) > 1 else []
 
 
 def refit_job(job: RefitJob) -> dict[str, Any]:
-    """`fitted` (values, edges) and `bezier` (coefficients), each None where the strokes do not tell it."""
+    """`fitted` (values, edges) and `bezier` (coefficients), each None where the strokes do not determine it."""
     strokes, grid = cropped(job)
     out: dict[str, Any] = {"fitted": None}
     if job.start is not None:
@@ -106,10 +106,10 @@ def cropped(job: RefitJob) -> tuple[list[Pressed], Grid]:
     return pressed, Grid(grid.x_mm, grid.y_mm[rows])
 
 
-def fitted_press(made: dict[str, Any], radius_mm: float, length_mm: float) -> FittedPress:
+def fitted_press(body: dict[str, Any], radius_mm: float, length_mm: float) -> FittedPress:
     """The brush of a finished job."""
-    edges = np.array(made["edges"]).reshape(2, MODES, TERMS)
-    return FittedPress(radius_mm, length_mm, np.array(made["values"]), edges)
+    edges = np.array(body["edges"]).reshape(2, MODES, TERMS)
+    return FittedPress(radius_mm, length_mm, np.array(body["values"]), edges)
 
 
 def bezier_pixels(coefficients: Sequence[float], height_mm: float, tilt_deg: float, view: Field) -> Pixels:
@@ -137,7 +137,7 @@ def refits_by_cell(
         cells.setdefault(row.cell, []).append(row)
     brush = brush_of(session.header)
     start = start_of(session.fit) if session.fit is not None else None
-    made: dict[Cell, dict[str, Any]] = {}
+    fits: dict[Cell, dict[str, Any]] = {}
     left = folds(list(cells), most_folds)
     jobs: list[tuple[str, RefitJob]] = []
     of_key: dict[str, list[Cell]] = {}
@@ -157,8 +157,8 @@ def refits_by_cell(
         done += 1
         progress(f"{session.header.session_id}: cells left out in turn", done, len(of_key))
     for key, fold in of_key.items():
-        made |= dict.fromkeys(fold, store.get(key))
-    return made
+        fits |= dict.fromkeys(fold, store.get(key))
+    return fits
 
 
 def _uncut(group: list[Row]) -> list[Row]:

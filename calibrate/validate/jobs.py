@@ -20,16 +20,14 @@ from calibrate.compare.images import captured_images, pack, prepare_press, to_pi
 from calibrate.errors import CaptureRefused
 from calibrate.stroke.measure import Measured, measure
 from calibrate.stroke.params import Params
+from calibrate.validate.store import VERSION, Store
 from sessions.errors import SessionDamaged
 from sessions.reader import Capture
 
 if TYPE_CHECKING:
     from calibrate.validate.pool import Progress, Scheduler
     from calibrate.validate.sources import LoadedSession
-    from calibrate.validate.store import Store
 
-VERSION = "1"
-"""Raise it whenever a job gives another result for the same input: finished work is then done again."""
 ABSENT = b""
 """In place of the images of a model that does not predict this press."""
 Values = NDArray[np.float64]
@@ -72,7 +70,7 @@ def press_of(body: dict[str, Any]) -> Press:
 
 
 def prepare_job(job: PrepareJob) -> Press:
-    """Never raises for a capture that cannot be used: the reason travels with it."""
+    """Prepare a capture; one that cannot be used comes back with the reason."""
     stroke = job.capture.stroke
     height, tilt = stroke.height_mm, stroke.tilt_deg
 
@@ -159,7 +157,7 @@ class ScoreJob:
 
     @property
     def key(self) -> str:
-        """A hash of all that the scores follow from."""
+        """A hash of everything that the scores follow from."""
         digest = hashlib.sha256(f"score {VERSION} {self.predicted_by}".encode())
         for group in (self.presses, self.predictions, self.others, self.originals):
             for item in group:

@@ -15,6 +15,8 @@ from importlib.metadata import version
 from types import TracebackType
 from typing import Any, ClassVar, Protocol, TypeVar
 
+from calibrate.validate import store
+
 Progress = Callable[[str, int, int], None]
 """What is being done, how much of it is done, of how much."""
 J = TypeVar("J")
@@ -27,7 +29,7 @@ CONNECT_S = 10.0
 
 
 class ClusterError(Exception):
-    """A cluster that cannot be used; says why in one line."""
+    """A cluster that cannot be used, with the reason in one line."""
 
     exit_code: ClassVar[int] = 2
 
@@ -46,7 +48,7 @@ class Scheduler(Protocol):
 
 
 class Threads(AbstractContextManager["Threads"]):
-    """This machine: as many threads as it has cores, unless told otherwise."""
+    """This machine: as many threads as it has cores by default."""
 
     def __init__(self, workers: int | None = None) -> None:
         self.workers = workers or _cores()
@@ -113,9 +115,9 @@ class Dask(AbstractContextManager["Dask"]):
         if not threads:
             raise ClusterError(f"--scheduler {address}: the cluster has no worker")
         found: dict[str, Any] = self._client.run(software, on_error="return")
-        for worker, told in found.items():
-            if told != software():
-                words = _line(told) if isinstance(told, BaseException) else f"has {told}"
+        for worker, answer in found.items():
+            if answer != software():
+                words = _line(answer) if isinstance(answer, BaseException) else f"has {answer}"
                 raise ClusterError(f"--scheduler {address}: worker {worker} {words}; {software()} is needed there")
         return sum(threads.values())
 
@@ -162,9 +164,7 @@ def _alone(function: Callable[[J], R], jobs: list[J]) -> list[R]:
 
 def software() -> str:
     """What runs here, as it must run on every worker."""
-    from calibrate.validate.jobs import VERSION
-
-    return f"brushloop {version('brushloop')} (work {VERSION})"
+    return f"brushloop {version('brushloop')} (work {store.VERSION})"
 
 
 def _cores() -> int:

@@ -112,10 +112,12 @@ def _validate(
     candidates: list[list[Candidate]] = []
     for number, session in enumerate(sessions):
         mine = [row for row in rows if row.session == number]
-        made = [*known[number], *_held_out(session, mine, options, scheduler, store, work, progress)]
-        candidates.append([one for one in _ordered(made) if not options.models or one.name in options.models])
+        known_and_held_out = [*known[number], *_held_out(session, mine, options, scheduler, store, work, progress)]
+        candidates.append(
+            [one for one in _ordered(known_and_held_out) if not options.models or one.name in options.models]
+        )
     for name in options.models:
-        if not any(one.name == name for made in candidates for one in made):
+        if not any(one.name == name for group in candidates for one in group):
             raise CalibrationError(
                 "--model", f"{name} needs a fit, or --tune: see `brushloop validate sessions --help`"
             )
@@ -150,8 +152,8 @@ def _validate(
 
 
 def _known(session: LoadedSession, options: Options) -> list[Candidate]:
-    made = who.closed_forms(session, options.view, ablations=options.ablations)
-    return _ordered([*who.generators(session, options.generators, options.view), *made])
+    closed = who.closed_forms(session, options.view, ablations=options.ablations)
+    return _ordered([*who.generators(session, options.generators, options.view), *closed])
 
 
 def _held_out(
@@ -235,10 +237,10 @@ def _put(values: NDArray[np.float64], chunk: list[int], columns: list[int], body
 
 
 def _ordered_names(candidates: list[list[Candidate]]) -> list[str]:
-    return list(dict.fromkeys(one.name for one in _ordered([one for made in candidates for one in made])))
+    return list(dict.fromkeys(one.name for one in _ordered([one for group in candidates for one in group])))
 
 
-def _ordered(made: list[Candidate]) -> list[Candidate]:
+def _ordered(found: list[Candidate]) -> list[Candidate]:
     """In the order of the paper's tables, calibrated beside uncalibrated; everything else comes after."""
     first = [
         "ccd-bsmg",
@@ -255,4 +257,4 @@ def _ordered(made: list[Candidate]) -> list[Candidate]:
         stem = one.name if one.name in first else "ccd-bsmg" if one.name.startswith("ccd-bsmg-") else ""
         return (first.index(stem), 0) if stem else (len(first), 0)
 
-    return sorted(made, key=place)
+    return sorted(found, key=place)

@@ -1,7 +1,7 @@
-"""Where sessions come from: folders and files here, or any URL that fsspec opens, which then tells its checksum.
+"""Where sessions come from: local folders and files, or any URL that fsspec opens.
 
-A remote recording is copied beside the finished work once, bounded in size, and believed only if its SHA-256 is the
-one given: as `#sha256=...` behind the URL, or in a file `<recording>.mcap.sha256` beside it.
+A remote recording is copied once, bounded in size, and accepted only with the expected SHA-256: given as
+`#sha256=...` after the URL, or in a file `<recording>.mcap.sha256` beside it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MAX_SUM_BYTES = 64 * 1024
 MAX_ARTEFACTS = 64
 MAX_ARTEFACT_BYTES = 4 * 1024 * 1024
 FORBIDDEN = 403
-"""What a bucket that may not be listed answers for a file that is not there."""
+"""Answer of a bucket that may not be listed, for a missing file."""
 URL = re.compile(r"^[a-z][a-z0-9+.-]+://", re.IGNORECASE)
 EXTRAS = {"http": "remote", "https": "remote", "s3": "s3", "s3a": "s3", "gs": "gs", "gcs": "gs"}
 """Kind of URL -> the extra that opens it."""
@@ -51,7 +51,7 @@ SHA256 = re.compile(r"\b[0-9a-f]{64}\b")
 
 @dataclass(frozen=True, slots=True)
 class LoadedSession:
-    """One session, checked, with what belongs to it."""
+    """A session that was checked, with its calibration and fit."""
 
     recording: Recording
     sha256: str
@@ -62,7 +62,7 @@ class LoadedSession:
 
     @property
     def header(self) -> Header:
-        """Who made it, on what."""
+        """The header of the recording."""
         return self.recording.header
 
 
@@ -90,12 +90,12 @@ def open_session(place: str, work: Path, calibration: Path | None, fit: Path | N
 
 
 def one_source(sessions: list[LoadedSession]) -> Source:
-    """The kind of ink of all of them, as the recordings say. Raises `CalibrationError` where they differ."""
+    """The kind of ink that all recordings name. Raises `CalibrationError` where they differ."""
     first = sessions[0]
     for other in sessions[1:]:
         if other.header.source != first.header.source:
-            told = f"is {other.header.source}, {first.recording.path.name} is {first.header.source}"
-            raise CalibrationError(str(other.recording.path), f"{told}: validate them apart")
+            what = f"is {other.header.source}, {first.recording.path.name} is {first.header.source}"
+            raise CalibrationError(str(other.recording.path), f"{what}: validate them separately")
     return first.header.source
 
 
@@ -138,18 +138,18 @@ def fetched(url: str, folder: Path) -> Path:
 
 
 def _backend_errors() -> tuple[type[Exception], ...]:
-    """The errors of their own that what fsspec loaded for this URL may raise, as for want of credentials."""
+    """Error classes of the packages that fsspec loaded for this URL, as raised without credentials."""
     loaded = [(sys.modules[module], name) for module, name in BACKEND_ERRORS if module in sys.modules]
     return tuple(getattr(module, name) for module, name in loaded if hasattr(module, name))
 
 
 def _expected(system: Any, where: str, address: str, fragment: str) -> str:
-    told = fragment
-    if not told and system.exists(f"{where}.sha256"):
-        told = b"".join(_pieces(system, f"{where}.sha256", MAX_SUM_BYTES, address)).decode("utf-8", "replace")
-    found = SHA256.search(told)
+    text = fragment
+    if not text and system.exists(f"{where}.sha256"):
+        text = b"".join(_pieces(system, f"{where}.sha256", MAX_SUM_BYTES, address)).decode("utf-8", "replace")
+    found = SHA256.search(text)
     if found is None:
-        what = "tells no checksum: add #sha256=... to the URL, or put it into a file beside, <recording>.mcap.sha256"
+        what = "has no checksum: add #sha256=... to the URL, or put it into a file beside it, <recording>.mcap.sha256"
         raise CalibrationError(address, what)
     return found[0]
 
@@ -186,8 +186,8 @@ def _pieces(system: Any, where: str, most_bytes: int, address: str) -> Iterator[
 def _copy_artefacts(system: Any, there: str, here: Path) -> None:
     """Artefacts of one kind as they lie beside a remote recording: the one that the pointer names, else all of them.
 
-    Each is named after its own hash, which is checked when it is read. Whoever cannot list folders, as a plain web
-    server, gives the one in use by a pointer, or by --calibration and --fit.
+    Each is named after its own hash, which is checked when it is read. Where folders cannot be listed, as on a plain
+    web server, a pointer names the one in use, or --calibration and --fit do.
     """
     pointer = _read(system, f"{there}/{POINTER}", MAX_POINTER_BYTES)
     try:
@@ -223,7 +223,7 @@ def _read(system: Any, name: str, most_bytes: int) -> bytes | None:
 
 
 def _keep_age(system: Any, name: str, copy: Path) -> None:
-    """Without a pointer the one written last is in use: by the age that the place tells, where it tells one."""
+    """Keep the time of the last change, if the place has one: without a pointer the newest artefact is in use."""
     try:
         at_s = float(system.modified(name).timestamp())
     except (AttributeError, NotImplementedError, OSError, ValueError, TypeError, KeyError):

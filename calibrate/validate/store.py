@@ -17,6 +17,8 @@ from typing import Any
 
 import cbor2
 
+VERSION = "1"
+"""Of finished work. Raise it whenever a job gives another result for the same input: the work is then done again."""
 TABLE = "CREATE TABLE IF NOT EXISTS work (number INTEGER PRIMARY KEY, key TEXT UNIQUE, crc INTEGER, body BLOB)"
 DAMAGED = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 Body = dict[str, Any]

@@ -26,8 +26,8 @@ from calibrate.stroke.params import PX_PER_MM, Params
 from calibrate.stroke.preprocess import Prepared
 from calibrate.validate.candidates import Generator
 from calibrate.validate.heldout import Cell, fitted_press, folds
-from calibrate.validate.jobs import VERSION
 from calibrate.validate.sources import LoadedSession, one_source
+from calibrate.validate.store import VERSION
 from model.ccdbsm import DomainError
 from sessions.errors import SessionDamaged
 

@@ -27,12 +27,12 @@ from model.registry import UnknownModelError, stroke_model
 Floats = NDArray[np.float64]
 STEPS = 60
 MOST_MM = 3.0
-"""Longest step of a coordinate in one round: what asks for more was not seen, or seen as another stroke's."""
+"""Longest step of a coordinate in one round: a larger one comes from ink that was not seen, or of another stroke."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lesson:
-    """One character's correction: rms of what was put right, in mm."""
+    """One character's correction: rms of the correction, in mm."""
 
     name: str
     sideways_mm: float
@@ -77,11 +77,11 @@ def _corrected(
     next_commanded: list[Floats] = []
     next_intended: list[Floats] = []
     off = [smoothed(want[:, :3] - have[:, :3]) for want, have in zip(intended, seen, strict=True)]
-    for told, want, move in zip(commanded, intended, off, strict=True):
-        tried = told.copy()
+    for command, want, move in zip(commanded, intended, off, strict=True):
+        tried = command.copy()
         tried[:, :3] += np.clip(gain * move, -MOST_MM, MOST_MM)
         feasible = np.round(reach.within(tried, side_mm), 3)
-        # The last column tells which points were kept.
+        # The last column holds the number of each point that was kept.
         kept: Floats = reach.spaced(np.hstack((feasible, np.arange(len(tried), dtype=np.float64)[:, None])))
         next_commanded.append(kept[:, :5])
         next_intended.append(want[kept[:, 5].astype(np.int64)])

@@ -151,7 +151,7 @@ def test_a_still_that_is_no_image_is_listed_by_name() -> None:
 def test_a_press_that_tells_no_depth_is_listed_by_name() -> None:
     stroke = capture("mute", drawn(11.0, 0.0), 11.0, 0.0)
     refused, _ = validate([Capture(stroke.stroke.model_copy(update={"tilt_deg": None}), stroke.still_png, "test")])
-    assert [(press.stroke_id, press.refused) for press in refused] == [("mute", "tells no depth or tilt")]
+    assert [(press.stroke_id, press.refused) for press in refused] == [("mute", "has no depth or tilt")]
 
 
 def test_best_shift_finds_a_shift_of_up_to_six_pixels_and_no_more() -> None:

@@ -1,4 +1,4 @@
-"""The report as data: everything that terminal, JSON, tables, gates and comparisons say comes from here."""
+"""The report as data: the source of everything in terminal, JSON, tables, gates and comparisons."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Stat(_Frozen):
 
 
 class CandidateInfo(_Frozen):
-    """What a row of the tables is, and what it knew of the strokes."""
+    """A row of the tables: what it is, and what it knew of the strokes."""
 
     name: str
     label: str
@@ -61,7 +61,7 @@ class CandidateInfo(_Frozen):
 
 
 class Collected(_Frozen):
-    """What the session's journal tells of how its strokes came about."""
+    """How the strokes were collected, from the session's journal."""
 
     planned: int | None
     """None where the protocol is no grid."""
@@ -76,7 +76,7 @@ class Collected(_Frozen):
 
 
 class Session(_Frozen):
-    """A recording, as it says of itself, and the artefacts that were used with it."""
+    """A recording, from its header, and the artefacts that were used with it."""
 
     session_id: str
     source: Source

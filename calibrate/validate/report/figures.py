@@ -83,7 +83,7 @@ def by_strokes(report: Report) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A training as its folder tells it: validation loss by step."""
+    """A training, from its folder: validation loss by step."""
 
     name: str
     steps: tuple[int, ...]
@@ -101,7 +101,7 @@ def read_curve(text: str) -> Curve:
         steps = tuple(int(row["step"]) for row in rows)
         losses = tuple(float(row["mse"]) for row in rows)
     except (KeyError, TypeError, ValueError):
-        raise CalibrationError(str(path), "is no table of validation losses (step, mse)") from None
+        raise CalibrationError(str(path), "is not a table of validation losses (step, mse)") from None
     if not steps:
         raise CalibrationError(str(path), "holds no validation yet")
     return Curve(name, steps, losses)
@@ -122,20 +122,20 @@ def curves(given: Sequence[Curve]) -> str:
 
 def samples(outcome: Outcome, shown: str) -> list[dict[str, Any]]:
     """The first capture of each cell above what one model predicts: the paper's figures 7 and 8."""
-    made: list[dict[str, Any]] = []
+    figures: list[dict[str, Any]] = []
     for k in _first_of_cells(outcome, MAX_SAMPLES):
         row = outcome.rows[k]
         image, measured = predicted(outcome, k, shown), row.press.measured
         size = "" if measured is None else f"{measured.length_mm:.1f} × {measured.breadth_mm:.1f} mm"
         drawn = "" if image is None else _ink(image)
-        made.append({"row": row, "size": size, "captured": _ink(captured_image(outcome, k)), "predicted": drawn})
-    return made
+        figures.append({"row": row, "size": size, "captured": _ink(captured_image(outcome, k)), "predicted": drawn})
+    return figures
 
 
 def side_by_side(outcome: Outcome, leave_out: Sequence[str]) -> dict[str, Any]:
     """Some captures beside what every contender predicts: the paper's figures 10 and 11."""
     chosen = _first_of_cells(outcome, MAX_CELLS)
-    known = {one.name: one.label for made in outcome.candidates for one in made if one.name not in leave_out}
+    known = {one.name: one.label for group in outcome.candidates for one in group if one.name not in leave_out}
     lines: list[dict[str, Any]] = []
     for k in chosen:
         images = [predicted(outcome, k, name) for name in known]
@@ -151,12 +151,12 @@ def of_one_cell(outcome: Outcome, names: Sequence[str]) -> list[tuple[str, str]]
         return []
     k = chosen[len(chosen) // 2]
     labels = {one.name: one.label for one in outcome.candidates[outcome.rows[k].session]}
-    made = [("captured", _ink(captured_image(outcome, k)))]
+    images = [("captured", _ink(captured_image(outcome, k)))]
     for name in names:
         image = predicted(outcome, k, name)
         if image is not None:
-            made.append((labels[name], _ink(image)))
-    return made
+            images.append((labels[name], _ink(image)))
+    return images
 
 
 def _first_of_cells(outcome: Outcome, most: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""A report besides its page: every score as CSV and Parquet, its tables as CSV, and its summary on the terminal."""
+"""A report apart from its page: every score as CSV and Parquet, its tables as CSV, and its summary on the terminal."""
 
 from __future__ import annotations
 

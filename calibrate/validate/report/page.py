@@ -75,7 +75,7 @@ def _cells(report: Report) -> dict[str, Any]:
 
 
 def _ablations(outcome: Outcome, report: Report, curves: Sequence[Curve]) -> dict[str, Any]:
-    made: dict[str, Any] = {}
+    parts: dict[str, Any] = {}
 
     def rows(names: Sequence[str]) -> list[dict[str, str]]:
         known = [found for name in names if (found := tables.candidate(report, name)) is not None]
@@ -90,10 +90,10 @@ def _ablations(outcome: Outcome, report: Report, curves: Sequence[Curve]) -> dic
         ]
 
     if any(tables.candidate(report, name) is not None for name in who.LAMBDAS):
-        made["lambdas"] = rows((*who.LAMBDAS, "ccd-bsm"))
-        made["lambda_images"] = figures.of_one_cell(outcome, (*who.LAMBDAS, "ccd-bsm"))
+        parts["lambdas"] = rows((*who.LAMBDAS, "ccd-bsm"))
+        parts["lambda_images"] = figures.of_one_cell(outcome, (*who.LAMBDAS, "ccd-bsm"))
     if tables.candidate(report, who.FITTED_HELD_OUT) is not None or tables.candidate(report, who.FITTED) is not None:
-        made["calibrated"] = rows(
+        parts["calibrated"] = rows(
             (
                 "ccd-bsmg",
                 who.GENERATOR_HELD_OUT,
@@ -105,13 +105,13 @@ def _ablations(outcome: Outcome, report: Report, curves: Sequence[Curve]) -> dic
             )
         )
     if report.by_strokes:
-        made["steps"] = figures.by_strokes(report)
+        parts["steps"] = figures.by_strokes(report)
     if curves:
-        made["curves"] = figures.curves(curves)
-    if not made:
+        parts["curves"] = figures.curves(curves)
+    if not parts:
         return {}
     empty: dict[str, Any] = {"lambdas": [], "lambda_images": [], "calibrated": [], "steps": "", "curves": ""}
-    return empty | made
+    return empty | parts
 
 
 def _of_session(one: Session) -> list[tuple[str, str]]:
@@ -136,13 +136,13 @@ def _of_session(one: Session) -> list[tuple[str, str]]:
 
 
 def _strokes(one: Session) -> str:
-    told = one.collected
-    if told is None:
+    collected = one.collected
+    if collected is None:
         return f"{one.strokes} captured, {one.compared} compared"
-    planned = "" if told.planned is None else f"{told.planned} planned, "
+    planned = "" if collected.planned is None else f"{collected.planned} planned, "
     return (
-        f"{planned}{told.photographed} photographed, {len(told.pressed_again)} of them pressed again, "
-        f"{len(told.left_out)} left out, {one.strokes} counted, {one.compared} compared"
+        f"{planned}{collected.photographed} photographed, {len(collected.pressed_again)} of them pressed again, "
+        f"{len(collected.left_out)} left out, {one.strokes} counted, {one.compared} compared"
     )
 
 
@@ -157,7 +157,7 @@ def _calibration(one: Session) -> str:
 
 
 def _of_others(report: Report) -> Iterator[list[tuple[str, str]]]:
-    """The loops and the characters that were taken up, each with its own digest."""
+    """The loops and the characters of the report, each with its own digest."""
     for loop in report.loops:
         yield [
             ("pressed again", f"{loop.again}, recording sha256 {loop.again_sha256}"),

@@ -82,7 +82,7 @@ def _stats(outcome: Outcome, cells: list[tuple[float, float]]) -> list[Stat]:
     for k, row in enumerate(rows):
         by_cell.setdefault(row.cell, []).append(k)
     groups += [(cell, np.array(by_cell[cell])) for cell in cells]
-    made: list[Stat] = []
+    stats: list[Stat] = []
     for cell, at in groups:
         for m, model in enumerate(outcome.names):
             for k, (alignment, tone) in enumerate(KEYS):
@@ -90,7 +90,7 @@ def _stats(outcome: Outcome, cells: list[tuple[float, float]]) -> list[Stat]:
                     found = summarise(100.0 * outcome.values[at, m, k, j], stratum[at])
                     if found is None:
                         continue
-                    made.append(
+                    stats.append(
                         Stat(
                             model=model,
                             alignment=alignment,
@@ -106,7 +106,7 @@ def _stats(outcome: Outcome, cells: list[tuple[float, float]]) -> list[Stat]:
                             median_interval=_interval(found.median_interval),
                         )
                     )
-    return made
+    return stats
 
 
 def _shown(outcome: Outcome) -> str:
@@ -140,10 +140,10 @@ def _extremes(outcome: Outcome, model: str) -> tuple[tuple[Extreme, ...], tuple[
 
 def _candidates(outcome: Outcome) -> tuple[CandidateInfo, ...]:
     files = {one.path: one.sha256 for one in outcome.options.generators}
-    by_name = {one.name: one for made in outcome.candidates for one in made}
+    by_name = {one.name: one for group in outcome.candidates for one in group}
     bases: dict[str, list[str]] = {}
-    for made in outcome.candidates:
-        for one in made:
+    for group in outcome.candidates:
+        for one in group:
             bases.setdefault(one.name, [])
             if one.basis not in bases[one.name]:
                 bases[one.name].append(one.basis)

@@ -118,7 +118,7 @@ def test_no_scheduler_there_is_one_clear_line(session: Path, tmp_path: Path) -> 
 
 def test_a_worker_with_other_software_is_refused(cluster: Cluster) -> None:
     program = (
-        "import calibrate.validate.jobs as jobs; jobs.VERSION = 'of tomorrow'\n"
+        "import calibrate.validate.store as store; store.VERSION = 'of tomorrow'\n"
         "from calibrate.validate.pool import ClusterError, Dask\n"
         f"try:\n    Dask({cluster.address!r})\nexcept ClusterError as error:\n    print(error)\n"
     )

@@ -121,7 +121,7 @@ def test_a_wrong_checksum_or_a_missing_bucket_is_one_line_and_leaves_nothing(
     bucket.put_object(Bucket="lab", Key="grid-01/grid-01.mcap.sha256", Body=b"0" * 64)
     for place, words in (
         ("s3://lab/grid-01", f"has SHA-256 .*, {'0' * 64} was expected"),
-        ("s3://no-such-bucket/grid-01", "tells no checksum"),
+        ("s3://no-such-bucket/grid-01", "has no checksum"),
         ("s3://no-such-bucket/grid-01#sha256=" + "0" * 64, "cannot be read: .*bucket does not exist"),
         ("s3://lab/none#sha256=" + "0" * 64, "cannot be read: "),
     ):

@@ -93,7 +93,7 @@ def test_of_several_calibrations_beside_the_pointed_one_is_used(session: Path, r
 @pytest.mark.parametrize(
     ("url", "words"),
     [
-        ("memory://lab/presses", "tells no checksum"),
+        ("memory://lab/presses", "has no checksum"),
         ("memory://lab/presses#sha256=" + "0" * 64, "0000 was expected"),
         ("memory://lab/nothing#sha256=" + "0" * 64, "cannot be read"),
         ("nosuch://lab/presses#sha256=" + "0" * 64, "cannot be opened"),
@@ -169,7 +169,7 @@ def test_a_web_server_that_lists_nothing_gives_the_calibration_in_use(session: P
 
 def test_a_web_server_is_a_place_like_any_other(web: str, session: Path, tmp_path: Path) -> None:
     assert open_session(f"{web}/presses.mcap#sha256={digest(session)}", tmp_path, None, None).count == 11
-    with pytest.raises(CalibrationError, match="tells no checksum"):
+    with pytest.raises(CalibrationError, match="has no checksum"):
         open_session(f"{web}/presses.mcap", tmp_path, None, None)
     with pytest.raises(CalibrationError, match="cannot be read"):
         open_session(f"{web}/nothing.mcap#sha256={digest(session)}", tmp_path, None, None)
