@@ -7,7 +7,7 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """Anything that tells nanoseconds since the epoch, monotonically."""
+    """A source of nanoseconds since the epoch that never goes backwards."""
 
     def now_ns(self) -> int:
         """Nanoseconds since 1970-01-01 UTC; never less than the value returned before."""
@@ -17,7 +17,7 @@ class Clock(Protocol):
 class HostClock:
     """Wall time read once, then carried forward by the monotonic clock.
 
-    An NTP step or an operator who sets the clock in mid-session must not reorder a recording.
+    An NTP step or an operator who sets the clock during a session must not reorder a recording.
     """
 
     def __init__(self) -> None:

@@ -1,12 +1,12 @@
-"""Errors of devices. Each says which device, in which operation, in what condition it is left, and what to do.
+"""Errors of devices. Each names the device, the operation, the condition that it leaves, and what to do.
 
 DeviceError
  +-- NotConnected           never connected, or closed
- +-- ConnectionLost         the peer went away in mid-operation
+ +-- ConnectionLost         the peer went away during an operation
  +-- DeviceTimeout          no answer in time
  |    +-- Stale             the newest sample is too old to act on
  +-- Stuck                  samples come, and all are the same
- +-- ProtocolViolation      bytes that the wire format does not allow
+ +-- ProtocolViolation      bytes outside the wire format
  +-- WrongGeneration        the cabinet runs software that this driver does not speak
  +-- RpcError               the controller answered with an error object
  +-- LimitExceeded          refused before anything moved
@@ -14,8 +14,8 @@ DeviceError
       +-- MotionRefused     the controller did not accept the command
       +-- MotionFailed      accepted, but the arm did not arrive
       +-- RobotNotSafe      protective, safeguard or emergency stop, violation or fault
-      +-- ArmMoved          somebody else has moved the arm, or moves it now
-      +-- SettingsChanged   the tool offset, or what else a press depends on, is not as it was set
+      +-- ArmMoved          another client or a person has moved the arm, or moves it now
+      +-- SettingsChanged   the tool offset, or another setting that a press depends on, has changed
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Stale(DeviceTimeout):
 
 
 class Stuck(DeviceError):
-    """A sensor sends, but always the same: it measures no more."""
+    """A sensor sends the same values again and again: it no longer measures."""
 
     def __init__(self, device: str, alike_ms: float, samples: int) -> None:
         self.alike_ms = alike_ms
@@ -119,7 +119,7 @@ class MotionFailed(MotionError):
 
 
 class RobotNotSafe(MotionError):
-    """The safety mode forbids motion; `mode` is the controller's own word for it."""
+    """The safety mode forbids motion; `mode` is the controller's name of it."""
 
     def __init__(self, device: str, op: str, mode: str, condition: str, remedy: str) -> None:
         self.mode = mode
@@ -139,7 +139,7 @@ class ArmMoved(MotionError):
             "the arm is moving, and not from here"
             if moving
             else f"the arm is {off_mm:.1f} mm and {off_deg:.1f} deg from where it was left",
-            condition="Another client or a person has it; nothing was sent to it.",
+            condition="Another client or a person moved it; nothing was sent to it.",
             remedy="Wait until it rests, and close the other client."
             if moving
             else "Nothing may stand in the way of the brush: the first motion is back along the tool axis.",
@@ -147,7 +147,7 @@ class ArmMoved(MotionError):
 
 
 class SettingsChanged(MotionError):
-    """The controller is not set up as it was; `changes` names each setting as found and as set."""
+    """Settings of the controller have changed; `changes` names each as found and as it was set."""
 
     def __init__(self, device: str, op: str, changes: tuple[str, ...]) -> None:
         self.changes = changes
@@ -155,6 +155,6 @@ class SettingsChanged(MotionError):
             device,
             op,
             "; ".join(changes),
-            condition="Nothing was sent to the arm; where the tip is may be other than it seems.",
-            remedy="Find out who changed it, the pendant or another client. Enabling the arm again sets it anew.",
+            condition="Nothing was sent to the arm; the tip may be elsewhere than reported.",
+            remedy="Find out who changed it, the pendant or another client. Enabling the arm again restores it.",
         )

@@ -1,4 +1,4 @@
-"""Poses of the brush from what the experiment speaks of: place, height, tilt and heading."""
+"""Poses of the brush from the quantities of the experiment: place, height, tilt and heading."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def lean(pose: Pose) -> tuple[float, float]:
 
 
 def to_wire(pose: Pose) -> list[float]:
-    """[x, y, z m, rx, ry, rz rad] as ARCS wants it: R = Rz(rz) Ry(ry) Rx(rx)."""
+    """[x, y, z m, rx, ry, rz rad] in ARCS' order: R = Rz(rz) Ry(ry) Rx(rx)."""
     rz, ry, rx = Rotation.from_quat(pose.quaternion).as_euler("ZYX")
     return [pose.x_mm / 1e3, pose.y_mm / 1e3, pose.z_mm / 1e3, float(rx), float(ry), float(rz)]
 
@@ -68,7 +68,7 @@ def interpolate(a: Pose, b: Pose, s: float) -> Pose:
 
 
 def steepest_deg(a: Pose, b: Pose) -> float:
-    """The largest tilt on the way from a to b, in deg: two poses within a cone may have steeper ones between them."""
+    """The largest tilt between a and b, in deg: two poses within a cone may have steeper ones between them."""
     start = Rotation.from_quat(a.quaternion)
     turn = (Rotation.from_quat(b.quaternion) * start.inv()).as_rotvec()
     ferrule = -start.as_matrix()[:, 2]

@@ -14,7 +14,7 @@ TILT_SLACK_DEG = 1e-6
 REST_SLACK_MM, REST_SLACK_DEG = 0.1, 0.2
 """An arm that was sent to a limit may rest a little beyond it."""
 ALONG_DEG = 1.0
-"""How far from the tool axis a way may lead that still counts as along it."""
+"""Angle from the tool axis up to which a line counts as along it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class Limits:
     speed_mm_s: float
     acc_mm_s2: float
     turn_deg_s: float = 45.0
-    """Fastest turn of the tool: a short line with a large turn would otherwise be a fling of the wrist."""
+    """Fastest turn of the tool: a short line with a large turn would otherwise whip the wrist round."""
 
     def turn_capped(self, start: Pose, target: Pose, speed_mm_s: float) -> float:
         """The speed along the line at which the tool turns no faster than allowed, in mm/s."""
@@ -41,7 +41,7 @@ class Limits:
     def check_start(self, device: str, here: Pose) -> None:
         """Raise `LimitExceeded` where the arm stands outside the box or the cone: no line from there is known.
 
-        Below the floor it may stand: up along the tool axis is a way out.
+        Below the floor is allowed: up along the tool axis is a way out.
         """
         for field, value, (low, high), slack, unit in (
             ("x", here.x_mm, self.x_mm, REST_SLACK_MM, "mm"),
@@ -53,10 +53,10 @@ class Limits:
                 raise _stands_outside(device, field, value, low, high, unit)
 
     def check_way(self, device: str, start: Pose, target: Pose) -> None:
-        """Raise `LimitExceeded` unless the whole line to a target that was checked lies within the limits.
+        """Raise `LimitExceeded` unless the whole line to a target that was checked before is within the limits.
 
-        A box that holds both ends holds the line; a tilt cone may not. From below the floor only the way up along the
-        tool axis is allowed.
+        A box that holds both ends holds the line; a tilt cone may not. From below the floor only a
+        line up along the tool axis is allowed.
         """
         self.check_start(device, start)
         if start.z_mm < self.z_mm[0] - REST_SLACK_MM and not _rises_along_tool(start, target):
@@ -90,7 +90,7 @@ def _stands_outside(device: str, field: str, value: float, low: float, high: flo
 
 
 def _rises_along_tool(start: Pose, target: Pose) -> bool:
-    """Whether the way leads up along the ferrule, without a turn."""
+    """Whether the line leads up along the ferrule, without a turn."""
     travel_mm, turn_deg = distance(start, target)
     tilt_deg, heading_deg = lean(start)
     out, up = math.sin(math.radians(tilt_deg)), math.cos(math.radians(tilt_deg))

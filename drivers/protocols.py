@@ -1,4 +1,4 @@
-"""The device protocols: what a rig is made of, seen from the engine."""
+"""The devices of a rig as the engine sees them."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ class Robot(Protocol):
         ...
 
     async def enable(self) -> None:
-        """Bring the arm to the state in which it can move; moves nothing."""
+        """Power the arm and release its brakes; moves nothing."""
         ...
 
     async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
         """Move the tip in a straight line; returns when the arm has settled within tolerance.
 
-        The whole way is checked, from where the arm is. Raises `ArmMoved` where it is not where it was left, and
-        `SettingsChanged` before a way down with another tool, payload or speed than was set.
+        The whole line is checked, from where the arm is. Raises `ArmMoved` where it is not where it was left, and
+        `SettingsChanged` before a line down with another tool, payload or speed than was set.
         """
         ...
 
@@ -37,7 +37,7 @@ class Robot(Protocol):
 
     async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
         """Carry out all lines, which the arm's controller holds before the first begins: once they have begun, they are
-        carried out to the end even if this program dies. Returns the poses that were seen on the way.
+        carried out to the end even if this program dies. Returns the poses seen meanwhile.
 
         Every pose is checked before anything is sent. The last one is not where the arm began. A stop drops them all.
         """
@@ -52,15 +52,15 @@ class Robot(Protocol):
         ...
 
     async def where(self) -> Pose:
-        """The pose now, asked of the controller."""
+        """Ask the controller for the pose."""
         ...
 
     async def confirm(self) -> None:
-        """Asks only. Raises `SettingsChanged`, then `ArmMoved`, unless the arm is as it was left."""
+        """Raise `SettingsChanged`, then `ArmMoved`, unless the arm is as it was left; only asks the controller."""
         ...
 
     async def take_up(self) -> Pose:
-        """Where the arm rests, whoever brought it there; the next move may begin here. Raises while it moves."""
+        """Accept the place where the arm rests as the start of the next move. Raises while it moves."""
         ...
 
     def listen(self, on_sample: Callable[[PoseSample], None] | None) -> None:

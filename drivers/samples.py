@@ -1,4 +1,4 @@
-"""What devices hand over: frozen samples, each with the time it was taken and its place in the sequence."""
+"""Samples from devices: frozen, each with the time at which it was taken and its place in the sequence."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class ForceSample:
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who answered: goes into the header of every recording, so that a number can be traced to its source."""
+    """Who answered: goes into the header of every recording, so that each number can be traced to its source."""
 
     device: str
     model: str

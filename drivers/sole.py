@@ -1,8 +1,8 @@
-"""One driver for one thing, whoever runs it and wherever his temporary files go.
+"""One driver per device on a machine, whichever user runs it.
 
 On Linux a claim is a name that the kernel keeps (an abstract socket): it leaves no file behind, ends with its process
-however that ends, and every user of the machine meets it. A container with a network of its own does not. Elsewhere it
-is a lock on a file that everybody may open, in a folder that is the same for everybody.
+however that ends, and every user of the machine sees it; a container with a network of its own does not. On other
+systems it is a lock on a file that every user may open, in a folder that is the same for all of them.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 WAITING = 64
-"""So many who are refused may ask who has it; nobody ever answers them."""
+"""Length of the backlog: refused processes that may connect to learn the holder. Their connections are never served."""
 
 
 class Claimed(Exception):
-    """Somebody has it: `pid` and `uid` of the process, where they are known."""
+    """Another process holds the name: its `pid` and `uid`, where they are known."""
 
     def __init__(self, pid: int | None = None, uid: int | None = None) -> None:
         self.pid = pid

@@ -15,7 +15,7 @@ from enum import IntEnum, StrEnum
 from drivers.errors import MotionError, MotionFailed, MotionRefused
 
 LOOPBACK_CONTROL_BOX = "brushloop-loopback"
-"""What the loopback controller answers to `getControlBoxType`; no robot maker calls a cabinet that."""
+"""What the loopback controller answers to `getControlBoxType`; no maker uses that name."""
 
 
 class ReturnCode(IntEnum):
@@ -67,7 +67,7 @@ class SafetyMode(StrEnum):
 
 MOVING_ALLOWED = frozenset({SafetyMode.NORMAL, SafetyMode.REDUCED})
 
-# Nothing here is ever cleared by software: a person looks first.
+# No software here clears any of them: a person looks first.
 CONDITION_AND_REMEDY: dict[SafetyMode, tuple[str, str]] = {
     SafetyMode.PROTECTIVE_STOP: (
         "The arm is powered, brakes open, and still holds its path.",
@@ -108,7 +108,7 @@ def refusal(code: int) -> tuple[str, str]:
 
 
 class WrongOperationalMode(MotionError):
-    """The operational mode is not one that a program may move the arm in; `mode` is the controller's word for it."""
+    """A program may not move the arm in this operational mode; `mode` is the controller's name of it."""
 
     def __init__(self, device: str, op: str, mode: str) -> None:
         self.mode = mode
@@ -117,7 +117,7 @@ class WrongOperationalMode(MotionError):
             op,
             f"operational mode is {mode}",
             condition="Nothing was set or powered.",
-            remedy="Turn it to Automatic on the pendant; nothing here does that for you.",
+            remedy="Turn it to Automatic on the pendant; no software here does that.",
         )
 
 
@@ -134,6 +134,6 @@ class OutOfReach(MotionFailed):
             device,
             op,
             f"the controller reports {code} ({name})",
-            condition="The arm was told to stop.",
+            condition="A stop was sent to the arm.",
             remedy="Bring the target within reach: move the sheet or turn the brush, then teach again.",
         )

@@ -1,4 +1,4 @@
-"""The controller's calls with types: what goes over one connection, and what the answers mean."""
+"""The controller's calls with types: what is sent over one connection, and what the answers mean."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from drivers.samples import Pose
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """The controller's words for robot mode and safety mode, and the median time of a call."""
+    """The controller's names of its robot and safety modes, and the median time of a call."""
 
     mode: str
     safety: str
@@ -44,7 +44,7 @@ class Controller:
         self._reduced = False
 
     async def ask(self, method: str, **params: object) -> Any:
-        """The answer of a method of the robot's, unchecked."""
+        """Call a method of the robot; the answer is unchecked."""
         return await self.connection.call(f"{self.robot}.{method}", params)
 
     async def robot_names(self) -> list[str]:
@@ -76,7 +76,7 @@ class Controller:
             raise ProtocolViolation(DEVICE, "getJointPositions", str(error)) from None
 
     async def mode(self) -> RobotMode:
-        """The robot mode. Raises `ProtocolViolation` for a word that is none."""
+        """The robot mode. Raises `ProtocolViolation` for an unknown name."""
         mode = await self.ask("RobotState.getRobotModeType")
         try:
             return RobotMode(mode)
@@ -84,7 +84,7 @@ class Controller:
             raise ProtocolViolation(DEVICE, "getRobotModeType", f"unknown mode {mode!r}") from None
 
     async def condition(self, calls: int) -> Condition:
-        """Asks only; `calls` of one kind are timed, one after the other."""
+        """Ask for modes and time `calls` calls of one kind, one after the other; sets nothing."""
         loop = asyncio.get_running_loop()
         took_s: list[float] = []
         for _ in range(calls):
@@ -138,22 +138,22 @@ class Controller:
         return running, size
 
     async def hold_path(self) -> None:
-        """Carry out nothing from now on, but take lines and keep them."""
+        """Let the controller hold its path: it accepts lines and keeps them, but carries out none."""
         accepted("stopMove", await self.ask("MotionControl.stopMove", quick=True, all_tasks=True))
 
     async def release(self) -> None:
-        """End a hold over an empty queue, which moves nothing; where there is none, whatever the answer is."""
+        """End a hold over an empty queue, which moves nothing; the answer does not matter where there was no hold."""
         await self.ask("MotionControl.startMove")
 
     async def go_on(self) -> None:
-        """Carry out what was kept. Raises `RobotNotSafe` or `MotionRefused`."""
+        """Carry out the lines that were kept. Raises `RobotNotSafe` or `MotionRefused`."""
         code = await self.ask("MotionControl.startMove")
         if code not in (ReturnCode.OK, ReturnCode.REQUEST_IGNORED):
             await self.require_safe("startMove")
         accepted("startMove", code)
 
     async def halt(self, acc_m_s2: float) -> None:
-        """Decelerate along the path, then drop whatever is queued, the second also where the first fails."""
+        """Decelerate along the path, then drop the queue, also where the first call fails."""
         try:
             await self.ask("MotionControl.stopLine", acc=acc_m_s2, acc_rot=acc_m_s2)
         except DeviceError:

@@ -1,5 +1,6 @@
-"""What must hold before a line is sent: the arm rests where it was left, it is set up as it was, and the whole way is
-allowed. Another client may have had the arm since the last line; nothing of what was known then is taken for granted.
+"""What must hold before a line is sent: the arm rests where it was left, is set up as it was, and may go the whole way.
+
+Another client may have used the arm since the last line, so everything is asked again.
 """
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ from drivers.limits import Limits
 from drivers.samples import Pose
 
 MOVED_MM, MOVED_DEG = 0.5, 0.5
-"""Beyond the tolerance of any settled move: somebody else moved the arm."""
+"""Larger than the tolerance of any settled move: another client or a person moved the arm."""
 DOWN_MM = 0.01
-"""A line that ends so much lower goes down."""
+"""A line that ends this much lower goes down."""
 RESTS_S, POLL_S = 0.5, 0.02
-"""An arm that has just settled may take a moment to say so."""
+"""An arm that has just settled may take a moment to report it."""
 
 
 class Departure:
-    """Where one arm was left, and how it was set up when it was enabled."""
+    """Place and settings in which one arm was left."""
 
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
@@ -34,14 +35,14 @@ class Departure:
         """Where the last line ended, or where the arm was taken up; None where a line was cut."""
 
     async def enabled(self, settings: Settings) -> None:
-        """The arm was set up so, and stands where it stands."""
+        """Note the settings with which the arm was enabled, and its place."""
         self._settings = settings
         self.left = await self._controller.pose()
 
     async def take_up(self) -> Pose:
-        """Where the arm rests, whoever brought it there: the next line may begin here.
+        """Accept the place where the arm rests as the start of the next line.
 
-        Raises `ArmMoved` while it moves, `SettingsChanged` where a pose would be of another tool, `RobotNotSafe`.
+        Raises `ArmMoved` while it moves, `SettingsChanged` where a pose would mean another tool, `RobotNotSafe`.
         """
         await self._require_rest("take up")
         await self._require_settings("take up")
@@ -55,9 +56,9 @@ class Departure:
         self._require_place("confirm", await self._controller.pose())
 
     async def ready(self, op: str, limits: Limits, poses: Sequence[Pose]) -> Pose:
-        """Where the arm is, from where it may now go through `poses`.
+        """Return where the arm is, once it may go from there through `poses`.
 
-        Raises as `confirm` does, and `LimitExceeded` for a way that leaves the limits.
+        Raises as `confirm` does, and `LimitExceeded` where a line would leave the limits.
         """
         await self._require_rest(op)
         start = await self._controller.pose()
@@ -82,7 +83,7 @@ class Departure:
         until = loop.time() + RESTS_S
         while not await self._controller.at_rest():
             if loop.time() > until:
-                await self._controller.require_safe(op)  # a safety stop holds its path: that is what to tell
+                await self._controller.require_safe(op)  # a safety stop holds its path: that is the cause to report
                 raise ArmMoved(DEVICE, op, *self._off(await self._controller.pose()), moving=True)
             await asyncio.sleep(POLL_S)
 

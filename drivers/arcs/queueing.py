@@ -24,7 +24,7 @@ from drivers.limits import Limits
 from drivers.samples import Pose, QueuedLine
 
 MOST_QUEUED = 16
-"""Lines that the controller holds at a time. How many a real cabinet takes is not documented; see `QueueFull` below."""
+"""Lines that the controller holds at a time. The queue of a real cabinet is not documented; see `QueueFull` below."""
 EMPTY = (-1, 0)
 LEAST_BLEND_MM = 1.0
 """ARCS takes 0 or 1 mm to 1 m."""
@@ -32,7 +32,7 @@ LEAST_BLEND_MM = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """One line of the way."""
+    """One line of a path."""
 
     target: Pose
     speed_mm_s: float
@@ -44,8 +44,11 @@ class Leg:
 def legs_of(
     start: Pose, poses: Sequence[Pose], limits: Limits, *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float
 ) -> list[Leg]:
-    """The lines, each as slow as its turn of the tool asks for. A corner is rounded within half the shorter line, but
-    never by less than the controller takes; at the last pose the arm halts."""
+    """The lines, each slow enough for its turn of the tool.
+
+    A corner is rounded within half the shorter line, but never by less than the controller accepts; at the last pose
+    the arm halts.
+    """
     ways = [distance(a, b)[0] for a, b in zip([start, *poses], poses, strict=False)]
     legs: list[Leg] = []
     before = start
@@ -68,7 +71,7 @@ async def feed(
     poll_s: float,
     notice: Callable[[str], None],
 ) -> None:
-    """Queue every leg, at most `MOST_QUEUED` at a time; returns once the last one is queued.
+    """Queue every leg, at most `MOST_QUEUED` at a time; return once the last one is queued.
 
     Raises `RobotNotSafe`, `MotionRefused`, and `MotionFailed` where the arm was stopped meanwhile or does not advance.
     """
@@ -79,15 +82,15 @@ async def feed(
     await controller.require_safe("moveLine")
     while True:
         while sent < len(legs) and room > 0:
-            # Looked at before every line, with nothing awaited between: after a stop none may follow.
+            # Checked before every line, with nothing awaited between: after a stop none may follow.
             if stopped():
-                raise _cut_short(sent, len(legs), "the arm was told to stop")
+                raise _cut_short(sent, len(legs), "the arm was stopped")
             leg = legs[sent]
             try:
                 await controller.move_line(leg.target, leg.speed_mm_s, acc_mm_s2, leg.blend_mm)
             except QueueFull:
-                # Refused, so it may be sent again: the controller holds fewer lines than we thought. One that
-                # goes on to refuse with nothing queued ends below, as an arm that does not advance.
+                # Refused, so it may be sent again: the controller holds fewer lines than assumed. A controller that
+                # still refuses with nothing queued ends below, as an arm that does not advance.
                 if sent == 0:
                     raise  # none of them is ours
                 break
@@ -105,7 +108,7 @@ async def feed(
         if queue != EMPTY:
             dry_since = None
             continue
-        # Fed too slowly, which is a pity; not begun yet; or stopped by somebody, and then nothing may follow.
+        # The lines came too late, or the arm has not begun, or another client stopped it: then nothing may follow.
         off_mm, off_deg = distance(await controller.pose(), legs[sent - 1].target)
         if off_mm <= tolerance.position_mm and off_deg <= tolerance.rotation_deg:
             notice(f"the arm halted at point {sent} of {len(legs)}: lines did not reach the controller in time")
@@ -120,7 +123,7 @@ def _cut_short(sent: int, legs: int, why: str) -> MotionFailed:
         DEVICE,
         "follow",
         f"{why}, after {sent} of {legs} points were sent",
-        condition="The arm was told to stop, and the brush may be down.",
+        condition="A stop was sent to the arm, and the brush may be down.",
         remedy="Lift the brush before anything else.",
     )
 
@@ -128,7 +131,7 @@ def _cut_short(sent: int, legs: int, why: str) -> MotionFailed:
 def capped(
     start: Pose, lines: Sequence[QueuedLine], limits: Limits, acc_mm_s2: float
 ) -> tuple[list[QueuedLine], float]:
-    """The lines, each as slow as its turn of the tool asks for, and an upper estimate of how long they take, in s."""
+    """The lines, each slow enough for its turn of the tool, and an upper estimate of how long they take, in s."""
     made: list[QueuedLine] = []
     seconds, before = 0.0, start
     for line in lines:
@@ -148,16 +151,16 @@ async def queue_all(
     stopped: Callable[[], bool],
     tolerance: Tolerance,
 ) -> None:
-    """Queue every line on an arm that rests at `start`, then let it begin; returns once it may have begun.
+    """Queue every line on an arm that rests at `start`, then release it; return once it may have begun.
 
     Raises `RobotNotSafe`, `MotionRefused`, and `MotionFailed` where the arm was stopped meanwhile, or where the
-    controller does not hold all lines: then the arm is not let go.
+    controller does not hold all lines: then the arm is not released.
     """
 
     def require_not_stopped() -> None:
-        # Looked at before every request, with nothing awaited between: after a stop none may follow.
+        # Checked before every request, with nothing awaited between: after a stop none may follow.
         if stopped():
-            raise _not_begun("the arm was told to stop")
+            raise _not_begun("the arm was stopped")
 
     await controller.require_safe("moveLine")
     require_not_stopped()
@@ -170,7 +173,7 @@ async def queue_all(
     if size < len(lines):
         raise _not_begun(f"the controller holds {size} of {len(lines)} lines")
     if not rests:
-        raise _not_begun("the controller does not hold its path: the arm moved before it was let go")
+        raise _not_begun("the controller does not hold its path: the arm moved before it was released")
     require_not_stopped()
     await controller.go_on()
 
@@ -179,7 +182,7 @@ def _not_begun(why: str) -> MotionFailed:
     return MotionFailed(
         DEVICE,
         "sequence",
-        f"{why}; the brush was not to go down before its lift was queued",
-        condition="The arm was told to stop.",
+        f"{why}; the brush must not go down before its lift is queued",
+        condition="A stop was sent to the arm.",
         remedy="Close other clients of the controller. See docs/decisions/0014-the-controller-lifts.md.",
     )

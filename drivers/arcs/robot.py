@@ -44,9 +44,9 @@ class AuboArcs:
         self._stopper = Stopper([self._stop, self._state], self._motion, self._restore_stop)
         self._own_stops: set[asyncio.Task[None]] = set()
         self._stops = 0
-        """How often the arm was told to stop: no line of a way may follow."""
+        """Stops so far: a motion compares it, since no line may follow a stop."""
         self._unsettled = False
-        """True from the moment a line is sent until the arm was seen at rest."""
+        """True from the moment a line is sent until the arm is seen at rest."""
         self._held = False
         """Whether the controller may hold its path."""
         self._connected = False
@@ -61,7 +61,7 @@ class AuboArcs:
     async def connect(self) -> Identity:
         """Connect and identify; telemetry runs from here on. Raises `WrongGeneration` for AUBOPE cabinets.
 
-        After a failure nothing is left open, and an arm that was not identified has been told nothing.
+        After a failure nothing is left open, and nothing was set on an arm that was not identified.
         """
         try:
             return await self._connect()
@@ -98,7 +98,7 @@ class AuboArcs:
             try:
                 await self.stop()
             except MotionFailed:
-                await self._motion.require_safe("power on")  # a safety stop holds its path: that is what to tell
+                await self._motion.require_safe("power on")  # a safety stop holds its path: that is the cause to report
                 raise
         settings = await make_ready(self._motion, self._options, self._notice)
         await power_on(self._motion, self._options)
@@ -110,7 +110,7 @@ class AuboArcs:
         await self._telemetry.read()
 
     async def condition(self, calls: int) -> Condition:
-        """What the controller says of the arm now; asks only. `calls` of one kind are timed, one after the other."""
+        """Modes of the arm now, and the time of a call; see `Controller.condition`."""
         return await self._motion.condition(calls)
 
     def check(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
@@ -120,8 +120,8 @@ class AuboArcs:
     async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
         """moveLine, then wait until the queue is empty, the arm steady and the pose within tolerance.
 
-        The whole way is checked, from where the arm really is. Any failure, cancellation included, stops the arm before
-        it is passed on.
+        The whole line is checked, from where the arm really is. Any failure, cancellation included, stops the arm
+        before it is raised.
         """
         self.check(target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
         start = await self._depart("moveLine", [target])
@@ -132,7 +132,7 @@ class AuboArcs:
     async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float) -> None:
         """Lines through all poses without a halt between them, then wait as `move` does at the last.
 
-        Every pose, and the way between two of them, is checked before the first line is sent. Raises ValueError for no
+        Every pose, and the line between two of them, is checked before the first line is sent. Raises ValueError for no
         poses.
         """
         if not poses:
@@ -154,7 +154,7 @@ class AuboArcs:
         await self._carry_out(feeding, poses[-1], sum(leg.seconds for leg in legs))
 
     async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
-        """All lines are queued while the controller holds its path, then it is let go and waited for as in `move`.
+        """Queue all lines while the controller holds its path, release it, and wait as `move` does.
 
         Raises ValueError for no lines and for lines that end where the arm is.
         """
@@ -163,7 +163,7 @@ class AuboArcs:
         start = await self._depart("sequence", [line.target for line in lines])
         tolerance = self._tolerance
         if not lines or tolerance.holds(start, lines[-1].target):
-            raise ValueError("sequence: it must end elsewhere than it begins")
+            raise ValueError("sequence: it must not end where it begins")
         stops = self._stops
         lines, expected_s = capped(start, lines, self._limits, acc_mm_s2)
         self._held = True
@@ -198,12 +198,12 @@ class AuboArcs:
             raise
 
     async def _depart(self, op: str, poses: Sequence[Pose]) -> Pose:
-        """Where the arm is, once it is known that it may go through `poses` from there; see `Departure`."""
+        """Return where the arm is, once it may go from there through `poses`; see `Departure`."""
         stops = self._stops
         await self._ready()
         start = await self._departure.ready(op, self._limits, poses)
         if self._stops != stops:
-            raise MotionFailed(DEVICE, op, "the arm was told to stop", condition="Nothing was sent to it.")
+            raise MotionFailed(DEVICE, op, "the arm was stopped", condition="Nothing was sent to it.")
         return start
 
     async def stop(self) -> None:
@@ -218,19 +218,19 @@ class AuboArcs:
         self._unsettled = False
 
     async def where(self) -> Pose:
-        """The pose as the controller tells it now, whatever telemetry does."""
+        """Ask the controller for the pose, independently of telemetry."""
         return await self._motion.pose()
 
     async def confirm(self) -> None:
-        """Asks only. Raises `RobotNotSafe`, `SettingsChanged`, then `ArmMoved`, unless all is as it was left."""
+        """Raise `RobotNotSafe`, `SettingsChanged`, then `ArmMoved`, unless the arm is as it was left; only asks."""
         await self._departure.confirm()
 
     async def take_up(self) -> Pose:
-        """Where the arm rests, whoever brought it there: the next move may begin here. Raises as `confirm` does."""
+        """Accept the place where the arm rests as the start of the next move. Raises as `confirm` does."""
         return await self._departure.take_up()
 
     def _own_stop(self) -> asyncio.Task[None]:
-        """A stop that goes on although whoever asked for it is cancelled; `close` waits for it."""
+        """Start a stop that continues although the caller is cancelled; `close` waits for it."""
         task = asyncio.create_task(self.stop(), name="stop after a move that failed")
         self._own_stops.add(task)
         task.add_done_callback(self._own_stops.discard)
@@ -247,8 +247,8 @@ class AuboArcs:
     async def close(self) -> None:
         """Stop, end telemetry, close all sockets in reverse order of opening.
 
-        An arm that was never enabled from here is not stopped: it may be somebody else's motion. Raises `MotionFailed`
-        where a line was under way and the arm is not seen at rest.
+        An arm that was never enabled from here is not stopped: its motion may be another client's. Raises
+        `MotionFailed` where a line was under way and the arm is not seen at rest.
         """
         self._telemetry.listener = None
         await asyncio.gather(*self._own_stops, return_exceptions=True)
@@ -258,7 +258,7 @@ class AuboArcs:
                 try:
                     await self.stop()
                 except DeviceError:
-                    # What cannot be stopped from here the controller stops by itself.
+                    # An arm that cannot be stopped from here is stopped by the controller's watchdog.
                     await self._watchdog.abandon()
                     if under_way:
                         raise

@@ -154,7 +154,7 @@ class RpcConnection:
             await self.open()
             await self.login()
         except BaseException:
-            # Half open is lost, so that whoever needs it opens it again.
+            # A half-open connection counts as lost, so that its next user opens it again.
             await self.close()
             self._lost = "it was not opened again"
             raise

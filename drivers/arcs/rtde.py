@@ -1,4 +1,4 @@
-"""RTDE: the controller pushes, nobody asks. A greeting that ends with two newlines, then SOF frames of CBOR (or JSON).
+"""RTDE, the controller's push of samples: a greeting that ends with two newlines, then SOF frames of CBOR (or JSON).
 
 | who | bytes |
 |---|---|
@@ -30,7 +30,7 @@ MAX_DEPTH = 16
 
 
 class _NoTags(Mapping[int, Any]):
-    """Refuses whatever tag is looked up. Poses and modes need none, and a tagged regular expression of 64 KiB takes
+    """Refuses every tag. Poses and modes need none, and a tagged regular expression of 64 KiB takes
     cbor2 half a minute to compile, a tagged big decimal half a second."""
 
     def __getitem__(self, tag: int) -> Any:
@@ -100,7 +100,7 @@ CHANNEL = 0
 
 
 class RtdeStream:
-    """A socket of its own; whoever reads it gets the newest sample, never a backlog."""
+    """One subscription on a socket of its own; a reader gets the newest sample, never a backlog."""
 
     def __init__(self, host: str, port: int, *, timeout_s: float = 0.5) -> None:
         self.host = host
@@ -136,7 +136,7 @@ class RtdeStream:
     async def newest(self) -> list[Any]:
         """The values of the newest sample, in the order of the segments.
 
-        Where several have piled up, nobody knows any more when the others came; they are left in `older`. Raises
+        Where several have piled up, the arrival of the older ones is unknown; they are left in `older`. Raises
         `DeviceTimeout` after silence, `ConnectionLost`, `ProtocolViolation`.
         """
         if self._reader is None:

@@ -36,7 +36,7 @@ class ArcsOptions:
     power_timeout_s: float = 60.0
     stop_acc_m_s2: float = 2.0
     framing: Framing = "sof"
-    """`sof` as the maker's client speaks, `bare` as the maker documents; a cabinet may well take only one of them."""
+    """`sof` as the maker's client speaks, `bare` as the maker documents; a cabinet may accept only one of them."""
     rtde_port: int | None = None
     """Where poses are pushed from, 30010 on a cabinet; None polls for them."""
     payload_kg: float | None = None
@@ -46,9 +46,9 @@ class ArcsOptions:
     collision_level: int | None = None
     """0 is off, 9 is the most sensitive."""
     speed_fraction: float | None = None
-    """Of every speed, in (0, 1]."""
+    """Share of every speed, in (0, 1]."""
     watchdog_s: float | None = None
-    """After so long without a sign of life the controller goes into a protective stop; None arms no watchdog."""
+    """Silence from this host after which the controller makes a protective stop; None arms no watchdog."""
 
 
 METHOD_NOT_FOUND = -32601
@@ -56,14 +56,14 @@ TOLERANCE = 1e-3
 """Of every number, in mm, deg and kg: a controller may keep single precision."""
 
 Value = tuple[float, ...] | str | None
-"""None: the controller has no such thing."""
+"""None: the controller has no such setting."""
 Settings = Mapping[str, Value]
 """By name, in the units of `SETTINGS`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """One thing that is set at the controller."""
+    """One setting of the controller."""
 
     name: str
     units: tuple[str, ...]
@@ -97,7 +97,7 @@ SETTINGS = (
 
 
 async def read_back(controller: Controller) -> Settings:
-    """All settings as the controller tells them. Raises `ProtocolViolation` for an answer of another shape."""
+    """Read all settings from the controller. Raises `ProtocolViolation` for an answer of another shape."""
     found: dict[str, Value] = {}
     for setting in SETTINGS:
         try:
@@ -112,7 +112,7 @@ async def read_back(controller: Controller) -> Settings:
 
 
 def configured(options: ArcsOptions) -> Settings:
-    """What `options` sets; the others are left as they are on the pendant."""
+    """The settings that `options` gives; the others stay as they are on the pendant."""
     wanted: dict[str, Value] = {TOOL_OFFSET: (*options.tcp_offset_mm, 0.0, 0.0, 0.0)}
     if options.payload_kg is not None:
         wanted[PAYLOAD] = (options.payload_kg, *options.payload_cog_mm)
@@ -124,7 +124,7 @@ def configured(options: ArcsOptions) -> Settings:
 
 
 def require_same(op: str, wanted: Settings, found: Settings) -> None:
-    """Raise `SettingsChanged` naming everything in `wanted` that was found otherwise."""
+    """Raise `SettingsChanged` naming every setting in `wanted` that was found different."""
     changes = tuple(
         f"{setting.name} is {_in_words(setting, found[setting.name])}, not {_in_words(setting, wanted[setting.name])}"
         for setting in SETTINGS
@@ -153,11 +153,10 @@ def _in_words(setting: Setting, value: Value) -> str:
 
 
 async def make_ready(controller: Controller, options: ArcsOptions, on_notice: Callable[[str], None]) -> Settings:
-    """Check the operational mode, then set tool, payload, collision level and speed, where configured, and read all
-    back: a return code is no proof, least of all `ignored`.
+    """Check the operational mode, set tool, payload, collision level and speed, where configured, and read all back.
 
-    Raises `WrongOperationalMode`, `MotionRefused` for what the controller does not take, and `SettingsChanged` for what
-    it says that it took and has not.
+    Raises `WrongOperationalMode`, `MotionRefused` for a setting that the controller refuses, and `SettingsChanged` for
+    one that it accepted and does not have.
     """
     _require_automatic((await read_back(controller))[OPERATIONAL_MODE], on_notice)
     await controller.set_tcp_offset(options.tcp_offset_mm)
@@ -178,12 +177,12 @@ async def make_ready(controller: Controller, options: ArcsOptions, on_notice: Ca
     found = await read_back(controller)
     require_same("power on", configured(options), found)
     for name in (name for name, value in found.items() if value is None and name != OPERATIONAL_MODE):
-        on_notice(f"the controller does not tell its {name}: whether it changes cannot be seen")
+        on_notice(f"the controller does not report its {name}: a change would go unnoticed")
     return found
 
 
 async def power_on(controller: Controller, options: ArcsOptions) -> None:
-    """Power the arm and release its brakes, where that was not done. Raises `RobotNotSafe`, `DeviceTimeout`."""
+    """Power the arm and release its brakes, if need be. Raises `RobotNotSafe`, `DeviceTimeout`."""
 
     async def until(*wanted: RobotMode) -> None:
         await until_mode(controller, {*wanted}, timeout_s=options.power_timeout_s, poll_s=options.poll_s)
@@ -197,7 +196,7 @@ async def power_on(controller: Controller, options: ArcsOptions) -> None:
 
 
 def _require_automatic(mode: Value, on_notice: Callable[[str], None]) -> None:
-    """Manual, or a word that is none, is for a person beside the arm."""
+    """Refuse manual and unknown modes: they are for a person next to the arm."""
     if mode is None:
         on_notice("the controller has no operational mode to check")
     elif mode == "Disabled":

@@ -21,18 +21,18 @@ from drivers.errors import DeviceError, MotionFailed, RpcError
 from drivers.geometry import distance
 
 HEDGE_S = 0.15
-"""A stop that is not acknowledged by then goes out over the next connection too."""
+"""A stop that is not acknowledged within this time is sent over the next connection too."""
 CONFIRM_S = 6.0
 """Rest must be seen within this time from the call on: a stop from full speed takes a fraction of a second."""
 RESEND_S = 0.3
 POLL_S = 0.02
 STILL_S = 0.1
 RESTS_NEEDED = 3
-"""So many polls in a row: a line that was on its way may start after the first."""
+"""Polls in a row: a line that was on its way may start after the first."""
 
 
 class Stopper:
-    """Stops one arm. `ways` are tried in order: its own connection first, then those that are known to work."""
+    """Stops one arm over several connections, tried in order: its own first, then those that are known to work."""
 
     def __init__(self, ways: list[Controller], behind: Controller, reopen: Callable[[], Awaitable[None]]) -> None:
         self._ways = ways
@@ -41,13 +41,13 @@ class Stopper:
         self._reopen = reopen
 
     async def stop(self, acc_m_s2: float) -> None:
-        """Send, then wait until the arm rests, sending again meanwhile; `CONFIRM_S` is the end of it all.
+        """Send a stop, then wait until the arm rests, sending again meanwhile; gives up after `CONFIRM_S`.
 
-        Raises `MotionFailed` saying that the arm may still be moving.
+        Raises `MotionFailed`, with the condition that the arm may still be moving.
         """
         failures: list[DeviceError] = []
         trailing: asyncio.Task[None] | None = None
-        # Whoever waits for this must hear in time that it is his turn, however many calls hang.
+        # The caller must learn in time that a person has to act, however many calls hang.
         limit = asyncio.timeout(CONFIRM_S)
         try:
             async with limit:
@@ -90,7 +90,7 @@ class Stopper:
             await asyncio.gather(*pending, return_exceptions=True)
 
     async def _until_rest(self, acc_m_s2: float, failures: list[DeviceError]) -> None:
-        """Return once rest was seen; never by itself where it is not."""
+        """Return once the arm was seen at rest; otherwise run until cancelled."""
         loop = asyncio.get_running_loop()
         resend_at, rests = loop.time() + RESEND_S, 0
         proofs = self._proofs()
@@ -102,7 +102,7 @@ class Stopper:
             try:
                 rests = rests + 1 if await proofs[0]() else 0
             except DeviceError as error:
-                # This question gets no answer; the next one may.
+                # This call fails; the next one may not.
                 failures.append(error)
                 rests = 0
                 proofs.pop(0)
@@ -119,7 +119,7 @@ class Stopper:
 
 
 async def _stands_still(way: Controller) -> bool:
-    """Whether the tip moves, for a controller that does not answer what its queue does."""
+    """Whether the tip stays where it is, for a controller that does not report its queue."""
     before = await way.pose()
     await asyncio.sleep(STILL_S)
     moved_mm, turned_deg = distance(before, await way.pose())
@@ -140,11 +140,11 @@ def _acknowledged(done: set[asyncio.Task[None]], failures: list[DeviceError]) ->
 KEY = "brushloop"
 NOTHING, PROTECTIVE_STOP = 0, 3
 FEEDINGS = 4
-"""Per timeout: three may be lost."""
+"""Times per timeout that it is fed: three may be lost."""
 
 
 class Watchdog:
-    """Armed while the arm is enabled; fed over the connection that telemetry uses."""
+    """The controller's watchdog: armed while the arm is enabled, fed over the connection that telemetry uses."""
 
     def __init__(self, connection: RpcConnection, timeout_s: float | None, on_notice: Callable[[str], None]) -> None:
         self._connection = connection
@@ -158,7 +158,7 @@ class Watchdog:
         return self._feeding is not None
 
     async def arm(self) -> None:
-        """Arm it and go on feeding it; a controller without one is reported, not refused."""
+        """Arm it and keep feeding it; a controller without one is reported, not refused."""
         if self.armed or self._timeout_s is None:
             return
         try:
@@ -172,14 +172,14 @@ class Watchdog:
         self._feeding = asyncio.create_task(self._feed(self._timeout_s), name="robot watchdog")
 
     async def disarm(self) -> None:
-        """End feeding, and tell the controller. Where it cannot be told, the watchdog bites: the arm stops."""
+        """Stop feeding and disarm it. Where the controller cannot be reached, the watchdog fires: the arm stops."""
         if self.armed and self._timeout_s is not None:
             await self.abandon()
             with contextlib.suppress(DeviceError):
                 await self._set(self._timeout_s, NOTHING)
 
     async def abandon(self) -> None:
-        """End feeding and leave it armed, so that it bites."""
+        """Stop feeding and leave it armed, so that it fires."""
         feeding, self._feeding = self._feeding, None
         if feeding is not None:
             feeding.cancel()
@@ -188,7 +188,7 @@ class Watchdog:
     async def _feed(self, timeout_s: float) -> None:
         while True:
             await asyncio.sleep(timeout_s / FEEDINGS)
-            # What fails here fails for telemetry too, and shows there; the controller stops the arm by itself.
+            # A failure here shows in telemetry too; the controller stops the arm by itself.
             with contextlib.suppress(DeviceError):
                 await self._set(timeout_s, PROTECTIVE_STOP)
 

@@ -1,4 +1,4 @@
-"""Where the arm is, all the time: pushed by the controller over RTDE, or asked for again and again."""
+"""The arm's pose, continuously: pushed by the controller over RTDE, or polled."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from drivers.samples import Pose, PoseSample, Stamp
 POSE_SEGMENT = "R1_actual_TCP_pose"
 JOINTS_SEGMENT = "R1_actual_q"
 MOST_SILENCES = 3
-"""Of half a second each, in a row: a machine that is busy may be silent for one or two."""
+"""Silences in a row, of half a second each: a busy machine may cause one or two."""
 GIVE_UP_S = 2.0
 
 
@@ -44,14 +44,14 @@ class Telemetry:
         return "RTDE" if self._stream is not None else "polling"
 
     async def start(self) -> None:
-        """Take the first pose, then go on until `stop`. Raises what asking for the first pose raises."""
+        """Take the first pose, then continue until `stop`. Raises as the call for the first pose does."""
         await self.read()
         if self._options.rtde_port is not None:
             await self._subscribe(self._options.rtde_port)
         self._task = asyncio.create_task(self._run(), name="robot telemetry")
 
     async def stop(self) -> None:
-        """End it; the newest pose stays and grows stale."""
+        """End telemetry; the newest pose stays and grows stale."""
         task, self._task = self._task, None
         if task is not None:
             task.cancel()
@@ -69,7 +69,7 @@ class Telemetry:
 
     @contextlib.contextmanager
     def seeing(self) -> Generator[list[Pose]]:
-        """Collect every pose that comes within the block, those included that come too late to be stamped."""
+        """Collect every pose that arrives within the block, also those that arrive too late to be stamped."""
         self._seen = seen = []
         try:
             yield seen
@@ -77,7 +77,7 @@ class Telemetry:
             self._seen = None
 
     async def reaching(self, target: Pose, tolerance: Tolerance) -> None:
-        """Wait until a pose at `target` has come: all before it have come by then. Gives up after `GIVE_UP_S`."""
+        """Wait until a pose at `target` has arrived, and with it all earlier ones. Gives up after `GIVE_UP_S`."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(GIVE_UP_S):
                 while self._latest is None or not tolerance.holds(self._latest.pose, target):
@@ -113,7 +113,7 @@ class Telemetry:
             await asyncio.sleep(due - loop.time())
 
     async def _listen(self, stream: RtdeStream) -> None:
-        """Take what is pushed. A short silence is bridged by asking: what piled up meanwhile will still come."""
+        """Take what is pushed. A short silence is bridged by polling: what piled up meanwhile will still come."""
         silences = 0
         while True:
             try:

@@ -16,16 +16,16 @@ from drivers.geometry import distance
 from drivers.samples import Pose
 
 RESTS_ELSEWHERE_S = 1.0
-"""An accepted move may not have started yet; an arm that rests elsewhere for so long will not start."""
+"""An accepted move may not have started yet; an arm that rests elsewhere for this long will not start."""
 
 STUCK_S = 3.0
 PROGRESS = 0.05
-"""mm or deg nearer that count as coming nearer."""
+"""mm or deg by which the arm must come nearer to count as moving on."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """How near is there."""
+    """Distance and angle within which the arm counts as arrived."""
 
     position_mm: float
     rotation_deg: float
@@ -59,7 +59,7 @@ async def until_settled(
 ) -> None:
     """Return once the queue is empty, the arm steady and the pose within tolerance.
 
-    Raises `RobotNotSafe`, or `MotionFailed` where the arm rests elsewhere, or where twice the planned time has gone
+    Raises `RobotNotSafe`, or `MotionFailed` where the arm rests elsewhere, or where twice the planned time has passed
     and it comes no nearer: a pendant whose speed is turned down is slow, not stuck.
     """
     loop = asyncio.get_running_loop()
@@ -100,7 +100,7 @@ def _not_arrived(what: str) -> MotionFailed:
         DEVICE,
         "moveLine",
         what,
-        condition="The arm was told to stop.",
+        condition="A stop was sent to the arm.",
         remedy="Check on the pendant whether the target is within reach.",
     )
 
@@ -115,21 +115,21 @@ class Messages:
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
         self._seen = 0
-        """The controller's own stamp; its unit is not known, its order is."""
+        """The controller's own stamp; its unit is unknown, but it rises."""
 
     async def begin(self) -> None:
-        """Forget what is already there; it is about somebody else's motion."""
+        """Skip the messages that are already there; they concern earlier motion."""
         await self._new()
 
     async def explain(self, error: MotionFailed) -> MotionFailed:
-        """`OutOfReach` where a new message says so, else the error itself."""
+        """`OutOfReach` where a new message reports it, else the error itself."""
         for code in await self._new():
             if code in PLANNING_FAILED:
                 return OutOfReach(DEVICE, error.op, code, PLANNING_FAILED[code])
         return error
 
     async def _new(self) -> list[int]:
-        """Codes of the messages that were not seen before; none where the controller cannot tell."""
+        """Codes of the messages that were not seen before; none where the controller does not answer."""
         found: Any = []
         with contextlib.suppress(DeviceError):
             found = await self._controller.ask("Trace.peek", num=NEWEST, last_time=self._seen)

@@ -1,4 +1,4 @@
-"""Whether a frame can be believed: black, saturated, torn, frozen and late ones are named and passed over."""
+"""Whether a frame is valid: black, saturated, torn, frozen and late ones are named and skipped."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SAMPLE_STEP = 7
-"""Every so many pixels in each direction are looked at; a prime, so that no pattern hides between them."""
+"""Pixels are sampled at this step in both directions; a prime, so that no pattern hides between them."""
 BLACK_BELOW = 25
 SATURATED_SHARE = 0.5
 TORN_BAND_SHARE = 0.02
@@ -45,7 +45,7 @@ class FrameHealth:
     """Judges the frames of one camera in the order in which they arrive."""
 
     def __init__(self, *, latency_ns: int, frozen_after: int, live: bool, independent: bool = False) -> None:
-        """`independent`: each frame is coded by itself; pixels of the one before are then the decoder's doing."""
+        """`independent`: each frame is coded by itself; pixels of the one before then come from the decoder."""
         self._latency_ns = latency_ns
         self._frozen_after = frozen_after
         self._live = live
@@ -56,15 +56,15 @@ class FrameHealth:
         self._last_ns: int | None = None
         self._periods: deque[int] = deque(maxlen=PERIODS_KEPT)
         self._backlog = 0
-        """How many frames may still have waited while nobody read."""
+        """How many frames may still have waited in a buffer."""
         self.counts: Counter[Fault] = Counter()
         self.repeated = False
-        """The frame judged last is the one before it again: nothing new, though as yet no fault."""
+        """Whether the last frame equals the one before it: nothing new, though not yet a fault."""
 
     def judge(self, image: NDArray[np.uint8], arrival_ns: int) -> Fault | None:
         """The first fault found in an (h, w) or (h, w, 3) uint8 frame, or None."""
         fault = self._look(image)
-        # Clock and digest go on also for a frame that is faulty otherwise.
+        # Clock and digest are kept up to date for faulty frames too.
         digest = zlib.crc32(image[::SAMPLE_STEP].tobytes())
         same, self._last_digest = digest == self._last_digest, digest
         self.repeated = self._live and same
@@ -82,9 +82,9 @@ class FrameHealth:
         """`3 black, 1 torn`, or empty."""
         return ", ".join(f"{count} {fault}" for fault, count in sorted(self.counts.items()))
 
-    def told(self, fault: Fault) -> str:
-        """What to look for now, where that is known, and how many frames of each kind were passed over."""
-        return f"{LIKELY.get(fault, '')}frames passed over: {self.summary()}"
+    def describe(self, fault: Fault) -> str:
+        """The likely cause, where it is known, and how many frames of each kind were skipped."""
+        return f"{LIKELY.get(fault, '')}frames skipped: {self.summary()}"
 
     def _look(self, image: NDArray[np.uint8]) -> Fault | None:
         import numpy as np
@@ -100,7 +100,7 @@ class FrameHealth:
         return None
 
     def _is_patched(self, image: NDArray[np.uint8], same: bool) -> bool:
-        """True where the end of the frame is to the bit that of the last whole one, while the frame is another.
+        """True where the end of the frame equals that of the last whole one bit for bit, while the rest differs.
 
         FFmpeg fills what is missing of a JPEG with the picture before: half of a photograph would be an old one.
         """
@@ -118,7 +118,7 @@ class FrameHealth:
         return self._equal + 1 >= self._frozen_after
 
     def _is_late(self, arrival_ns: int) -> bool:
-        """True for what had waited in a buffer while nobody read: arrival then says nothing about exposure."""
+        """True for a frame that had waited in a buffer: its arrival says nothing about its exposure."""
         gap_ns = arrival_ns - self._last_ns if self._last_ns is not None else 0
         self._last_ns = arrival_ns
         if len(self._periods) < 3:
@@ -127,7 +127,7 @@ class FrameHealth:
         usual_ns = max(sorted(self._periods)[len(self._periods) // 2], 1)
         stalled = gap_ns > max(3 * usual_ns, self._latency_ns)
         if stalled:
-            # No more can have waited than came in the gap: a camera whose period was misjudged is not late for ever.
+            # No more can have waited than came in the gap: so a camera whose period was misjudged recovers.
             self._backlog = 1 + gap_ns // usual_ns
         if self._backlog == 0:
             self._periods.append(gap_ns)

@@ -1,8 +1,8 @@
 """A camera that is read without pause, so that no frame is older than it looks.
 
 An unread capture hands back frames that are seconds old (its buffer cannot be shortened). A grabber thread
-reads all the time and keeps only the newest sound frame; `fresh` then waits for one that was exposed late enough.
-A live source that ends is opened again, and says so.
+reads all the time and keeps only the newest valid frame; `fresh` then waits for one that was exposed late enough.
+A live source that ends is opened again, with a notice.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class OpenCvCamera:
         self._condition = threading.Condition()
         self._newest: Frame | None = None
         self._trouble = ""
-        """Why no sound frame comes, for the message of a timeout."""
-        self._told = False
+        """Why no valid frame arrives, for the message of a timeout."""
+        self._reported = False
         self._ended: DeviceError | None = None
         self._closing = threading.Event()  # one for each grabber: an old one that hangs must not wake up again
         self._thread: threading.Thread | None = None
@@ -47,7 +47,7 @@ class OpenCvCamera:
         self._simulated = False
 
     async def connect(self) -> Identity:
-        """Start the grabber and wait for its first sound frame. Raises `ConnectionLost`, `DeviceError`, ..."""
+        """Start the grabber and wait for its first valid frame. Raises `ConnectionLost`, `DeviceError`, ..."""
         self._newest, self._ended, self._trouble, self._closing = None, None, "", threading.Event()
         self._thread = threading.Thread(target=self._grab, args=(self._closing,), name="camera grabber", daemon=True)
         self._thread.start()
@@ -61,7 +61,7 @@ class OpenCvCamera:
         return Identity(DEVICE, f"{self._options.source} {width}x{height}{locked}", "", self._simulated)
 
     async def fresh(self, after: Stamp) -> Frame:
-        """The first sound frame exposed after `after.host_ns`. Raises `DeviceTimeout`, `ConnectionLost`."""
+        """The first valid frame exposed after `after.host_ns`. Raises `DeviceTimeout`, `ConnectionLost`."""
         if self._thread is None:
             raise NotConnected(DEVICE, "fresh", "not connected")
         return await asyncio.to_thread(self._wait_for, after.host_ns)
@@ -91,7 +91,7 @@ class OpenCvCamera:
                 raise DeviceTimeout(
                     DEVICE,
                     "fresh",
-                    f"no sound new frame from {self._options.source} in {self._options.timeout_s:g} s{why}",
+                    f"no valid new frame from {self._options.source} in {self._options.timeout_s:g} s{why}",
                     remedy="Check cable, light and stream; the arm does not move meanwhile.",
                 )
             frame = late_enough()
@@ -122,7 +122,7 @@ class OpenCvCamera:
                 if not source.live:
                     raise ConnectionLost(DEVICE, "read", f"{self._options.source} ended")
                 lost_ns = self._clock.now_ns()
-                self._tell_trouble("the stream ended and is opened again")
+                self._report("the stream ended and is opened again")
                 closing.wait(REOPEN_AFTER_S)
         except DeviceError as error:
             self._end(error, closing)
@@ -131,7 +131,7 @@ class OpenCvCamera:
             raise
 
     def _read_all(self, source: Source, closing: threading.Event, opening_ns: int) -> None:
-        """Read until the source ends; only sound frames are kept."""
+        """Read until the source ends; only valid frames are kept."""
         import cv2
 
         self.settings, self._simulated = source.settings, source.simulated
@@ -142,7 +142,7 @@ class OpenCvCamera:
             live=source.live,
             independent=source.independent,
         )
-        first, sound_ns = True, opening_ns
+        first, valid_ns = True, opening_ns
         while not closing.is_set():
             image = source.read()
             arrival_ns = self._clock.now_ns()
@@ -152,10 +152,10 @@ class OpenCvCamera:
                 image = cast("NDArray[np.uint8]", cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
             fault = health.judge(image, arrival_ns)
             if fault is not None:
-                # Single ones happen; a second without a sound frame is worth a word.
-                self._tell_trouble(health.told(fault), aloud=arrival_ns - sound_ns > LASTING_NS)
+                # Single ones happen; a second without a valid frame is reported.
+                self._report(health.describe(fault), aloud=arrival_ns - valid_ns > LASTING_NS)
                 continue
-            sound_ns = arrival_ns
+            valid_ns = arrival_ns
             if health.repeated:
                 continue  # it arrived now, but was exposed when its first copy was
             # The first frame was read to learn the format, and waited until the capture was open.
@@ -164,15 +164,15 @@ class OpenCvCamera:
             with self._condition:
                 seq = self._newest.stamp.seq + 1 if self._newest is not None else 0
                 self._newest = Frame(Stamp(arrival_ns, None, seq), exposed_ns, image)
-                self._trouble, self._told = "", False
+                self._trouble, self._reported = "", False
                 self._condition.notify_all()
 
-    def _tell_trouble(self, text: str, *, aloud: bool = True) -> None:
+    def _report(self, text: str, *, aloud: bool = True) -> None:
         with self._condition:
             self._trouble = text
-            tell = aloud and not self._told
-            self._told = self._told or tell
-        if tell:
+            notify = aloud and not self._reported
+            self._reported = self._reported or notify
+        if notify:
             self._on_notice(f"camera: {text}")
 
     def _end(self, error: DeviceError, closing: threading.Event) -> None:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 DEVICE = "camera"
 LOOPBACK_SERVER = "brushloop-loopback"
-"""What the loopback camera calls itself in HTTP; no camera maker does."""
+"""The loopback camera's HTTP server name; no camera maker uses it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Locked:
     """Turns autofocus off."""
 
     def wanted(self) -> dict[str, float]:
-        """The settings that are asked for, by name."""
+        """The settings to lock, by name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: float(value) for name, value in values.items() if value is not None}
 
@@ -56,7 +56,7 @@ class CameraOptions:
     folder_fps: float = 10.0
     """Pace at which a folder of images is shown."""
     frozen_after: int = 5
-    """So many equal frames in a row mean that the camera has stopped looking; real ones have noise."""
+    """Equal frames in a row that mean a frozen camera; real frames have noise."""
 
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg"}
@@ -77,14 +77,14 @@ class Source(Protocol):
     """What was read back, by name."""
 
     simulated: bool
-    """True for the loopback camera, which says so itself, and for recordings, which show no ink of this session."""
+    """True for the loopback camera, which identifies itself, and for recordings, which show no ink of this session."""
 
     def read(self) -> NDArray[np.uint8] | None:
         """The next frame, gray or BGR; None at the end."""
         ...
 
     def release(self) -> None:
-        """Let go of the device."""
+        """Release the device."""
         ...
 
 
@@ -96,7 +96,7 @@ def open_source(options: CameraOptions) -> Source:
 
 
 def says_loopback(url: str) -> bool:
-    """Whether an HTTP server calls itself the loopback camera; False where it cannot be asked."""
+    """Whether an HTTP server identifies itself as the loopback camera; False where it does not answer."""
     if not url.startswith("http://"):
         return False
     parts = urlsplit(url)
@@ -111,7 +111,7 @@ def says_loopback(url: str) -> bool:
 
 
 class FolderSource:
-    """The images of a folder in order of name, at a steady pace, the last one for ever."""
+    """The images of a folder in order of name, at a steady pace; the last one is repeated without end."""
 
     def __init__(self, options: CameraOptions) -> None:
         folder = Path(options.source)
@@ -138,7 +138,7 @@ class FolderSource:
         return cast("NDArray[np.uint8]", image)
 
     def release(self) -> None:
-        """Nothing to let go of."""
+        """Nothing to release."""
 
 
 class CaptureSource:

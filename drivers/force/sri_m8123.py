@@ -25,13 +25,13 @@ MIN_ALIKE_ROUNDS = 10
 """Fewer may be alike by chance, on a sensor that is slow or coarse."""
 MAX_BIAS_S = 60.0
 MORE_BIAS_S = 1.0
-"""By so much it averages longer where too little came."""
+"""Extra time of averaging where too few rounds came."""
 NO_BIAS: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class SriOptions:
-    """Which bus the board is on and what to believe of it."""
+    """Which bus the board is on, and which samples to accept."""
 
     interface: str = "socketcan"
     channel: str = "can0"
@@ -41,7 +41,7 @@ class SriOptions:
     port: int | None = None
     stale_after_ms: float = 100.0
     stuck_after_ms: float = 100.0
-    """Rounds that come for so long and are alike to the last bit in all six values are those of a stuck sensor."""
+    """Time over which rounds that are equal to the last bit in all six values mean a stuck sensor."""
     connect_timeout_s: float = 2.0
     round_ms: float = 5.0
     """The longest from the first to the third frame of a round. Shorter than the sensor's period, or two rounds that
@@ -116,7 +116,7 @@ class SriM8123:
         except BaseException:
             await self.close()
             raise
-        # The board does not tell who it is. Nothing real can be on a virtual bus, nor on the loopback rig's.
+        # The board has no identification. No real board can be on a virtual bus or on the loopback rig's bus.
         return Identity(DEVICE, f"SRI M8123B2 on {stream.channel_info}", "", stream.virtual)
 
     def latest_n(self) -> tuple[float, float, float]:
@@ -155,7 +155,7 @@ class SriM8123:
             stream.collecting = rounds
             try:
                 await asyncio.sleep(seconds)
-                if len(rounds) < MIN_BIAS_ROUNDS:  # a busy computer: so few would tell nothing
+                if len(rounds) < MIN_BIAS_ROUNDS:  # a busy computer: so few say nothing about stillness
                     await asyncio.sleep(MORE_BIAS_S)
             finally:
                 stream.collecting = None

@@ -23,7 +23,7 @@ BUS_OFF = 0x40
 """Bit of an error frame's id (Linux `can/error.h`): the controller took itself off the bus."""
 RATE_WINDOW = 200
 SILENT_S = 1.0
-"""A board that streamed and then sends nothing for so long is lost: a gateway that goes away never says so."""
+"""A board that streamed and then sends nothing for this long is lost: a gateway that goes away gives no notice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,14 +86,14 @@ class RoundStream:
         self._rounds = self._gaps = self._bus_errors = 0
         self.newest: tuple[Stamp, Wrench] | None = None
         self.alike = 0
-        """Rounds that were exactly as the one before, up to the newest; a strain gauge is never that still."""
+        """Newest rounds in a row that equal the one before exactly; a strain gauge is never that still."""
         self.alike_since_ns = 0
-        """When the first that was like the newest came."""
+        """When the first round equal to the newest came."""
         self.loss: Loss | None = None
         self.channel_info = ""
         self.virtual = False
         self.collecting: list[Wrench] | None = None
-        """Where every round is put while somebody averages."""
+        """Collects every round while an average is taken."""
         self._thread = threading.Thread(target=self._run, name="force reader", daemon=True)
 
     def start(self) -> None:
@@ -145,7 +145,7 @@ class RoundStream:
     def _open(self) -> can.BusABC:
         settings = self._settings
         # Only what was asked for: python-can would also read can.ini, the environment and the home folder.
-        # A frame that comes in two pieces is none of the operator's business; a lost one shows in the counts.
+        # The library warns of frames that come in two pieces, which are harmless; a lost one shows in the counts.
         logging.getLogger("can").setLevel(logging.ERROR)
         gateway: dict[str, Any] = {} if settings.host is None else {"host": settings.host, "port": settings.port}
         return can.Bus(settings.channel, settings.interface, ignore_config=True, bitrate=settings.bitrate, **gateway)

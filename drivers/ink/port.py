@@ -21,7 +21,7 @@ from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, LimitExce
 
 
 class InkRefused(DeviceError):
-    """The device understood the request and refused it; `code` is its own number for the reason."""
+    """The device understood the request and refused it; `code` is the device's number for the reason."""
 
     def __init__(self, device: str, op: str, code: int, text: str, *, condition: str = "", remedy: str = "") -> None:
         self.code = code
@@ -70,7 +70,7 @@ class DoseBudget:
 
 
 MAX_REPLY_BYTES = 4096
-"""Far above any reply; a device that chatters without end must not fill the memory."""
+"""Far above any reply; a device that sends without end must not fill the memory."""
 POLL_S = 0.02
 REPLUG = "Check cable, power and the path of the port, then connect again."
 
@@ -125,7 +125,7 @@ class SerialPort:
     async def exchange(
         self, op: str, request: bytes, find: Callable[[bytes], T | None], *, timeout_s: float, condition: str = ""
     ) -> T:
-        """Send `request`, then show all that arrives to `find` until it makes something of it.
+        """Send `request`, then pass all bytes received so far to `find` until it returns a reply.
 
         Raises `DeviceTimeout` where nothing came, `ProtocolViolation` where something else came, `ConnectionLost`,
         `NotConnected`, each with `condition`.

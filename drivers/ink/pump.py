@@ -193,8 +193,8 @@ class ModbusPump:
 
         The reply to a write is the request itself, so an echo would pass for a pump that obeys.
         """
-        sound = write_register(self._options.unit, RUN_REGISTER, STOP)
-        damaged = sound[:-2] + bytes(byte ^ 0xFF for byte in sound[-2:])
+        intact = write_register(self._options.unit, RUN_REGISTER, STOP)
+        damaged = intact[:-2] + bytes(byte ^ 0xFF for byte in intact[-2:])
         try:
             await self._port.exchange(
                 "connect",

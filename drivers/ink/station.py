@@ -25,7 +25,7 @@ _NUMBER = re.compile(r"[0-9]{1,6}(\.[0-9]{1,6})?")
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A sound line: its sequence number and what it says."""
+    """A valid line: its sequence number and its text."""
 
     number: int
     text: str
@@ -33,7 +33,7 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """`ok` with its values, or `err` with `code` above zero and a text."""
+    """The reply `ok` with its values, or `err` with `code` above zero and a text."""
 
     values: tuple[str, ...] = ()
     code: int = 0
@@ -41,7 +41,7 @@ class Reply:
 
 
 def seal(number: int, text: str) -> bytes:
-    """A line as it goes over the wire. Raises ValueError where it would not be a line."""
+    """A line as sent over the wire. Raises ValueError for text that a line cannot carry."""
     body = f"{number:03d} {text}".encode("ascii")
     line = b"%b*%04X\n" % (body, crc16(body))
     if not 0 <= number < NUMBERS or len(line) > MAX_LINE_BYTES or not _SEALED.fullmatch(line):
@@ -64,7 +64,7 @@ def unseal(line: bytes) -> Line:
 def find_reply(received: bytes, number: int) -> Reply | None:
     """The first whole reply to request `number`; None while there is none.
 
-    Noise, echoes, damaged lines and replies to other requests are passed over: the sender asks again in time.
+    Noise, echoes, damaged lines and replies to other requests are skipped: the sender asks again in time.
     """
     *lines, _ = received.split(b"\n")
     for raw in lines:
@@ -97,7 +97,7 @@ MODEL = "ink-station"
 PROTOCOL = "1"
 SMALLEST_ML = 0.001
 FAILED = 6
-"""The one refusal after which something may have been done."""
+"""The only refusal after which something may have been done."""
 REMEDIES = {
     1: "The firmware is older than this software; update it.",
     3: "The station's own limit is lower than the configured one; set the configured one to match.",
@@ -151,7 +151,7 @@ class InkStation:
     async def dose(self, volume_ml: float) -> None:
         """Add ink to the well; returns when it is in. Raises `LimitExceeded`, `InkRefused`, `DeviceError`.
 
-        It cannot be interrupted once it was sent, which is why one dose is small.
+        It cannot be interrupted once it is sent, which is why a dose is small.
         """
         self._budget.take(volume_ml, self._clock.now_ns())
         unknown = f"Between 0 and {volume_ml:.3f} ml may be in the well."

@@ -172,6 +172,6 @@ async def test_a_camera_that_only_shows_black_times_out_and_says_so(monkeypatch:
 
     monkeypatch.setattr(cv2, "VideoCapture", Dark)
     with pytest.raises(
-        DeviceTimeout, match=r"The picture is black: lens covered or light off\? frames passed over: \d+ black"
+        DeviceTimeout, match=r"The picture is black: lens covered or light off\? frames skipped: \d+ black"
     ):
         await OpenCvCamera(CameraOptions("0", timeout_s=0.5), CLOCK).connect()

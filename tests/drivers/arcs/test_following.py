@@ -126,7 +126,7 @@ async def test_a_stop_in_mid_path_ends_it_and_no_line_follows(
 ):
     await arm.stop()
     assert await rests_short(cabinet)
-    with pytest.raises(MotionFailed, match="told to stop"):
+    with pytest.raises(MotionFailed, match="was stopped"):
         await way
 
 

@@ -112,7 +112,7 @@ async def test_a_connection_that_is_lost_before_the_path_is_let_go_leaves_the_ar
 async def test_a_stop_before_the_path_is_let_go_drops_it(arm: AuboArcs, cabinet: ArcsServer, method: str):
     stops: list[asyncio.Task[None]] = []
     before_each(cabinet, method, lambda now: stops.append(asyncio.create_task(arm.stop())) if now == 1 else None)
-    with pytest.raises(MotionFailed, match="told to stop"):
+    with pytest.raises(MotionFailed, match="was stopped"):
         await arm.sequence(PRESS, acc_mm_s2=ACC)
     await asyncio.gather(*stops)
     assert z_mm(cabinet) == HOME.z_mm
