@@ -1,4 +1,4 @@
-"""What the loopback rig is: its truth, which the software under test may only find out by measuring."""
+"""Configuration of the loopback rig: its truth, which the software under test may only find out by measuring."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Table:
     paper_z_mm: float = 120.0
     """Of the sheet at its origin; the well stands at this height too."""
     slope_deg: tuple[float, float] = (0.0, 0.0)
-    """How the sheet is turned about paper x (its far edge rises) and about paper y (its right edge falls)."""
+    """Rotation of the sheet about paper x (its far edge rises) and about paper y (its right edge falls)."""
     sheet_mm: tuple[float, float] = (244.0, 172.0)
     board_origin_mm: tuple[float, float] = (-34.0, -34.0)
     """Lower left corner of the ChArUco board, in the paper frame. The sheet lies on it, so that corners are seen all
@@ -73,7 +73,7 @@ class View:
     shadow: float = 0.0
     """Light that a soft-edged shadow across the sheet takes away, 0 to 1."""
     glare: float = 0.0
-    """Gray levels that the reflection of a lamp adds where it is brightest; wet ink throws it back as paper does."""
+    """Gray levels that the reflection of a lamp adds where it is brightest; wet ink reflects it as paper does."""
     glare_mm: tuple[float, float] = (122.0, 86.0)
     """Where it lies, in the paper frame."""
     glare_sigma_mm: float = 6.0
@@ -84,9 +84,9 @@ class View:
     fps: float = 8.0
     jpeg_quality: int = 95
     delay_s: float = 0.0
-    """Real seconds that a picture waits before it is sent, besides drawing and coding it."""
+    """Real seconds that a picture waits before it is sent, on top of drawing and coding it."""
     delay_jitter_s: float = 0.0
-    """Up to so much more, at random; pictures never overtake each other."""
+    """Largest extra delay, at random; pictures never overtake each other."""
     delay_drift: float = 0.0
     """Seconds by which the delay grows in each second of the stream."""
     stamp_strip: bool = False
@@ -108,9 +108,9 @@ class SimConfig:
     home_mm: tuple[float, float, float] = (250.0, -230.0, 260.0)
     """Where the tip rests when the rig starts, in the base frame."""
     ink_device: Literal["station", "pump", "none"] = "station"
-    """What stands at the well: an ink station, a Modbus pump, or a person with a bottle."""
+    """The device at the well: an ink station, a Modbus pump, or none (a person with a bottle)."""
     reservoir_ml: float = 100.0
-    """What the ink device can still give."""
+    """Ink that the device can still give."""
     force_sensor: bool = True
     """Whether a force sensor sits between flange and brush."""
     force_hz: float = 200.0
@@ -122,7 +122,7 @@ class SimConfig:
     hanging_kg: float = 0.12
     """Holder and brush below the sensor."""
     tool_mm: float = 180.0
-    """True length from the flange to the tip, along the flange's z: what an operator measures and configures."""
+    """True length from the flange to the tip, along the flange's z: which an operator measures and configures."""
     brush: BrushSpec = field(default_factory=BrushSpec)
     table: Table = field(default_factory=Table)
     view: View = field(default_factory=View)

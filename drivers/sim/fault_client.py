@@ -1,4 +1,4 @@
-"""`brushloop fault`: says one thing to the control socket of a rig and prints what it answers."""
+"""`brushloop fault`: sends one request to the control socket of a rig and prints the answer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PLAIN = ("list", "clear", "state", "release", "fresh-sheet")
 
 
 class FaultRefused(Exception):
-    """Nobody listens, or the rig did not take it."""
+    """No rig listens, or the rig refused the request."""
 
     exit_code: ClassVar[int] = 2
 

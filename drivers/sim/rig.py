@@ -22,7 +22,7 @@ from drivers.sim.rig_toml import PUMP_ML, Addresses, rig_toml
 from drivers.sim.world import World
 
 HOST = "127.0.0.1"
-"""Not configurable: nothing off this machine may ever drive or watch a simulated arm by mistake."""
+"""Not configurable: no other machine may drive or watch a simulated arm by mistake."""
 TICK_S = 0.002
 IDLE_TICK_S = 0.02
 
@@ -31,14 +31,14 @@ class Failing(Protocol):
     """A simulated instrument that keeps its own list of faults: `PtyLine`, `ForceBoard`."""
 
     def fail(self, *faults: Any) -> None:
-        """Let the next requests or rounds meet these, one each."""
+        """Apply these faults to the next requests or rounds, one each."""
         ...
 
 
 class Faults:
-    """Puts one board in every server of a rig, watches for faults that begin by themselves, and is the person there.
+    """The faults of a rig: one board for all servers, a watch for those that begin by themselves, and the person there.
 
-    `ink` and `force` are None in a rig without them; faults of theirs are refused then.
+    `ink` and `force` are None in a rig without them; their faults are refused then.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Faults:
         self._watching: asyncio.Task[None] | None = None
 
     def hang(self, fault: Fault) -> int:
-        """Hang one; returns its number. Raises ValueError for a device that the rig does not have."""
+        """Put a fault on the board; return its number. Raises ValueError for a device that the rig does not have."""
         if fault.device in self._instruments and self._instruments[fault.device] is None:
             raise ValueError(f"device = {fault.device.value!r}: this rig has none")
         return self.board.hang(fault)
@@ -70,7 +70,7 @@ class Faults:
         self._watching = asyncio.create_task(self._watch(), name="faults")
 
     async def stop(self) -> None:
-        """End watching; what hangs stays."""
+        """End watching; faults stay on the board."""
         task, self._watching = self._watching, None
         if task is not None:
             task.cancel()
@@ -98,7 +98,7 @@ class Faults:
         self._world.fresh_sheet()
 
     def state(self) -> dict[str, Any]:
-        """What the world knows now, as JSON."""
+        """State of the world now, as JSON."""
         cabinet = self._arcs.cabinet
         x_mm, y_mm, z_mm = self._world.tool().position_mm
         return {
@@ -146,11 +146,11 @@ class LoopbackRig:
 
     async def __aenter__(self) -> LoopbackRig:
         try:
-            await asyncio.to_thread(self.world.reaction.prepare)  # both the cabinet and the sensor tell the push
             await self.arcs.start(HOST, self.config.arcs_port)
             await self.rtde.start(HOST, self.config.rtde_port)
             await self.camera.start(HOST, self.config.camera_port)
             if self.force is not None:
+                await asyncio.to_thread(self.world.reaction.prepare)  # some tenths of a second, so not in the loop
                 await self.force.start(HOST, self.config.force_port)
             if self.ink is not None:
                 self.ink.__enter__()
@@ -203,7 +203,7 @@ def _force(world: World) -> SocketcandServer:
     board = ForceBoard(
         lambda _t_s: world.wrench(), noise_n=config.force_noise_n, noise_nm=config.force_noise_nm, seed=config.seed
     )
-    return SocketcandServer(board, world.clock, world.reaction, rate_hz=config.force_hz)
+    return SocketcandServer(board, world.clock.now_s, rate_hz=config.force_hz)
 
 
 def _ink(world: World, device: Literal["station", "pump"]) -> Instrument:

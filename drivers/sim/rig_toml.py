@@ -1,4 +1,4 @@
-"""The `rig.toml` of the loopback rig: what an operator would have taught, small errors included."""
+"""The `rig.toml` of the loopback rig: as an operator would have taught it, small errors included."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from drivers.sim.config import SimConfig
 
 LOOPBACK_HEAD = "# The loopback rig"
 TAUGHT_TOUCH_ERROR_MM = 0.03
-"""Nobody teaches a touch height exactly."""
+"""Error of a taught touch height."""
 SEEN_S = 0.05
-"""Real time that a pose needs to be seen in."""
+"""Real time within which a pose is seen by polling."""
 PUMP_ML = 0.1
-"""What one revolution of the loopback pump delivers."""
+"""Delivery of the loopback pump, ml per revolution."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,14 +119,14 @@ port = {at.force_port}
 
 
 def _dwell(config: SimConfig) -> str:
-    """Where time runs faster than life, a tenth of a second is over before anybody looks."""
+    """Where simulated time is fast, a tenth of a second of it passes between two polls."""
     if config.rate <= 2.0:
         return ""
     return f"least_dwell_s = {SEEN_S * config.rate:g}    # simulated time runs {config.rate:g} times as fast as life\n"
 
 
 def _staleness(config: SimConfig) -> str:
-    """As of a real sensor, unless time runs faster than life: then no time of the host's means anything to the arm."""
+    """As for a real sensor, unless simulated time is fast: then the age of a sample says nothing about the arm."""
     if config.rate <= 1.0:
         return "stale_ms = 100.0\n"
     return (

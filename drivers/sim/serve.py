@@ -84,7 +84,7 @@ async def _serve(
 
 
 class RigFileExists(Exception):
-    """The file cannot be written: there is no such folder, or it is not a loopback rig's and may be a lab's own."""
+    """The file cannot be written: there is no such folder, or no loopback rig wrote it, so it may be a lab's own."""
 
     exit_code: ClassVar[int] = 2
 
@@ -97,7 +97,7 @@ def _refuse_to_overwrite(path: Path) -> None:
 
 
 def _write_whole(path: Path, text: str) -> None:
-    """Whoever waits for the file sees all of it or none."""
+    """Write the file so that a reader sees all of it or none."""
     part = path.with_name(path.name + ".part")
     part.write_text(text, encoding="utf-8")
     part.replace(path)
@@ -115,7 +115,7 @@ FIELDS: dict[str, tuple[str, ...]] = {
     "release": (),
     "fresh-sheet": (),
 }
-"""What may stand beside `do`."""
+"""Other keys allowed with each `do`."""
 USAGE = (
     'not a request: {"do": "add", "fault": {...}}, or "list", "clear" (with a number "id" or without), '
     '"state", "release", "fresh-sheet"'
@@ -141,7 +141,7 @@ class ControlServer(LoopbackServer):
         self._made = (0, 0)
 
     async def open(self, path: Path) -> None:
-        """Listen at `path`. Raises `ControlPathError`; a socket that a dead rig left there is replaced."""
+        """Listen at `path`. Raises `ControlPathError`; the socket of a rig that has ended is replaced."""
         listener = _listener(path)
         made = path.stat()
         self._path, self._made = path, (made.st_dev, made.st_ino)
@@ -172,7 +172,7 @@ class ControlServer(LoopbackServer):
             await writer.drain()
 
     def answer(self, line: bytes) -> dict[str, Any]:
-        """What a request gets; never raises for what a client says."""
+        """The answer to a request; never raises, whatever a client sends."""
         try:
             request: Any = json.loads(line)
         except (ValueError, RecursionError):
@@ -192,7 +192,7 @@ class ControlServer(LoopbackServer):
             case "add", dict(values), _:  # pyright: ignore[reportUnknownVariableType]
                 return {"id": self._faults.hang(fault_of(values))}  # pyright: ignore[reportUnknownArgumentType]
             case "list", _, _:
-                return {"hanging": [_told(h) for h in board.hanging], "over": [_told(h) for h in board.over]}
+                return {"hanging": [_as_json(h) for h in board.hanging], "over": [_as_json(h) for h in board.over]}
             case "clear", _, None:
                 return {"taken": board.clear()}
             case "clear", _, int(ident) if not isinstance(ident, bool):
@@ -220,7 +220,7 @@ async def live_control(faults: Faults, path: Path | None) -> AsyncGenerator[None
         await server.stop()
 
 
-def _told(hung: Hung) -> dict[str, Any]:
+def _as_json(hung: Hung) -> dict[str, Any]:
     fault = hung.fault.model_dump(mode="json", exclude_defaults=True)
     return {"id": hung.ident, "fault": fault, "struck": hung.struck}
 
@@ -239,7 +239,7 @@ def _listener(path: Path) -> socket.socket:
         raise ControlPathError(path, f"the path of a socket has at most {MAX_PATH_BYTES} bytes")
     _clear_away(path)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    # Set before the path exists: nobody may slip in between `bind` and a later `chmod`.
+    # Set before the path exists: with a later `chmod` another user could connect in between.
     mask = os.umask(0o177)
     try:
         listener.bind(str(path))
@@ -253,7 +253,7 @@ def _listener(path: Path) -> socket.socket:
 
 
 def _clear_away(path: Path) -> None:
-    """Remove a socket on which nobody listens; refuse anything else that is there."""
+    """Remove a socket without a listener; refuse anything else that is there."""
     try:
         mode = path.lstat().st_mode
     except OSError:

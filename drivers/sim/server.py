@@ -1,4 +1,4 @@
-"""What the loopback servers share: a listener, its clients, and an end that leaves nothing behind."""
+"""Base of the loopback servers: a listener, its clients, and a clean end."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class LoopbackServer(abc.ABC):
 
     @abc.abstractmethod
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Speak to one client until it goes away; may raise what its going away raises."""
+        """Serve one client until it goes away; may raise the errors of a connection that ends."""
 
     async def start(self, host: str, port: int) -> None:
-        """Listen; `port` 0 lets the system choose, `self.port` tells.
+        """Listen; with `port` 0 the system chooses `self.port`.
 
         Raises `NotLoopback` unless `host` is a loopback address; a name could resolve to anything.
         """
@@ -52,7 +52,7 @@ class LoopbackServer(abc.ABC):
             await self._server.wait_closed()
 
     def drop_clients(self) -> None:
-        """Close every connection from the server's side (also a fault that tests script)."""
+        """Close every connection from the server's side."""
         for task in list(self._clients):
             task.cancel()
 

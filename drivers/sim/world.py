@@ -1,4 +1,4 @@
-"""One truth: where the tool is, whether it touches the paper or the ink, and what that leaves behind."""
+"""The simulated world: where the tool is, whether it touches paper or ink, and the mark that this leaves."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class SimClock:
 
 
 BRUSH_ML = 0.5
-"""What a dry brush takes up."""
+"""Ink that a dry brush takes up."""
 
 
 class Well:
-    """Ink in a pot whose bottom is at height 0."""
+    """The ink well, a straight pot whose bottom is at height 0: dips lower its level, doses raise it."""
 
     def __init__(self, ml: float, capacity_ml: float, ml_per_mm: float = 1.0) -> None:
         self.ml = ml
@@ -66,11 +66,11 @@ class Well:
         return min(1.0, self.ml / self.capacity_ml)
 
     def add(self, volume_ml: float) -> None:
-        """A dose; what does not fit runs over."""
+        """Add a dose; what does not fit runs over."""
         self.ml = min(self.capacity_ml, self.ml + volume_ml)
 
     def dip(self, ink_load: float) -> float:
-        """Fill a brush that holds `ink_load` (0 to 1); returns what it holds then."""
+        """Fill a brush that holds `ink_load` (0 to 1); return its new load."""
         taken_ml = min(self.ml, (1.0 - ink_load) * BRUSH_ML)
         self.ml -= taken_ml
         return ink_load + taken_ml / BRUSH_ML
@@ -82,7 +82,7 @@ INK_PER_PRESS = 0.12
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """One contact of brush and paper, as it really happened: the answer sheet for tests."""
+    """One contact of brush and paper as it really happened, for tests to compare with."""
 
     index: int
     x_mm: float
@@ -92,7 +92,7 @@ class Press:
     heading_deg: float
     ink_load: float
     flaw: Flaw | None = None
-    """What is wrong with the mark: scripted, a split that came by itself, or what the ink load makes of it."""
+    """The flaw of the mark: scripted, a split that came by itself, or caused by the ink load."""
     severity: float = 0.0
 
 
@@ -126,7 +126,7 @@ class World:
         self.presses: list[Press] = []
         self.drags: list[Drag] = []
         self.flaws: dict[int, tuple[Flaw, float]] = {}
-        """Flaw and severity to come, by the index of the press; severity 0 rules out that it splits by itself."""
+        """Scripted flaw and severity by the index of the press; severity 0 rules out a split by itself."""
         self.ink_load = 0.0
         table = config.table
         self.well = Well.round(table.well_radius_mm, table.ink_level_mm, table.well_depth_mm)
@@ -139,7 +139,7 @@ class World:
         self.motion = ArmQueue(brush_pose(*config.home_mm), self._travelled, tool)
 
     def flaw_next(self, flaw: Flaw, severity: float = 1.0) -> None:
-        """Let something go wrong with the next press to lift off; raises ValueError unless severity is in 0 .. 1."""
+        """Give the next press to lift off a flaw; raises ValueError unless severity is in 0 .. 1."""
         if not 0.0 <= severity <= 1.0:
             raise ValueError(f"severity = {severity:g} is outside 0 .. 1")
         self.flaws[len(self.presses)] = (flaw, severity)
@@ -154,7 +154,7 @@ class World:
         return self.motion.pose(self.clock.now_s())
 
     def wrench(self) -> Wrench:
-        """What the force sensor feels now, in the tool's frame."""
+        """Wrench on the force sensor now, in the tool's frame."""
         tip = self.tool()
         x_mm, y_mm, depth_mm = self._on_sheet(tip)
         return self.reaction.wrench(tip, 0.0 if self._in_well(x_mm, y_mm) else depth_mm, self._normal)
@@ -204,7 +204,7 @@ class World:
         self.paper.lay_later(make, x_mm, y_mm, heading_deg)
         want = flaw_of_load(self.ink_load)
         if want is Flaw.BLANK or (flaw is None and want is not None):
-            # nothing was put on the hairs, or nothing of it shows
+            # there is no ink on the hairs, or too little for the mark
             flaw, severity = want, 1.0 - self.ink_load
         self.presses.append(Press(index, x_mm, y_mm, depth_mm, tilt_deg, heading_deg, self.ink_load, flaw, severity))
         self.ink_load = max(0.0, self.ink_load - INK_PER_PRESS)
@@ -233,7 +233,7 @@ class World:
         self.version += 1
 
     def _flaw(self, index: int, depth_mm: float) -> tuple[Flaw | None, float]:
-        """What the hairs of this press suffer from: what was scripted, or a split that comes by itself."""
+        """The flaw of this press: the scripted one, or a split that comes by itself."""
         if index in self.flaws:
             flaw, severity = self.flaws[index]
         else:

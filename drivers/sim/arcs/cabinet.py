@@ -1,7 +1,7 @@
-"""The loopback cabinet: an arm's motion, tool, safety and watchdogs, whoever asks for them and however.
+"""The loopback cabinet: an arm's motion, tool, safety and watchdogs, independent of the wire.
 
-It keeps the parts that a driver can get wrong: refusals by return code, poses that are accepted first and fail in
-planning, a path that a protective stop keeps. It fakes no accuracy and no safety function.
+It simulates what a driver can get wrong: refusals by return code, poses that are accepted first and fail in planning, a
+path that a protective stop keeps. It simulates neither accuracy nor safety functions.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Params = dict[str, Any]
 
 
 class Cabinet:
-    """What the methods of the controller act on. The tip is where the world says; the joints follow from it."""
+    """State behind the controller's methods. The world decides where the tip is; the joints follow from it."""
 
     def __init__(self, world: World) -> None:
         self.world = world
@@ -80,7 +80,7 @@ class Cabinet:
 
     @property
     def tcp_offset(self) -> list[float]:
-        """Flange to tool centre point as configured: [x, y, z m, rx, ry, rz rad]. It moves no real tip."""
+        """Flange to tool centre point as configured: [x, y, z m, rx, ry, rz rad]. The true tip stays where it is."""
         return self._tcp_offset
 
     @tcp_offset.setter
@@ -97,7 +97,7 @@ class Cabinet:
         return self._tool
 
     def tcp(self) -> Pose:
-        """Where the configured tool centre point is: what the controller takes for the tip."""
+        """Pose of the configured tool centre point, which the controller takes for the tip."""
         return self.configured(self.world.tool())
 
     def configured(self, tip: Pose) -> Pose:
@@ -160,14 +160,14 @@ class Cabinet:
         return ReturnCode.OK
 
     def set_watchdog(self, key: str, timeout_s: float, action: int) -> int:
-        """Start it again from now; action 0 ends it. Its time is real time, as its client's is."""
+        """Start it again from now; action 0 ends it. It counts real time, as its client does."""
         if action not in (0, 1, 2, 3) or not timeout_s >= 0.1:
             return -ReturnCode.INVALID_ARGUMENT
         if (timer := self._timers.pop(key, None)) is not None:
             timer.cancel()
         self.watchdogs[key] = (timeout_s, action)
         if action:
-            self._timers[key] = asyncio.get_running_loop().call_later(timeout_s, self._bite, key, action)
+            self._timers[key] = asyncio.get_running_loop().call_later(timeout_s, self._fire, key, action)
         return ReturnCode.OK
 
     def close(self) -> None:
@@ -176,7 +176,7 @@ class Cabinet:
             timer.cancel()
         self._timers.clear()
 
-    def _bite(self, key: str, action: int) -> None:
+    def _fire(self, key: str, action: int) -> None:
         self._timers.pop(key, None)
         match action:
             case 1:

@@ -1,4 +1,4 @@
-"""The loopback cabinet's power and safety states: what takes time, and what only a person may clear."""
+"""The loopback cabinet's power and safety states: their delays, and the stops that only a person may clear."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Power:
         self._then((0.0, RobotMode.POWER_OFF))
 
     def release_emergency_stop(self) -> None:
-        """A person releases the button. That alone brings nothing back: the board is restarted, then the power."""
+        """A person releases the button. The board must then be restarted, then the power."""
         self.button_down = False
 
     def reset_safeguard(self) -> None:

@@ -1,4 +1,4 @@
-"""The loopback controller's RTDE port: it greets, and pushes what clients subscribe to at the frequency they ask."""
+"""The loopback controller's RTDE port: it greets, and pushes samples to subscribers at the frequency they ask for."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ MAX_HZ = 500.0
 BACKLOG_BYTES = 32 * 1024
 """A client that does not read is sent nothing more until it has caught up."""
 MALFORMED = b"\xff\x81"
-"""A break where a value should be: neither CBOR nor JSON."""
+"""A CBOR break instead of a value: neither CBOR nor JSON."""
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """What one client wants on one channel."""
+    """One client's subscription on one channel."""
 
     chanel: int
     period_s: float
@@ -41,7 +41,7 @@ class RtdeServer(LoopbackServer):
     def __init__(self, cabinet: Cabinet) -> None:
         super().__init__()
         self.faults = FaultBoard(Truth(cabinet.world))
-        """What goes wrong here; a rig puts one board in all its servers."""
+        """Faults of this server; a rig shares one board among all its servers."""
         self._cabinet = cabinet
         self._muted: int | None = None
         self.pings = 0
@@ -102,8 +102,8 @@ class RtdeServer(LoopbackServer):
             await asyncio.sleep(due - loop.time())
 
     def _rests(self, after_s: float, until_s: float) -> list[Rest]:
-        """Where the arm rested between two pushes. A clock that runs faster than life leaves so much between them that
-        a whole press might pass unseen."""
+        """Where the arm rested between two pushes. With fast simulated time a whole
+        press might otherwise pass between two pushes."""
         world = self._cabinet.world
         world.motion.advance(until_s)
         return [rest for rest in world.motion.rests if after_s < rest.at_s <= until_s] if world.clock.rate > 1.0 else []
@@ -135,7 +135,7 @@ class RtdeServer(LoopbackServer):
 
 
 def topic_of(payload: bytes) -> Topic:
-    """What a client asks for; a period of 0 where it unsubscribes. Raises `ProtocolViolation`."""
+    """The subscription in a payload; a period of 0 where the client unsubscribes. Raises `ProtocolViolation`."""
     match decode_message(payload, "rtde"):
         case (100, [{"chanel": int(chanel), "frequency": float() | int() as hz, "segments": list(names)}]):  # pyright: ignore[reportUnknownVariableType]
             wanted = tuple(str(name) for name in names)  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]

@@ -26,7 +26,7 @@ from drivers.sim.world import World
 
 PIECE_S = 0.001
 CUTS = (2, 6, 9)
-"""Within the mark, within the length, and just behind the head of a frame."""
+"""Cuts within the magic bytes, within the length, and just after the head of a frame."""
 GARBAGE = b"\x00\xffnothing that anyone speaks\r\n"
 
 
@@ -35,7 +35,7 @@ class Dropped(ConnectionError):
 
 
 class Replies:
-    """The way of one connection's replies to its client, faults included."""
+    """Replies of one connection on their way to the client, faults included."""
 
     def __init__(self, writer: asyncio.StreamWriter, frame: Callable[[bytes], bytes]) -> None:
         self._writer = writer
@@ -43,7 +43,7 @@ class Replies:
         self._late: set[asyncio.TimerHandle] = set()
 
     async def send(self, answer: bytes, fault: Fault | None) -> None:
-        """Send the answer, or what the fault makes of it. Raises `Dropped`."""
+        """Send the answer as the fault changes it. Raises `Dropped`."""
         match fault.kind if fault is not None else "":
             case "mute":
                 return
@@ -91,7 +91,7 @@ class Replies:
 
 
 def _with_another_id(answer: bytes) -> bytes:
-    """A sound reply to a request that nobody made; the login's reply has no id and becomes one that has."""
+    """A valid reply to another request; the login's reply, which has no id, becomes one with an id."""
     try:
         body = json.loads(answer)
     except ValueError:
@@ -112,9 +112,9 @@ class ArcsServer(LoopbackServer):
         self._world = world
         self.cabinet = Cabinet(world)
         self.faults = FaultBoard(Truth(world))
-        """What goes wrong here; a rig puts one board in all its servers."""
+        """Faults of this server; a rig shares one board among all its servers."""
         self._mutes: dict[str, int] = {}
-        """Faults that `mute` and `mute_to` have hung, by method; "" is any."""
+        """Faults that `mute` and `mute_to` have added, by method; "" is any."""
         self._methods = methods(self.cabinet)
 
     async def stop(self) -> None:
@@ -200,7 +200,7 @@ class ArcsServer(LoopbackServer):
                 try:
                     payloads = decoder.feed(data)
                 except ProtocolViolation as error:
-                    if bare:  # a peer that speaks JSON is told before it is hung up on
+                    if bare:  # a peer that speaks JSON gets an error before the connection is closed
                         writer.write(_error(None, PARSE_ERROR, f"parse error: {error.what}"))
                     raise
                 for payload in payloads:

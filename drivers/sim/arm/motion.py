@@ -1,7 +1,7 @@
 """The loopback arm's motion: a queue of moves with trapezoidal timing and rounded corners, evaluated when asked.
 
-Nothing depends on when it is asked. A move that comes later may change how an earlier one ends, but only where that
-agrees with all that was done by then; otherwise the arm comes to rest between the two.
+The result does not depend on when it is asked for. A later move may change how an earlier one ends, but only where that
+agrees with the motion so far; otherwise the arm comes to rest between the two.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SAME_POSE_MM = 1e-4
 SAME_POSE_DEG = 1e-4
 RESTS_KEPT = 64
 AGREES = 1e-6
-"""mm, rad or those per second: two timings that differ by less are one."""
+"""mm, rad or those per second: two timings that differ by less count as equal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Segment:
     stop_s: float | None = None
     stop_acc: float = 0.0
     stops: bool = False
-    """True where it is on the way to a rest that was asked for."""
+    """True for a piece that brakes for a stop or hold."""
 
     @property
     def end_s(self) -> float:
@@ -70,7 +70,7 @@ class Segment:
         return self.path.joints(self.enter + self.at(now_s)[0])
 
     def way(self) -> list[Pose]:
-        """The straight stretches that it was, as their ends."""
+        """The travelled path as the ends of straight stretches."""
         total = self.at(self.end_s)[0]
         pieces = self.path.stretches
         return [self.path.pose(self.enter + total * k / pieces) for k in range(pieces + 1)]
@@ -78,18 +78,18 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class Rest:
-    """The tip came to rest here, be it for a moment."""
+    """Time and place at which the tip came to rest, even for a moment."""
 
     at_s: float
     pose: Pose
 
 
 class MotionQueue:
-    """First in, first out. `on_path(start, end)` is told of every stretch once it has been travelled."""
+    """A queue of moves. `on_path(start, end)` is called for every stretch once it has been travelled."""
 
     def __init__(self, home: Pose, on_path: Callable[[Pose, Pose], None], capacity: int = 64) -> None:
         self.fraction = 1.0
-        """Share of its speed at which every move runs that has not begun."""
+        """Share of its speed for every move that has not begun."""
         self.near: Joints = HOME
         """The joints where the arm was last seen: where inverse kinematics begins."""
         self._rest = home

@@ -21,7 +21,7 @@ STRETCHES = 16
 
 
 class Path(Protocol):
-    """A way of `length` mm, or rad where `angular`."""
+    """A path of `length` mm, or rad where `angular`."""
 
     @property
     def length(self) -> float:
@@ -43,12 +43,12 @@ class Path(Protocol):
         ...
 
     def joints(self, done: float) -> Joints | None:
-        """The joints there, where the way is given in joints."""
+        """The joints there, where the path is given in joints."""
         ...
 
 
 class InSpace:
-    """A way that is given in space alone."""
+    """A path that is given in space only."""
 
     def joints(self, done: float) -> Joints | None:
         """None: not given in joints."""
@@ -76,12 +76,12 @@ class Line(InSpace):
 
     @property
     def length(self) -> float:
-        """Of the way, or of the turn."""
+        """Length of the line, or of the turn."""
         return self._measure[1] if self.angular else self._measure[0]
 
     @property
     def stretches(self) -> int:
-        """1 unless the tip goes round a wrong tool centre point."""
+        """1 unless the true tip circles a wrongly configured tool centre point."""
         return 1 if self.fix is None or self._measure[1] < TURN_RAD else STRETCHES
 
     def along(self, done: float) -> Pose:
@@ -107,7 +107,7 @@ class Corner(InSpace):
 
     @property
     def length(self) -> float:
-        """What is cut off; the curve itself is shorter."""
+        """Length that the corner replaces; the curve itself is shorter."""
         return 2.0 * self.cut
 
     @cached_property

@@ -80,7 +80,7 @@ def paced(length: float, speed: float, acc: float, duration_s: float, rests: int
 
 SHORTEST_CUT = 1e-6
 SLACK = 1e-9
-"""Rounding of speeds; a plan that needs more is none."""
+"""Tolerance of speeds for rounding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +140,7 @@ def pieces_of(
 ) -> list[Piece]:
     """The moves with their corners, in order. `first_cap` is the speed of a first move that has begun already.
 
-    `corners_known` is looked into and added to.
+    `corners_known` is read and extended.
     """
     corners: list[Corner | None] = []
     for a, b in itertools.pairwise(moves):

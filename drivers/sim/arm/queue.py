@@ -64,7 +64,7 @@ class ArmQueue(MotionQueue):
             return
         moves, planned = self._moves, list(self._queue)
         resting = self._brake(acc_mm_s2, acc_rad_s2, now_s)
-        # what was already braking has forgotten where it was going; what was queued behind it has not begun
+        # a move that was already braking has lost its target; moves queued behind it have not begun
         self._held = moves if resting is None else []
         if resting is None:
             return

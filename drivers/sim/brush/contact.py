@@ -1,4 +1,4 @@
-"""One contact of brush and paper, from touching to lifting off, cut out of the path of the tip."""
+"""One contact of brush and paper, from touching to lifting off, from the path of the tip."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class ContactWatch:
 
 
 def _sideways_mm(a: Pose, b: Pose) -> float:
-    """Way along the paper or across the brush's axis, whichever is shorter."""
+    """Travel along the paper or across the brush's axis, whichever is shorter."""
     way = np.subtract(b.position_mm, a.position_mm)
     axis = Rotation.from_quat(b.quaternion).as_matrix()[:, 2]
     return min(math.hypot(way[0], way[1]), float(np.linalg.norm(way - (way @ axis) * axis)))

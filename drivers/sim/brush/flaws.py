@@ -1,6 +1,6 @@
-"""What goes wrong in a press, and how each flaw changes the lie and the ink of the hairs.
+"""Flaws of a press, and how each changes the place and the ink of the hairs.
 
-A flaw is put on top of the mechanics of a sound press: forces and the shape of the spine stay as they are.
+A flaw is added to the mechanics of a flawless press: forces and the shape of the spine do not change.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ SPLIT_DEPTH_MM = 3.0
 """Shallower presses do not push the hairs apart."""
 
 FAINT_LOAD, DRY_LOAD, BLANK_LOAD = 0.5, 0.3, 0.02
-"""Ink loads below which a sound brush leaves a faint, a dry, a blank mark."""
+"""Ink loads below which a flawless brush leaves a faint, a dry, a blank mark."""
 
 
 class Flaw(StrEnum):
@@ -85,7 +85,7 @@ class Trouble:
         return ink_load * (1.0 - SPENT * self.severity) if self.flaw is Flaw.DRY else ink_load
 
     def flow(self, flow: Vector) -> Vector:
-        """Ink flow (m,) per hair, given that of a sound press."""
+        """Ink flow (m,) per hair, given that of a flawless press."""
         if self.flaw is Flaw.BLANK:
             return np.zeros_like(flow)
         if self.flaw is Flaw.DRY:
@@ -139,7 +139,7 @@ def natural_split(ink_load: float, depth_mm: float, rng: np.random.Generator) ->
 
 
 def flaw_of_load(ink_load: float) -> Flaw | None:
-    """What a mark suffers from for want of ink alone; None where there is enough."""
+    """The flaw of a mark that lack of ink alone causes; None where there is enough."""
     if ink_load <= BLANK_LOAD:
         return Flaw.BLANK
     if ink_load <= DRY_LOAD:

@@ -1,4 +1,4 @@
-"""Ink on paper: how a sheet takes up what is offered, and the whole sheet, footprint by footprint."""
+"""Ink on paper: how a sheet takes up the ink offered, and the whole sheet, footprint by footprint."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ class Paper:
 
     @property
     def density(self) -> NDArray[np.float32]:
-        """Ink per area, (rows, columns), 0 to 1, with every mark that was announced."""
+        """Ink per area, (rows, columns), 0 to 1, with every mark laid so far."""
         with self._lock:
             while self._coming:
                 make, x_mm, y_mm, heading_deg = self._coming[0]
@@ -135,9 +135,9 @@ class Paper:
             self._density = density
 
     def lay_later(self, make: Callable[[], Footprint], x_mm: float, y_mm: float, heading_deg: float) -> None:
-        """Lay what `make` returns before anybody next looks at the sheet, in whatever thread looks.
+        """Lay the footprint that `make` returns when the sheet is read next, in the reader's thread.
 
-        A footprint takes a tenth of a second to work out; whoever moves the arm has no such time.
+        A footprint takes a tenth of a second to compute, too long for the thread that moves the arm.
         """
         self.presses += 1
         self._coming.append((make, x_mm, y_mm, heading_deg))

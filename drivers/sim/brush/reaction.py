@@ -1,4 +1,4 @@
-"""What the force sensor between flange and brush feels: the bundle's push, and the weight of what hangs below it."""
+"""Wrench on the force sensor between flange and brush: the bundle's push, and the weight below the sensor."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Reaction:
     """The wrench for a pose of the tip above or in the paper.
 
     The push comes from the same spine as the ink, on the way down. Friction along the paper, the pull of the menisci
-    and the slack on the way up are left out: what a press leaves here is its normal force.
+    and the hysteresis on the way up are left out: only the normal force of a press remains.
     """
 
     def __init__(self, brush: Brush, *, sensor_to_tip_mm: float, hanging_kg: float) -> None:

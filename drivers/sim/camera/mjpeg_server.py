@@ -29,7 +29,7 @@ def dark(shape: tuple[int, ...], seed: int) -> NDArray[np.uint8]:
     return np.random.default_rng(seed).integers(0, NOISE_LEVELS, shape, np.uint8)
 
 
-def retold(jpeg: bytes, number: int) -> bytes:
+def renumbered(jpeg: bytes, number: int) -> bytes:
     """The same picture in other bytes: a JPEG comment with a number, after the two bytes of the start."""
     text = b"%d" % number
     comment = b"\xff\xfe" + (len(text) + 2).to_bytes(2, "big") + text
@@ -37,7 +37,7 @@ def retold(jpeg: bytes, number: int) -> bytes:
 
 
 def torn(jpeg: bytes) -> bytes:
-    """The first half, with a sound end mark: the rest never arrived."""
+    """The first half with a valid end mark: the rest never arrived."""
     return jpeg[: len(jpeg) // 2] + b"\xff\xd9"
 
 
@@ -49,7 +49,7 @@ BACKLOG = 64
 
 
 class _Line:
-    """One client's connection, over which pictures come as late as the view says; none overtakes another."""
+    """One client's connection with the view's delay; no picture overtakes another."""
 
     def __init__(self, view: View, writer: asyncio.StreamWriter) -> None:
         self._view = view
@@ -78,7 +78,7 @@ class MjpegServer(LoopbackServer):
     """Serves `/stream.mjpg`. A client that does not drain is sent the newest image next, never a backlog."""
 
     def __init__(self, scene: Scene, *, fps: float, jpeg_quality: int, view: View | None = None) -> None:
-        """`view` tells how late pictures are sent; left out, at once."""
+        """`view` gives the delay of pictures; without it they are sent at once."""
         super().__init__()
         self._scene = scene
         self._view = view or View()
@@ -88,7 +88,7 @@ class MjpegServer(LoopbackServer):
         self._coded: deque[tuple[NDArray[np.uint8], bytes]] = deque(maxlen=NOISE_FIELDS)
         """The newest images of the scene, which are handed out again while nothing changes, and their JPEGs."""
         self.faults: FaultBoard | None = None
-        """What goes wrong here; a rig puts one board in all its servers."""
+        """Faults of this server; a rig shares one board among all its servers."""
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer any request with the stream."""
@@ -118,7 +118,7 @@ class MjpegServer(LoopbackServer):
                     held.append(await self._jpeg(black=True))
                     shown = await self._send(held, line)
                 case "frozen":
-                    held.append(retold(shown or await self._jpeg(), time.time_ns()))
+                    held.append(renumbered(shown or await self._jpeg(), time.time_ns()))
                     shown = await self._send(held, line)
                 case kind if kind in SPOILED:
                     held.append(SPOILED[kind](await self._jpeg()))

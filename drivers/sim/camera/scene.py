@@ -30,26 +30,26 @@ class Optics:
         f, cx, cy = float(view.width_px), (view.width_px - 1) / 2, (view.height_px - 1) / 2
         self.camera_matrix: Floats = np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
         self.distortion: Floats = np.array([view.k1, 0.0, 0.0, 0.0])
-        self._map = self._straight_places(view) if view.k1 else None
+        self._map = self._undistorted_places(view) if view.k1 else None
 
     def image_of(self, paper_mm: Floats) -> Floats:
         """(n, 2) pixels (centres on integers) of (n, 2) points of the paper plane, distortion included."""
         mapped = np.column_stack([paper_mm, np.ones(len(paper_mm))]) @ self.homography.T
-        straight = mapped[:, :2] / mapped[:, 2:]
-        rays = np.column_stack([straight, np.ones(len(straight))]) @ np.linalg.inv(self.camera_matrix).T
+        undistorted = mapped[:, :2] / mapped[:, 2:]
+        rays = np.column_stack([undistorted, np.ones(len(undistorted))]) @ np.linalg.inv(self.camera_matrix).T
         none = np.zeros(3)
-        bent, _ = cv2.projectPoints(rays[:, None], none, none, self.camera_matrix, self.distortion)
-        return np.asarray(bent, np.float64).reshape(-1, 2)
+        distorted, _ = cv2.projectPoints(rays[:, None], none, none, self.camera_matrix, self.distortion)
+        return np.asarray(distorted, np.float64).reshape(-1, 2)
 
-    def distort(self, straight: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def distort(self, undistorted: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """An image as this lens would have taken it; the same where the lens is perfect."""
         if self._map is None:
-            return straight
-        bent = cv2.remap(straight, self._map, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return cast("NDArray[np.uint8]", bent)
+            return undistorted
+        distorted = cv2.remap(undistorted, self._map, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return cast("NDArray[np.uint8]", distorted)
 
-    def _straight_places(self, view: View) -> NDArray[np.float32]:
-        """(h, w, 2): for every pixel of the bent image, its place in the straight one."""
+    def _undistorted_places(self, view: View) -> NDArray[np.float32]:
+        """(h, w, 2): for every pixel of the distorted image, its place in the undistorted one."""
         columns, rows = np.meshgrid(np.arange(view.width_px), np.arange(view.height_px))
         pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(np.float64)
         places = cv2.undistortPoints(pixels, self.camera_matrix, self.distortion, P=self.camera_matrix)
@@ -79,7 +79,7 @@ def _light(view: View, rng: np.random.Generator) -> NDArray[np.float32]:
 
 
 def _glare(view: View, paper_to_image: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Gray levels (h, w) that a lamp's reflection adds; it is far larger than what the lens could bend."""
+    """Gray levels (h, w) that a lamp's reflection adds; the lens's distortion of it is left out."""
     u, v, scale = paper_to_image @ np.array([*view.glare_mm, 1.0])
     x, y = np.arange(view.width_px) - u / scale, np.arange(view.height_px)[:, None] - v / scale
     sigma_px = view.glare_sigma_mm * view.px_per_mm

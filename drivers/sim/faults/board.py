@@ -1,4 +1,4 @@
-"""The board on which faults hang until they strike; every server of the rig looks at it before it answers."""
+"""The board of faults: every server of the rig asks it, before it answers, whether a fault strikes."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from drivers.sim.faults.kinds import Device, Fault
 from drivers.sim.faults.phases import Phase
 
 KEPT = 100
-"""Faults that are over and still told."""
+"""Finished faults that are still listed."""
 MOST = 1000
-"""Faults that may hang at once."""
+"""Most faults on the board at once."""
 
 
 class Watched(Protocol):
@@ -31,13 +31,13 @@ class Watched(Protocol):
         ...
 
     def phase(self) -> Phase:
-        """What the arm does."""
+        """Phase of the arm."""
         ...
 
 
 @dataclass(slots=True)
 class Hung:
-    """A fault on the board and how far it has got."""
+    """A fault on the board and its progress."""
 
     ident: int
     fault: Fault
@@ -45,11 +45,11 @@ class Hung:
     """Requests that matched before it began."""
     struck: int = 0
     until_s: float | None = None
-    """Real time at which `for_s` is over, once it has begun."""
+    """Real time at which `for_s` is over; None before it begins."""
 
 
 class FaultBoard:
-    """Faults in the order in which they were hung; of several that match one request the first strikes it.
+    """Faults in the order in which they were added; of several that match one request the first strikes it.
 
     `hang`, `take` and `clear` may come from any thread; the rest belongs to the event loop of the rig.
     """
@@ -63,7 +63,7 @@ class FaultBoard:
         """The newest faults whose extent is over."""
 
     def hang(self, fault: Fault) -> int:
-        """Arm a fault; returns the number by which it can be taken down. Raises ValueError above `MOST`."""
+        """Add a fault; return the number by which it can be removed. Raises ValueError above `MOST`."""
         if len(self._hanging) >= MOST:
             raise ValueError(f"{MOST} faults hang already")
         hung = Hung(next(self._idents), fault)
@@ -71,25 +71,25 @@ class FaultBoard:
         return hung.ident
 
     def take(self, ident: int) -> bool:
-        """Take one down; False where none of that number hangs."""
+        """Remove one; False where there is none of that number."""
         before = self._hanging
         self._hanging = tuple(hung for hung in before if hung.ident != ident)
         return len(self._hanging) < len(before)
 
     def clear(self) -> int:
-        """Take all down; returns how many hung."""
+        """Remove all; return how many there were."""
         count, self._hanging = len(self._hanging), ()
         return count
 
     @property
     def hanging(self) -> tuple[Hung, ...]:
-        """What waits or strikes."""
+        """Faults that wait or strike."""
         self._expire()
         return self._hanging
 
     @property
     def waits_by_itself(self) -> bool:
-        """True while a fault hangs that no request will find: somebody must ask `due` now and then."""
+        """True while a fault waits that no request triggers: `due` must be polled."""
         return any(hung.fault.by_itself for hung in self._hanging)
 
     def meet(self, device: Device, op: str, kinds: frozenset[str]) -> Fault | None:
@@ -101,7 +101,7 @@ class FaultBoard:
         return None
 
     def due(self) -> list[Fault]:
-        """Faults that begin by themselves and do so now; they are over with that."""
+        """Faults that begin by themselves and do so now; they are finished with that."""
         begun = [hung for hung in self._hanging if hung.fault.by_itself and self._holds(hung.fault)]
         for hung in begun:
             hung.struck = hung.fault.strikes or 1

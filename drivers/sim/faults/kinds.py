@@ -17,7 +17,7 @@ ALWAYS = 1_000_000
 
 
 class Device(StrEnum):
-    """What breaks."""
+    """The device that fails."""
 
     ROBOT = "robot"
     """The controller's JSON-RPC port."""
@@ -91,13 +91,13 @@ KINDS: dict[Device, frozenset[str]] = {
     Device.FORCE: frozenset(kind.value for kind in ForceFault),
 }
 HANDED_OVER = frozenset({Device.INK, Device.FORCE})
-"""Their simulators keep their own list of faults, one for each of the next requests or rounds."""
+"""Devices whose simulators keep their own list of faults, one for each of the next requests or rounds."""
 
 
 class Fault(BaseModel):
     """One fault. All conditions of its trigger must hold at once; without any it begins at once.
 
-    Once begun it strikes every request, push or frame that it matches until its extent is over.
+    Once begun it strikes every matching request, push or frame until its `count` or `for_s` is over.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -105,19 +105,19 @@ class Fault(BaseModel):
     device: Device
     kind: str
     after_s: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
-    """Not before so many simulated seconds since the rig started."""
+    """Earliest beginning, in simulated seconds since the rig started."""
     on: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.]{0,79}$")] | None = None
     """Only requests of this method: `moveLine`, or in full `rob1.MotionControl.moveLine`; `login` for the login."""
     nth: Annotated[int, Field(ge=1, le=ALWAYS)] = 1
-    """It begins with the n-th request, push or frame of those for which all other conditions hold."""
+    """Begins with the n-th request, push or frame for which all other conditions hold."""
     phase: Phase | None = None
     """Begins only while the arm really does this."""
     press: Annotated[int, Field(ge=0, le=ALWAYS)] | None = None
-    """Begins only while so many presses lie on the paper: from lifting off one to lifting off the next."""
+    """Begins only while this many presses are on the paper: from lifting off one to lifting off the next."""
     count: Annotated[int, Field(ge=1, le=ALWAYS)] | None = None
-    """Strikes so many times; once where neither this nor `for_s` is given."""
+    """Number of strikes; 1 where neither this nor `for_s` is given."""
     for_s: Annotated[float, Field(gt=0.0, le=86_400.0)] | None = None
-    """Strikes for so many real seconds, as the timeouts of drivers are, from when it begins."""
+    """Duration in real seconds, as the timeouts of drivers are, from when it begins."""
     late_s: Annotated[float, Field(ge=0.001, le=60.0)] = 0.3
     """How late a `late` reply of the robot comes, in real seconds."""
 
@@ -147,11 +147,11 @@ class Fault(BaseModel):
 
     @property
     def strikes(self) -> int | None:
-        """How often; None where `for_s` ends it."""
+        """Number of strikes; None where `for_s` ends it."""
         return None if self.for_s is not None else self.count or 1
 
     def matches(self, op: str) -> bool:
-        """Whether `op`, a method's full name, is one that it waits for."""
+        """Whether the fault waits for `op`, a method's full name."""
         return self.on is None or op == self.on or op.endswith(f".{self.on}")
 
 
@@ -195,7 +195,7 @@ def load_faults(path: Path) -> tuple[Fault, ...]:
 
 
 def hang_script(path: Path, hang: Callable[[Fault], int], faults: Iterable[Fault]) -> None:
-    """Hang all of a script. Raises `FaultScriptError` for a fault of a device that the rig does not have."""
+    """Add all faults of a script. Raises `FaultScriptError` for a fault of a device that the rig does not have."""
     for index, fault in enumerate(faults):
         try:
             hang(fault)
@@ -204,7 +204,7 @@ def hang_script(path: Path, hang: Callable[[Fault], int], faults: Iterable[Fault
 
 
 def fault_of(values: dict[str, Any]) -> Fault:
-    """One fault from what a client said. Raises ValueError with one line that names the field."""
+    """One fault from a client's request. Raises ValueError with one line that names the field."""
     try:
         return Fault.model_validate(values)
     except ValidationError as error:
@@ -222,5 +222,5 @@ def complaint(error: ValidationError) -> tuple[str, str]:
 
 
 def _plain(text: str) -> str:
-    """One printable line, whatever keys somebody made up."""
+    """One printable line, whatever the file holds."""
     return "".join(char if char.isprintable() else "?" for char in text)[:300]

@@ -1,4 +1,4 @@
-"""What the arm is doing, from where its tip is and where it goes: what the world knows, not what anyone asked for."""
+"""The phase of the arm, from where its tip really is and where it goes, not from what a client asked for."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from drivers.sim.config import Table
 from drivers.sim.world import World
 
 ON_PAPER_MM = 0.1
-"""Nobody teaches the paper's height exactly: a tip that ends or rests so little above it counts as on it."""
+"""The paper's height is taught with an error: a tip that ends or rests this little above it counts as on it."""
 ALL_BUT_THERE_MM = 0.1
-"""A dwell is the end of a descent, very slow."""
+"""A dwell is the very slow end of a descent."""
 LIFT_MM = 10.0
-"""Rising counts as lifting from so low on."""
+"""Height below which rising counts as lifting."""
 HOME_MM = 1.0
 
 
 class Phase(StrEnum):
-    """One at a time; the first that fits."""
+    """What the arm is doing: the first of these that applies."""
 
     DIPPING = "dipping"
     """Over the well, and below its rim or on the way there."""
@@ -79,7 +79,7 @@ def _over_sheet(table: Table, spot: Spot) -> bool:
 
 
 class Truth:
-    """One world, seen by what a fault may wait for. To be asked in the thread that owns the world."""
+    """The facts about one world that faults may wait for. Use it in the thread that owns the world."""
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -101,7 +101,7 @@ class Truth:
         return None if line is None else line.pose(line.end_s)
 
     def phase(self) -> Phase:
-        """What the arm does now."""
+        """The phase of the arm now."""
         config, to = self._world.config, self.target()
         return phase_of(
             config.table,

@@ -22,10 +22,8 @@ from dataclasses import dataclass
 from drivers.errors import ProtocolViolation
 from drivers.force.rounds import COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, Wrench, encode_round
 from drivers.force.stream import BUS_OFF
-from drivers.sim.brush.reaction import Reaction
 from drivers.sim.faults.kinds import ForceFault
 from drivers.sim.server import LoopbackServer
-from drivers.sim.world import SimClock
 
 BUS_ERROR = 0x04
 """Class of an error frame: the controller has a problem but is on the bus."""
@@ -56,11 +54,11 @@ class ForceBoard:
         self._before: Wrench | None = None
 
     def fail(self, *faults: ForceFault) -> None:
-        """Let the next rounds meet these, one each."""
+        """Apply these faults to the next rounds, one each."""
         self._faults.extend(faults)
 
     def obey(self, frame: CanFrame) -> None:
-        """Take one frame from the bus; what is no command is not for the board."""
+        """Obey one frame from the bus; other frames than commands are ignored."""
         if frame.can_id == COMMAND_ID and not frame.error:
             self.commands.append(frame.data)
             if frame.data in (START, STOP):
@@ -104,21 +102,17 @@ BACKLOG_BYTES = 32 * 1024
 class SocketcandServer(LoopbackServer):
     """One board on one bus, for any number of clients."""
 
-    def __init__(self, board: ForceBoard, clock: SimClock, reaction: Reaction, *, rate_hz: float) -> None:
+    def __init__(self, board: ForceBoard, now_s: Callable[[], float], *, rate_hz: float) -> None:
         super().__init__()
         self.board = board
-        self._clock = clock
-        self._reaction = reaction
+        self._now_s = now_s
         self._period_s = 1.0 / rate_hz
         self._listeners: set[asyncio.StreamWriter] = set()
         self._streaming: asyncio.Task[None] | None = None
-        self._preparing: asyncio.Task[None] | None = None
 
     async def stop(self) -> None:
         """Close the listener and every client, and end the stream."""
         await super().stop()
-        if self._preparing is not None:
-            await self._preparing
         if self._streaming is not None:
             self._streaming.cancel()
             await asyncio.gather(self._streaming, return_exceptions=True)
@@ -126,8 +120,6 @@ class SocketcandServer(LoopbackServer):
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Greet, then carry frames both ways until the client goes."""
-        prepared = self._preparing or asyncio.create_task(asyncio.to_thread(self._reaction.prepare), name="force table")
-        self._preparing = prepared
         writer.write(b"< hi >")
         try:
             while True:
@@ -136,7 +128,6 @@ class SocketcandServer(LoopbackServer):
                     case ["open", name]:
                         writer.write(b"< ok >" if name == LOOPBACK_CHANNEL else b"< error could not open bus >")
                     case ["rawmode"]:
-                        await asyncio.shield(prepared)
                         writer.write(b"< ok >")
                         self._listeners.add(writer)
                     case ["send", can_id, length, *data]:
@@ -156,7 +147,7 @@ class SocketcandServer(LoopbackServer):
         loop = asyncio.get_running_loop()
         due_s = loop.time()
         while self.board.streaming and self._listeners:
-            text = "".join(_ascii(frame) for frame in self.board.round(self._clock.now_s())).encode()
+            text = "".join(_ascii(frame) for frame in self.board.round(self._now_s())).encode()
             for writer in self._listeners:
                 if not writer.is_closing() and writer.transport.get_write_buffer_size() < BACKLOG_BYTES:
                     writer.write(text)

@@ -24,11 +24,11 @@ class Instrument(Protocol):
     """The device at the other end of the line; bytes in, bytes out."""
 
     def take(self, buffer: bytearray) -> bytes | None:
-        """Cut one request off the buffer; None while it is not whole."""
+        """Remove one request from the buffer; None while it is incomplete."""
         ...
 
     def answer(self, request: bytes) -> bytes | None:
-        """Do as asked, and reply; None for silence."""
+        """Carry out the request and reply; None for silence."""
         ...
 
     def damage(self, reply: bytes) -> bytes:
@@ -36,7 +36,7 @@ class Instrument(Protocol):
         ...
 
     def mistake(self, reply: bytes) -> bytes:
-        """A sound reply, but not to this request."""
+        """A valid reply, but not to this request."""
         ...
 
 
@@ -76,7 +76,7 @@ class PtyLine:
         self._wake = (-1, -1)
 
     def fail(self, *faults: InkFault) -> None:
-        """Let the next requests meet these, one each."""
+        """Apply these faults to the next requests, one each."""
         self._faults.extend(faults)
 
     def unplug(self) -> None:

@@ -14,7 +14,7 @@ FULL_SPEED = 2
 
 
 class PumpFirmware:
-    """Turns while it runs, by `now_s`; what it has pumped can be read at any time."""
+    """A simulated pump that turns by `now_s`; its delivery can be read at any time."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class PumpFirmware:
 
     @property
     def pumped_ml(self) -> float:
-        """All that has been pumped so far."""
+        """Volume pumped so far."""
         self._settle()
         return self._pumped_ml
 
@@ -83,7 +83,7 @@ class PumpFirmware:
         return reply[:-1] + bytes([reply[-1] ^ 0x55])
 
     def mistake(self, reply: bytes) -> bytes:
-        """A sound confirmation of some other register."""
+        """A valid confirmation of another register."""
         return seal(bytes([self.unit, WRITE_REGISTER, 0x00, 0x77, 0x00, 0x00]))
 
     def _settle(self) -> None:
