@@ -150,13 +150,6 @@ async def test_no_sample_is_delivered_after_close(board: SimForceSensor, sensor:
     assert len(seen) == size
 
 
-async def test_latest_never_blocks(sensor: SriM8123):
-    began = time.monotonic()
-    for _ in range(1000):
-        sensor.latest_n()
-    assert time.monotonic() - began < 0.5
-
-
 async def test_the_rate_is_measured(sensor: SriM8123):
     await until(lambda: sensor.health().rounds >= 30)
     health = sensor.health()

@@ -44,14 +44,14 @@ class Told:
         return self.queue
 
 
-def walked(queue: MotionQueue, until_s: float) -> np.ndarray:
+def walked(queue: MotionQueue, until_s: float, dt_s: float = DT_S) -> np.ndarray:
     """(times, positions) from 0 on."""
-    times = np.arange(0.0, until_s, DT_S)
+    times = np.arange(0.0, until_s, dt_s)
     return np.array([[t, *queue.pose(t).position_mm] for t in times])
 
 
-def speeds(walk: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(np.diff(walk[:, 1:], axis=0), axis=1) / DT_S
+def speeds(walk: np.ndarray, dt_s: float = DT_S) -> np.ndarray:
+    return np.linalg.norm(np.diff(walk[:, 1:], axis=0), axis=1) / dt_s
 
 
 def test_a_corner_is_rounded_within_its_radius_and_taken_without_a_rest():
@@ -90,7 +90,7 @@ def test_a_straight_corner_is_no_corner():
 
 
 ways = st.lists(
-    st.tuples(st.floats(-80.0, 80.0), st.floats(-80.0, 80.0), st.floats(0.0, 60.0), st.floats(20.0, 200.0)),
+    st.tuples(st.floats(-80.0, 80.0), st.floats(-80.0, 80.0), st.floats(0.0, 60.0), st.floats(60.0, 200.0)),
     min_size=2,
     max_size=6,
 )
@@ -106,15 +106,15 @@ def test_no_way_is_taken_faster_or_harder_than_allowed_and_all_of_them_arrive(
         queue.add(at(x, y), v, A, 0.0, blend_mm=blend)
     fastest = max(v for *_, v in way)
     end_s = queue._queue[-1].end_s if queue._queue else 0.0
-    walk = walked(queue, min(end_s + 0.1, 30.0))
-    moving = speeds(walk)
+    coarse_s = 4 * DT_S
+    walk = walked(queue, end_s + 0.1, coarse_s)
+    moving = speeds(walk, coarse_s)
     assert moving.max() <= fastest * (1 + 1e-6)
-    change = np.linalg.norm(np.diff(walk[:, 1:], n=2, axis=0), axis=1) / DT_S**2
+    change = np.linalg.norm(np.diff(walk[:, 1:], n=2, axis=0), axis=1) / coarse_s**2
     # a straight piece slows down while the corner bends at an even speed: never both at once
     assert change.max() <= A * 1.02 + 1e-3
-    if end_s < 29.0:
-        x, y, *_ = way[-1]
-        assert np.linalg.norm(walk[-1, 1:3] - (x, y)) < 1e-3
+    x, y, *_ = way[-1]
+    assert np.linalg.norm(walk[-1, 1:3] - (x, y)) < 1e-3
 
 
 @settings(deadline=None, max_examples=20)
