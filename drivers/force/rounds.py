@@ -26,6 +26,8 @@ START = b"\x02"
 STOP = b"\x00"
 FIRST_ID = 0x291
 BITRATE = 1_000_000
+BUS_OFF = 0x40
+"""Bit of an error frame's id (Linux `can/error.h`): the controller took itself off the bus."""
 _PAIR = struct.Struct("<2f")
 
 

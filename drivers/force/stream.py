@@ -15,12 +15,10 @@ from typing import Any
 import can
 
 from drivers.clock import Clock
-from drivers.force.rounds import COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, RoundAssembler, Wrench
+from drivers.force.rounds import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, RoundAssembler, Wrench
 from drivers.samples import Stamp
 
 RECEIVE_S = 0.05
-BUS_OFF = 0x40
-"""Bit of an error frame's id (Linux `can/error.h`): the controller took itself off the bus."""
 RATE_WINDOW = 200
 SILENT_S = 1.0
 """A board that streamed and then sends nothing for this long is lost: a gateway that goes away gives no notice."""

@@ -15,11 +15,10 @@ from drivers.geometry import brush_pose, lean
 from drivers.samples import Pose
 from drivers.sim.arm.queue import ArmQueue
 from drivers.sim.brush.brush import MAX_TILT_DEG, Brush
-from drivers.sim.brush.contact import Contact, ContactWatch
+from drivers.sim.brush.contact import Contact, ContactWatch, Reaction, leaning_with
 from drivers.sim.brush.drag import Waypoint, ink_left
 from drivers.sim.brush.flaws import Flaw, flaw_of_load, natural_split
 from drivers.sim.brush.paper import Paper
-from drivers.sim.brush.reaction import Reaction, leaning_with
 from drivers.sim.config import SimConfig
 
 

@@ -1,17 +1,21 @@
-"""One contact of brush and paper, from touching to lifting off, from the path of the tip."""
+"""Contact of brush and paper: each one from touching to lifting off, and the wrench on the force sensor meanwhile."""
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drivers.geometry import interpolate
+from drivers.force.rounds import Wrench
+from drivers.geometry import interpolate, lean
 from drivers.samples import Pose
+from drivers.sim.brush.brush import Brush, BrushSpec
 
 SIDEWAYS_MM = 0.5
 """A contact that travels less far sideways is a press."""
@@ -60,3 +64,68 @@ def _sideways_mm(a: Pose, b: Pose) -> float:
     way = np.subtract(b.position_mm, a.position_mm)
     axis = Rotation.from_quat(b.quaternion).as_matrix()[:, 2]
     return min(math.hypot(way[0], way[1]), float(np.linalg.norm(way - (way @ axis) * axis)))
+
+
+TILTS_DEG = (0.0, 7.5, 15.0, 30.0)
+"""Where the push is solved for; between them it is interpolated."""
+GRAVITY_M_S2 = 9.81
+LEVEL = (0.0, 0.0, 1.0)
+
+
+class Reaction:
+    """The wrench for a pose of the tip above or in the paper.
+
+    The push comes from the same spine as the ink, on the way down. Friction along the paper, the pull of the menisci
+    and the hysteresis on the way up are left out: only the normal force of a press remains.
+    """
+
+    def __init__(self, brush: Brush, *, sensor_to_tip_mm: float, hanging_kg: float) -> None:
+        self._brush = brush
+        self._arm_m = sensor_to_tip_mm / 1e3
+        self._weight_n = hanging_kg * GRAVITY_M_S2
+        self._table: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+
+    def prepare(self) -> None:
+        """Solve the spines; takes some tenths of a second, so call it off the loop. Once is enough."""
+        if self._table is not None:
+            return
+        self._table = _pushes(self._brush.spec)
+
+    def push_n(self, depth_mm: float, tilt_deg: float) -> float:
+        """Normal force of the paper on the bundle; 0 in the air."""
+        if depth_mm <= 0.0:
+            return 0.0
+        self.prepare()
+        assert self._table is not None
+        steps_mm, rows = self._table
+        at_tilts = np.array([np.interp(depth_mm, steps_mm, rows[k]) for k in range(len(TILTS_DEG))], np.float64)
+        return float(np.interp(tilt_deg, np.array(TILTS_DEG), at_tilts))
+
+    def wrench(self, tip: Pose, depth_mm: float, normal: tuple[float, float, float] = LEVEL) -> Wrench:
+        """Force in N and torque in Nm on the sensor, in the tool's frame: z along the tool, towards the tip.
+
+        `normal` is the unit vector out of the paper, in the base frame.
+        """
+        push_n = self.push_n(depth_mm, lean(leaning_with(tip, normal))[0])
+        force_n = np.multiply(normal, push_n) - np.array([0.0, 0.0, self._weight_n])
+        fx, fy, fz = (float(v) for v in Rotation.from_quat(tip.quaternion).inv().apply(force_n))
+        return fx, fy, fz, -self._arm_m * fy, self._arm_m * fx, 0.0
+
+
+def leaning_with(pose: Pose, normal: tuple[float, float, float]) -> Pose:
+    """The pose in a frame whose z is the paper's normal, turned out of the base frame by the least angle."""
+    if normal == LEVEL:
+        return pose
+    axis = np.cross(normal, LEVEL)  # its length is the sine of the angle
+    level = Rotation.from_rotvec(axis / np.linalg.norm(axis) * math.acos(normal[2]))
+    qx, qy, qz, qw = (float(v) for v in (level * Rotation.from_quat(pose.quaternion)).as_quat())
+    return Pose(*pose.position_mm, qx, qy, qz, qw)
+
+
+@functools.lru_cache(maxsize=8)
+def _pushes(spec: BrushSpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Depths (n,) in mm and the normal force (tilts, n) in N at each."""
+    brush = Brush(spec)
+    depth_mm = brush.deepest_mm(TILTS_DEG[-1])
+    rows = [brush.push_n(depth_mm, tilt_deg) for tilt_deg in TILTS_DEG]
+    return np.linspace(0.0, depth_mm, rows[0].size), np.asarray(rows)

@@ -20,8 +20,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from drivers.errors import ProtocolViolation
-from drivers.force.rounds import COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, Wrench, encode_round
-from drivers.force.stream import BUS_OFF
+from drivers.force.rounds import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, Wrench, encode_round
 from drivers.sim.faults.kinds import ForceFault
 from drivers.sim.server import LoopbackServer
 

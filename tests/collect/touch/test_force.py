@@ -12,7 +12,7 @@ from collect.rig.config_touch import ForceTouchConfig
 from collect.touch.force import Contact, Reading, touch_by_force
 from collect.touch.heights import Reach
 from drivers.sim.brush.brush import Brush, BrushSpec
-from drivers.sim.brush.reaction import Reaction
+from drivers.sim.brush.contact import Reaction
 from drivers.sim.config import SimConfig
 
 NOISE_N = SimConfig().force_noise_n

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.geometry import brush_pose
 from drivers.samples import Pose
-from drivers.sim.brush.reaction import leaning_with
+from drivers.sim.brush.contact import leaning_with
 from drivers.sim.config import SimConfig, Table
 from drivers.sim.world import World
 
