@@ -80,7 +80,14 @@ class Lab:
         return self.folder / "sessions"
 
     def engine(
-        self, *, new: bool = False, sheet: int | None = None, armed: bool = False, watched: bool = False
+        self,
+        *,
+        new: bool = False,
+        sheet: int | None = None,
+        armed: bool = False,
+        watched: bool = False,
+        guided: bool = False,
+        preview: bool = False,
     ) -> Engine:
         rig, protocol, clock = self.folder / "rig.toml", self.folder / "protocol.toml", HostClock()
         opening = Opening.load(self.sessions, rig, protocol, new=new, sheet=sheet)
@@ -92,6 +99,8 @@ class Lab:
             clock,
             watched=watched,
             armed=armed,
+            guided=guided,
+            preview=preview,
         )
 
     def process(self) -> subprocess.Popen[str]:

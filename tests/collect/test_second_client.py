@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import functools
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -16,8 +15,7 @@ from drivers.arcs.waiting import Tolerance, until_settled
 from drivers.errors import MotionFailed, SettingsChanged
 from drivers.geometry import brush_pose, from_wire, lean, to_wire
 from sessions.journal.lines import read_lines
-from tests.collect.until import until as waited_until
-from tests.collect.until import wait_for_end
+from tests.collect.until import until, wait_for_end
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -35,9 +33,6 @@ UNDER = brush_pose(480.0, 40.0, PAPER_Z_MM - 20.0, tilt_deg=10.0)
 def lab(lab: Lab) -> Lab:
     lab.write_protocol("[11.0]", "[0.0]", repeats=2)
     return lab
-
-
-until = functools.partial(waited_until, timeout_s=60.0)
 
 
 def start_and_pause(engine: Engine) -> None:

@@ -15,7 +15,7 @@ END_S = 100.0
 """Time for a run to end, on a busy machine: less than the time-out of a test, whose message would not say as much."""
 
 
-def until(engine: Engine, condition: Callable[[Snapshot], bool], timeout_s: float = 30.0) -> Snapshot:
+def until(engine: Engine, condition: Callable[[Snapshot], bool], timeout_s: float = 60.0) -> Snapshot:
     """The first snapshot that meets the condition; fails where it does not come in time, or the run is over."""
     deadline = time.monotonic() + timeout_s
     while not condition(now := engine.snapshot()):

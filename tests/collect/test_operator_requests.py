@@ -1,47 +1,21 @@
-"""What the app asks of an engine, other than pause and stop, on the loopback rig: requests, park, guided set-up."""
+"""What an operator asks of a run by key, on the loopback rig: requests, park, and a guided set-up."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 import pytest
 
 from collect.engine.control import State
 from collect.engine.engine import Engine
-from collect.engine.opening import Opening, find_resumable, open_store
-from collect.engine.snapshot import Mark, Snapshot
+from collect.engine.snapshot import Mark
 from collect.errors import CollectAborted, NeedsOperator, Parked
 from collect.operator import OperatorRequest, OperatorRequests
-from drivers.clock import HostClock
 from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 from sessions.remarks import mark_bad_or_good
 from tests.collect.conftest import Lab
-from tests.collect.until import wait_for_end
-
-
-def engine_of(lab: Lab, *, guided: bool = False, preview: bool = False) -> Engine:
-    opening, clock = Opening.load(lab.sessions, lab.folder / "rig.toml", lab.folder / "protocol.toml"), HostClock()
-    resume = find_resumable(opening)
-    return Engine(
-        opening.rig,
-        opening.protocol,
-        lambda rig: open_store(opening, resume, rig, clock),
-        clock,
-        watched=True,
-        guided=guided,
-        preview=preview,
-    )
-
-
-def until(engine: Engine, condition: Callable[[Snapshot], bool], timeout_s: float = 60.0) -> Snapshot:
-    deadline = time.monotonic() + timeout_s
-    while not condition(now := engine.snapshot()):
-        assert time.monotonic() < deadline, now
-        assert not engine.finished, now
-        time.sleep(0.005)
-    return now
+from tests.collect.until import until, wait_for_end
 
 
 def answer(engine: Engine, words: str, key: str) -> None:
@@ -74,7 +48,7 @@ def test_a_request_made_twice_is_withdrawn_and_retake_and_skip_exclude_each_othe
 
 def test_a_stroke_is_pressed_again_on_a_new_cell_because_the_operator_asked(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
-    engine = engine_of(lab)
+    engine = lab.engine(watched=True)
     engine.request(OperatorRequest.RETAKE)
     engine.request(OperatorRequest.NEW_SHEET)
     engine.request(OperatorRequest.NEW_SHEET)
@@ -91,7 +65,7 @@ def test_a_stroke_is_pressed_again_on_a_new_cell_because_the_operator_asked(lab:
 
 def test_a_stroke_is_left_out_before_it_is_pressed_and_stays_left_out_after_a_resume(lab: Lab) -> None:
     lab.write_protocol("[11.0, 15.0]", "[0.0]")
-    first = engine_of(lab)
+    first = lab.engine(watched=True)
     first.request(OperatorRequest.SKIP)
     first.start()
     until(first, lambda now: now.given_up == 1)
@@ -99,7 +73,7 @@ def test_a_stroke_is_left_out_before_it_is_pressed_and_stays_left_out_after_a_re
     with pytest.raises(Parked):
         wait_for_end(first)
     assert first.snapshot().strokes_done + first.snapshot().given_up < 3
-    again = engine_of(lab)
+    again = lab.engine(watched=True)
     again.start()
     wait_for_end(again)
     now = again.snapshot()
@@ -110,7 +84,7 @@ def test_a_stroke_is_left_out_before_it_is_pressed_and_stays_left_out_after_a_re
 
 def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(lab: Lab) -> None:
     lab.write_protocol("[11.0, 15.0]", "[0.0]")
-    first = engine_of(lab)
+    first = lab.engine(watched=True)
     first.start()
     last = until(first, lambda now: now.strokes_done == 1 and now.last is not None).last
     assert last is not None
@@ -120,7 +94,7 @@ def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(l
     first.park()
     with pytest.raises(Parked):
         wait_for_end(first)
-    again = engine_of(lab)
+    again = lab.engine(watched=True)
     again.start()
     wait_for_end(again)
 
@@ -136,7 +110,7 @@ def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(l
 
 def test_what_is_good_after_all_is_not_pressed_again(lab: Lab) -> None:
     lab.write_protocol("[11.0, 15.0]", "[0.0]")
-    engine = engine_of(lab)
+    engine = lab.engine(watched=True)
     engine.start()
     last = until(engine, lambda now: now.strokes_done == 1 and now.last is not None).last
     assert last is not None
@@ -148,7 +122,7 @@ def test_what_is_good_after_all_is_not_pressed_again(lab: Lab) -> None:
 
 def test_a_new_sheet_is_asked_for_and_the_next_stroke_lies_on_it(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
-    engine = engine_of(lab)
+    engine = lab.engine(watched=True)
     engine.request(OperatorRequest.NEW_SHEET)
     engine.start()
     answer(engine, "Put a new sheet in for sheet 1", "g")
@@ -161,7 +135,7 @@ def test_a_new_sheet_is_asked_for_and_the_next_stroke_lies_on_it(lab: Lab) -> No
 
 def test_the_paper_is_found_again_by_jog_between_two_strokes(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
-    engine = engine_of(lab)
+    engine = lab.engine(watched=True)
     engine.request(OperatorRequest.JOG)
     engine.start()
     for _ in range(3):  # touches at one point, which must agree
@@ -177,7 +151,7 @@ def test_the_paper_is_found_again_by_jog_between_two_strokes(lab: Lab) -> None:
 
 def test_a_height_that_is_not_taken_and_a_jog_that_is_given_up_leave_the_paper_where_it_was(lab: Lab) -> None:
     lab.write_protocol("[11.0, 15.0]", "[0.0]")
-    engine = engine_of(lab)
+    engine = lab.engine(watched=True)
     engine.request(OperatorRequest.JOG)
     engine.start()
     for number in range(1, 4):
@@ -201,7 +175,7 @@ def test_who_gives_the_jog_of_the_set_up_up_keeps_the_taught_height_and_the_run_
     lab.write_protocol("[11.0]", "[0.0]")
     rig = lab.folder / "rig.toml"
     rig.write_text(rig.read_text().replace("[paper]", '[touch]\nmethod = "jog"\n\n[paper]'))
-    engine = engine_of(lab, guided=guided)
+    engine = lab.engine(watched=True, guided=guided)
     engine.start()
     if guided:
         answer(engine, "Camera, board, scale", "g")
@@ -223,7 +197,7 @@ def test_who_gives_the_jog_of_the_set_up_up_keeps_the_taught_height_and_the_run_
 
 def test_park_ends_the_run_after_the_step_with_the_arm_at_its_place(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0, 10.0]")
-    engine = engine_of(lab)
+    engine = lab.engine(watched=True)
     engine.start()
     until(engine, lambda now: now.strokes_done == 1)
     engine.park()
@@ -232,7 +206,7 @@ def test_park_ends_the_run_after_the_step_with_the_arm_at_its_place(lab: Lab) ->
     now = engine.snapshot()
     assert (now.state, now.voids) == (State.STOPPED, 0)
     assert now.parked
-    again = engine_of(lab)
+    again = lab.engine(watched=True)
     again.start()
     wait_for_end(again)
     assert again.snapshot().strokes_done == 2
@@ -240,7 +214,7 @@ def test_park_ends_the_run_after_the_step_with_the_arm_at_its_place(lab: Lab) ->
 
 
 def test_park_while_paused_parks_too(lab: Lab) -> None:
-    engine = engine_of(lab)
+    engine = lab.engine(watched=True)
     engine.pause()
     engine.start()
     until(engine, lambda now: now.state is State.PAUSED)
@@ -251,7 +225,7 @@ def test_park_while_paused_parks_too(lab: Lab) -> None:
 
 
 def test_park_while_a_question_waits_asks_nobody_any_more(lab: Lab) -> None:
-    engine = engine_of(lab, guided=True)
+    engine = lab.engine(watched=True, guided=True)
     engine.start()
     until(engine, lambda now: now.prompt is not None)
     engine.park()
@@ -263,7 +237,7 @@ def test_park_while_a_question_waits_asks_nobody_any_more(lab: Lab) -> None:
 
 def test_a_guided_set_up_measures_again_when_it_is_asked_to_and_shows_the_camera(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
-    engine = engine_of(lab, guided=True, preview=True)
+    engine = lab.engine(watched=True, guided=True, preview=True)
     engine.start()
     answer(engine, "Camera, board, scale", "a")
     now = until(engine, lambda now: now.prompt is not None and now.prompt.number == 2)
