@@ -23,14 +23,14 @@ FOLDER = "calibration"
 HASH_CHARS = 16
 POINTER = "current"
 NAME = re.compile(rb"([0-9a-f]{%d}\.json)\n?" % HASH_CHARS)
-"""Of an artefact: nothing else is followed, least of all a way out of the folder."""
+"""File name of an artefact: nothing else is followed, least of all a path out of the folder."""
 MAX_POINTER_BYTES = 256
 
 _log = logging.getLogger(__name__)
 
 
 class Artefact(BaseModel):
-    """Base: frozen, nothing unknown is let in, saved under the hash of its canonical JSON."""
+    """Base: frozen, unknown fields are refused, saved under the hash of its canonical JSON."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     versions: ClassVar[tuple[int, ...]] = (1,)
@@ -45,7 +45,7 @@ class Artefact(BaseModel):
         return self.model_dump_json(indent=2).encode() + b"\n"
 
     def save(self, folder: Path) -> Path:
-        """Write `<digest>.json` into `folder`; where it is there already, it is the same and stays. Raises OSError."""
+        """Write `<digest>.json` into `folder`; a file of that name holds the same and stays. Raises OSError."""
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"{self.digest}.json"
         if not path.exists():
@@ -68,7 +68,7 @@ A = TypeVar("A", bound=Artefact)
 
 
 def load_artefact(path: Path, kind: type[A]) -> A:
-    """Read an artefact of this kind. Raises `CalibrationError` where it is none, was edited or is too new."""
+    """Read an artefact of this kind. Raises `CalibrationError` for any other file, an edited one or a newer version."""
     data = read_bounded(path)
     version = _version(data)
     if isinstance(version, int) and version not in kind.versions:
@@ -87,7 +87,7 @@ def _version(data: bytes) -> object:
     try:
         parsed: Any = json.loads(data)
     except (ValueError, RecursionError):
-        return None  # said better by the model
+        return None  # the model gives the better message
     return cast("dict[str, Any]", parsed).get("schema_version") if isinstance(parsed, dict) else None
 
 

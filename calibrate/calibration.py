@@ -28,11 +28,11 @@ class Foreign(BaseModel):
     source: str
     recording_sha256: str
     board_off_mm: float | None
-    """Root mean square by which this session's own board lies off under it; missing where no board is seen."""
+    """Root mean square by which this session's own board lies off under it; None where no board is seen."""
 
 
 class Calibration(Artefact):
-    """What was measured, from which recording, with which software. Equal inputs give an equal file."""
+    """Scale and paper plane, the recording they come from and the software. Equal inputs give an equal file."""
 
     versions: ClassVar[tuple[int, ...]] = (1, 2)
 
@@ -55,14 +55,14 @@ class Calibration(Artefact):
     """Outliers: seen, but not on the plane of the others."""
     preprocess: dict[str, float]
     lens: LensUsed | None = None
-    """By which photographs are straightened first; none in files of version 1, which knew no lens."""
+    """By which photographs are undistorted first; none in files of version 1, which had no lens."""
     middle_px: tuple[float, float] | None = None
-    """Where `mm_per_px` holds, in the photograph as it was taken."""
+    """Pixel at which `mm_per_px` holds, in the photograph as it was taken."""
     board: BoardSpec | None = None
     still_sha256: str = ""
-    """Of the encoded photograph of the board that this was measured on."""
+    """sha256 of the encoded photograph of the board that this was measured on."""
     flags: tuple[str, ...] = ()
-    """What was not as it should be with that photograph: partly hidden, saturated."""
+    """What was wrong with that photograph: partly hidden, saturated."""
     foreign: Foreign | None = None
 
     def homography(self) -> NDArray[np.float64]:
@@ -85,7 +85,7 @@ class Calibration(Artefact):
 
     @property
     def label(self) -> str:
-        """What every result must say of it; empty for a session's own."""
+        """Note that every result must carry; empty for a session's own calibration."""
         if self.foreign is None:
             return ""
         off = (

@@ -1,4 +1,4 @@
-"""Artefacts in words: what one holds, and what is different in another."""
+"""Text for `calibrate show` and `calibrate diff`: what an artefact holds, and how another one differs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ KINDS: dict[str, type[Artefact]] = {
     "robot_to_paper": RegistrationFile,
     "edges_mm": BrushFit,
 }
-"""A field that only this kind has."""
+"""Each kind by a field that no other kind has."""
 
 
 def read_any(path: Path) -> tuple[Path, Artefact]:
@@ -43,7 +43,7 @@ def read_any(path: Path) -> tuple[Path, Artefact]:
 
 
 def described(artefact: Artefact) -> list[str]:
-    """One line a field, dotted names; what a calibration is labelled with comes first."""
+    """One line for each field by dotted name; the label of a calibration comes first."""
     label = [artefact.label] if isinstance(artefact, Calibration) and artefact.label else []
     return label + [f"{name} = {_short(value)}" for name, value in fields(artefact).items()]
 
@@ -54,11 +54,11 @@ def differences(one: Artefact, other: Artefact) -> list[str]:
     Raises `CalibrationError` where they are of two kinds.
     """
     if type(one) is not type(other):
-        told = f"{type(one).__name__} and {type(other).__name__} are not compared"
-        raise CalibrationError(f"{one.digest}, {other.digest}", told)
+        problem = f"{type(one).__name__} and {type(other).__name__} are not compared"
+        raise CalibrationError(f"{one.digest}, {other.digest}", problem)
     left, right = fields(one), fields(other)
     names = [*left, *(name for name in right if name not in left)]
-    lines = [f"{n}: {_told(left, n)} -> {_told(right, n)}" for n in names if left.get(n) != right.get(n)]
+    lines = [f"{n}: {_value_of(left, n)} -> {_value_of(right, n)}" for n in names if left.get(n) != right.get(n)]
     if lines and isinstance(one, Calibration) and isinstance(other, Calibration):
         lines += _meaning(one, other)
     return lines
@@ -79,8 +79,8 @@ def _flat(name: str, value: object) -> Iterator[tuple[str, object]]:
 
 def _meaning(one: Calibration, other: Calibration) -> Iterator[str]:
     apart = other.mm_per_px_low > one.mm_per_px_high or one.mm_per_px_low > other.mm_per_px_high
-    words = "their intervals lie apart" if apart else "their intervals overlap"
-    yield f"pix2len differs by {100.0 * (other.mm_per_px / one.mm_per_px - 1.0):+.4f} %, {words}"
+    verdict = "their intervals lie apart" if apart else "their intervals overlap"
+    yield f"pix2len differs by {100.0 * (other.mm_per_px / one.mm_per_px - 1.0):+.4f} %, {verdict}"
     board = one.board
     if board is None:
         return
@@ -92,7 +92,7 @@ def _meaning(one: Calibration, other: Calibration) -> Iterator[str]:
     yield f"the same pixel lies {off_mm.mean():.3f} mm apart on average over the board, {off_mm.max():.3f} mm at most"
 
 
-def _told(values: dict[str, object], name: str) -> str:
+def _value_of(values: dict[str, object], name: str) -> str:
     return _short(values[name]) if name in values else "none"
 
 

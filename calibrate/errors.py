@@ -1,6 +1,6 @@
 """Errors of calibration and validation.
 
-CalibrationError       the captures do not allow the number that was asked for; says which and why
+CalibrationError       the captures do not allow the requested result; says which and why
  +-- CaptureRefused    one capture cannot be used: blank, cut, no contrast; named in every report
 """
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class CalibrationError(Exception):
-    """A number cannot be had from these captures."""
+    """The captures or files do not allow the requested result."""
 
     exit_code: ClassVar[int] = 2
 

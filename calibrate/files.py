@@ -1,4 +1,4 @@
-"""Writing files that are whole or not there, and reading files that may be anything."""
+"""Write files atomically, and read files of unknown content and size."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_PHOTOGRAPH_BYTES = 256 * 1024 * 1024
 def check_target(path: Path, ending: str, *inputs: Path | None) -> None:
     """Before any work: whether a file may be written there. Raises `CalibrationError`.
 
-    Another ending might be a recording's or a photograph's, and what is read is never overwritten.
+    Another suffix might be a recording's or a photograph's, and inputs are never overwritten.
     """
     if path.suffix.lower() != ending:
         raise CalibrationError(str(path), f"must end in {ending}")
@@ -39,7 +39,7 @@ def check_folder(folder: Path) -> None:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write beside, then rename: a reader sees the old file or the new one. Raises OSError; the part is then gone.
+    """Write beside, then rename: a reader sees the old file or the new one. Raises OSError and removes the part.
 
     Line ends stay as they are, and who may read a file that was there already.
     """
@@ -57,7 +57,7 @@ def write_whole(path: Path, text: str) -> None:
 def read_bounded(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
     """The bytes of a file of at most so many. Raises `CalibrationError` where it is larger or cannot be read.
 
-    What grows while it is read, or tells no size as a pipe does, is cut off all the same.
+    A file that grows while it is read, or a pipe without a size, is cut off at that length.
     """
     try:
         if not path.is_file() and path.exists():
@@ -72,7 +72,7 @@ def read_bounded(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
 
 
 def read_gray(path: Path) -> NDArray[np.uint8]:
-    """(h, w) gray of a photograph, PNG or JPEG. Raises `CalibrationError` where it is none, or absurdly large."""
+    """(h, w) gray of a photograph, PNG or JPEG. Raises `CalibrationError` for other files and larger ones."""
     from sessions.errors import SessionDamaged
     from sessions.recording.messages import decode_gray
 

@@ -28,7 +28,7 @@ def calibrate_session(session: Path, lens: Path | None = None) -> Path:
     """Calibrate, save beside the recording and use it from now on; returns the artefact's path.
 
     The lens is the file that is given, else the one that the session was collected with. Raises `CalibrationError`,
-    also for a lens that visibly bends and is not known.
+    also for a lens that visibly distorts and is not known.
     """
     recording = Recording(session)
     if recording.header.source == Source.IMPORT:
@@ -66,8 +66,8 @@ def calibrate_session(session: Path, lens: Path | None = None) -> Path:
 def apply_calibration(path: Path, session: Path, *, force: bool = False) -> Path:
     """Put the calibration to use for the session; returns where it lies.
 
-    Another recording's is refused unless forced; it then becomes an artefact of its own that names where it comes from
-    and how far this session's board lies off under it. Raises `CalibrationError`.
+    Another recording's is refused unless forced; a new artefact then names its origin and how far off
+    this session's board lies under it. Raises `CalibrationError`.
     """
     recording, given = Recording(session), load_artefact(path, Calibration)
     folder = recording.path.parent
@@ -77,8 +77,8 @@ def apply_calibration(path: Path, session: Path, *, force: bool = False) -> Path
         return put_to_use(given, folder)
     if force:
         return put_to_use(_labelled(given, recording), folder)
-    told = f"belongs to another recording ({given.session_id}); --force applies it, and labels every result"
-    raise CalibrationError(str(path), told)
+    problem = f"belongs to another recording ({given.session_id}); --force applies it, and labels every result"
+    raise CalibrationError(str(path), problem)
 
 
 def calibration_of(recording: Recording, first: Stroke, digest: str, given: Path | None) -> Calibration | None:
@@ -95,8 +95,10 @@ def calibration_of(recording: Recording, first: Stroke, digest: str, given: Path
         )
     calibration = load_artefact(path, Calibration)
     if calibration.recording_sha256 != digest:
-        told = f"belongs to another recording ({calibration.session_id}): `brushloop calibrate apply --force` labels it"
-        raise CalibrationError(str(path), told)
+        problem = (
+            f"belongs to another recording ({calibration.session_id}): `brushloop calibrate apply --force` labels it"
+        )
+        raise CalibrationError(str(path), problem)
     return calibration
 
 

@@ -32,8 +32,8 @@ PAPER = 255
 def show_stroke(session: Path, stroke: str, out: Path, params: Params | None = None, lens: Path | None = None) -> Trace:
     """A stroke of a session by its name, the first where that is empty.
 
-    Seen by the calibration that the session uses, as a validation sees it; by a lens file, or where there is none by
-    the session's own lens, on its last photograph of the board. Raises `CalibrationError`.
+    Rectified by the calibration that the session uses, as in a validation; with a lens file, or without a calibration,
+    by the session's last photograph of the board. Raises `CalibrationError`.
     """
     recording = Recording(session)
     before: Capture | None = None
@@ -87,7 +87,7 @@ def show_photograph(
 
 
 def only_new(before: Gray, after: Gray, px_per_mm: float, where: str) -> Gray:
-    """A page with nothing on it but what came since `before`, black on white. Raises `CaptureRefused`."""
+    """A page with only the ink that is new since `before`, black on white. Raises `CaptureRefused`."""
     new = new_stroke(before, after, px_per_mm, where)
     return np.rint(PAPER * (1.0 - new.soft)).astype(np.uint8)
 
@@ -95,6 +95,6 @@ def only_new(before: Gray, after: Gray, px_per_mm: float, where: str) -> Gray:
 def _written(trace: Trace, params: Params, out: Path) -> Trace:
     _, data = cv2.imencode(".png", contact_sheet(trace))
     out.write_bytes(data.tobytes())
-    told = {"where": trace.where, "params": asdict(params), "fitted": trace.log, "flags": list(trace.flags)}
-    write_whole(out.with_suffix(".json"), json.dumps(told, indent=2) + "\n")
+    numbers = {"where": trace.where, "params": asdict(params), "fitted": trace.log, "flags": list(trace.flags)}
+    write_whole(out.with_suffix(".json"), json.dumps(numbers, indent=2) + "\n")
     return trace

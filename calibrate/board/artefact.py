@@ -23,26 +23,26 @@ class LensFile(Artefact):
     photographs: dict[str, str]
     """Name of every photograph that was given, and the sha256 of its bytes."""
     board: str
-    """In words: kind, size in squares or corners, mm."""
+    """Description: kind, size in squares or corners, mm."""
     size_px: tuple[int, int]
     matrix: tuple[float, float, float, float]
     """fx, fy, cx, cy in pixels, pixel centres on integers."""
     distortion: tuple[float, float, float, float, float]
     """k1, k2, p1, p2, k3 of OpenCV's model."""
     focal_se_px: tuple[float, float] | None
-    """By leaving out each way in which the board was held; None where there were too few to tell."""
+    """By leaving out each way in which the board was held; None where there were too few."""
     rms_px: float
     rms_limit_px: float
     residuals_px: dict[str, float]
     dropped: dict[str, float]
     """Outlier views and their residuals."""
     unusable: dict[str, str]
-    """Photographs without a usable board, or that show nothing new, and why."""
+    """Photographs without a usable board, or that show nothing new, and the reason."""
     guidance: tuple[str, ...]
     warnings: tuple[str, ...]
 
     def lens(self) -> Lens:
-        """To look through."""
+        """The lens to compute with."""
         return lens_of(self.matrix, self.distortion, self.size_px)
 
 
@@ -81,13 +81,13 @@ def read_lens(path: Path) -> LensUsed:
 
 
 class RegistrationFile(Artefact):
-    """Where the robot's points lie on the paper, with what each of them says."""
+    """Where the robot's points lie on the paper, with the residual of each."""
 
     versions: ClassVar[tuple[int, ...]] = (1, 2)
 
     kind: Literal["registration"] = "registration"
     schema_version: int = 2
-    """Version 1 told `turn_deg`, and took the board's corner for the origin of the paper frame."""
+    """Version 1 held `turn_deg`, and took the board's corner for the origin of the paper frame."""
     software: str
     source: str
     """The table of points, or the session, and its sha256."""

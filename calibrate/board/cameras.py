@@ -1,8 +1,8 @@
-"""Photographs of two cameras in one set: each part fits a lens of its own far better than all fit one.
+"""The lens of a set of views by Zhang's method, and sets that mix two cameras.
 
-The parts are sought without a look at the names. At the lens that fits all, each view pulls the lens its own way, and
-views of one camera pull alike. Names only confirm: parts that differ little are told where the files are named after
-them.
+Two cameras are found where each part of the set fits its own lens far better than all fit one. The parts are sought
+without looking at file names: at the lens that fits all, each view pulls the lens in a direction of its own, and views
+of one camera pull alike. Names only confirm: parts that differ little count where files are named after them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from calibrate.board.lens import Floats, Lens
 from calibrate.errors import CalibrationError
 
 LEAST = 3
-"""Views of a camera: fewer are outliers and tell no lens."""
+"""Views of a camera: fewer are outliers and do not determine a lens."""
 STARTS, ROUNDS = 60, 20
 APART = 0.65
 """Share of the squared residuals that two lenses leave of one's, below which they are two. One camera with the best of
@@ -30,16 +30,16 @@ WORSE = 1.5
 NAMED_APART, ALIKE = 0.97, 0.9
 """Where the files are named after the parts: of the residuals as above, and of the views that lie as they are named."""
 LEAST_NAMED = 8
-"""Below, names and parts agree by chance."""
+"""With fewer views, names and parts agree by chance."""
 UNITS = np.array([500.0, 500.0, 500.0, 500.0, 1.0, 1.0, 0.01, 0.01, 1.0])
-"""Of fx, fy, cx, cy, k1, k2, p1, p2, k3: so that all weigh alike."""
+"""Of fx, fy, cx, cy, k1, k2, p1, p2, k3: scales that make all weigh alike."""
 
 Part = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
 class Solved:
-    """A lens, and how each board lies before it."""
+    """A lens, and the pose of each board in front of it."""
 
     lens: Lens
     rms_px: float
@@ -82,7 +82,7 @@ def flat(view: BoardView) -> Floats:
 
 
 def through(lens: Lens, view: BoardView) -> float:
-    """Residual of a view, root mean square in px, its board laid as well as this lens allows."""
+    """Residual of a view, root mean square in px, its board posed as well as this lens allows."""
     board = flat(view)
     _, turn, shift = cv2.solvePnP(board, view.pixels, lens.matrix, lens.distortion)
     turn, shift = cv2.solvePnPRefineLM(board, view.pixels, lens.matrix, lens.distortion, turn, shift)
@@ -92,7 +92,7 @@ def through(lens: Lens, view: BoardView) -> float:
 
 @dataclass(frozen=True, slots=True)
 class TwoCameras:
-    """Which photographs belong together."""
+    """The photographs of each of two cameras."""
 
     parts: tuple[tuple[str, ...], tuple[str, ...]]
     together_px: float

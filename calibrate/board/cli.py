@@ -64,7 +64,7 @@ def intrinsics(
     ] = False,
     out: Annotated[Path, typer.Option(help="Folder for the lens file.")] = Path("camera"),
 ) -> None:
-    """Fit the lens; says what each photograph contributes, which were dropped, and what to photograph besides."""
+    """Fit the lens; says what each photograph contributes, which were dropped, and what else to photograph."""
     import hashlib
     from importlib.metadata import version
 
@@ -212,8 +212,8 @@ def register(
         assert isinstance(flat, BoardSpec)
         spec = flat.model_copy(update={"origin_mm": origin_mm})
     else:
-        told = "is not known: give --config rig.toml, or the board by its options and --origin-mm X Y"
-        raise CalibrationError("where the sheet lies on the board", told)
+        problem = "is not known: give --config rig.toml, or the board by its options and --origin-mm X Y"
+        raise CalibrationError("where the sheet lies on the board", problem)
     points = read_points(table)
     lens = lens or (rig.lens_file if rig else None)
     known = read_lens(lens) if lens else None

@@ -30,7 +30,7 @@ CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 LEAST_CONTRAST = 30.0
 BLANK = "is blank: nothing in it is darker than the rest"
 GOES_ON = 0.75
-"""Of the contrast of its own corners: at its outer edge a board has half."""
+"""Share of the contrast of the board's own corners; at its outer edge a board has half."""
 GRID_ERROR = 0.25
 """In squares: a strong lens displaces corners by less."""
 

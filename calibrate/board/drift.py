@@ -17,7 +17,7 @@ from calibrate.line import Line, fit_line
 from sessions.reader import Recording
 
 MOVED_PX = 1.0
-"""The board's middle moved by more between two views: someone touched the camera, or the board."""
+"""Movement of the board's middle between two views above which someone touched the camera, or the board."""
 CHANGED = 5e-4
 """Relative change of pix2len that is worth a warning: 0.01 mm over a stroke of 20 mm."""
 
@@ -29,9 +29,9 @@ class BoardAt:
     t_ns: int
     plane: Plane
     mm_per_px: float
-    """pix2len in the board's own middle: a view that shows other corners would else tell another place's."""
+    """pix2len in the board's own middle: otherwise a view of other corners would give the scale of another place."""
     moved_px: float
-    """How far the board's middle lies from where it was first seen."""
+    """Distance of the board's middle from where it was first seen."""
 
     @property
     def reach(self) -> float:
@@ -83,10 +83,10 @@ def drift(
         here, then = plane.to_image(middle)[0], first.to_image(middle)[0]
         seen.append(BoardAt(t_ns, plane, plane.scale_at(here), float(np.linalg.norm(here - then))))
     if not seen:
-        told = (
+        problem = (
             f"is not seen in any of {len(unseen)} photographs: {unseen[0][1]}" if unseen else "was never photographed"
         )
-        raise CalibrationError("the board", told)
+        raise CalibrationError("the board", problem)
     return Drift(tuple(seen), tuple(unseen), _trend(seen), _warnings(seen, unseen))
 
 
@@ -99,13 +99,15 @@ def _trend(seen: Sequence[BoardAt]) -> Line | None:
 
 
 def _warnings(seen: Sequence[BoardAt], unseen: Sequence[tuple[int, str]]) -> tuple[str, ...]:
-    told = [f"the board is not seen at {t_ns} ns: {why}" for t_ns, why in unseen]
-    told += [f"at {s.t_ns} ns: {flag}" for s in seen for flag in s.plane.flags]
+    warnings = [f"the board is not seen at {t_ns} ns: {why}" for t_ns, why in unseen]
+    warnings += [f"at {s.t_ns} ns: {flag}" for s in seen for flag in s.plane.flags]
     first = seen[0]
     for s in seen[1:]:
         change = s.mm_per_px / first.mm_per_px - 1.0
         if abs(change) > max(CHANGED, float(np.hypot(first.reach, s.reach))):
-            told.append(f"pix2len changed by {100 * change:+.3f} % until {s.t_ns} ns: calibrate the parts on their own")
+            warnings.append(
+                f"pix2len changed by {100 * change:+.3f} % until {s.t_ns} ns: calibrate the parts on their own"
+            )
         if s.moved_px > MOVED_PX:
-            told.append(f"the board moved by {s.moved_px:.1f} px until {s.t_ns} ns: camera or board was touched")
-    return tuple(told)
+            warnings.append(f"the board moved by {s.moved_px:.1f} px until {s.t_ns} ns: camera or board was touched")
+    return tuple(warnings)

@@ -1,7 +1,7 @@
 """Corners of a board as crossings of its edges, each edge followed for half a square.
 
-A window round the corner sees few pixels of each edge, and where the edge runs along the pixel rows they all err alike.
-Half a square crosses pixel rows at several phases, and their errors cancel.
+A window around the corner sees few pixels of each edge, and where the edge runs along the pixel rows they all have the
+same error. Half a square crosses pixel rows at several phases, and their errors cancel.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ ALONG_SHARE = 0.45
 """How far an edge is followed to either side, as a share of a square."""
 MOST_ALONG_PX = 40
 ACROSS_SHARE = 0.6
-"""How far is looked across an edge, as a share of the way to the next one."""
+"""Distance searched across an edge, as a share of the distance to the next one."""
 MOST_ACROSS_PX = 6
 LEAST_ACROSS_PX = 2.5
 CORNER_PX = 3
-"""So close to the corner the two edges blur into each other."""
+"""Closer than this to the corner the two edges blur into each other."""
 LEAST_CONTRAST = 0.4
 """Of the median edge: less is a shadow, a fold, or the edge of a sheet that lies on the board."""
 LEAST_SEEN = 0.6

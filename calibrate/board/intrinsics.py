@@ -20,9 +20,9 @@ Ways = NDArray[np.int64]
 LEAST_VIEWS = 4
 GOOD_VIEWS = 10
 EARNED_WAYS = 6
-"""Ways of holding the board from which an interval is told: below, leaving one out shakes the lens too much."""
+"""Ways of holding the board from which an interval is given: with fewer, leaving one out changes the lens too much."""
 MOST_LEFT_OUT = 12
-"""So many are left out at most, some together: more tell no more of the spread."""
+"""At most so many are left out, several together if need be: more do not improve the estimate of the spread."""
 OUTLIER_MEDIANS = 3.0
 """A view whose residual is so many times the median's is dropped and named."""
 LEAST_OUTLIER_PX = 0.4
@@ -36,11 +36,11 @@ GRID_WORDS = (
     ("lower left", "lower middle", "lower right"),
 )
 LEAST_SLANT_DEG = 15.0
-"""Boards face on tell focal length and distance together only."""
+"""Boards seen face on determine only the ratio of focal length and distance."""
 SAME_SHARE = 0.0015
 """Of the image's longer side. Corners that lie nearer are the same but for noise: 1 px of 640."""
 DISTINCT_DEG = 5.0
-"""Boards less than this apart are held alike: parallel planes tell a lens's focal length no more than one of them."""
+"""Boards less than this apart are held alike: parallel planes determine a focal length no better than one of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,13 +57,13 @@ class Fitted:
     residuals_px: dict[str, float]
     """Of each kept view by name."""
     dropped: dict[str, float]
-    """Views left out as outliers, with the residual that told so."""
+    """Views left out as outliers, with their residuals."""
     unusable: dict[str, str]
-    """Photographs that tell nothing, or nothing new, and why."""
+    """Photographs that show no board, or nothing new, and the reason."""
     slants_deg: dict[str, float]
     """How far each kept board is turned from face on."""
     guidance: tuple[str, ...]
-    """What to photograph besides; empty where the coverage is good."""
+    """What else to photograph; empty where the coverage is good."""
     warnings: tuple[str, ...]
     """What a pre-flight check must show."""
 
@@ -86,7 +86,7 @@ def fit_lens(
     """Zhang's method over the views that fit together; `unusable` names the photographs without one, and why.
 
     Raises `CalibrationError` for fewer than `LEAST_VIEWS` views that differ, and for photographs of two cameras, by
-    their size or (unless they are said to be of `one_camera`) by what they tell of the lens.
+    their size or (unless they are said to be of `one_camera`) by the lens that they fit.
     """
     seen, left_out = distinct_views(views)
     left_out = {**(unusable or {}), **left_out}
@@ -96,8 +96,8 @@ def fit_lens(
     while True:
         if len(kept) < LEAST_VIEWS:
             out = f", dropped: {', '.join(sorted(dropped))}" if dropped else ""
-            told = f"{len(kept)} usable views of the board, at least {LEAST_VIEWS} needed{out}"
-            raise CalibrationError(where, "; ".join([told, *reasons(left_out)]))
+            problem = f"{len(kept)} usable views of the board, at least {LEAST_VIEWS} needed{out}"
+            raise CalibrationError(where, "; ".join([problem, *reasons(left_out)]))
         solved = solve(kept, where)
         if not dropped and not one_camera and (two := two_cameras(kept, solved)) is not None:
             raise CalibrationError(where, _two_cameras(two))
@@ -112,13 +112,13 @@ def fit_lens(
     ways = held(solved.normals)
     fewest = min(int(ways.max()), int(held(nominal_normals(kept)).max())) + 1
     if fewest < LEAST_VIEWS:
-        told = f"{len(kept)} usable views, but the board is held in {fewest} ways, at least {LEAST_VIEWS} needed"
-        raise CalibrationError(where, "; ".join([f"{told}: slant it to other sides", *reasons(left_out)]))
+        problem = f"{len(kept)} usable views, but the board is held in {fewest} ways, at least {LEAST_VIEWS} needed"
+        raise CalibrationError(where, "; ".join([f"{problem}: slant it to other sides", *reasons(left_out)]))
     slants = {v.name: float(s) for v, s in zip(kept, np.degrees(np.arccos(solved.normals[:, 2])), strict=True)}
     warnings = [f"{view.name}: {flag}" for view in kept for flag in view.flags]
     if solved.rms_px > rms_limit_px:
-        told = f"residual {solved.rms_px:.2f} px exceeds {rms_limit_px:g} px: is the board flat, sharp and still?"
-        warnings.insert(0, told)
+        problem = f"residual {solved.rms_px:.2f} px exceeds {rms_limit_px:g} px: is the board flat, sharp and still?"
+        warnings.insert(0, problem)
     return Fitted(
         solved.lens,
         _focal(kept, ways, where),
@@ -138,8 +138,8 @@ def _one_size(views: Sequence[BoardView], where: str) -> None:
     for view in views:
         sizes.setdefault(view.size_px, []).append(view.name)
     if len(sizes) > 1:
-        told = "; ".join(f"{w} x {h} px: {', '.join(names)}" for (w, h), names in sorted(sizes.items()))
-        raise CalibrationError(where, f"have several sizes, so they are of two cameras or settings ({told})")
+        problem = "; ".join(f"{w} x {h} px: {', '.join(names)}" for (w, h), names in sorted(sizes.items()))
+        raise CalibrationError(where, f"have several sizes, so they are of two cameras or settings ({problem})")
 
 
 def _two_cameras(two: TwoCameras) -> str:
@@ -188,7 +188,7 @@ def guidance(views: Sequence[BoardView], slants_deg: Sequence[float], ways: int 
 
 
 def named(photographs: Sequence[Path]) -> dict[str, Path]:
-    """Each photograph by a name of its own: the file's, with its folder where there are several, else numbered."""
+    """Each photograph by a unique name: the file's, with its folder where there are several, else numbered."""
     folders = len({path.parent for path in photographs})
     found: dict[str, Path] = {}
     for path in photographs:
@@ -202,7 +202,7 @@ def named(photographs: Sequence[Path]) -> dict[str, Path]:
 
 
 def distinct_views(views: Iterable[BoardView]) -> tuple[list[BoardView], dict[str, str]]:
-    """The views that show the board somewhere else than those before; of each other one, which it repeats."""
+    """The views that show the board in a new place, and for each other one the view that it repeats."""
     kept, again = list[BoardView](), dict[str, str]()
     for view in views:
         twin = next((one for one in kept if _same(one, view)), None)
@@ -225,7 +225,7 @@ def held(normals: Floats) -> Ways:
 
 
 def nominal_normals(views: Sequence[BoardView]) -> Floats:
-    """(n, 3) unit vectors out of each board as a straight lens of one image width sees them.
+    """(n, 3) unit vectors out of each board as seen by an undistorted lens of one image width.
 
     Rough, but no lens that was fitted to boards that are all held alike can tell them apart here.
     """
@@ -239,11 +239,11 @@ def nominal_normals(views: Sequence[BoardView]) -> Floats:
 
 
 def reasons(why: Mapping[str, str]) -> list[str]:
-    """What is wrong with which photographs, once each."""
+    """Each problem once, with the photographs that have it."""
     names: dict[str, list[str]] = {}
-    for name, told in why.items():
-        names.setdefault(told, []).append(name)
-    return [f"{', '.join(those)}: {told}" for told, those in names.items()]
+    for name, problem in why.items():
+        names.setdefault(problem, []).append(name)
+    return [f"{', '.join(those)}: {problem}" for problem, those in names.items()]
 
 
 def _same(one: BoardView, other: BoardView) -> bool:

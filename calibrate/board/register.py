@@ -26,7 +26,7 @@ WORST_RMS_MM = 5.0
 TRIALS = 500
 OUTLIER_MEDIANS = 5.0
 LEAST_OUTLIER_MM = 0.3
-"""Marks that lie closer to where they should be are never outliers."""
+"""Marks that lie closer than this to the predicted place are never outliers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,7 @@ class Registration:
 def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats, model: Model = "rigid") -> Registration:
     """Least squares over (n, 2) points of both frames, outliers dropped and named (Umeyama 1991, eq. 40-43).
 
-    Outliers are told by the few points (two, or three for an affine fit) that explain the others best. A similarity
+    Outliers are found by the few points (two, or three for an affine fit) that explain the others best. A similarity
     also lets the scale go, where the board was not printed at true scale; an affine fit lets x and y go their own ways,
     where a page was rectified to wrong proportions. Raises `CalibrationError` for
     fewer than three points, points that are all in one place, or where most do not fit together.
@@ -100,8 +100,8 @@ def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats, model: Mod
     matrix = _fit(robot_mm[kept], seen_mm[kept], model)
     residuals = seen_mm - _apply(matrix, robot_mm)
     if _rms(residuals[kept]) > WORST_RMS_MM:
-        told = f"{_rms(residuals[kept]):.1f} mm off on average, at most {WORST_RMS_MM:g}: are their names mixed up?"
-        raise CalibrationError(where, told)
+        problem = f"{_rms(residuals[kept]):.1f} mm off on average, at most {WORST_RMS_MM:g}: are their names mixed up?"
+        raise CalibrationError(where, problem)
     left_out = residuals.copy()
     for index in np.flatnonzero(kept):
         others = kept.copy()
@@ -162,7 +162,7 @@ def _rms(residuals: Floats) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """What the robot was told and where the camera saw it."""
+    """Points that the robot was commanded to, and where the camera saw them."""
 
     names: tuple[str, ...]
     robot_mm: Floats

@@ -98,8 +98,10 @@ def read_rig(path: Path) -> RigFile:
     try:
         board = BoardSpec.model_validate(tables.get("board"))
     except ValidationError as error:
-        told = invalid("board", error)
-        raise CalibrationError(str(path), f"board.{told.what}" if "board" in tables else "[board] is missing") from None
+        found = invalid("board", error)
+        raise CalibrationError(
+            str(path), f"board.{found.what}" if "board" in tables else "[board] is missing"
+        ) from None
     camera = tables.get("camera")
     lens = cast("dict[str, Any]", camera).get("lens_file") if isinstance(camera, dict) else None
     return RigFile(path, text, board, path.parent / lens if isinstance(lens, str) else None)

@@ -1,4 +1,4 @@
-"""What a session tells of its camera: the board, the lens, and the photographs of the board."""
+"""The board, the lens and the photographs of the board that a session recorded."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ EFFECTIVE = "rig.effective.json"
 NO_BOARD = "holds no view of the board (a `board` step)"
 
 
-Told = Recording | Path
+SessionSource = Recording | Path
 """A recording, or the folder of a session that may still be open."""
 
 
@@ -35,7 +35,7 @@ class _Paper(BaseModel):
 M = TypeVar("M", bound=BaseModel)
 
 
-def board_of(session: Told) -> BoardSpec:
+def board_of(session: SessionSource) -> BoardSpec:
     """The board of a session's rig. Raises `CalibrationError` where the session names none."""
     try:
         board = _rig(session)["board"]
@@ -45,13 +45,13 @@ def board_of(session: Told) -> BoardSpec:
 
 
 def sheet_of(recording: Recording) -> tuple[float, float] | None:
-    """Width and height in mm of the sheet that lies on the board; None where the rig's configuration tells none."""
+    """Width and height in mm of the sheet that lies on the board; None where the rig's configuration has none."""
     paper = _rig(recording).get("paper")
     size = cast("dict[str, Any]", paper).get("size_mm") if isinstance(paper, dict) else None
     return None if size is None else _parsed(recording, "paper", _Paper, {"size_mm": size}).size_mm
 
 
-def lens_of_session(session: Told) -> LensUsed | None:
+def lens_of_session(session: SessionSource) -> LensUsed | None:
     """The lens that the session was collected with; None where its rig named none. Raises `CalibrationError`."""
     camera = _rig(session).get("camera")
     optics = cast("dict[str, Any]", camera).get("optics") if isinstance(camera, dict) else None
@@ -74,7 +74,7 @@ def board_stills(recording: Recording) -> Iterator[tuple[int, Gray]]:
             yield message.log_time, decode_gray(decode_still(message.data), str(recording.path))
 
 
-def _rig(session: Told) -> dict[str, Any]:
+def _rig(session: SessionSource) -> dict[str, Any]:
     data = read_bounded(session / EFFECTIVE) if isinstance(session, Path) else session.attachment(EFFECTIVE)
     try:
         rig: Any = json.loads(data)
@@ -85,7 +85,7 @@ def _rig(session: Told) -> dict[str, Any]:
     return cast("dict[str, Any]", rig)
 
 
-def _parsed(session: Told, name: str, kind: type[M], values: object) -> M:
+def _parsed(session: SessionSource, name: str, kind: type[M], values: object) -> M:
     try:
         return kind.model_validate(values)
     except ValidationError as error:
@@ -94,5 +94,5 @@ def _parsed(session: Told, name: str, kind: type[M], values: object) -> M:
         raise CalibrationError(_where(session), f"{field}: {first['msg']}") from None
 
 
-def _where(session: Told) -> str:
+def _where(session: SessionSource) -> str:
     return str(session / EFFECTIVE) if isinstance(session, Path) else f"{session.path} {EFFECTIVE}"

@@ -1,7 +1,7 @@
 """Dragged strokes of a session as commanded paths and the ink beside them, for `calibrate.drags.fit`.
 
-Drawn sessions tell their trajectories in the protocol that the recording holds. Imported photographs tell numbers:
-`length_mm` along x from the start, a depth (`depth_mm`, ...), and as one likes `bend_mm` (both inner control points of
+The protocol in a recording holds the trajectories that were drawn. Imported photographs come with numbers:
+`length_mm` along x from the start, a depth (`depth_mm`, ...), and optionally `bend_mm` (both inner control points of
 a cubic Bezier curve lie so far to the left of the line) and `depth_ends_mm` (the depth at both ends, reached from the
 middle over a third of the length).
 """
@@ -47,7 +47,7 @@ class Drawn:
     x_mm: Floats
     y_mm: Floats
     paths: list[Floats]
-    """Of all images after each other, (n, 4): x, y, depth in mm, heading in deg."""
+    """The paths of all images in order, (n, 4) each: x, y, depth in mm, heading in deg."""
     groups: NDArray[np.int64]
     """(B + 1,): paths `groups[i]` to `groups[i + 1]` are the strokes of image i."""
     ink: NDArray[np.float32]
@@ -70,7 +70,7 @@ def read_drags(session: Path, mm_per_px: float, calibration_path: Path | None = 
     if not strokes or {stroke.kind for stroke in strokes} != {"drag"}:
         raise CalibrationError(where, "holds no strokes that travel: fit its presses without --drags")
     calibration = calibration_of(recording, strokes[0], digest, calibration_path)
-    told = figures_of(recording.header) if calibration is not None else {}
+    figures = figures_of(recording.header) if calibration is not None else {}
     x_mm, y_mm = _cell_grid(strokes, mm_per_px, where) if calibration is not None else _grid(strokes, mm_per_px, where)
     paths: list[list[Floats]] = []
     images: list[NDArray[np.float32]] = []
@@ -80,7 +80,7 @@ def read_drags(session: Path, mm_per_px: float, calibration_path: Path | None = 
         name = capture.stroke.stroke_id
         try:
             if calibration is not None:
-                drawn, image = _figure(capture, calibration, told, x_mm, y_mm)
+                drawn, image = _figure(capture, calibration, figures, x_mm, y_mm)
             else:
                 drawn, image = [_path(capture.stroke)], _photograph(capture, x_mm, y_mm)
         except (CaptureRefused, SessionDamaged) as error:
@@ -108,8 +108,8 @@ def figures_of(header: Header) -> dict[str, list[Floats]]:
             for figure in protocol["figures"]
         }
     except (ValueError, KeyError, TypeError) as error:
-        told = f"its recorded protocol tells no trajectories ({error})"
-        raise CalibrationError(header.session_id, told) from None
+        problem = f"its recorded protocol holds no trajectories ({error})"
+        raise CalibrationError(header.session_id, problem) from None
 
 
 def commanded_path(length_mm: float, bend_mm: float, depth_mm: float, depth_ends_mm: float) -> Floats:
@@ -120,18 +120,20 @@ def commanded_path(length_mm: float, bend_mm: float, depth_mm: float, depth_ends
 
 
 def _path(stroke: Stroke) -> Floats:
-    told = dict(stroke.commanded)
-    depth = next((told[name] for name in DEPTH_NAMES if name in told), stroke.height_mm)
-    if LENGTH_NAME not in told or depth is None:
-        raise CaptureRefused(stroke.stroke_id, f"tells no {LENGTH_NAME} or no depth")
-    return commanded_path(told[LENGTH_NAME], told.get("bend_mm", 0.0), depth, told.get("depth_ends_mm", depth))
+    commanded = dict(stroke.commanded)
+    depth = next((commanded[name] for name in DEPTH_NAMES if name in commanded), stroke.height_mm)
+    if LENGTH_NAME not in commanded or depth is None:
+        raise CaptureRefused(stroke.stroke_id, f"has no {LENGTH_NAME} or no depth")
+    return commanded_path(
+        commanded[LENGTH_NAME], commanded.get("bend_mm", 0.0), depth, commanded.get("depth_ends_mm", depth)
+    )
 
 
 def _figure(
-    capture: Capture, calibration: Calibration, told: dict[str, list[Floats]], x_mm: Floats, y_mm: Floats
+    capture: Capture, calibration: Calibration, figures: dict[str, list[Floats]], x_mm: Floats, y_mm: Floats
 ) -> tuple[list[Floats], NDArray[np.float32]]:
     stroke = capture.stroke
-    paths = told.get(stroke.stroke_id.rpartition("-r")[0])
+    paths = figures.get(stroke.stroke_id.rpartition("-r")[0])
     if paths is None or stroke.cell_mm is None:
         raise CaptureRefused(stroke.stroke_id, "is no figure of the recorded protocol")
     if any(len(path) < 2 for path in paths):
@@ -180,7 +182,7 @@ def _cell_grid(strokes: list[Stroke], mm_per_px: float, where: str) -> tuple[Flo
 def _grid(strokes: list[Stroke], mm_per_px: float, where: str) -> tuple[Floats, Floats]:
     paths = list(_paths(strokes))
     if not paths:
-        raise CalibrationError(where, f"no stroke tells {LENGTH_NAME} and a depth: where it was drawn is not known")
+        raise CalibrationError(where, f"no stroke has {LENGTH_NAME} and a depth: where it was drawn is not known")
     places = np.concatenate(paths)
     low, high = places[:, :2].min(axis=0) - MARGIN_MM, places[:, :2].max(axis=0) + MARGIN_MM
     columns, rows = (int(n) for n in np.ceil((high - low) / mm_per_px))

@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 SPREAD_MM = 0.9
-"""Scale of the logistic, unless told otherwise: an edge that strays by 1.6 mm (standard deviation)."""
+"""Default scale of the logistic: an edge that strays by 1.6 mm (standard deviation)."""
 INK_ABOVE = 0.42
 """A pixel is called ink above this chance: half of the Dice score to be had maximises its expectation."""
 PRIOR = (2.0, 0.2, 0.01, 3.0, 1.0, 4.0, 1.5, 1.5, 0.2, 0.2, 3.0, 3.0, 0.5, 0.5)
@@ -32,13 +32,13 @@ ROUNDS = 25
 
 @dataclass(frozen=True, slots=True)
 class DragFit:
-    """A drag model fitted to strokes, and how it was got."""
+    """A drag model fitted to strokes, and how the fit went."""
 
     model: DragModel
     place_mm: Floats
     """(q, 2): shift in x and y of a stroke by each column of its place."""
     condition: float
-    """Condition number of the scaled normal equations: above some 1e4 parameters stand in for each other."""
+    """Condition number of the scaled normal equations: above about 1e4 the parameters cannot be told apart."""
     cost: float
     rounds: int
     spread_mm: float = SPREAD_MM

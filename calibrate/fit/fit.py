@@ -67,7 +67,7 @@ class Stage:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A brush fitted to presses, and what its intervals and the next press are reckoned from."""
+    """A brush fitted to presses, and the basis of its intervals and of the choice of the next press."""
 
     press: FittedPress
     free: tuple[str, ...]

@@ -52,7 +52,10 @@ class Fitted:
 
 
 def fit_session(captures: Captures, view: Field) -> Fitted:
-    """Fit, leave each cell out in turn, and make the artefact. Raises `CalibrationError` where no stage can be told."""
+    """Fit, leave each cell out in turn, and make the artefact.
+
+    Raises `CalibrationError` where the strokes determine no stage.
+    """
     grid, strokes = captures.grid, captures.strokes
     fit = fit_presses(strokes, grid, captures.radius_mm, captures.length_mm)
     if not fit.free:

@@ -1,4 +1,4 @@
-"""Which press tells most about a brush, chosen from the ink of those before. No torch: a rig PC runs it.
+"""Choose the press that tells most about a brush from the ink of the presses before. No torch: a rig PC runs it.
 
 With J the derivatives of a predicted image by the parameters, the presses done carry the Fisher information
 sum J'J / noise, and the image of a cell is uncertain by tr(J'J C), C the inverse of information and prior. Half of that
@@ -158,7 +158,7 @@ def next_press(
     if not candidates:
         raise ValueError("there is no cell to choose from")
     press = fit if isinstance(fit, FittedPress) else fit.press
-    # All parameters count, those too that a stage refused: what cannot be told yet is what a press is to tell.
+    # All parameters count, also those that a stage refused: the next press is to determine them.
     views = {cell: _look(press, cell, grid) for cell in {*done, *candidates}}
     information = np.eye(len(NAMES)) + sum((views[cell].square for cell in done), np.zeros((len(NAMES), len(NAMES))))
     terms = _terms_information(done, views, grid)

@@ -28,8 +28,8 @@ def write_inversion(made: Inversion, out: Path, repeats: int = 1, seed: int = 1)
         why = f": {made.refused[0][0]}: {made.refused[0][1]}" if made.refused else ""
         raise CalibrationError(str(made.recording), f"no stroke could be recovered{why}")
     if len(made.rows) * repeats > MAX_ROWS:
-        told = f"{len(made.rows) * repeats} strokes with repeats, a protocol holds at most {MAX_ROWS}"
-        raise CalibrationError(str(made.recording), told)
+        problem = f"{len(made.rows) * repeats} strokes with repeats, a protocol holds at most {MAX_ROWS}"
+        raise CalibrationError(str(made.recording), problem)
     if out.name == PROTOCOL or not out.name.isprintable() or "\\" in out.name or len(out.name) > 200:
         raise CalibrationError(str(out), "a protocol cannot name this file: give a plain name, as recovered.csv")
     out.parent.mkdir(parents=True, exist_ok=True)

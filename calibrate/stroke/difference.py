@@ -1,4 +1,4 @@
-"""The stroke that came between two photographs of one page: pages that already carry ink, frame after frame."""
+"""The stroke that is new between two photographs of one page that may already carry ink."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from calibrate.stroke.light import LIGHT_ROUNDS
 from calibrate.stroke.params import Floats, Gray, Mask, Soft
 
 DARK_SHARE = 0.6
-"""Darker than this share of the paper, a place held ink before: what came on top of it cannot be told."""
+"""Darker than this share of the paper, a place held ink before: ink on top of it cannot be seen."""
 SHRINK = 8
 MOST_SHIFT_PX = 8.0
 LEAST_RESPONSE = 0.05
@@ -40,7 +40,7 @@ class DifferenceParams:
 
 @dataclass(frozen=True, slots=True)
 class NewStroke:
-    """What came in between."""
+    """The new stroke."""
 
     mask: Mask
     """(h, w), True where ink came."""
@@ -49,7 +49,7 @@ class NewStroke:
     start_px: tuple[float, float]
     """(x, y) of the end that lies against the heading: the middle of its outermost ink; pixel j covers [j, j + 1)."""
     shift_px: tuple[float, float]
-    """How far the page lay from where it was, undone before comparing."""
+    """Shift of the page between the photographs, undone before comparing."""
     noise: float
     """Standard deviation of the difference on paper, as a share of its brightness."""
     flags: tuple[str, ...]
@@ -117,7 +117,7 @@ def end_of(mask: Mask, heading_deg: float, px_per_mm: float, reach_mm: float = 1
 
 
 def _shift(before: Gray, after: Gray) -> tuple[float, float]:
-    """How far the page moved, (x, y) px, by phase correlation; 0 where the two photographs do not tell."""
+    """How far the page moved, (x, y) px, by phase correlation; 0 where the two photographs do not determine it."""
     a, b = (cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float64) for image in (before, after))
     if float(a.std()) < 3.0:
         return 0.0, 0.0
@@ -210,13 +210,13 @@ def _grown(
 
 
 def _flags(mask: Mask, clean: Mask, shift: tuple[float, float], px_per_mm: float) -> tuple[str, ...]:
-    told: list[str] = []
+    flags: list[str] = []
     around = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     touching_mm = float(np.count_nonzero(around & ~clean)) / px_per_mm
     if touching_mm > 1.0:
-        told.append(f"crosses: {touching_mm:.1f} mm of its edge lie on older ink, what is below cannot be told")
+        flags.append(f"crosses: {touching_mm:.1f} mm of its edge lie on older ink, what is below cannot be seen")
     if max(map(abs, shift)) > 1.0:
-        told.append(f"moved: the page lay {np.hypot(*shift):.1f} px from where it was")
+        flags.append(f"moved: the page lay {np.hypot(*shift):.1f} px from where it was")
     if mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any():
-        told.append("cut: the stroke reaches the edge of the photograph")
-    return tuple(told)
+        flags.append("cut: the stroke reaches the edge of the photograph")
+    return tuple(flags)
