@@ -10,6 +10,7 @@ from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 from sessions.repair.verify import verify_session
 from tests.collect.durability.conftest import Disk, parked, the_session
+from tests.command import brushloop
 
 if TYPE_CHECKING:
     from tests.collect.conftest import Lab
@@ -23,10 +24,9 @@ def wait_for_a_file(lab: Lab, pattern: str) -> None:
 
 
 def run(lab: Lab) -> tuple[int, str]:
-    process = lab.process()
-    _, stderr = process.communicate(timeout=60)
-    assert "Traceback" not in stderr
-    return process.returncode, stderr.splitlines()[-1]
+    ran = brushloop("collect", "--no-tui", *lab.options)
+    assert "Traceback" not in ran.stderr
+    return ran.returncode, ran.stderr.splitlines()[-1]
 
 
 def test_a_disk_that_fills_up_in_mid_step_parks_the_arm_and_with_room_the_same_command_goes_on(
