@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 TORCH ?= auto
 
-.PHONY: demo test lint types bench soak clean
+.PHONY: demo test suite lint types bench soak clean
 .DELETE_ON_ERROR:
 
 $(VENV)/bin/python:
@@ -25,7 +25,10 @@ $(STAMP)-dev: requirements/run.lock requirements/dev.lock requirements/install.p
 demo: $(STAMP)  ## collect, calibrate and validate a short session on the loopback rig
 	$(BIN)/brushloop demo
 
-test: lint types  ## lint, layers, types, and the tests
+test: $(STAMP)-dev  ## lint, layers, types, and the tests; types are checked beside the tests
+	@$(MAKE) --no-print-directory --jobs 2 lint types suite
+
+suite: $(STAMP)-dev
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 lint: $(STAMP)-dev

@@ -37,6 +37,7 @@ def run_and_stop(engine: Engine, when: Callable[[Snapshot], bool]) -> None:
         wait_for_end(engine)
 
 
+@pytest.mark.xdist_group("collected")
 def test_a_whole_session_is_collected_merged_and_told(collected: Collected) -> None:
     now = collected.engine.snapshot()
     assert (now.state, now.strokes_done, now.strokes_planned) == (State.DONE, 4, 4)
@@ -48,6 +49,7 @@ def test_a_whole_session_is_collected_merged_and_told(collected: Collected) -> N
     assert all(c.image().shape == (384, 512) for c in captures)
 
 
+@pytest.mark.xdist_group("collected")
 def test_the_arm_presses_what_the_protocol_says_where_the_cell_lies(collected: Collected) -> None:
     # World's own answer sheet; the operator taught the touch height .03 mm too high. The first contact is zero touch.
     strokes = {c.stroke.still: c.stroke for c in Recording(collected.folder).captures()}
@@ -176,6 +178,7 @@ def test_a_sheet_is_not_changed_while_a_press_on_it_waits_for_its_photograph(lab
     run(lab.engine())
 
 
+@pytest.mark.xdist_group("collected")
 def test_a_finished_session_is_not_followed_by_another_on_the_same_sheet(collected: Collected) -> None:
     with pytest.raises(ConfigError, match="Put a fresh sheet in, then confirm it with --sheet 1"):
         collected.lab.engine()

@@ -54,6 +54,7 @@ def at_rest(lab: Lab) -> bool:
     return world.motion.steady(world.clock.now_s() + 1.0)
 
 
+@pytest.mark.xdist_group("collected")
 def test_force_ink_and_their_cadence_are_recorded_beside_the_poses(collected: Collected) -> None:
     folder = collected.folder
     with (folder / f"{folder.name}.mcap").open("rb") as file:

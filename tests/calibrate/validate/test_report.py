@@ -22,6 +22,8 @@ from calibrate.validate.report.page import _of_session
 from sessions.reader import Recording
 from sessions.remarks import Remark, add_remark
 
+pytestmark = pytest.mark.xdist_group("report")  # validated once
+
 MODELS = ("ccd-bsm", "bezier", "bezier-refitted", "ellipse", "line", "circle", "qbc", "another press")
 
 
