@@ -250,7 +250,7 @@ async def test_an_arm_in_the_picture_is_no_mark(make_bench: MakeBench) -> None:
 
     def with_arm() -> NDArray[np.uint8]:
         image = photograph()
-        return cv2.circle(image, (250, 550), 90, 70, -1) if next(shots) else image  # pyright: ignore[reportReturnType]
+        return cv2.circle(image.copy(), (250, 550), 90, 70, -1) if next(shots) else image  # pyright: ignore[reportReturnType]
 
     bench.photograph = with_arm  # pyright: ignore[reportAttributeAccessIssue]
     with pytest.raises(StepError, match=r"mm2 at \(.*\) mm became dark, which no mark does: is the arm"):
