@@ -168,6 +168,7 @@ def arm_the_fault(stage: Stage, engine: Engine, name: str, phase: str) -> list[P
     methods = rig.arcs._methods
     original: Callable[[dict[str, Any]], Any] = methods[moment.method]
     targets: list[Pose | None] = []
+    slow = SLOW / 2 if name in WAITED_OUT else SLOW  # the arm is still on its way when the time is out
 
     def now() -> bool:
         if not engine.snapshot().step.startswith(moment.step):
@@ -183,7 +184,7 @@ def arm_the_fault(stage: Stage, engine: Engine, name: str, phase: str) -> list[P
         if targets:
             return original(params)
         if moment.method != WAITING:
-            stage.gears.shift(SLOW)  # or a line would be over before anyone has looked at it
+            stage.gears.shift(slow)  # or a line would be over before anyone has looked at it
         result = original(params)
         if now():
             targets.append(rig.faults.truth.target())
@@ -200,7 +201,7 @@ def arm_the_fault(stage: Stage, engine: Engine, name: str, phase: str) -> list[P
 
     def slowly(params: dict[str, Any]) -> Any:
         if moment.method == WAITING and not targets and engine.snapshot().step.startswith(moment.step):
-            stage.gears.shift(SLOW)
+            stage.gears.shift(slow)
         return let_go(params)
 
     methods[moment.method], methods[LET_GO] = watched, slowly
