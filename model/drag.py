@@ -33,7 +33,7 @@ class DragModel:
     """Growth of the half width by depth."""
     half_per_mm2: float = 0.0
     leash_mm: float = 2.0
-    """How far the footprint trails behind the tip at depth 0."""
+    """Distance by which the footprint trails behind the tip at depth 0."""
     leash_per_mm: float = 0.35
     """Growth of the leash by depth."""
     settle_mm: float = 3.0

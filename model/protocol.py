@@ -1,4 +1,4 @@
-"""What every stroke model offers: named parameters with units and ranges, and the shapes they stand for.
+"""Interface of stroke models: named parameters with units and ranges, and the shapes they describe.
 
 The rest follows from the shape: `model.raster` makes coverage images at any heading and place, `shape.outline()` is
 the boundary, `shape.area_mm2` the area, and all of it is differentiable in the parameters.

@@ -1,4 +1,4 @@
-"""What a generator is trained on: a stroke model's exact coverage over ranges of its parameters, in one placement."""
+"""Training targets of a generator: a stroke model's exact coverage over ranges of its parameters, in one placement."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ class Target:
         return torch.cat(found)[:count]
 
     def _accepted(self, inputs: Tensor) -> Tensor:
-        """Which inputs the model draws, (N,) bool: halves what is refused until the culprits are found."""
+        """Whether the model accepts each input, (N,) bool; halves refused batches until the bad inputs are found."""
         try:
             self.shape(inputs)
         except DomainError:
@@ -150,7 +150,7 @@ _PRESS = {"height_mm": (11.0, 20.0), "tilt_deg": (0.0, 10.0)}
 
 @dataclass(frozen=True, slots=True)
 class Preset:
-    """What a target is by default, and a network that fits it."""
+    """Defaults of a target, with a network that fits it."""
 
     model: str
     ranges: dict[str, tuple[float, float]]

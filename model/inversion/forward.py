@@ -1,4 +1,4 @@
-"""What the fit asks of a model: the normal equations of a batch of images at given parameters.
+"""Forward models of a fit: the normal equations of a batch of images at given parameters.
 
 Two kinds: outlines drawn by the exact raster with derivatives along the boundary (fast), and any differentiable
 renderer, such as a trained generator, with derivatives by `torch.func.jvp`.
@@ -50,7 +50,7 @@ class Forward(Protocol):
         ...
 
     def of(self, images: Rows) -> Forward:
-        """The same for these images of a batch, in this order: what is known of each goes with it."""
+        """Restrict the model, with what is known of each image, to these images of a batch."""
         ...
 
     def predict(self, values: Floats) -> Images:

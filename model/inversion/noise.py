@@ -24,7 +24,7 @@ from model.inversion.levenberg import Fit, Limits
 
 Floats = NDArray[np.float64]
 LEAST_NOISE = 1e-6
-"""Of a pixel: what the raster itself is off by. A clean image is not known better than it was drawn."""
+"""Error of the raster itself in a pixel: a clean image is not known better than it was drawn."""
 REDRAWS = 12
 STEPS = 2
 """Presses drawn near each estimate for `quantised`."""
@@ -33,7 +33,7 @@ _FEW = 2.179 / 1.960
 
 
 class Noise(StrEnum):
-    """What separates an image from the model's."""
+    """Model of the differences between an image and the fitted one."""
 
     PIXEL = "pixel"
     QUANTISED = "quantised"

@@ -1,4 +1,4 @@
-"""What a training is, as a file: frozen, checked, and kept inside every checkpoint."""
+"""Configuration of a training, as a TOML file: frozen, validated, and stored in every checkpoint."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class LayerConfig(_Frozen):
 
 
 class TargetConfig(_Frozen):
-    """Which strokes are drawn; see `model.generator.targets.Target`."""
+    """Strokes that are drawn; see `model.generator.targets.Target`."""
 
     model: Annotated[str, Field(max_length=64)] = "ccd-bsm"
     radius_mm: Annotated[float, Field(gt=0, le=100)] = 6.0
@@ -58,7 +58,7 @@ class TuningConfig(_Frozen):
     start_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     captures_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     source: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\r\n]*$")]
-    """What kind of ink the captures are of, as `loopback rig`."""
+    """Origin of the captured ink, as `loopback rig`."""
     held_out: Annotated[float, Field(gt=0, lt=1)] = 0.2
     """The share of captures that is validated on and never learned from."""
 
@@ -91,7 +91,7 @@ class TrainConfig(_Frozen):
     blank_after: Annotated[int, Field(ge=1)] = 2
     """Validations in a row with blank output that end the training."""
     tuning: TuningConfig | None = None
-    """Where the weights and the images come from, when captures are what is learned from."""
+    """Origin of weights and images when training on captures."""
     threads: Annotated[int, Field(ge=1, le=256)] = 1
     """Threads of torch in each process; another number changes the last bits of the weights."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -106,7 +106,7 @@ class TrainConfig(_Frozen):
         return self
 
     def weight_count(self) -> int:
-        """How many numbers the network has, without building it."""
+        """Number of weights, without building the network."""
         n, upscale = self.layers, self.target.size_px // self.layers.side
         sizes = [n.degree * len(self.target.ranges), *[n.width] * n.depth, n.channels * n.side**2]
         fully = sum((a + 1) * b for a, b in pairwise(sizes))
@@ -134,7 +134,7 @@ class TrainConfig(_Frozen):
             return Generator(self.build_target().inputs, self.build_layers())
 
     def build_layers(self) -> Layers:
-        """The sizes as the network takes them."""
+        """Sizes for the network."""
         return Layers(**self.layers.model_dump(), size_px=self.target.size_px)
 
 
@@ -180,7 +180,7 @@ def checked(where: Path | str, fields: Any) -> TrainConfig:
 
 
 def differences(old: TrainConfig, new: TrainConfig) -> list[str]:
-    """What two configurations disagree on, as `field: old -> new`."""
+    """Differences between two configurations, as `field: old -> new`."""
     found: list[str] = []
 
     def walk(a: Any, b: Any, path: str) -> None:

@@ -31,7 +31,7 @@ class Images(Protocol):
     """A numbered set of (inputs, image)."""
 
     def __len__(self) -> int:
-        """How many."""
+        """Number of images."""
         ...
 
     def pick(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
@@ -41,7 +41,7 @@ class Images(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exact:
-    """Images that are made when they are asked for: the target's exact coverage of `inputs` (n, P)."""
+    """Images made on demand: the target's exact coverage of `inputs` (n, P)."""
 
     target: Target
     inputs: Tensor

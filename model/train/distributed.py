@@ -40,7 +40,7 @@ class Group:
         return values
 
     def wait(self) -> None:
-        """Go on when all processes are here."""
+        """Wait until all processes arrive here."""
         if self.world > 1:
             torch.distributed.barrier()
 

@@ -1,9 +1,9 @@
 """Errors of training.
 
 TrainError              a file or a setting cannot be used; nothing half-written is left
-TrainingStopped         the training ran into something that going on would not mend
+TrainingStopped         the training cannot usefully continue
  +-- BlankOutput        the generator draws nothing, or ink everywhere, whatever its inputs
- +-- Diverged           the loss is no number any more
+ +-- Diverged           the loss became NaN or infinite
 MissingExtra            an optional package is not installed
 """
 
@@ -25,7 +25,7 @@ class TrainError(Exception):
 
 
 class TrainingStopped(Exception):
-    """Stopped at `step`; the last checkpoint is whole."""
+    """Stopped at `step`; the last checkpoint is complete."""
 
     exit_code: ClassVar[int] = 4
 

@@ -35,33 +35,33 @@ class Validation:
 
     @property
     def blank(self) -> bool:
-        """Whether hardly anything is drawn, or hardly anything left white."""
+        """Whether the images hold almost no ink, or almost no paper."""
         paper, target_paper = 1 - self.ink_share, 1 - self.target_share
         return self.ink_share < BLANK_SHARE * self.target_share or paper < BLANK_SHARE * target_paper
 
 
 class Watcher(Protocol):
-    """Who is told how the training goes; only the first process' watcher is."""
+    """Receives the progress of a training, in the first process only."""
 
     def stepped(self, step: int, loss: float) -> None:
-        """A step was done."""
+        """Called after a step."""
         ...
 
     def validated(self, validation: Validation) -> None:
-        """A validation was done."""
+        """Called after a validation."""
         ...
 
     def pictures(self, step: int, inputs: Tensor, targets: Tensor, drawn: Tensor) -> None:
-        """Every m steps: some validation strokes, the target and what the generator draws."""
+        """Called every m steps with some validation strokes: targets and drawn images."""
         ...
 
     def checkpoint(self, state: State) -> None:
-        """A state to keep."""
+        """Called with a state to save."""
         ...
 
 
 def new_state(config: TrainConfig) -> State:
-    """Step 0: the weights of the seed, and Adam without a past."""
+    """State at step 0: the weights of the seed, and Adam without moments."""
     weights = {name: value.detach().clone() for name, value in config.build_network().named_parameters()}
     return State(weights, {name: (torch.zeros_like(v), torch.zeros_like(v)) for name, v in weights.items()})
 
@@ -107,7 +107,7 @@ def train(
                 watcher.checkpoint(run.state(step))
         if stop and not last:
             group.wait()
-            raise TrainingStopped(saved, "stopped as asked; the same command goes on from here")
+            raise TrainingStopped(saved, "stopped as requested; the same command resumes here")
     return run.state(step)
 
 
@@ -149,7 +149,7 @@ def validate(network: Generator, images: Images, group: Group, batch: int, step:
 
 @dataclass(slots=True, eq=False)
 class _Run:
-    """What the loop works on."""
+    """State of a running training."""
 
     config: TrainConfig
     network: Generator
@@ -219,7 +219,7 @@ class _Run:
 
 
 def _put_moments(optimiser: torch.optim.Adam, network: Generator, state: State) -> None:
-    """Give Adam its past; its own count of steps is the state's."""
+    """Load the state's moments and step count into Adam."""
     for name, parameter in network.named_parameters():
         first, second = (torch.empty_like(parameter).copy_(part) for part in state.moments[name])
         count = torch.tensor(float(state.step), device=parameter.device)

@@ -47,7 +47,7 @@ class Tuning:
 
 
 class Progress(Protocol):
-    """What the command line shows."""
+    """Display of a training on the command line."""
 
     def stepped(self, step: int, loss: float) -> None:
         """A step was done."""
@@ -117,7 +117,7 @@ def _start(config: TrainConfig, folder: Path, tuning: Tuning | None) -> State:
 
 
 def _sets(config: TrainConfig, tuning: Tuning | None) -> tuple[Images, Images]:
-    """What is learned from and what is validated on."""
+    """Training and validation images."""
     if config.tuning is None:
         return exact_sets(config)
     if tuning is None:
@@ -130,7 +130,7 @@ def _sets(config: TrainConfig, tuning: Tuning | None) -> tuple[Images, Images]:
 
 @dataclass(slots=True, eq=False)
 class _Files:
-    """Writes what the loop hands out."""
+    """Writes pictures, checkpoints and events of a training."""
 
     config: TrainConfig
     folder: Path

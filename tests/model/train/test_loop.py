@@ -51,7 +51,7 @@ def test_batches_follow_from_seed_and_step(tiny: TrainConfig) -> None:
 
 
 def test_asked_to_stop_it_keeps_the_last_step(tiny: TrainConfig, notes) -> None:
-    with pytest.raises(TrainingStopped, match=r"step 4: .* goes on from here"):
+    with pytest.raises(TrainingStopped, match=r"step 4: .* resumes here"):
         train(tiny, new_state(tiny), exact_sets(tiny), notes, stopping=lambda: len(notes.losses) == 3)
     assert list(notes.states) == [4]
 
