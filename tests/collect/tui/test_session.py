@@ -168,6 +168,7 @@ async def test_a_day_at_the_rig(day: Day) -> None:
         await operator.on(RunScreen)
 
         # pause, look, go on
+        await operator.reads("space pause")
         await operator.press("space")
         await operator.in_state(State.PAUSED)
         await operator.reads("PAUSED", "space resume")
