@@ -210,7 +210,7 @@ async def test_a_day_at_the_rig(day: Day) -> None:
         await operator.press("escape", "escape", "q")
         await operator.on(StartScreen)
         await operator.reads("closed")
-        await operator.press("q")
+        await pilot.press("q")
     assert app.engine is not None
     wait_for_end(app.engine)
 
