@@ -193,7 +193,7 @@ def _has_pressed(journal: Path) -> bool:
 def put_in_sheet(store: SessionStore, sheet: int | None) -> None:
     """Record which sheet the operator says is in; the same number again changes nothing.
 
-    Raises `ConfigError` for an impossible number, or while a press still has to be photographed.
+    Raises `ConfigError` for an impossible number, or while a stroke still has to be photographed.
     """
     now = store.state.sheet + 1
     if sheet is None or sheet == now:
@@ -201,7 +201,7 @@ def put_in_sheet(store: SessionStore, sheet: int | None) -> None:
     if sheet != now + 1:
         raise ConfigError("--sheet", "", f"{sheet}: sheet {now} is in use, so only {now} or {now + 1} can be in")
     results = [(line["kind"], line["result"]) for line in store.state.segments]
-    pressed = {r["stroke_id"] for kind, r in results if kind == StepKind.PRESS}
+    pressed = {r["stroke_id"] for kind, r in results if kind in (StepKind.PRESS, StepKind.DRAW)}
     waiting = sorted(pressed - {r["stroke_id"] for kind, r in results if kind == StepKind.CAPTURE})
     if waiting:
         raise ConfigError(

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from collect.engine.opening import Opening, find_resumable
+from collect.engine.opening import Opening, find_resumable, put_in_sheet
 from collect.errors import ConfigError
 from collect.planning.limits import distinct_steps
 from collect.protocols.steps import StepKind
@@ -164,3 +166,13 @@ def test_a_session_goes_on_with_or_without_its_check_as_it_was_begun(lab: Path, 
         assert kinds(going_on) == kinds(opening(armed=begun_armed))
     edit("rig.toml", "[motion]", f"[self_check]\nenabled = {str(not begun_armed).lower()}\n\n[motion]")
     assert "self_check.enabled" in "".join(refused())
+
+
+@pytest.mark.parametrize("kind", [StepKind.PRESS, StepKind.DRAW])
+def test_a_sheet_stays_in_until_each_stroke_on_it_is_photographed(kind: StepKind) -> None:
+    segments = [{"kind": kind, "result": {"stroke_id": "first"}}]
+    store: Any = SimpleNamespace(state=SimpleNamespace(sheet=0, segments=segments), fresh_sheet=lambda: None)
+    with pytest.raises(ConfigError, match="first is pressed on sheet 1 but not photographed"):
+        put_in_sheet(store, 2)
+    segments.append({"kind": StepKind.CAPTURE, "result": {"stroke_id": "first"}})
+    put_in_sheet(store, 2)
