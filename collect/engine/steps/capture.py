@@ -1,5 +1,4 @@
-"""Photographs: the BOARD step, the look at a blank sheet, and the CAPTURE step, which decides whether a stroke counts,
-is pressed again or is left out."""
+"""Photographs: the BOARD step, the look at a blank sheet, and the CAPTURE step."""
 
 from __future__ import annotations
 
@@ -14,8 +13,8 @@ from calibrate.stroke.params import Gray
 from collect.engine.last_capture import LastCapture, pictures_of, published_mark
 from collect.engine.steps.choose import measured
 from collect.engine.steps.context import RunContext, StepContext, uninterrupted
-from collect.errors import BadPicture, NeedsOperator, StepError
-from collect.operator import Choice, OperatorRequest, Prompt
+from collect.engine.steps.retake import decide
+from collect.errors import BadPicture, StepError
 from collect.protocols.steps import Result
 from collect.quality.checks import cell_is_blank, check_capture, check_drawing, check_frame
 from collect.quality.verdict import Check, Family, Verdict
@@ -24,9 +23,6 @@ from collect.rig.paper import Cell
 from sessions.history import limit_s, unlike, waits_of
 from sessions.recording import schemas
 
-KEEP, AGAIN, SKIP = Choice("g", "good all the same: it counts"), Choice("r", "press it again"), Choice("k", "skip it")
-PICTURE_MARGIN_PX = 40
-"""Margin around the cell in the picture that goes with a question."""
 
 
 async def board(context: StepContext) -> Result:
@@ -125,15 +121,7 @@ async def capture(context: StepContext) -> Result:
     run.memory.sound_frame = image
     if run.asker.watched:
         await uninterrupted(_show, context, verdict, image, cell)
-    kept, retake = True, False
-    if run.requests.take(OperatorRequest.RETAKE):
-        kept, retake = False, True
-        run.progress.log(f"{stroke_id}: is pressed again, as the operator asked")
-    elif run.requests.take(OperatorRequest.SKIP):
-        kept = False
-        run.progress.log(f"{stroke_id}: is left out, as the operator asked")
-    elif verdict is not None and not verdict.passed:
-        kept, retake = await _decide(context, verdict, image, cell)
+    kept, retake = await decide(context, verdict, image, cell)
     if not kept:
         run.progress.looked_at(kept=False)
     if kept:
@@ -208,24 +196,6 @@ def _judge(context: StepContext, image: Gray, cell: Cell) -> Verdict:
     )
 
 
-async def _decide(context: StepContext, verdict: Verdict, image: Gray, cell: Cell) -> tuple[bool, bool]:
-    """(kept, retake): retake while takes are left, then a person decides; unwatched, the stroke is given up."""
-    run = context.run
-    take = int(context.step.params.get("take") or 1)
-    if take <= run.rig.config.quality.retakes:
-        return False, True
-    stroke_id = str(context.step.params["stroke_id"])
-    text = f"{stroke_id}, take {take}: {verdict.reason}"
-    prompt = Prompt(text, (KEEP, AGAIN, SKIP), SKIP.key, image=_cut_out(run, image, cell))
-    try:
-        with run.progress.meanwhile("wait for an answer"):
-            answer = await run.asker.ask(prompt)
-    except NeedsOperator:
-        run.progress.log(f"{stroke_id}: given up", warning=True)
-        return False, False
-    return answer == KEEP.key, answer == AGAIN.key
-
-
 def _show(context: StepContext, verdict: Verdict | None, image: Gray, cell: Cell) -> None:
     photo = binary = None
     with contextlib.suppress(BadPicture):
@@ -236,19 +206,6 @@ def _show(context: StepContext, verdict: Verdict | None, image: Gray, cell: Cell
     sizes = {"radius_mm": brush.radius_mm, "length_mm": brush.length_mm}
     model = None if _drawn(context) else published_mark(height_mm, tilt_deg, **sizes)
     context.run.progress.show(LastCapture(stroke_id, height_mm, tilt_deg, still, True, verdict, photo, binary, model))
-
-
-def _cut_out(run: RunContext, image: Gray, cell: Cell) -> Gray:
-    """The cell and a margin around it."""
-    plane = run.memory.image_plane
-    assert plane is not None
-    x_mm, y_mm, width_mm, height_mm = cell.rect_mm
-    corners = np.array([[x, y, 1.0] for x in (x_mm, x_mm + width_mm) for y in (y_mm, y_mm + height_mm)])
-    seen = corners @ np.linalg.inv(plane.image_to_paper).T
-    px = seen[:, :2] / seen[:, 2:]
-    (left, top), (right, bottom) = px.min(axis=0).astype(int), px.max(axis=0).astype(int)
-    m = PICTURE_MARGIN_PX
-    return image[max(0, top - m) : bottom + m, max(0, left - m) : right + m]
 
 
 def _stroke(context: StepContext, cell: Cell, dip_to_touch_s: float | None) -> schemas.Stroke:
