@@ -132,7 +132,7 @@ def _around(move: Span, motion: list[Span]) -> tuple[Span, Span]:
 
 def _collect(folder: Path) -> None:
     from collect.engine.engine import Engine
-    from collect.engine.opening import Opening, find_resumable, open_store
+    from collect.engine.open_or_resume import Opening, find_resumable, open_store
     from drivers.clock import HostClock
 
     opening = Opening.load(folder / "sessions", folder / "rig.toml", folder / "protocol.toml")

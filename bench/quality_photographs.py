@@ -16,7 +16,7 @@ import numpy as np
 
 from bench.harness import BenchError
 from calibrate.board.lens import unknown_lens
-from calibrate.board.plane import Plane
+from calibrate.board.pix2len import Plane
 from collect.quality.checks import check_capture
 from collect.quality.verdict import Failure, Verdict
 from collect.rig.config_quality import QualityConfig

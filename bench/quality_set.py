@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.plane import Plane
+from calibrate.board.pix2len import Plane
 from calibrate.board.spec import BoardSpec
 from calibrate.board.view import see_board
 from collect.quality.verdict import Failure

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from calibrate.artefact import Artefact
 from calibrate.board.lens import LensUsed
-from calibrate.board.plane import apply
+from calibrate.board.pix2len import apply
 from calibrate.board.spec import BoardSpec
 
 SCHEMA_VERSION = 2

@@ -11,7 +11,7 @@ import numpy as np
 
 from calibrate.artefact import current
 from calibrate.board.lens import Gray, unknown_lens
-from calibrate.board.plane import Plane
+from calibrate.board.pix2len import Plane
 from calibrate.board.session import NO_BOARD, board_of, known_lens
 from calibrate.board.view import calibration_plane
 from calibrate.compare.field import Field

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from calibrate.board.plane import Plane
+from calibrate.board.pix2len import Plane
 from calibrate.compare.field import Field, Tone, captured_mm, crop, crop_at_anchor
 from calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params, Soft
 from calibrate.stroke.preprocess import preprocess, to_levels

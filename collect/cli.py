@@ -14,7 +14,7 @@ from sessions.terminal import say
 
 if TYPE_CHECKING:
     from collect.engine.engine import Engine
-    from collect.engine.opening import Opening
+    from collect.engine.open_or_resume import Opening
 
 app = typer.Typer(invoke_without_command=True, pretty_exceptions_enable=False)
 
@@ -61,7 +61,7 @@ def collect(
 
     from collect import start
     from collect.engine.live import LiveView
-    from collect.engine.opening import Opening
+    from collect.engine.open_or_resume import Opening
 
     on_screen = tui if tui is not None else sys.stdin.isatty() and sys.stdout.isatty()
     if dry_run is not None:
@@ -112,7 +112,7 @@ def plan(
     import asyncio
     import json
 
-    from collect.planning.limits import all_poses, check_protocol
+    from collect.planning.limit_check import all_poses, check_protocol
     from collect.planning.summary import make_plan, plan_table
     from collect.protocols.config import load_protocol
     from collect.rig.config import load_rig
@@ -129,7 +129,7 @@ def plan(
     made = make_plan(rig, wanted)
     asked = None
     if ask:
-        from collect.planning.limits import ask_reach
+        from collect.planning.limit_check import ask_reach
 
         poses = all_poses(rig, wanted, PaperPlane(rig.paper.touch_z_mm), every_cell=True)
         asked = asyncio.run(ask_reach(config, rig, poses))

@@ -12,9 +12,9 @@ from collect.chains.commands import ending
 from collect.engine.dry_run import DryRunEngine
 from collect.engine.engine import Engine
 from collect.engine.live import LiveView
-from collect.engine.opening import Opening, check_writable, find_resumable, open_store
+from collect.engine.open_or_resume import Opening, check_writable, find_resumable, open_store
 from collect.headless import run_headless
-from collect.planning.limits import check_protocol
+from collect.planning.limit_check import check_protocol
 from drivers.clock import HostClock
 from sessions.terminal import plain
 

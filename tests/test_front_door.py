@@ -32,7 +32,7 @@ def test_help_loads_nothing_heavy() -> None:
 
 def test_a_rig_pc_collects_without_torch_and_a_validator_without_devices() -> None:
     assert "torch" not in loaded(
-        "import collect.engine.engine, collect.headless, collect.engine.opening, collect.tui.app"
+        "import collect.engine.engine, collect.headless, collect.engine.open_or_resume, collect.tui.app"
     )
     validating = loaded("import calibrate.session, calibrate.drags.report")
     assert not {"serial", "can", "textual", "drivers"} & set(validating)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calibrate.board.edges import on_edges
 from calibrate.board.lens import Floats, Gray
-from calibrate.board.plane import apply
+from calibrate.board.pix2len import apply
 from calibrate.board.spec import Board, BoardSpec, Checkerboard, charuco_board
 from calibrate.errors import CalibrationError
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.board.lens import Gray, Lens
-from calibrate.board.plane import Plane
+from calibrate.board.pix2len import Plane
 from calibrate.board.session import NO_BOARD, board_stills, sheet_of
 from calibrate.board.spec import BoardSpec
 from calibrate.board.view import see_board_and_lens

@@ -13,7 +13,7 @@ from scipy.special import stdtrit
 from calibrate.board.cameras import TwoCameras, solve, two_cameras
 from calibrate.board.detect import BoardView
 from calibrate.board.lens import Floats, Lens, unknown_lens
-from calibrate.board.plane import homography
+from calibrate.board.pix2len import homography
 from calibrate.errors import CalibrationError
 
 Ways = NDArray[np.int64]

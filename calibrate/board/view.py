@@ -10,7 +10,7 @@ from calibrate.board.artefact import LensFile
 from calibrate.board.detect import BoardView, find_board
 from calibrate.board.intrinsics import RMS_LIMIT_PX
 from calibrate.board.lens import Floats, Gray, Lens, unknown_lens
-from calibrate.board.plane import Plane, distorted_share, fit_plane
+from calibrate.board.pix2len import Plane, distorted_share, fit_plane
 from calibrate.board.spec import BoardSpec
 from calibrate.errors import CalibrationError
 

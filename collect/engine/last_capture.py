@@ -20,7 +20,7 @@ from model.fitted import FittedPress
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from calibrate.board.plane import Plane
+    from calibrate.board.pix2len import Plane
     from calibrate.stroke.params import Gray
 
 FIELD = Field()

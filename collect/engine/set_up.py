@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from calibrate.board.plane import WORST_RMS_PX
+from calibrate.board.pix2len import WORST_RMS_PX
 from collect.engine.policy import GO_ON, KEEP, STOP
 from collect.engine.snapshot import SET_UP, TITLES, Fact, SetUpStep, Standing
 from collect.operator import Choice, Prompt

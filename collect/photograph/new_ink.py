@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.board.lens import Floats
-from calibrate.board.plane import apply, local_scale
+from calibrate.board.pix2len import apply, local_scale
 from calibrate.board.view import see_board
 from calibrate.errors import CalibrationError
 from calibrate.stroke.params import PX_PER_MM

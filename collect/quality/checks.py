@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.board.plane import Plane
+from calibrate.board.pix2len import Plane
 from calibrate.stroke.params import PX_PER_MM, Gray, Params
 from calibrate.stroke.rectify import rectify
 from collect.quality import measure

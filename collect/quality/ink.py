@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from calibrate.board.lens import Floats
-from calibrate.board.plane import apply
+from calibrate.board.pix2len import apply
 from calibrate.stroke.light import flatten
 from calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params, Soft
 from calibrate.stroke.rectify import rectify

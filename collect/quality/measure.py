@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.board.lens import Floats
-from calibrate.board.plane import Plane, apply
+from calibrate.board.pix2len import Plane, apply
 from calibrate.stroke.params import PX_PER_MM, Gray, Mask, Soft
 from collect.quality.ink import Ink, Point
 

@@ -14,13 +14,13 @@ from collect.rig.config_devices import ForceConfig, InkDeviceConfig, InkStationC
 from drivers.arcs.robot import ArcsOptions, AuboArcs
 from drivers.camera import CameraOptions, Locked, OpenCvCamera
 from drivers.clock import Clock
+from drivers.exclusive import Claimed, claimed
 from drivers.force.sri_m8123 import SriM8123, SriOptions
 from drivers.ink.pump import ModbusPump, PumpOptions
 from drivers.ink.station import InkStation, StationOptions
 from drivers.limits import Limits
 from drivers.protocols import Camera, ForceSensor, Ink, Robot
 from drivers.samples import Identity
-from drivers.sole import Claimed, claimed
 
 FORCE_CONNECT_S = 10.0
 """Time to open the bus, even through a gateway, and get a first round."""

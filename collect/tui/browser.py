@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from collect.engine.opening import Opening
+    from collect.engine.open_or_resume import Opening
     from collect.headless import RunnableEngine
     from collect.rig.doctor import Finding
     from sessions.show import Details, Summary
@@ -85,7 +85,7 @@ class SessionBrowser:
 
         Connects nothing yet. Raises `ConfigError`, also where these files belong to another open session.
         """
-        from collect.engine.opening import Opening, find_resumable
+        from collect.engine.open_or_resume import Opening, find_resumable
         from collect.errors import ConfigError
 
         paths, new = self.paths, session_id is None

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from calibrate.board.plane import Plane
+from calibrate.board.pix2len import Plane
 from calibrate.board.session import board_of
 from calibrate.board.spec import BoardSpec
 from calibrate.board.view import see_board

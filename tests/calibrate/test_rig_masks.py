@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.preprocess_rigs import BRUSHES, Shot, heading_free_window, sheet, true_mask
-from calibrate.board.plane import Plane
+from calibrate.board.pix2len import Plane
 from calibrate.board.view import see_board_and_lens
 from calibrate.compare import MM_PER_PX
 from calibrate.stages import trace_seen

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from collect.errors import ConfigError
-from collect.planning.limits import check_protocol
+from collect.planning.limit_check import check_protocol
 from collect.protocols.config import load_protocol
 from collect.rig.config import load_rig
 from drivers.sim.config import SimConfig

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from collect.chains.commands import ending
-from collect.engine.opening import Opening
+from collect.engine.open_or_resume import Opening
 from collect.start import start
 from tests.collect.until import wait_for_end
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from collect.engine.control import State
-from collect.engine.opening import Opening
+from collect.engine.open_or_resume import Opening
 from collect.errors import ConfigError
 from drivers.arcs.codes import SafetyMode
 from drivers.errors import RobotNotSafe

@@ -24,7 +24,7 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from collect.engine.live import HOST, QUEUE_LIMIT, LiveView
-from collect.engine.opening import Opening
+from collect.engine.open_or_resume import Opening
 from collect.engine.telemetry import FRAME_PERIOD_S
 from collect.errors import ConfigError
 from collect.start import start

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from collect.engine.opening import Opening, find_resumable, put_in_sheet
+from collect.engine.open_or_resume import Opening, find_resumable, put_in_sheet
 from collect.errors import ConfigError
-from collect.planning.limits import distinct_steps
+from collect.planning.limit_check import distinct_steps
 from collect.protocols.steps import StepKind
 from drivers.clock import HostClock
 from drivers.sim.config import SimConfig

@@ -14,7 +14,7 @@ import pytest
 from collect.errors import ConfigError
 from collect.rig.config import RigConfig, load_rig
 from collect.rig.devices import sole_driver
-from drivers import sole
+from drivers import exclusive as sole
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml
 

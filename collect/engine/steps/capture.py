@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 
-import numpy as np
-
-from calibrate.board.plane import Plane
+from calibrate.board.pix2len import Plane
 from calibrate.board.view import see_board
 from calibrate.errors import CalibrationError
 from calibrate.stroke.params import Gray
@@ -14,7 +12,7 @@ from collect.engine.last_capture import LastCapture, pictures_of, published_mark
 from collect.engine.steps.choose import measured
 from collect.engine.steps.context import RunContext, StepContext, uninterrupted
 from collect.engine.steps.retake import decide
-from collect.errors import BadPicture, StepError
+from collect.errors import BadPicture, NeedsOperator, StepError
 from collect.protocols.steps import Result
 from collect.quality.checks import cell_is_blank, check_capture, check_drawing, check_frame
 from collect.quality.verdict import Check, Family, Verdict
@@ -22,7 +20,6 @@ from collect.rig.optics import undistorted
 from collect.rig.paper import Cell
 from sessions.history import limit_s, unlike, waits_of
 from sessions.recording import schemas
-
 
 
 async def board(context: StepContext) -> Result:

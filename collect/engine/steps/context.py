@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeVar
 
-from calibrate.board.plane import Plane
+from calibrate.board.pix2len import Plane
 from calibrate.board.view import see_board
 from calibrate.errors import CalibrationError
 from collect.engine.force_guard import ForceGuard

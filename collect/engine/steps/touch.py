@@ -11,7 +11,7 @@ from collect.engine.steps.dip import fill_brush, set_light
 from collect.errors import ConfigError, StepError
 from collect.motion.moves import visit_moves
 from collect.operator import Choice, Prompt
-from collect.planning.limits import check_poses, check_step
+from collect.planning.limit_check import check_poses, check_step
 from collect.planning.walk import touch_of
 from collect.protocols.steps import Result
 from collect.rig.config_touch import TouchConfig

@@ -16,7 +16,7 @@ from typer.testing import CliRunner, Result
 from brushloop import app
 from calibrate.board.artefact import LensFile
 from calibrate.board.lens import Gray
-from calibrate.board.plane import apply
+from calibrate.board.pix2len import apply
 from calibrate.board.spec import BoardSpec, charuco_board
 from calibrate.errors import CalibrationError
 

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from calibrate.board.detect import find_board
 from calibrate.board.lens import unknown_lens
-from calibrate.board.plane import Plane, apply, distorted_share, fit_plane, local_scale
+from calibrate.board.pix2len import Plane, apply, distorted_share, fit_plane, local_scale
 from calibrate.board.spec import BoardSpec
 from calibrate.board.view import DISTORTED_SHARE, paper_mm, see_board
 from calibrate.errors import CalibrationError

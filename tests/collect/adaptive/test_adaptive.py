@@ -12,7 +12,7 @@ import pytest
 from pydantic import ValidationError
 
 from calibrate.fit.stepwise import CapturedPress, Design, field_grid, next_cell, packed, unpacked
-from collect.planning.limits import check_protocol
+from collect.planning.limit_check import check_protocol
 from collect.planning.summary import make_plan
 from collect.protocols.adaptive import AdaptiveConfig
 from collect.protocols.config import load_protocol

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from collect.engine.engine import Engine
-from collect.engine.opening import Opening, find_resumable, open_store
+from collect.engine.open_or_resume import Opening, find_resumable, open_store
 from drivers.arcs import stopping
 from drivers.arcs.rpc import RpcConnection
 from drivers.clock import HostClock

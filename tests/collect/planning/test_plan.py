@@ -11,7 +11,7 @@ import pytest
 from collect.errors import ConfigError
 from collect.motion.moves import Move, Way
 from collect.planning.estimate import _apart, bundle_ml, ink_need, move_s, reach_of, trapezoid_s, way_s
-from collect.planning.limits import all_poses, check_poses, check_protocol
+from collect.planning.limit_check import all_poses, check_poses, check_protocol
 from collect.planning.summary import Plan, make_plan
 from collect.planning.walk import moves_of, sheet_of, walk
 from collect.protocols.config import ProtocolConfig, load_protocol

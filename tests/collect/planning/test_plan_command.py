@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import collect.cli
 from collect.errors import ConfigError
-from collect.planning.limits import all_poses, ask_reach
+from collect.planning.limit_check import all_poses, ask_reach
 from collect.planning.picture import draw_plan
 from collect.planning.summary import make_plan
 from collect.protocols.config import load_protocol

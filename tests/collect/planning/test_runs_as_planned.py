@@ -11,7 +11,7 @@ from collect.engine.perform import Performer
 from collect.engine.steps import choose as choosing
 from collect.engine.steps.context import StepContext
 from collect.motion.moves import inking_moves
-from collect.planning.limits import all_poses, check_protocol
+from collect.planning.limit_check import all_poses, check_protocol
 from collect.planning.walk import moves_of
 from collect.protocols.config import load_protocol
 from collect.protocols.steps import MARKING, Result, Step, StepKind

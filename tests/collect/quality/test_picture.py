@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from calibrate.board.lens import unknown_lens
-from calibrate.board.plane import Plane
+from calibrate.board.pix2len import Plane
 from collect.quality.checks import cell_is_blank, check_capture, check_drawing, check_frame
 from collect.quality.measure import blur_px, glare, paper_level
 from collect.quality.verdict import Failure, Family

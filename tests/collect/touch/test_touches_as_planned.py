@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from collect.errors import ConfigError
-from collect.planning.limits import check_step
+from collect.planning.limit_check import check_step
 from collect.planning.walk import moves_of
 from collect.protocols.steps import Step, StepKind
 from collect.rig.config import RigConfig
