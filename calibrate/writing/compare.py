@@ -19,7 +19,7 @@ from calibrate.files import read_gray
 from calibrate.session import calibration_of
 from calibrate.stroke.params import Params
 from calibrate.stroke.preprocess import Prepared, prepare
-from calibrate.stroke.rectify import rectify
+from calibrate.stroke.rectify import rectify_by
 from calibrate.writing.plan_files import FigureRecord, PlanRecord, points_digest
 from calibrate.writing.scores import Character, Ink, Table3Row, WrittenScore, score_character, table_3
 from sessions.errors import SessionDamaged
@@ -137,7 +137,7 @@ def captured(capture: Capture, calibration: Calibration) -> tuple[Ink, bool]:
     _, _, width_mm, height_mm = stroke.cell_mm
     if not math.isclose(width_mm, height_mm):
         raise CaptureRefused(stroke.stroke_id, f"its cell is {width_mm:g} x {height_mm:g} mm, a square is needed")
-    raster = rectify(capture.image(), calibration.homography(), stroke.cell_mm)
+    raster = rectify_by(capture.image(), calibration, stroke.cell_mm, capture.where)
     prepared = _whole_cell(raster, capture.where, calibration, math.hypot(width_mm, height_mm))
     return {Tone.BINARY: _small(prepared.mask.astype(np.float32)), Tone.GRAY: _small(prepared.soft)}, prepared.cut
 

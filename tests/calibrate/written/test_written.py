@@ -9,9 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
+from calibrate.board.lens import LensUsed
 from calibrate.compare.field import Alignment, Tone
 from calibrate.compare.similarity import Polarity
 from calibrate.errors import CalibrationError, CaptureRefused
+from calibrate.stroke.rectify import rectify_by
 from calibrate.writing.compare import as_ink, captured, read_reference
 from calibrate.writing.plan_files import PlanRecord, figure_record, load_plan, points_digest
 from calibrate.writing.scores import (
@@ -78,6 +80,18 @@ def test_ink_on_the_edge_of_the_cell_is_told_and_other_cells_are_refused() -> No
         captured(capture(page((250, 300, 500, 340)), (20.0, 10.0, 60.0, 40.0)), CALIBRATION)
     with pytest.raises(CaptureRefused, match="is blank"):
         captured(capture(page()), CALIBRATION)
+
+
+def test_a_character_is_seen_through_the_lens_of_the_calibration() -> None:
+    lens = LensUsed(
+        source="lens file a", size_px=(1000, 800), matrix=(1200.0, 1200.0, 500.0, 400.0), distortion=(-0.3, 0, 0, 0, 0)
+    )
+    image = page((250, 600, 750, 640))
+    undistorted = rectify_by(image, through := CALIBRATION.model_copy(update={"lens": lens}), CELL, "test")
+    assert np.abs(undistorted.astype(float) - rectify_by(image, CALIBRATION, CELL, "test")).max() > 100
+    through_lens, plain = (captured(capture(image), given)[0][Tone.BINARY] for given in (through, CALIBRATION))
+    ink = cv2.resize((undistorted < 125).astype(np.float32), (128, 128), interpolation=cv2.INTER_AREA)
+    assert np.abs(through_lens - ink).sum() < 0.1 * np.abs(plain - ink).sum()
 
 
 def test_size_normalised_forgives_place_and_size_and_mm_does_not() -> None:
