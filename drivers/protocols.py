@@ -23,8 +23,8 @@ class Robot(Protocol):
     async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
         """Move the tip in a straight line; returns when the arm has settled within tolerance.
 
-        The whole line is checked, from where the arm is. Raises `ArmMoved` where it is not where it was left, and
-        `SettingsChanged` before a line down with another tool, payload or speed than was set.
+        The whole line is checked, from where the arm is. Raises `ArmMoved` if the arm is not where it was left, and
+        `SettingsChanged` before a line down if tool, payload or speed differ from what was set.
         """
         ...
 
@@ -36,10 +36,11 @@ class Robot(Protocol):
         ...
 
     async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
-        """Carry out all lines, which the arm's controller holds before the first begins: once they have begun, they are
-        carried out to the end even if this program dies. Returns the poses seen meanwhile.
+        """Send all lines to the arm's controller, then start them: once started, they are carried out to the end even
+        if this program dies. Returns the poses seen meanwhile.
 
-        Every pose is checked before anything is sent. The last one is not where the arm began. A stop drops them all.
+        Every pose is checked before anything is sent. The last one must differ from where the arm starts. A stop drops
+        all lines.
         """
         ...
 
@@ -56,7 +57,7 @@ class Robot(Protocol):
         ...
 
     async def confirm(self) -> None:
-        """Raise `SettingsChanged`, then `ArmMoved`, unless the arm is as it was left; only asks the controller."""
+        """Raise `SettingsChanged` or `ArmMoved` if the arm is not as it was left; sets nothing."""
         ...
 
     async def take_up(self) -> Pose:

@@ -1,7 +1,7 @@
 """`brushloop demo`: the real commands, in order, against a loopback rig in a process of its own.
 
-Everything lies under one folder. Killed anywhere and started again, it goes on where it stopped: the rig's process
-outlives the demo by a minute, as a real sheet of paper would.
+All files go under one folder. A demo that is killed and started again continues where it stopped: the rig's process,
+which holds the simulated sheet, outlives the demo by a minute.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ IDLE_EXIT_S = 60.0
 def run_demo(out: Path, repeats: int, rate: float, seed: int) -> int:
     """Collect, calibrate, fit and validate under `out`; at the end print the paths of the report and of the MCAP.
 
-    Returns the exit code: 3 where the collection left strokes out. A session without a report is continued; a new one
-    is begun only once the last one has its report.
+    Returns the exit code, 3 if the collection left strokes out. A session without a report is continued; a new one is
+    started only when the last one has its report.
     """
     out.mkdir(parents=True, exist_ok=True)
     rig_toml, protocol_toml, sessions = out / "rig.toml", out / "protocol.toml", out / "sessions"
@@ -38,7 +38,7 @@ def run_demo(out: Path, repeats: int, rate: float, seed: int) -> int:
     if not protocol_toml.exists() or protocol_toml.read_text(encoding="utf-8") != protocol:
         protocol_toml.write_text(protocol, encoding="utf-8")
     if (session := finished_session(sessions, protocol_toml)) is not None and not _report(session).is_file():
-        say(f"goes on with {session}, which is collected")
+        say(f"continuing with {session}: its collection is finished")
         _evaluate(session)
         return 0
     finished = sessions.is_dir() and any(sessions.iterdir()) and not open_sessions(sessions)
@@ -69,7 +69,7 @@ def _report(session: Path) -> Path:
 
 
 def _serving(rig_toml: Path, rate: float, seed: int, *, fresh: bool) -> subprocess.Popen[bytes] | None:
-    """Start a rig, unless that of an earlier demo still serves and has a session to finish: then None."""
+    """Start a rig; return None if the rig of an earlier demo still runs and has a session to finish."""
     arcs_port, camera_port = _free_port(), _free_port()
     if rig_toml.exists() and not fresh:
         known = load_rig(rig_toml)

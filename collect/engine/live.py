@@ -1,7 +1,7 @@
-"""`--live`: shows what is being recorded to a Foxglove viewer on this machine. Never slows the run.
+"""`--live`: shows what is being recorded in a Foxglove viewer on this machine, without slowing the run.
 
-Messages wait in a short queue for a thread of their own; when it is full they are dropped and counted. Recording does
-not pass through here.
+A thread sends the messages from a short queue; when the queue is full, messages are dropped and counted. Recording
+does not pass through here.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from sessions.recording.messages import CompressedImage
 
 HOST = "127.0.0.1"
-"""This machine only, and not configurable: a viewer needs no password."""
+"""Loopback only, and not configurable, because a viewer needs no password."""
 PORT = 8765
 """The default port of Foxglove."""
 QUEUE_LIMIT = 2000
@@ -47,7 +47,7 @@ class LiveView:
     def __init__(self, port: int = PORT) -> None:
         self.port = port
         self.dropped = 0
-        """Messages that found no room in the queue; of pictures, only those that were due."""
+        """Messages dropped because the queue was full; pictures count only if one was due."""
         self._queue: queue.Queue[Outgoing | Frame | None] = queue.Queue(QUEUE_LIMIT)
         self._next_preview_s = 0.0
         self._thread: threading.Thread | None = None
@@ -55,12 +55,12 @@ class LiveView:
         self._closing = threading.Event()
 
     def start(self) -> None:
-        """Listen, on 127.0.0.1 only. Raises `ConfigError` without foxglove-sdk, or where the port is taken."""
+        """Listen, on 127.0.0.1 only. Raises `ConfigError` if foxglove-sdk is missing or the port is taken."""
         try:
             import foxglove
         except ImportError:
             raise ConfigError("--live", "", "needs foxglove-sdk: pip install 'brushloop[live]'") from None
-        # A viewer that hangs up must not write across the operator's screen.
+        # Otherwise a viewer that disconnects would cause log lines across the operator's screen.
         foxglove.set_log_level("CRITICAL")
         context = foxglove.Context()
         try:
@@ -94,7 +94,7 @@ class LiveView:
         self._closing.set()
         if self._thread is not None:
             with contextlib.suppress(queue.Full):
-                self._queue.put_nowait(None)  # wakes the thread; while the queue is full it is awake
+                self._queue.put_nowait(None)  # wakes the thread; if the queue is full, it is awake already
             self._thread.join()
             self._thread = None
         if self._server is not None:
@@ -122,7 +122,7 @@ class LiveView:
             if item is None:
                 continue
             picture = isinstance(item, Frame) or item.topic is Topic.STILL
-            # Encode nothing while nobody looks.
+            # Encode nothing while no viewer is subscribed.
             if channels.watched(Topic.PREVIEW if picture else cast("Outgoing", item).topic):
                 with contextlib.suppress(SessionDamaged):
                     table.add(_preview(item) if picture else cast("Outgoing", item))
@@ -130,7 +130,7 @@ class LiveView:
 
 @contextlib.asynccontextmanager
 async def watching(live: LiveView | None, camera: Camera, log: Callable[[str], None]) -> AsyncGenerator[None]:
-    """Within the block show the camera's newest frames, and `log` where to look; without `live` do nothing."""
+    """Show the camera's newest frames during the block, and `log` the address; do nothing if `live` is None."""
     if live is None:
         yield
         return
@@ -144,7 +144,7 @@ async def watching(live: LiveView | None, camera: Camera, log: Callable[[str], N
 
 
 class _Channels:
-    """The methods of an MCAP writer that `ChannelTable` calls, on a viewer's channels."""
+    """The methods of an MCAP writer that `ChannelTable` calls, implemented for a viewer's channels."""
 
     def __init__(self, context: Any) -> None:
         self._context = context

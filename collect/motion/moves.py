@@ -15,7 +15,7 @@ from drivers.samples import Pose
 CLEARANCE_MM = 8.0
 """Height above the paper at which the fast approach ends."""
 DWELL_MM = 0.05
-"""Length of the dwell: the last part of the descent, made slow. ARCS can only wait in its queue by moving."""
+"""Length of the slow end of the descent that serves as the dwell: ARCS's queue can only wait by moving."""
 CHECK_APPROACH_MM = 4.0
 """Height above the paper at which the slow approach of a self-check's mark begins."""
 CHECK_SPEED_MM_S = 5.0
@@ -29,12 +29,12 @@ class Move:
     target: Pose
     speed_mm_s: float
     least_s: float = 0.0
-    """How long it takes at least."""
+    """Minimum duration."""
 
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """Poses that are passed without a halt."""
+    """Poses to pass through without a halt."""
 
     poses: list[Pose]
     speed_mm_s: float
@@ -42,18 +42,18 @@ class Way:
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """Where a touch that decides by itself may send the upright brush: any pose between these, its outermost ones."""
+    """The outermost poses of the region in which a touch that decides by itself may move the upright brush."""
 
     poses: tuple[Pose, ...]
-    """The lowest ones come first."""
+    """Lowest first."""
     speed_mm_s: float
-    """No move within is faster."""
+    """Highest speed of any move in the region."""
 
     @classmethod
     def over(
         cls, config: RigConfig, rect_mm: tuple[float, float, float, float], lowest_z_mm: float, speed_mm_s: float
     ) -> Room:
-        """Over a rectangle of the sheet (x, y, width, height), which may be a point, up to travel height."""
+        """The region over a rectangle of the sheet (x, y, width, height), which may be a point, up to travel height."""
         x_mm, y_mm, width_mm, height_mm = rect_mm
         places = dict.fromkeys((x, y) for x in (x_mm, x_mm + width_mm) for y in (y_mm, y_mm + height_mm))
         heights = (lowest_z_mm, config.motion.safe_z_mm)
@@ -64,7 +64,7 @@ Part = Move | Way | Room
 
 
 def commanded(parts: Iterable[Part]) -> list[tuple[Pose, float]]:
-    """Every pose with its speed in mm/s; the outermost ones where a touch decides by itself."""
+    """Every pose with its speed in mm/s; of a `Room`, the outermost poses."""
     found: list[tuple[Pose, float]] = []
     for part in parts:
         match part:
@@ -92,7 +92,7 @@ def retreat_moves(config: RigConfig, here: Pose) -> list[Move]:
         qx, qy, qz, qw = here.quaternion
         z_mm = motion.safe_z_mm
         moves.append(Move(Pose(x_mm, y_mm, z_mm, qx, qy, qz, qw), motion.press_speed_mm_s))
-    # Upright in place before travelling: a turn and a long line at once sweep the ferrule around.
+    # Turn upright before travelling: turning along a long line would sweep the ferrule around.
     moves.append(Move(_upright_in_base(config, x_mm, y_mm, z_mm), motion.travel_speed_mm_s))
     return moves + park_moves(config)
 
@@ -117,7 +117,7 @@ def photograph_moves(config: RigConfig) -> list[Move]:
 
 
 def inking_moves(config: RigConfig, dips: int) -> list[Move]:
-    """The dip after `dips` others of this process, and the wash before it where one is due."""
+    """The dip that follows `dips` others in this process, with a wash before it if one is due."""
     wash = config.ink.wash
     washed = wash is not None and dips % wash.every_dips == wash.every_dips - 1
     return [*(wash_moves(config, wash) if wash is not None and washed else ()), *dip_moves(config)]
@@ -148,10 +148,10 @@ def wash_moves(config: RigConfig, wash: WashConfig) -> list[Move]:
 def press_moves(
     config: RigConfig, plane: PaperPlane, cell: Cell, height_mm: float, tilt_deg: float, dwell_s: float = 0.0
 ) -> tuple[list[Move], list[Move]]:
-    """(over the cell and tilted about the tip at clearance; down to touch height and by H, dwell, and up again).
+    """Two lists: over the cell and tilt about the tip at clearance; down to touch height and by H, dwell, up again.
 
     The controller carries out the second list by itself, so that list must end above the paper.
-    Tilting about the tip just above the paper instead of on it leaves the same pose at touch and no smear.
+    Tilting about the tip just above the paper gives the same pose at touch as tilting on it, without a smear.
     """
     motion, paper = config.motion, config.paper
     above = over(config, *cell.anchor_mm)
@@ -212,10 +212,10 @@ def stroke_moves(
     first, *rest = points
     last = points[-1]
     down = [
-        # The wrist turns on the way there, where the brush is upright and turns about itself.
+        # The wrist turns during the approach, while the upright brush turns about its own axis.
         Move(high(first), motion.travel_speed_mm_s),
         Move(at(first, clear(first), 0.0), motion.travel_speed_mm_s),
-        # A turn about the tip that stays where it is: ARCS reads mm/s as thousandths of rad/s.
+        # The tip stays in place while the brush turns about it: ARCS then reads mm/s as thousandths of rad/s.
         Move(at(first, clear(first), first[3]), motion.travel_speed_mm_s),
         Move(at(first, -first[2], first[3]), motion.press_speed_mm_s),
     ]
@@ -245,7 +245,7 @@ def up(config: RigConfig, x_mm: float, y_mm: float) -> Move:
 
 
 def lift(config: RigConfig, here: Pose) -> list[Move]:
-    """Straight up to travel height from wherever the tip is; no move where it is there already."""
+    """Straight up to travel height from wherever the tip is; no move if it is there already."""
     high = Pose(here.x_mm, here.y_mm, config.motion.safe_z_mm, *here.quaternion)
     return [Move(high, config.motion.press_speed_mm_s)] if here.z_mm < config.motion.safe_z_mm else []
 
@@ -256,7 +256,7 @@ def zero_touch_moves(config: RigConfig) -> list[Move]:
 
 
 def visit_moves(config: RigConfig, plane: PaperPlane, x_mm: float, y_mm: float) -> list[Move]:
-    """Over a point of the sheet, down to clearance, slowly to where the surface is thought to be, and up."""
+    """Over a point of the sheet, down to clearance, slowly to the expected surface, and up."""
     motion, paper = config.motion, config.paper
     above = over(config, x_mm, y_mm)
     return [
@@ -268,7 +268,7 @@ def visit_moves(config: RigConfig, plane: PaperPlane, x_mm: float, y_mm: float) 
 
 
 def mark_moves(config: RigConfig, plane: PaperPlane, x_mm: float, y_mm: float) -> list[Move]:
-    """A mark of the self-check: over the place, near; then, as one, slowly to its depth and up."""
+    """One mark of the self-check: over the place, down near the paper, slowly to its depth, and up."""
     surface_z_mm = plane.touch_z_mm(x_mm, y_mm)
     down = near(config, x_mm, y_mm, surface_z_mm + CHECK_APPROACH_MM)
     mark = Move(touching(config, x_mm, y_mm, surface_z_mm - config.self_check.depth_mm), CHECK_SPEED_MM_S)
@@ -279,7 +279,7 @@ def mark_moves(config: RigConfig, plane: PaperPlane, x_mm: float, y_mm: float) -
 
 
 def touching(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Pose:
-    """The pose of `upright`, no higher than travel height."""
+    """Like `upright`, but no higher than travel height."""
     return upright(config, x_mm, y_mm, min(z_mm, config.motion.safe_z_mm))
 
 

@@ -1,6 +1,6 @@
-"""The limit check before motion: every pose that a protocol can command, and what the controller says of its reach.
+"""The limit check before motion: every pose that a protocol can command, and whether the arm can reach it.
 
-Poses are checked on every cell, since a press that is voided moves all that follow to other cells.
+Poses are checked on every cell, because a void press moves all later ones to other cells.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MARKED = {"sheet": 0, "cell": 0}
 
 
 def check_protocol(rig_path: Path, protocol_path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
-    """Raise `ConfigError` with file, field and range for the first thing that cannot be done."""
+    """Raise `ConfigError` with file, field and range for the first problem."""
     _check_brush(protocol_path, rig, protocol)
     sheet = sheet_of(rig, protocol)
     if not isinstance(protocol, CalibrationConfig):
@@ -46,7 +46,7 @@ def check_protocol(rig_path: Path, protocol_path: Path, rig: RigConfig, protocol
 
 
 def distinct_steps(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Step]:
-    """The steps, leaving out those that ask for the same moves as one before."""
+    """The steps, without those that make the same moves as an earlier one."""
     generator = steps_on(config, protocol)
     seen: set[tuple[object, ...]] = set()
     try:
@@ -145,12 +145,12 @@ def _check_touches(path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None
 
 
 def check_poses(rig_path: Path, rig: RigConfig, protocol: ProtocolConfig, plane: PaperPlane) -> None:
-    """Check every pose over this plane, which is the taught or the touched one. Raises `ConfigError`."""
+    """Check every pose over this plane, taught or measured by touch. Raises `ConfigError`."""
     _check(rig_path, rig, all_poses(rig, protocol, plane))
 
 
 def check_step(rig_path: Path, rig: RigConfig, plane: PaperPlane, step: Step) -> None:
-    """Check the poses of one step without a cell, which the operator asked for. Raises `ConfigError`."""
+    """Check the poses of a step that the operator asked for and that needs no cell. Raises `ConfigError`."""
     _check(rig_path, rig, ((*pose, step.kind) for pose in moves_of(rig, plane, step, None).poses))
 
 
@@ -166,15 +166,15 @@ def _check(rig_path: Path, rig: RigConfig, poses: Iterable[tuple[Pose, float, st
 def all_poses(
     rig: RigConfig, protocol: ProtocolConfig, plane: PaperPlane, *, every_cell: bool = False
 ) -> Iterator[tuple[Pose, float, str]]:
-    """(pose, speed in mm/s, what it belongs to) of everything that the protocol can ask for.
+    """Yield (pose, speed in mm/s, what it belongs to) for everything that the protocol can command.
 
-    The box of the limits is convex: what fits on the outermost cells fits on all. The arm's reach is not, and needs
-    `every_cell`.
+    The box of the limits is convex, so what fits on the outermost cells fits on all. The arm's reach is not convex and
+    needs `every_cell`.
     """
     yield from ((move.target, move.speed_mm_s, "park") for move in park_moves(rig))
     sheet = sheet_of(rig, protocol)
     cells = [sheet.cell(i) for i in range(sheet.capacity)] if every_cell else sheet.corners
-    # Every step as if a wash were due: when one is depends on the step at which the process began.
+    # Assume that a wash is due in every step: when one is due depends on the step at which the process starts.
     dips = 0 if rig.ink.wash is None else rig.ink.wash.every_dips - 1
     for step in distinct_steps(rig, protocol):
         for cell, more in _places(step, cells):
@@ -199,10 +199,10 @@ DEVICE = "robot"
 
 
 async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[tuple[Pose, float, str]]) -> int:
-    """Ask the controller for joints for each pose, near those of the pose before; returns how many poses differ.
+    """Ask the controller for the joints of each pose, near those of the previous pose; return how many poses differ.
 
     Powers, sets and moves nothing. The tool that is set on the controller stays: every pose is converted to that tool.
-    Raises `ConfigError` with the first pose that is out of reach, and `DeviceError`.
+    Raises `ConfigError` for the first pose that is out of reach, and `DeviceError`.
     """
     robot = config.robot
     controller = Controller(RpcConnection(robot.host, robot.port, framing=robot.framing))

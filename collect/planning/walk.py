@@ -1,4 +1,4 @@
-"""Walks a protocol as if all went well: each step, its cell and its moves. Nothing connects, nothing moves."""
+"""Walks a protocol as if every step succeeded: each step, its cell and its moves. Nothing connects, nothing moves."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from drivers.samples import Pose
 
 @dataclass(frozen=True, slots=True)
 class StepMoves:
-    """What a step does, in order, and what takes time or ink in it apart from moving."""
+    """The moves of a step in order, and what else in it takes time or ink."""
 
     parts: list[Part] = field(default_factory=list[Part])
     dwell_s: float = 0.0
@@ -41,7 +41,7 @@ class StepMoves:
 
     @property
     def poses(self) -> list[tuple[Pose, float]]:
-        """Every pose that is commanded, with its speed; the outermost ones where a touch decides by itself."""
+        """Every pose that is commanded, with its speed; of a `Room`, the outermost poses."""
         return commanded(self.parts)
 
 
@@ -91,7 +91,7 @@ def touch_of(config: RigConfig, step: Step) -> TouchConfig:
 
 
 def _touches(config: RigConfig, plane: PaperPlane, step: Step, dips: int) -> StepMoves:
-    """A touch by force or jog decides how deep it goes; one by camera also where its next spot lies."""
+    """A touch by force or jog decides how deep it goes; a touch by camera also chooses its next spot."""
     touch = touch_of(config, step)
     if touch.method == "taught":
         [point] = touch.points_mm if step.kind is StepKind.TOUCH else [None]
@@ -148,7 +148,7 @@ def sheet_of(config: RigConfig, protocol: ProtocolConfig) -> Sheet:
 
 
 def layout_of(config: RigConfig, protocol: ProtocolConfig) -> Layout:
-    """The sheet's columns and rows, and the cells of the first sheet that the self-check takes."""
+    """The sheet's columns and rows, and the cells of the first sheet that the self-check uses."""
     sheet = sheet_of(config, protocol)
     if not config.self_check.enabled or not sheet.capacity:
         return sheet.layout
@@ -157,7 +157,7 @@ def layout_of(config: RigConfig, protocol: ProtocolConfig) -> Layout:
 
 
 def steps_on(config: RigConfig, protocol: ProtocolConfig) -> Protocol:
-    """The steps as this rig runs them: balanced over its sheet, with the self-check where it is on."""
+    """The steps as this rig runs them: balanced over its sheet, with the self-check if it is on."""
     found = protocol.steps(layout_of(config, protocol))
     return with_self_check(found) if config.self_check.enabled else found
 

@@ -13,7 +13,7 @@ from typing import Any
 Value = float | int | str | bool | None
 Params = dict[str, Value]
 Result = dict[str, Any]
-"""JSON-able: it goes into the journal and comes back from there."""
+"""Must be valid JSON: it is written to the journal and read back."""
 
 
 class StepKind(StrEnum):
@@ -24,12 +24,12 @@ class StepKind(StrEnum):
     DIP = "dip"
     PRESS = "press"
     DRAW = "draw"
-    """A figure: all strokes of one character, on one cell. Cut anywhere, the whole of it is done again."""
+    """A figure: all strokes of one character, on one cell. If it is interrupted, all of it is done again."""
     TOUCH = "touch"
     """Bring the tip down on a given point of the sheet and measure its height."""
     CAPTURE = "capture"
     CHOOSE = "choose"
-    """Fit the brush to the captures so far, and choose the next press or the end; nothing moves."""
+    """Fit the brush to the captures so far, and choose the next press or to stop; nothing moves."""
     REVIEW = "review"
     """Read which captures a person has marked bad; nothing moves."""
     SELF_CHECK = "self_check"
@@ -39,7 +39,7 @@ class StepKind(StrEnum):
 MARKING = frozenset({StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK})
 """Steps that leave ink on a paper cell of their own."""
 RUN_SCOPED = frozenset({StepKind.ZERO_TOUCH})
-"""Steps that are done again in every process, since what they establish does not outlive it."""
+"""Steps that are done again in every process, because their results are lost when it ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class Step:
 
     @property
     def run_scoped(self) -> bool:
-        """Whether it must be done again even where a stored result exists."""
+        """Whether it must be done again even if a stored result exists."""
         return self.kind in RUN_SCOPED
 
 

@@ -1,7 +1,7 @@
-"""The checks of a capture, in order, and the verdict that they make.
+"""The checks of a capture, in order, and the resulting verdict.
 
-A new check is a name in `Failure`, a limit in `QualityConfig`, and a function here: of the measured mark in
-`MARK_CHECKS`, of the photograph or the ink where `check_capture` judges those.
+A new check needs a name in `Failure`, a limit in `QualityConfig`, and a function here: listed in `MARK_CHECKS` if it
+judges the measured mark, called by `check_capture` if it judges the photograph or the ink.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from collect.rig.config_quality import QualityConfig
 from collect.rig.paper import Cell
 
 MARGIN_MM = 4.0
-"""Around the cell, where a stroke that leaves it may be found."""
+"""Margin around the cell in which a stroke that leaves it is looked for."""
 FAR_MM = 45.0
-"""Around the cell, where a press that left nothing in it is looked for."""
+"""Margin around the cell in which a press that left nothing in it is looked for."""
 LIGHT_MM = 22.0
-"""Around the cell, to tell glare from the light."""
+"""Margin around the cell that shows enough paper to tell glare from the light."""
 CROSSING_MM = 4.0
-"""Ink across the edge of a cell: more than the end of one stroke that went too far."""
+"""Length of ink across the edge of a cell: more than the end of one stroke that went too far."""
 
 
 def check_frame(image: Gray, plane: Plane, limits: QualityConfig) -> Verdict:
-    """Exposure and blur of an (h, w) frame; needs no ink. For the board's picture, and before any press."""
+    """Check exposure and blur of an (h, w) frame without ink, as before any press or for the board's picture."""
     return Verdict((exposure(image, limits), *blurred(image, plane, limits)))
 
 
@@ -49,10 +49,10 @@ def check_capture(
 ) -> Verdict:
     """Judge one press of commanded depth `height_mm` from the (h, w) photograph taken after it.
 
-    `previous` is the last sound photograph before the press, from the same camera pose: with it, old ink is told from
-    new, and a press that landed far off is found. `sheet_mm` (width, height) keeps the table beyond the sheet out.
-    `anchor_mm` is the zero-touch point where it is not the cell's own. Checks that a failed one would spoil are left
-    out of the verdict.
+    `previous` is the last valid photograph before the press, from the same camera pose: it separates new ink from old,
+    and reveals a press that landed far off. `sheet_mm` (width, height) excludes the table beyond the sheet. `anchor_mm`
+    is the zero-touch point if it is not the cell's own. Checks that an earlier failure makes meaningless are left out
+    of the verdict.
     """
     frame = check_frame(image, plane, limits)
     if not frame.passed:
@@ -81,8 +81,8 @@ def check_drawing(
 ) -> Verdict:
     """Judge a figure, drawn down to `height_mm`, from the (h, w) photograph taken after it.
 
-    Exposure, blur, whether its cell holds ink that `previous` does not show, and none across the cell's edge, as an arm
-    would be that is still in the picture. Its shape is not judged: no two figures have one in common.
+    Checks exposure and blur, that the cell holds ink that `previous` does not show, and that nothing new lies across
+    the cell's edge, as an arm still in the picture would. The shape is not judged: every figure has its own.
     """
     frame = check_frame(image, plane, limits)
     if not frame.passed:
@@ -95,7 +95,7 @@ def check_drawing(
 
 
 def cell_is_blank(image: Gray, plane: Plane, cell: Cell, *, limits: QualityConfig) -> Check:
-    """Whether the cell may be pressed on, from an (h, w) photograph; `NEIGHBOUR` where it holds ink or is not seen."""
+    """Check in an (h, w) photograph that the cell is blank; `NEIGHBOUR` if it holds ink or is not wholly seen."""
     patch = take(image, plane.image_to_paper, cell.rect_mm, Params())
     hidden_mm2 = mm2(~patch.in_view)
     if hidden_mm2 > 0.0:
@@ -105,7 +105,7 @@ def cell_is_blank(image: Gray, plane: Plane, cell: Cell, *, limits: QualityConfi
 
 @dataclass(frozen=True, slots=True)
 class _Press:
-    """One press as `check_capture` was given it."""
+    """The arguments of `check_capture`."""
 
     image: Gray
     previous: Gray | None
@@ -117,11 +117,11 @@ class _Press:
     limits: QualityConfig
 
     def around(self, margin_mm: float) -> Rect:
-        """The cell with a margin, no farther than the sheet."""
+        """The cell with a margin, clipped to the sheet."""
         return around(self.cell.rect_mm, margin_mm, self.sheet_mm)
 
     def ink(self, margin_mm: float) -> Ink:
-        """The ink in the cell and a margin around it, told apart."""
+        """The ink in the cell and a margin around it: the stroke's own, other new ink, and old ink."""
         window, to_paper = self.around(margin_mm), self.plane.image_to_paper
         now = take(self.image, to_paper, window, Params())
         before = None if self.previous is None else take(self.previous, to_paper, window, Params())
@@ -148,7 +148,7 @@ def _ink_checks(press: _Press, ink: Ink) -> list[Check]:
     assert mark is not None
     checks += [enough, dry(mark, limits)]
     if checks[-1].passed:
-        # The head, tip and tone that a dry brush leaves tell nothing.
+        # The head, tip and tone of a dry brush's mark mean nothing.
         checks += [check(mark, limits) for check in MARK_CHECKS]
     return checks
 
@@ -164,7 +164,7 @@ def _at_least(name: Failure, score: float, unit: str, limit: float, reason: str)
 
 
 def exposure(image: Gray, limits: QualityConfig) -> Check:
-    """Paper neither dark nor saturated."""
+    """The paper is neither dark nor saturated."""
     level = measure.paper_level(image)
     reason = ""
     if level < limits.dark_level:
@@ -176,7 +176,7 @@ def exposure(image: Gray, limits: QualityConfig) -> Check:
 
 
 def blurred(image: Gray, plane: Plane, limits: QualityConfig) -> tuple[Check, ...]:
-    """Sharp edges; none where the picture has no edge to measure, as with a bare sheet that fills it."""
+    """Edges are sharp; no check if the picture has no edge to measure, as when a bare sheet fills it."""
     sigma_px = measure.blur_px(image)
     if sigma_px is None:
         return ()
@@ -186,7 +186,7 @@ def blurred(image: Gray, plane: Plane, limits: QualityConfig) -> tuple[Check, ..
 
 
 def cut(ink: Ink, plane: Plane, shape: tuple[int, ...], anchor_mm: Point, limits: QualityConfig) -> Check:
-    """The stroke, or where there is none the zero-touch point, wholly in the frame."""
+    """The stroke, or the zero-touch point if there is none, lies wholly in the frame."""
     points = ink.patch.points_mm(ink.own) if ink.own.any() else np.array([anchor_mm])
     gap_mm = measure.edge_mm(points, plane, shape)
     reason = f"The stroke ends {max(gap_mm, 0.0):.1f} mm from the edge of the picture. Move the camera or the sheet."
@@ -212,7 +212,7 @@ def before_press(cell: int, area_mm2: float, limits: QualityConfig) -> Check:
 
 
 def unseen(cell: int, hidden_mm2: float, limits: QualityConfig) -> Check:
-    """A cell that the frame cuts cannot be said to be blank."""
+    """A cell that lies partly outside the frame cannot be called blank."""
     reason = (
         f"Cell {cell} is not wholly in the picture, {hidden_mm2:.0f} mm^2 are hidden. Move the camera or the sheet."
     )
@@ -220,7 +220,7 @@ def unseen(cell: int, hidden_mm2: float, limits: QualityConfig) -> Check:
 
 
 def neighbour(ink: Ink, limits: QualityConfig) -> Check:
-    """No ink in the cell but the press's own."""
+    """The cell holds no ink but the press's own."""
     area_mm2 = ink.before_mm2 + ink.beside_mm2
     source = (
         "a stroke from next door reaches in. Keep this cell out and make the cells larger"
@@ -238,9 +238,9 @@ def crossing(length_mm: float) -> Check:
 
 
 def blank(own_mm2: float, height_mm: float, limits: QualityConfig) -> Check:
-    """Some ink at all."""
+    """The press left ink."""
     least_mm2 = limits.blank_mm2_per_mm * height_mm
-    reason = f"No stroke: {own_mm2:.1f} mm^2 of ink. Dip again; if the well is full, teach the touch height anew."
+    reason = f"No stroke: {own_mm2:.1f} mm^2 of ink. Dip again; if the well is full, teach the touch height again."
     return _at_least(Failure.BLANK, own_mm2, "mm^2", least_mm2, reason)
 
 
@@ -283,5 +283,5 @@ def bent(mark: Mark, limits: QualityConfig) -> Check:
 
 
 MARK_CHECKS = (misplaced, faint, split, bent)
-"""What is judged of a mark whose ink is whole."""
+"""Checks of a mark that is not dry."""
 _WHERE = "Check the sheet's origin, that the sheet has not slipped, and that the brush sits firm."

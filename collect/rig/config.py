@@ -1,4 +1,4 @@
-"""`rig.toml`: frozen, complete, refused with one line that names file, field and range.
+"""`rig.toml`: frozen and complete; an error is one line that names file, field and range.
 
 The environment overrides any value: `BRUSHLOOP_ROBOT__HOST=192.0.2.7` sets `[robot] host`.
 """
@@ -30,7 +30,7 @@ PREFIX, DELIMITER = "BRUSHLOOP_", "__"
 
 
 def overrides(settings: type[BaseSettings]) -> dict[tuple[str, ...], str]:
-    """Variable by the path that it sets: `("robot", "port")` -> `BRUSHLOOP_ROBOT__PORT`.
+    """Map each path to the variable that sets it: `("robot", "port")` -> `BRUSHLOOP_ROBOT__PORT`.
 
     Raises `ConfigError` for a variable whose table or top field does not exist: pydantic would ignore it silently.
     """
@@ -49,7 +49,7 @@ def overrides(settings: type[BaseSettings]) -> dict[tuple[str, ...], str]:
 
 
 def unreadable(settings: type[BaseSettings], error: SettingsError) -> ConfigError:
-    """The refusal of a variable whose text should be a list or a table and is not JSON."""
+    """The error for a variable that must hold a list or a table and is not JSON."""
     for path, name in overrides(settings).items():
         source = EnvSettingsSource(settings)
         source.env_vars = {name.lower(): os.environ[name]}
@@ -64,7 +64,7 @@ def unreadable(settings: type[BaseSettings], error: SettingsError) -> ConfigErro
 
 MAX_CONFIG_BYTES = 1024 * 1024
 TRAVEL_CLEARANCE_MM = 15.0
-"""Least height of travel above the paper: more than a drop at the tip hangs down."""
+"""Minimum travel height above the paper: more than the length of a drop hanging from the tip."""
 
 
 class BrushConfig(Config):
@@ -74,7 +74,7 @@ class BrushConfig(Config):
     radius_mm: Annotated[float, Field(gt=0.0, le=50.0)] = 6.0
     length_mm: Annotated[float, Field(gt=0.0, le=200.0)] = 48.0
     max_depth_mm: Annotated[float, Field(gt=0.0, le=100.0)] = 22.0
-    """Deepest press that this brush bears."""
+    """Deepest press that this brush can take."""
 
 
 class PaperConfig(Config):
@@ -84,23 +84,23 @@ class PaperConfig(Config):
     origin_mm: tuple[Finite, Finite]
     """Lower left corner in the base frame."""
     yaw_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
-    """From base x to paper x."""
+    """Angle from base x to paper x."""
     touch_z_mm: Finite
     """Height in the base frame at which the tip of the vertical brush just touches: taught by the operator."""
     size_mm: tuple[Positive, Positive]
     cell_mm: tuple[Positive, Positive] = (40.0, 24.0)
     """Width and height of the patch for one press."""
     touch_point_mm: tuple[Finite, Finite] = (4.0, 4.0)
-    """Where the taught height is visited at the start of each run, in the paper frame; off every cell's ink."""
+    """Where each run first goes to the taught height, in the paper frame; clear of every cell's ink."""
 
 
 class WipeConfig(Config):
     """Wiping off a drop at the rim of the well, after each dip."""
 
     rim_mm: tuple[Finite, Finite]
-    """Where the tip is drawn to from the middle of the well, past its rim; in the paper frame, off the sheet."""
+    """Where the wipe from the middle of the well across its rim ends; in the paper frame, off the sheet."""
     z_mm: Finite
-    """Height of the tip on the way, in the base frame: a little below the rim."""
+    """Height of the tip during the wipe, in the base frame: a little below the rim."""
 
 
 class WashConfig(Config):
@@ -113,7 +113,7 @@ class WashConfig(Config):
     every_dips: Annotated[int, Field(ge=1, le=1000)] = 30
     """The brush is washed before each dip whose number, from 1, is a multiple of this."""
     strokes: Annotated[int, Field(ge=1, le=20)] = 3
-    """How often the brush goes down and up."""
+    """Number of times the brush goes down and up."""
 
 
 class InkConfig(Config):
@@ -127,7 +127,7 @@ class InkConfig(Config):
     wipe: WipeConfig | None = None
     wash: WashConfig | None = None
     device: InkDeviceConfig | None = None
-    """What keeps the well filled; left out, the operator does."""
+    """The device that keeps the well filled; if left out, the operator does."""
 
 
 class MotionConfig(Config):
@@ -141,7 +141,7 @@ class MotionConfig(Config):
     press_speed_mm_s: Annotated[float, Field(gt=0.0, le=100.0)] = 20.0
     acc_mm_s2: Annotated[float, Field(gt=0.0, le=5000.0)] = 500.0
     least_dwell_s: Annotated[float, Field(ge=0.05, le=60.0)] = 0.1
-    """Least time at depth, however short a dwell is configured: the depth must be observed."""
+    """Minimum time at depth, even if a shorter dwell is configured: the depth must be observed."""
 
 
 class RigConfig(BaseSettings):
@@ -163,13 +163,13 @@ class RigConfig(BaseSettings):
     quality: QualityConfig = QualityConfig()
 
     def settled(self, armed: bool) -> RigConfig:
-        """The same with the self-check decided where it was left out: on wherever real hardware may move."""
+        """Return a copy that decides the self-check if it was left out: on wherever real hardware may move."""
         if self.self_check.enabled is not None:
             return self
         return self.checking_itself(armed or not self.robot.on_this_machine)
 
     def checking_itself(self, enabled: bool) -> RigConfig:
-        """The same with the self-check on or off."""
+        """Return a copy with the self-check on or off."""
         return self.model_copy(update={"self_check": self.self_check.model_copy(update={"enabled": enabled})})
 
     @model_validator(mode="after")
@@ -210,7 +210,7 @@ class RigConfig(BaseSettings):
         dotenv_settings: PydanticBaseSettingsSource,
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """The environment wins over the file; nothing else is read."""
+        """The environment overrides the file; nothing else is read."""
         return env_settings, init_settings
 
 

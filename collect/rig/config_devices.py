@@ -12,18 +12,18 @@ from collect.rig.config_file import Config, Finite, Positive, Range
 from drivers.force.rounds import LOOPBACK_CHANNEL
 
 MOST_STALE_MS = 100.0
-"""At 20 mm/s a brush goes down 2 mm in this time without being felt."""
+"""Longest silence allowed: at 20 mm/s the brush goes down 2 mm in this time without being felt."""
 MOST_STALE_LOOPBACK_MS = 2000.0
-"""On the loopback rig's bus, where simulated time may run faster than the sensor's rounds come."""
+"""The same on the loopback rig's bus, where simulated time may run faster than the sensor's rounds arrive."""
 
 
 class LimitsConfig(Config):
-    """Where the brush tip may ever be, in the robot's base frame."""
+    """The region that the brush tip must never leave, in the robot's base frame."""
 
     x_mm: Range
     y_mm: Range
     z_mm: Range
-    """The lower end is the floor: paper height less the deepest press."""
+    """The lower end is the floor: paper height minus the deepest press."""
     tilt_deg: Annotated[float, Field(gt=0.0, le=30.0)] = 15.0
     speed_mm_s: Annotated[float, Field(gt=0.0, le=500.0)] = 250.0
     acc_mm_s2: Annotated[float, Field(gt=0.0, le=5000.0)] = 1000.0
@@ -48,27 +48,28 @@ class RobotConfig(Config):
     framing: Literal["sof", "bare"] = "sof"
     """`sof` as in the maker's client, `bare` as in the maker's documentation."""
     rtde_port: int | None = Field(None, ge=1, le=65535)
-    """Where poses are pushed from (30010); left out, they are polled for."""
+    """Port that pushes poses (30010); if left out, poses are polled."""
     watchdog_s: Annotated[float, Field(ge=0.5, le=60.0)] | None = None
     """Dead-man switch on the controller: after this long without a sign of life it makes a protective stop, which only
-    a person releases and which leaves the brush where it is. Left out, none is armed, and a press lifts by itself."""
+    a person can release and which leaves the brush where it is. If left out, it is not armed, and a press lifts by
+    itself."""
     speed_fraction: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
     collision_level: Annotated[int, Field(ge=1, le=9)] | None = None
-    """1 to 9, the most sensitive; left out, the pendant's setting stays."""
+    """1 to 9 (most sensitive); if left out, the pendant's setting stays."""
     payload_kg: Annotated[float, Field(ge=0.0, le=5.0)] | None = None
-    """Mass of sensor, holder and brush; an i5 carries 5 kg. Left out, the pendant's setting stays."""
+    """Mass of sensor, holder and brush; an i5 carries 5 kg. If left out, the pendant's setting stays."""
     payload_cog_mm: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
-    """Its centre, from the flange."""
+    """Centre of that mass, from the flange."""
     limits: LimitsConfig
 
     @property
     def on_this_machine(self) -> bool:
-        """Whether its controller is reached over loopback, as that of the loopback rig is."""
+        """Whether its controller has a loopback address, as the loopback rig's has."""
         return self.host in ("localhost", "::1") or self.host.startswith("127.")
 
 
 class LockedConfig(Config):
-    """Settings of a camera device that must not drift; left out means left as it is. The device's own units."""
+    """Camera settings that must not drift, in the device's own units; one that is left out is not changed."""
 
     width: Annotated[int, Field(ge=16, le=65535)] | None = None
     height: Annotated[int, Field(ge=16, le=65535)] | None = None
@@ -88,16 +89,16 @@ class CameraConfig(Config):
     source: str = Field(min_length=1)
     """Stream URL, file, folder of images, or device number as text."""
     latency_ms: Annotated[float, Field(ge=0.0, le=10_000.0)] = 250.0
-    """From exposure to arrival, roughly: used by `doctor` and the live picture. A run measures it."""
+    """Approximate time from exposure to arrival, used by `doctor` and the live picture. A run measures it."""
     max_delay_ms: Annotated[float, Field(ge=50.0, le=10_000.0)] = 1500.0
-    """A camera whose pictures are measured to come later is refused."""
+    """A camera whose measured delay is longer is refused."""
     max_jitter_ms: Annotated[float, Field(ge=10.0, le=10_000.0)] = 500.0
     """A camera whose measured delay varies by more is refused."""
     timeout_s: Annotated[float, Field(gt=0.0, le=120.0)] = 10.0
     lens: str = ""
-    """Its name, for the record."""
+    """Name of the lens, for the record."""
     lens_file: Path | None = None
-    """Written by `brushloop camera intrinsics`, beside rig.toml: distortion is undone before anything is measured."""
+    """Written by `brushloop camera intrinsics`, beside rig.toml: distortion is removed before anything is measured."""
     optics: LensUsed | None = None
     """Contents of that file; filled in when rig.toml is read, so that the session holds them."""
     locked: LockedConfig = LockedConfig()
@@ -120,7 +121,7 @@ class InkStationConfig(Config):
 
 
 class ModbusPumpConfig(Config):
-    """A peristaltic pump without a gauge: replaces what dips take without measuring it."""
+    """A peristaltic pump without a gauge: replaces the ink that dips take without measuring it."""
 
     kind: Literal["modbus-pump"]
     port: str = Field(min_length=1)
@@ -148,10 +149,10 @@ class ForceConfig(Config):
     channel: str = Field("can0", min_length=1)
     bitrate: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
     host: str | None = None
-    """Of a CAN gateway, for the interface socketcand."""
+    """Address of a CAN gateway, for the interface socketcand."""
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
     rate_hz: Annotated[float, Field(gt=0.0, le=2000.0)] = 200.0
-    """Rate that the sensor's board is set to; gaps are counted by it."""
+    """Rate set on the sensor's board, from which gaps are counted."""
     max_n: Positive = 5.0
     """Ceiling while the brush is down: above it the arm is stopped and the press is void."""
     stale_ms: Annotated[float, Field(ge=20.0)] = 100.0
@@ -170,6 +171,6 @@ class ForceConfig(Config):
         most_ms = MOST_STALE_LOOPBACK_MS if self.channel == LOOPBACK_CHANNEL else MOST_STALE_MS
         if self.stale_ms > most_ms:
             raise ValueError(
-                f"stale_ms = {self.stale_ms:g}: must be from 20 to {most_ms:g}; the brush is blind so long"
+                f"stale_ms = {self.stale_ms:g}: must be from 20 to {most_ms:g}; the brush is blind that long"
             )
         return self

@@ -1,4 +1,4 @@
-"""Configuration files: what a table is made of, how a file is read, and how a wrong value is refused in one line."""
+"""Configuration files: the base model of a table, reading a file, and one-line errors for wrong values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 MOST = 1e6
-"""Largest number: a length of a kilometre is a slip of the pen, and refused as one."""
+"""Largest number accepted: a length of a kilometre is a typing error."""
 Positive = Annotated[float, Field(gt=0.0, le=MOST, allow_inf_nan=False)]
 Finite = Annotated[float, Field(ge=-MOST, le=MOST, allow_inf_nan=False)]
 Range = tuple[Finite, Finite]
@@ -31,7 +31,7 @@ class Config(BaseModel):
 
 
 def place(name: str) -> str:
-    """How a refusal names an environment variable."""
+    """How an error message names an environment variable."""
     return f"environment variable {name}"
 
 
@@ -70,11 +70,11 @@ def refusal(
     tagged: bool = False,
     environment: Mapping[tuple[str, ...], str] | None = None,
 ) -> ConfigError:
-    """The first error in one line; an unknown key comes first: it is often the misspelt name of a missing one.
+    """The first error in one line. An unknown key comes first, because it is often a missing key misspelt.
 
     `of` is the model, or the union of models; `tagged` says that it is a union, whose tag pydantic puts in front of
-    each field's name. `environment` holds the variable that sets each path: a value from there is refused by its
-    variable's name.
+    each field's name. `environment` maps each path to the variable that sets it: an error in such a value names the
+    variable.
     """
     errors = error.errors()
     first = min(errors, key=lambda e: e["type"] != "extra_forbidden")
@@ -95,7 +95,7 @@ def refusal(
 
 
 def _what(first: ErrorDetails, errors: list[ErrorDetails], of: object) -> tuple[str, int]:
-    """(what is wrong, how many of the errors that covers)."""
+    """Return (what is wrong, number of errors that this covers)."""
     loc = first["loc"]
     match first["type"]:
         case "extra_forbidden":
@@ -121,7 +121,7 @@ def _what(first: ErrorDetails, errors: list[ErrorDetails], of: object) -> tuple[
 
 
 def _is_tag(part: str | int) -> bool:
-    """Whether this is the tag of a union within the file rather than a field: those tags have a hyphen."""
+    """Whether this is the tag of a union within the file, not a field: only such tags have a hyphen."""
     return isinstance(part, str) and "-" in part
 
 
@@ -129,7 +129,7 @@ HOLDERS = (Annotated, Union, UnionType, list, tuple)
 
 
 def models_at(of: object, loc: Sequence[str | int]) -> list[type[BaseModel]]:
-    """The models of the table at `loc`, which is where pydantic places an error: with tags of unions and item numbers.
+    """The models of the table at `loc`, an error location of pydantic, which includes union tags and item numbers.
 
     `of` is a model, or a union of models.
     """
@@ -146,7 +146,7 @@ def models_at(of: object, loc: Sequence[str | int]) -> list[type[BaseModel]]:
 
 
 def fields(models: Sequence[type[BaseModel]]) -> list[str]:
-    """Names that any of these tables may have, in order."""
+    """Names of the fields that any of these tables may have, in order."""
     return list(dict.fromkeys(name for model in models for name in model.model_fields))
 
 

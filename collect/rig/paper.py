@@ -1,4 +1,4 @@
-"""The sheet of paper: its cells, the plane in which it lies, and the way between the paper frame and the base frame."""
+"""The sheet of paper: its cells, its plane, and the transforms between the paper frame and the base frame."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Layout:
 
 
 ANCHOR_SHARE = 0.75
-"""Where the zero-touch point lies along a cell: the mark reaches mostly toward -x, where the tip lies."""
+"""Place of the zero-touch point along a cell, as a share of its width: the mark extends mostly toward -x."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ class Sheet:
         return [self.cell(i) for i in sorted({0, self.columns - 1, last_row, self.capacity - 1})]
 
     def cell(self, index: int) -> Cell:
-        """The cell of that number."""
+        """The cell with this number."""
         if not 0 <= index < self.capacity:
             raise IndexError(f"cell {index} is outside [0, {self.capacity - 1}]")
         row, column = divmod(index, self.columns)
@@ -96,7 +96,7 @@ class Sheet:
         return Cell(index, self._left + column * cell_w, y_mm, cell_w, cell_h)
 
     def free(self, used: set[int], sheet: int = 1) -> Cell:
-        """The first cell that is not used; `sheet` is the sheet's number for the error. Raises `SheetFull`."""
+        """The first unused cell. Raises `SheetFull`, which names the number `sheet`."""
         for index in range(self.capacity):
             if index not in used:
                 return self.cell(index)
@@ -113,7 +113,7 @@ def to_base(paper: PaperConfig, x_mm: float, y_mm: float) -> tuple[float, float]
 
 
 MAX_SLOPE_DEG = 3.0
-"""A sheet cannot lean more than this: something else was touched."""
+"""A sheet cannot lean more than this: a steeper plane means that something else was touched."""
 LEAST_SPREAD_MM = 20.0
 """Touched points must span at least this much in their narrowest direction to give a slope."""
 
@@ -191,7 +191,7 @@ class PlaneFit:
 
     plane: PaperPlane
     residuals_mm: tuple[float, ...]
-    """Touched less fitted height, in the order of the points; zeros where three points leave no freedom."""
+    """Touched minus fitted height, in the order of the points; zeros for three points, which a plane always fits."""
 
     @property
     def worst_mm(self) -> float:

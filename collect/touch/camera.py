@@ -1,4 +1,4 @@
-"""Zero touch by first ink: rows of touches at fresh places, each a little lower, and where the ink begins."""
+"""Zero touch by first ink: touch rows of fresh spots, each a little lower, and find where the ink begins."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from drivers.samples import Frame
 
 @dataclass(frozen=True, slots=True)
 class FirstInk:
-    """Between which spots of a row the ink begins."""
+    """The two spots of a row between which the ink begins."""
 
     clean: int
     """Index of the last spot without ink."""
@@ -32,10 +32,10 @@ class FirstInk:
 
 
 def first_ink(ink_mm2: Floats, least_mm2: float) -> FirstInk:
-    """Where the ink begins in a row of spots, (m,) from the highest to the lowest.
+    """Find where the ink begins in a row of spots, (m,) from the highest to the lowest.
 
-    Raises `StepError` where the first spot has ink, where none has, and where ink ends again further down: otherwise a
-    brush that ran dry would be taken for one that did not touch.
+    Raises `StepError` if the first spot has ink, if none has, or if a spot below an inked one has none: otherwise a
+    brush that ran dry would be mistaken for one that did not touch.
     """
     seen = np.asarray(ink_mm2) >= least_mm2
     if not seen.any():
@@ -52,7 +52,7 @@ def first_ink(ink_mm2: Floats, least_mm2: float) -> FirstInk:
 Spot = tuple[float, float, float]
 """x and y in the paper frame, z of the tip in the base frame."""
 WINDOW_SHARE = 0.75
-"""Side of the window that counts for a spot, as a share of the pitch."""
+"""Side of the window in which a spot's ink is measured, as a share of the pitch."""
 
 
 class FirstInkTouch:
@@ -73,9 +73,9 @@ class FirstInkTouch:
         self._last: Frame | None = None
 
     async def measure(self, points_mm: list[tuple[float, float]]) -> list[PointTouches]:
-        """Touch every point coarsely, then finely in rounds, each along the plane through the round before.
+        """Touch every point coarsely, then finely in rounds, each along the plane fitted to the previous round.
 
-        Without that plane, the sheet's lean along a row would be taken for height. Raises `StepError`.
+        Without that plane, the sheet's lean along a row would be mistaken for height. Raises `StepError`.
         """
         paper, extent_mm = self._rig.config.paper, self._config.camera.extent_mm
         known = KnownHeights(paper, self._config)

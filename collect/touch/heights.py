@@ -43,7 +43,7 @@ class KnownHeights:
         self._heights.append(((x_mm, y_mm), z_mm))
 
     def reach(self, x_mm: float, y_mm: float, extent_mm: float = 0.0) -> Reach:
-        """The approach at a point: around the nearest known height, wider by what the sheet may lean on the way there.
+        """The approach at a point: around the nearest known height, extended by how far the sheet may lean in between.
 
         `extent_mm` is how far from the point the touches of its approach may lie.
         """
@@ -80,7 +80,7 @@ class PointTouches:
 
     touches: tuple[Touch, ...]
     span_mm: float
-    """Largest less smallest height, each taken from the first plane where the touches lie apart."""
+    """Largest minus smallest height; for touches that lie apart, heights above the first plane."""
 
     @property
     def mean(self) -> tuple[float, float, float]:
@@ -98,10 +98,10 @@ class PlaneResult:
 
     plane: PaperPlane
     method: Method | Literal["kept"]
-    """`kept`: nothing was touched, the plane known before still holds."""
+    """`kept`: nothing was touched, and the previous plane still holds."""
     points: tuple[PointTouches, ...]
     residuals_mm: tuple[float, ...]
-    """Point less plane, in the order of the points; zeros where three points leave no freedom."""
+    """Point minus plane, in the order of the points; zeros for three points, which a plane always fits."""
 
     def as_dict(self) -> dict[str, object]:
         """For the journal: plain numbers, texts and lists."""
@@ -127,9 +127,9 @@ class PlaneResult:
 
 
 def at_one_point(touches: list[Touch], config: TouchConfig, guide: PaperPlane | None = None) -> PointTouches:
-    """Compare the touches of one point. Raises `StepError` where they span too much.
+    """Compare the touches of one point. Raises `StepError` if they span too much.
 
-    `guide` is the sheet's lean as far as it is known, for touches that lie some millimetres apart.
+    `guide` is the known lean of the sheet, for touches that lie some millimetres apart.
     """
     lean = guide or PaperPlane(0.0)
     heights = [t.z_mm - lean.touch_z_mm(t.x_mm, t.y_mm) for t in touches]
@@ -144,13 +144,13 @@ def at_one_point(touches: list[Touch], config: TouchConfig, guide: PaperPlane | 
 
 
 def kept(plane: PaperPlane, at_mm: tuple[float, float]) -> PlaneResult:
-    """The plane known before as a result, after touching was given up; `at_mm` is where its height is stated."""
+    """The previous plane as a result, after touching was given up; `at_mm` is where its height is stated."""
     point = PointTouches((Touch(*at_mm, plane.touch_z_mm(*at_mm)),), 0.0)
     return PlaneResult(plane, "kept", (point,), (0.0,))
 
 
 def through(points: list[PointTouches], config: TouchConfig) -> PlaneResult:
-    """The plane through the points. Raises `StepError` where one lies too far from it, or it leans too much."""
+    """The plane through the points. Raises `StepError` if one lies too far from it, or it leans too much."""
     fit = fit_plane([point.mean for point in points])
     if fit.worst_mm > config.residual_mm:
         listed = ", ".join(f"{r:+.3f}" for r in fit.residuals_mm)

@@ -1,4 +1,4 @@
-"""Where zero touch and the self-check mark the paper, and which cells that uses up."""
+"""Where zero touch and the self-check mark the paper, and which cells they use up."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from collect.touch.heights import KnownHeights, Reach
 
 Triangle = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 SLACK_STEPS = 2
-"""Fine steps beyond the coarse one, on either side: a coarse touch is only as good as its step."""
+"""Fine steps beyond the coarse step, on either side: a coarse touch is accurate only to its step."""
 
 
 class Patch:
-    """The spots around one point, from its lower left, to and fro: one touch after the other lies beside it."""
+    """The spots around one point, to and fro from the lower left, so that consecutive touches are neighbours."""
 
     def __init__(
         self, at_mm: tuple[float, float], config: CameraTouchConfig, sheet_mm: tuple[float, float], lowest_z_mm: float
@@ -91,7 +91,7 @@ def touched_rects(paper: PaperConfig, config: TouchConfig) -> list[Rect]:
 def used_cells(sheet: Sheet, paper: PaperConfig, config: TouchConfig, check_mm: Triangle | None = None) -> set[int]:
     """The cells whose middle parts zero touch, and a self-check at `check_mm`, may ink.
 
-    A cell counts where a mark reaches more than `MARK_MM` into it: touch points in the sheet's margin cost no cell.
+    A cell counts if a mark reaches more than `MARK_MM` into it: touch points in the sheet's margin cost no cell.
     """
     m = MARK_MM
     rects = touched_rects(paper, config) + [(x - m, y - m, 2 * m, 2 * m) for x, y in check_mm or ()]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collect.engine.last_capture import LastCapture
 
 LABEL, LONGEST_TRACE = 9, 60
-"""Columns of a figure's name, and of the force trace at most."""
+"""Columns of a figure's name, and the most columns of the force trace."""
 COMPLETE, NOW, NEXT, BAD, LEFT_OUT = "✓", "▶", "›", "!", "×"
 LEGEND = f"{COMPLETE} done {NOW} now {NEXT} next {BAD} bad takes {LEFT_OUT} left out"
 GRID_STYLES = {
@@ -84,7 +84,7 @@ def _counts(now: Snapshot) -> tuple[str, str]:
 
 
 def target_text(now: Snapshot) -> str:
-    """Where the arm was sent, and how far that is from where it is."""
+    """Where the arm was sent, and how far it still has to go."""
     if now.target_mm is None:
         return "not sent anywhere yet"
     if now.tip_mm is None:
@@ -156,7 +156,7 @@ def _cell_text(cell: CellCount | None) -> str:
 
 
 def _cell_sign(cell: CellCount) -> str:
-    """What matters most about a cell."""
+    """The sign of a cell's most important state."""
     if cell.now:
         return NOW
     if cell.left_out:
@@ -219,7 +219,7 @@ class CapturePane(Vertical):
             yield self._model
 
     def show(self, last: LastCapture | None) -> None:
-        """Draw this capture, if it is another one."""
+        """Draw this capture if it is a new one."""
         if last is None:
             self._words.show(Content.styled("nothing captured by this process yet", "dim"))
             return
@@ -252,5 +252,5 @@ def _capture_words(last: LastCapture) -> Content:
 def _check(check: Check) -> Content:
     sign, style = ("✓", "") if check.passed else ("!", "bold $text-warning")
     score = f"{check.score:.2f}" if abs(check.score) < 10.0 else f"{check.score:.0f}"
-    # In columns: a line that is broken anywhere would part the sign from its check.
+    # In columns, because a line break could separate the sign from its check.
     return Content.styled(f"{sign} {check.name} {score}".ljust(CHECK_WIDTH), style)

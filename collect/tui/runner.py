@@ -1,4 +1,4 @@
-"""Runs the app around engines so that no arm is left unwatched: on a signal, a lost terminal, a crash of the screen."""
+"""Runs the app so that no arm is left unwatched after a signal, a lost terminal or a crash of the screen."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from collect.tui.pictures import Pictures, Preview
 
 
 class ScreenCrashed(Exception):
-    """The screen ended by a defect, and has printed it; the arm was stopped."""
+    """The screen crashed and has printed the error; the arm was stopped."""
 
 
 def run_screen(engine: RunnableEngine, preview: Preview = "cells") -> None:
@@ -27,7 +27,7 @@ def run_screen(engine: RunnableEngine, preview: Preview = "cells") -> None:
 
 
 def run_browser(browser: SessionBrowser) -> None:
-    """Show the start screen, and run what is begun from it; raises what ended the last run."""
+    """Show the start screen, and run what is started from it; raises what ended the last run."""
     app = OperatorApp(browser=browser, pictures=Pictures())
     with _signals(app):
         _run(app)
@@ -44,7 +44,7 @@ def _run(app: OperatorApp) -> None:
     finally:
         engine = app.engine
         if engine is not None:
-            # However the screen ended, nobody watches the arm any more. One that parks already goes on with that.
+            # However the screen ended, nobody watches the arm any more. An arm that is already parking continues.
             if not engine.finished and not app.leaving:
                 engine.stop()
             if not intact:

@@ -1,4 +1,4 @@
-"""The start screen: recent sessions and how each stands, the rig's and the protocol's file, the rig's health."""
+"""The start screen: recent sessions and their state, the rig and protocol files, the rig's health."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class StartScreen(Screen[None]):
         self.reread()
 
     def reread(self) -> None:
-        """Read which sessions there are, and show them."""
+        """Read the list of sessions again and show it."""
         self._title.show(f"brushloop   sessions in {one_line(str(self._browser.paths.root))}")
         try:
             self._rows = self._browser.recent()
@@ -131,7 +131,7 @@ class StartScreen(Screen[None]):
             self._standing.show(WELCOME)
 
     def show_trouble(self, text: str) -> None:
-        """Show what went wrong, or with an empty text nothing."""
+        """Show what went wrong; an empty text clears it."""
         self._trouble.show(plain(text))
 
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
@@ -149,7 +149,7 @@ class StartScreen(Screen[None]):
             self._look(row.session_id)
 
     def on_input_submitted(self, _event: Input.Submitted) -> None:
-        """Go back to the list with the files that were typed; what was shown of others is gone."""
+        """Go back to the list with the files that were typed, and clear what was shown of the previous ones."""
         self._choose()
         self._health.show(UNASKED)
         self.show_trouble("")
@@ -161,7 +161,7 @@ class StartScreen(Screen[None]):
         self._to_list()
 
     def action_files(self) -> None:
-        """Let other files be typed."""
+        """Let the operator type other files."""
         self._keys.show(TYPING_KEYS)
         self._config.focus()
 
@@ -189,7 +189,7 @@ class StartScreen(Screen[None]):
 
     @work(exclusive=True, group="health")
     async def action_health(self) -> None:
-        """Ask every device how it is, off the screen's loop."""
+        """Check every device, outside the screen's event loop."""
         self._choose()
         self._health.show("Rig health: asking every device ...")
         try:
@@ -228,7 +228,7 @@ def _standing_content(details: Details) -> Content:
     if details.state == "open":
         following = details.next or ("the next stroke" if details.strokes else "set-up")
         parts.append(Content.assemble(("Next      ", "dim"), (plain(following), "bold")))
-        parts.append(Content("The arm first lifts and parks; then it goes on there. No stroke is made twice."))
+        parts.append(Content("The arm first lifts and parks; then the run continues there. No stroke is made twice."))
     parts.append(Content.assemble(("Sheets    ", "dim"), f"{len(details.sheets)}"))
     if details.repairs:
         parts.append(Content.styled(f"{len(details.repairs)} repairs", "$text-warning"))

@@ -1,7 +1,7 @@
-"""A terminal that may go away (a closed window, a lost ssh), and on which no text acts.
+"""A terminal that may be lost (a closed window, a dropped ssh connection), and that no displayed text can control.
 
-textual's own driver waits for ever once the terminal is gone: its writer thread dies of the first failed write, and
-SIGCONT, which comes with every hang-up, starts a second set of threads that nobody ends.
+textual's own driver waits for ever once the terminal is gone: the first failed write ends its writer thread, and
+SIGCONT, which comes with every hang-up, starts a second set of threads that nothing ends.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ class TerminalDriver(LinuxDriver):
 
 
 class PlainApp(App[None]):
-    """An app on which no text acts on the terminal, whoever wrote it."""
+    """An app that shows text of any origin without letting it control the terminal."""
 
     def get_line_filters(self) -> Sequence[LineFilter]:
-        """Add one behind textual's own."""
+        """Add `PlainLines` after textual's own filters."""
         return [*super().get_line_filters(), PLAIN_LINES]
 
 
 class PlainLines(LineFilter):
-    """Takes characters that a terminal acts on out of all text; textual's own controls stay."""
+    """Removes characters that control a terminal from all text; textual's own controls stay."""
 
     def apply(self, segments: list[Segment], background: Color) -> list[Segment]:
         """Filter one line."""
@@ -62,7 +62,7 @@ PLAIN_LINES = PlainLines()
 
 
 class _LostWrites(io.StringIO):
-    """A file whose failed writes are dropped: those to a terminal that is gone."""
+    """A file that ignores failed writes: those to a terminal that is gone."""
 
     def __init__(self, file: TextIO) -> None:
         super().__init__()

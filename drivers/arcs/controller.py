@@ -1,4 +1,4 @@
-"""The controller's calls with types: what is sent over one connection, and what the answers mean."""
+"""Typed calls to the controller: what is sent over one connection, and what the answers mean."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ class Controller:
         return await self.connection.call(f"{self.robot}.{method}", params)
 
     async def robot_names(self) -> list[str]:
-        """At least one name. Raises `ProtocolViolation`."""
+        """Names of the robots, at least one. Raises `ProtocolViolation`."""
         names = await self.connection.call("getRobotNames")
         if not isinstance(names, list) or not names:
             raise ProtocolViolation(DEVICE, "getRobotNames", f"expected a list of names, got {names!r}")
         return [str(name) for name in names]  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
 
     async def set_tcp_offset(self, offset_mm: tuple[float, float, float]) -> None:
-        """Flange to brush tip. Raises `MotionRefused`: with another offset every height would be wrong."""
+        """Set the offset from flange to brush tip. Raises `MotionRefused`: every height depends on the offset."""
         x, y, z = (v / 1e3 for v in offset_mm)
         accepted("setTcpOffset", await self.ask("RobotConfig.setTcpOffset", offset=[x, y, z, 0.0, 0.0, 0.0]))
 
@@ -84,7 +84,7 @@ class Controller:
             raise ProtocolViolation(DEVICE, "getRobotModeType", f"unknown mode {mode!r}") from None
 
     async def condition(self, calls: int) -> Condition:
-        """Ask for modes and time `calls` calls of one kind, one after the other; sets nothing."""
+        """Read the modes and time `calls` consecutive calls of one kind; sets nothing."""
         loop = asyncio.get_running_loop()
         took_s: list[float] = []
         for _ in range(calls):
@@ -110,9 +110,9 @@ class Controller:
     async def move_line(
         self, target: Pose, speed_mm_s: float, acc_mm_s2: float, blend_mm: float = 0.0, least_s: float = 0.0
     ) -> None:
-        """Queue a straight line. Raises `RobotNotSafe` or `MotionRefused`; already there is fine.
+        """Queue a straight line. Raises `RobotNotSafe` or `MotionRefused`; to be there already is no error.
 
-        The next line may begin `blend_mm` before its end: 0 halts there, else 1 mm to 1 m. `least_s` stretches it.
+        The next line may begin `blend_mm` before its end: 0 halts there, else 1 mm to 1 m. It takes at least `least_s`.
         """
         code = await self.ask(
             "MotionControl.moveLine",
@@ -142,7 +142,7 @@ class Controller:
         accepted("stopMove", await self.ask("MotionControl.stopMove", quick=True, all_tasks=True))
 
     async def release(self) -> None:
-        """End a hold over an empty queue, which moves nothing; the answer does not matter where there was no hold."""
+        """End a hold while the queue is empty, which moves nothing; the answer is ignored, as there may be no hold."""
         await self.ask("MotionControl.startMove")
 
     async def go_on(self) -> None:
@@ -153,7 +153,7 @@ class Controller:
         accepted("startMove", code)
 
     async def halt(self, acc_m_s2: float) -> None:
-        """Decelerate along the path, then drop the queue, also where the first call fails."""
+        """Decelerate along the path, then drop the queue, even if the first call fails."""
         try:
             await self.ask("MotionControl.stopLine", acc=acc_m_s2, acc_rot=acc_m_s2)
         except DeviceError:

@@ -43,10 +43,10 @@ def encode(payload: bytes) -> bytes:
 
 
 class FrameDecoder:
-    """Turns a byte stream, cut anywhere, into payloads."""
+    """Turns a byte stream, split at any point, into payloads."""
 
     def __init__(self, device: str = "arcs", *, skip: bytes = b"", max_bytes: int = MAX_PAYLOAD_BYTES) -> None:
-        """`skip` is what may stand between frames and means nothing."""
+        """`skip` holds bytes that may appear between frames and are ignored."""
         self._device = device
         self._skip = skip
         self._max_bytes = max_bytes
@@ -56,8 +56,8 @@ class FrameDecoder:
     def feed(self, data: bytes) -> list[bytes]:
         """Payloads completed by `data`, in order.
 
-        Raises `ProtocolViolation` where the stream is not SOF, and from then on always: nothing after it, nor of the
-        same `data`, can be trusted.
+        Raises `ProtocolViolation` if the stream is not SOF, and on every later call: neither this `data` nor anything
+        after it can be trusted.
         """
         if self._broken is not None:
             raise self._violation(self._broken)
@@ -111,7 +111,7 @@ _CLOSES = {ord("}"): ord("{"), ord("]"): ord("[")}
 
 
 class BareDecoder:
-    """Turns a byte stream, cut anywhere, into JSON documents; bounded in size and depth."""
+    """Turns a byte stream, split at any point, into JSON documents; bounded in size and depth."""
 
     def __init__(self, device: str = "arcs", *, max_bytes: int = MAX_DOCUMENT_BYTES) -> None:
         self._device = device
@@ -123,9 +123,9 @@ class BareDecoder:
         self._broken: str | None = None
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Documents completed by `data`, in order, each JSON as Python takes it: NaN and Infinity are let through.
+        """Documents completed by `data`, in order; NaN and Infinity are accepted, as by Python's `json`.
 
-        Raises `ProtocolViolation`, and from then on always: nothing after it, nor of the same `data`, can be trusted.
+        Raises `ProtocolViolation`, also on every later call: neither this `data` nor anything after it can be trusted.
         """
         if self._broken is not None:
             raise self._violation(self._broken)
@@ -155,7 +155,7 @@ class BareDecoder:
         return document
 
     def _scan(self) -> int | None:
-        """Go on from where the last piece ended; the end of the document, or None where it is not here yet."""
+        """Continue where the last piece ended; return the end of the document, or None if it has not arrived."""
         buffer = self._buffer
         while True:
             found = (_STRING_END if self._in_string else _STRUCTURE).search(buffer, self._at)
@@ -164,7 +164,7 @@ class BareDecoder:
                 return None
             byte, self._at = buffer[found.start()], found.end()
             if byte == ord("\\"):
-                if self._at == len(buffer):  # what it escapes is not here yet: look at it again
+                if self._at == len(buffer):  # the escaped character has not arrived: scan again from here
                     self._at -= 1
                     return None
                 self._at += 1
@@ -189,7 +189,7 @@ class BareDecoder:
 def numbers(values: object, count: int) -> list[float]:
     """`values` as floats. Raises ValueError unless it is a list of `count` finite numbers.
 
-    JSON knows integers that no float holds, and a text of six digits is no pose.
+    JSON allows integers too large for a float, and a string of six digits is not a pose.
     """
     if not isinstance(values, list):
         raise ValueError(f"expected {count} numbers, got {str(values)[:80]!r}")

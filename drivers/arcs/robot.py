@@ -44,7 +44,7 @@ class AuboArcs:
         self._stopper = Stopper([self._stop, self._state], self._motion, self._restore_stop)
         self._own_stops: set[asyncio.Task[None]] = set()
         self._stops = 0
-        """Stops so far: a motion compares it, since no line may follow a stop."""
+        """Number of stops so far; a motion compares it, because it must send no line after a stop."""
         self._unsettled = False
         """True from the moment a line is sent until the arm is seen at rest."""
         self._held = False
@@ -94,11 +94,11 @@ class AuboArcs:
         """
         self._enabled = True
         if not await self._motion.at_rest():
-            # A process that was killed may have left a line in the queue; nothing is set or computed meanwhile.
+            # A process that was killed may have left a line in the queue: stop it before anything is set or computed.
             try:
                 await self.stop()
             except MotionFailed:
-                await self._motion.require_safe("power on")  # a safety stop holds its path: that is the cause to report
+                await self._motion.require_safe("power on")  # a safety stop holds the path, and is the cause
                 raise
         settings = await make_ready(self._motion, self._options, self._notice)
         await power_on(self._motion, self._options)
@@ -110,15 +110,15 @@ class AuboArcs:
         await self._telemetry.read()
 
     async def condition(self, calls: int) -> Condition:
-        """Modes of the arm now, and the time of a call; see `Controller.condition`."""
+        """The arm's current modes, and the time of a call; see `Controller.condition`."""
         return await self._motion.condition(calls)
 
     def check(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
-        """Pure: raises `LimitExceeded`, asks nothing of the controller."""
+        """Raise `LimitExceeded` where the target is not allowed, without asking the controller."""
         self._limits.check(DEVICE, target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
 
     async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
-        """moveLine, then wait until the queue is empty, the arm steady and the pose within tolerance.
+        """Send moveLine, then wait until the queue is empty, the arm steady and the pose within tolerance.
 
         The whole line is checked, from where the arm really is. Any failure, cancellation included, stops the arm
         before it is raised.
@@ -130,10 +130,10 @@ class AuboArcs:
         await self._carry_out(self._motion.move_line(target, speed_mm_s, acc_mm_s2), target, expected_s)
 
     async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float) -> None:
-        """Lines through all poses without a halt between them, then wait as `move` does at the last.
+        """Send lines through all poses without a halt between them, then wait as `move` does at the last.
 
-        Every pose, and the line between two of them, is checked before the first line is sent. Raises ValueError for no
-        poses.
+        Every pose, and every line between two of them, is checked before the first line is sent. Raises ValueError for
+        no poses.
         """
         if not poses:
             raise ValueError("follow: no poses")
@@ -198,7 +198,7 @@ class AuboArcs:
             raise
 
     async def _depart(self, op: str, poses: Sequence[Pose]) -> Pose:
-        """Return where the arm is, once it may go from there through `poses`; see `Departure`."""
+        """Check that the arm may go through `poses` from where it is, and return that place; see `Departure`."""
         stops = self._stops
         await self._ready()
         start = await self._departure.ready(op, self._limits, poses)
@@ -209,7 +209,7 @@ class AuboArcs:
     async def stop(self) -> None:
         """Decelerate along the path, drop whatever is queued, and return once the arm is seen at rest.
 
-        Raises `MotionFailed` where it is not: then only the emergency stop is left.
+        Raises `MotionFailed` if it is not: then only the emergency stop is left.
         """
         if not self._connected:
             raise NotConnected(DEVICE, "stop", "not connected")
@@ -222,7 +222,7 @@ class AuboArcs:
         return await self._motion.pose()
 
     async def confirm(self) -> None:
-        """Raise `RobotNotSafe`, `SettingsChanged`, then `ArmMoved`, unless the arm is as it was left; only asks."""
+        """Raise `RobotNotSafe`, `SettingsChanged` or `ArmMoved` if the arm is not as it was left; sets nothing."""
         await self._departure.confirm()
 
     async def take_up(self) -> Pose:
@@ -248,7 +248,7 @@ class AuboArcs:
         """Stop, end telemetry, close all sockets in reverse order of opening.
 
         An arm that was never enabled from here is not stopped: its motion may be another client's. Raises
-        `MotionFailed` where a line was under way and the arm is not seen at rest.
+        `MotionFailed` if a line was under way and the arm is not seen at rest.
         """
         self._telemetry.listener = None
         await asyncio.gather(*self._own_stops, return_exceptions=True)
@@ -274,14 +274,14 @@ class AuboArcs:
         self._departure = Departure(self._motion)
 
     async def _ready(self) -> None:
-        """Before each motion: a way to stop it, and a controller that does not hold its path."""
+        """Before each motion, make sure that it can be stopped and that the controller does not hold its path."""
         await self._restore_stop()
         if self._held and await self._motion.at_rest():
             await self._motion.release()  # nothing is queued
             self._held = False
 
     async def _restore_stop(self) -> None:
-        """No motion without a way to stop it: a controller may have dropped the idle connection."""
+        """Reopen the stop connection if it is lost: the controller may have dropped it while idle."""
         async with self._reopening:
             if self._stop.connection.lost:
                 await self._stop.connection.reopen()

@@ -1,7 +1,7 @@
 """How an arm is set up: what is configured, what is set before the arm is powered, and what is read back.
 
-Any client may change what a press depends on, so a return code is no proof, least of all `ignored`. No step here moves
-the arm or clears a stop.
+Any client may change these settings, so a return code proves nothing, `ignored` least of all. No step here moves the
+arm or clears a stop.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class ArcsOptions:
     host: str
     port: int = 30004
     tcp_offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Flange to brush tip."""
+    """Offset from flange to brush tip."""
     position_tolerance_mm: float = 0.05
     rotation_tolerance_deg: float = 0.1
     poll_s: float = 0.02
@@ -38,9 +38,9 @@ class ArcsOptions:
     framing: Framing = "sof"
     """`sof` as the maker's client speaks, `bare` as the maker documents; a cabinet may accept only one of them."""
     rtde_port: int | None = None
-    """Where poses are pushed from, 30010 on a cabinet; None polls for them."""
+    """Port that pushes poses, 30010 on a cabinet; None polls for them."""
     payload_kg: float | None = None
-    """Mass at the flange; None leaves what is set on the pendant, as with the three below."""
+    """Mass at the flange; None keeps the pendant's setting, here and in the next three."""
     payload_cog_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Centre of that mass, from the flange."""
     collision_level: int | None = None
@@ -53,10 +53,10 @@ class ArcsOptions:
 
 METHOD_NOT_FOUND = -32601
 TOLERANCE = 1e-3
-"""Of every number, in mm, deg and kg: a controller may keep single precision."""
+"""Difference allowed in every number, in mm, deg and kg: a controller may keep single precision."""
 
 Value = tuple[float, ...] | str | None
-"""None: the controller has no such setting."""
+"""None if the controller has no such setting."""
 Settings = Mapping[str, Value]
 """By name, in the units of `SETTINGS`."""
 
@@ -97,7 +97,7 @@ SETTINGS = (
 
 
 async def read_back(controller: Controller) -> Settings:
-    """Read all settings from the controller. Raises `ProtocolViolation` for an answer of another shape."""
+    """Read all settings from the controller. Raises `ProtocolViolation` for an answer of the wrong shape."""
     found: dict[str, Value] = {}
     for setting in SETTINGS:
         try:
@@ -156,7 +156,7 @@ async def make_ready(controller: Controller, options: ArcsOptions, on_notice: Ca
     """Check the operational mode, set tool, payload, collision level and speed, where configured, and read all back.
 
     Raises `WrongOperationalMode`, `MotionRefused` for a setting that the controller refuses, and `SettingsChanged` for
-    one that it accepted and does not have.
+    one that it accepted but did not apply.
     """
     _require_automatic((await read_back(controller))[OPERATIONAL_MODE], on_notice)
     await controller.set_tcp_offset(options.tcp_offset_mm)

@@ -1,4 +1,4 @@
-"""Stopping the arm: over any connection that works, and not believed until the arm rests; and the watchdog.
+"""Stopping the arm over any connection that works, not believed until the arm rests; and the watchdog.
 
 Two connections have no common order, so a stop on its own connection may overtake a line that is still on its way.
 That is why a stop is sent a second time behind that line, and why the arm is polled until it is seen at rest.
@@ -23,12 +23,12 @@ from drivers.geometry import distance
 HEDGE_S = 0.15
 """A stop that is not acknowledged within this time is sent over the next connection too."""
 CONFIRM_S = 6.0
-"""Rest must be seen within this time from the call on: a stop from full speed takes a fraction of a second."""
+"""Rest must be seen within this time of the call: a stop from full speed takes a fraction of a second."""
 RESEND_S = 0.3
 POLL_S = 0.02
 STILL_S = 0.1
 RESTS_NEEDED = 3
-"""Polls in a row: a line that was on its way may start after the first."""
+"""Consecutive polls that must see rest: a line that was on its way may start after the first."""
 
 
 class Stopper:
@@ -37,7 +37,7 @@ class Stopper:
     def __init__(self, ways: list[Controller], behind: Controller, reopen: Callable[[], Awaitable[None]]) -> None:
         self._ways = ways
         self._behind = behind
-        """The connection that lines go out on: a stop there cannot overtake one."""
+        """The connection that carries the lines: a stop sent there cannot overtake one."""
         self._reopen = reopen
 
     async def stop(self, acc_m_s2: float) -> None:
@@ -140,7 +140,7 @@ def _acknowledged(done: set[asyncio.Task[None]], failures: list[DeviceError]) ->
 KEY = "brushloop"
 NOTHING, PROTECTIVE_STOP = 0, 3
 FEEDINGS = 4
-"""Times per timeout that it is fed: three may be lost."""
+"""Times that it is fed per timeout: three may be lost."""
 
 
 class Watchdog:

@@ -20,7 +20,7 @@ from drivers.samples import Pose, PoseSample, Stamp
 POSE_SEGMENT = "R1_actual_TCP_pose"
 JOINTS_SEGMENT = "R1_actual_q"
 MOST_SILENCES = 3
-"""Silences in a row, of half a second each: a busy machine may cause one or two."""
+"""Consecutive silences, of half a second each: a busy machine may cause one or two."""
 GIVE_UP_S = 2.0
 
 
@@ -40,11 +40,11 @@ class Telemetry:
 
     @property
     def source(self) -> str:
-        """How poses come: `RTDE` or `polling`."""
+        """How poses arrive: `RTDE` or `polling`."""
         return "RTDE" if self._stream is not None else "polling"
 
     async def start(self) -> None:
-        """Take the first pose, then continue until `stop`. Raises as the call for the first pose does."""
+        """Read the first pose, then continue until `stop`. Raises what the first read raises."""
         await self.read()
         if self._options.rtde_port is not None:
             await self._subscribe(self._options.rtde_port)
@@ -69,7 +69,7 @@ class Telemetry:
 
     @contextlib.contextmanager
     def seeing(self) -> Generator[list[Pose]]:
-        """Collect every pose that arrives within the block, also those that arrive too late to be stamped."""
+        """Collect every pose that arrives during the block, including those that arrive too late to be stamped."""
         self._seen = seen = []
         try:
             yield seen
@@ -113,7 +113,7 @@ class Telemetry:
             await asyncio.sleep(due - loop.time())
 
     async def _listen(self, stream: RtdeStream) -> None:
-        """Take what is pushed. A short silence is bridged by polling: what piled up meanwhile will still come."""
+        """Receive pushed poses. A short silence is bridged by polling: the poses that piled up will still arrive."""
         silences = 0
         while True:
             try:

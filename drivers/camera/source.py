@@ -51,30 +51,30 @@ class CameraOptions:
     """The longest time from exposure to arrival; a frame counts as exposed after (arrival - latency)."""
     timeout_s: float = 10.0
     gray: bool = True
-    """Ink on paper has no colour worth three times the disk."""
+    """The colour of ink on paper is not worth three times the disk space."""
     locked: Locked = Locked()
     folder_fps: float = 10.0
-    """Pace at which a folder of images is shown."""
+    """Rate at which the images of a folder are shown."""
     frozen_after: int = 5
-    """Equal frames in a row that mean a frozen camera; real frames have noise."""
+    """Number of identical consecutive frames that mean a frozen camera; real frames have noise."""
 
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg"}
 SETTING_TOLERANCE = 0.01
-"""Relative difference up to which a setting that was read back counts as the one asked for."""
+"""Relative difference up to which a setting that is read back counts as applied."""
 
 
 class Source(Protocol):
     """Owned by one thread from open to release."""
 
     live: bool
-    """False where the frames are recorded: their end is an end, and equal ones are no fault."""
+    """False for recorded frames: they may end, and identical ones are not a fault."""
 
     independent: bool
     """True where FFmpeg decodes a JPEG for each frame."""
 
     settings: dict[str, float]
-    """What was read back, by name."""
+    """Settings that were read back, by name."""
 
     simulated: bool
     """True for the loopback camera, which identifies itself, and for recordings, which show no ink of this session."""
@@ -89,7 +89,7 @@ class Source(Protocol):
 
 
 def open_source(options: CameraOptions) -> Source:
-    """Open what `options.source` names. Raises `ConnectionLost`, or `DeviceError` for settings that do not hold."""
+    """Open what `options.source` names. Raises `ConnectionLost`, or `DeviceError` for settings that have no effect."""
     if Path(options.source).is_dir():
         return FolderSource(options)
     return CaptureSource(options)
@@ -111,7 +111,7 @@ def says_loopback(url: str) -> bool:
 
 
 class FolderSource:
-    """The images of a folder in order of name, at a steady pace; the last one is repeated without end."""
+    """The images of a folder in order of name, at a steady rate; the last one is repeated without end."""
 
     def __init__(self, options: CameraOptions) -> None:
         folder = Path(options.source)
@@ -145,7 +145,7 @@ class CaptureSource:
     """A `cv2.VideoCapture` on a device, a stream or a file, its settings locked and read back."""
 
     def __init__(self, options: CameraOptions) -> None:
-        # Before the first capture of the process: the libraries would write their own lines across the screen.
+        # Set before the first capture: otherwise the libraries would write their own lines across the screen.
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         import cv2
 

@@ -22,10 +22,10 @@ DEVICE = "force"
 AXES = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 MIN_BIAS_ROUNDS = 10
 MIN_ALIKE_ROUNDS = 10
-"""Fewer may be alike by chance, on a sensor that is slow or coarse."""
+"""Fewer rounds may be equal by chance, on a sensor that is slow or coarse."""
 MAX_BIAS_S = 60.0
 MORE_BIAS_S = 1.0
-"""Extra time of averaging where too few rounds came."""
+"""Extra averaging time if too few rounds arrived."""
 NO_BIAS: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -37,19 +37,19 @@ class SriOptions:
     channel: str = "can0"
     bitrate: int = BITRATE
     host: str | None = None
-    """Of a CAN gateway, for the interface `socketcand`."""
+    """Address of a CAN gateway, for the interface `socketcand`."""
     port: int | None = None
     stale_after_ms: float = 100.0
     stuck_after_ms: float = 100.0
     """Time over which rounds that are equal to the last bit in all six values mean a stuck sensor."""
     connect_timeout_s: float = 2.0
     round_ms: float = 5.0
-    """The longest from the first to the third frame of a round. Shorter than the sensor's period, or two rounds that
-    each lost frames can pass for one."""
+    """Longest time from the first to the third frame of a round. It must be shorter than the sensor's period:
+    otherwise two rounds that each lost frames can pass for one."""
     gap_ms: float = 20.0
     max_n: float = 1000.0
     max_nm: float = 100.0
-    """More than the sensor can measure is refused like NaN."""
+    """Values beyond what the sensor can measure are refused like NaN."""
     still_n: float = 0.05
     still_nm: float = 0.01
     """The largest standard deviation, in each axis, at which the sensor counts as still."""
@@ -68,7 +68,7 @@ class SriM8123:
         """What is subtracted from every round; raw value = sample + bias."""
 
     async def connect(self) -> Identity:
-        """Open the bus, start the board, wait for its first whole round. Raises `ConnectionLost`, `DeviceTimeout`.
+        """Open the bus, start the board, wait for its first complete round. Raises `ConnectionLost`, `DeviceTimeout`.
 
         After a failure the board is stopped and nothing is left open. A bias does not survive.
         """
@@ -144,8 +144,8 @@ class SriM8123:
     async def bias(self, seconds: float) -> None:
         """Average for `seconds` with nothing touching, and subtract that from now on.
 
-        Raises `DeviceError` where the sensor was not still, `Stale` or `DeviceTimeout` where it sent too little,
-        `LimitExceeded` for a time not in (0, 60] s; the former bias stays then.
+        Raises `DeviceError` if the sensor was not still, `Stale` or `DeviceTimeout` if it sent too little,
+        `LimitExceeded` for a time not in (0, 60] s; the previous bias then remains.
         """
         if not 0.0 < seconds <= MAX_BIAS_S:
             raise LimitExceeded(DEVICE, "bias time", seconds, 0.0, MAX_BIAS_S, "s")
@@ -155,7 +155,7 @@ class SriM8123:
             stream.collecting = rounds
             try:
                 await asyncio.sleep(seconds)
-                if len(rounds) < MIN_BIAS_ROUNDS:  # a busy computer: so few say nothing about stillness
+                if len(rounds) < MIN_BIAS_ROUNDS:  # a busy computer: too few to judge stillness
                     await asyncio.sleep(MORE_BIAS_S)
             finally:
                 stream.collecting = None

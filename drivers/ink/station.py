@@ -62,9 +62,9 @@ def unseal(line: bytes) -> Line:
 
 
 def find_reply(received: bytes, number: int) -> Reply | None:
-    """The first whole reply to request `number`; None while there is none.
+    """The first complete reply to request `number`; None while there is none.
 
-    Noise, echoes, damaged lines and replies to other requests are skipped: the sender asks again in time.
+    Noise, echoes, damaged lines and replies to other requests are skipped: the sender repeats its request in time.
     """
     *lines, _ = received.split(b"\n")
     for raw in lines:
@@ -117,7 +117,7 @@ class StationOptions:
     max_per_minute_ml: float = 5.0
     timeout_s: float = 0.5
     s_per_ml: float = 4.0
-    """The longest that the station takes for 1 ml; its reply comes when the ink is in the well."""
+    """Longest time that the station takes for 1 ml; its reply comes when the ink is in the well."""
     attempts: int = 2
     connect_attempts: int = 6
     """Many boards restart when their port is opened, and are deaf for two seconds."""
@@ -162,7 +162,7 @@ class InkStation:
             raise DeviceError(DEVICE, "dose", f"gave {given_ml:.3f} ml instead of {volume_ml:.3f} ml")
 
     async def light(self, level: float) -> bool:
-        """Set the light, 0 to 1; True: it has one.
+        """Set the light, 0 to 1; returns True, as the station has one.
 
         Raises `LimitExceeded`, `InkRefused`, `DeviceTimeout`, `ConnectionLost`.
         """

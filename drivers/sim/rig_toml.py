@@ -55,7 +55,7 @@ acc_mm_s2 = 1000.0
 kind = "opencv"
 source = "http://{at.host}:{at.camera_port}/stream.mjpg"
 latency_ms = 250.0
-max_delay_ms = 3000.0     # drawn and coded beside you on one machine, a picture may have to wait for it
+max_delay_ms = 3000.0     # drawn and encoded on the same machine as the run, a picture may be late
 max_jitter_ms = 2000.0
 lens = "simulated, {view.px_per_mm:g} px/mm, no distortion"
 
@@ -119,16 +119,14 @@ port = {at.force_port}
 
 
 def _dwell(config: SimConfig) -> str:
-    """Where simulated time is fast, a tenth of a second of it passes between two polls."""
+    """If simulated time runs fast, a tenth of a simulated second passes between two polls."""
     if config.rate <= 2.0:
         return ""
-    return f"least_dwell_s = {SEEN_S * config.rate:g}    # simulated time runs {config.rate:g} times as fast as life\n"
+    return f"least_dwell_s = {SEEN_S * config.rate:g}    # simulated time runs at {config.rate:g} times real time\n"
 
 
 def _staleness(config: SimConfig) -> str:
     """As for a real sensor, unless simulated time is fast: then the age of a sample says nothing about the arm."""
     if config.rate <= 1.0:
         return "stale_ms = 100.0\n"
-    return (
-        f"stale_ms = 1000.0    # allowed on this bus alone: simulated time runs {config.rate:g} times as fast as life\n"
-    )
+    return f"stale_ms = 1000.0    # allowed on this bus alone: simulated time runs at {config.rate:g} times real time\n"

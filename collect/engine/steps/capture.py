@@ -55,8 +55,8 @@ def _board(run: RunContext, image: Gray) -> tuple[Plane, tuple[Check, ...]]:
 async def look_at_sheet(context: StepContext) -> None:
     """Once for each sheet, check that every free cell is blank. Raises `NeedsOperator`.
 
-    The operator says that a fresh sheet is in; the camera confirms it before ink goes on ink. If the brush was full of
-    ink, it counts as dry afterwards.
+    The operator says that a fresh sheet is in; the camera confirms it, so that no press lands on old ink. A brush that
+    was full of ink counts as dry afterwards.
     """
     run = context.run
     sheet = run.store.state.sheet
@@ -76,7 +76,7 @@ async def look_at_sheet(context: StepContext) -> None:
 
 def _inked_cells(run: RunContext, image: Gray, begun: int | None) -> list[str]:
     plane = run.image_plane(image)
-    used = run.used_cells() - {begun}  # the cell of this very attempt is still to be pressed
+    used = run.used_cells() - {begun}  # this attempt's own cell is not pressed yet
     free = [run.sheet.cell(index) for index in range(run.sheet.capacity) if index not in used]
     checks = [cell_is_blank(image, plane, cell, limits=run.rig.config.quality) for cell in free]
     return [check.reason for check in checks if not check.passed]
@@ -104,13 +104,13 @@ def _camera_delay(context: StepContext) -> Result:
 
 
 async def capture(context: StepContext) -> Result:
-    """The CAPTURE step: `kept` where the stroke counts, `retake` where it is to be pressed again on another cell.
+    """The CAPTURE step: `kept` if the stroke counts, `retake` if it must be pressed again on another cell.
 
-    Raises `BadPicture` where the photograph, not the stroke, is at fault.
+    Raises `BadPicture` if the photograph, not the stroke, is at fault.
     """
     run, stroke_id = context.run, str(context.step.params["stroke_id"])
     if int(context.number("sheet")) != run.store.state.sheet:
-        raise StepError(f"{stroke_id} lies on another sheet than the one that is in")
+        raise StepError(f"{stroke_id} is not on the sheet that is in")
     cell = run.sheet.cell(int(context.number("cell")))
     image = await photograph(context)
     waited = _wait_check(context)
@@ -137,9 +137,9 @@ async def capture(context: StepContext) -> Result:
 
 
 def _wait_check(context: StepContext) -> schemas.Check | None:
-    """Time from dip to touch of this stroke, compared with those before; None where none was recorded.
+    """Compare this stroke's time from dip to touch with those of earlier strokes; None if it was not recorded.
 
-    It is recorded as a remark and decides nothing: the ink is judged by how it looks.
+    The check is recorded as a remark and decides nothing: the ink is judged from the photograph.
     """
     still, stroke_id = context.attempt.serial, context.step.params["stroke_id"]
     this = {"kind": "capture", "result": {"stroke_id": stroke_id, "still": still}}

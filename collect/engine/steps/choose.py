@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 async def choose(context: StepContext) -> Result:
     """The CHOOSE step: `height_mm` and `tilt_deg` of the next press, or `stop` with the number of presses saved.
 
-    Depends only on the captures in the journal, so that after a kill the same press is chosen.
+    The choice depends only on the captures in the journal, so a killed run chooses the same press again.
     """
     run, protocol = context.run, context.run.protocol
     assert isinstance(protocol, AdaptiveConfig)
@@ -41,7 +41,7 @@ async def choose(context: StepContext) -> Result:
         return {**result, "stop": False, "height_mm": height_mm, "tilt_deg": tilt_deg}
     pressed = context.step.index
     saved = max(0, protocol.whole_grid - pressed)
-    why = found.why if found.cell is None else f"most_presses is reached; {found.points:.2f} points are left to be won"
+    why = found.why if found.cell is None else f"most_presses is reached; {found.points:.2f} points could be gained"
     run.progress.log(
         f"stopped choosing after {pressed} presses: {why}. "
         f"{saved} of the {protocol.whole_grid} presses of the shuffled grid were saved"
@@ -86,7 +86,7 @@ def _fitted(run: RunContext, protocol: AdaptiveConfig, seen: list[CapturedPress]
 
 
 def _ink(run: RunContext, image: Gray, cell: Cell) -> tuple[str, str]:
-    """(ink, why there is none)."""
+    """Return (packed ink, why there is none)."""
     from calibrate.fit.stepwise import packed
 
     try:

@@ -1,4 +1,4 @@
-"""What steps work with: the rig for the length of a run, and the attempt that is being recorded."""
+"""What a step works with: the rig during a run, and the attempt that is being recorded."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class RunMemory:
     """What this process has seen and done on the rig; a new process starts without it."""
 
     left_ink_ns: int | None = None
-    """When the brush left the ink, by the host's clock; None where it has marked since, or may have lost its ink."""
+    """Host time at which the brush left the ink; None if it has marked since or may have lost its ink."""
     image_plane: Plane | None = None
     """Plane of the newest frame in which the board was seen."""
     sound_frame: Gray | None = None
@@ -64,15 +64,15 @@ class RunContext:
     memory: RunMemory = field(default_factory=RunMemory)
 
     def used_cells(self) -> set[int]:
-        """Cells of the current sheet on which a mark was ever begun, or which zero touch may ink."""
+        """Cells of the current sheet on which any mark was started, or which zero touch may ink."""
         state, config = self.store.state, self.rig.config
         marked = {cell for sheet, cell in state.used_cells if sheet == state.sheet}
         return marked | touched_cells(self.sheet, config.paper, config.touch)
 
     def image_plane(self, image: Gray) -> Plane:
-        """Where the paper lies in this frame: from its own board, else from the newest board that was seen.
+        """Where the paper lies in this frame: from the board in it, else from the newest frame that showed one.
 
-        Raises `BadPicture` where none was.
+        Raises `BadPicture` if none did.
         """
         try:
             self.memory.image_plane = see_board(image, self.rig.config.board)
@@ -117,7 +117,7 @@ class StepContext:
 async def uninterrupted(function: Callable[..., _R], *args: object) -> _R:
     """Run `function` in a thread; on cancellation wait until it has returned.
 
-    Half of a file operation is worse than one that ends a few milliseconds after the stop key.
+    An unfinished file operation is worse than one that ends a few milliseconds after the stop key.
     """
     task = asyncio.ensure_future(asyncio.to_thread(function, *args))
     try:

@@ -17,7 +17,7 @@ ROTATION_AS_LINEAR_MM = 1.0
 """Below this travel, ARCS reads speed and acceleration as rad/s and rad/s2."""
 TURN_RAD = 1e-4
 STRETCHES = 16
-"""Straight pieces in which a curved path is reported to the world."""
+"""Number of straight pieces in which a curved path is reported to the world."""
 
 
 class Path(Protocol):
@@ -25,7 +25,7 @@ class Path(Protocol):
 
     @property
     def length(self) -> float:
-        """From end to end."""
+        """Length from end to end."""
         ...
 
     @property
@@ -35,7 +35,7 @@ class Path(Protocol):
 
     @property
     def stretches(self) -> int:
-        """Straight pieces that stand for it; 1 for a straight line."""
+        """Number of straight pieces that approximate it; 1 for a straight line."""
         ...
 
     def pose(self, done: float) -> Pose:
@@ -97,7 +97,7 @@ class Line(InSpace):
 
 @dataclass(frozen=True)
 class Corner(InSpace):
-    """The parabola that leaves `a` at `cut` before its end and meets `b` at `cut` after its start; turns go along."""
+    """The parabola that leaves `a` at `cut` before its end and meets `b` at `cut` after its start, turns included."""
 
     a: Line
     b: Line
@@ -112,12 +112,12 @@ class Corner(InSpace):
 
     @cached_property
     def bend(self) -> float:
-        """Length of the difference of the two directions: 0 straight on, 2 back again."""
+        """Length of the difference of the two unit directions: 0 for straight on, 2 for a reversal."""
         ways = [np.subtract(w.end.position_mm, w.start.position_mm) / w.length for w in (self.a, self.b)]
         return float(np.linalg.norm(ways[1] - ways[0]))
 
     def pose(self, done: float) -> Pose:
-        """By de Casteljau: lines between lines."""
+        """Where the true tip is after `done`, by de Casteljau's algorithm."""
         u = done / self.length
         start, end = self.a.along(self.a.length - self.cut), self.b.along(self.cut)
         there = interpolate(interpolate(start, self.a.end, u), interpolate(self.b.start, end, u), u)
@@ -126,7 +126,7 @@ class Corner(InSpace):
 
 @dataclass(frozen=True)
 class JointLine:
-    """Straight in joints; its length is that of the joint that turns farthest."""
+    """Straight in joints; its length is the angle of the joint that turns farthest."""
 
     start: Joints
     end: Joints
@@ -165,17 +165,17 @@ class Part:
 
     @property
     def length(self) -> float:
-        """Of the rest."""
+        """Length of the rest."""
         return max(self.whole.length - self.begin, 0.0)
 
     @property
     def angular(self) -> bool:
-        """As the whole."""
+        """As for the whole path."""
         return self.whole.angular
 
     @property
     def stretches(self) -> int:
-        """As the whole."""
+        """As for the whole path."""
         return self.whole.stretches
 
     def pose(self, done: float) -> Pose:
@@ -183,7 +183,7 @@ class Part:
         return self.whole.pose(self.begin + done)
 
     def joints(self, done: float) -> Joints | None:
-        """As the whole."""
+        """As for the whole path."""
         return self.whole.joints(self.begin + done)
 
 

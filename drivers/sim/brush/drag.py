@@ -16,7 +16,7 @@ from drivers.sim.brush.paper import Dots, Footprint, Image, scatter, soak
 from drivers.sim.brush.spine import SpineShape, Vector
 
 STEP_MM = 0.3
-"""Longest way of the commanded tip between two moments of a drag."""
+"""Longest distance that the commanded tip travels between two moments of a drag."""
 
 SHORTEST = 0.3
 """Length of a patch that is pulled square across, as a share of its full length."""
@@ -37,9 +37,9 @@ class Reach:
 
     depth_mm: Vector
     pressed_mm: Vector
-    """From the tip to the middle of the patch when the brush only came down."""
+    """Distance from the tip to the middle of the patch after a straight descent."""
     pulled_mm: Vector
-    """The same while it is drawn along: the length of the leash."""
+    """The same while the brush is dragged: the length of the leash."""
     half_mm: Vector
     """Half the length of the patch."""
 
@@ -57,7 +57,7 @@ class Moment:
     """Factor on its length."""
     depth_mm: float
     travel_mm: float
-    """Sideways way of the commanded tip until then."""
+    """Sideways distance that the commanded tip has travelled so far."""
     pulled: bool
     """True once the leash has come taut."""
 
@@ -107,7 +107,7 @@ def _samples(path: Sequence[Waypoint]) -> tuple[Vector, Vector, Vector]:
 
 
 INK_PER_MM = 0.005
-"""Share of a full brush that one mm of a drag takes, on top of what landing takes."""
+"""Share of a full brush that one mm of a drag uses, on top of what landing uses."""
 
 DEPTH_STEP_MM = 0.2
 LOAD_STEP = 0.02
@@ -121,7 +121,7 @@ STAMP_MARGIN_MM = 1.5
 
 @dataclass(frozen=True)
 class Stances:
-    """How one brush stands on the paper by depth: pressed straight down, and drawn along. Both start unloaded."""
+    """How one brush stands on the paper at each depth: pressed straight down, and dragged. Both start unloaded."""
 
     pressed: tuple[SpineShape, ...]
     pulled: tuple[SpineShape, ...]
@@ -171,7 +171,7 @@ def _half_mm(shape: SpineShape) -> float:
 
 
 def ink_left(ink_load: float, travel_mm: float) -> float:
-    """Load after so many mm of a drag."""
+    """Ink load after `travel_mm` of a drag."""
     return max(0.0, ink_load - INK_PER_MM * travel_mm)
 
 
@@ -184,7 +184,7 @@ def draw_drag(
     px_per_mm: float,
     paper_rng: np.random.Generator,
 ) -> Footprint:
-    """Lay the patch along the path in a frame along the paper's, its origin at the first waypoint."""
+    """Lay the patch along the path, in a frame parallel to the paper's with its origin at the first waypoint."""
     start = path[0]
     local = tuple(Waypoint(w.x_mm - start.x_mm, w.y_mm - start.y_mm, w.depth_mm) for w in path)
     track = follow(local, stances.reach, heading_rad)
@@ -239,7 +239,7 @@ def _corners_mm(stamp: _Stamp, moment: Moment, px_per_mm: float) -> Vector:
 def _lay(
     wet: Image, load_map: Image, stamp: _Stamp, column: float, row: float, heading_rad: float, length: float
 ) -> None:
-    """Shorten a stamp to `length`, turn it about its middle, put that at (column, row), and keep the wetter."""
+    """Shorten a stamp to `length`, turn it, put its middle at (column, row), and keep the wetter of each pixel."""
     h, w = stamp.wet.shape
     ox, oy = stamp.origin_px
     far = math.ceil(math.hypot(max(ox, w - ox), max(oy, h - oy))) + 1
@@ -253,6 +253,6 @@ def _lay(
     turned = np.asarray(cv2.warpAffine(stamp.wet, np.column_stack([linear, offset]), size), np.float32)
     patch = wet[top:bottom, left:right]
     passed = load_map[top:bottom, left:right]
-    # paper that a fuller brush has wetted stays so when a drier one passes again
+    # paper that a fuller brush has wetted stays wet when a drier one passes
     np.maximum(passed, stamp.load, out=passed, where=turned > 0.0)
     np.maximum(patch, turned, out=patch)

@@ -65,7 +65,7 @@ class Trouble:
 
     flaw: Flaw
     severity: float
-    """0 = none .. 1 = as bad as it gets."""
+    """From 0, none, to 1, the worst."""
     side: float
     """+1 or -1: where a bent tip goes."""
     cleft: float
@@ -103,7 +103,7 @@ class Trouble:
         return x_mm, y_mm
 
     def _parted(self, across: Vector, to_tip_mm: Vector, squash_mm: Vector, half_width_mm: Vector) -> Vector:
-        # the tuft gives way where it is squashed most, and each half then runs straight on
+        # the tuft parts where it is squashed most, and each half then runs straight on
         beyond = np.maximum(0.0, to_tip_mm[int(squash_mm.argmax())] - to_tip_mm)
         group = np.where(across >= self.cleft, 1.0, -1.0)
         middle = 0.5 * (self.cleft + group)
@@ -114,7 +114,7 @@ class Trouble:
     def _bowed(self, x_mm: Vector, y_mm: Vector, to_tip_mm: Vector) -> tuple[Vector, Vector]:
         reach_mm = BENT_SHARE * self.length_mm
         gone = np.clip(1.0 - to_tip_mm / reach_mm, 0.0, 1.0)
-        # the set shows as far as the tip lies down: one that just touches still points at its place
+        # the bend shows as far as the tip lies down: a tip that just touches is not displaced
         lying = min(1.0, float(to_tip_mm[0]) / (0.5 * self.length_mm))
         full = max(BEND_RAD * self.severity * lying, 1e-9)
         turn = full * gone
@@ -124,7 +124,7 @@ class Trouble:
 
 
 def draw_trouble(flaw: Flaw, severity: float, hairs: int, length_mm: float, rng: np.random.Generator) -> Trouble:
-    """How one flaw turns out this time: which side, where it parts, which hairs are dry."""
+    """Draw the details of one flaw at random: which side, where it parts, which hairs are dry."""
     side = 1.0 if rng.random() < 0.5 else -1.0
     cleft = rng.uniform(-0.25, 0.25)
     thirst = rng.random(hairs).argsort().argsort() / hairs
@@ -139,7 +139,7 @@ def natural_split(ink_load: float, depth_mm: float, rng: np.random.Generator) ->
 
 
 def flaw_of_load(ink_load: float) -> Flaw | None:
-    """The flaw of a mark that lack of ink alone causes; None where there is enough."""
+    """The flaw that lack of ink alone causes in a mark; None if there is enough ink."""
     if ink_load <= BLANK_LOAD:
         return Flaw.BLANK
     if ink_load <= DRY_LOAD:

@@ -34,7 +34,7 @@ class Bristles:
     short_mm: Vector
     """(m,) how far each hair ends before the tip."""
     phase_mm: Vector
-    """(m,) where along its length each hair's deposit points start; without it the stations show as ribs."""
+    """(m,) where along its length each hair's deposit points start; without this the stations would show as ribs."""
     clump: NDArray[np.int64]
     """(m,) which clump of hairs it belongs to, 0 .. CLUMPS - 1."""
     bow_mm: float
@@ -82,7 +82,7 @@ def draw_wander(count: int, rng: np.random.Generator) -> Wander:
 
 
 def clump_flow(clump_ink: Vector, ink_load: float) -> Vector:
-    """Ink flow (CLUMPS,) in 0 .. 1: all clumps run when dipped, below a load of about 0.4 some are dry."""
+    """Ink flow (CLUMPS,) in 0 .. 1: after a dip every clump gives ink, below a load of about 0.4 some are dry."""
     return np.clip(1.9 * ink_load - 0.75 * clump_ink, 0.0, 1.0)
 
 
@@ -99,7 +99,7 @@ the hairs part."""
 
 @dataclass(frozen=True, slots=True)
 class Tuft:
-    """A wet brush as it comes to the paper: its mechanics, its hairs, how they lie this time, and what is wrong."""
+    """A wet brush as it meets the paper: its mechanics, its hairs, how they lie in this press, and any flaw."""
 
     bundle: Bundle
     bristles: Bristles
@@ -173,7 +173,7 @@ def print_footprint(
 def frame_around(
     dots: Sequence[Dots], px_per_mm: float, margin_mm: float
 ) -> tuple[tuple[int, int], tuple[float, float]]:
-    """(rows, columns) of a raster that holds the dots and the frame's origin with a margin, and where that lies."""
+    """(rows, columns) of a raster that holds the dots and the origin with a margin, and (column, row) of the origin."""
     x = np.concatenate([d.x_mm for d in dots])
     y = np.concatenate([d.y_mm for d in dots])
     left, right = min(0.0, x.min(initial=0.0)) - margin_mm, max(0.0, x.max(initial=0.0)) + margin_mm

@@ -1,4 +1,4 @@
-"""Ink on paper: how a sheet takes up the ink offered, and the whole sheet, footprint by footprint."""
+"""Ink on paper: how much of the ink offered the paper absorbs, and the sheet that collects all footprints."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def scatter(
 
 
 def soak(wet: Image, ink_load: float | Image, px_per_mm: float, rng: np.random.Generator) -> Image:
-    """Ink taken up, (h, w) in 0 .. 1: fibres decide at the edge and, when the brush is dry, everywhere.
+    """Ink absorbed, (h, w) in 0 .. 1: fibres decide at the edge and, when the brush is dry, everywhere.
 
     `ink_load` is one number, or for a drag the load of the brush when it passed each pixel.
     """
@@ -120,7 +120,7 @@ class Paper:
 
     @property
     def density(self) -> NDArray[np.float32]:
-        """Ink per area, (rows, columns), 0 to 1, with every mark laid so far."""
+        """Ink per area, (rows, columns), 0 to 1, including every mark laid so far."""
         with self._lock:
             while self._coming:
                 make, x_mm, y_mm, heading_deg = self._coming[0]
@@ -135,7 +135,7 @@ class Paper:
             self._density = density
 
     def lay_later(self, make: Callable[[], Footprint], x_mm: float, y_mm: float, heading_deg: float) -> None:
-        """Lay the footprint that `make` returns when the sheet is read next, in the reader's thread.
+        """When the sheet is next read, call `make` in the reader's thread and lay the footprint that it returns.
 
         A footprint takes a tenth of a second to compute, too long for the thread that moves the arm.
         """

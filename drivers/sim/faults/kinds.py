@@ -44,9 +44,9 @@ class InkFault(StrEnum):
     DAMAGED = "damaged"
     """The reply has a wrong checksum."""
     MISTAKEN = "mistaken"
-    """A sound reply to another request."""
+    """A valid reply to another request."""
     ECHO = "echo"
-    """The request comes back and nothing else."""
+    """Only an echo of the request comes back."""
     UNPLUG = "unplug"
     """The port disappears."""
 
@@ -73,11 +73,11 @@ class ForceFault(StrEnum):
     BUS_OFF = "bus-off"
     """The bus goes off."""
     STUCK = "stuck"
-    """The round before comes once more."""
+    """The previous round is repeated."""
 
 
 LOST = frozenset({"deaf"})
-"""The request never arrives: neither done nor answered."""
+"""The request never arrives: it is neither carried out nor answered."""
 REPLIES = frozenset({"mute", "late", "split", "duplicate", "wrong-id", "malformed", "garbage", "drop"})
 """The request is carried out; something is wrong with its reply."""
 STOPS = frozenset({"protective-stop", "emergency-stop", "safeguard-stop"})
@@ -111,13 +111,13 @@ class Fault(BaseModel):
     nth: Annotated[int, Field(ge=1, le=ALWAYS)] = 1
     """Begins with the n-th request, push or frame for which all other conditions hold."""
     phase: Phase | None = None
-    """Begins only while the arm really does this."""
+    """Begins only while the arm is really doing this."""
     press: Annotated[int, Field(ge=0, le=ALWAYS)] | None = None
     """Begins only while this many presses are on the paper: from lifting off one to lifting off the next."""
     count: Annotated[int, Field(ge=1, le=ALWAYS)] | None = None
     """Number of strikes; 1 where neither this nor `for_s` is given."""
     for_s: Annotated[float, Field(gt=0.0, le=86_400.0)] | None = None
-    """Duration in real seconds, as the timeouts of drivers are, from when it begins."""
+    """Duration in real seconds from its beginning; the timeouts of drivers are in real time too."""
     late_s: Annotated[float, Field(ge=0.001, le=60.0)] = 0.3
     """How late a `late` reply of the robot comes, in real seconds."""
 
@@ -142,7 +142,7 @@ class Fault(BaseModel):
 
     @property
     def by_itself(self) -> bool:
-        """True where it begins without anything being asked."""
+        """True if it begins without a request."""
         return self.device in HANDED_OVER or (self.kind in STOPS and self.on is None)
 
     @property

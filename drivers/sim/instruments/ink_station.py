@@ -1,4 +1,4 @@
-"""Serial instruments on a pty: the ink station's firmware, and the line and faults that every simulated one has."""
+"""Serial instruments on a pty: the ink station's firmware, and the line and faults that all simulated ones share."""
 
 from __future__ import annotations
 
@@ -160,13 +160,13 @@ class StationFirmware:
         return line
 
     def answer(self, request: bytes) -> bytes | None:
-        """The reply; a line seen just before is answered from memory; a damaged one is not answered at all."""
+        """The reply; a repeated line is answered from memory, a damaged one not at all."""
         if request == self._memory[0]:
             return self._memory[1]
         try:
             line = unseal(request)
         except ProtocolViolation:
-            return None  # whose number it carries cannot be trusted
+            return None  # the number that it carries cannot be trusted
         try:
             text = self._obey(line.text.split(" "))
         except ProtocolViolation:
@@ -180,7 +180,7 @@ class StationFirmware:
         return reply[:-2] + (b"0" if reply[-2:-1] != b"0" else b"1") + b"\n"
 
     def mistake(self, reply: bytes) -> bytes:
-        """The number of the request before."""
+        """A reply with the number of the previous request."""
         line = unseal(reply)
         return seal((line.number - 1) % 1000, line.text)
 
