@@ -1,9 +1,9 @@
 """The simple shapes that CCD-BSM is compared with: ellipse, circle and line, each derived from the CCD-BSM mark.
 
-Every baseline takes its sizes from the mark of the same (H, alpha) and stands on the mark's bounding box in
-the frame of `model.raster.frame`, so a score between two models shows their shape and not a shift. The sources do
-not define them; each function states the definition chosen and its alternatives, because a score depends on
-them strongly.
+Every baseline takes its sizes from the mark of the same (H, alpha) and is placed on the mark's bounding box in
+the frame of `model.raster.frame`, so a score between two models shows a difference of shape, not a shift. The sources
+do not define these shapes; each function states the definition chosen and its alternatives, because scores depend
+strongly on the choice.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Capsule:
         return self.radius_mm * (math.pi * self.radius_mm + 4 * (self.reach_x_mm + self.reach_y_mm))
 
     def outline(self) -> Outline:
-        """Four quarters of a circle and four straight lines, two of them of no length."""
+        """Four quarters of a circle and four straight lines, two of them of zero length."""
         r = self.radius_mm
         return rounded(self.centre_mm, self.reach_x_mm + r, self.reach_y_mm + r, r, r)
 
@@ -121,7 +121,7 @@ class Capsule:
         end = reach + radius
         offset = torch.clamp(x_mm - column(self.centre_mm), -end, end)
         straight = torch.clamp(offset, -reach, reach)
-        # Beyond the straight part the rest of the offset lies in one of the two half discs.
+        # The part of the offset beyond the straight section lies in one of the two half discs.
         caps = radius**2 * (disc_integral(((offset - straight) / radius).clamp(-1, 1)) + 0.25 * math.pi)
         return caps + radius * (straight + reach) + column(self.reach_y_mm) * (offset + end)
 
@@ -157,7 +157,7 @@ def circle(mark: CcdBsm) -> Ellipse:
 def line(mark: CcdBsm) -> Capsule:
     """The capsule with the mark's length and width, round ends included in the length.
 
-    A mark wider than long (a stubby brush) gives the capsule that lies across. Alternatives not taken: the
+    A mark that is wider than long (a stubby brush) gives a capsule along y. Alternatives not taken: the
     rectangle of that length and width (butt ends), and round ends added beyond the length.
     """
     half_length, half_width = 0.5 * mark.length_mm, 0.5 * mark.width_mm
@@ -173,12 +173,12 @@ def line(mark: CcdBsm) -> Capsule:
 def rounded(
     centre: Tensor, half_x: Tensor, half_y: Tensor, corner_x: Tensor | None = None, corner_y: Tensor | None = None
 ) -> Outline:
-    """A box about (centre, 0) whose corners are quarters of an ellipse, all (B,); an ellipse without corners."""
+    """A box around (centre, 0) with quarter-ellipse corners, all (B,); an ellipse if no corner sizes are given."""
     ex, ey = half_x if corner_x is None else corner_x, half_y if corner_y is None else corner_y
     x, y, quarter = half_x - ex, half_y - ey, math.sqrt(0.5)
     arcs: list[tuple[list[Tensor], float]] = []
     for k in range(4):
-        # Corners counter-clockwise from the upper right: each a quarter, then the line to the next.
+        # Counter-clockwise from the upper right: each corner is a quarter, followed by the line to the next.
         sx, sy = (1, -1, -1, 1)[k], (1, 1, -1, -1)[k]
         nx, ny = (-1, -1, 1, 1)[k], (1, -1, -1, 1)[k]
         side, top = [centre + sx * half_x, sy * y], [centre + sx * x, sy * half_y]

@@ -1,4 +1,4 @@
-"""Shapes of strokes: what a raster needs of a shape, and the outline that every shape has, a loop of conic arcs.
+"""Shapes of strokes: the interface that a raster needs, and the outline of a shape, a loop of conic arcs.
 
 A conic arc is a quadratic Bezier curve with a weight w on its middle point (L. Piegl and W. Tiller, "The NURBS
 Book", 2nd ed., ch. 7): w = 1 is a parabola or, with the middle point halfway, a straight line; 0 < w < 1 is an arc
@@ -6,7 +6,7 @@ of an ellipse that spans 2 acos(w) of it. So lines, circles, ellipses and CCD-BS
 curves are cut into short parabolas by `through`.
 
 A profile is a shape that is symmetric about the x axis and whose half width w(x) rises to one plateau or peak and
-falls again on [x_min, x_max], so that every level set {x : w(x) >= a} is one interval. The frame is defined in
+then falls on [x_min, x_max], so that every level set {x : w(x) >= a} is one interval. The frame is defined in
 `model.raster.frame`. All parameters are batched: one shape per row, `(B,)`.
 """
 
@@ -35,7 +35,7 @@ class Shape(Protocol):
 
     @property
     def width_mm(self) -> Tensor:
-        """The extent along y; for a profile, the full width at the widest place, (B,)."""
+        """The extent along y, (B,); for a profile, the full width at its widest point."""
         ...
 
     @property
@@ -63,13 +63,13 @@ class Profile(Shape, Protocol):
     def level(self, a_mm: Tensor) -> tuple[Tensor, Tensor]:
         """The ends (x_left, x_right) of {x : w(x) >= a}, (B, N) -> two (B, N), for a >= 0.
 
-        Above the greatest half width the set is empty and both ends are the place of the peak.
+        Above the greatest half width the set is empty and both ends are at the peak.
         """
         ...
 
 
 def column(parameter: Tensor) -> Tensor:
-    """A (B,) parameter as (B, 1), to meet a (B, N) grid."""
+    """A (B,) parameter as (B, 1), to broadcast with a (B, N) grid."""
     return parameter.unsqueeze(-1)
 
 
@@ -91,8 +91,8 @@ def disc_integral(u: Tensor) -> Tensor:
 class Outline:
     """B closed loops of K conic arcs, mm: `points` (B, K, 3, 2) and `weights` (B, K), 0 < w <= 1.
 
-    Each arc ends where the next begins, and a loop runs counter-clockwise with x to the right and y up. A loop that
-    crosses itself is drawn with what it winds around twice counted once.
+    Each arc ends where the next begins, and a loop runs counter-clockwise with x to the right and y up. Where a
+    loop that crosses itself winds twice around an area, the area is drawn once.
     """
 
     points: Tensor
@@ -119,7 +119,7 @@ class Outline:
 
     @property
     def area_mm2(self) -> Tensor:
-        """The enclosed area by Green's theorem, (B,): the polygon of the ends and a segment under each arc."""
+        """The enclosed area by Green's theorem, (B,): the polygon of the arcs' ends plus a segment under each."""
         start, middle, end = self.points.unbind(2)
         polygon = 0.5 * cross(start, end)
         # A parabola fills two thirds of its triangle (Archimedes).
@@ -132,13 +132,13 @@ class Outline:
         return (polygon + torch.where(curved, segment, parabola)).sum(-1)
 
     def at(self, t: Tensor) -> Tensor:
-        """Every arc at its own parameter t in [0, 1]: (N,) -> (B, K, N, 2) mm."""
+        """Evaluate every arc at t in [0, 1]: (N,) -> (B, K, N, 2) mm."""
         return evaluate(self.points[:, :, None], self.weights[:, :, None], t)
 
     def polyline(self, per_arc: int = 32) -> Tensor:
         """Points on the loop in order, per_arc on each arc, (B, K per_arc, 2) mm; the last joins the first."""
         if per_arc < 1:
-            raise ValueError(f"per_arc = {per_arc}: at least one point an arc")
+            raise ValueError(f"per_arc = {per_arc}: expected at least one point per arc")
         t = torch.arange(per_arc, dtype=self.points.dtype, device=self.points.device) / per_arc
         return self.at(t).flatten(1, 2)
 
@@ -146,7 +146,7 @@ class Outline:
         """The greatest of sign * coordinate over each loop, times sign, (B,)."""
         p0, p1, p2 = (sign * self.points[..., axis]).unbind(2)
         ends = torch.maximum(p0, p2)
-        # An arc leaves the span of its ends only where its middle point does.
+        # An arc leaves the span of its ends only if its middle point does.
         w = self.weights
         curved = w < 1
         safe = torch.where(curved, w, torch.full_like(w, 0.5))
@@ -166,7 +166,7 @@ def cross(a: Tensor, b: Tensor) -> Tensor:
 def ellipse_of(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Centre C and half axes E, F of arcs of ellipses, (..., 3, 2), (...) -> three (..., 2).
 
-    The arc is C + E cos u + F sin u for |u| <= acos(w); E points at the middle of the arc. Needs 0 < w < 1.
+    The arc is C + E cos u + F sin u for |u| <= acos(w); E points to the middle of the arc. Requires 0 < w < 1.
     """
     start, middle, end = points.unbind(-2)
     w = weights.unsqueeze(-1)
@@ -184,7 +184,7 @@ def evaluate(points: Tensor, weights: Tensor, t: Tensor) -> Tensor:
 
 
 def loop(*arcs: tuple[Sequence[Tensor], float | Tensor]) -> Outline:
-    """An outline from ((x0, y0, x1, y1, x2, y2), weight) an arc, every number (B,)."""
+    """Make an outline from one ((x0, y0, x1, y1, x2, y2), weight) per arc, every number (B,)."""
     points = torch.stack([torch.stack(list(numbers), dim=-1) for numbers, _ in arcs], dim=1)
     weights = [torch.as_tensor(w, dtype=points.dtype, device=points.device).expand(len(points)) for _, w in arcs]
     return Outline(points.unflatten(-1, (3, 2)), torch.stack(weights, dim=1))

@@ -1,4 +1,4 @@
-"""How the strokes of a session came about: takes that did not count, heights of the paper, waits from dip to touch."""
+"""History of a session's strokes: takes that did not count, paper heights, waits from dip to touch."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from sessions.journal.journal import JOURNAL_NAME, replay
 
 CAPTURE, DIP, ZERO_TOUCH = "capture", "dip", "zero_touch"
 LEAST_S = 2.0
-"""Smallest difference between waits that can show in the ink, s."""
+"""Smallest difference between waits that can be visible in the ink, s."""
 SPREADS = 3.0
 """Median absolute deviations within which waits count as alike."""
 LEAST_STROKES = 4
-"""With fewer strokes no one wait is the odd one."""
+"""Number of strokes below which no wait can be called an outlier."""
 WAIT = "dip_to_touch_s"
 """Name of the wait in a step's result, in a stroke and in an export's columns."""
 
@@ -37,7 +37,7 @@ class ZeroTouch:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """What the journal of one session says of its takes and its paper."""
+    """Takes and paper heights of one session, from its journal."""
 
     photographed: int
     """Marks that were photographed and judged."""
@@ -88,7 +88,7 @@ def _zero_touch(line: Line) -> ZeroTouch:
 def waits_of(segments: Iterable[Line]) -> dict[int, float]:
     """Seconds from dip to touch, by number of the still that shows the stroke, from a journal's finished steps.
 
-    Empty for sessions recorded before waits were.
+    Empty for sessions recorded before waits were measured.
     """
     pressed: dict[str, float] = {}
     waits: dict[int, float] = {}

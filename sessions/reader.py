@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 MAX_ATTACHMENT_BYTES = 1024 * 1024
 STILLS_KEPT = 8
-"""A stroke refers to a still shortly before it, so that older stills need not stay in memory."""
+"""Stills kept in memory: a stroke refers to one shortly before it, so older ones can be dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class Capture:
     still_png: bytes
     where: str
     bad: str = ""
-    """Reason why it does not count, given by a person; empty where it was not marked bad."""
+    """Reason given by the person who marked it bad; empty if it was not marked."""
 
     def image(self) -> NDArray[np.uint8]:
         """(h, w) uint8 gray. Raises `SessionDamaged` naming the stroke."""
@@ -86,7 +86,9 @@ class Recording:
                 continue
             stroke = _event(self.path, Stroke, data)
             if stroke.still not in stills:
-                raise SessionDamaged(self.path, f"stroke {stroke.stroke_id} names still {stroke.still}, not there")
+                raise SessionDamaged(
+                    self.path, f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there"
+                )
             where = f"{self.path} stroke {stroke.stroke_id}"
             yield Capture(stroke, stills[stroke.still], where, bad.get(stroke.still, ""))
 

@@ -1,4 +1,4 @@
-"""Printing to a terminal: text from a file, a folder's name or a device is shown, and never acted on."""
+"""Print to a terminal: control characters in text from files, names or devices are shown, never executed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ACTED_ON = re.compile(
 def plain(text: str, *, keep: str = "") -> str:
     r"""Escape every character that a terminal acts on, as `\u001b`: a JSON string keeps its value.
 
-    Line ends are escaped as well: a name may not pretend to be the next line. `keep` lists characters left as they are.
+    Line ends are escaped as well, so that a name cannot fake a new line. `keep` lists characters left as they are.
     """
     if text.isprintable():
         return text
@@ -30,7 +30,7 @@ def plain(text: str, *, keep: str = "") -> str:
 
 
 def inert(text: str) -> str:
-    """Remove those characters, for a place whose width is laid out already: they have none."""
+    """Remove those characters, for places with a fixed layout: they have no width."""
     return text if text.isprintable() else _ACTED_ON.sub("", text)
 
 

@@ -18,21 +18,21 @@ from calibrate.errors import CalibrationError
 
 MIN_CORNERS = 8
 WINDOW_SHARE = 0.3
-"""Half the window of corner refinement as a share of the way to the next edge: a wider one would include that edge."""
+"""Half the corner refinement window, as a share of the distance to the next edge, which it must not include."""
 MOST_WINDOW_PX = 8
 SATURATED = 254
 MOST_SATURATED = 0.4
-"""Share of saturated pixels above which edges have moved: light bleeds over them."""
+"""Share of saturated pixels above which a view is flagged: light that bleeds over an edge moves it."""
 PARTLY_HIDDEN = 0.7
-"""Share of corners below which a board is said to be partly hidden."""
+"""Share of corners below which a board is reported as partly hidden."""
 CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 
 LEAST_CONTRAST = 30.0
 BLANK = "is blank: nothing in it is darker than the rest"
 GOES_ON = 0.75
-"""Share of the contrast of the board's own corners; at its outer edge a board has half."""
+"""Contrast at which squares continue, as a share of that at the board's own corners; its outer edge has half."""
 GRID_ERROR = 0.25
-"""In squares: a strong lens displaces corners by less."""
+"""Largest distance of a corner from a regular grid, in squares: a strong lens displaces corners by less."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,17 +43,17 @@ class BoardView:
     size_px: tuple[int, int]
     """Width and height of the photograph."""
     pixels: Floats
-    """(n, 2) corners in it."""
+    """(n, 2) corners in the photograph."""
     board_mm: Floats
     """(n, 2) the same corners on the board: x right, y down, from its upper left corner."""
     ids: NDArray[np.int64]
     """(n,) number of each corner, row by row."""
     flags: tuple[str, ...] = ()
-    """What is wrong with the photograph, though corners were found."""
+    """Problems with the photograph, although corners were found."""
 
 
 def find_board(image: Gray, board: Board, name: str, expected: int | None = None) -> BoardView:
-    """Find the corners of the board in a gray photograph. Raises `CalibrationError` that says what is wrong.
+    """Find the corners of the board in a gray photograph. Raises `CalibrationError`, which says what is wrong.
 
     `expected` is the number of corners that a sheet on the board leaves visible; all of them by default.
     """
@@ -80,7 +80,7 @@ def _charuco(image: Gray, spec: BoardSpec, name: str) -> tuple[Floats, NDArray[n
     markers, numbers = _markers(image, board)
     twice = sorted(number for number, times in Counter(int(n) for n in numbers).items() if times > 1)
     if len(twice) > 1:
-        raise CalibrationError(name, f"shows two boards: markers {twice[0]} and {twice[1]} are there twice")
+        raise CalibrationError(name, f"shows two boards: markers {twice[0]} and {twice[1]} appear twice")
     own = np.asarray(board.getIds()).ravel()
     foreign = np.setdiff1d(numbers, own)
     if len(foreign) > max(1, 0.1 * len(numbers)):
@@ -96,10 +96,10 @@ def _charuco(image: Gray, spec: BoardSpec, name: str) -> tuple[Floats, NDArray[n
         if _blank(image):
             raise CalibrationError(name, BLANK)
         if len(markers) > MIN_CORNERS:
-            why += f", though {len(markers)} markers are seen: they do not lie as this board has them"
+            why += f", though {len(markers)} markers are seen: they are not arranged as on this board"
         mirrored, _ = _markers(np.ascontiguousarray(image[:, ::-1]), board)
         if len(mirrored) >= max(4, 2 * len(markers)):
-            why = "the photograph is mirrored: its markers can only be read the other way round"
+            why = "the photograph is mirrored: its markers can only be read in reverse"
         raise CalibrationError(name, why)
     board_mm = np.asarray(board.getChessboardCorners(), np.float64)[ids, :2]
     gap_mm = 0.5 * (spec.square_mm - spec.marker_mm)
@@ -144,7 +144,7 @@ def _checkerboard(image: Gray, board: Checkerboard, name: str) -> tuple[Floats, 
     rest = image.copy()
     hull = cv2.convexHull(pixels.astype(np.float32))
     centre = pixels.mean(axis=0)
-    # A square more all round, so that nothing of this board is found again.
+    # One more square on every side, so that no part of this board is found again.
     wider = centre + (hull.reshape(-1, 2) - centre) * (max(columns, rows) + 3) / (max(columns, rows) - 1)
     cv2.fillConvexPoly(rest, np.rint(wider).astype(np.int32), int(np.median(image)))
     if _squares(rest, board.inner_corners, quick=True) is not None:
@@ -156,7 +156,7 @@ def _checkerboard(image: Gray, board: Checkerboard, name: str) -> tuple[Floats, 
 
 
 def _goes_on(image: Gray, pixels: Floats, inner: tuple[int, int]) -> tuple[int, int] | None:
-    """The larger size, where squares go on beyond the outermost corners; None where the board ends."""
+    """Return the larger size if squares continue beyond the outermost corners, None if the board ends there."""
     columns, rows = inner
     grid = np.array([(k % columns, k // columns) for k in range(columns * rows)], np.float64)
     to_image, _ = cv2.findHomography(grid, pixels, 0)
@@ -194,7 +194,7 @@ def _squares(image: Gray, inner: tuple[int, int], *, quick: bool = False) -> Flo
 
 
 def _is_grid(pixels: Floats, inner: tuple[int, int]) -> bool:
-    """Whether the corners lie as a flat board's would: OpenCV now and then takes a shadow's edge for a row."""
+    """Whether the corners fit a flat board: OpenCV sometimes mistakes the edge of a shadow for a row."""
     places = np.array([(k % inner[0], k // inner[0]) for k in range(inner[0] * inner[1])], np.float64)
     to_grid, _ = cv2.findHomography(pixels, places, 0)
     if to_grid is None:  # pyright: ignore[reportUnnecessaryComparison]
@@ -211,11 +211,11 @@ def _why_no_board(image: Gray, inner: tuple[int, int]) -> str:
     for other in (*more, *fewer):
         if _squares(image, other, quick=True) is not None:
             return f"shows a board of {other[0]} x {other[1]} inner corners, not {columns} x {rows}"
-    return f"shows no whole board of {columns} x {rows} inner corners; a plain checkerboard must not be hidden anywhere"
+    return f"shows no complete board of {columns} x {rows} inner corners; a plain checkerboard must be fully visible"
 
 
 def _gap_px(pixels: Floats, board_mm: Floats, gap_mm: float) -> float:
-    """How many pixels `gap_mm` of the board are where the board is smallest in the photograph."""
+    """Length of `gap_mm` in pixels, where the board is smallest in the photograph."""
     apart_mm = np.linalg.norm(board_mm[:, None] - board_mm[None], axis=2)
     apart_px = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
     apart_mm[np.diag_indices(len(pixels))] = np.inf
@@ -230,7 +230,7 @@ def _refined(image: Gray, pixels: Floats, board_mm: Floats, square_mm: float, ga
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-4)
     start = pixels.astype(np.float32).reshape(-1, 1, 2).copy()
     fine = np.asarray(cv2.cornerSubPix(image, start, (window, window), (-1, -1), criteria), np.float64).reshape(-1, 2)
-    # Where it walked away it found something else.
+    # A corner that moved beyond the window has settled on something else.
     walked = np.linalg.norm(fine - pixels, axis=1) > window
     fine = np.where(walked[:, None], pixels, fine)
     to_image, _ = cv2.findHomography(board_mm, fine, cv2.LMEDS)

@@ -1,4 +1,4 @@
-"""pix2len over a session: the board seen again at intervals, and whether the camera or the paper moved in between."""
+"""pix2len over a session: measures the board at intervals, and detects whether camera or paper moved in between."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from calibrate.line import Line, fit_line
 from sessions.reader import Recording
 
 MOVED_PX = 1.0
-"""Movement of the board's middle between two views above which someone touched the camera, or the board."""
+"""Movement of the board's middle between two views above which the camera or the board must have been touched."""
 CHANGED = 5e-4
 """Relative change of pix2len that is worth a warning: 0.01 mm over a stroke of 20 mm."""
 
@@ -29,7 +29,7 @@ class BoardAt:
     t_ns: int
     plane: Plane
     mm_per_px: float
-    """pix2len in the board's own middle: otherwise a view of other corners would give the scale of another place."""
+    """pix2len in the middle of the whole board, so that views of different corners give the scale of the same place."""
     moved_px: float
     """Distance of the board's middle from where it was first seen."""
 
@@ -53,7 +53,7 @@ class Drift:
 
 
 def board_over_session(recording: Recording, spec: BoardSpec, lens: Lens | None = None) -> Drift:
-    """Every still taken in a `board` step. Raises `CalibrationError` where there is none."""
+    """Measure the board in every still of a `board` step. Raises `CalibrationError` where there is none."""
     stills = list(board_stills(recording))
     if not stills:
         raise CalibrationError(str(recording.path), NO_BOARD)
@@ -68,7 +68,7 @@ def drift(
 ) -> Drift:
     """pix2len of each (t_ns, gray photograph) in order. Photographs without a board are listed, not raised.
 
-    Raises `CalibrationError` where it is seen in none.
+    Raises `CalibrationError` if the board is seen in none.
     """
     seen: list[BoardAt] = []
     unseen: list[tuple[int, str]] = []
@@ -106,7 +106,7 @@ def _warnings(seen: Sequence[BoardAt], unseen: Sequence[tuple[int, str]]) -> tup
         change = s.mm_per_px / first.mm_per_px - 1.0
         if abs(change) > max(CHANGED, float(np.hypot(first.reach, s.reach))):
             warnings.append(
-                f"pix2len changed by {100 * change:+.3f} % until {s.t_ns} ns: calibrate the parts on their own"
+                f"pix2len changed by {100 * change:+.3f} % until {s.t_ns} ns: calibrate the parts separately"
             )
         if s.moved_px > MOVED_PX:
             warnings.append(f"the board moved by {s.moved_px:.1f} px until {s.t_ns} ns: camera or board was touched")

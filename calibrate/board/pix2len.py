@@ -16,34 +16,34 @@ from calibrate.errors import CalibrationError
 
 MOST_OUTLIERS = 0.1
 WORST_RMS_PX = 1.0
-"""Above this the board was not flat, not seen sharply, or is not the board of the configuration."""
+"""Residual above which the board was not flat, was out of focus, or is not the configured board."""
 RADIAL_TERMS = 1
-"""k1 is fitted anew on every view: refocusing changes it. A second term costs a flat view three times the interval."""
+"""k1 is refitted for every view, as refocusing changes it. With a flat view, a second term triples the interval."""
 OUTLIER_SIGMAS = 5.0
 LEAST_OUTLIER_PX = 0.75
 SOFT_PX = 0.5
-"""Residuals far above this count less while outliers are still in."""
+"""Residuals far above this are given less weight until outliers are removed."""
 STEP_PX = 0.5
 LAGS = 2
-"""Squares over which the errors of corners may be correlated."""
+"""Distance in squares over which corner errors may be correlated."""
 
 
 def apply(homography: Floats, points: Floats) -> Floats:
-    """(n, 2) points through a (3, 3) homography."""
+    """Map (n, 2) points through a (3, 3) homography."""
     mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
     return mapped[:, :2] / mapped[:, 2:]
 
 
 def homography(pixels: Floats, paper_mm: Floats, where: str) -> Floats:
-    """(3, 3) from (n, 2) to (n, 2) points by least squares. Raises `CalibrationError` where they lie on a line."""
+    """Fit the (3, 3) homography from (n, 2) to (n, 2) points. Raises `CalibrationError` if they lie on a line."""
     found, _ = cv2.findHomography(pixels, paper_mm, 0)
     if found is None or not np.all(np.isfinite(found)):  # pyright: ignore[reportUnnecessaryComparison]
-        raise CalibrationError(where, "the board's corners lie on a line: no plane can be had from them")
+        raise CalibrationError(where, "the board's corners lie on a line, which does not determine a plane")
     return np.asarray(found, np.float64)
 
 
 def local_scale(to_paper: Callable[[Floats], Floats], pixel: Floats) -> float:
-    """mm per pixel at a pixel (2,): square root of the area of its image on the paper."""
+    """mm per pixel at a pixel (2,): the square root of the area that the pixel covers on the paper."""
     return float(np.sqrt(_area(to_paper, pixel))) / (2.0 * STEP_PX)
 
 
@@ -59,26 +59,26 @@ class Plane:
     """The paper plane as a camera sees it, and the lens that it was seen through."""
 
     lens: Lens
-    """With the radial terms of this view."""
+    """The lens, with the radial terms of this view."""
     image_to_paper: Floats
     """(3, 3) homography: pixels of the undistorted photograph (centres on integers) to mm in the paper frame."""
     mm_per_px: float
-    """pix2len in the middle of the corners, of the photograph as it was taken."""
+    """pix2len in the middle of the corners, for the photograph as taken (with distortion)."""
     interval_mm_per_px: tuple[float, float]
-    """95 %: the noise of corners carried through homography and radial terms, not an error of the printed board."""
+    """95 % interval: propagates the noise of corners, but does not include errors of the printed board."""
     rms_px: float
     distortion_px: float
-    """Distortion that the given lens does not describe: root mean square of what this view's radial terms explain."""
+    """Distortion that the given lens does not describe: root mean square of the part that this view's terms explain."""
     middle_px: tuple[float, float]
-    """Where pix2len holds, in the photograph as it was taken."""
+    """Pixel at which pix2len holds, in the photograph as taken."""
     corners: int
     dropped: tuple[int, ...]
-    """Indices of the given corners that do not lie on the plane of the others."""
+    """Indices of corners that do not lie in the plane of the others."""
     flags: tuple[str, ...] = ()
-    """What is wrong with the photograph, though the board was found: partly hidden, saturated."""
+    """Problems with the photograph, although the board was found: partly hidden, saturated."""
 
     def scale_at(self, pixel: Floats) -> float:
-        """mm per pixel of the photograph as it was taken, at one of its pixels (2,)."""
+        """mm per pixel of the photograph as taken, at one of its pixels (2,)."""
         return local_scale(self.to_paper, pixel)
 
     def to_paper(self, pixels: Floats) -> Floats:
@@ -95,8 +95,8 @@ def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_t
 
     Minimises |distort(H mm) - px| over the eight numbers of H and the first `radial_terms` of k1, k2; with 0 the lens
     stays as given. pix2len is a function of the same numbers, so its standard error follows by the delta method
-    (Hartley and Zisserman, Multiple View Geometry, 2nd ed., section 5.2), with the correlation of neighbouring corners
-    counted. Raises `CalibrationError` where more than a tenth of the corners are outliers or the residual is above
+    (Hartley and Zisserman, Multiple View Geometry, 2nd ed., section 5.2), including the correlation of neighbouring
+    corners. Raises `CalibrationError` where more than a tenth of the corners are outliers or the residual is above
     `WORST_RMS_PX`: a wrong or curled board.
     """
     model = _Model.of(lens, paper_mm, radial_terms)
@@ -121,7 +121,7 @@ def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_t
     middle = pixels[kept].mean(axis=0)
     scale = model.log_scale(fitted.x, middle)
     jacobian = np.asarray(fitted.jac, np.float64)
-    # How far each corner's error moves the scale, (n, 2).
+    # Change of the scale with each corner's error, (n, 2).
     pull = (jacobian @ np.linalg.pinv(jacobian.T @ jacobian) @ model.slope(fitted.x, middle)).reshape(-1, 2)
     spread = _spread(pull, left.reshape(-1, 2), paper_mm[kept], float(left @ left) / free)
     reach = float(stdtrit(free, 0.975)) * spread
@@ -143,7 +143,7 @@ def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_t
 
 
 def distorted_share(pixels: Floats, paper_mm: Floats, lens: Lens, where: str) -> float:
-    """Share of a flat board's squared residuals through this lens that its k1 would explain; outliers count."""
+    """Share of a flat board's squared residuals with this lens that refitting k1 would explain; outliers included."""
 
     def cost(radial_terms: int) -> float:
         model = _Model.of(lens, paper_mm, radial_terms)
@@ -160,8 +160,9 @@ def distorted_share(pixels: Floats, paper_mm: Floats, lens: Lens, where: str) ->
 def _spread(pull: Floats, left: Floats, paper_mm: Floats, variance: float) -> float:
     """Standard error of a quantity that each corner error moves by `pull`; errors correlate as the residuals do.
 
-    Neighbouring edges that fall alike on the pixel rows have similar errors: the correlation is taken from pairs one
-    and two squares apart and tapered as by Newey and West (Econometrica 55, 1987). It may only widen the interval.
+    Neighbouring edges that cross the pixel rows in the same way have similar errors. Their correlation is estimated
+    from pairs one and two squares apart, tapered as by Newey and West (Econometrica 55, 1987), and only ever widens
+    the interval.
     """
     apart = np.linalg.norm(paper_mm[:, None] - paper_mm[None], axis=2)
     squares = np.rint(apart / np.min(apart[apart > 0.0])).astype(np.int64)
@@ -189,7 +190,7 @@ class _Model:
 
     @classmethod
     def of(cls, lens: Lens, paper_mm: Floats, radial_terms: int) -> _Model:
-        """Scaled to the board's corners."""
+        """Make a model scaled to the board's corners."""
         return cls(lens, paper_mm.mean(axis=0), float(np.ptp(paper_mm, axis=0).max()), radial_terms)
 
     def start(self, pixels: Floats, paper_mm: Floats, where: str) -> Floats:
@@ -205,13 +206,13 @@ class _Model:
         return lens.distorted(apply(np.linalg.inv(self._rays()) @ paper_to_rays, unit))
 
     def log_scale(self, theta: Floats, pixel: Floats) -> float:
-        """Logarithm of mm per px of the photograph as it was taken, at a pixel."""
+        """Logarithm of mm per px of the photograph as taken, at a pixel."""
         lens, image_to_paper = self.parts(theta)
         area = _area(lambda at: apply(image_to_paper, lens.undistorted(at)), pixel)
         return 0.5 * float(np.log(area / (2.0 * STEP_PX) ** 2))
 
     def slope(self, theta: Floats, pixel: Floats) -> Floats:
-        """Derivative of `log_scale` by each parameter, by central differences."""
+        """Derivative of `log_scale` with respect to each parameter, by central differences."""
         steps = _steps(theta)
         change = [self.log_scale(theta + d, pixel) - self.log_scale(theta - d, pixel) for d in steps]
         return np.array(change) / (2.0 * np.diag(np.array(steps)))

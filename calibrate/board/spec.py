@@ -66,7 +66,7 @@ def describe(board: Board) -> str:
 
 
 def charuco_board(spec: BoardSpec, where: str) -> cv2.aruco.CharucoBoard:
-    """OpenCV's board. Raises `CalibrationError` where OpenCV refuses it: more markers than the dictionary has."""
+    """Make OpenCV's board. Raises `CalibrationError` if it needs more markers than the dictionary has."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
     try:
         return cv2.aruco.CharucoBoard(spec.squares, spec.square_mm, spec.marker_mm, dictionary)

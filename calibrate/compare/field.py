@@ -1,7 +1,7 @@
-"""The 128 x 128 images that are compared, and how a captured stroke gets onto them.
+"""The 128 x 128 images that are compared, and how a captured stroke is placed on them.
 
 Two alignment protocols: `mm` keeps millimetres and the zero-touch anchor; `size-normalised` scales each image to one
-length and then takes the best shift. The second is how the paper's spread comes about; the first is the honest one.
+length and then takes the best shift. The second reproduces the spread in the paper; the first is the honest one.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ SIZE_PX = 128
 NORMAL_LENGTH_PX = 100
 BEST_SHIFT_PX = 6
 FINE = 4
-"""A stroke is moved on a raster so many times finer, near its own 20 px/mm, then averaged over areas."""
+"""Oversampling: strokes are moved on a raster finer by this factor, near their own 20 px/mm, then area-averaged."""
 
 
 class Alignment(StrEnum):
-    """How captured and simulated images are laid over each other."""
+    """How captured and simulated images are aligned."""
 
     MM = "mm"
     SIZE_NORMALISED = "size-normalised"
@@ -53,7 +53,7 @@ class Field:
 
     mm_per_px: float = MM_PER_PX
     anchor_share: tuple[float, float] = (0.76, 0.5)
-    """Where the zero-touch point lies, as a share of the field from the left and from the top."""
+    """Position of the zero-touch point, as a share of the field from the left and from the top."""
 
     @property
     def side_mm(self) -> float:
@@ -62,28 +62,28 @@ class Field:
 
     @property
     def anchor_mm(self) -> tuple[float, float]:
-        """The zero-touch point from the left and from the top."""
+        """Distance of the zero-touch point from the left and from the top."""
         return self.anchor_share[0] * self.side_mm, self.anchor_share[1] * self.side_mm
 
     def window_mm(self, anchor: tuple[float, float]) -> tuple[float, float, float, float]:
-        """(x, y, width, height) in the paper frame of the field around an anchor there (y upward)."""
+        """(x, y, width, height) of the field around an anchor, both in the paper frame (y upward)."""
         left, top = self.anchor_mm
         return anchor[0] - left, anchor[1] - (self.side_mm - top), self.side_mm, self.side_mm
 
     def corner_px(self, anchor_px: tuple[float, float]) -> tuple[int, int]:
-        """Column and row on the 20 px/mm raster at which the field around an anchor there begins."""
+        """First column and row of the field around an anchor, both on the 20 px/mm raster."""
         left, top = self.anchor_mm
         return round(anchor_px[0] - left * PX_PER_MM), round(anchor_px[1] - top * PX_PER_MM)
 
     def corner_around_px(self, mask: NDArray[np.bool_]) -> tuple[int, int]:
-        """The same for a stroke without an anchor: the field lies around the middle of the stroke's box."""
+        """The same for a stroke without an anchor: the field is centred on the stroke's bounding box."""
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         side = round(self.side_mm * PX_PER_MM)
         return int(columns[0] + columns[-1] + 1 - side) // 2, int(rows[0] + rows[-1] + 1 - side) // 2
 
 
 def crop(prepared: Prepared, corner_px: tuple[int, int], view: Field) -> Prepared:
-    """As much of a raster as the field shows from that corner on; `cut` where ink is left out."""
+    """Crop a raster to the field that begins at a corner; `cut` is set where ink is left out."""
     side, (height, width) = round(view.side_mm * PX_PER_MM), prepared.mask.shape
     left, top = min(max(corner_px[0], -side), width), min(max(corner_px[1], -side), height)
     window = slice(top + side, top + 2 * side), slice(left + side, left + 2 * side)
@@ -99,7 +99,7 @@ def crop(prepared: Prepared, corner_px: tuple[int, int], view: Field) -> Prepare
 
 
 def crop_at_anchor(prepared: Prepared, anchor_px: tuple[float, float], view: Field) -> Prepared:
-    """The field around an anchor. Raises `CaptureRefused` where the stroke lies outside it."""
+    """Crop to the field around an anchor. Raises `CaptureRefused` if the stroke lies outside it."""
     cropped = crop(prepared, view.corner_px(anchor_px), view)
     if not cropped.mask.any():
         raise CaptureRefused("anchor", "lies so far from the stroke that none of it is in the field")
@@ -107,19 +107,19 @@ def crop_at_anchor(prepared: Prepared, anchor_px: tuple[float, float], view: Fie
 
 
 def captured_mm(prepared: Prepared, tone: Tone) -> Image:
-    """(128, 128) of a capture that was rectified to the field."""
+    """(128, 128) image of a capture that was rectified to the field."""
     side = (SIZE_PX, SIZE_PX)
     source = prepared.soft if tone is Tone.GRAY else prepared.mask.astype(np.float32)
     return to_tone(cast("Image", cv2.resize(source, side, interpolation=cv2.INTER_AREA)), tone)
 
 
 def captured_normalised(prepared: Prepared, tone: Tone) -> Image:
-    """(128, 128) with the stroke's length scaled to 100 px and its bounding box in the middle."""
+    """(128, 128) image with the stroke's length scaled to 100 px and its bounding box in the middle."""
     rows, columns = np.flatnonzero(prepared.mask.any(axis=1)), np.flatnonzero(prepared.mask.any(axis=0))
     source = prepared.soft if tone is Tone.GRAY else prepared.mask.astype(np.float32)
     scale = FINE * NORMAL_LENGTH_PX / (columns[-1] + 1 - columns[0])
-    # To the middle without rounding: half a pixel off costs a perfect model several points of SSIM. cv2 puts pixel
-    # centres on integers, a pixel here covers [j, j + 1).
+    # Centre without rounding: an offset of half a pixel costs a perfect model several points of SSIM. cv2 puts pixel
+    # centres on integers; here a pixel covers [j, j + 1).
     x, y = 0.5 * (columns[0] + columns[-1] + 1), 0.5 * (rows[0] + rows[-1] + 1)
     middle = 0.5 * FINE * SIZE_PX
     move = np.array([[scale, 0.0, middle - 0.5 - scale * (x - 0.5)], [0.0, scale, middle - 0.5 - scale * (y - 0.5)]])
@@ -128,12 +128,12 @@ def captured_normalised(prepared: Prepared, tone: Tone) -> Image:
 
 
 def to_tone(coverage: Image, tone: Tone) -> Image:
-    """Coverage as it is, or whether a pixel is mostly ink."""
+    """Coverage unchanged, or 1 where a pixel is mostly ink."""
     return coverage if tone is Tone.GRAY else (coverage > 0.5).astype(np.float32)
 
 
 def best_shift(moving: Image, fixed: Image) -> Image:
-    """`moving` shifted by at most 6 px each way so that its overlap with `fixed` is largest."""
+    """Shift `moving` by at most 6 px each way so that its overlap with `fixed` is largest."""
     reach = BEST_SHIFT_PX
     padded = np.pad(moving, reach)
     overlap = cv2.matchTemplate(padded, fixed, cv2.TM_CCORR)

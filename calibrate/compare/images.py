@@ -1,6 +1,6 @@
 """Images of a press for every alignment and tone: as it was captured, and as a model predicts it.
 
-The modules of `model` load torch, which workers that only prepare captures do without: they are imported late.
+The modules of `model` load torch, which workers that only prepare captures do not need, so they are imported late.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ MAX_UNPACKED_BYTES = 256 * (len(KEYS) + 1) * SIZE_PX**2
 
 
 def prepare_press(capture: Capture, calibration: Calibration | None, params: Params, view: Field) -> Prepared:
-    """The stroke on the millimetre field, rectified by the calibration or by the import's own scale.
+    """Rectify a stroke to the millimetre field, by the calibration or by the import's own scale.
 
     Raises `CaptureRefused` for a capture that cannot be used, `SessionDamaged` for a picture that cannot be read.
     """
@@ -101,7 +101,7 @@ def shape_pixels(profile: Shape, origin_x_mm: float, field: Field) -> Pixels:
 
 
 def axis_mm(height_mm: float, tilt_deg: float) -> float:
-    """Where the brush axis meets the paper, from the zero-touch point toward the side that the ferrule leans to.
+    """Distance from the zero-touch point to where the brush axis meets the paper, toward the side the ferrule leans to.
 
     The press tilts about the tip, then descends.
     """
@@ -109,7 +109,7 @@ def axis_mm(height_mm: float, tilt_deg: float) -> float:
 
 
 def _drawn(profile: Shape, origin_x_mm: float, alignment: Alignment, field: Field) -> Image:
-    """(128, 128) coverage by one shape; `origin_x_mm` places it on the millimetre field."""
+    """(128, 128) coverage of one shape; `origin_x_mm` places it on the millimetre field."""
     from model.coverage import centred_origin, coverage
 
     if alignment is Alignment.MM:
@@ -124,7 +124,7 @@ def _drawn(profile: Shape, origin_x_mm: float, alignment: Alignment, field: Fiel
 
 
 def brush_of(header: Header) -> Brush:
-    """The brush that a recording names; sizes that it does not name are those of the published brush."""
+    """The brush that a recording names; missing sizes are those of the published brush."""
     from model.ccdbsm import Brush
 
     nominal = Brush()
@@ -134,17 +134,17 @@ def brush_of(header: Header) -> Brush:
 
 
 def to_pixels(image: Image) -> Pixels:
-    """Ink in [0, 1] on 256 levels, like the camera's."""
+    """Convert ink in [0, 1] to 256 levels, like the camera's."""
     return np.rint(255.0 * image).astype(np.uint8)
 
 
 def pack(images: Pixels) -> bytes:
-    """(n, 128, 128) images, deflated: most of them is paper."""
+    """Compress (n, 128, 128) images, which are mostly blank paper."""
     return zlib.compress(np.ascontiguousarray(images).tobytes(), 1)
 
 
 def unpack(packed: bytes) -> Pixels:
-    """(n, 128, 128) images that `pack` made. Raises ValueError for anything else."""
+    """Decompress (n, 128, 128) images from `pack`. Raises ValueError for anything else."""
     try:
         inflater = zlib.decompressobj()
         raw = inflater.decompress(packed, MAX_UNPACKED_BYTES)

@@ -1,6 +1,6 @@
-"""CSIM and SSIM of two images, and how images are laid over each other before.
+"""CSIM and SSIM of two images, and how the images are aligned first.
 
-Ink is 1 on paper of 0: with paper as 1, a blank page would score .94.
+Ink is 1 and paper 0: with paper as 1, a blank page would score .94.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SSIM_SETTINGS = (
 
 
 class Polarity(StrEnum):
-    """Which of ink and paper is 1."""
+    """Whether ink or paper is 1."""
 
     INK = "ink = 1"
     PAPER = "paper = 1"
@@ -31,7 +31,7 @@ class Polarity(StrEnum):
 def similarity(
     captured: Image, other: Image, alignment: Alignment, polarity: Polarity = Polarity.INK
 ) -> tuple[float, float]:
-    """(CSIM, SSIM) of two (128, 128) images of one alignment; size-normalised, the other takes its best shift first.
+    """(CSIM, SSIM) of two (128, 128) images of one alignment; if size-normalised, the other is shifted to best overlap.
 
     Raises ValueError for a blank image. `compiled.py` does the same for one capture and many predictions.
     """
@@ -45,7 +45,7 @@ def similarity(
 
 
 def csim(a: Image, b: Image) -> float:
-    """Cosine similarity of two (h, w) images with values in [0, 1]. Raises ValueError for a blank one."""
+    """Cosine similarity of two (h, w) images with values in [0, 1]. Raises ValueError if one is blank."""
     _check(a, b)
     x, y = a.astype(np.float64).ravel(), b.astype(np.float64).ravel()
     norm = float(np.linalg.norm(x) * np.linalg.norm(y))

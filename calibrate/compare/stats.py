@@ -1,4 +1,4 @@
-"""Summaries with intervals, and paired tests. All from a fixed seed: equal scores give equal numbers."""
+"""Summaries with intervals, and paired tests. The seed is fixed: equal scores give equal numbers."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Interval = tuple[float, float]
-"""95 %."""
+"""Ends of a 95 % interval."""
 SEED = 0
 MAX_DRAWS, MIN_DRAWS, MAX_VALUES_DRAWN = 2000, 200, 4_000_000
-"""Draws of a bootstrap: as many as `MAX_VALUES_DRAWN` allow, between the first two."""
+"""Limits on the draws of a bootstrap: the most and the fewest, and the most values in all draws together."""
 MIN_CELLS, MIN_PRESSES, MANY_PRESSES = 3, 3, 5
 FLIPS = 10_000
-"""Random flips of signs; where there are no more different flips than that (up to 13 pairs), every one is tried."""
+"""Number of random sign flips; where no more than that exist (up to 13 pairs), each is tried once."""
 BATCH_VALUES = 1_000_000
 """Values held in memory at a time."""
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Of some scores; intervals are None where there are too few."""
+    """Summary of scores; intervals are None where there are too few scores."""
 
     n: int
     max: float
@@ -36,16 +36,16 @@ class Summary:
 
     @property
     def range_and_avg(self) -> tuple[float, float, float]:
-        """Max, min and avg, as the paper's tables have them."""
+        """Max, min and average, in the order of the paper's tables."""
         return self.max, self.min, self.avg
 
 
 def summarise(values: Floats, strata: NDArray[np.int64] | None = None) -> Summary | None:
-    """Summary of (n,) scores, NaN left out; None where none is left. Intervals only with strata, (n,) numbers.
+    """Summarise (n,) scores without NaN; None if none is left. Intervals need strata, (n,) numbers.
 
-    Strokes are drawn again with replacement within their stratum (a cell of a session), so that the share of each cell
-    stays what it is. With fewer than five presses in a typical cell that would be too sure of itself: then whole cells
-    are drawn. No interval for one cell with fewer than three presses.
+    Strokes are resampled with replacement within their stratum (a cell of a session), so that the share of each cell
+    is preserved. With fewer than five presses in a typical cell such an interval would be too narrow, so whole cells
+    are resampled. A single cell with fewer than three presses gets no interval.
     """
     known = np.isfinite(values)
     values = values[known]
@@ -71,7 +71,7 @@ def summarise(values: Floats, strata: NDArray[np.int64] | None = None) -> Summar
 
 
 def interval_over_groups(groups: Sequence[Sequence[float]]) -> Interval | None:
-    """Interval of the mean of all values, whole groups drawn with replacement; None for fewer than three groups."""
+    """Interval of the mean of all values, resampling whole groups; None for fewer than three groups."""
     if len(groups) < MIN_CELLS:
         return None
     sums, counts = np.array([sum(group) for group in groups]), np.array([len(group) for group in groups])
@@ -80,7 +80,7 @@ def interval_over_groups(groups: Sequence[Sequence[float]]) -> Interval | None:
 
 
 def _draws(values: Floats, strata: NDArray[np.int64]) -> Iterator[tuple[Floats, Floats]]:
-    """Means and medians of redrawn samples, some at a time: memory stays flat."""
+    """Yield means and medians of bootstrap samples in batches, which bounds memory."""
     order = np.argsort(strata, kind="stable")
     ordered = values[order]
     _, first, inverse, counts = np.unique(strata[order], return_index=True, return_inverse=True, return_counts=True)
@@ -92,7 +92,7 @@ def _draws(values: Floats, strata: NDArray[np.int64]) -> Iterator[tuple[Floats, 
 
 
 def _cell_draws(values: Floats, strata: NDArray[np.int64]) -> Iterator[tuple[Floats, Floats]]:
-    """The same with whole strata redrawn: each value then counts as often as its stratum was drawn."""
+    """The same, resampling whole strata: each value counts as often as its stratum was drawn."""
     order = np.argsort(values, kind="stable")
     ordered = values[order]
     _, inverse = np.unique(strata[order], return_inverse=True)
@@ -116,7 +116,7 @@ def _batches(size: int) -> Iterator[int]:
 
 @dataclass(frozen=True, slots=True)
 class Paired:
-    """What became better: the mean of paired differences, its 95 % interval, and its p-value."""
+    """Mean of paired differences, its 95 % interval, and its p-value."""
 
     n: int
     mean: float
@@ -135,14 +135,14 @@ def paired(before: Floats, after: Floats) -> Paired | None:
     interval = None
     if n > 1:
         interval = _interval(np.concatenate([means for means, _ in _draws(difference, np.zeros(n, np.int64))]))
-    # Below a millionth of a point nothing is a difference: reports keep six digits.
+    # Differences below one millionth are ignored: reports keep six digits.
     equal = bool(np.all(np.abs(difference) < 1e-6))
     p = 1.0 if equal or n == 1 else _sign_flip_p(difference)
     return Paired(n, float(difference.mean()), interval, p)
 
 
 def _sign_flip_p(difference: Floats) -> float:
-    """Share of sign flips whose mean is at least as far from 0 as that of two differences or more, two-sided."""
+    """Two-sided p-value: share of sign flips whose mean is at least as far from 0; needs two or more differences."""
     import scipy.stats  # slow to import
 
     untyped: Any = scipy.stats

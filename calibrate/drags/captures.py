@@ -1,9 +1,9 @@
-"""Dragged strokes of a session as commanded paths and the ink beside them, for `calibrate.drags.fit`.
+"""Drags of a session as commanded paths with their captured ink, for `calibrate.drags.fit`.
 
 The protocol in a recording holds the trajectories that were drawn. Imported photographs come with numbers:
-`length_mm` along x from the start, a depth (`depth_mm`, ...), and optionally `bend_mm` (both inner control points of
-a cubic Bezier curve lie so far to the left of the line) and `depth_ends_mm` (the depth at both ends, reached from the
-middle over a third of the length).
+`length_mm` along x from the start, a depth (`depth_mm`, ...), and optionally `bend_mm` (the distance of both inner
+control points of a cubic Bezier curve to the left of the line) and `depth_ends_mm` (the depth at both ends, reached
+from the middle over a third of the length).
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from sessions.recording.schemas import Header, Stroke
 
 Floats = NDArray[np.float64]
 MARGIN_MM = 16.0
-"""Around an imported stroke's path: wider than any mark."""
+"""Margin around an imported stroke's path: wider than any mark."""
 NODES = 28
 SPECK_SHARE = 0.002
-"""A dot of a figure is smaller against its longest stroke than a drop against a press."""
+"""Lower than for a press: relative to its longest stroke, a figure's dot is smaller than a drop is to a press."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """Dragged strokes on one grid of pixel centres, mm, y upward."""
+    """Drags on one grid of pixel centres, mm, y upward."""
 
     header: Header
     recording_sha256: str
@@ -54,7 +54,7 @@ class Drawn:
     """(B, len(y_mm), len(x_mm)) from 0 to 1."""
     stroke_ids: list[str]
     refused: list[tuple[str, str]]
-    """(stroke, why): captures that cannot be used, or that their photograph cuts."""
+    """(stroke, why): captures that cannot be used, or that are cut by the edge of their photograph."""
 
     @property
     def mm_per_px(self) -> float:
@@ -63,7 +63,7 @@ class Drawn:
 
 
 def read_drags(session: Path, mm_per_px: float, calibration_path: Path | None = None) -> Drawn:
-    """Every usable dragged stroke or drawn figure. Raises `CalibrationError` where a session holds none."""
+    """Read every usable drag or drawn figure. Raises `CalibrationError` if a session holds none."""
     recording = Recording(session)
     digest, strokes = recording.sha256, list(recording.stroke_records())
     where = str(recording.path)
@@ -90,14 +90,14 @@ def read_drags(session: Path, mm_per_px: float, calibration_path: Path | None = 
         images.append(image)
         names.append(name)
     if not images:
-        raise CalibrationError(where, f"holds no stroke that can be used: {refused[0][0]}: {refused[0][1]}")
+        raise CalibrationError(where, f"holds no usable stroke: {refused[0][0]}: {refused[0][1]}")
     groups = np.cumsum([0, *(len(one) for one in paths)])
     flat = [path for one in paths for path in one]
     return Drawn(recording.header, digest, calibration, x_mm, y_mm, flat, groups, np.array(images), names, refused)
 
 
 def figures_of(header: Header) -> dict[str, list[Floats]]:
-    """Figure -> its strokes, (n, 4) each on its cell, from the recorded protocol. Raises `CalibrationError`."""
+    """Map each figure to its strokes, (n, 4) in cell coordinates, from the protocol. Raises `CalibrationError`."""
     try:
         protocol: dict[str, Any] = json.loads(header.protocol)
         return {
@@ -113,7 +113,7 @@ def figures_of(header: Header) -> dict[str, list[Floats]]:
 
 
 def commanded_path(length_mm: float, bend_mm: float, depth_mm: float, depth_ends_mm: float) -> Floats:
-    """(28, 4) of an imported stroke, its start at (0, 0)."""
+    """(28, 4) path of an imported stroke that starts at (0, 0)."""
     t = np.linspace(0.0, 1.0, NODES)
     depth = np.interp(t, [0.0, 1 / 3, 2 / 3, 1.0], [depth_ends_mm, depth_mm, depth_mm, depth_ends_mm])
     return np.column_stack([length_mm * t, 3.0 * bend_mm * t * (1.0 - t), depth, np.zeros(NODES)])
@@ -135,11 +135,11 @@ def _figure(
     stroke = capture.stroke
     paths = figures.get(stroke.stroke_id.rpartition("-r")[0])
     if paths is None or stroke.cell_mm is None:
-        raise CaptureRefused(stroke.stroke_id, "is no figure of the recorded protocol")
+        raise CaptureRefused(stroke.stroke_id, "is not a figure of the recorded protocol")
     if any(len(path) < 2 for path in paths):
-        raise CaptureRefused(stroke.stroke_id, "has a stroke of one point")
+        raise CaptureRefused(stroke.stroke_id, "has a stroke with only one point")
     raster = rectify_by(capture.image(), calibration, stroke.cell_mm, capture.where)
-    # All ink of the cell is the figure's, however far its strokes lie apart.
+    # All ink of the cell belongs to the figure, however far apart its strokes are.
     reach = {"join_mm": float(np.hypot(*stroke.cell_mm[2:])), "speck_share": SPECK_SHARE}
     prepared = prepare(raster, None, capture.where, Params(**(calibration.preprocess | reach)))
     if prepared.cut:
@@ -172,7 +172,7 @@ def _shrunk(mask: NDArray[np.bool_], x_mm: Floats, y_mm: Floats) -> NDArray[np.f
 def _cell_grid(strokes: list[Stroke], mm_per_px: float, where: str) -> tuple[Floats, Floats]:
     sizes = {stroke.cell_mm[2:] for stroke in strokes if stroke.cell_mm is not None}
     if len(sizes) != 1:
-        raise CalibrationError(where, "its figures lie on no cells, or on cells of several sizes")
+        raise CalibrationError(where, "its figures have no cells, or cells of several sizes")
     [(width_mm, height_mm)] = sizes
     columns, rows = round(width_mm / mm_per_px), round(height_mm / mm_per_px)
     x_mm = (np.arange(columns) + 0.5) * width_mm / columns
@@ -182,7 +182,7 @@ def _cell_grid(strokes: list[Stroke], mm_per_px: float, where: str) -> tuple[Flo
 def _grid(strokes: list[Stroke], mm_per_px: float, where: str) -> tuple[Floats, Floats]:
     paths = list(_paths(strokes))
     if not paths:
-        raise CalibrationError(where, f"no stroke has {LENGTH_NAME} and a depth: where it was drawn is not known")
+        raise CalibrationError(where, f"no stroke has {LENGTH_NAME} and a depth: its path is unknown")
     places = np.concatenate(paths)
     low, high = places[:, :2].min(axis=0) - MARGIN_MM, places[:, :2].max(axis=0) + MARGIN_MM
     columns, rows = (int(n) for n in np.ceil((high - low) / mm_per_px))

@@ -1,10 +1,10 @@
-"""Choose the press that tells most about a brush from the ink of the presses before. No torch: a rig PC runs it.
+"""Choose the most informative next press from the ink of earlier presses. Runs on a rig PC, without torch.
 
-With J the derivatives of a predicted image by the parameters, the presses done carry the Fisher information
-sum J'J / noise, and the image of a cell is uncertain by tr(J'J C), C the inverse of information and prior. Half of that
-over the ink's own square is the cosine similarity that is still to be won there. The edges' free terms are treated
-the same way. The next press is the one after which the mean over all cells is least (V-optimal design: V. Fedorov,
-"Theory of Optimal Experiments"). The same captures give the same choice, in every process.
+Let J be the derivatives of a predicted image with respect to the parameters. The presses done carry the Fisher
+information sum J'J / noise, and the uncertainty of a cell's image is tr(J'J C), with C the inverse of information plus
+prior. Half of that, divided by the sum of squares of the ink, is the cosine similarity still to be gained in that cell.
+The free terms of the edges are treated the same way. The next press is the one that minimises the expected mean over
+all cells (V-optimal design: V. Fedorov, "Theory of Optimal Experiments"). Equal captures give equal choices.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ Cell = tuple[float, float]
 """Depth in mm and tilt in deg."""
 
 NOISE = 1.0
-"""Variance of a pixel of the edge times the number of pixels that stray together."""
+"""Variance of an edge pixel times the number of pixels whose errors are correlated."""
 ENOUGH_POINTS = 1.0
-"""Stop when fewer points of CSIM (percent) than this are expected to be won by pressing on. The expectation is about
-twice the actual gain: the parameters' prior is wide."""
+"""Stop when fewer points of CSIM (percent) than this are expected from further presses. The expectation is about
+twice the actual gain, because the parameters' prior is wide."""
 FIELD = Field()
-"""Around the point of touch, as `brushloop fit` has it by default."""
+"""Field around the point of touch, the default of `brushloop fit`."""
 REACH_MM = 12.0
-"""To either side of the axis: no press of a brush that the loopback rig or the paper has is wider."""
+"""Reach to either side of the axis: no press of the loopback rig's or the paper's brushes is wider."""
 LEVELS = 15
 GIVEN_UP = 2
-"""A cell whose captures showed no whole stroke so often is not chosen again."""
+"""Number of captures without a whole stroke after which a cell is not chosen again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +49,12 @@ class CapturedPress:
     height_mm: float
     tilt_deg: float
     ink: str
-    """Of `packed`; empty where the capture showed no whole stroke."""
+    """Ink as returned by `packed`; empty if the capture showed no whole stroke."""
 
 
 @dataclass(frozen=True, slots=True)
 class Design:
-    """What can be chosen, and when to stop."""
+    """The candidate cells, and when to stop."""
 
     radius_mm: float
     length_mm: float
@@ -65,46 +65,46 @@ class Design:
 
 @dataclass(frozen=True, slots=True)
 class Next:
-    """The choice."""
+    """The chosen cell, and the fit that it is based on."""
 
     cell: Cell | None
-    """None: stop."""
+    """Cell to press next; None to stop."""
     points: float
-    """CSIM points, in the mean over the cells, that the presses so far leave to be won."""
+    """CSIM points still to be gained after the presses so far, mean over the cells."""
     points_after: float
     strokes: int
-    """Captures that the fit was made of."""
+    """Number of captures in the fit."""
     ink_sha256: str
-    """Of their ink, in the order of the fit."""
+    """SHA-256 of their ink, in the order of the fit."""
     why: str
 
 
 def packed(mask: NDArray[np.bool_]) -> str:
-    """A stroke on the field's raster (any even scale) as text: coverage of each pixel in 16 steps, compressed."""
+    """Encode a stroke on the field's raster (any even scale) as text: coverage per pixel in 16 steps, compressed."""
     ink = cv2.resize(mask.astype(np.float32), (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA)[_rows()]
     return base64.b64encode(zlib.compress(np.round(LEVELS * ink).astype(np.uint8).tobytes(), 9)).decode()
 
 
 def unpacked(text: str) -> NDArray[np.float64]:
-    """The inverse: coverage on the pixels of `field_grid`. Raises ValueError for anything else."""
+    """Decode text from `packed` to coverage on the pixels of `field_grid`. Raises ValueError for anything else."""
     grid = field_grid()
     shape = len(grid.y_mm), len(grid.x_mm)
     try:
         data = zlib.decompressobj().decompress(base64.b64decode(text, validate=True), shape[0] * shape[1])
         return np.frombuffer(data, np.uint8).reshape(shape) / LEVELS
     except (binascii.Error, zlib.error) as error:
-        raise ValueError(f"no ink of a press: {error}") from None
+        raise ValueError(f"not the packed ink of a press: {error}") from None
 
 
 def field_grid() -> Grid:
-    """Pixel centres of packed ink around the point of touch."""
+    """Pixel centres of packed ink, around the point of touch."""
     left, top = FIELD.anchor_mm
     centres = np.asarray((np.arange(SIZE_PX) + 0.5) * FIELD.mm_per_px, np.float64)
     return Grid(np.asarray(centres - left), np.asarray(top - centres)[_rows()])
 
 
 def next_cell(design: Design, seen: Sequence[CapturedPress]) -> Next:
-    """Fit what is seen, and choose. A second or two on a slow core."""
+    """Fit the captured presses and choose the next cell. Takes a second or two on a slow core."""
     strokes = [Pressed(s.height_mm, s.tilt_deg, unpacked(s.ink)) for s in seen if s.ink]
     digest = hashlib.sha256("\n".join(s.ink for s in seen if s.ink).encode()).hexdigest()
     failed = [(s.height_mm, s.tilt_deg) for s in seen if not s.ink]
@@ -119,25 +119,25 @@ def next_cell(design: Design, seen: Sequence[CapturedPress]) -> Next:
     choice = next_press(brush, done, left, grid, enough_points=design.enough_points, least=design.least)
     points, after = min(choice.points, 100.0), min(choice.points_after, 100.0)
     why = (
-        f"{points:.2f} points of CSIM are left to be won, at most {design.enough_points:g} were to be"
+        f"{points:.2f} points of CSIM are left to gain, at most {design.enough_points:g} are accepted"
         if choice.cell is None
-        else f"{points:.2f} points of CSIM are left to be won, {after:.2f} after it"
+        else f"{points:.2f} points of CSIM are left to gain, {after:.2f} after it"
     )
     return Next(choice.cell, points, after, len(strokes), digest, why)
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What to do next."""
+    """The next cell to press, or the decision to stop."""
 
     cell: Cell | None
-    """Where to press; None: stop."""
+    """Cell to press; None to stop."""
     points: float
-    """CSIM points, in the mean over the cells, that the presses done leave to be won."""
+    """CSIM points still to be gained after the presses done, mean over the cells."""
     points_after: float
-    """The same, expected after the press."""
+    """The same, as expected after the chosen press."""
     saved: int
-    """Presses of the whole grid that need not be made, where `cell` is None; else 0."""
+    """Presses of the whole grid that are saved if `cell` is None; else 0."""
 
 
 def next_press(
@@ -150,15 +150,15 @@ def next_press(
     whole_grid: int = 0,
     least: int = 3,
 ) -> Choice:
-    """The cell that tells most after the cells `done`, or to stop. Pure: equal arguments, equal answer.
+    """Choose the most informative cell after the cells `done`, or stop. Pure: equal arguments give equal answers.
 
-    Before the first press give `FittedPress(radius_mm, length_mm)`, the published brush. `whole_grid` is how many
-    presses the grid has. Raises ValueError without candidates.
+    Before the first press, pass `FittedPress(radius_mm, length_mm)`, the published brush. `whole_grid` is the number
+    of presses in the grid. Raises ValueError without candidates.
     """
     if not candidates:
         raise ValueError("there is no cell to choose from")
     press = fit if isinstance(fit, FittedPress) else fit.press
-    # All parameters count, also those that a stage refused: the next press is to determine them.
+    # Parameters that a stage refused count as well: the next press should determine them.
     views = {cell: _look(press, cell, grid) for cell in {*done, *candidates}}
     information = np.eye(len(NAMES)) + sum((views[cell].square for cell in done), np.zeros((len(NAMES), len(NAMES))))
     terms = _terms_information(done, views, grid)
@@ -177,7 +177,7 @@ def next_press(
 @dataclass(frozen=True, slots=True)
 class _View:
     square: Floats
-    """J'J over the noise."""
+    """J'J divided by the noise."""
     ink: float
     """Sum of squares of the image."""
     columns: float
@@ -193,14 +193,14 @@ def _look(press: FittedPress, cell: Cell, grid: Grid) -> _View:
 
 
 def _terms_information(cells: Sequence[Cell], views: dict[Cell, _View], grid: Grid, *, prior: bool = True) -> Floats:
-    """(MODES, T, T) information on the edges' terms, mm^-2: a sine has half its columns' worth."""
+    """(MODES, T, T) information on the edges' terms, mm^-2: a sine counts half of its columns."""
     out = np.zeros((MODES, len(EDGE_SPREAD_MM), len(EDGE_SPREAD_MM)))
     if prior:
         for k in range(MODES):
             out[k] += np.diag(((k + 1) / np.array(EDGE_SPREAD_MM)) ** 2)
     for cell in cells:
         view = views[cell]
-        # Neighbouring columns stray together: over about 3 mm.
+        # Errors of neighbouring columns are correlated over about 3 mm.
         independent = view.columns * grid.px_mm / 3.0
         out += 0.5 * independent / EDGE_NOISE_MM**2 * np.outer(view.terms, view.terms)
     return out
@@ -208,7 +208,7 @@ def _terms_information(cells: Sequence[Cell], views: dict[Cell, _View], grid: Gr
 
 def _points(information: Floats, terms: Floats, cells: Sequence[Cell], views: dict[Cell, _View], grid: Grid) -> float:
     covariance, edges = np.linalg.inv(information), np.linalg.inv(terms)
-    # An edge off by d changes a column's logistic by d^2 / (6 spread) in sum of squares per mm.
+    # Moving an edge by d changes the sum of squares of a column's logistic by d^2 / (6 spread) per mm.
     per_mm2 = 1.0 / (6.0 * SPREAD_MM * grid.px_mm)
     losses: list[float] = []
     for cell in cells:

@@ -1,8 +1,8 @@
 """Presses recovered from captures: each stroke on the millimetre field, inverted in batches, with its interval.
 
-What is fitted is the coverage of the stroke's mask: its share of each pixel of the 128 x 128 field. The recovered
-(H, alpha) is the press for which this model makes this mark. It is a measurement of the press only as far as the model
-is true to the brush.
+The fit is to the coverage of the stroke's mask: its share of each pixel of the 128 x 128 field. The recovered
+(H, alpha) is the press for which this model makes this mark. It measures the actual press only as well as the model
+describes the brush.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from sessions.recording.schemas import Header, Stroke
 
 BATCH = 64
 USELESS = frozenset({Flag.BLANK, Flag.DID_NOT_CONVERGE, Flag.CUT})
-"""A stroke with one of these is listed with the reason and not pressed again."""
+"""Flags that exclude a stroke: it is listed with the reason and not pressed again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,14 +43,14 @@ class Settings:
 
     model: str = "ccd-bsm"
     fitted: StrokeModel | None = None
-    """A calibrated brush, which then stands for `model`."""
+    """A calibrated brush, which replaces `model`."""
     lam: float | None = None
     """lambda of CCD-BSM; None is pi, the default of the paper."""
     within: Range = field(default_factory=Range)
     anchor_sigma_mm: float = 0.1
-    """How well the zero-touch point is known; 0: exactly."""
+    """Standard deviation of the zero-touch point; 0 if it is known exactly."""
     assumed_tilt_deg: float = 0.0
-    """alpha where it cannot be known: for captures without an anchor that were commanded none."""
+    """alpha to assume for captures that have neither an anchor nor a commanded tilt."""
     view: Field = field(default_factory=Field)
 
 
@@ -71,7 +71,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Inversion:
-    """What came out of a recording."""
+    """Presses recovered from a recording."""
 
     header: Header
     recording: Path
@@ -84,7 +84,7 @@ class Inversion:
 
 @dataclass(frozen=True, slots=True)
 class AlignedStroke:
-    """A stroke on its field: coverage, and the anchor in mm from the left and top edge, where it is known."""
+    """A stroke on its field: coverage, and the anchor in mm from the left and top edge if it is known."""
 
     stroke: Stroke
     image: Image
@@ -92,7 +92,7 @@ class AlignedStroke:
 
 
 def invert_recording(session: Path, settings: Settings, calibration_path: Path | None) -> Inversion:
-    """Recover every press of a session. Raises `CalibrationError` where it was not calibrated or holds no press."""
+    """Recover every press of a session. Raises `CalibrationError` if it is not calibrated or holds no press."""
     recording = Recording(session)
     digest = recording.sha256
     strokes = list(recording.stroke_records())
@@ -123,7 +123,7 @@ def invert_recording(session: Path, settings: Settings, calibration_path: Path |
 
 
 def align(capture: Capture, calibration: Calibration | None, view: Field) -> AlignedStroke:
-    """A capture on the field, by the calibration or by the import's own scale. Raises `CaptureRefused`."""
+    """Place a capture on the field, by the calibration or by the import's own scale. Raises `CaptureRefused`."""
     stroke = capture.stroke
     params = Params(**calibration.preprocess) if calibration else Params()
     if stroke.px_per_mm is None or stroke.anchor_px is not None:
@@ -141,7 +141,7 @@ def align(capture: Capture, calibration: Calibration | None, view: Field) -> Ali
 
 
 def _invert(made: Inversion, inverter: Inverter, batch: list[AlignedStroke]) -> None:
-    """Invert a batch of one kind, and file each stroke where it belongs."""
+    """Invert a batch, all with or all without an anchor, and file each stroke as recovered or refused."""
     if not batch:
         return
     images = np.stack([aligned.image for aligned in batch])
@@ -151,7 +151,7 @@ def _invert(made: Inversion, inverter: Inverter, batch: list[AlignedStroke]) -> 
         _file(made, batch, found)
         return
     for aligned in batch:
-        # What was commanded is the better guess: without an anchor alpha stays what is assumed.
+        # Without an anchor alpha keeps the assumed value, so the commanded tilt is preferred.
         tilt = aligned.stroke.tilt_deg
         low, high = made.settings.within.tilt_deg
         assumed = made.settings.assumed_tilt_deg if tilt is None else min(max(tilt, low), high)
@@ -178,7 +178,7 @@ def _file(made: Inversion, batch: list[AlignedStroke], found: Recovered) -> None
 
 
 def _unnameable(ident: str, taken: set[str]) -> str:
-    """Why a protocol could not press a stroke of that name again; empty where it can."""
+    """Reason why a protocol cannot press a stroke of this name again; empty if it can."""
     if ident in taken:
         return "its name stands for two strokes"
     if not 1 <= len(ident) <= 100 or not ident.isprintable() or any(c in ' /\\<>:"|?*' for c in ident):
@@ -187,7 +187,7 @@ def _unnameable(ident: str, taken: set[str]) -> str:
 
 
 def _inverters(header: Header, settings: Settings) -> tuple[Inverter, Inverter]:
-    """With a known anchor, and without."""
+    """Make the inverters for captures with and without a known anchor."""
     brush = brush_of(header)
     basis = Basis(brush) if settings.lam is None else Basis(brush, settings.lam)
     options = {"within": settings.within, "noise": Noise.BLOCKS, "px_mm": settings.view.mm_per_px}
@@ -205,7 +205,7 @@ def _inverters(header: Header, settings: Settings) -> tuple[Inverter, Inverter]:
 
 
 def off_command(rows: list[Row]) -> Iterator[tuple[str, float, float, float, int]]:
-    """(what, mean difference, its standard deviation, share in the 95 % interval, n) of recovered against commanded."""
+    """Yield (parameter, mean of recovered - commanded, standard deviation, share in the 95 % interval, n)."""
     pairs = {
         "H": [(r.height_mm, r.height_sd_mm, r.commanded_height_mm) for r in rows],
         "alpha": [(r.tilt_deg, r.tilt_sd_deg, r.commanded_tilt_deg) for r in rows if r.tilt_sd_deg is not None],

@@ -1,4 +1,4 @@
-"""Writes the loop: a picture, one HTML file that needs nothing else, and every number behind it as CSV and JSON."""
+"""Write the loop's report: a picture, one self-contained HTML file, and every number behind it as CSV and JSON."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from calibrate.report import (
 HEADLINE, GRAY = (Alignment.MM, Tone.BINARY), (Alignment.MM, Tone.GRAY)
 PICTURE, PAGE, TABLE = "loop.png", "loop.html", "loop.csv"
 SHEET_ROWS = slice(32, 96)
-"""The middle half: a press is at most half as thick as the field is high."""
+"""Rows shown, the middle half: a press is at most half as thick as the field is high."""
 MAX_PICTURE_ROWS = 12
 MAX_PAIRS_SHOWN = 150
 
@@ -70,7 +70,7 @@ def write_loop(loop: LoopComparison, folder: Path, command: str) -> Path:
 
 
 def answer(loop: LoopComparison) -> str:
-    """What came out, in one sentence."""
+    """Return the result in one sentence."""
     if not loop.verdicts:
         return "No cell of the original session was pressed twice, so its repeatability is not known."
     failed = [v for v in loop.verdicts if not v.holds]
@@ -78,13 +78,13 @@ def answer(loop: LoopComparison) -> str:
     where = f"{least.measure.upper()}, {least.alignment}, {least.tone}"
     if not failed:
         return (
-            f"The re-pressed strokes are as like their originals as the brush's own presses are to each other, or less "
-            f"than {GOAL_POINTS:g} point behind, in all {len(loop.verdicts)} comparisons "
+            f"The re-pressed strokes are as similar to their originals as the brush's own presses are to each other, "
+            f"or less than {GOAL_POINTS:g} point below, in all {len(loop.verdicts)} comparisons "
             f"(least: {least.difference:+.2f} points, {where})."
         )
     return (
-        f"In {len(failed)} of {len(loop.verdicts)} comparisons the re-pressed strokes are more than {GOAL_POINTS:g} "
-        f"point less like their originals than other presses of the same cell are (least: {least.difference:+.2f} "
+        f"In {len(failed)} of {len(loop.verdicts)} comparisons the re-pressed strokes score more than {GOAL_POINTS:g} "
+        f"point below other presses of the same cell against their originals (least: {least.difference:+.2f} "
         f"points, {where})."
     )
 
@@ -101,7 +101,7 @@ def summary(loop: LoopComparison) -> Iterator[str]:
 
 
 def loop_csv(scores: list[PairScore], source: str) -> str:
-    """A row for every comparison with every original."""
+    """Return a CSV row for every comparison with every original."""
     head = ["original", "again", "height_mm", "tilt_deg", "what", "alignment", "tone", "csim", "ssim", "source"]
     rows = (
         (s.original, s.again, *s.cell, s.what, s.alignment, s.tone, f"{s.csim:.6f}", f"{s.ssim:.6f}", source)
@@ -111,7 +111,7 @@ def loop_csv(scores: list[PairScore], source: str) -> str:
 
 
 def record_of(loop: LoopComparison, command: str) -> LoopRecord:
-    """Everything but the images and the single scores, with its digest."""
+    """Return the loop without images and individual scores, with its digest."""
     return LoopRecord(
         source=loop.again.header.source,
         original=loop.original.header.session_id,
@@ -132,7 +132,7 @@ def record_of(loop: LoopComparison, command: str) -> LoopRecord:
 
 
 def draw(loop: LoopComparison, path: Path) -> None:
-    """A row a pair: original, recovered and simulated, re-pressed, and original under re-pressed. Raises OSError."""
+    """Draw one row per pair: original, simulation of the recovered press, re-pressed, overlay. Raises OSError."""
     pairs = _in_picture(loop)
     scores = _again_scores(loop)
     title = f"{loop.original.header.session_id}, pressed again ({loop.again.header.source})"
@@ -156,7 +156,7 @@ def draw(loop: LoopComparison, path: Path) -> None:
 
 
 def _in_picture(loop: LoopComparison) -> list[Pair]:
-    """At most `MAX_PICTURE_ROWS` pairs by depth and tilt, evenly over all of them, the worst among them."""
+    """Choose at most `MAX_PICTURE_ROWS` pairs, evenly over depth and tilt, the worst included."""
     pairs = sorted(loop.paired.pairs, key=lambda p: (*p.original.cell, p.again.stroke_id))
     if len(pairs) <= MAX_PICTURE_ROWS:
         return pairs
@@ -167,7 +167,7 @@ def _in_picture(loop: LoopComparison) -> list[Pair]:
 
 
 def _again_scores(loop: LoopComparison) -> dict[str, PairScore]:
-    """Score of each repetition, strictly compared, by its name."""
+    """Score of each repetition by name, from the headline comparison (mm, binary)."""
     return {s.again: s for s in loop.scores if (s.what, s.alignment, s.tone) == (AGAIN, *HEADLINE)}
 
 
@@ -177,7 +177,7 @@ def _gray_images(pair: Pair) -> list[Any]:
 
 
 def _tables(rows: list[Table1Row]) -> list[dict[str, Any]]:
-    """A table for each alignment and tone."""
+    """Return one table per alignment and tone."""
     return [
         {"alignment": key[0], "tone": key[1], "rows": [row for row in rows if (row.alignment, row.tone) == key]}
         for key in KEYS

@@ -1,4 +1,4 @@
-"""How alike a press and its repetition are, beside any two presses of one (H, alpha): Table 1's third row as data."""
+"""Similarity of a press and its repetition, against that of two presses of one cell: data of Table 1's third row."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAX_BYTES = 8 * 1024 * 1024
 AGAIN, SIMULATED, ANOTHER = "re-pressed", "recovered, simulated", "another press"
 """What is compared with an original: its repetition, the model's image of it, other originals of the same cell."""
 GOAL_POINTS = 1.0
-"""By how much the re-pressed strokes may score less than the originals' own repeatability."""
+"""Points by which re-pressed strokes may score below the originals' own repeatability."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class CapturedPress:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """One stroke twice. Depth and tilt of `original` are as commanded, those of `again` as recovered."""
+    """A stroke and its repetition. Depth and tilt of `original` are as commanded, those of `again` as recovered."""
 
     original: CapturedPress
     again: CapturedPress
@@ -56,7 +56,7 @@ class Pair:
 
 @dataclass(frozen=True, slots=True)
 class PairScore:
-    """One comparison with one original."""
+    """Scores of one comparison with an original."""
 
     original: str
     again: str
@@ -71,7 +71,7 @@ class PairScore:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Re-pressed minus another press, over the originals that have both, in points (percent)."""
+    """Score of re-pressed minus another press, over the originals that have both, in points (percent)."""
 
     alignment: Alignment
     tone: Tone
@@ -89,13 +89,13 @@ class Verdict:
 
     @property
     def certain(self) -> bool:
-        """Whether the whole interval says the same."""
+        """Whether the whole interval lies on the same side of the limit."""
         bound = self.low if self.holds else self.high
         return bound is not None and (bound >= -GOAL_POINTS) == self.holds
 
 
 class Table1Row(BaseModel):
-    """Over the presses that were made again, in percent."""
+    """Statistics over the presses that were pressed again, in percent."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -105,7 +105,7 @@ class Table1Row(BaseModel):
     again: str
     """Session ids."""
     model: str
-    """What recovered depth and tilt."""
+    """Model that recovered depth and tilt."""
     what: str
     """`re-pressed`, `another press` or `recovered, simulated`."""
     alignment: Alignment
@@ -125,19 +125,19 @@ class Table1Row(BaseModel):
 
 
 class LoopRecord(Sealed):
-    """A closed loop as its `loop.json` holds it: everything but the images and the single scores."""
+    """A closed loop as stored in `loop.json`: everything but the images and the individual scores."""
 
     FORMAT: ClassVar[str] = FORMAT
     MADE_BY: ClassVar[str] = "brushloop loop compare"
 
     format: str = FORMAT
     source: Source
-    """Of the session that pressed again."""
+    """Kind of ink of the session that pressed again."""
     original: str
     original_sha256: str
     again: str
     again_sha256: str
-    """Session ids, and of their recordings."""
+    """Session ids, and the SHA-256 of each recording."""
     model: str
     in_sample: bool
     """Whether that model was fitted to the original presses themselves."""
@@ -161,7 +161,7 @@ class LoopRecord(Sealed):
 
 
 def read_loop(path: Path) -> LoopRecord:
-    """A `loop.json`, or the one in a loop's folder. Raises `CalibrationError` if it is not one, or was edited."""
+    """Read a `loop.json`, or the one in a loop's folder. Raises `CalibrationError` if it is invalid or was edited."""
     return load_sealed(path / FILE if path.is_dir() else path, LoopRecord, MAX_BYTES)
 
 
@@ -190,13 +190,13 @@ def _score(pair: Pair, what: str, key: Key, images: list[Image]) -> PairScore:
 
 
 def summary_of(scores: Sequence[PairScore], what: str, key: Key, measure: str) -> Summary | None:
-    """Of `csim` or `ssim` in percent; None where there is no such score."""
+    """Summarise `csim` or `ssim` in percent; None if there is no such score."""
     found = [getattr(s, measure) for s in scores if (s.what, s.alignment, s.tone) == (what, *key)]
     return summarise(100.0 * np.asarray(found))
 
 
 def table_1(scores: Sequence[PairScore], *, source: Source, original: str, again: str, model: str) -> list[Table1Row]:
-    """The rows in the order of `KEYS`; the paper's numbers stand beside the re-pressed ones."""
+    """Rows in the order of `KEYS`; rows of re-pressed strokes also have the paper's numbers."""
     paper = TABLE_1[ROBOT_WRITING]
     rows: list[Table1Row] = []
     for key in KEYS:
@@ -226,7 +226,7 @@ def table_1(scores: Sequence[PairScore], *, source: Source, original: str, again
 
 
 def verdicts(scores: Sequence[PairScore]) -> list[Verdict]:
-    """One for each alignment, tone and measure; none where no cell was pressed twice."""
+    """Verdicts for each alignment, tone and measure; empty if no cell was pressed twice."""
     return [found for key in KEYS for of in ("csim", "ssim") if (found := _verdict(scores, key, of)) is not None]
 
 

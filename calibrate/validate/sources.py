@@ -1,7 +1,7 @@
-"""Where sessions come from: local folders and files, or any URL that fsspec opens.
+"""Open sessions from local folders and files, or from any URL that fsspec opens.
 
-A remote recording is copied once, bounded in size, and accepted only with the expected SHA-256: given as
-`#sha256=...` after the URL, or in a file `<recording>.mcap.sha256` beside it.
+A remote recording is copied once, up to a size limit, and accepted only with the expected SHA-256, which is given as
+`#sha256=...` after the URL or in a file `<recording>.mcap.sha256` beside it.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ MAX_SUM_BYTES = 64 * 1024
 MAX_ARTEFACTS = 64
 MAX_ARTEFACT_BYTES = 4 * 1024 * 1024
 FORBIDDEN = 403
-"""Answer of a bucket that may not be listed, for a missing file."""
+"""HTTP status for a missing file in a bucket that may not be listed."""
 URL = re.compile(r"^[a-z][a-z0-9+.-]+://", re.IGNORECASE)
 EXTRAS = {"http": "remote", "https": "remote", "s3": "s3", "s3a": "s3", "gs": "gs", "gcs": "gs"}
-"""Kind of URL -> the extra that opens it."""
+"""URL scheme -> the extra that supports it."""
 BACKEND_ERRORS = (
     ("aiohttp", "ClientError"),
     ("botocore.exceptions", "BotoCoreError"),
@@ -45,7 +45,7 @@ BACKEND_ERRORS = (
     ("gcsfs.retry", "HttpError"),
     ("google.auth.exceptions", "GoogleAuthError"),
 )
-"""Module and name: none of them is an OSError, and none is imported unless its kind of URL is asked for."""
+"""Module and class: none is an OSError, and none is imported unless a URL of its scheme is given."""
 SHA256 = re.compile(r"\b[0-9a-f]{64}\b")
 
 
@@ -67,7 +67,7 @@ class LoadedSession:
 
 
 def open_session(place: str, work: Path, calibration: Path | None, fit: Path | None) -> LoadedSession:
-    """A session by path or URL. Raises `CalibrationError`, `InputError` or `SessionDamaged`, each naming it."""
+    """Open a session by path or URL. Raises `CalibrationError`, `InputError` or `SessionDamaged`, each naming it."""
     path = fetched(place, work / "remote") if URL.match(place) else Path(place)
     recording = Recording(path)
     digest = recording.sha256
@@ -90,7 +90,7 @@ def open_session(place: str, work: Path, calibration: Path | None, fit: Path | N
 
 
 def one_source(sessions: list[LoadedSession]) -> Source:
-    """The kind of ink that all recordings name. Raises `CalibrationError` where they differ."""
+    """Kind of ink of all recordings. Raises `CalibrationError` if they differ."""
     first = sessions[0]
     for other in sessions[1:]:
         if other.header.source != first.header.source:
@@ -100,7 +100,7 @@ def one_source(sessions: list[LoadedSession]) -> Source:
 
 
 def _check_journal(recording: Recording, digest: str) -> None:
-    """The file must be the one that the session's journal closed with; imports and exports have no journal."""
+    """Check that the file is the one with which the journal was closed; imports and exports have no journal."""
     journal = recording.path.parent / JOURNAL_NAME
     if not journal.is_file():
         return
@@ -110,7 +110,7 @@ def _check_journal(recording: Recording, digest: str) -> None:
 
 
 def fetched(url: str, folder: Path) -> Path:
-    """A local copy of a remote recording, with its calibration and fit beside it. Raises `CalibrationError`."""
+    """Copy a remote recording to `folder`, with its calibration and fit. Raises `CalibrationError`."""
     address, _, fragment = url.partition("#")
     try:
         untyped: Any = importlib.import_module("fsspec")  # without type stubs
@@ -118,7 +118,7 @@ def fetched(url: str, folder: Path) -> Path:
         raise CalibrationError(address, "a URL needs fsspec: pip install 'brushloop[remote]'") from None
     try:
         system, where = untyped.core.url_to_fs(address)
-        system.invalidate_cache()  # listings of before: fsspec keeps one system an address as long as the process lives
+        system.invalidate_cache()  # fsspec caches listings per address for the life of the process
     except (ImportError, ValueError) as error:
         extra = EXTRAS.get(address.partition(":")[0].lower()) if isinstance(error, ImportError) else None
         how = f": pip install 'brushloop[{extra}]'" if extra else ""
@@ -138,7 +138,7 @@ def fetched(url: str, folder: Path) -> Path:
 
 
 def _backend_errors() -> tuple[type[Exception], ...]:
-    """Error classes of the packages that fsspec loaded for this URL, as raised without credentials."""
+    """Error classes, raised without credentials, of the packages that fsspec loaded for this URL."""
     loaded = [(sys.modules[module], name) for module, name in BACKEND_ERRORS if module in sys.modules]
     return tuple(getattr(module, name) for module, name in loaded if hasattr(module, name))
 
@@ -171,8 +171,8 @@ def _copy(system: Any, where: str, target: Path, expected: str, address: str) ->
 
 
 def _pieces(system: Any, where: str, most_bytes: int, address: str) -> Iterator[bytes]:
-    """A remote file from its beginning to its end. Raises `CalibrationError` beyond so many bytes."""
-    # By blocks, fsspec asks a web server for ranges, and there are servers that have none.
+    """Read a remote file in pieces. Raises `CalibrationError` beyond `most_bytes`."""
+    # Reading by blocks, fsspec requests ranges, which some web servers do not support.
     options = {"block_size": 0} if "http" in system.protocol else {}
     size = 0
     with system.open(where, "rb", **options) as file:
@@ -184,10 +184,10 @@ def _pieces(system: Any, where: str, most_bytes: int, address: str) -> Iterator[
 
 
 def _copy_artefacts(system: Any, there: str, here: Path) -> None:
-    """Artefacts of one kind as they lie beside a remote recording: the one that the pointer names, else all of them.
+    """Copy artefacts of one kind from beside a remote recording: the one that the pointer names, or else all of them.
 
-    Each is named after its own hash, which is checked when it is read. Where folders cannot be listed, as on a plain
-    web server, a pointer names the one in use, or --calibration and --fit do.
+    Each is named after its own hash, which is checked when it is read. If folders cannot be listed, as on a plain web
+    server, the artefact in use must be named by a pointer, or by --calibration and --fit.
     """
     pointer = _read(system, f"{there}/{POINTER}", MAX_POINTER_BYTES)
     try:
@@ -197,7 +197,7 @@ def _copy_artefacts(system: Any, there: str, here: Path) -> None:
     kept = here / POINTER
     kept.unlink(missing_ok=True)
     for old in here.glob("*.json"):
-        old.unlink()  # copies of an earlier visit
+        old.unlink()  # copies from an earlier run
     for name in names[:MAX_ARTEFACTS]:
         data = _read(system, name, MAX_ARTEFACT_BYTES)
         if data is None:
@@ -211,7 +211,7 @@ def _copy_artefacts(system: Any, there: str, here: Path) -> None:
 
 
 def _read(system: Any, name: str, most_bytes: int) -> bytes | None:
-    """A remote file; None where there is none. Raises `CalibrationError` beyond so many bytes."""
+    """Read a remote file; None if it does not exist. Raises `CalibrationError` beyond `most_bytes`."""
     try:
         return b"".join(_pieces(system, name, most_bytes, name))
     except (FileNotFoundError, PermissionError):
@@ -223,7 +223,7 @@ def _read(system: Any, name: str, most_bytes: int) -> bytes | None:
 
 
 def _keep_age(system: Any, name: str, copy: Path) -> None:
-    """Keep the time of the last change, if the place has one: without a pointer the newest artefact is in use."""
+    """Copy the modification time, if there is one: without a pointer the newest artefact is in use."""
     try:
         at_s = float(system.modified(name).timestamp())
     except (AttributeError, NotImplementedError, OSError, ValueError, TypeError, KeyError):

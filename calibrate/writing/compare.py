@@ -1,4 +1,4 @@
-"""A session of written characters and the plan that it was drawn from, from the recording to the scores."""
+"""Compare a session of written characters with its plan, from the recording to the scores."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from sessions.reader import Capture, Recording
 from sessions.recording.schemas import Header
 
 SPECK_SHARE = 0.002
-"""A dot of a dense character is smaller against its longest stroke than a drop against a press."""
+"""Lower than for a press: relative to its longest stroke, a character's dot is smaller than a drop is to a press."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +48,9 @@ class WritingComparison:
 
 
 def compare_written(session: Path, plan: PlanRecord, references: dict[str, tuple[str, Image]]) -> WritingComparison:
-    """Compare a session with its plan. `references` (character -> name, image) stand for the plan's own.
+    """Compare a session with its plan. `references` (character -> name, image) replace those of the plan.
 
-    Raises `CalibrationError` where the two do not belong together or nothing can be compared.
+    Raises `CalibrationError` if the two do not belong together or nothing can be compared.
     """
     recording = Recording(session)
     digest = recording.sha256
@@ -65,7 +65,7 @@ def compare_written(session: Path, plan: PlanRecord, references: dict[str, tuple
     characters = [_character(figure, found, cut, references) for figure in plan.figures if figure.name in found]
     if not characters:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
-        raise CalibrationError(str(recording.path), f"not one character can be compared{why}")
+        raise CalibrationError(str(recording.path), f"no character can be compared{why}")
     scores = [score for one in characters for score in score_character(one)]
     header = recording.header
     table = table_3(
@@ -92,7 +92,7 @@ def _writings(
         stroke_id = capture.stroke.stroke_id
         name = stroke_id.rsplit("-r", 1)[0]
         if capture.stroke.kind != "drag" or plan.figure(name) is None:
-            refused.append((stroke_id, "is no character of this plan"))
+            refused.append((stroke_id, "is not a character of this plan"))
             continue
         try:
             ink, is_cut = captured(capture, calibration)
@@ -114,7 +114,7 @@ def _character(
 
 
 def _check_points(recording: Recording, plan: PlanRecord) -> None:
-    """The session's protocol must have drawn what the plan has planned."""
+    """Check that the session's protocol drew the plan. Raises `CalibrationError` otherwise."""
     try:
         protocol: Any = json.loads(recording.header.protocol)
         points = {f["name"]: points_digest([s["points"] for s in f["strokes"]]) for f in protocol["figures"]}
@@ -130,13 +130,13 @@ def _check_points(recording: Recording, plan: PlanRecord) -> None:
 
 
 def captured(capture: Capture, calibration: Calibration) -> tuple[Ink, bool]:
-    """The ink on the character's paper cell, and whether it reaches the edge. Raises `CaptureRefused`."""
+    """Return the ink on the character's paper cell, and whether it reaches the edge. Raises `CaptureRefused`."""
     stroke = capture.stroke
     if stroke.cell_mm is None:
         raise CaptureRefused(stroke.stroke_id, "has no paper cell")
     _, _, width_mm, height_mm = stroke.cell_mm
     if not math.isclose(width_mm, height_mm):
-        raise CaptureRefused(stroke.stroke_id, f"its cell is {width_mm:g} x {height_mm:g} mm, a square is needed")
+        raise CaptureRefused(stroke.stroke_id, f"its cell is {width_mm:g} x {height_mm:g} mm, but must be square")
     raster = rectify_by(capture.image(), calibration, stroke.cell_mm, capture.where)
     prepared = _whole_cell(raster, capture.where, calibration, math.hypot(width_mm, height_mm))
     return {Tone.BINARY: _small(prepared.mask.astype(np.float32)), Tone.GRAY: _small(prepared.soft)}, prepared.cut
@@ -147,13 +147,13 @@ def _small(image: Image) -> Image:
 
 
 def _whole_cell(raster: np.ndarray, where: str, calibration: Calibration, reach_mm: float) -> Prepared:
-    """All ink of the cell is the character's, however far its strokes lie apart."""
+    """Prepare a whole cell: all its ink belongs to the character, however far apart the strokes are."""
     params = calibration.preprocess | {"join_mm": reach_mm, "speck_share": SPECK_SHARE}
     return prepare(raster.astype(np.uint8), None, where, Params(**params))
 
 
 def read_reference(path: Path) -> Image:
-    """(128, 128) ink of a picture of a character, dark on light, padded to a square. Raises `CalibrationError`."""
+    """Read (128, 128) ink from a picture of a dark character on light, padded to square. Raises `CalibrationError`."""
     gray = read_gray(path)
     ink = 1.0 - gray.astype(np.float32) / 255.0
     if float(ink.mean()) > 0.5:
@@ -166,5 +166,5 @@ def read_reference(path: Path) -> Image:
 
 
 def as_ink(image: Image) -> Ink:
-    """The ink of an image that was not photographed: as dark as covered."""
+    """Make ink from an image that was not photographed: its darkness is its coverage."""
     return dict.fromkeys(Tone, image)

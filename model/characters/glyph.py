@@ -1,7 +1,7 @@
-"""A character as hanzi-writer and makemeahanzi give it: an outline and a median for each stroke. Parsing, no files.
+"""Parse a character of hanzi-writer or makemeahanzi: an outline and a median for each stroke. Reads no files.
 
-Font units: 1024 to the side, x to the right, y upward from -124 at the foot to 900 at the head. Whoever wrote the data
-is not trusted: sizes are bounded, and what is wrong is one line.
+Font units: 1024 per side, x to the right, y upward from -124 at the bottom to 900 at the top. The data is not trusted:
+sizes are bounded, and an error is one line.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _TAKES = {"M": 2, "L": 2, "Q": 4, "C": 6, "Z": 0}
 
 
 class GlyphError(ValueError):
-    """Data that is no character; `field` says where, `what` what is wrong there."""
+    """Data that is not a character; `field` says where, `what` says what is wrong there."""
 
     def __init__(self, field: str, what: str) -> None:
         super().__init__(f"{field}: {what}" if field else what)
@@ -36,7 +36,7 @@ class GlyphError(ValueError):
 @dataclass(frozen=True, slots=True)
 class GlyphStroke:
     """One stroke in font units: `arcs` (K, 3, 2), the outline as a closed loop of parabolas, counter-clockwise, and
-    `median` (N, 2), where the brush goes."""
+    `median` (N, 2), the path of the brush."""
 
     arcs: Floats
     median: Floats
@@ -57,10 +57,10 @@ class Glyph:
 
 
 def parse_glyph(text: str, name: str) -> Glyph:
-    """A character out of `{"strokes": [path, ...], "medians": [[[x, y], ...], ...]}`; raises GlyphError."""
+    """Parse a character from `{"strokes": [path, ...], "medians": [[[x, y], ...], ...]}`; raises GlyphError."""
     data = json_of(text, MAX_CHARS)
     if not isinstance(data, dict):
-        raise GlyphError("", "is no JSON object")
+        raise GlyphError("", "is not a JSON object")
     table = cast("dict[str, Any]", data)
     paths, medians = (_list(table, key, 1, MAX_STROKES) for key in ("strokes", "medians"))
     if len(paths) != len(medians):
@@ -68,13 +68,13 @@ def parse_glyph(text: str, name: str) -> Glyph:
     strokes: list[GlyphStroke] = []
     for k, (path, median) in enumerate(zip(paths, medians, strict=True)):
         if not isinstance(path, str):
-            raise GlyphError(f"strokes.{k}", "is no text")
+            raise GlyphError(f"strokes.{k}", "is not text")
         strokes.append(GlyphStroke(parse_path(path, f"strokes.{k}"), _median(median, f"medians.{k}")))
     return Glyph(name, tuple(strokes))
 
 
 def json_of(text: str, most_chars: int) -> Any:
-    """What a JSON text of at most so many characters holds; raises GlyphError."""
+    """Decode a JSON text of at most `most_chars` characters; raises GlyphError."""
     if len(text) > most_chars:
         raise GlyphError("", f"is longer than {most_chars} characters")
     try:
@@ -84,14 +84,14 @@ def json_of(text: str, most_chars: int) -> Any:
 
 
 def parse_path(path: str, field: str) -> Floats:
-    """The arcs (K, 3, 2) of a closed SVG path of M, L, Q, C and Z, all absolute; raises GlyphError."""
+    """Parse a closed SVG path of absolute M, L, Q, C and Z into arcs (K, 3, 2); raises GlyphError."""
     arcs: list[Floats] = []
     at = begin = np.zeros(2)
     for letter, numbers in _commands(path, field):
         points = np.array(numbers, np.float64).reshape(-1, 2)
         if letter == "M":
             if arcs:
-                raise GlyphError(field, "holds more than one loop")
+                raise GlyphError(field, "has more than one loop")
             at = begin = points[0]
             continue
         if letter == "Z":
@@ -127,7 +127,7 @@ def _commands(path: str, field: str) -> list[tuple[str, list[float]]]:
     while at < len(path):
         token = _TOKEN.match(path, at)
         if token is None:
-            raise GlyphError(field, f"is no path at character {at + 1}: {path[at : at + 12]!r}")
+            raise GlyphError(field, f"is not a path at character {at + 1}: {path[at : at + 12]!r}")
         at = token.end()
         if token[1] is not None:
             if numbers:
@@ -154,7 +154,7 @@ def _commands(path: str, field: str) -> list[tuple[str, list[float]]]:
 
 
 def _cubic(nodes: Floats) -> list[Floats]:
-    """A cubic curve as parabolas through three points of it each."""
+    """Approximate a cubic curve by parabolas, each through three of its points."""
     t = np.linspace(0, 1, 2 * _CUBIC_PIECES + 1)[:, None]
     p, q, r, s = nodes
     on = (1 - t) ** 3 * p + 3 * t * (1 - t) ** 2 * q + 3 * t**2 * (1 - t) * r + t**3 * s

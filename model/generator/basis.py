@@ -1,11 +1,11 @@
-"""The field basis: an interpolator fitted by least squares, offered beside the network and not one itself.
+"""The field basis: an interpolator fitted by least squares, an alternative to the network.
 
-A field is expanded in products of Chebyshev polynomials of the inputs, one image of numbers for each product, and
-the coverage is clamp(1/2 + field, 0, 1) as in the network. Nothing is learned by descent: samples are taken at the
+A field is expanded in products of Chebyshev polynomials of the inputs, with one image of coefficients per product;
+the coverage is clamp(1/2 + field, 0, 1) as in the network. The fit uses no gradient descent: samples are taken at the
 zeros of Chebyshev polynomials, where a fit of that degree is best conditioned; the first field is the signed distance
-to the stroke; then the residual of the coverage is fitted and added, again and again. Each such step lowers a convex
-bound of the misfit (see `model.generator.network`). The number of terms is the product over the inputs, so this
-is for one to three inputs; a network is for more.
+to the stroke; then the residual of the coverage is fitted and added repeatedly. Each such step lowers a convex bound
+of the misfit (see `model.generator.network`). The number of terms is the product over the inputs, so this suits one
+to three inputs; use a network for more.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from model.generator.targets import Target
 from model.protocol import ParameterSpec
 
 MAX_TERMS = 512
-_POINTS = 256  # on an outline, for the distance to it
+_POINTS = 256  # points on an outline, to compute the distance to it
 
 
 class FieldBasis(nn.Module):
-    """(B, P) inputs in their own units to (B, N, N) coverage; `coefficients` (terms, N, N)."""
+    """Map (B, P) inputs in their own units to (B, N, N) coverage; `coefficients` (terms, N, N)."""
 
     coefficients: Tensor
 
@@ -49,7 +49,7 @@ class FieldBasis(nn.Module):
         return product
 
     def field(self, values: Tensor) -> Tensor:
-        """The field, about the signed distance in pixels, (B, N, N)."""
+        """The field, roughly the signed distance in pixels, (B, N, N)."""
         return (self.terms(values) @ self.coefficients.flatten(1)).unflatten(1, self.coefficients.shape[1:])
 
     def forward(self, values: Tensor) -> Tensor:
@@ -60,14 +60,14 @@ class FieldBasis(nn.Module):
 def fit_basis(target: Target, degrees: Sequence[int] = (7, 2), samples: int = 768, rounds: int = 45) -> FieldBasis:
     """Fit the basis to a target; deterministic, without random numbers.
 
-    Raises ValueError where there are not as many degrees as inputs, or too many terms, and DomainError where the
-    target has no shape at a sample.
+    Raises ValueError if the number of degrees differs from that of inputs or there are too many terms, and
+    DomainError if the target has no shape at a sample.
     """
     basis = FieldBasis(target.inputs, degrees, target.size_px)
     start = _between(target, torch.cartesian_prod(*(nodes(degree + 1) for degree in degrees)).reshape(-1, len(degrees)))
     field = signed_distance(target, start)
     coefficients = torch.linalg.pinv(basis.terms(start).double()).float() @ field.flatten(1)
-    # The boundary passes several pixels between two nodes, so the polish needs more samples than the start.
+    # The boundary moves by several pixels between nodes, so refinement needs more samples than the start.
     spread = torch.quasirandom.SobolEngine(len(degrees)).draw(samples, dtype=torch.float64)
     inputs = _between(target, torch.cos(torch.pi * spread))
     wanted = target.images(inputs).flatten(1)
@@ -95,7 +95,7 @@ def signed_distance(target: Target, inputs: Tensor) -> Tensor:
     for place, tangent, length, image in zip(points, along, step[..., 0], target.images(inputs), strict=True):
         nearest = ((place**2).sum(-1) - 2 * (pixels @ place.T)).argmin(-1)
         offset = pixels - place[nearest]
-        # Beside a point the boundary runs on along its tangent.
+        # Near a point the boundary follows its tangent.
         run = (offset * tangent[nearest]).sum(-1)
         run = torch.minimum(run.abs(), 0.25 * length[nearest]) * run.sign()
         distance = torch.linalg.vector_norm(offset - run[:, None] * tangent[nearest], dim=-1)
@@ -104,7 +104,7 @@ def signed_distance(target: Target, inputs: Tensor) -> Tensor:
 
 
 def _between(target: Target, unit: Tensor) -> Tensor:
-    """Inputs at places in [-1, 1] of their ranges, (B, P)."""
+    """Map positions in [-1, 1] to inputs within their ranges, (B, P)."""
     low = torch.tensor([spec.low for spec in target.inputs], dtype=torch.float64)
     span = torch.tensor([spec.high - spec.low for spec in target.inputs], dtype=torch.float64)
     return (low + span * (unit + 1) / 2).float()

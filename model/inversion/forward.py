@@ -1,4 +1,4 @@
-"""Forward models of a fit: the normal equations of a batch of images at given parameters.
+"""Forward models of a fit, which give the normal equations of a batch of images at given parameters.
 
 Two kinds: outlines drawn by the exact raster with derivatives along the boundary (fast), and any differentiable
 renderer, such as a trained generator, with derivatives by `torch.func.jvp`.
@@ -36,21 +36,21 @@ class Normal:
     cost: Floats
     """r r, (B,)."""
     meat: Floats
-    """Sum over blocks of (J r)(J r)', (B, P, P): their covariance where only blocks are independent."""
+    """Sum over blocks of (J r)(J r)', (B, P, P): the covariance of J r if only blocks are independent."""
     cut: Floats
     """The most ink in a pixel on the target's edge, (B,)."""
 
 
 class Forward(Protocol):
-    """A model as the fit sees it."""
+    """Interface of a model to the fit."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The parameters in order, out of `PARAMETERS`."""
+        """Free parameters in order, a subset of `PARAMETERS`."""
         ...
 
     def of(self, images: Rows) -> Forward:
-        """Restrict the model, with what is known of each image, to these images of a batch."""
+        """Restrict the model, with the known values of each image, to these images of a batch."""
         ...
 
     def predict(self, values: Floats) -> Images:
@@ -64,11 +64,11 @@ class Forward(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Outlines:
-    """Outlines on the exact raster. Of the five parameters those in `names` are free; the others are `held` (B, 5), or
-    (1, 5) for all.
+    """Outlines on the exact raster. Of the five parameters, those in `names` are free; the others are fixed at `held`
+    (B, 5), or (1, 5) for all.
 
-    `anchored` says that x and y are the zero-touch point, which lies H tan(alpha) behind the stroke's origin: the press
-    tilts about the tip, then descends.
+    With `anchored`, x and y are the zero-touch point, which lies H tan(alpha) behind the stroke's origin: the brush
+    tilts about its tip, then descends.
     """
 
     jets: Jets
@@ -112,7 +112,7 @@ class Outlines:
         return out
 
     def _placed(self, values: Floats, *, derivatives: bool) -> tuple[Floats, Floats, Floats, Floats]:
-        """Outlines in pixels with the derivatives in the free parameters; see `model.raster.frame` for the map."""
+        """Outlines in pixels with derivatives with respect to the free parameters; `model.raster.frame` has the map."""
         full = np.repeat(self.held, len(values) // len(self.held), axis=0)
         full[:, [PARAMETERS.index(name) for name in self.names]] = values
         height, tilt, x, y, heading = full.T
@@ -125,7 +125,7 @@ class Outlines:
             velocities[:, 0, ..., 0] += np.tan(alpha)[:, None, None]
             velocities[:, 1, ..., 0] += (height * np.radians(1.0) / np.cos(alpha) ** 2)[:, None, None]
         c, s = np.cos(np.radians(heading)), np.sin(np.radians(heading))
-        # Row vectors: (x, y) of the stroke times this is (column, row), in pixels.
+        # For row vectors: (x, y) of the stroke times this matrix is (column, row), in pixels.
         turn = np.array([[c, -s], [-s, -c]]).transpose(2, 0, 1) / self.px_mm
         drawn = np.einsum("bkpc,bcd->bkpd", points, turn)
         place = np.stack((x, y), axis=-1)[:, None, None] / self.px_mm
@@ -152,7 +152,7 @@ Render = Callable[[Tensor], Tensor]
 class Rendered:
     """Any differentiable renderer: (B, P) parameters to (B, N, N) images, such as a trained generator.
 
-    Its place is its own: what it draws must be aligned with the targets.
+    It chooses its own placement: its images must be aligned with the targets.
     """
 
     render: Render

@@ -1,10 +1,10 @@
 """Compiled sums of the inversion: the moments of images, and the normal equations of outlines against images (numba).
 
 A pixel's coverage changes only where the boundary moves through it, by the flow of the boundary inside the pixel
-(Reynolds' transport theorem, as in `model.raster.exact`): dA = integral of (vy dx - vx dy). So a Jacobian has a few
-hundred rows that are not zero, and they are summed up piece by piece without ever making the images of derivatives.
+(Reynolds' transport theorem, as in `model.raster.exact`): dA = integral of (vy dx - vx dy). So a Jacobian has only a
+few hundred nonzero rows, which are summed piece by piece without ever making images of derivatives.
 
-Everything is in pixels: x is the column, y the row. Velocities are control points' derivatives in each parameter.
+Everything is in pixels: x is the column, y the row. Velocities are derivatives of control points by parameter.
 """
 
 import math
@@ -15,21 +15,21 @@ import numpy as np
 
 _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
 _compile = numba.njit(**_OPTIONS)
-# Without reference counts: views of arrays in inner loops would count up and down atomically, at half of the time.
+# No reference counting: views of arrays in inner loops would update counts atomically, half of the run time.
 _INNER: dict[str, Any] = {**_OPTIONS, "_nrt": False}
 _inner = numba.njit(**_INNER)
 _GAUSS = 0.5 / math.sqrt(3.0)
 _FAINT = 0.25
-_SORT_PX = 8.0  # a parabola is taken in stretches about so long, because their crossings have to be sorted
-_CUT_PX = 3.0  # an arc of an ellipse is cut into pieces about so long, at least eight
+_SORT_PX = 8.0  # length of the pieces of a parabola: their crossings have to be sorted
+_CUT_PX = 3.0  # length of the pieces of an arc of an ellipse, at least eight
 
 
 @_compile
 def moments(images, out):
     """Fill `out` (B, 10) with sums of image x^a y^b about the top left corner, pixel centres at halves.
 
-    Pixels fainter than a quarter count as blank: noise far from the mark would weigh more than the mark itself.
-    In the order 1, x, y, xx, xy, yy, xxx, xxy, xyy, yyy.
+    Pixels fainter than a quarter count as blank: noise far from the mark would outweigh the mark itself.
+    The order is 1, x, y, xx, xy, yy, xxx, xxy, xyy, yyy.
     """
     count, rows, columns = images.shape
     for n in range(count):
@@ -65,8 +65,8 @@ def normal_equations(
     """The sums over pixels of J J', J r and r r, and over square blocks of (sum J r)(sum J r)', r = target - predicted.
 
     points (B, K, 3, 2) and weights (B, K) of loops of conic arcs, velocities (B, P, K, 3, 2) and rates (B, P, K) their
-    derivatives; predicted and target (B, N, N); `block` the side of a block in pixels. Image n is held against
-    target[row[n]]. Fills hessian (B, P, P), gradient (B, P), cost (B,), meat (B, P, P); `cut` (B,) tells the largest
+    derivatives; predicted and target (B, N, N); `block` the side of a block in pixels. Image n is compared with
+    target[row[n]]. Fills hessian (B, P, P), gradient (B, P), cost (B,), meat (B, P, P); `cut` (B,) is the largest
     share of ink in a pixel on the target's edge.
     """
     size, p_count = predicted.shape[1], velocities.shape[1]
@@ -88,7 +88,7 @@ def _sums(
     points, weights, velocities, rates, predicted, target, block, row, hessian, gradient, cost, meat, cut,
     rows, touched, seen, times, blocks, v, on, moved, curve,
 ):  # fmt: skip
-    """The loop of `normal_equations`, with room for one image."""
+    """The loop of `normal_equations`, with work space for one image."""
     count, arcs = points.shape[0], points.shape[1]
     size, p_count = predicted.shape[1], velocities.shape[1]
     across = (size + block - 1) // block
@@ -143,7 +143,7 @@ def _sums(
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def _square_sum(a, b):
-    """The sum of squared differences, in whatever order is fastest."""
+    """The sum of squared differences, in unspecified order."""
     total = 0.0
     for k in range(len(a)):
         r = float(a[k]) - float(b[k])
@@ -153,7 +153,7 @@ def _square_sum(a, b):
 
 @_inner
 def _conic(q, w, velocity, rate, size, times, rows, touched, seen, used, on, moved, curve, v):
-    """An arc of an ellipse as parabolas through points at even angles, each with its velocities."""
+    """Add an arc of an ellipse as parabolas through points at equal angles, with their velocities."""
     p_count = velocity.shape[0]
     half_angle = math.acos(w)
     pieces = max(8, math.ceil(_length(q) / _CUT_PX))
@@ -183,13 +183,13 @@ def _conic(q, w, velocity, rate, size, times, rows, touched, seen, used, on, mov
 
 @_inner
 def _length(q):
-    """Of the polygon of an arc's control points."""
+    """Length of the polygon of an arc's control points."""
     return math.hypot(q[1, 0] - q[0, 0], q[1, 1] - q[0, 1]) + math.hypot(q[2, 0] - q[1, 0], q[2, 1] - q[1, 1])
 
 
 @_inner
 def _sort(part):
-    """By insertion: a piece meets few edges."""
+    """Sort by insertion: a piece crosses few edges."""
     for k in range(1, len(part)):
         t, m = part[k], k
         while m > 0 and part[m - 1] > t:
@@ -200,7 +200,7 @@ def _sort(part):
 
 @_inner
 def _piece(q, v, t0, t1, size, times, rows, touched, seen, used):
-    """Add the flow of a parabola between two t to the rows of the pixels it passes; returns how many are touched."""
+    """Add the flow of a parabola from t0 to t1 to the rows of the pixels it passes; return how many are touched."""
     x0, y0 = q[0, 0], q[0, 1]
     bx, by = 2.0 * (q[1, 0] - x0), 2.0 * (q[1, 1] - y0)
     ax, ay = x0 - 2.0 * q[1, 0] + q[2, 0], y0 - 2.0 * q[1, 1] + q[2, 1]
@@ -226,7 +226,7 @@ def _piece(q, v, t0, t1, size, times, rows, touched, seen, used):
             seen[at] = True
             touched[used] = at
             used += 1
-        # Two points integrate the cubic exactly.
+        # Two-point quadrature integrates the cubic exactly.
         for side in range(2):
             t = middle + (2 * side - 1) * _GAUSS * d
             dx, dy = 0.5 * d * (bx + 2.0 * ax * t), 0.5 * d * (by + 2.0 * ay * t)
@@ -241,7 +241,7 @@ def _piece(q, v, t0, t1, size, times, rows, touched, seen, used):
 
 @_inner
 def _crossings(start, slope, bend, t0, t1, size, times, count):
-    """Put every t in (t0, t1) at which a coordinate meets a pixel edge of the image into `times`."""
+    """Store every t in (t0, t1) at which a coordinate crosses a pixel edge of the image in `times`."""
     begin, end = start + (slope + bend * t0) * t0, start + (slope + bend * t1) * t1
     low, high = min(begin, end), max(begin, end)
     if bend != 0.0:
@@ -252,7 +252,7 @@ def _crossings(start, slope, bend, t0, t1, size, times, count):
     for edge in range(max(0, math.ceil(low)), min(size, math.floor(high)) + 1):
         rise = edge - start
         root = math.sqrt(max(0.0, slope * slope + 4.0 * bend * rise))
-        both = slope + (root if slope >= 0.0 else -root)  # never cancels
+        both = slope + (root if slope >= 0.0 else -root)  # no cancellation
         if both != 0.0:
             t = 2.0 * rise / both
             if t0 < t < t1:

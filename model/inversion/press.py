@@ -1,4 +1,4 @@
-"""`Inverter`: images of presses to depth H, tilt alpha and place, each with its interval and what to think of it."""
+"""`Inverter` recovers depth H, tilt alpha and place from images of presses, each with its interval and flags."""
 
 from __future__ import annotations
 
@@ -19,40 +19,40 @@ from model.raster.frame import PX_MM, SIZE_PX
 
 Floats = NDArray[np.float64]
 EDGE_INK = 0.3
-"""More ink than this in a pixel on the image's edge, and the mark may go on beyond it."""
+"""With more ink than this in a pixel on the image's edge, the mark may continue beyond it."""
 _STEP: dict[str, float] = dict(zip(PARAMETERS, (2.0, 4.0, 2.0, 2.0, 10.0), strict=True))
 _STILL: dict[str, float] = dict(zip(PARAMETERS, (1e-4, 1e-3, 1e-4, 1e-4, 1e-3), strict=True))
 _TABLE_DEPTHS, _TABLE_TILTS = 32, 7
 
 
 class Flag(StrEnum):
-    """What a reader of a recovered press has to know."""
+    """Warning about a recovered press."""
 
     ALPHA_UNKNOWN = "alpha_unknown"
-    """No zero-touch anchor: shape alone does not tell alpha, since 1 % error of R or lambda moves it by 4.4 deg."""
+    """No zero-touch anchor: shape does not determine alpha, since 1 % error of R or lambda moves it by 4.4 deg."""
     AT_BOUND = "at_bound"
-    """H, alpha or place lies on the edge of what was allowed; its interval holds for one side at most."""
+    """H, alpha or place lies at the limit of its range; its interval holds for one side at most."""
     DID_NOT_CONVERGE = "did_not_converge"
     CUT = "cut"
-    """The mark reaches the edge of the image: ink beyond it is not known."""
+    """The mark reaches the edge of the image; ink beyond it is unknown."""
     BLANK = "blank"
     """Too little ink to be a mark; the values are NaN."""
 
 
 class Known(StrEnum):
-    """What is known of a press's place."""
+    """What is known of the place of a press."""
 
     ANCHOR = "anchor"
-    """The zero-touch point, where the tip met the paper, and the heading: alpha moves the mark away from it."""
+    """The zero-touch point, where the tip first touches the paper, and the heading: alpha moves the mark off it."""
     ORIGIN = "origin"
-    """Where the brush axis meets the paper, and the heading. Of a simulation; no rig knows it without alpha."""
+    """Where the brush axis meets the paper, and the heading. Simulations only: a rig needs alpha to know it."""
     NOTHING = "nothing"
-    """Place and heading are fitted too."""
+    """Nothing: place and heading are fitted too."""
 
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """The depths and tilts that are looked for."""
+    """Range of depths and tilts to search."""
 
     height_mm: tuple[float, float] = (2.0, 30.0)
     tilt_deg: tuple[float, float] = (0.0, 30.0)
@@ -67,8 +67,9 @@ class Range:
 class Recovered:
     """B recovered presses. `values` (B, 5) are H, alpha, x, y, heading (`PARAMETERS`), mm and degrees.
 
-    `sigma` are standard deviations, 0 for what was known and NaN where the image does not tell; `covariance`
-    (B, P, P) is that of the fitted ones, `fitted`. x and y are the anchor's or the origin's place in the image.
+    `sigma` are standard deviations, 0 for known values and NaN where the image does not determine the value;
+    `covariance` (B, P, P) is that of the parameters in `fitted`. x and y are the position of the anchor or origin in
+    the image.
     """
 
     values: Floats
@@ -87,21 +88,21 @@ class Recovered:
 
     @property
     def tilt_deg(self) -> Floats:
-        """alpha, (B,). Read the flags before believing it."""
+        """alpha, (B,). Check the flags before using it."""
         return self.values[:, 1]
 
     def interval(self, name: str, z: float = 1.96) -> tuple[Floats, Floats]:
-        """Ends of the interval of a parameter, each (B,); z = 1.96 is 95 % of a normal distribution."""
+        """Ends of the interval of a parameter, (B,) each; z = 1.96 covers 95 % of a normal distribution."""
         k = PARAMETERS.index(name)
         return self.values[:, k] - z * self.sigma[:, k], self.values[:, k] + z * self.sigma[:, k]
 
 
 @dataclass(frozen=True, slots=True)
 class Inverter:
-    """Recovers presses from images of one model, raster and kind of knowledge. Made once, used for many batches.
+    """Recovers presses from images, for one model, raster and `Known`. Make it once and use it for many batches.
 
-    `anchor_sigma_mm` above 0 says how well the anchor is known, along either axis; its place is then fitted with that
-    as a prior. `tilt_deg`, where given, holds alpha there: what else to do without an anchor.
+    An `anchor_sigma_mm` above 0 is the anchor's standard deviation along either axis; its place is then fitted with
+    that prior. `tilt_deg`, if given, fixes alpha, which is recommended without an anchor.
     """
 
     jets: Jets
@@ -121,7 +122,7 @@ class Inverter:
         if self.tilt_deg is not None and not low <= self.tilt_deg <= high:
             raise ValueError(f"tilt_deg = {self.tilt_deg:g}: expected {low:g} to {high:g}")
         side = self.size_px * self.px_mm
-        # Twice the image at half the resolution: a mark is then never cut, wherever its origin lies.
+        # Twice the image size at half the resolution, so that no mark is cut, wherever its origin lies.
         place = (side, side)
         held = np.array([[0.0, 0.0, *place, 0.0]])
         coarse = Outlines(self.jets, PARAMETERS[:2], held, self.known is Known.ANCHOR, self.size_px, 2 * self.px_mm)
@@ -131,13 +132,13 @@ class Inverter:
 
     @classmethod
     def of_brush(cls, basis: Basis, **options: object) -> Inverter:
-        """For CCD-BSM of a brush, with derivatives in closed form."""
+        """Make an inverter for CCD-BSM of a brush, with derivatives in closed form."""
         radius, length = float(basis.brush.radius_mm), float(basis.brush.length_mm)
         return cls(analytic(radius, length, basis.lam), **options)  # pyright: ignore[reportArgumentType]
 
     @classmethod
     def of_model(cls, model: StrokeModel, **options: object) -> Inverter:
-        """For any stroke model, with derivatives by forward-mode differentiation."""
+        """Make an inverter for any stroke model, with derivatives by forward-mode differentiation."""
         return cls(of_model(model), **options)  # pyright: ignore[reportArgumentType]
 
     def __call__(
@@ -148,8 +149,8 @@ class Inverter:
     ) -> Recovered:
         """Recover the presses of (B, N, N) coverage images, ink = 1.
 
-        `place_mm` (2,) or (B, 2) is the known anchor or origin, as mm from the left and top edge; `heading_deg` the
-        known heading, 0 where left out. Raises ValueError for images of another size or values outside [0, 1].
+        `place_mm` (2,) or (B, 2) is the known anchor or origin, mm from the left and top edge; `heading_deg` is the
+        known heading, 0 by default. Raises ValueError for images of another size or values outside [0, 1].
         """
         target = self._checked(images)
         count = len(target)
@@ -167,7 +168,7 @@ class Inverter:
                         alpha_known=self.known is Known.ANCHOR, near_mm=self.px_mm)  # fmt: skip
 
     def assuming(self, tilt_deg: float) -> Inverter:
-        """The same with alpha held there."""
+        """Return this inverter with alpha fixed at `tilt_deg`."""
         return replace(self, tilt_deg=tilt_deg)
 
     def _checked(self, images: NDArray[np.floating]) -> Images:  # pyright: ignore[reportMissingTypeArgument]
@@ -186,7 +187,7 @@ class Inverter:
         return tuple(names)
 
     def _limits(self, names: tuple[str, ...]) -> Limits:
-        # Beyond the image on every side: an anchor may lie outside it.
+        # Beyond the image on every side, as an anchor may lie outside it.
         reach = (-self.size_px * self.px_mm, 2 * self.size_px * self.px_mm)
         box = {"height_mm": self.within.height_mm, "tilt_deg": self.within.tilt_deg}
         box |= {"x_mm": reach, "y_mm": reach, "heading_deg": (-720.0, 720.0)}
@@ -216,8 +217,8 @@ def invert_rendered(
 ) -> Recovered:
     """Recover (H, alpha) through any differentiable renderer, (B, 2) to (B, N, N), such as a trained generator.
 
-    The targets must be aligned as the renderer draws; `anchored` says that this alignment is on the zero-touch point.
-    The start is the nearest of a table that the renderer draws, by area, place and spread.
+    The targets must be aligned as the renderer draws; `anchored` means aligned on the zero-touch point. The fit starts
+    from the nearest image, by area, place and spread, of a table that the renderer draws.
     """
     target = np.ascontiguousarray(images, np.float32)
     seen = moments_of(target, px_mm)

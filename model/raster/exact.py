@@ -1,10 +1,10 @@
 """Exact area coverage of any outline at any heading and place, in plain torch on any device, differentiable.
 
-The outline is cut into parabolas shorter than a pixel, and each of these where it crosses pixel edges: what lies in
-one cell adds its area there and the rest of its height to the cells on its right, by a running sum along the row.
+The outline is cut into parabolas shorter than a pixel, and these are cut where they cross pixel edges. A piece within
+one cell adds its area to that cell and its full height to the cells on the right, by a running sum along the row.
 The derivative of a pixel's coverage is the flow of the boundary inside that pixel (Reynolds' transport theorem),
-dA = integral of (dx dy' - dy dx'), so gradients are polynomials that need no square root and no running sum; they
-are exact in first order, in reverse and in forward mode. Second derivatives are not offered.
+dA = integral of (dx dy' - dy dx'), so gradients are polynomials that need no square root and no running sum;
+first derivatives are exact, in reverse and forward mode. Second derivatives are not supported.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from torch.autograd import forward_ad
 from model.outline import Outline, Shape, evaluate
 from model.raster.frame import PX_MM, SIZE_PX, Place, check_raster, to_pixels
 
-_CHUNK = 16  # images at a time: some 2,500 pieces each, a dozen numbers a piece
-_LEAST_CUTS = 24  # an arc of an ellipse in at least so many parabolas: below 1e-6 of a pixel for any radius
+_CHUNK = 16  # images at a time: about 2,500 pieces each, a dozen numbers per piece
+_LEAST_CUTS = 24  # parabolas per arc of an ellipse: the error is below 1e-6 of a pixel for any radius
 
 
 def coverage_at(
@@ -39,7 +39,7 @@ def coverage_at(
     check_raster(size_px, px_mm)
     outline = shape.outline()
     kind = outline.points.dtype
-    # In double precision whatever the image's: a pixel's share is a small difference of places in the image.
+    # Always in double precision: the share of a pixel is a small difference of positions in the image.
     wide = kind if outline.points.device.type == "mps" else torch.float64
     m = to_pixels(origin_mm, heading_deg, px_mm, outline.weights.to(wide))[:, None, None]
     x, y = outline.points.to(wide).unbind(-1)
@@ -51,19 +51,19 @@ def coverage_at(
 
 
 def _draw(outline: Outline, size: int) -> Tensor:
-    """The coverage of outlines in pixels, (C, size, size)."""
+    """The coverage of outlines given in pixels, (C, size, size)."""
     x, y = _short(outline)
     still_x, still_y = x.detached(), y.detached()
     cuts = _cuts(still_x, still_y)
     low, high = cuts[..., :-1], cuts[..., 1:]
     middle = 0.5 * (low + high)
     column, row = still_x.at(middle).floor(), still_y.at(middle).floor()
-    # A margin cell on either side of each row and one row below take what lies outside the image.
+    # A margin cell on either side of each row and one row below collect what lies outside the image.
     row = torch.where((row >= 0) & (row < size), row, torch.full_like(row, size))
     cell = (row * (size + 2) + column.clamp(-1, size) + 1).long().flatten(1)
     drop = still_y.at(high) - still_y.at(low)
-    beyond = _integral(still_x, still_y, low, high) - column * drop  # what is for the cells to the right
-    # Left of the image a piece gives its whole drop to the first column; right of it, nothing to anyone.
+    beyond = _integral(still_x, still_y, low, high) - column * drop  # height for the cells to the right
+    # Left of the image, a piece adds its whole drop to the first column; right of the image, it adds nothing.
     beyond = torch.where(column < 0, drop, beyond)
     drop, beyond = (torch.where(column >= size, torch.zeros_like(drop), part).flatten(1) for part in (drop, beyond))
     empty = drop.new_zeros((len(drop), (size + 1) * (size + 2)))
@@ -88,7 +88,7 @@ def _wants_gradient(value: Tensor) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Polynomial:
-    """start + slope s + bend s^2 for s in [0, 1], one coordinate of short parabolas, each (C, N, 1)."""
+    """One coordinate of short parabolas, start + slope s + bend s^2 for s in [0, 1], each (C, N, 1)."""
 
     start: Tensor
     slope: Tensor
@@ -113,7 +113,7 @@ def _short(outline: Outline) -> tuple[_Polynomial, _Polynomial]:
     cuts = torch.where((w < 1).any(0), cuts.clamp(min=_LEAST_CUTS), cuts).long()
     arc = torch.repeat_interleave(torch.arange(len(cuts), device=cuts.device), cuts)
     step = torch.arange(len(arc), device=cuts.device) - (cuts.cumsum(0) - cuts)[arc]
-    # Equal angles rather than equal t: a parabola then follows the arc of an ellipse to the fourth order.
+    # Equal angles rather than equal t: parabolas then approximate an arc of an ellipse to fourth order.
     half_angle = torch.acos(w.clamp(max=1 - 1e-9))[:, arc]
     points, weights = points[:, arc], weights[:, arc]
     start, on, end = (
@@ -125,7 +125,7 @@ def _short(outline: Outline) -> tuple[_Polynomial, _Polynomial]:
 
 
 def _even(half_angle: Tensor, share: Tensor) -> Tensor:
-    """The t of a conic arc at a share of its angle: t : (1 - t) = sin(share u) : sin((1 - share) u)."""
+    """The t at which a conic arc reaches a share of its angle: t : (1 - t) = sin(share u) : sin((1 - share) u)."""
     before, after = torch.sin(share * half_angle), torch.sin((1 - share) * half_angle)
     return before / (before + after)
 
@@ -141,7 +141,7 @@ def _cuts(x: _Polynomial, y: _Polynomial) -> Tensor:
 
 
 def _crossings(p: _Polynomial) -> tuple[Tensor, Tensor]:
-    """The two s at which a short parabola meets the one pixel edge within its span; 0 where it does not."""
+    """The two s at which a short parabola crosses the only pixel edge within its span; 0 for no crossing."""
     end = p.start + p.slope + p.bend
     one = torch.ones_like(end)
     turn = -p.slope / torch.where(p.bend == 0, one, 2 * p.bend)
@@ -151,7 +151,7 @@ def _crossings(p: _Polynomial) -> tuple[Tensor, Tensor]:
     edge = top.floor()
     rise = edge - p.start
     root = (p.slope**2 + 4 * p.bend * rise).clamp(min=0).sqrt()
-    sum_ = p.slope + torch.where(p.slope < 0, -root, root)  # never cancels
+    sum_ = p.slope + torch.where(p.slope < 0, -root, root)  # no cancellation
     first = 2 * rise / torch.where(sum_ == 0, one, sum_)
     second = -sum_ / torch.where(p.bend == 0, one, 2 * p.bend)
     crosses = edge > bottom
@@ -161,7 +161,7 @@ def _crossings(p: _Polynomial) -> tuple[Tensor, Tensor]:
 def _integral(p: _Polynomial, q: _Polynomial, low: Tensor, high: Tensor) -> Tensor:
     """The integral of p dq over each cut, (C, N, 5)."""
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    # About the middle only even powers count: p = p0 + p1 u + p2 u^2, q' = q1 + 2 q2 u.
+    # Around the middle of a cut only even powers contribute: p = p0 + p1 u + p2 u^2, q' = q1 + 2 q2 u.
     p0, p1 = p.at(middle), p.slope + 2 * p.bend * middle
     q1 = q.slope + 2 * q.bend * middle
     return 2 * half * (p0 * q1 + half**2 / 3 * (p.bend * q1 + 2 * p1 * q.bend))

@@ -1,14 +1,15 @@
-"""Conic arcs to steps: the compiled rasteriser's way with marks that lie inside the image (numba).
+"""Cut conic arcs into steps: the compiled rasteriser's fast path for marks inside the image (numba).
 
 Everything is in pixels: x is the column, y the row. An arc is cut where it turns back in x or y and where it runs at
-45 degrees, so that along each piece one coordinate, u, grows by at least as much as the other, v. A step is what
-lies between two whole numbers of u: it passes at most two pixels, and meets at most one whole number of v between
-them. Both crossings are roots of quadratics, so all steps of a piece are one loop without branches, which compiles
-to vector instructions. Pieces that come down on the left in the mirror are mirrored in y first, so that u and v both
-grow. `model.raster.rows` turns steps into pixels.
+45 degrees, so that along each piece one coordinate, u, grows by at least as much as the other, v. A step is the part
+between two consecutive integers of u: it passes through at most two pixels and crosses at most one integer of v.
+Both crossings are roots of quadratics, so all steps of a piece are one loop without branches, which compiles to
+vector instructions. Pieces along which only one coordinate grows are mirrored in y first, so that u and v both grow.
+`model.raster.rows` turns steps into pixels.
 
-The area under a step is that of its chord and a segment. A parabola's segment is a cube (Archimedes); an ellipse's
-is (angle - sin angle) / 2 of its half axes' product, with the angle as a series in the sine, which is short.
+The area under a step is the area under its chord plus a segment. A parabola's segment is proportional to a cube
+(Archimedes); an ellipse's is (angle - sin angle) / 2 times the product of its half axes, with the angle as a short
+series in the sine.
 """
 
 import math
@@ -17,18 +18,18 @@ from typing import Any
 import numba
 import numpy as np
 
-TINY = 1e-300  # keeps 0 / 0 at a tangent from becoming NaN
-MOST_SINE = 0.35  # of the angle of a step on an ellipse; tighter curves are walked
-MOST_SEGMENT = 1e-8  # of a pixel: the part of a segment's series that is left out
-FALLEN = -1  # what is returned where a mark is not of this kind
-# Without reference counts: they are atomic, and cost twice as much as all that is computed here.
+TINY = 1e-300  # prevents NaN from 0 / 0 at a tangent
+MOST_SINE = 0.35  # largest sine of a step's angle on an ellipse; tighter curves go to `walk`
+MOST_SEGMENT = 1e-8  # largest error of a truncated segment series, in pixels
+FALLEN = -1  # returned for a mark that this path cannot draw
+# No reference counting: it is atomic, and costs twice as much as all computation here.
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}, "_nrt": False}
 inline = numba.njit(**OPTIONS, forceinline=True)
 
 
 @inline
 def parabola(x0, y0, x1, y1, x2, y2, size, work, used):
-    """Add the steps of a quadratic Bezier curve to `work`; returns how many there are so far."""
+    """Add the steps of a quadratic Bezier curve to `work`; return the number of steps so far."""
     cuts = work.cuts
     bx, by = x1 - x0, y1 - y0
     ax, ay = x2 - x1 - bx, y2 - y1 - by
@@ -53,14 +54,14 @@ def parabola(x0, y0, x1, y1, x2, y2, size, work, used):
 
 @inline
 def _turn(slope, bend):
-    """Where slope + bend t vanishes within (0, 1), else 1."""
+    """The t in (0, 1) at which slope + bend t is 0, or else 1."""
     t = -slope / bend if bend != 0.0 else 1.0
     return t if 0.0 < t < 1.0 else 1.0
 
 
 @inline
 def _sorted(a, b, c, d):
-    """Four numbers in order, without branches that could be guessed wrong."""
+    """Sort four numbers without branches, which could be mispredicted."""
     a, b, c, d = min(a, b), max(a, b), min(c, d), max(c, d)
     a, c, b, d = min(a, c), max(a, c), min(b, d), max(b, d)
     return a, min(b, c), max(b, c), d
@@ -93,7 +94,7 @@ def ellipse(x0, y0, x1, y1, x2, y2, w, size, work, used):
 
 @inline
 def _extreme(e, f, w):
-    """The sine of the angle at which e cos + f sin is extreme, where the arc reaches it, else 1."""
+    """The sine of the angle at which e cos + f sin is extreme if the arc reaches it, or else 1."""
     r = 1 / math.sqrt(e * e + f * f + TINY)
     c, s = e * r, f * r
     if c < 0:
@@ -136,7 +137,7 @@ def _parabola_piece(x0, y0, x1, y1, x2, y2, size, work, used):
 
 @inline
 def _lattice(first, steep, mirrored, size):
-    """Where a piece's pixels lie in the flat image: start + along step + across v, and the second pixel of a step."""
+    """Index of a piece's pixels in the flat image: start + along step + across v, and the second pixel of a step."""
     down = -size if mirrored else size
     top = (size - 1) * size if mirrored else 0
     if steep:
@@ -233,7 +234,7 @@ def _ellipse_piece(x0, y0, x2, y2, cx, cy, ex, ey, fx, fy, size, work, used):
 
 @inline
 def _left_out(det, sine):
-    """What `_segment` leaves out of a segment at most."""
+    """Upper bound of the truncation error of `_segment`."""
     q = sine * sine
     return 0.01 * det * sine * q * q * q * q * q * q * q
 
@@ -292,9 +293,9 @@ def _ellipse_steps(
 
 @inline
 def _ends(count, first, us, ue, vs, ve, sign, mirrored, steep, size, work):
-    """Note for each row that a piece passes where the pixels begin that it leaves wholly on its right.
+    """Store, for each row that a piece passes, the first of the pixels that lie wholly to its right.
 
-    Rows passed from edge to edge go to `work.ends`, one list for either sign, the two others to `work.parts`.
+    Rows crossed from edge to edge go to `work.ends`, one list per sign; the first and last go to `work.parts`.
     """
     low = work.low
     ys, ye = (us, ue) if steep else (vs, ve)
@@ -306,7 +307,7 @@ def _ends(count, first, us, ue, vs, ve, sign, mirrored, steep, size, work):
         for p in range(count):
             edge[p] = low[p] + 2
     else:
-        # The last column of a row overwrites those before; a row that a step jumps over has its predecessor's.
+        # The last column of a row overwrites earlier ones; a row that a step skips takes its predecessor's.
         row = begin
         for p in range(count):
             r = low[p]

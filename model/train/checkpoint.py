@@ -1,8 +1,8 @@
 """Checkpoints and finished generators on disk: safetensors only, checked before anything is built from them.
 
-Such a file may come from anyone. safetensors holds numbers and strings, never code. Here besides: the size is
-bounded before reading, the configuration is validated, and names, shapes, types and finiteness of all tensors must
-be those of the network that the configuration describes.
+The files are not trusted. safetensors holds numbers and strings, never code. In addition, the size is bounded before
+reading, the configuration is validated, and all tensors must be finite and have the names, shapes and types of the
+network that the configuration describes.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from model.train.errors import TrainError
 CHECKPOINT, GENERATOR = "brushloop-checkpoint-1", "brushloop-generator-1"
 _MAX_FILE_BYTES = 3 * 4 * MAX_WEIGHTS + 2**26
 COLUMNS = ("step", "mse", "iou", "csim")
-"""Of the validation history."""
+"""Columns of the validation history."""
 
 
 @dataclass(slots=True, eq=False)
 class State:
-    """A training after `step` steps: weights and Adam's moments by parameter name, and what happened so far.
+    """A training after `step` steps: weights and Adam's moments by parameter name, and the history so far.
 
     `losses` (step,) is Eq. 6 of every step, `validations` (k, 4) the columns of COLUMNS.
     """
@@ -46,7 +46,7 @@ class State:
 
 
 def save_checkpoint(path: Path, config: TrainConfig, state: State) -> None:
-    """Write a checkpoint so that a reader, or the next process after a kill, sees the old one or the new one."""
+    """Write a checkpoint atomically: a reader, or the next process after a kill, sees the old or the new one."""
     tensors = {f"weights.{name}": value for name, value in state.weights.items()}
     for name, (first, second) in state.moments.items():
         tensors |= {f"adam.{name}.first": first, f"adam.{name}.second": second}
@@ -55,7 +55,7 @@ def save_checkpoint(path: Path, config: TrainConfig, state: State) -> None:
 
 
 def load_checkpoint(path: Path) -> tuple[TrainConfig, State]:
-    """Read a checkpoint back. Raises TrainError for a file that is not exactly one."""
+    """Read a checkpoint. Raises TrainError for anything but a valid checkpoint."""
     config, metadata, tensors = _read(path, CHECKPOINT)
     step = _whole(path, metadata, "step", config.steps)
     names = {name: value.shape for name, value in _skeleton(config).named_parameters()}
@@ -66,7 +66,7 @@ def load_checkpoint(path: Path) -> tuple[TrainConfig, State]:
     if losses is None or losses.shape != (step,) or losses.dtype != torch.float32:
         raise TrainError(path, f"history.losses is not {step} float32 numbers")
     if validations is None or validations.ndim != 2 or validations.shape[1] != len(COLUMNS):
-        raise TrainError(path, f"history.validations has not the columns {', '.join(COLUMNS)}")
+        raise TrainError(path, f"history.validations does not have the columns {', '.join(COLUMNS)}")
     if validations.dtype != torch.float64 or len(validations) > step + 1:
         raise TrainError(path, "history.validations is too long or not float64")
     weights = {name: tensors[f"weights.{name}"] for name in names}
@@ -81,7 +81,7 @@ def save_generator(path: Path, config: TrainConfig, weights: dict[str, Tensor], 
 
 
 def load_weights(path: Path) -> tuple[TrainConfig, Generator, dict[str, Any]]:
-    """A finished generator as (configuration, network in eval mode, report). Raises TrainError."""
+    """Load a finished generator as (configuration, network in eval mode, report). Raises TrainError."""
     config, metadata, tensors = _read(path, GENERATOR)
     network = config.build_network().eval()
     _match(path, tensors, {f"weights.{name}": value.shape for name, value in network.named_parameters()})
@@ -89,16 +89,16 @@ def load_weights(path: Path) -> tuple[TrainConfig, Generator, dict[str, Any]]:
     try:
         report = json.loads(metadata.get("report", "{}"))
     except (ValueError, RecursionError) as error:
-        raise TrainError(path, "report is no JSON") from error
+        raise TrainError(path, "report is not JSON") from error
     if not isinstance(report, dict):
-        raise TrainError(path, "report is no table")
+        raise TrainError(path, "report is not a table")
     return config, network, report
 
 
 def load_generator(path: Path | str, brush: Brush | None = None) -> GeneratorModel:
-    """The stroke model that `generator.safetensors` holds, for the brush it was trained with or for another.
+    """Load `generator.safetensors` as a stroke model, for the brush it was trained with or for another.
 
-    Raises TrainError for a file that cannot be used, and for another brush where R and L are no inputs of it.
+    Raises TrainError for a file that cannot be used, and for another brush if R and L are not inputs of the generator.
     """
     config, network, _ = load_weights(Path(path))
     if brush is not None:
@@ -113,14 +113,14 @@ def load_generator(path: Path | str, brush: Brush | None = None) -> GeneratorMod
 
 
 def put_weights(network: Generator, weights: dict[str, Tensor]) -> None:
-    """Copy weights by name into a network; layouts and devices stay the network's."""
+    """Copy weights by name into a network, keeping the network's layouts and devices."""
     with torch.no_grad():
         for name, parameter in network.named_parameters():
             parameter.copy_(weights[name])
 
 
 def sha256(path: Path) -> str:
-    """The content hash of a file. Raises TrainError where it cannot be read."""
+    """SHA-256 of a file's content. Raises TrainError if it cannot be read."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -134,7 +134,7 @@ def _write(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> 
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write beside, flush to the disk, then rename: also after a kill there is the old file or the new one."""
+    """Write a temporary file, flush it to disk and rename it: after a kill there is the old file or the new one."""
     part = path.with_name(path.name + ".part")
     try:
         with part.open("wb") as file:
@@ -153,7 +153,7 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def read_tensors(path: Path, most_bytes: int) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Metadata and tensors of a safetensors file of bounded size. Raises TrainError."""
+    """Read metadata and tensors of a safetensors file of at most `most_bytes`. Raises TrainError."""
     try:
         size = path.stat().st_size
     except OSError as error:
@@ -161,7 +161,7 @@ def read_tensors(path: Path, most_bytes: int) -> tuple[dict[str, str], dict[str,
             path, "no such file" if isinstance(error, FileNotFoundError) else str(error.strerror)
         ) from error
     if not path.is_file():
-        raise TrainError(path, "is no file")
+        raise TrainError(path, "is not a file")
     if size > most_bytes:
         raise TrainError(path, f"holds {size:,} bytes; at most {most_bytes:,} are read")
     try:
@@ -169,7 +169,7 @@ def read_tensors(path: Path, most_bytes: int) -> tuple[dict[str, str], dict[str,
             untyped: Any = file
             return dict(untyped.metadata() or {}), {name: untyped.get_tensor(name) for name in untyped.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError, RuntimeError) as error:
-        raise TrainError(path, f"is no safetensors file: {str(error).splitlines()[0][:200]}") from error
+        raise TrainError(path, f"is not a safetensors file: {str(error).splitlines()[0][:200]}") from error
 
 
 def _read(path: Path, kind: str) -> tuple[TrainConfig, dict[str, str], dict[str, Tensor]]:
@@ -182,12 +182,12 @@ def _read(path: Path, kind: str) -> tuple[TrainConfig, dict[str, str], dict[str,
     try:
         fields = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise TrainError(path, "config is no JSON") from error
+        raise TrainError(path, "config is not JSON") from error
     return checked(path, fields), metadata, tensors
 
 
 def _skeleton(config: TrainConfig) -> Generator:
-    """The network without numbers: names and shapes only."""
+    """Make the network without values: names and shapes only."""
     inputs, layers = config.build_target().inputs, config.build_layers()
     with torch.device("meta"):
         return Generator(inputs, layers)
@@ -208,5 +208,5 @@ def _match(path: Path, tensors: dict[str, Tensor], wanted: dict[str, torch.Size]
 def _whole(path: Path, metadata: dict[str, str], name: str, most: int) -> int:
     text = metadata.get(name, "")
     if not text.isascii() or not text.isdigit() or len(text) > 9 or int(text) > most:
-        raise TrainError(path, f"{name} = {text[:40]!r} is no number from 0 to {most}")
+        raise TrainError(path, f"{name} = {text[:40]!r} is not a number from 0 to {most}")
     return int(text)

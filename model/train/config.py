@@ -1,4 +1,4 @@
-"""Configuration of a training, as a TOML file: frozen, validated, and stored in every checkpoint."""
+"""Configuration of a training, read from TOML: frozen, validated, and stored in every checkpoint."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class _Frozen(BaseModel):
 
 
 class LayerConfig(_Frozen):
-    """Sizes of the network; see `model.generator.network.Layers`."""
+    """Network sizes; see `model.generator.network.Layers`."""
 
     degree: Annotated[int, Field(ge=1, le=16)] = 4
     width: Annotated[int, Field(ge=1, le=2048)] = 256
@@ -37,14 +37,14 @@ class LayerConfig(_Frozen):
 
 
 class TargetConfig(_Frozen):
-    """Strokes that are drawn; see `model.generator.targets.Target`."""
+    """Strokes to draw; see `model.generator.targets.Target`."""
 
     model: Annotated[str, Field(max_length=64)] = "ccd-bsm"
     radius_mm: Annotated[float, Field(gt=0, le=100)] = 6.0
     length_mm: Annotated[float, Field(gt=0, le=400)] = 48.0
     lam: Annotated[float, Field(gt=0, le=10)] = math.pi
     fitted_brush: bool = False
-    """Whether lambda or the brush were fitted to captures; every report then says so."""
+    """Whether lambda or the brush was fitted to captures; if so, every report says it."""
     ranges: Annotated[dict[str, Range], Field(min_length=1, max_length=16)]
     fixed: Annotated[dict[str, float], Field(max_length=16)] = {}
     placement: Placement = Placement.CENTRED
@@ -53,14 +53,14 @@ class TargetConfig(_Frozen):
 
 
 class TuningConfig(_Frozen):
-    """Fine-tuning on captured strokes: what it started from and what it learned from, by content."""
+    """Fine-tuning on captured strokes: the initial generator and the captures, by content hash."""
 
     start_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     captures_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     source: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\r\n]*$")]
-    """Origin of the captured ink, as `loopback rig`."""
+    """Origin of the captured ink, for example `loopback rig`."""
     held_out: Annotated[float, Field(gt=0, lt=1)] = 0.2
-    """The share of captures that is validated on and never learned from."""
+    """Share of captures used only for validation, never for training."""
 
 
 class TrainConfig(_Frozen):
@@ -72,7 +72,7 @@ class TrainConfig(_Frozen):
     training_images: Annotated[int, Field(ge=1, le=1_000_000)] = 20_000
     validation_images: Annotated[int, Field(ge=1, le=1_000_000)] = 2_000
     batch: Annotated[int, Field(ge=1, le=4_096)] = 64
-    """Images a step, over all processes."""
+    """Images per step, over all processes."""
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 6_000
     """G of Algorithm 1."""
     picture_every: Annotated[int, Field(ge=1)] = 1_000
@@ -80,20 +80,20 @@ class TrainConfig(_Frozen):
     validate_every: Annotated[int, Field(ge=1)] = 250
     checkpoint_every: Annotated[int, Field(ge=1)] = 250
     learning_rate: Annotated[float, Field(gt=0, le=1)] = 5e-3
-    """At its highest: it rises over `warmup_steps`, then falls to 0 at the last step along half a cosine."""
+    """Peak: the rate rises over `warmup_steps`, then falls along half a cosine to 0 at the last step."""
     warmup_steps: Annotated[int, Field(ge=0)] = 50
     ink_weight: Annotated[float, Field(ge=1, le=1000)] = 1.0
-    """w of Eq. 6 where the target is ink; 1 where it is paper."""
+    """w of Eq. 6 where the target is ink; w is 1 where it is paper."""
     target_mse: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Converged when the validation MSE is at most this; 0 never."""
+    """Converged when the validation MSE is at most this; 0 disables."""
     patience: Annotated[int, Field(ge=0)] = 0
-    """Converged when so many validations in a row brought no gain of 1 %; 0 never."""
+    """Converged after this many validations in a row without a gain of 1 %; 0 disables."""
     blank_after: Annotated[int, Field(ge=1)] = 2
-    """Validations in a row with blank output that end the training."""
+    """Number of validations in a row with blank output that ends the training."""
     tuning: TuningConfig | None = None
     """Origin of weights and images when training on captures."""
     threads: Annotated[int, Field(ge=1, le=256)] = 1
-    """Threads of torch in each process; another number changes the last bits of the weights."""
+    """Threads of torch in each process; a different number changes the last bits of the weights."""
     device: Literal["cpu", "cuda"] = "cpu"
 
     @model_validator(mode="after")
@@ -114,7 +114,7 @@ class TrainConfig(_Frozen):
         return fully + sum((9 * a + 1) * b for a, b in pairwise(planes))
 
     def build_target(self) -> Target:
-        """The target; ValueError where it makes no sense."""
+        """Build the target. Raises ValueError if the fields are inconsistent."""
         t = self.target
         try:
             basis = stroke_model(t.model, Brush(t.radius_mm, t.length_mm), t.lam, fitted=t.fitted_brush)
@@ -126,7 +126,7 @@ class TrainConfig(_Frozen):
         return Target(basis, t.ranges, fixed, t.placement, t.px_mm, t.size_px)
 
     def build_network(self) -> Generator:
-        """The network with the weights of `seed`; the state of torch's generator is left as it was."""
+        """Build the network with the weights of `seed`, leaving the state of torch's random generator unchanged."""
         import torch
 
         with torch.random.fork_rng(devices=[]):
@@ -134,12 +134,12 @@ class TrainConfig(_Frozen):
             return Generator(self.build_target().inputs, self.build_layers())
 
     def build_layers(self) -> Layers:
-        """Sizes for the network."""
+        """Build the network sizes."""
         return Layers(**self.layers.model_dump(), size_px=self.target.size_px)
 
 
 def preset(name: str, **changes: Any) -> TrainConfig:
-    """The configuration of a preset, with fields changed. Raises TrainError for an unknown name or a bad field."""
+    """Make the configuration of a preset with fields changed. Raises TrainError for an unknown name or bad field."""
     if name not in PRESETS:
         raise TrainError(name, f"no such target; known: {', '.join(PRESETS)}")
     chosen = PRESETS[name]
@@ -155,7 +155,7 @@ def preset(name: str, **changes: Any) -> TrainConfig:
 
 
 def load_config(path: Path) -> TrainConfig:
-    """Read a TOML file; raises TrainError with file, field and what is allowed."""
+    """Read a TOML file. Raises TrainError with file, field and allowed values."""
     try:
         data = path.read_bytes()[: MAX_BYTES + 1]
     except OSError as error:
@@ -165,11 +165,11 @@ def load_config(path: Path) -> TrainConfig:
     try:
         return checked(path, tomllib.loads(data.decode("utf-8")))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise TrainError(path, f"is no TOML: {error}") from error
+        raise TrainError(path, f"is not TOML: {error}") from error
 
 
 def checked(where: Path | str, fields: Any) -> TrainConfig:
-    """A configuration from plain data; raises TrainError that names the first bad field."""
+    """Make a configuration from plain data. Raises TrainError that names the first bad field."""
     try:
         return TrainConfig.model_validate(fields)
     except ValidationError as error:
@@ -180,7 +180,7 @@ def checked(where: Path | str, fields: Any) -> TrainConfig:
 
 
 def differences(old: TrainConfig, new: TrainConfig) -> list[str]:
-    """Differences between two configurations, as `field: old -> new`."""
+    """List differences between two configurations as `field: old -> new`."""
     found: list[str] = []
 
     def walk(a: Any, b: Any, path: str) -> None:

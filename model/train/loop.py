@@ -1,4 +1,4 @@
-"""Algorithm 1 of the paper: draw H and alpha, draw the stroke, compare, update, until converged or G steps are done."""
+"""Algorithm 1 of the paper: sample H and alpha, draw the stroke, compare, update, until convergence or G steps."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from model.train.distributed import Group
 from model.train.errors import BlankOutput, Diverged, TrainingStopped
 
 BLANK_SHARE = 0.05
-"""Less ink than this share of the targets' ink is blank; as little paper of their paper is full."""
+"""Output is blank if its ink, or its paper, is less than this share of the targets' ink or paper."""
 _GAIN = 0.99
 
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """The means over the validation set after `step` steps; ink shares are of all pixels."""
+    """Means over the validation set after `step` steps; ink shares are of all pixels."""
 
     step: int
     mse: float
@@ -52,7 +52,7 @@ class Watcher(Protocol):
         ...
 
     def pictures(self, step: int, inputs: Tensor, targets: Tensor, drawn: Tensor) -> None:
-        """Called every m steps with some validation strokes: targets and drawn images."""
+        """Called every m steps with the targets and drawn images of some validation strokes."""
         ...
 
     def checkpoint(self, state: State) -> None:
@@ -61,7 +61,7 @@ class Watcher(Protocol):
 
 
 def new_state(config: TrainConfig) -> State:
-    """State at step 0: the weights of the seed, and Adam without moments."""
+    """Make the state at step 0: the weights of the seed, and Adam without moments."""
     weights = {name: value.detach().clone() for name, value in config.build_network().named_parameters()}
     return State(weights, {name: (torch.zeros_like(v), torch.zeros_like(v)) for name, v in weights.items()})
 
@@ -74,11 +74,11 @@ def train(
     group: Group | None = None,
     stopping: Callable[[], bool] = lambda: False,
 ) -> State:
-    """Go on from `state` to the end; returns the last state, which also went to `watcher.checkpoint`.
+    """Train from `state` to the end; returns the last state, which is also passed to `watcher.checkpoint`.
 
-    Sets torch's threads to `config.threads`. One process gives the same bits however often it was cut and resumed;
-    several give the same sums per global batch up to rounding. Raises BlankOutput, Diverged, or TrainingStopped when
-    `stopping` says so: on several processes when any of them does.
+    Sets torch's threads to `config.threads`. A single process gives the same bits however often it is interrupted and
+    resumed; several give the same sums per global batch up to rounding. Raises BlankOutput, Diverged, or
+    TrainingStopped when `stopping` returns true in any process.
     """
     group = group or Group()
     torch.set_num_threads(config.threads)
@@ -112,7 +112,7 @@ def train(
 
 
 def converged(config: TrainConfig, validations: list[list[float]]) -> bool:
-    """Whether the validations so far, rows of `checkpoint.COLUMNS`, meet the target or stopped gaining."""
+    """Whether the validations so far, rows of `checkpoint.COLUMNS`, meet the target or stopped improving."""
     errors = [row[1] for row in validations]
     if not errors:
         return False
@@ -125,13 +125,13 @@ def converged(config: TrainConfig, validations: list[list[float]]) -> bool:
 
 
 def learning_rate(config: TrainConfig, step: int) -> float:
-    """The rate of a step: rises evenly over the warm-up, and falls along half a cosine to the last step."""
+    """The rate of a step: rises linearly over the warm-up, then falls along half a cosine to the last step."""
     rise = min(1.0, (step + 1) / config.warmup_steps) if config.warmup_steps else 1.0
     return config.learning_rate * rise * 0.5 * (1 + math.cos(math.pi * step / config.steps))
 
 
 def validate(network: Generator, images: Images, group: Group, batch: int, step: int = 0) -> Validation:
-    """Means over the whole set, each process taking its share."""
+    """Compute means over the whole set; each process evaluates its share."""
     sums = torch.zeros(5, dtype=torch.float64)
     with torch.no_grad():
         for numbers in group.share(torch.arange(len(images))).split(batch):
@@ -162,7 +162,7 @@ class _Run:
     blanks: int = 0
 
     def step(self, step: int, stopping: bool) -> tuple[float, bool]:
-        """One update; returns Eq. 6 over the global batch and whether any process was asked to stop."""
+        """Make one update; return Eq. 6 over the global batch and whether any process was asked to stop."""
         config, training = self.config, self.sets[0]
         numbers = batch_numbers(len(training), config.batch, config.seed, step)
         inputs, target = (part.to(self.group.device) for part in training.pick(self.group.share(numbers)))
@@ -173,13 +173,13 @@ class _Run:
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         total, stop = self._summed(loss.detach(), stopping)
-        if math.isfinite(total):  # the last good weights stay
+        if math.isfinite(total):  # keep the last good weights
             self.optimiser.step()
             self.losses.append(total)
         return total, stop
 
     def _summed(self, loss: Tensor, stopping: bool) -> tuple[float, bool]:
-        """Add loss, wishes to stop and gradients over the group, in one message."""
+        """Sum loss, requests to stop and gradients over the group, in one message."""
         if self.group.world == 1:
             return float(loss), stopping
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
@@ -191,7 +191,7 @@ class _Run:
         return float(message[0]), bool(message[1] > 0)
 
     def validate(self, step: int) -> None:
-        """Validate, and raise BlankOutput when it was blank too often."""
+        """Validate, and raise BlankOutput if the output was blank too often."""
         found = validate(self.network, self.sets[1], self.group, self.config.batch, step)
         self.validations.append([float(step), found.mse, found.iou, found.csim])
         if self.group.first:

@@ -18,7 +18,7 @@ from model.train.errors import MissingExtra
 
 
 def write_curves(folder: Path, state: State, title: str) -> None:
-    """Write `loss.png`, and `loss.csv` and `validation.csv` with every number in it. Raises OSError."""
+    """Write `loss.png`, and its numbers as `loss.csv` and `validation.csv`. Raises OSError."""
     from matplotlib.figure import Figure
 
     losses = state.losses.double().numpy()
@@ -45,7 +45,7 @@ def write_curves(folder: Path, state: State, title: str) -> None:
 def write_pictures(
     path: Path, specs: tuple[ParameterSpec, ...], inputs: Tensor, targets: Tensor, drawn: Tensor
 ) -> None:
-    """Write targets above what the generator draws, a column a stroke, as PNG. Raises OSError."""
+    """Write a PNG of targets above generated images, one column per stroke. Raises OSError."""
     from matplotlib.figure import Figure
 
     count = len(inputs)
@@ -66,7 +66,7 @@ def write_pictures(
 
 
 class Events:
-    """TensorBoard's event files; steps after `step` of an earlier, killed run are hidden. Raises MissingExtra."""
+    """TensorBoard event files; steps that an earlier, killed run wrote after `step` are hidden. Raises MissingExtra."""
 
     def __init__(self, folder: Path, step: int) -> None:
         try:
@@ -77,7 +77,7 @@ class Events:
         self._writer: Any = untyped(log_dir=str(folder), purge_step=step)
 
     def scalar(self, name: str, value: float, step: int) -> None:
-        """Note one number."""
+        """Write one number."""
         self._writer.add_scalar(name, value, step)
 
     def __enter__(self) -> Events:
@@ -142,16 +142,18 @@ def card_text(path: Path, config: TrainConfig, report: dict[str, Any], checks: t
     lines += ["", "## Limits", ""]
     if tuning:
         lines += [
-            f"- Tuned on captures of: {_plain(tuning.source)}. Other captures of that kind are not blind.",
+            f"- Tuned on captures of: {_plain(tuning.source)}. Other captures of that kind are not a blind test.",
             f"- Started from a generator with sha256 `{tuning.start_sha256}`; captures `{tuning.captures_sha256}`.",
         ]
     else:
-        lines.append("- It has seen no real ink: it repeats a closed-form model, and is no better on paper than that.")
-    lines.append("- Outside the ranges above it extrapolates polynomials: do not ask it there.")
+        lines.append(
+            "- It has seen no real ink: it reproduces a closed-form model, and is no better on paper than that."
+        )
+    lines.append("- Outside the ranges above it extrapolates polynomials: do not use it there.")
     lines += [f"- {check}" for check in checks]
     return "\n".join(lines) + "\n"
 
 
 def _plain(text: str) -> str:
-    """Words from a file, without what Markdown or HTML would read."""
+    """Text from a file, without characters that Markdown or HTML would interpret."""
     return "".join(c if c.isalnum() or c in " .,-_()/:" else "?" for c in text)

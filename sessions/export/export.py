@@ -1,7 +1,7 @@
 """Export a recording for other tools: images with CSV tables, NumPy arrays, or Parquet.
 
-Every export is a folder, written beside its place and renamed when it is complete; nothing is written into a folder
-that holds anything. The images are the photographs as they were recorded, byte for byte.
+Every export is a folder, written under a temporary name and renamed when complete; a folder that is not empty is never
+written to. The images are the photographs as they were recorded, byte for byte.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def export(source: Path, out: Path, kind: str) -> Path:
         raise InputError("--format", f"{kind!r}, allowed: {', '.join(writers)}")
     recording = Recording(source)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(out, "exists and is not an empty folder; nothing is ever written over")
+        raise InputError(out, "exists and is not an empty folder; nothing is ever overwritten")
     if recording.strokes() == 0:
         raise InputError(recording.path, "holds no strokes to export")
     try:

@@ -20,7 +20,7 @@ _WHOLE = re.compile(rb'\{"t_ns":.*?,"crc":"[0-9a-f]{8}"\}', re.DOTALL)
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """Link to the line before: number of this line, its session, and the hash of what it follows."""
+    """Link to the preceding line: number of this line, its session, and the hash of what precedes it."""
 
     seq: int
     session: str
@@ -52,7 +52,7 @@ def with_crc(body: bytes) -> bytes:
 
 
 def digest(data: bytes) -> str:
-    """SHA-256 by which a chained line names what it follows."""
+    """SHA-256 of what precedes a chained line."""
     return hashlib.sha256(data).hexdigest()
 
 
@@ -61,7 +61,7 @@ class BadLine(Exception):
 
 
 def has_crc(raw: bytes) -> bool:
-    """Whether the line ends as one with a CRC does."""
+    """Whether the line ends with a CRC."""
     return _TAIL.search(raw) is not None
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 FLUSH_S = 0.25
 QUEUE_LIMIT = 20_000
-"""About 200 s of poses: more means that the disk does not keep up, which is an error."""
+"""Queue size, about 200 s of poses: a full queue means that the disk does not keep up, which is an error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Outgoing:
 class SegmentWriter:
     """Writes `<name>.mcap.part`, then renames it to `<name>.mcap`.
 
-    `begun` travels inside as a note, so that a lost journal can be rebuilt from the files. Raises `SessionError`
+    `begun` is stored inside as metadata, so that a lost journal can be rebuilt from the files. Raises `SessionError`
     where either file exists: recordings are never overwritten.
     """
 
@@ -82,7 +82,7 @@ class SegmentWriter:
     def finish(self, finished: dict[str, Any] | None = None) -> Recorded:
         """Drain, finish, fsync, rename, fsync the folder. Raises `SessionError`; the part file then stays.
 
-        `finished` travels inside as a note, with the counts of messages.
+        `finished` is stored inside as metadata, with the counts of messages.
         """
         self._finished = finished
         self._join()
@@ -96,7 +96,7 @@ class SegmentWriter:
         return recorded
 
     def abandon(self) -> None:
-        """End the thread and keep the part file as evidence of a step that was cut."""
+        """End the thread and keep the part file as evidence of an interrupted step."""
         self._join()
 
     def _raise_error(self) -> None:
@@ -115,7 +115,7 @@ class SegmentWriter:
                 sync(self._file)
         except Exception as error:
             self._error = error
-            while not self._ended:  # whoever writes must not block on a thread that failed
+            while not self._ended:  # the caller must not block on a thread that failed
                 self._ended = self._queue.get() is None
 
     def _write_all(self) -> None:

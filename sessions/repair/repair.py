@@ -36,10 +36,10 @@ MEASURED = (str(Topic.STILL), str(Topic.STROKE))
 
 
 def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
-    """Repair a session's folder, or one MCAP file. Raises `SessionDamaged` where nothing can be rebuilt.
+    """Repair a session's folder, or one MCAP file. Raises `SessionDamaged` if nothing can be rebuilt.
 
-    `InputError` for what is no session, and for a folder that was renamed: there is nothing to repair about that.
-    `SessionLocked` while another process has the session, `DiskFull` and `SessionError` where the disk fails.
+    `InputError` for anything that is not a session, and for a renamed folder, which needs no repair.
+    `SessionLocked` while another process has the session open, `DiskFull` and `SessionError` if the disk fails.
     """
     target = path.resolve()
     if not target.exists():
@@ -64,7 +64,7 @@ def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
 
 
 class FolderRepair:
-    """One repair of one folder, its lock held."""
+    """Repair of one folder while its lock is held."""
 
     def __init__(self, folder: Path, now_ns: Callable[[], int]) -> None:
         self._folder = folder
@@ -90,7 +90,7 @@ class FolderRepair:
             raise
 
     def run(self) -> Report:
-        """Configuration, steps, merged file."""
+        """Repair configuration, steps and merged file."""
         try:
             self._snapshots()
             for line in list(self._state.segments):
@@ -171,7 +171,7 @@ class FolderRepair:
                 yield Source(self._look(place)[0], self._totals, self._merged[path.name])
 
     def _look(self, path: Path) -> tuple[Scan, tuple[str, int] | None]:
-        """Content of a file and the step it belongs to; read once, even if the file is renamed meanwhile."""
+        """Read the content of a file and the step it belongs to; only once, even if the file is renamed meanwhile."""
         stat = path.stat()
         known = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
         if known not in self._scans:
@@ -216,7 +216,7 @@ class FolderRepair:
             self._lose_its_press(line)
 
     def _lose_its_press(self, line: Line) -> None:
-        """Mark the press as lost too where its sheet is no longer in: it cannot be photographed again."""
+        """Mark the press as lost too if its sheet was removed: it cannot be photographed again."""
         stroke = line["result"].get("stroke_id")
         for other in list(self._state.segments):
             result = other["result"]
@@ -267,7 +267,7 @@ class FolderRepair:
         if problems:
             kept = self._move_aside(self._final)
             self._report.did.append(
-                f"put {self._final.name} aside, which no close was journalled for{kept_words(kept)}"
+                f"put {self._final.name} aside, for which the journal has no close{kept_words(kept)}"
             )
 
     def _log(self, line: Line) -> None:

@@ -30,7 +30,7 @@ class Source:
 
     found: Scan
     totals: Counter[str]
-    """Messages by topic in the whole file, as it was written."""
+    """Messages by topic in the whole file, as originally written."""
     before: Counter[str]
     """Messages by topic that precede the step."""
 
@@ -51,11 +51,11 @@ def identity_of(found: Scan) -> tuple[str, int] | None:
 
 
 def united(line: Line, sources: Iterable[Source]) -> list[Record]:
-    """Messages left of the step with this `done` line, in the order in which they were written."""
+    """Messages that remain of the step with this `done` line, in the order in which they were written."""
     counts = Counter[str](line["counts"])
     records: dict[Place, Record] = {}
     after: dict[Place | None, Place | None] = {None: None}
-    """Place that follows each place; None is the beginning."""
+    """Next place after each place; None is the beginning."""
     for source in sources:
         part = dict(_of_step(source, counts))
         if not _agrees(part, records, line):

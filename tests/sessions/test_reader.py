@@ -53,7 +53,7 @@ def test_captures_are_lazy_so_that_a_session_need_not_fit_in_memory(make, path):
     captures = Recording(path).captures()
     assert len(list(itertools.islice(captures, 2))) == 2
     captures.close()
-    with pytest.raises(SessionDamaged, match="names still 3, not there"):
+    with pytest.raises(SessionDamaged, match="names still 3, which is not there"):
         list(Recording(path).captures())
 
 

@@ -1,4 +1,4 @@
-"""A report apart from its page: every score as CSV and Parquet, its tables as CSV, and its summary on the terminal."""
+"""Outputs of a report other than its page: scores as CSV and Parquet, tables as CSV, and the terminal summary."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from sessions.cells import CsvWriter
 
 COLUMNS = ("session_id", "stroke_id", "height_mm", "tilt_deg", "model", "alignment", "tone", "csim", "ssim", "source")
 GROUP = 2000
-"""Strokes of one row group of the Parquet file."""
+"""Strokes per row group of the Parquet file."""
 MAX_REFUSED = 20
-"""Lines on the terminal."""
+"""Refused strokes listed on the terminal."""
 SHORT = {"fitted, held-out cells": ", held out", "fitted, in sample": ", in sample"}
-"""What a candidate knows of the strokes, as the terminal has room for it."""
+"""What a candidate knows of the strokes, shortened for the terminal."""
 Cells = tuple[str, str, float, float, str, str, str, float, float, str]
 
 
 def score_rows(outcome: Outcome) -> Iterator[Cells]:
-    """One row a score, by session and order of capture; scores that are not there are left out."""
+    """Yield one row per score, by session and order of capture; missing scores are left out."""
     for k, row in enumerate(outcome.rows):
         header = outcome.sessions[row.session].header
         press = row.press
@@ -56,7 +56,7 @@ def score_rows(outcome: Outcome) -> Iterator[Cells]:
 
 
 def write_csv(outcome: Outcome, path: Path) -> str:
-    """Write every score and return the file's SHA-256. Raises OSError; what was half written is then gone."""
+    """Write every score and return the file's SHA-256. Raises OSError and leaves no partial file."""
     part = path.with_name(path.name + ".part")
     digest = hashlib.sha256()
     try:
@@ -85,7 +85,7 @@ def _lines(outcome: Outcome) -> Iterator[str]:
 
 
 def write_parquet(outcome: Outcome, path: Path) -> None:
-    """The same rows. Raises `CalibrationError` where pyarrow is not installed."""
+    """Write the same rows as Parquet. Raises `CalibrationError` if pyarrow is not installed."""
     try:
         pa: Any = importlib.import_module("pyarrow")  # without type stubs
         pq: Any = importlib.import_module("pyarrow.parquet")
@@ -107,7 +107,7 @@ def write_parquet(outcome: Outcome, path: Path) -> None:
 
 
 def summary_csv(report: Report) -> str:
-    """Every statistic, per cell and overall; strokes that `brushloop loop` pressed again as “robot writing”."""
+    """Return every statistic, per cell and overall; “robot writing” is what `brushloop loop` pressed again."""
     head = ("model", "alignment", "tone", "measure", "height_mm", "tilt_deg", "n", "max", "min", "avg")
     ends = ("avg_low", "avg_high", "median", "median_low", "median_high", "source")
     rows = [(*_stat_row(stat), report.label) for stat in report.stats]
@@ -134,7 +134,7 @@ def _loop_rows(report: Report) -> Iterator[tuple[object, ...]]:
 
 
 def table_3_csv(report: Report) -> str:
-    """Every row of Table 3, the paper's numbers in the rows that stand beside them."""
+    """Return every row of Table 3, with the paper's numbers in the corresponding rows."""
     head = ["session_id", "character", "reference", "model", "compared", "alignment", "tone", "polarity", "n"]
     head += [f"{of}_{what}" for of in ("csim", "ssim") for what in ("max", "min", "avg", "median")]
     head += ["paper_row", *(f"paper_{of}_{what}" for of in ("csim", "ssim") for what in ("max", "min", "avg"))]
@@ -164,7 +164,7 @@ def _groups(outcome: Outcome) -> Iterator[list[Cells]]:
 
 
 def summary(report: Report) -> Iterator[Table | str]:
-    """Renderables for the terminal."""
+    """Yield tables and lines for the terminal."""
     names = ", ".join(session.session_id for session in report.sessions[:4])
     yield f"{names}: {source_note(report.source)}"
     yield findings.measured(report)
@@ -182,7 +182,7 @@ def summary(report: Report) -> Iterator[Table | str]:
 
 
 def _scores(report: Report, alignment: Alignment) -> Table:
-    # The paper's numbers stand beside the table that is made like its own, as far as it says how.
+    # The paper's numbers are shown only in the table made in the same way, as far as the paper describes it.
     with_paper = alignment is Alignment.SIZE_NORMALISED
     columns = [
         "model",
@@ -208,7 +208,7 @@ def _scores(report: Report, alignment: Alignment) -> Table:
 
 
 def _character(report: Report, one: tables.CharacterTables) -> Iterator[Table]:
-    """A table for each alignment and polarity."""
+    """Yield one table per alignment and polarity."""
     for alignment, rows in ((Alignment.SIZE_NORMALISED, one.paper_like), (Alignment.MM, one.strict)):
         for polarity, group in itertools.groupby(rows, key=lambda row: row.basis.partition(";")[0]):
             with_paper = alignment is Alignment.SIZE_NORMALISED

@@ -76,7 +76,7 @@ def test_every_stroke_of_a_character_counts_however_far_apart_and_the_neighbour_
 def test_ink_on_the_edge_of_the_cell_is_told_and_other_cells_are_refused() -> None:
     _, cut = captured(capture(page((150, 300, 500, 340))), CALIBRATION)
     assert cut
-    with pytest.raises(CaptureRefused, match="a square is needed"):
+    with pytest.raises(CaptureRefused, match="must be square"):
         captured(capture(page((250, 300, 500, 340)), (20.0, 10.0, 60.0, 40.0)), CALIBRATION)
     with pytest.raises(CaptureRefused, match="is blank"):
         captured(capture(page()), CALIBRATION)

@@ -46,19 +46,19 @@ def test_a_checkpoint_comes_back_whole(good: Path, tiny: TrainConfig) -> None:
 BIAS = "weights.convolution.0.bias"
 HOSTILE: dict[str, tuple[Callable[[Path], Any], str]] = {
     "absent": (Path.unlink, "no such file"),
-    "text": (lambda p: p.write_text("hello"), "is no safetensors file"),
-    "pickle": (lambda p: torch.save({"a": torch.zeros(1)}, p), "is no safetensors file"),
-    "cut": (lambda p: p.write_bytes(p.read_bytes()[:-100]), "is no safetensors file"),
-    "endless header": (lambda p: p.write_bytes(struct.pack("<Q", 2**60) + b"{}"), "is no safetensors file"),
+    "text": (lambda p: p.write_text("hello"), "is not a safetensors file"),
+    "pickle": (lambda p: torch.save({"a": torch.zeros(1)}, p), "is not a safetensors file"),
+    "cut": (lambda p: p.write_bytes(p.read_bytes()[:-100]), "is not a safetensors file"),
+    "endless header": (lambda p: p.write_bytes(struct.pack("<Q", 2**60) + b"{}"), "is not a safetensors file"),
     "another kind": (lambda p: changed(p, format="brushloop-generator-1"), "format is 'brushloop-generator-1'"),
-    "no config": (lambda p: changed(p, config=""), "config is no JSON"),
-    "deep config": (lambda p: changed(p, config="[" * 60_000), "config is no JSON"),
+    "no config": (lambda p: changed(p, config=""), "config is not JSON"),
+    "deep config": (lambda p: changed(p, config="[" * 60_000), "config is not JSON"),
     "long config": (lambda p: changed(p, config=" " * 70_000), "config is longer than"),
     "unknown field": (
         lambda p: changed(p, config=json.dumps({"evil": 1, "target": {}})),
         "target.ranges: Field required",
     ),
-    "step": (lambda p: changed(p, step="31"), "step = '31' is no number from 0 to 30"),
+    "step": (lambda p: changed(p, step="31"), "step = '31' is not a number from 0 to 30"),
     "step in words": (lambda p: changed(p, step="1e9"), "step = '1e9'"),
     "history": (lambda p: changed(p, step="5"), "history.losses is not 5"),
     "shape": (lambda p: changed(p, {BIAS: torch.zeros(17)}), "expected float32 (16,)"),
@@ -116,7 +116,7 @@ def test_a_generator_s_report_must_be_a_table(tmp_path: Path, tiny: TrainConfig)
     save_generator(path, tiny, new_state(tiny).weights, {"mse": 0.5})
     assert load_weights(path)[2] == {"mse": 0.5}
     changed(path, report="[1]")
-    with pytest.raises(TrainError, match="report is no table"):
+    with pytest.raises(TrainError, match="report is not a table"):
         load_weights(path)
 
 
