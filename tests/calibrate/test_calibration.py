@@ -47,7 +47,7 @@ def half(image: np.ndarray, share: float) -> np.ndarray:
         (lambda image: np.hstack([image, image]), SPEC, "two boards"),
         (lambda image: half(image, 0.97), SPEC, "board corners found, at least 8 are needed"),
         (lambda image: image, SPEC.model_copy(update={"squares": (9, 7)}), "it is another board"),
-        (lambda image: image, SPEC.model_copy(update={"squares": (25, 21)}), "do not lie as this board has them"),
+        (lambda image: image, SPEC.model_copy(update={"squares": (25, 21)}), "are not arranged as on this board"),
     ],
     ids=["blank", "mirrored", "two boards", "hidden", "a smaller board", "a wrong board"],
 )

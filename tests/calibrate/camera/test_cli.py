@@ -101,7 +101,9 @@ USELESS = [
     pytest.param(BLANK, BOARD, "is blank", id="blank page"),
     pytest.param(half_hidden(0.18), BOARD, "of 48 board corners found", id="board hidden"),
     pytest.param(board(), ("--charuco", "5x4", *BOARD[2:]), "it is another board", id="a smaller board is expected"),
-    pytest.param(board(), ("--charuco", "8x8", *BOARD[2:]), "do not lie as this board", id="a wrong size is expected"),
+    pytest.param(
+        board(), ("--charuco", "8x8", *BOARD[2:]), "are not arranged as on this board", id="a wrong size is expected"
+    ),
     pytest.param(MIRRORED, BOARD, "is mirrored", id="mirrored"),
     pytest.param(TWO, BOARD, "two boards", id="two boards"),
 ]

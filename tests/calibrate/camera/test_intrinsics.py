@@ -255,8 +255,8 @@ def test_too_few_photographs_or_mixed_sizes_are_refused() -> None:
         (np.hstack([charuco(), charuco()]), CHARUCO, "two boards"),
         (np.ascontiguousarray(charuco()[:, ::-1]), CHARUCO, "mirrored"),
         (charuco(), CHARUCO.model_copy(update={"squares": (4, 5)}), "another board"),
-        (charuco(), CHARUCO.model_copy(update={"squares": (6, 7)}), "do not lie as this board has them"),
-        (np.where(np.arange(520) > 240, 128, checkers()), CHECKERS, "no whole board"),
+        (charuco(), CHARUCO.model_copy(update={"squares": (6, 7)}), "are not arranged as on this board"),
+        (np.where(np.arange(520) > 240, 128, checkers()), CHECKERS, "no complete board"),
     ],
     ids=["blank", "blank charuco", "smaller", "larger", "two", "two charuco", "mirrored", "few", "many", "hidden"],
 )
