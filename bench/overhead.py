@@ -30,7 +30,7 @@ GOAL_PERCENT = 2.0
 STEADY, FRAME, INK = "the controller calls the arm steady", "a fresh frame", "the ink station"
 WAITS = (STEADY, FRAME, INK)
 ENCODE, JUDGE, FILES, MERGE = "encode the still", "judge the capture", "journal and files", "merge and verify"
-BLANK = "look whether the sheet is blank"
+BLANK = "check that the sheet is blank"
 """Once a sheet, which holds dozens of strokes: told apart from what each stroke takes."""
 BEFORE, SETTLING, REST = "from a move to its motion", "from steady to the move's end", "the rest"
 PARTS = ("motion", ENCODE, JUDGE, BLANK, FILES, FRAME, INK, STEADY, BEFORE, SETTLING)

@@ -199,7 +199,7 @@ DEVICE = "robot"
 
 
 async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[tuple[Pose, float, str]]) -> int:
-    """Ask the controller for the joints of each pose, near those of the previous pose; return how many poses differ.
+    """Ask the controller for the joints of each pose, near those of the previous one; return how many are distinct.
 
     Powers, sets and moves nothing. The tool that is set on the controller stays: every pose is converted to that tool.
     Raises `ConfigError` for the first pose that is out of reach, and `DeviceError`.
@@ -223,7 +223,7 @@ async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[tuple[Pos
                 raise ConfigError(
                     rig_path,
                     "paper",
-                    f"the controller finds no joints for {where}: "
+                    f"the controller finds no joint solution for {where}: "
                     f"x = {pose.x_mm:.1f}, y = {pose.y_mm:.1f}, z = {pose.z_mm:.1f} mm, "
                     "for robot.tcp_offset_mm. Move the paper nearer to the arm, or change its yaw",
                 )

@@ -223,7 +223,7 @@ def neighbour(ink: Ink, limits: QualityConfig) -> Check:
     """The cell holds no ink but the press's own."""
     area_mm2 = ink.before_mm2 + ink.beside_mm2
     source = (
-        "a stroke from next door reaches in. Keep this cell out and make the cells larger"
+        "a stroke from next door reaches in. Leave this cell out and make the cells larger"
         if ink.before_mm2 > ink.beside_mm2
         else "something dripped or lies apart from the stroke. Wipe the brush on the rim after a dip"
     )

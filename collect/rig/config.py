@@ -43,7 +43,7 @@ def overrides(settings: type[BaseSettings]) -> dict[tuple[str, ...], str]:
             # Compared without the prefix, which would make all of them similar.
             meant = nearest(DELIMITER.join(path), [DELIMITER.join(known) for known in paths([settings])])
             hint = f"; did you mean {PREFIX}{meant.upper()}?" if meant else f": {PREFIX}TABLE{DELIMITER}FIELD would"
-            raise ConfigError(place(name), "", f"sets nothing of rig.toml{hint}")
+            raise ConfigError(place(name), "", f"sets nothing in rig.toml{hint}")
         found[path] = name
     return found
 

@@ -60,7 +60,7 @@ Rect = tuple[float, float, float, float]
 
 
 def touch_rects(paper: PaperConfig, config: TouchConfig) -> list[Rect]:
-    """Where a measured zero touch lowers the tip: at points, or by camera within a patch for each point."""
+    """Where a measured zero touch lowers the tip: at points or, by camera, in a patch around each point."""
     match config.method:
         case "taught":
             return []

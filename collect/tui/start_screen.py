@@ -34,7 +34,7 @@ KEYS = (
     ("q", "leave"),
     ("ctrl-p", "commands"),
 )
-TYPING_KEYS = (("enter", "use these files"), ("tab", "the other file"), ("escape", "back, as they were"))
+TYPING_KEYS = (("enter", "use these files"), ("tab", "the other file"), ("escape", "keep the old files"))
 UNASKED = Content.styled("Rig health: d asks every device; powers nothing, moves nothing", "dim")
 WELCOME = (
     "No session yet.\n\nn starts one: the set-up looks through the camera, finds the paper, and asks "
@@ -74,7 +74,7 @@ class StartScreen(Screen[None]):
     def __init__(
         self, browser: SessionBrowser, begin: Callable[[str | None], object], look: Callable[[str], None]
     ) -> None:
-        """`begin` resumes the session of that name, or begins a new one (None); `look` looks through one."""
+        """`begin` resumes the named session, or begins a new one (None); `look` opens one for review."""
         super().__init__()
         self._browser = browser
         self._begin = begin

@@ -134,7 +134,7 @@ class FolderSource:
         self._shown += 1
         image = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if image is None:  # pyright: ignore[reportUnnecessaryComparison]
-            raise DeviceError(DEVICE, "read", f"{path} is no image")
+            raise DeviceError(DEVICE, "read", f"{path} is not an image")
         return cast("NDArray[np.uint8]", image)
 
     def release(self) -> None:

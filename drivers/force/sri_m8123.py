@@ -200,7 +200,7 @@ class SriM8123:
                 DEVICE,
                 "bias",
                 f"{name} varied by {deviation:.4f} {unit} (standard deviation), limit {limit:g} {unit}",
-                condition="The former bias stays.",
+                condition="The previous bias remains.",
                 remedy="Let nothing touch the brush, wait until the arm is still, and try again.",
             )
         return statistics.fmean(values)

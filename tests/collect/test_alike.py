@@ -89,7 +89,7 @@ def targets(request: pytest.FixtureRequest) -> list[str]:
 def test_nobody_looks_at_the_paper_between_dip_and_press(sharp_lab: Lab, targets: list[str], screen: list[str]) -> None:
     folder = run(sharp_lab)
     assert targets[targets.index("ink") :][:3] == ["ink", "paper", "park"]
-    assert screen[screen.index("dip") :][:4] == ["dip", "look whether the sheet is blank", "dip", "press H13-a0-r01"]
+    assert screen[screen.index("dip") :][:4] == ["dip", "check that the sheet is blank", "dip", "press H13-a0-r01"]
     presses = results(folder, "press")  # more than one where a photograph was late and the stroke was made again
     waits = [press["dip_to_touch_s"] for press in presses]
     assert min(waits) > 0.0

@@ -63,7 +63,7 @@ async def look_at_sheet(context: StepContext) -> None:
     if run.memory.looked_at_sheet == sheet or not run.rig.config.quality.enabled:
         return
     run.memory.left_ink_ns = None
-    with run.progress.meanwhile("look whether the sheet is blank"):
+    with run.progress.meanwhile("check that the sheet is blank"):
         image = await photograph(context)
         inked = await uninterrupted(_inked_cells, run, image, context.cell.index if context.cell is not None else None)
     if inked:

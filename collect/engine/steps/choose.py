@@ -50,7 +50,7 @@ async def choose(context: StepContext) -> Result:
 
 
 async def measured(context: StepContext, image: Gray, cell: Cell) -> Result:
-    """The ink of a captured press, packed for the journal; empty where no whole stroke is seen."""
+    """The ink of a captured press, packed for the journal; empty if no whole stroke is seen."""
     with context.recorder.sections.timed("measure the ink"):
         ink, why = await uninterrupted(_ink, context.run, image, cell)
     if why:

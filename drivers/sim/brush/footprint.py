@@ -32,7 +32,7 @@ class Bristles:
     outward: Vector
     """(m,) place in the unit disc away from the paper."""
     short_mm: Vector
-    """(m,) how far each hair ends before the tip."""
+    """(m,) distance from each hair's end to the tip."""
     phase_mm: Vector
     """(m,) where along its length each hair's deposit points start; without this the stations would show as ribs."""
     clump: NDArray[np.int64]
@@ -43,7 +43,7 @@ class Bristles:
 
 @dataclass(frozen=True, slots=True)
 class Wander:
-    """What differs between two presses of one cell: how the wet bundle lay, and the ink per clump."""
+    """What differs between two presses of one cell: how the wet bundle lies, and the ink per clump."""
 
     spread: float
     """Factor on the sideways spread."""

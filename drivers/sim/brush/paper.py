@@ -57,7 +57,7 @@ def scatter(
     offered = np.bincount(row * w + column, weights=dots.ink, minlength=h * w).reshape(h, w)
     per_mm2 = (offered * px_per_mm**2).astype(np.float32)
     lines = np.asarray(cv2.GaussianBlur(per_mm2, (0, 0), HAIR_MM * px_per_mm), np.float32)
-    # hairs that lie on top of each other, as at the tip, hold no more ink between them than the film does
+    # hairs on top of each other, as at the tip, hold no more ink between them than the film does
     np.minimum(lines, FULL_PER_MM2, out=lines)
     return np.asarray(cv2.GaussianBlur(lines, (0, 0), (0.04 + 0.18 * ink_load) * px_per_mm), np.float32)
 

@@ -91,7 +91,7 @@ KINDS: dict[Device, frozenset[str]] = {
     Device.FORCE: frozenset(kind.value for kind in ForceFault),
 }
 HANDED_OVER = frozenset({Device.INK, Device.FORCE})
-"""Devices whose simulators keep their own list of faults, one for each of the next requests or rounds."""
+"""Devices whose simulators keep their own list of faults, one for each coming request or round."""
 
 
 class Fault(BaseModel):

@@ -102,7 +102,7 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
     thread.start()
     rig, loop, over = ready.result(timeout=30)
     text = rig.toml().replace("latency_ms = 250.0", f"latency_ms = 60.0\ntimeout_s = {CAMERA_TIMEOUT_S}")
-    text = re.sub("least_dwell_s = .*", "", text)  # a phase is struck at half the pace of life
+    text = re.sub("least_dwell_s = .*", "", text)  # a phase is struck at half real speed
     (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
     (tmp_path / "protocol.toml").write_text(PROTOCOL, encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:

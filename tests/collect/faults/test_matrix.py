@@ -1,6 +1,6 @@
 """Ten faults in ten phases of a session: each cell has its outcome, and in every one the arm ends at rest.
 
-A run is fast up to its phase. As that begins, simulated time slows to half the pace of life, and the fault strikes a
+A run is fast up to its phase. As that begins, simulated time slows to half real speed, and the fault strikes a
 move that is under way. docs/faults.md holds the same table.
 """
 

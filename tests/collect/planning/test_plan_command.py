@@ -140,7 +140,7 @@ async def test_the_first_pose_out_of_reach_is_named(rig_path: Path, cabinet: Arc
     config = at(rig_path, cabinet.port)
     far = config.model_copy(update={"paper": config.paper.model_copy(update={"origin_mm": (1200.0, -110.0)})})
     wanted = load_protocol(EXAMPLES / "protocol.toml")
-    with pytest.raises(ConfigError, match=r"rig.toml: paper: the controller finds no joints for zero_touch: x = 1198"):
+    with pytest.raises(ConfigError, match=r"paper: the controller finds no joint solution for zero_touch: x = 1198"):
         await ask_reach(rig_path, far, all_poses(far, wanted, PaperPlane(120.0)))
 
 

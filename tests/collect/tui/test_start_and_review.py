@@ -110,7 +110,7 @@ async def test_escape_leaves_the_files_as_they_were() -> None:
         before = browser.paths
         await ready(app, pilot)
         await pilot.press("e", *"xx")
-        assert "escape back, as they were" in await ready(app, pilot)
+        assert "escape keep the old files" in await ready(app, pilot)
         await pilot.press("escape")
         text = await ready(app, pilot)
         assert str(before.config) in text

@@ -328,7 +328,7 @@ async def test_a_bias_while_something_moves_is_refused(channel: str, axis: int, 
     with SimForceSensor(channel, shake) as board:
         sensor = sensor_on(board.channel)
         await sensor.connect()
-        with pytest.raises(DeviceError, match=rf"{says}.*The former bias stays.*try again"):
+        with pytest.raises(DeviceError, match=rf"{says}.*The previous bias remains.*try again"):
             await sensor.bias(0.2)
         assert sensor.bias_wrench == (0.0,) * 6
         await sensor.close()
