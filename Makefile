@@ -29,7 +29,7 @@ test: $(STAMP)-dev  ## lint, layers, types, and the tests; types are checked bes
 	@$(MAKE) --no-print-directory --jobs 2 lint types suite
 
 suite: $(STAMP)-dev
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+	$(BIN)/python -m pytest -n 3 --dist loadgroup
 
 lint: $(STAMP)-dev
 	$(BIN)/ruff check .

@@ -25,6 +25,18 @@ settings.load_profile("same")
 TOLERATED = ("asyncio_", "pytest_timeout", "ThreadPoolExecutor", "tqdm", "fsspecIO")
 """Pools that live as long as their loop or process; nothing of ours is called that."""
 
+LONGEST = (
+    "tests/test_demo.py",
+    "tests/collect/tui/test_session.py",
+    "tests/collect/quality",
+    "tests/calibrate/validate",
+)
+"""They come first, so that no worker is left alone with one of them at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: not item.nodeid.startswith(LONGEST))  # stable: otherwise the order stays
+
 
 @pytest.fixture(autouse=True)
 def no_thread_outlives_the_test() -> Iterator[None]:

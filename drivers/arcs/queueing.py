@@ -98,6 +98,8 @@ async def feed(
         if sent == len(legs):
             return
         await asyncio.sleep(poll_s)
+        if stopped():  # also where no line may follow for want of room
+            raise _cut_short(sent, len(legs), "the arm was stopped")
         await controller.require_safe("moveLine")
         queue, now = await controller.queue(), loop.time()
         if queue != seen:

@@ -177,5 +177,5 @@ async def test_what_cannot_be_carried_out_is_refused_before_anything_is_sent(arm
     with pytest.raises(LimitExceeded):
         await arm.sequence(refused(DEEP, brush_pose(250.0, -230.0, 60.0), TOP), acc_mm_s2=ACC)
     for lines in ([], refused(DEEP, HOME)):
-        with pytest.raises(ValueError, match="end elsewhere"):
+        with pytest.raises(ValueError, match="must not end where it begins"):
             await arm.sequence(lines, acc_mm_s2=ACC)
