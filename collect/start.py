@@ -1,4 +1,4 @@
-"""One run of `brushloop collect`: reads, checks, opens, and hands over to a screen or a progress bar."""
+"""One run of `brushloop collect`: read, check and open the session, then hand over to a screen or a progress bar."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def start(
 ) -> int:
     """Run to the end and print where the recording lies and what comes next; return how many strokes were left out.
 
-    Raises what ended the run.
+    Raises the error that ended the run.
     """
     engine = engine_for(opening, watched=on_screen, live=live, guided=guided, preview=on_screen and preview != "off")
     with contextlib.ExitStack() as stack:
@@ -91,4 +91,4 @@ def _say(text: str) -> None:
         sys.stdout.write(plain(text, keep="\n"))
         sys.stdout.flush()
     except OSError:
-        sys.stdout = None  # nobody reads any more; Python would write again at its exit, and change the exit code
+        sys.stdout = None  # the reader is gone; Python would write again at exit and change the exit code

@@ -1,9 +1,9 @@
-"""What a protocol has planned: its strokes, their order over the sheet, and the steps that each stroke takes.
+"""The plan of a protocol: its strokes, their order over the sheet, and the steps that each stroke takes.
 
-Conditions of a design are spread over the sheet. Its cells are used in order, so a stroke's number says where it will
-lie. The sheet is cut into three bands of rows and three of columns; within each round, pairs of strokes change places
-wherever that evens out how often each (H, alpha) lies in each band. Rounds stay whole, so a drift of ink still meets
-every condition alike. A void press moves what follows by one cell: the balance is of the plan.
+Conditions of a design are spread over the sheet. Its cells are used in order, so a stroke's number determines
+its place. The sheet is cut into three bands of rows and three of columns; within each round, pairs of strokes change
+places wherever that evens out how often each (H, alpha) lies in each band. Rounds stay whole, so a drift of ink still
+affects every condition alike. A void press shifts what follows by one cell: only the plan stays balanced.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ PathDepthMm = Annotated[float, Field(ge=-20.0, le=100.0)]
 TiltDeg = Annotated[float, Field(ge=0.0, le=30.0)]
 HeadingDeg = Annotated[float, Field(ge=-720.0, le=720.0)]
 TrajectoryPoint = tuple[InCellMm, InCellMm, PathDepthMm, TiltDeg, HeadingDeg]
-"""x, y in the figure's cell; depth below the touch height, negative above the paper; tilt; where the ferrule leans to,
-counter-clockwise from the sheet's x."""
+"""x, y in the figure's cell; depth below the touch height, negative above the paper; tilt; direction in which the
+ferrule leans, counter-clockwise from the sheet's x."""
 AGAIN = "-again"
 
 
@@ -66,7 +66,7 @@ class Drawn:
         }
 
     def dips_before(self, stroke: int) -> bool:
-        """Whether the brush dips again before that stroke, counted from 0: the DIP step has served the first."""
+        """Whether the brush dips again before that stroke, counted from 0; the DIP step already served stroke 0."""
         return stroke > 0 and self.dip_every_strokes > 0 and stroke % self.dip_every_strokes == 0
 
 
@@ -76,9 +76,9 @@ class Planned:
 
     stroke_id: str
     height_mm: float
-    """Depth; of a figure, its deepest."""
+    """Depth of the press; of a figure, its greatest depth."""
     tilt_deg: float
-    """Of a figure, at its deepest point."""
+    """Tilt of the press; of a figure, at its deepest point."""
     repeat: int
     """Round, from 1."""
     index: int = 0
@@ -86,18 +86,18 @@ class Planned:
     not depend on the sheet."""
     dwell_s: float = 0.0
     drawn: Drawn | None = None
-    """The figure; None is a press."""
+    """The figure; None for a press."""
     again_of: str | None = None
     """The stroke of another session that this one repeats."""
 
 
 def made_again(marked: Planned, index: int) -> Planned:
-    """The same press under a name of its own: both are in the recording, and the first stays marked."""
+    """The same press under a new name: the recording holds both, and the first stays marked bad."""
     return replace(marked, stroke_id=f"{marked.stroke_id}{AGAIN}", index=index)
 
 
 def with_review(plan: Iterable[Planned], reviewed: Result) -> list[Planned]:
-    """The plan after a REVIEW step: each stroke that was marked bad is replaced by the one that is pressed again.
+    """The plan after a REVIEW step: each stroke that was marked bad is replaced by its repetition.
 
     `reviewed` holds `again`: [stroke_id, index] of each.
     """
@@ -116,19 +116,19 @@ def stroke_steps(plan: Iterable[Planned], *, board_every: int | None) -> Protoco
 
 
 def takes(stroke: Planned, *, measured: bool = False) -> Generator[Step, Result, None]:
-    """Dip, press or draw, capture; again where the capture asks for it.
+    """Steps of one stroke: dip, press or draw, capture; repeated while the capture asks for a retake.
 
     `measured`: the capture's result also holds the ink.
     """
     for take in itertools.count(1):
-        # Only a second take has a number: the keys of first ones are those of older sessions.
+        # Only later takes are numbered, so that the keys of first takes match those of older sessions.
         taken: Params = {} if take == 1 else {"take": take}
         dipped = yield Step(StepKind.DIP, stroke.index, taken)
         if dipped.get("skipped"):
             break
         kind = StepKind.PRESS if stroke.drawn is None else StepKind.DRAW
         marked = yield Step(kind, stroke.index, _mark_params(stroke) | taken)
-        # A capture belongs to one cell: made again elsewhere, it is another step.
+        # A capture belongs to one cell: a capture of another cell is another step.
         place = _capture_params(stroke, int(marked["sheet"]), int(marked["cell"]))
         if measured:
             place["measured"] = True
@@ -138,7 +138,7 @@ def takes(stroke: Planned, *, measured: bool = False) -> Generator[Step, Result,
 
 
 def strokes_text(strokes: Iterable[Iterable[TrajectoryPoint]]) -> str:
-    """Trajectories as a step's parameter holds them: JSON, [stroke][point][x, y, height, tilt, heading]."""
+    """Trajectories as text for a step's parameter: JSON, [stroke][point][x, y, height, tilt, heading]."""
     return json.dumps([[list(point) for point in stroke] for stroke in strokes], separators=(",", ":"))
 
 
@@ -260,5 +260,5 @@ def _exchange(a: list[int], b: list[int], from_bands: tuple[int, int], to_bands:
 
 
 def _unevenness(counts: list[int], share: list[float]) -> float:
-    """Smallest where the counts are in proportion to the shares."""
+    """Measure of unevenness: smallest if the counts are in proportion to the shares."""
     return sum(count * count / part for count, part in zip(counts, share, strict=True))

@@ -75,9 +75,9 @@ class PressRow(Config):
     height_mm: DeepMm
     tilt_deg: TiltDeg = 0.0
     dwell_s: DwellS | None = None
-    """Left out, the protocol's."""
+    """Time at full depth; if left out, the protocol's."""
     stroke_id: StrokeId | None = None
-    """Left out, it is made from the row's number, H and alpha."""
+    """If left out, it is made from the row's number, H and alpha."""
 
 
 class ListConfig(ProtocolBase):
@@ -95,7 +95,7 @@ class ListConfig(ProtocolBase):
     seed: Seed | None = None
     """Shuffles each round; left out, the order is that of the list."""
     dwell_s: DwellS = 0.2
-    """Time at full depth of presses without their own."""
+    """Time at full depth of presses that have no `dwell_s` of their own."""
 
     @model_validator(mode="after")
     def _named_apart(self) -> ListConfig:
@@ -104,7 +104,7 @@ class ListConfig(ProtocolBase):
         return self
 
     def names(self, repeat: int) -> list[str]:
-        """Stroke ids of one round, from 1.
+        """Stroke ids of round `repeat`, counted from 1.
 
         A press without an id is named after its number in the list, H and alpha, as `003-H15-a5-r01`. A given id gets
         `-r02` and so on from the second round on.

@@ -1,4 +1,4 @@
-"""`write`: figures of trajectories, each on a paper cell of its own."""
+"""`write`: figures made of trajectories, each on its own paper cell."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from collect.rig.config_file import Config
 from collect.rig.paper import Layout
 
 MAX_POINTS = 10_000
-"""Of all trajectories of one protocol together."""
+"""Most points in all trajectories of one protocol together."""
 LEAST_APART_MM = 1.0
 """ARCS reads a line shorter than this as a turn on the spot, with speeds in rad/s, and halts for it."""
 
@@ -64,7 +64,7 @@ class Figure(Config):
     name: Annotated[str, Field(min_length=1, max_length=60)]
     """The stroke id is this name and the number of the repeat."""
     strokes: Annotated[tuple[DrawnStroke, ...], Field(min_length=1, max_length=100)]
-    """In the order of writing."""
+    """The strokes, in the order of writing."""
 
 
 class WriteConfig(ProtocolBase):
@@ -84,10 +84,10 @@ class WriteConfig(ProtocolBase):
     speed_mm_s: Annotated[float, Field(ge=1.0, le=100.0)] = 20.0
     """Speed of the tip along the trajectory."""
     blend_mm: Annotated[float, Field(ge=1.0, le=20.0)] = 1.0
-    """How near to a point the tip may leave it for the next, so that the arm does not halt there. ARCS takes no less
-    than 1 mm."""
+    """Distance from a point at which the tip may turn towards the next, so that the arm does not halt there. ARCS
+    accepts no less than 1 mm."""
     dip_every_strokes: Annotated[int, Field(ge=0, le=100)] = 1
-    """Dip again within a figure after so many strokes; 0 writes it with one dip."""
+    """Dip again within a figure after this many strokes; 0 writes it with one dip."""
 
     @model_validator(mode="after")
     def _on_the_cell(self) -> WriteConfig:

@@ -17,7 +17,7 @@ Rect = tuple[float, float, float, float]
 """x, y, width, height in the paper frame, mm."""
 Point = tuple[float, float]
 GRAIN_MM = 0.15
-"""Ink is looked for after smoothing over this: noise and paper fibres are finer."""
+"""Scale of the smoothing before ink is looked for: noise and paper fibres are finer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,29 +26,29 @@ class Patch:
 
     window_mm: Rect
     raster: Gray
-    """(h, w) as photographed; beyond the frame, its border repeated."""
+    """(h, w) as photographed; beyond the frame, its border is repeated."""
     dark: Soft
     """(h, w) 0 = paper, 1 = reflects nothing; 0 beyond the frame."""
     in_view: Mask
     """(h, w) False where the photograph does not reach."""
 
     def to_px(self, point_mm: Point) -> Point:
-        """(x, y) on the raster, pixel j covers [j, j + 1)."""
+        """(x, y) on the raster, where pixel j covers [j, j + 1)."""
         x, y, _, height = self.window_mm
         return (point_mm[0] - x) * PX_PER_MM, (y + height - point_mm[1]) * PX_PER_MM
 
     def inside(self, rect_mm: Rect) -> tuple[slice, slice]:
-        """Rows and columns of a rectangle, as far as the window has them."""
+        """Rows and columns of a rectangle, clipped to the window."""
         left, bottom = self.to_px((rect_mm[0], rect_mm[1]))
         right, top = self.to_px((rect_mm[0] + rect_mm[2], rect_mm[1] + rect_mm[3]))
         return slice(max(round(top), 0), max(round(bottom), 0)), slice(max(round(left), 0), max(round(right), 0))
 
     def inked(self, gate: float) -> Mask:
-        """(h, w) where there is ink, noise and grain smoothed away."""
+        """(h, w) True where there is ink, after noise and grain are smoothed away."""
         return np.asarray(cv2.GaussianBlur(self.dark, (0, 0), GRAIN_MM * PX_PER_MM), np.float32) > gate
 
     def points_mm(self, mask: Mask) -> Floats:
-        """(n, 2) middles of a mask's pixels in the paper frame."""
+        """(n, 2) centres of a mask's pixels in the paper frame."""
         x, y, _, height = self.window_mm
         rows, columns = np.nonzero(mask)
         places = np.column_stack([x + (columns + 0.5) / PX_PER_MM, y + height - (rows + 0.5) / PX_PER_MM])
@@ -56,7 +56,7 @@ class Patch:
 
 
 def take(image: Gray, image_to_paper: Floats, window_mm: Rect, params: Params) -> Patch:
-    """Rectify a window of an (h, w) photograph and divide it by its light. `image_to_paper` is (3, 3)."""
+    """Rectify a window of an (h, w) photograph and divide it by its illumination. `image_to_paper` is (3, 3)."""
     raster = rectify(image, image_to_paper, window_mm)
     in_view = _in_view(image, image_to_paper, window_mm, raster)
     dark = np.where(in_view, 1.0 - flatten(raster, params), 0.0).astype(np.float32)
@@ -92,7 +92,7 @@ def _in_view(image: Gray, image_to_paper: Floats, window_mm: Rect, raster: Gray)
 
 
 COARSE = 4
-"""Parts of a stroke are put together on a raster so many times coarser."""
+"""Parts of a stroke are joined on a raster this many times coarser."""
 JOIN_MM = 2.5
 """Spots of ink closer than this belong together: hairs of a dry brush, the halves of a split tuft."""
 NEAR_MM = 3.0
@@ -124,7 +124,7 @@ class Ink:
 
 
 def tell_apart(now: Patch, before: Patch | None, cell_mm: Rect, anchor_mm: Point, gate: float) -> Ink:
-    """Find the press's own ink: new since `before` where that is given, in one piece, and near the anchor."""
+    """Find the press's own ink: new since `before` if that is given, in one piece, and near the anchor."""
     ink = now.inked(gate)
     cell = now.inside(cell_mm)
     before_mm2 = 0.0
@@ -145,7 +145,7 @@ def mm2(mask: Mask) -> float:
 
 
 def _own_piece(ink: Mask, anchor_px: Point, cell: tuple[slice, slice], least_share: float) -> tuple[Mask, float]:
-    """(the piece that is the stroke, with `least_share` of it in the cell; mm^2 of the other pieces in the cell)."""
+    """(the stroke's piece, of which at least `least_share` lies in the cell; mm^2 of the other pieces in the cell)."""
     height, width = ink.shape
     pieces, count = _pieces(ink)
     areas = np.bincount(pieces.ravel(), minlength=count) / PX_PER_MM**2

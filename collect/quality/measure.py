@@ -14,7 +14,7 @@ from calibrate.stroke.params import PX_PER_MM, Gray, Mask, Soft
 from collect.quality.ink import Ink, Point
 
 FINE_PX, WIDE_PX = 1.0, 2.0
-"""Two blurs that are added; how much more the second weakens an edge than the first gives the edge's own blur."""
+"""Two blurs that are added; the ratio of an edge's slopes after each gives the edge's own blur."""
 EDGE_SHARE = 0.02
 """Share of the frame's pixels, the steepest ones, that are taken for edges."""
 LEAST_EDGE = 3.0
@@ -27,7 +27,7 @@ BRIGHT_PX_PER_MM = 2.5
 INK_WIDTH_MM = 12.0
 """Strokes are narrower than this: closing fills them with the paper beside them."""
 SPOT_MM = 36.0
-"""A bright area wider than this is the light, not glare."""
+"""A bright area wider than this is uneven illumination, not glare."""
 SATURATED = 252
 
 
@@ -44,7 +44,7 @@ def blur_px(image: Gray) -> float | None:
 
     After S. Zhuo and T. Sim, "Defocus map estimation from a single image", Pattern Recognition 44(9), 2011: the
     gradient of a step of blur s, blurred again by a, is proportional to 1 / sqrt(s^2 + a^2). Two such blurs give s,
-    whatever the contrast. At less than 80 levels of it the pixels' rounding makes s up to a third too large or small.
+    whatever the contrast. At a contrast of less than 80 levels, rounding makes s up to a third too large or small.
     """
     found = [s for s in (_blur_along(image, 1, 0), _blur_along(image, 0, 1)) if s is not None]
     return max(found) if found else None
@@ -128,15 +128,15 @@ class Mark:
     uneven: float
     """Standard deviation of darkness over mean, within its outline without rim and cleft."""
     head_mm: Point
-    """Where it begins, from the zero-touch point: along the heading, away from the tip, and to the left."""
+    """Where it begins, from the zero-touch point: along the heading, positive away from the tip; and to the left."""
     gap_mm: float
     """Widest gap between two groups of hairs, averaged over 2 mm of length."""
     bent_deg: float
-    """Direction from its head to its tip, off the heading."""
+    """Angle between the heading and the direction from its head to its tip."""
 
 
 def measure_mark(ink: Ink, anchor_mm: Point) -> Mark | None:
-    """Measure the press's own ink; None where there is none."""
+    """Measure the press's own ink; None if it left no ink."""
     rows, columns = np.flatnonzero(ink.own.any(axis=1)), np.flatnonzero(ink.own.any(axis=0))
     if not rows.size:
         return None
@@ -144,7 +144,7 @@ def measure_mark(ink: Ink, anchor_mm: Point) -> Mark | None:
     own, dark = ink.own[box], ink.patch.dark[box]
     x, y = ink.patch.to_px(anchor_mm)
     right_mm, left_mm = (columns[-1] + 1 - x) / PX_PER_MM, (x - columns[0]) / PX_PER_MM
-    # The head is the end near the zero-touch point, whichever way this brush lies down.
+    # The head is the end near the zero-touch point, to whichever side the brush bends.
     flip = abs(left_mm) < abs(right_mm)
     if flip:
         own, dark = own[:, ::-1], dark[:, ::-1]

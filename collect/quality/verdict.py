@@ -22,15 +22,15 @@ class Family(StrEnum):
 class Failure(StrEnum):
     """The failures in the order in which they are judged; the first that is found is the cause.
 
-    A stroke can only be judged in a sound picture, and where it is distinguished from other ink; its place and tone
-    only where the hairs carried ink; its shape last.
+    A stroke can be judged only in a sound picture and once it is distinguished from other ink; its place and tone,
+    only if the hairs carried ink; its shape comes last.
     """
 
     family: Family
     """What it spoils."""
 
     def __new__(cls, value: str, family: Family) -> Failure:
-        """A member is its text, and carries its family."""
+        """Make a member that equals its text and carries its family."""
         member = str.__new__(cls, value)
         member._value_ = value
         member.family = family

@@ -40,7 +40,7 @@ class QualityConfig(BaseModel):
     blank_mm2_per_mm: Area = 0.1
     """A press that leaves less ink for each mm of its depth is blank."""
     uneven: Share = 0.125
-    """Standard deviation of the ink's darkness within the stroke, as a share of its mean: from here on it is dry."""
+    """Standard deviation of the darkness within a stroke, as a share of its mean, from which it counts as dry."""
     head_mm: Annotated[float, Field(ge=-20.0, le=20.0)] = 0.7
     """How far a sound mark begins behind the zero-touch point, on the side away from its tip."""
     misplaced_mm: Length = 1.6
@@ -50,7 +50,7 @@ class QualityConfig(BaseModel):
     split_mm: Length = 0.3
     """Gap between two groups of hairs, averaged over 2 mm of its length."""
     bent_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = 5.5
-    """Direction of the mark from its head to its tip, off the heading."""
+    """Angle between the heading and the direction of the mark from its head to its tip."""
 
     @model_validator(mode="after")
     def _ordered(self) -> QualityConfig:

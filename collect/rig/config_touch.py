@@ -13,29 +13,30 @@ Step = Annotated[float, Field(ge=0.01, le=5.0)]
 
 
 class ForceTouchConfig(Config):
-    """Zero touch by force: fast steps until something is felt, then slow ones around where it was."""
+    """Zero touch by force: fast steps until something is felt, then slow ones around that height."""
 
     threshold_n: Positive = 0.0012
     """Force in N that ends the fast approach. A soft brush pushes with a few mN in its first millimetre."""
     fast_step_mm: Step = 0.5
     fast_samples: Annotated[int, Field(ge=4, le=10_000)] = 60
-    """Averaged at each rest of the fast approach."""
+    """Samples averaged at each rest of the fast approach."""
     medium_step_mm: Step = 0.1
     medium_samples: Annotated[int, Field(ge=4, le=10_000)] = 150
     slow_samples: Annotated[int, Field(ge=10, le=100_000)] = 1000
-    """Averaged over the three rests of one slow descent."""
+    """Samples averaged over the three rests of one slow descent."""
     sigma_mm: Annotated[float, Field(ge=0.001, le=0.5)] = 0.0135
     """Slow descents are repeated until the contact is known to this standard error."""
     max_samples: Annotated[int, Field(ge=100, le=1_000_000)] = 60_000
-    """Most samples of a touch: where they are not enough, the sensor is too noisy for the brush."""
+    """Most samples of one touch; if they are not enough, the sensor is too noisy for the brush."""
     linear_mm: Annotated[float, Field(ge=0.05, le=5.0)] = 0.45
     """Depth to which the brush counts as a linear spring; readings below it are left out."""
     push_axis: tuple[Finite, Finite, Finite] = (0.0, 0.0, -1.0)
-    """Where the paper pushes, in the sensor's frame: against its z axis, if that points along the tool to the tip."""
+    """Direction of the paper's push in the sensor's frame: against its z axis if that points along the tool to the
+    tip."""
     clear_mm: Annotated[float, Field(ge=0.0, le=20.0)] = 1.0
-    """A rest above the one before is approached from this much higher: every rest is reached on the way down."""
+    """A rest above the previous one is approached from this much higher: every rest is reached on the way down."""
     settle_s: Annotated[float, Field(ge=0.0, le=10.0)] = 0.05
-    """From the arm at rest to the first sample that counts."""
+    """Time from the arm at rest to the first sample that counts."""
 
     @model_validator(mode="after")
     def _axis(self) -> ForceTouchConfig:
@@ -49,16 +50,16 @@ class CameraTouchConfig(Config):
 
     coarse_step_mm: Step = 0.5
     fine_step_mm: Step = 0.08
-    """About half of it is the error of a touch."""
+    """Step of the fine rows; the error of a touch is about half of it."""
     pitch_mm: Annotated[float, Field(ge=2.0, le=20.0)] = 4.0
-    """Between spots; a shallow touch leaves a mark of one to three millimetres. Camera and arm must agree on the place
-    within a quarter of it."""
+    """Distance between spots; a shallow touch leaves a mark of one to three millimetres. Camera and arm must agree on
+    the place within a quarter of it."""
     columns: Annotated[int, Field(ge=2, le=50)] = 9
     """Spots in a row of a point's patch."""
     spots_per_dip: Annotated[int, Field(ge=1, le=20)] = 2
     """Touches after which the brush is dipped again: a tip that dries leaves no ink at first."""
     spots_per_photo: Annotated[int, Field(ge=1, le=20)] = 2
-    """In the coarse row, which ends at the photograph that shows ink: few, so that no spot gets deep and large."""
+    """Touches per photograph in the coarse row, which ends when ink is seen; few, so that spots stay small."""
     least_ink_mm2: Annotated[float, Field(gt=0.0, le=10.0)] = 0.25
     """Darkening that counts as ink: area times how much darker it became, 1 being black."""
 
@@ -82,13 +83,13 @@ class TouchConfig(Config):
     touches: Annotated[int, Field(ge=1, le=50)] = 3
     """Number of touches at each point."""
     repeatability_mm: Positive = 0.15
-    """How much the touches of one point may span; beyond it the run stops and names the heights."""
+    """How far the touches of one point may spread; beyond it the run stops and names the heights."""
     residual_mm: Positive = 0.2
     """How far a point may lie from the plane through all of them; three points have no residuals."""
     above_mm: Annotated[float, Field(gt=0.0, le=20.0)] = 2.0
     """How far above the expected height the approach begins: more than the error of that height."""
     travel_mm: Annotated[float, Field(gt=0.0, le=20.0)] = 2.0
-    """How far below the expected height the approach ends, with nothing touched."""
+    """How far below the expected height the approach ends if nothing is touched."""
     moved_mm: Positive = 0.5
     """A height measured this far from the one before is doubtful, and is pointed out in the set-up."""
     lean_deg: Annotated[float, Field(ge=0.0, le=3.0)] = 1.0
@@ -122,17 +123,17 @@ class SelfCheckConfig(Config):
     """Three marks at the corners of an uneven triangle, found by the camera, before a session."""
 
     enabled: bool | None = None
-    """Left out, it is on where real hardware may move (with `--arm`, or an arm that is not on this machine); a session
-    goes on as it was begun."""
+    """If left out, it is on where real hardware may move (with `--arm`, or an arm that is not on this machine); a
+    resumed session keeps the setting with which it began."""
     depth_mm: Annotated[float, Field(ge=0.5, le=10.0)] = 2.0
     legs_mm: tuple[Annotated[float, Field(ge=8.0, le=200.0)], Annotated[float, Field(ge=8.0, le=200.0)]] = (24.0, 15.0)
-    """Along paper x and y from the corner of the triangle, on sheets without room for one over three cells; uneven, so
-    that no corner is mistaken for another."""
+    """Legs of the triangle along paper x and y, on sheets without room for one over three cells; unequal, so that no
+    corner is mistaken for another."""
     offset_mm: Positive = 3.0
-    """How far all marks together may lie from where they were commanded; a soft tip lands beside its axis."""
+    """How far the marks may lie, on average, from where they were commanded; a soft tip lands beside its axis."""
     turn_deg: Positive = 1.0
     scale: Annotated[float, Field(gt=0.0, le=0.2)] = 0.01
-    """Relative error of a length that is refused, once `mark_mm` is taken off the triangle's extent."""
+    """Largest relative error of a length, on top of `mark_mm` divided by the triangle's extent."""
     mark_mm: Positive = 0.3
     """How far one mark's centre may lie from where the others imply: no two presses bend the hairs alike. To
     distinguish 2 % from 1 %, a triangle must extend over more than 50 mm along both axes."""

@@ -120,7 +120,7 @@ def make_ink(config: InkDeviceConfig, clock: Clock) -> InkStation | ModbusPump:
 
 
 def _resolved(host: str) -> str:
-    """The address of a host, so that one arm under two names is one arm."""
+    """The address of a host, so that two names of one arm count as one arm."""
     try:
         return socket.gethostbyname(host)
     except OSError:
@@ -129,7 +129,7 @@ def _resolved(host: str) -> str:
 
 @contextlib.contextmanager
 def sole_driver(config: RigConfig) -> Generator[None]:
-    """Hold the arm at this address against other processes of this machine, of any user. Raises `ConfigError`."""
+    """Reserve the arm at this address against other processes of this machine, of any user. Raises `ConfigError`."""
     address = f"{_resolved(config.robot.host)}:{config.robot.port}"
     with contextlib.ExitStack() as stack:
         try:
@@ -144,7 +144,7 @@ def sole_driver(config: RigConfig) -> Generator[None]:
 async def connected(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> AsyncGenerator[Rig]:
     """Connect camera, force sensor, ink device, then the robot; on the way out always stop the arm first.
 
-    `on_notice` gets what a device reports without being asked, from any thread. Raises `ConfigError` where another
+    `on_notice` gets what a device reports without being asked, from any thread. Raises `ConfigError` if another
     brushloop on this machine drives the arm: closing ours would stop its motion.
     """
     async with contextlib.AsyncExitStack() as stack:

@@ -40,7 +40,7 @@ class Finding:
     identity: str = ""
     firmware: str = ""
     latency_ms: float | None = None
-    """Median of several calls; for a camera, the time to a frame exposed after asking."""
+    """Median of several calls; for a camera, the time to a frame exposed after the request."""
     notes: str = ""
     problem: str = ""
     remedy: str = ""

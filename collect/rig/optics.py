@@ -1,4 +1,4 @@
-"""The lens of the rig's camera: read from beside `rig.toml`; its distortion is undone before anything is measured."""
+"""The lens of the rig's camera, from a file beside `rig.toml`; distortion is removed before anything is measured."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def gray(image: NDArray[np.uint8]) -> Gray:
 
 
 def undistorted(camera: CameraConfig, photograph: NDArray[np.uint8]) -> Gray:
-    """An (h, w) or (h, w, 3) BGR photograph in gray, without the distortion of the lens; recordings keep it.
+    """An (h, w) or (h, w, 3) BGR photograph in gray, without the lens distortion that recordings keep.
 
-    Raises `StepError` where the camera no longer gives photographs of the size that its lens was calibrated at.
+    Raises `StepError` if photographs no longer have the size at which the lens was calibrated.
     """
     image = gray(photograph)
     lens = lens_of(camera)

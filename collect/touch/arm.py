@@ -20,7 +20,7 @@ from drivers.samples import ForceSample, Frame, QueuedLine
 
 
 class Effector(Protocol):
-    """What touches need done on the rig apart from moving the brush; begins and ends at travel height."""
+    """Actions on the rig that touches need, apart from moving the brush; each begins and ends at travel height."""
 
     async def dip(self) -> None:
         """Fill the brush."""
@@ -32,7 +32,7 @@ class Effector(Protocol):
 
 
 class TouchEffector(Effector, Protocol):
-    """What zero touch needs done on the rig."""
+    """Actions on the rig that zero touch needs."""
 
     async def zero_touch(self) -> float:
         """Visit the taught height; returns where the arm rests."""
@@ -76,7 +76,7 @@ class TouchArm:
             await self.go(move)
 
     async def go(self, move: Move) -> None:
-        """Make one move, to its end."""
+        """Make one move and wait until it ends."""
         acc_mm_s2 = self._rig.config.motion.acc_mm_s2
         await self._rig.robot.move(move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=acc_mm_s2)
 
@@ -119,7 +119,7 @@ class ForceTap:
     ) -> tuple[float, float, int]:
         """(mean push in N, standard deviation of one sample, samples) of the next ones received after `after_ns`.
 
-        Raises `StepError` where the sensor falls silent.
+        Raises `StepError` if the sensor falls silent.
         """
         length = math.hypot(*push_axis)
         self._after_ns, self._wanted = after_ns, []

@@ -22,10 +22,10 @@ class Contact:
 
     z_mm: float
     sigma_mm: float
-    """Standard error from the noise of the samples alone: how far a brush differs from a hinge is not in it."""
+    """Standard error from the noise of the samples alone, without the error of taking the brush for a hinge."""
     stiffness_n_mm: float
     misfit: float
-    """Chi-square per degree of freedom: about 1 where the brush is a linear spring this near to the paper."""
+    """Chi-square per degree of freedom: about 1 if the brush is a linear spring this near to the paper."""
     samples: int
 
 
@@ -36,7 +36,7 @@ def find_contact(
 
     All arrays are (m,): height, mean force, number of samples in the mean, and descent (0, 1, ...) that it belongs to.
     Each descent has its own offset, so that a slow drift of the sensor is not taken for force. `sample_sd_n` is the
-    standard deviation of one sample. The join is solved exactly between each two heights (D. J. Hudson, Fitting
+    standard deviation of one sample. The join is solved exactly between neighbouring heights (D. J. Hudson, Fitting
     segmented curves whose join points have to be estimated, J. Am. Stat. Assoc. 61, 1966).
     Raises `StepError` where the force does not rise over at least two heights.
     """
@@ -54,7 +54,7 @@ def find_contact(
         return np.asarray(rows - means @ descents, np.float64)
 
     force = free_of_offsets(force_n)
-    # Each height but the highest as the upper end of what lies below the join: (j, m).
+    # (j, m): one row for each height but the highest, taken as the uppermost below the join.
     below = z_mm[None, :] <= heights[:-1, None]
     step, ramp = free_of_offsets(below.astype(np.float64)), free_of_offsets(np.where(below, -z_mm, 0.0))
     # Below the join, force = offset + stiffness * contact - stiffness * z, linear in both: 2 x 2 normal equations.
@@ -92,7 +92,7 @@ FELT_SIGMAS = 4.0
 LATE_STEPS = 2
 """Steps by which the fast approach may feel a soft brush too late."""
 CLEAR_STEPS = 4
-"""Rests in the air with which the medium approach begins."""
+"""Number of rests in the air at the start of the medium approach."""
 ROUGH_RUN = 0
 
 
@@ -105,7 +105,7 @@ class Reading:
     force_n: float
     samples: int
     sd_n: float
-    """Of one sample."""
+    """Standard deviation of one sample."""
 
 
 class Probe(Protocol):
@@ -127,7 +127,7 @@ class _Log:
         return sum(reading.samples for reading, _ in self.readings)
 
     def contact(self, config: ForceTouchConfig) -> Contact:
-        """The hinge through the readings of the linear part, iterated: which those are depends on the hinge."""
+        """Fit the hinge to the readings of the linear part; iterated, because that part depends on the hinge."""
         found = self._fit(-math.inf)
         for _ in range(3):
             found = self._fit(found.z_mm - config.linear_mm)
@@ -149,10 +149,10 @@ class _Log:
 async def touch_by_force(
     probe: Probe, reach: Reach, config: ForceTouchConfig, near_z_mm: float | None = None
 ) -> Contact:
-    """One touch; the probe is left down.
+    """Touch once; the probe is left down.
 
-    `near_z_mm` is where it touched last time, and makes the fast approach unnecessary. Raises `StepError` where nothing
-    is felt over the whole travel, where something is felt at its start, and where the noise leaves the contact unknown.
+    `near_z_mm` is the height of the last touch, and makes the fast approach unnecessary. Raises `StepError` if nothing
+    is felt over the whole travel, if something is felt at its start, or if the noise leaves the contact unknown.
     """
     lowest_z_mm = reach.lowest_z_mm
     if near_z_mm is None:
@@ -177,7 +177,7 @@ async def touch_by_force(
 
 
 async def _fast(probe: Probe, start_z_mm: float, lowest_z_mm: float, config: ForceTouchConfig) -> float:
-    """The height of the first rest at which something is felt."""
+    """Go down in large steps; return the height of the first rest at which something is felt."""
     z_mm, reading = start_z_mm, await probe.rest(start_z_mm, config.fast_samples)
     felt_n = _felt_n(reading, config)
     if abs(reading.force_n) > felt_n:
@@ -193,7 +193,7 @@ async def _fast(probe: Probe, start_z_mm: float, lowest_z_mm: float, config: For
 
 
 async def _medium(probe: Probe, start_z_mm: float, lowest_z_mm: float, config: ForceTouchConfig) -> _Log:
-    """Down in smaller steps until two rests in a row feel it."""
+    """Go down in smaller steps until something is felt at two rests in a row."""
     log, z_mm, before_n = _Log(), start_z_mm, 0.0
     while True:
         reading = await probe.rest(z_mm, config.medium_samples)

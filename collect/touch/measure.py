@@ -27,8 +27,8 @@ async def measure_plane(
 ) -> PlaneResult:
     """Touch as configured and fit the plane. The arm begins and ends at travel height.
 
-    `tap` is handed every sample of the force sensor, which must have been set to zero with nothing touching. `next_jog`
-    asks the operator, `tell` reports progress. Raises `StepError`, with the figures, where nothing is touched, touches
+    `tap` receives every sample of the force sensor, which must have been set to zero with nothing touching. `next_jog`
+    asks the operator, `tell` reports progress. Raises `StepError`, with the figures, if nothing is touched, touches
     do not repeat, or the points do not lie in a plane; the brush is lifted in that case too.
     """
     if config.method == "taught":
@@ -109,17 +109,17 @@ class Jogged:
     """Where the tip is, for the operator."""
 
     above_mm: float
-    """Above the expected height."""
+    """Height above the expected one."""
     lowest: bool
     """Whether it is at the end of the travel: nothing lower is allowed."""
     number: int
     """Number of the touch, from 1."""
     of: int
-    """Touches of this point and of all others."""
+    """Total number of touches, over all points."""
 
 
 NextJog = Callable[[Jogged], Awaitable[float | None]]
-"""The next step in mm, positive up; None where the tip touches."""
+"""The next step in mm, positive up; None if the tip touches."""
 ROUNDING_MM = 1e-6
 
 
@@ -150,9 +150,9 @@ async def touch_by_jog(
 
 
 def asked(asker: Asker, config: JogTouchConfig, height: str = "the height") -> NextJog:
-    """Ask for each jog on the screen. `height` names the height that holds without a jog.
+    """Ask for each jog on the screen. `height` names the height that is kept without a jog.
 
-    What it returns raises `NeedsOperator` where nobody watches, and `JogGivenUp` where the operator gives up.
+    The returned function raises `NeedsOperator` if nobody watches, and `JogGivenUp` if the operator gives up.
     """
     small, middle, large = config.steps_mm
     keys = {"1": -large, "2": -middle, "3": -small, "8": small, "9": middle, "0": large}

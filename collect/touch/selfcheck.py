@@ -27,7 +27,7 @@ from drivers.samples import Frame
 Floats = NDArray[np.float64]
 
 UNEVEN = 0.2
-"""How badly the second best order of the marks must fit; otherwise a mirror image could be taken for a turn."""
+"""Least misfit of the second best order of the marks; below it, a mirror image could be taken for a turn."""
 LEAST_SPAN_MM = 60.0
 """Least extent of a wide triangle along either axis."""
 MOST_OF_SHEET = 0.25
@@ -51,7 +51,7 @@ class SelfCheck:
     found_mm: Floats
     """(3, 2), in the same order."""
     offset_mm: tuple[float, float]
-    """Mean of found less commanded: the bend of the tip, and errors of the frame's origin."""
+    """Mean of found minus commanded: the bend of the tip, and errors of the frame's origin."""
     turn_deg: float
     scale: tuple[float, float]
     """Found over commanded length, along paper x and y."""
@@ -86,9 +86,9 @@ def triangle_of(cells: Sequence[Cell]) -> Triangle:
 
 
 def partners(sheet: Sheet, cell: Cell, used: Set[int]) -> tuple[Cell, ...]:
-    """Two free cells that make a wide triangle with this one, along its row and its column; none without room.
+    """Two free cells that make a wide triangle with this one, along its row and its column; empty if there is no room.
 
-    A wide triangle distinguishes an error of 2 % from one of 1 % by marks known to a few tenths of a millimetre.
+    With marks known to a few tenths of a millimetre, a wide triangle distinguishes an error of 2 % from one of 1 %.
     """
     if sheet.capacity * MOST_OF_SHEET < 3:
         return ()
@@ -118,7 +118,7 @@ def triangle_on(cells: Sequence[Cell], config: SelfCheckConfig) -> Triangle:
 async def self_check(rig: Rig, effector: Effector, places_mm: Triangle, plane: PaperPlane) -> SelfCheck:
     """Press the marks, photograph them and judge. The arm begins and ends at travel height; the cells are used up.
 
-    Raises `StepError` with the figures where the marks are not found, mirrored, turned, stretched or displaced.
+    Raises `StepError` with the figures if the marks are not found, mirrored, turned, stretched or displaced.
     """
     config, commanded = rig.config.self_check, np.array(places_mm, np.float64)
     if abs(float(np.linalg.det(commanded[1:] - commanded[0]))) < 1.0 or _second_best(commanded) < UNEVEN:
@@ -163,7 +163,7 @@ def judge(commanded_mm: Floats, found_mm: Floats, config: SelfCheckConfig) -> Se
     """Compare three found marks, in any order, with the commanded ones; both are (3, 2).
 
     There is one affine map for each order of three points; the right order is the one whose map keeps angles best.
-    Raises `StepError` with the figures where the map mirrors, or turns, stretches or displaces beyond the limits.
+    Raises `StepError` with the figures if the map mirrors, or turns, stretches or displaces beyond the limits.
     """
     orders = [found_mm[list(order)] for order in itertools.permutations(range(3))]
     found, linear = min(((f, _linear(commanded_mm, f)) for f in orders), key=lambda pair: _unlike(pair[1]))

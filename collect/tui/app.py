@@ -33,11 +33,11 @@ from sessions.errors import SessionError
 from sessions.remarks import mark_bad_or_good
 
 BOUNCE_S = 0.7
-"""For so long after an answer the keys of requests do nothing: an answer's key pressed twice would be a request."""
+"""Time after an answer in which the keys of requests do nothing: pressing an answer's key twice sends no request."""
 
 
 class OperatorApp(PlainApp):
-    """With a browser, one app for a whole day; with an engine, for one run."""
+    """The operator's app: for a whole day with a browser, for one run with an engine."""
 
     TITLE = "brushloop"
     # A selection would be copied with ctrl+c, which is a stop key here.
@@ -95,7 +95,7 @@ class OperatorApp(PlainApp):
         await super().on_event(event)
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Switch off the keys of a run where there is none."""
+        """Disable the keys of a run if there is no run."""
         if action == "stop":
             return self.at_work
         if action == "pause":
@@ -120,7 +120,7 @@ class OperatorApp(PlainApp):
         )
 
     def action_stop(self) -> None:
-        """Stop the arm at once, and show it, whatever lies over the run."""
+        """Stop the arm at once and show that, even if another screen lies over the run."""
         if self.engine is not None:
             self.engine.stop()
             if self._main is not None and self._main.is_mounted:
@@ -163,7 +163,7 @@ class OperatorApp(PlainApp):
             self._review(Path(self._now.folder))
 
     async def action_quit(self) -> None:
-        """Leave, but with the arm not parked only after a question."""
+        """Leave; ask first if the arm is not parked."""
         if isinstance(self.screen, Confirm):
             return
         now = self._now
@@ -190,7 +190,7 @@ class OperatorApp(PlainApp):
             self._away()
 
     def _away(self) -> None:
-        """Go back to the start screen where there is one, else end the app."""
+        """Go back to the start screen if there is one, else end the app."""
         if self._browser is None:
             self.exit()
             return
@@ -246,7 +246,7 @@ class OperatorApp(PlainApp):
         elif self.screen is self._main:
             self.switch_screen(screen)  # pyright: ignore[reportUnknownMemberType]
         else:
-            return  # something lies over it; at the next poll
+            return  # something lies over it: try again at the next poll
         self._main = screen
 
     def _poll(self) -> None:
@@ -265,7 +265,7 @@ class OperatorApp(PlainApp):
                 self.pop_screen()  # what it asks about is over
         if self._leave_when_over and self._now.state in FINAL:
             if self._now.rest_unknown:
-                self._leave_when_over = False  # that has to be read first
+                self._leave_when_over = False  # the operator has to read that first
             else:
                 self._away()
 

@@ -1,4 +1,4 @@
-"""What the start screen works with: recent sessions and how each stands, the rig's health, and engines.
+"""Data and actions of the start screen: recent sessions and their state, the rig's health, and engines.
 
 Heavy imports wait until they are needed, so that the screen is up first.
 """
@@ -20,7 +20,7 @@ RECENT = 50
 
 @dataclass(frozen=True, slots=True)
 class Paths:
-    """Which rig and protocol, and where sessions lie."""
+    """Paths of the rig, the protocol and the folder of sessions."""
 
     root: Path = Path("sessions")
     config: Path = Path("rig.toml")
@@ -47,7 +47,7 @@ class SessionBrowser:
         self.paths = replace(self.paths, config=Path(config), protocol=Path(protocol))
 
     def recent(self) -> list[Summary]:
-        """The newest sessions first; none where there is no folder yet."""
+        """The newest sessions first; empty if there is no folder yet."""
         from sessions.show import summaries
 
         if not self.paths.root.is_dir():
@@ -55,7 +55,7 @@ class SessionBrowser:
         return sorted(summaries(self.paths.root), key=lambda row: row.session_id, reverse=True)[:RECENT]
 
     def standing(self, session_id: str) -> Details:
-        """What of a session is finished, void, and next. Raises `SessionError`."""
+        """What is finished, void and next in a session. Raises `SessionError`."""
         from sessions.show import details
 
         return details(self.paths.root / session_id)

@@ -45,13 +45,13 @@ class ReviewCapture:
     kept: bool
     """False for a take that was pressed again, or left out."""
     verdict: str
-    """Name of the check that it failed; empty where it passed."""
+    """Name of the check that it failed; empty if it passed."""
     file: str
     remark: Remark | None
     waited_s: float | None = None
-    """From dip to touch; None where the session did not record it."""
+    """From dip to touch; None if the session did not record it."""
     unlike: str = ""
-    """Why that is far from the other strokes of the session; empty where it is not."""
+    """How `waited_s` differs from that of the session's other strokes; empty if it does not."""
 
     @property
     def counts(self) -> bool:
@@ -71,13 +71,13 @@ class CapturePictures:
 
 
 class Review:
-    """One session's folder, open or closed; reads, and writes nothing."""
+    """One session's folder, open or closed; reads it and writes nothing."""
 
     not_compared: str = ""
     """Why photographs are shown whole and presses are not compared; empty where board and lens are known."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises `SessionDamaged`, and `InputError` where the session was not collected here or holds links."""
+        """Raises `SessionDamaged`, and `InputError` if the session was not collected here or holds links."""
         self.folder = folder
         if not (folder / JOURNAL_NAME).is_file():
             raise InputError(folder, f"holds no {JOURNAL_NAME}: imported photographs are compared with `validate`")
@@ -110,7 +110,7 @@ class Review:
     def pictures(self, capture: ReviewCapture) -> CapturePictures:
         """The pictures of one capture, made once. Takes a tenth of a second: call it off a screen's loop.
 
-        Raises `SessionDamaged` where the still is not there.
+        Raises `SessionDamaged` if the still is missing.
         """
         if capture.still not in self._pictures:
             self._pictures[capture.still] = self._make_pictures(capture)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sessions.repair.verify import Verdict
 
 MOST_LINES = 400
-"""Of a command's output, the last so many are shown."""
+"""Number of lines shown of a command's output: the last ones."""
 COLUMNS = 68
 """Width that commands format their output for: that of this page on a terminal of 80 columns."""
 

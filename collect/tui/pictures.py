@@ -62,8 +62,8 @@ class CellPicture(Widget):
 class SixelPicture(Container):
     """A picture in sixels, as large as its place allows, its shape kept.
 
-    The border goes around a widget of its own: textual cuts and pads the lines of a widget that has one, and drops the
-    pixels.
+    The border belongs to this container, not to the pixels' widget: textual cuts and pads the lines of a widget with a
+    border, and drops the pixels.
     """
 
     DEFAULT_CSS = """
@@ -117,7 +117,7 @@ class Pixels(Widget):
         if self._made_for != self.size:
             self._fit()
         width, ground = self.size.width, self.rich_style
-        # While something lies over the screen textual dims what is below, which pixels cannot be.
+        # While something lies over the screen, textual dims what is below; pixels cannot be dimmed.
         if y >= len(self._lines) or not self.screen.is_active:
             return Strip.blank(width, ground)
         pixels = f"\x1b[{width}D\x1b7{sixels(self._lines[y])}\x1b8\x1b[{width}C"
@@ -172,7 +172,7 @@ class Pictures:
 
 
 def _best_kind() -> Callable[[str], CellPicture | SixelPicture | ImagePicture]:
-    """Ask the terminal which kind it shows; half-cells where textual-image is not installed."""
+    """Ask the terminal which kind it shows; half-cells if textual-image is not installed."""
     try:
         from textual_image.renderable import Image, SixelImage, TGPImage
         from textual_image.widget import TGPImage as Widget

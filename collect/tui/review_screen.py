@@ -35,7 +35,7 @@ KEYS = (
 )
 KEYS_AT_WORK = (("s", LABELS["s"]), *(pair for pair in KEYS if pair[0] not in ("o", "f")))
 KEYS_S = 0.5
-"""How often the line of keys is made anew, as a run may begin or end."""
+"""Interval at which the line of keys is updated, as a run may begin or end."""
 
 
 class ReviewScreen(Screen[None]):
@@ -71,7 +71,7 @@ class ReviewScreen(Screen[None]):
         at_work: Callable[[], bool] = lambda: False,
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """`at_work` says whether a run is on: then no text is typed, as `s` stops the arm."""
+        """`at_work` says whether a run is on: then no text can be typed, as `s` stops the arm."""
         super().__init__()
         self._review = review
         self._at_work = at_work
@@ -140,7 +140,7 @@ class ReviewScreen(Screen[None]):
                 self.notify(f"{self._capture.stroke_id}: pressed again once the plan is through")
 
     def action_note(self) -> None:
-        """Let a note be typed."""
+        """Let the operator type a note."""
         if self._capture is None:
             return
         if self._at_work():

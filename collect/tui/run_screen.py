@@ -142,7 +142,7 @@ class RunScreen(Screen[None]):
         self._log_pane.anchor()
 
     def on_resize(self, event: events.Resize) -> None:
-        """Choose what is shown by the terminal's size."""
+        """Choose what to show for the terminal's size."""
         self.set_class(event.size.width < NARROW_COLUMNS, "-narrow")
         self.set_class(event.size.height >= TALL_ROWS, "-tall")
 

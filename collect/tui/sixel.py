@@ -1,4 +1,4 @@
-"""Gray pictures as few gray levels, in runs, and as sixels: escape sequences that draw pixels on some terminals."""
+"""Gray pictures reduced to few levels, as runs, and as sixels: escape sequences that draw pixels on some terminals."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def sixels(levels: NDArray[np.int64]) -> str:
 
 
 def terminal_cell_px() -> tuple[int, int]:
-    """Width and height of a cell of this terminal; a VT340's where the terminal does not say."""
+    """Width and height of a cell of this terminal; a VT340's if the terminal does not report them."""
     answer = bytes(8)
     if sys.__stderr__ is not None:
         with contextlib.suppress(OSError, ValueError):

@@ -18,7 +18,7 @@ SHORT_STOP = "s: software stop; red button: emergency stop"
 
 
 def plain(text: str) -> str:
-    """The text with every character that a terminal acts on written out; a device's reply may hold an escape code."""
+    """Escape every character that a terminal acts on; a device's reply may hold an escape code."""
     return terminal.plain(text, keep="\n")
 
 

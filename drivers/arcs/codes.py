@@ -108,7 +108,7 @@ def refusal(code: int) -> tuple[str, str]:
 
 
 class WrongOperationalMode(MotionError):
-    """A program may not move the arm in this operational mode; `mode` is the controller's name of it."""
+    """A program may not move the arm in this operational mode; `mode` is the controller's name for it."""
 
     def __init__(self, device: str, op: str, mode: str) -> None:
         self.mode = mode
@@ -126,7 +126,7 @@ class QueueFull(MotionRefused):
 
 
 class OutOfReach(MotionFailed):
-    """The controller accepted a target and could not plan a way to it; `code` is its message."""
+    """The controller accepted a target and could not plan a path to it; `code` is the number of its message."""
 
     def __init__(self, device: str, op: str, code: int, name: str) -> None:
         self.code = code

@@ -1,6 +1,6 @@
-"""What must hold before a line is sent: the arm rests where it was left, is set up as it was, and may go the whole way.
+"""Checks before a line is sent: the arm rests where it was left, has the same settings, and may move the whole way.
 
-Another client may have used the arm since the last line, so everything is asked again.
+Another client may have used the arm since the last line, so everything is checked again.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from drivers.limits import Limits
 from drivers.samples import Pose
 
 MOVED_MM, MOVED_DEG = 0.5, 0.5
-"""Larger than the tolerance of any settled move: another client or a person moved the arm."""
+"""Limits beyond which another client or a person moved the arm: larger than the tolerance of any settled move."""
 DOWN_MM = 0.01
-"""A line that ends this much lower goes down."""
+"""A line that ends more than this lower counts as going down."""
 RESTS_S, POLL_S = 0.5, 0.02
-"""An arm that has just settled may take a moment to report it."""
+"""Longest wait for rest, and interval of the checks: an arm that has just settled may take a moment to report it."""
 
 
 class Departure:
@@ -32,7 +32,7 @@ class Departure:
         self._controller = controller
         self._settings: Settings = {}
         self.left: Pose | None = None
-        """Where the last line ended, or where the arm was taken up; None where a line was cut."""
+        """Where the last line ended, or where `take_up` found the arm; None after a line that did not reach its end."""
 
     async def enabled(self, settings: Settings) -> None:
         """Note the settings with which the arm was enabled, and its place."""
@@ -42,7 +42,7 @@ class Departure:
     async def take_up(self) -> Pose:
         """Accept the place where the arm rests as the start of the next line.
 
-        Raises `ArmMoved` while it moves, `SettingsChanged` where a pose would mean another tool, `RobotNotSafe`.
+        Raises `ArmMoved` while it moves, `SettingsChanged` if a pose would refer to another tool, `RobotNotSafe`.
         """
         await self._require_rest("take up")
         await self._require_settings("take up")
@@ -50,7 +50,7 @@ class Departure:
         return self.left
 
     async def confirm(self) -> None:
-        """Raise `RobotNotSafe`, `SettingsChanged`, then `ArmMoved`, unless all is as it was left."""
+        """Check that all is as it was left. Raises `RobotNotSafe`, `SettingsChanged`, then `ArmMoved`."""
         await self._require_settings("confirm")
         await self._require_rest("confirm")
         self._require_place("confirm", await self._controller.pose())
@@ -58,14 +58,14 @@ class Departure:
     async def ready(self, op: str, limits: Limits, poses: Sequence[Pose]) -> Pose:
         """Return where the arm is, once it may go from there through `poses`.
 
-        Raises as `confirm` does, and `LimitExceeded` where a line would leave the limits.
+        Raises as `confirm` does, and `LimitExceeded` if a line would leave the limits.
         """
         await self._require_rest(op)
         start = await self._controller.pose()
         way = [start, *poses]
         down = any(b.z_mm < a.z_mm - DOWN_MM for a, b in itertools.pairwise(way))
         if down or self._moved(start):
-            await self._require_settings(op)  # another tool would look like another place
+            await self._require_settings(op)  # with another tool, the same place would look like another
         self._require_place(op, start)
         for a, b in itertools.pairwise(way):
             limits.check_way(DEVICE, a, b)

@@ -47,7 +47,7 @@ PARAMETERS: dict[str, tuple[str, ...]] = {
     "RobotManage.setOperationalMode": ("mode",),
     "Trace.peek": ("num", "last_time"),
 }
-"""By `Class.method`, without the robot's name. A method that is not here takes nothing."""
+"""Parameter names by `Class.method`, without the robot's name. A method that is not listed takes none."""
 
 
 def parameters(method: str) -> tuple[str, ...]:
@@ -56,7 +56,7 @@ def parameters(method: str) -> tuple[str, ...]:
 
 
 def positional(method: str, params: Mapping[str, object]) -> list[object]:
-    """The values in the maker's order. Raises ValueError for a name that is missing or too many."""
+    """The values in the maker's order. Raises ValueError for a missing or unknown name."""
     names = parameters(method)
     if set(names) != set(params):
         raise ValueError(f"{method} takes {names}, got {tuple(params)}")
@@ -91,7 +91,7 @@ def encode_request(ident: str, method: str, params: Mapping[str, object] | None)
 
 
 def encode_bare_request(ident: int, method: str, params: Mapping[str, object] | None) -> bytes:
-    """As the maker documents it. Raises ValueError for a parameter that the method does not have."""
+    """A request as the maker documents it. Raises ValueError for a parameter that the method does not have."""
     values = positional(method, params or {})
     body = {"jsonrpc": "2.0", "method": method, "params": values, "id": ident}
     return json.dumps(body, separators=(",", ":")).encode()
@@ -240,7 +240,7 @@ class RpcConnection:
 
 
 async def open_arcs(connection: RpcConnection, aubope_port: int) -> None:
-    """Open the connection. Raises `WrongGeneration` where only the older software's port answers."""
+    """Open the connection. Raises `WrongGeneration` if only the older software's port answers."""
     try:
         await connection.open()
     except (ConnectionLost, DeviceTimeout):

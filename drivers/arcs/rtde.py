@@ -61,7 +61,7 @@ def outputs_of(greeting: bytes, device: str) -> dict[str, int]:
 
 
 def encode_topic(chanel: int, segments: Sequence[str], frequency_hz: float) -> bytes:
-    """Subscribe a channel; no segments at frequency 0 end it. The spelling is the maker's."""
+    """Message that subscribes a channel; no segments at frequency 0 end it. The spelling is the maker's."""
     topic = {
         "chanel": chanel,
         "frequency": float(frequency_hz),
@@ -86,7 +86,7 @@ def decode_message(payload: bytes, device: str) -> tuple[int, list[Any]]:
             message = cbor2.loads(
                 payload, semantic_decoders=_NoTags(), tag_hook=_refuse, max_depth=MAX_DEPTH, strict_hashable_types=True
             )
-    except Exception as error:  # what the decoders raise is not a closed list
+    except Exception as error:  # the decoders may raise anything
         raise ProtocolViolation(device, "decode", f"neither CBOR nor JSON: {error}") from None
     match message:
         case [int(head), *rest] if not isinstance(head, bool):
@@ -111,7 +111,7 @@ class RtdeStream:
         self._writer: asyncio.StreamWriter | None = None
         self._segments: tuple[str, ...] = ()
         self.older: list[list[Any]] = []
-        """What had piled up before the newest sample when that was read, oldest first."""
+        """Samples that had piled up before the newest one when it was read, oldest first."""
 
     async def open(self, segments: Sequence[str], frequency_hz: float) -> None:
         """Connect, read the greeting, subscribe. Raises `ConnectionLost`, `DeviceTimeout`, `ProtocolViolation`."""
@@ -136,7 +136,7 @@ class RtdeStream:
     async def newest(self) -> list[Any]:
         """The values of the newest sample, in the order of the segments.
 
-        Where several have piled up, the arrival of the older ones is unknown; they are left in `older`. Raises
+        If several have piled up, the arrival time of the older ones is unknown; they are left in `older`. Raises
         `DeviceTimeout` after silence, `ConnectionLost`, `ProtocolViolation`.
         """
         if self._reader is None:
