@@ -36,14 +36,14 @@ class DomainError(ValueError):
 
 
 DILATIONS = {"1": 1.0, "pi/2": 0.5 * math.pi, "pi": math.pi}
-"""The lambdas of the paper's figure 3; a fitted one is any positive number."""
+"""The values of lambda in the paper's figure 3; a fitted lambda may be any positive number."""
 
 
 @dataclass(frozen=True, slots=True)
 class Brush:
     """The hair bundle as a cone: largest radius R and length L, mm; both must be positive, else DomainError.
 
-    Floats, or (B,) tensors where a gradient with respect to the brush itself is wanted.
+    R and L are floats, or (B,) tensors for gradients with respect to the brush.
     """
 
     radius_mm: float | Tensor = 6.0
@@ -112,7 +112,7 @@ class CcdBsm:
     def half_width(self, x_mm: Tensor) -> Tensor:
         """Eq. 1 at x, (B, N) -> (B, N) mm; zero outside the mark."""
         heel, tip = self._fractions(x_mm)
-        # With the other side's fraction clamped to 0, its factor is 1: one product covers both sides.
+        # The other side's fraction is clamped to 0, so its factor is 1 and one product covers both sides.
         return column(self.half_width_mm) * safe_sqrt((1 - heel) * (1 + heel)) * (1 - tip) * (1 + tip)
 
     def area_to(self, x_mm: Tensor) -> Tensor:
@@ -143,7 +143,7 @@ def ccdbsm(
     """The CCD-BSM mark (Eq. 1-5) of presses to depth H at tilt alpha; scalars or (B,) tensors, broadcast to
     one (B,).
 
-    The dtype is `dtype`, else that of the floating-point tensors given, else float64. lambda = pi keeps the
+    The dtype is `dtype`, else that of the floating-point arguments, else float64. lambda = pi preserves the
     area of each cross-section. Raises DomainError unless alpha >= 0, alpha + theta < 90 deg, 0 < H <= L cos
     alpha, lambda > 0.
     """
@@ -163,8 +163,8 @@ def ccdbsm(
 def as_batch(*values: float | Tensor, dtype: torch.dtype | None = None) -> tuple[Tensor, ...]:
     """All values as (B,) tensors of one floating dtype on the device of the first tensor.
 
-    The dtype is `dtype`, else that of the floating-point tensors given, else float64. Raises ValueError for a
-    tensor of two dimensions or more.
+    The dtype is `dtype`, else that of the floating-point arguments, else float64. Raises ValueError for a
+    tensor of two or more dimensions.
     """
     tensors = [value for value in values if isinstance(value, Tensor)]
     if dtype is None:
@@ -180,7 +180,7 @@ def as_batch(*values: float | Tensor, dtype: torch.dtype | None = None) -> tuple
 
 
 def _check_domain(height: Tensor, tilt: Tensor, theta: Tensor, length: Tensor) -> None:
-    """Raise DomainError for the first press outside the domain; NaN is outside."""
+    """Raise DomainError for the first press outside the domain; NaN counts as outside."""
     limit_deg = 90 - torch.rad2deg(theta)
     bad = ~((tilt >= 0) & (tilt < limit_deg))
     if bad.any():

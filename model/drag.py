@@ -1,13 +1,13 @@
-"""Dragged strokes with bristle lag: the footprint trails behind the tip, so the ink is not where the command was.
+"""Dragged strokes with bristle lag: the footprint trails behind the tip, so the ink is not where the command is.
 
-A stamp laid along the commanded path cuts no corner and starts at full width; real ink does neither (a path-tangent
-stamp of any shape scores like plain circles). Here the footprint is a disc whose centre p follows the tip q over the
-length s of the path as a first-order lag,
+A stamp moved along the commanded path cuts no corners and starts at full width; real ink cuts corners and starts
+narrower (a path-tangent stamp of any shape scores like plain circles). Here the footprint is a disc whose centre p
+follows the tip q over the length s of the path as a first-order lag,
 
     dp/ds = (q - p) / leash,    leash = leash_mm + leash_per_mm * depth,
 
-and whose half width follows the depth with a lag of its own, `settle_mm`. Drift stands for how the brush is set: it
-turns with the brush, where the path tells its heading. The mark is the union of the discs between neighbouring nodes.
+and whose half width follows the depth with a separate lag, `settle_mm`. Drift describes how the brush is mounted: it
+turns with the brush if the path gives a heading. The mark is the union of the discs between neighbouring nodes.
 Lengths are mm, x and y in the frame of the path, y upward, depth into the paper. No torch here: numpy and, at the first
 call, numba.
 """
@@ -25,33 +25,33 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class DragModel:
-    """One brush drawn along the paper. The defaults are a start for a fit, not a brush."""
+    """One brush dragged along the paper. The defaults are a starting point for a fit, not a real brush."""
 
     half_mm: float = 3.0
     """Half width at depth 0, extrapolated; ink ends where the half width falls below 0."""
     half_per_mm: float = 0.25
-    """Growth of the half width by depth."""
+    """Growth of the half width per mm of depth."""
     half_per_mm2: float = 0.0
     leash_mm: float = 2.0
-    """Distance by which the footprint trails behind the tip at depth 0."""
+    """Distance by which the footprint trails the tip at depth 0."""
     leash_per_mm: float = 0.35
-    """Growth of the leash by depth."""
+    """Growth of the leash per mm of depth."""
     settle_mm: float = 3.0
     """Path length over which the footprint's width follows the depth."""
     drift_x_mm: float = 0.0
-    """Where the footprint lies from its lagging place, toward the heading; the x axis where a path has none."""
+    """Offset of the footprint from its lagged position, along the heading; along the x axis if a path has none."""
     drift_y_mm: float = 0.0
     drift_x_per_mm: float = 0.0
-    """Growth of the drift by depth."""
+    """Growth of the drift per mm of depth."""
     drift_y_per_mm: float = 0.0
     land_mm: float = 0.0
-    """Where the footprint lands, ahead of the tip along the path's first direction."""
+    """Distance ahead of the tip, along the path's first direction, at which the footprint lands."""
     back_mm: float = 0.0
-    """How far the mark reaches behind the place of landing."""
+    """How far the mark extends behind the landing point."""
     front: float = 0.3
-    """Share of the last gap between footprint and tip that ink still bridges while the brush lifts off."""
+    """Share of the final gap between footprint and tip that is inked while the brush lifts off."""
     front_width: float = 0.5
-    """Half width there, as a share of the last footprint's."""
+    """Half width at that end, as a share of the last footprint's."""
 
     def vector(self) -> Floats:
         """The parameters in order, (14,)."""
@@ -68,21 +68,21 @@ class DragModel:
         return DragModel(*(float(value) for value in vector))
 
     def trail(self, path: Floats) -> Floats:
-        """Where the footprint goes: (n, 3) nodes x, y, depth of the tip, or (n, 4) with the heading in degrees,
+        """Trail of the footprint: (n, 3) nodes x, y, depth of the tip, or (n, 4) with the heading in degrees,
         counter-clockwise from x -> (n + 2, 3) x, y, half width, mm.
 
-        The first and the last row are the mark's reach behind the landing and ahead of the lift-off. Raises
+        The first and the last row are the mark's ends behind the landing and ahead of the lift-off. Raises
         ValueError for a path of another shape, or of fewer than 2 nodes.
         """
         return trails([path], self.vector())[0]
 
     def distance(self, path: Floats, x_mm: Floats, y_mm: Floats) -> Floats:
-        """Signed distance in mm to the mark's edge, positive in ink, at the grid (len(y_mm), len(x_mm))."""
+        """Signed distance in mm to the mark's edge, positive in ink, on the grid (len(y_mm), len(x_mm))."""
         nodes, starts = trails([path], self.vector())
         return distances(nodes, starts, x_mm, y_mm)[0]
 
     def coverage(self, path: Floats, x_mm: Floats, y_mm: Floats, softness_mm: float) -> Floats:
-        """Ink from 0 to 1 at the grid, falling from .88 to .12 over `softness_mm` about the edge. Raises ValueError
+        """Ink from 0 to 1 on the grid, falling from .88 to .12 over `softness_mm` across the edge. Raises ValueError
         unless the softness is positive."""
         if not softness_mm > 0.0:
             raise ValueError(f"softness_mm = {softness_mm:g}: must be positive")
@@ -90,12 +90,12 @@ class DragModel:
 
 
 def ink(distance_mm: Floats, spread_mm: float) -> Floats:
-    """Signed distance to the chance of ink, if the edge strays by `spread_mm` (logistic)."""
+    """Probability of ink at a signed distance, if the edge varies by `spread_mm` (logistic)."""
     return 1.0 / (1.0 + np.exp(-np.clip(distance_mm / spread_mm, -40.0, 40.0)))
 
 
 def trails(paths: Sequence[Floats], vector: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """All paths' trails after each other, (sum(n + 2), 3), and where each begins and the last ends, (B + 1,)."""
+    """All paths' trails concatenated, (sum(n + 2), 3), and the rows where each begins and the last ends, (B + 1,)."""
     for path in paths:
         if path.ndim != 2 or path.shape[1] not in (3, 4) or len(path) < 2:
             raise ValueError(f"a path is (n, 3) or (n, 4) with n >= 2, got {path.shape}")
@@ -120,7 +120,7 @@ def distances(
 ) -> Floats:
     """Signed distance of every trail on one grid, (B, len(y_mm), len(x_mm)) mm, positive in ink.
 
-    Where an image shows several strokes, image i is that of trails `groups[i]` to `groups[i + 1]`, (B + 1,).
+    For images of several strokes, image i shows trails `groups[i]` to `groups[i + 1]`, (B + 1,).
     """
     from model.drag_kernel import signed
 

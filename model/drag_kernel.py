@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 _compile = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-_FAR = 6.0  # edge spreads from the edge beyond which a pixel's slope is below 3e-3 of its greatest
+_FAR = 6.0  # distance in edge spreads beyond which a pixel's slope is below 3e-3 of the maximum
 
 
 @_compile
@@ -30,7 +30,7 @@ def follow(path, ends, p, out, starts):
                 depth += (path[k, 2] - depth) * (1.0 - math.exp(-ds / max(p[5], 0.05)))
                 leash = max(p[3] + p[4] * depth, 0.05)
                 if ds > 1e-9:
-                    # The exact answer to a target that moves evenly: a steady gap of one leash, and what decays.
+                    # Exact response to a target at constant speed: a steady lag of one leash, plus a decaying term.
                     lag_x, lag_y = leash * dx / ds, leash * dy / ds
                     keep = math.exp(-ds / leash)
                     x = path[k, 0] - lag_x - (path[k - 1, 0] - x - lag_x) * keep
@@ -51,7 +51,7 @@ def follow(path, ends, p, out, starts):
 
 @_compile
 def _nearest(nodes, a, b, gx, gy):
-    """(signed distance, node, share, unit x, unit y) of the disc that reaches farthest over a point."""
+    """(signed distance, node, share, unit x, unit y) of the disc that covers a point most deeply."""
     best, node, share, ux, uy = -1e30, a, 0.0, 0.0, 0.0
     for k in range(a, b - 1):
         bx, by = nodes[k + 1, 0] - nodes[k, 0], nodes[k + 1, 1] - nodes[k, 1]
@@ -68,7 +68,7 @@ def _nearest(nodes, a, b, gx, gy):
 
 @_compile
 def _nearest_of(nodes, starts, first, last, gx, gy):
-    """The same over several trails."""
+    """As `_nearest`, over several trails."""
     found = _nearest(nodes, starts[first], starts[first + 1], gx, gy)
     for i in range(first + 1, last):
         other = _nearest(nodes, starts[i], starts[i + 1], gx, gy)
@@ -91,7 +91,7 @@ def signed(nodes, starts, groups, x, y, out):
 def normal_equations(nodes, starts, groups, slopes, x, y, target, spread, square, gradient):
     """Add J'J and J'r of ink minus target over every pixel; returns half the sum of squares.
 
-    `slopes` (nodes, 3, P) are the nodes' derivatives. The place t of the nearest disc is held while differentiating.
+    `slopes` (nodes, 3, P) are the nodes' derivatives. The position t of the nearest disc is held constant.
     """
     count = slopes.shape[2]
     j = np.empty(count)

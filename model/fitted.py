@@ -1,4 +1,4 @@
-"""CCD-BSM with the numbers of one brush: its lengths keep the geometry of Eq. 2-5, and what the paper fixes is fitted.
+"""CCD-BSM fitted to one brush: lengths follow the geometry of Eq. 2-5, and constants that the paper fixes are fitted.
 
 With h = H + h0, c = h / 15 mm, and CCD-BSM's own O3A, O4O3 and O3C at (h, alpha):
     tip = tip_gain O4O3 c^(length_power - 1) (1 + length_tilt alpha),
@@ -6,9 +6,9 @@ With h = H + h0, c = h / 15 mm, and CCD-BSM's own O3A, O4O3 and O3C at (h, alpha
     half width = lam O3C c^(width_power - 1) (1 + width_tilt alpha),
     profile = core sqrt(1 - u^6) + half width (1 - u^round)^power on either side (the paper: no core, u^2, power 1/2 at
     the heel and 1 at the tip).
-The widest place lies at lean H tan(alpha) + origin_mm + origin_gain h from the point where the tip touched, toward the
-side that the ferrule leans to: friction holds the tip back, so that only part of the lean may reach the ink (lean < 1).
-The defaults are CCD-BSM as published. No torch here: a rig PC evaluates it too.
+The widest place lies at lean H tan(alpha) + origin_mm + origin_gain h from the point where the tip touched, in the
+direction in which the ferrule leans; friction holds the tip back, so lean may be < 1.
+The defaults are CCD-BSM as published. No torch here, so that a rig PC can evaluate it too.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 DEPTH_MM = 15.0
-"""Where powers and edges are centred: the middle of the paper's depths."""
+"""Depth at which powers and edges are centred: the middle of the paper's range."""
 DEPTH_SPAN_MM, TILT_DEG = 4.5, 5.0
 TERMS = 5
 MODES = 10
-"""Sines along the mark by which each edge may differ from the profile."""
+"""Number of sines along the mark by which each edge may differ from the profile."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One fitted number: where it starts, how far it may plausibly be from there, and what it may be."""
+    """One fitted number: its start value, its plausible spread about that, and its bounds."""
 
     name: str
     unit: str
@@ -73,7 +73,7 @@ def published() -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Sizes:
-    """The mark of one press, mm: the widest place from the point of touch, the two sides, the half width."""
+    """The mark of one press, mm: offset of the widest place from the point of touch, the two sides, the half width."""
 
     widest: float
     tip: float
@@ -85,8 +85,8 @@ class Sizes:
 class FittedPress:
     """A calibrated brush: `values` (17,) in the order of `PARAMETERS`, `edges` (2, MODES, TERMS) mm.
 
-    The edges are what the profile leaves of the upper and the lower edge: sines along the mark, each with the terms of
-    `command_terms`.
+    The edges are the residuals of the upper and the lower edge from the profile: sines along the mark, each with the
+    terms of `command_terms`.
     """
 
     radius_mm: float
@@ -114,7 +114,7 @@ class FittedPress:
         return Sizes(widest, p["tip_gain"] * o4o3 * long, heel, p["lam"] * o3c * wide)
 
     def half_width(self, height_mm: float, tilt_deg: float, x_mm: Floats) -> Floats:
-        """The profile's half width at x from the point of touch, mm, any shape; beyond the ends minus the distance."""
+        """Half width of the profile at x from the point of touch, mm, any shape; beyond an end, minus the distance."""
         s = self.sizes(height_mm, tilt_deg)
         heel_power, heel_round, tip_power, tip_round, core = self.values[6:11]
         u = x_mm - s.widest
@@ -124,14 +124,14 @@ class FittedPress:
         return width - np.maximum(u - s.heel, 0.0) - np.maximum(-u - s.tip, 0.0)
 
     def edge_offsets(self, height_mm: float, tilt_deg: float, x_mm: Floats) -> tuple[Floats, Floats]:
-        """What the upper and the lower edge add to the half width at x, mm; zero beyond the ends."""
+        """Offsets of the upper and the lower edge from the half width at x, mm; zero beyond the ends."""
         s = self.sizes(height_mm, tilt_deg)
         waves = modes((x_mm - s.widest + s.tip) / (s.tip + s.heel))
         upper, lower = self.edges @ command_terms(height_mm, tilt_deg)
         return waves @ upper, waves @ lower
 
     def chance(self, height_mm: float, tilt_deg: float, x_mm: Floats, y_mm: Floats, spread_mm: float) -> Floats:
-        """The chance of ink (len(y_mm), len(x_mm)) where edges stray by `spread_mm`; y upward from the touch."""
+        """The probability of ink (len(y_mm), len(x_mm)) if edges vary by `spread_mm`; y upward from the touch."""
         width = self.half_width(height_mm, tilt_deg, x_mm)
         upper, lower = self.edge_offsets(height_mm, tilt_deg, x_mm)
         side = np.where(y_mm[:, None] > 0.0, upper[None], lower[None])
@@ -141,7 +141,7 @@ class FittedPress:
     def outline(self, height_mm: float, tilt_deg: float, points: int = 97) -> Floats:
         """The boundary as a counter-clockwise polygon (2 points, 2) mm, x from the point of touch, y upward."""
         s = self.sizes(height_mm, tilt_deg)
-        # Points crowd at both ends, where the outline turns fastest.
+        # Points are denser at both ends, where the outline turns fastest.
         share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, points))
         x = s.widest - s.tip + share * (s.tip + s.heel)
         width = np.maximum(self.half_width(height_mm, tilt_deg, x), 0.0)
@@ -156,6 +156,6 @@ def modes(share: Floats) -> Floats:
 
 
 def command_terms(height_mm: float, tilt_deg: float) -> Floats:
-    """1, depth, tilt, their product and depth squared, about their middles, (TERMS,): what an edge depends on."""
+    """The terms of an edge, (TERMS,): 1, depth, tilt, their product and depth squared, centred on their middles."""
     h, a = (height_mm - DEPTH_MM) / DEPTH_SPAN_MM, (tilt_deg - TILT_DEG) / TILT_DEG
     return np.array([1.0, h, a, h * a, h * h])

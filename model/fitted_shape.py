@@ -1,4 +1,4 @@
-"""The fitted brush of `model.fitted` as a stroke model: its outline for the rasters, beside the other models."""
+"""The fitted brush of `model.fitted` as a stroke model: its outline for the rasterisers."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ PARAMETERS = (
 
 
 def fitted_model(press: FittedPress, label: str = "CCD-BSM fitted") -> StrokeModel:
-    """The stroke model of a calibrated brush. Its shapes carry no gradient: the fit has its own.
+    """The stroke model of a calibrated brush. Its shapes carry no gradient; the fit computes its derivatives itself.
 
-    The shapes' origin is where the brush axis meets the paper, as every model's.
+    The shapes' origin is where the brush axis meets the paper, as in every model.
     """
 
     def of_press(height_mm: Number, tilt_deg: Number) -> Values:

@@ -1,7 +1,7 @@
 """Interface of stroke models: named parameters with units and ranges, and the shapes they describe.
 
-The rest follows from the shape: `model.raster` makes coverage images at any heading and place, `shape.outline()` is
-the boundary, `shape.area_mm2` the area, and all of it is differentiable in the parameters.
+The rest follows from the shape: `model.raster` makes coverage images at any heading and position, `shape.outline()` is
+the boundary, `shape.area_mm2` the area, and all are differentiable in the parameters.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class ParameterSpec:
     meaning: str
 
     def check(self, values: Tensor) -> None:
-        """Raise DomainError for the first of the values outside the range; NaN is outside."""
+        """Raise DomainError for the first value outside the range; NaN counts as outside."""
         bad = ~((values >= self.low) & (values <= self.high))
         if bad.any():
             unit = "" if self.unit == "1" else f" {self.unit}"
@@ -40,7 +40,7 @@ class ParameterSpec:
 
 
 class StrokeModel(Protocol):
-    """A family of shapes with named parameters, and what it predicts for a press."""
+    """A family of shapes with named parameters, and its prediction for a press."""
 
     @property
     def name(self) -> str:
@@ -54,7 +54,7 @@ class StrokeModel(Protocol):
 
     @property
     def fitted(self) -> bool:
-        """Whether any parameter was fitted to captures; a report must say so beside a score."""
+        """Whether any parameter was fitted to captures; a report must state this with each score."""
         ...
 
     @property
@@ -68,14 +68,14 @@ class StrokeModel(Protocol):
         ...
 
     def shape(self, values: Mapping[str, Number]) -> Shape:
-        """The shapes of these parameters, scalars or (B,) broadcast to one (B,); defaults for those left out.
+        """The shapes of these parameters, scalars or (B,) broadcast to one (B,); omitted ones take their defaults.
 
-        Raises DomainError outside a range or the model's own domain, and ValueError for an unknown name.
+        Raises DomainError outside a range or the model's domain, and ValueError for an unknown name.
         """
         ...
 
     def of_press(self, height_mm: Number, tilt_deg: Number) -> Values:
-        """The parameters that the model gives a press to depth H at tilt alpha, each (B,); may raise DomainError."""
+        """The model's parameters for a press to depth H at tilt alpha, each (B,); may raise DomainError."""
         ...
 
     def profile(self, height_mm: Number, tilt_deg: Number) -> Shape:
@@ -85,9 +85,9 @@ class StrokeModel(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Basis:
-    """What models of one brush are derived from: CCD-BSM with that brush and lambda.
+    """The CCD-BSM, with its brush and lambda, from which the other models of that brush are derived.
 
-    `fitted` says that lambda (or the brush) was fitted to captures, so that every model derived from it says so.
+    `fitted` says that lambda (or the brush) was fitted to captures; every derived model is then marked as fitted.
     """
 
     brush: Brush

@@ -1,7 +1,7 @@
 """The stroke models by name: what a validation compares, a report describes and a generator is trained on.
 
-A model is a file in `model/strokes/` with a function `models(basis) -> tuple[StrokeModel, ...]`; being there is
-enough to be listed here.
+A model is a file in `model/strokes/` with a function `models(basis) -> tuple[StrokeModel, ...]`; files there are
+found automatically.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Linear regression of stroke parameters on depth and tilt, as Wang and Min do for Bezier strokes.
 
 The paper describes theirs as a least-squares multiple linear regression of the stroke's lengths on the descending
-height and the tilt angle. Here the terms are 1, H and H alpha: the tilt acts in proportion to the depth, as every
-length of CCD-BSM does, so a regressed stroke stays a stroke far from the cells. Where no captures are at hand the
-regression runs on CCD-BSM's own marks at the cells of the paper and adds no information about real ink.
+height and the tilt angle. Here the terms are 1, H and H alpha: the effect of tilt is proportional to depth, as is
+every length of CCD-BSM, so a regressed stroke stays valid far from the cells. Without captures the regression runs
+on CCD-BSM's marks at the cells of the paper and adds no information about real ink.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 from model.ccdbsm import CcdBsm, as_batch
 from model.protocol import Basis, Number, Values
 
-# The paper's H and alpha; H as a share of its brush's 48 mm, so that any brush is regressed inside its domain.
+# The paper's H and alpha; H as a share of its brush's 48 mm, so that the cells lie in the domain of any brush.
 DEPTHS = tuple(height_mm / 48 for height_mm in (11.0, 13.0, 15.0, 17.0, 20.0))
 TILTS_DEG = (0.0, 5.0, 10.0)
 
@@ -39,7 +39,7 @@ class Plane:
 def fit_plane(height_mm: Tensor, tilt_deg: Tensor, values: Values) -> Plane:
     """The least-squares fit to values (N,) at H and alpha (N,), for captures or marks alike.
 
-    Raises ValueError where the cells do not span a plane: at least two depths and two tilts are needed.
+    Raises ValueError if the cells do not span a plane: at least two depths and two tilts are needed.
     """
     design = torch.stack((torch.ones_like(height_mm), height_mm, height_mm * tilt_deg), dim=-1).double()
     if torch.linalg.matrix_rank(design) < 3:
@@ -49,7 +49,7 @@ def fit_plane(height_mm: Tensor, tilt_deg: Tensor, values: Values) -> Plane:
 
 
 def regressed(basis: Basis, measure: Callable[[CcdBsm], Values]) -> Callable[[Number, Number], Values]:
-    """(H, alpha) to parameters: `measure` of CCD-BSM's marks at the paper's cells, regressed at the first press.
+    """A function (H, alpha) -> parameters: `measure` of CCD-BSM's marks at the paper's cells, regressed on first use.
 
     The function raises DomainError where CCD-BSM has no mark.
     """
@@ -70,7 +70,7 @@ def regressed(basis: Basis, measure: Callable[[CcdBsm], Values]) -> Callable[[Nu
 
 
 def solve(value: Callable[[Tensor], Tensor], target: Tensor, low: Tensor, high: Tensor, steps: int = 50) -> Tensor:
-    """Where a growing function (B,) -> (B,) reaches `target` between low and high, by bisection; else the end.
+    """Where an increasing function (B,) -> (B,) reaches `target` between low and high, by bisection; else an end.
 
     The result carries no gradient.
     """

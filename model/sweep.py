@@ -1,7 +1,7 @@
-"""The outline of a disc that is moved along a quadratic Bezier curve while its width changes evenly.
+"""The outline of a disc that moves along a quadratic Bezier curve while its width changes linearly.
 
 With centre c(t), radius r(t), tangent T, left normal N and k = r' / |c'|, the disc's envelope is
-c + r (-k T +- sqrt(1 - k^2) N): the two sides of the stroke. The first and the last disc close it.
+c + r (-k T +- sqrt(1 - k^2) N): the two sides of the stroke. The first and the last disc close the outline.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ _CAP_ARCS = 3  # arcs in a round end: each spans less than 120 degrees
 
 
 def swept(nodes_mm: Tensor, start_width_mm: Tensor, end_width_mm: Tensor, pieces: int = 64) -> Outline:
-    """The strokes with control points (B, 3, 2) and widths (B,), as `pieces` parabolas a side and round ends.
+    """The strokes with control points (B, 3, 2) and widths (B,), as `pieces` parabolas per side and round ends.
 
-    Raises DomainError where one disc holds its neighbours (the width changes faster than the curve runs) or where a
-    bend is tighter than the stroke is thick, so that its inner side folds over. Two stretches of one stroke that
-    overlap elsewhere are counted twice by `area_mm2` and wrongly along the overlap's boundary by the rasters.
+    Raises DomainError if a disc contains its neighbours (the width changes faster than the curve advances) or if a
+    bend is tighter than the stroke is thick, so that its inner side folds over. Where a stroke overlaps itself
+    elsewhere, `area_mm2` counts the overlap twice and the rasterisers are wrong along its boundary.
     """
     t = torch.linspace(0, 1, 2 * pieces + 1, dtype=nodes_mm.dtype, device=nodes_mm.device)
     centre = evaluate(nodes_mm[:, None], torch.ones_like(t), t)
@@ -44,7 +44,7 @@ def swept(nodes_mm: Tensor, start_width_mm: Tensor, end_width_mm: Tensor, pieces
     right_side, left_side = centre + back - aside, centre + back + aside
     _check_folds(right_side, left_side, along, nodes_mm)
     heading = torch.atan2(along[..., 1], along[..., 0])
-    lean = torch.atan2(safe_sqrt((1 - k) * (1 + k)), -k)  # from the tangent to where the disc is touched
+    lean = torch.atan2(safe_sqrt((1 - k) * (1 + k)), -k)  # angle from the tangent to the envelope's point of contact
     end, end_weights = _cap(centre[:, -1], radius[:, -1], heading[:, -1] - lean[:, -1], 2 * lean[:, -1])
     start, start_weights = _cap(centre[:, 0], radius[:, 0], heading[:, 0] + lean[:, 0], 2 * (math.pi - lean[:, 0]))
     points = torch.cat((through(right_side), end, through(left_side.flip(1)), start), dim=1)

@@ -1,4 +1,4 @@
-"""Cells of CSV files: text that a spreadsheet would run as a formula is written with an apostrophe before it."""
+"""Cells of CSV files: text that a spreadsheet would run as a formula is prefixed with an apostrophe."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FORMULA_STARTS = frozenset("=+-@\t\r\n＝＋－＠")
 
 
 def as_cell(value: object) -> object:
-    """Cell for a value: numbers unchanged, also as text (`-0.5`), and no other text as a formula."""
+    """Cell for a value: numbers, also as text (`-0.5`), are unchanged; other text is never a formula."""
     if isinstance(value, str) and value and (value[0] in FORMULA_STARTS or _marked(value)) and not _is_number(value):
         return MARK + value
     return value
@@ -23,7 +23,7 @@ def as_text(cell: str) -> str:
 
 
 class CsvWriter:
-    """Writes a CSV file whose cells may hold text from elsewhere."""
+    """Writes a CSV file whose cells may hold untrusted text."""
 
     def __init__(self, file: Any, lineterminator: str = "\n") -> None:
         self._out = csv.writer(file, lineterminator=lineterminator)  # noqa: TID251 - the one place

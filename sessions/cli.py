@@ -1,6 +1,6 @@
 """`brushloop sessions ...`: inspect, check, repair, import, merge and export recordings.
 
-Heavy imports wait until a command runs. Exit codes beside the usual ones: 3 repaired, but something is lost; 6 damaged.
+Heavy imports wait until a command runs. Additional exit codes: 3 repaired, but something is lost; 6 damaged.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def show(
 def verify(session: Session) -> None:
     """Read every file again, check each against its CRC, its counts and the journal, and decode every image.
 
-    Exit code 0: all is sound. 6: something is damaged, and is named.
+    Exit code 0: everything is intact. 6: something is damaged, and is named.
     """
     from sessions.repair.verify import verify_session
 
@@ -89,7 +89,7 @@ def verify(session: Session) -> None:
 
 @app.command()
 def repair(session: Session) -> None:
-    """Give back every intact finished stroke of a damaged session, mark the rest as lost, and say what was done.
+    """Recover every intact finished stroke of a damaged session, mark the rest as lost, and report what was done.
 
     Nothing recorded is overwritten: damaged files are kept as `<name>.damaged-1`. Exit code 0: nothing was lost.
     3: something was, and is named. 6: nothing could be rebuilt.

@@ -36,9 +36,9 @@ class Failing(Protocol):
 
 
 class Faults:
-    """The faults of a rig: one board for all servers, a watch for those that begin by themselves, and the person there.
+    """The faults of a rig: a board that all servers share, a task that starts due faults, and the release of stops.
 
-    `ink` and `force` are None in a rig without them; their faults are refused then.
+    `ink` and `force` are None in a rig without these devices; their faults are then refused.
     """
 
     def __init__(
@@ -66,21 +66,21 @@ class Faults:
         return self.board.hang(fault)
 
     def start(self) -> None:
-        """Watch, from the running event loop on."""
+        """Start the watching task in the running event loop."""
         self._watching = asyncio.create_task(self._watch(), name="faults")
 
     async def stop(self) -> None:
-        """End watching; faults stay on the board."""
+        """Stop the watching task; faults stay on the board."""
         task, self._watching = self._watching, None
         if task is not None:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
 
     def release(self) -> str:
-        """End a safety stop as a person at the arm would; returns what the safety mode was.
+        """End a safety stop as a person at the arm would; return the previous safety mode.
 
-        A protective stop is unlocked at the pendant, a safeguard is reset at its input; an emergency stop's button is
-        released and the interface board restarted, which leaves the arm without power.
+        A protective stop is unlocked at the pendant, and a safeguard stop is reset at its input. For an emergency stop,
+        the button is released and the interface board restarted, which leaves the arm without power.
         """
         cabinet = self._arcs.cabinet
         before = cabinet.power.safety
@@ -94,11 +94,11 @@ class Faults:
         return before.value
 
     def fresh_sheet(self) -> None:
-        """Put a blank sheet in."""
+        """Replace the sheet by a blank one."""
         self._world.fresh_sheet()
 
     def state(self) -> dict[str, Any]:
-        """State of the world now, as JSON."""
+        """Current state of the world, as JSON."""
         cabinet = self._arcs.cabinet
         x_mm, y_mm, z_mm = self._world.tool().position_mm
         return {
@@ -150,7 +150,7 @@ class LoopbackRig:
             await self.rtde.start(HOST, self.config.rtde_port)
             await self.camera.start(HOST, self.config.camera_port)
             if self.force is not None:
-                await asyncio.to_thread(self.world.reaction.prepare)  # some tenths of a second, so not in the loop
+                await asyncio.to_thread(self.world.reaction.prepare)  # takes some tenths of a second
                 await self.force.start(HOST, self.config.force_port)
             if self.ink is not None:
                 self.ink.__enter__()
@@ -189,7 +189,7 @@ class LoopbackRig:
         return ", ".join(places)
 
     async def idle(self, seconds: float) -> None:
-        """Return once no client has been connected for so long."""
+        """Return once no client has been connected for `seconds`."""
         loop = asyncio.get_running_loop()
         since = loop.time()
         while loop.time() - since < seconds:

@@ -2,12 +2,12 @@
 
 The control socket takes one JSON object per line and answers with one per line, over a unix socket of mode 0600:
 
-| request | answer, beside `"ok": true` |
+| request | answer, in addition to `"ok": true` |
 |---|---|
 | `{"do": "add", "fault": {...}}` | `id` of the fault |
-| `{"do": "list"}` | `hanging` and `over`: id, fault, how often it has struck |
+| `{"do": "list"}` | `hanging` and `over`: id, fault, number of strikes |
 | `{"do": "clear"}`, or with `"id": 3` | `taken`: how many were removed |
-| `{"do": "state"}` | what the world knows: phase, tip, presses, ink load, modes |
+| `{"do": "state"}` | state of the world: phase, tip, presses, ink load, modes |
 | `{"do": "release"}` | `was`: the safety mode that a person at the arm has ended |
 | `{"do": "fresh-sheet"}` | |
 
@@ -44,10 +44,10 @@ def serve(
     faults: Path | None = None,
     control: Path | None = None,
 ) -> None:
-    """Serve until a signal, or until idle for `idle_exit_s` (0 means never), with a script of faults if there is one.
+    """Serve until a signal, or until idle for `idle_exit_s` (0 means never); `faults` is an optional fault script.
 
     Raises `RigFileExists` rather than overwrite a file that no loopback rig wrote, `FaultScriptError`, and
-    `ControlPathError` where no control socket can be made.
+    `ControlPathError` if the control socket cannot be created.
     """
     asyncio.run(_serve(config, write_rig, idle_exit_s, tell, faults, control))
 
@@ -84,7 +84,7 @@ async def _serve(
 
 
 class RigFileExists(Exception):
-    """The file cannot be written: there is no such folder, or no loopback rig wrote it, so it may be a lab's own."""
+    """The file cannot be written: its folder is missing, or it is not from a loopback rig and may be a real rig's."""
 
     exit_code: ClassVar[int] = 2
 
@@ -106,7 +106,7 @@ def _write_whole(path: Path, text: str) -> None:
 MAX_LINE_BYTES = 8192
 MAX_CLIENTS = 16
 MAX_PATH_BYTES = 100
-"""Of a unix socket's path; the system's own limit is a little above."""
+"""Longest allowed path of a unix socket; the system's limit is slightly higher."""
 FIELDS: dict[str, tuple[str, ...]] = {
     "add": ("fault",),
     "list": (),
@@ -123,7 +123,7 @@ USAGE = (
 
 
 class ControlPathError(Exception):
-    """The socket cannot be made at this path."""
+    """The socket cannot be created at this path."""
 
     exit_code: ClassVar[int] = 2
 
@@ -141,14 +141,14 @@ class ControlServer(LoopbackServer):
         self._made = (0, 0)
 
     async def open(self, path: Path) -> None:
-        """Listen at `path`. Raises `ControlPathError`; the socket of a rig that has ended is replaced."""
+        """Listen at `path`, replacing the socket of a rig that has ended. Raises `ControlPathError`."""
         listener = _listener(path)
         made = path.stat()
         self._path, self._made = path, (made.st_dev, made.st_ino)
         self._server = await asyncio.start_unix_server(self._serve, sock=listener, limit=MAX_LINE_BYTES)
 
     async def stop(self) -> None:
-        """Close the listener and every client, and take the socket away."""
+        """Close the listener and every client, and remove the socket."""
         await super().stop()
         path, self._path = self._path, None
         if path is not None:
@@ -158,7 +158,7 @@ class ControlServer(LoopbackServer):
                     path.unlink()
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Answer line by line; a line that is too long ends the connection after its answer."""
+        """Answer line by line; an overlong line is answered, then the connection is closed."""
         if self.clients > MAX_CLIENTS:
             writer.write(_line(_error(f"more than {MAX_CLIENTS} clients")))
             return
@@ -210,7 +210,7 @@ class ControlServer(LoopbackServer):
 
 @contextlib.asynccontextmanager
 async def live_control(faults: Faults, path: Path | None) -> AsyncGenerator[None]:
-    """A control socket at `path` until the block ends; none where there is no path. Raises `ControlPathError`."""
+    """A control socket at `path` until the block ends; none if `path` is None. Raises `ControlPathError`."""
     server = ControlServer(faults)
     if path is not None:
         await server.open(path)
@@ -234,12 +234,12 @@ def _line(body: dict[str, Any]) -> bytes:
 
 
 def _listener(path: Path) -> socket.socket:
-    """A bound socket that only its owner can open. Raises `ControlPathError`."""
+    """A bound socket to which only its owner can connect. Raises `ControlPathError`."""
     if len(os.fsencode(path)) > MAX_PATH_BYTES:
         raise ControlPathError(path, f"the path of a socket has at most {MAX_PATH_BYTES} bytes")
     _clear_away(path)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    # Set before the path exists: with a later `chmod` another user could connect in between.
+    # Set before the path exists: another user could connect before a later `chmod`.
     mask = os.umask(0o177)
     try:
         listener.bind(str(path))
@@ -253,7 +253,7 @@ def _listener(path: Path) -> socket.socket:
 
 
 def _clear_away(path: Path) -> None:
-    """Remove a socket without a listener; refuse anything else that is there."""
+    """Remove a socket that has no listener; refuse to remove anything else."""
     try:
         mode = path.lstat().st_mode
     except OSError:

@@ -12,7 +12,7 @@ from drivers.errors import ProtocolViolation
 
 
 class NotLoopback(ValueError):
-    """A simulated device was to be served where others could reach it."""
+    """A simulated device was asked to listen where other machines could reach it."""
 
     exit_code: ClassVar[int] = 2
 
@@ -31,12 +31,12 @@ class LoopbackServer(abc.ABC):
 
     @abc.abstractmethod
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve one client until it goes away; may raise the errors of a connection that ends."""
+        """Serve one client until it disconnects; may raise connection errors."""
 
     async def start(self, host: str, port: int) -> None:
         """Listen; with `port` 0 the system chooses `self.port`.
 
-        Raises `NotLoopback` unless `host` is a loopback address; a name could resolve to anything.
+        Raises `NotLoopback` unless `host` is a loopback address; a host name could resolve to any address.
         """
         if not _is_loopback(host):
             raise NotLoopback(host)
@@ -58,7 +58,7 @@ class LoopbackServer(abc.ABC):
 
     @property
     def clients(self) -> int:
-        """How many are connected."""
+        """Number of connected clients."""
         return len(self._clients)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -68,9 +68,9 @@ class LoopbackServer(abc.ABC):
         try:
             await self.converse(reader, writer)
         except (ConnectionError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            pass  # the client went away
+            pass  # the client disconnected
         except ProtocolViolation:
-            pass  # it does not speak the protocol
+            pass  # the client does not speak the protocol
         except asyncio.CancelledError:
             pass  # `stop`: the streams module would report a cancelled handler as an error
         finally:

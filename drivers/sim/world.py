@@ -1,4 +1,4 @@
-"""The simulated world: where the tool is, whether it touches paper or ink, and the mark that this leaves."""
+"""The simulated world: where the tool is, whether it touches paper or ink, and the marks it leaves."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from drivers.sim.config import SimConfig
 
 
 class SimClock:
-    """Seconds of simulated time since the start, `rate` of them per real second."""
+    """A clock of simulated time, which passes `rate` times as fast as real time."""
 
     def __init__(self, rate: float = 1.0) -> None:
         if not 0.0 < rate <= 1000.0:
@@ -32,12 +32,12 @@ class SimClock:
         self._start = time.monotonic()
 
     def now_s(self) -> float:
-        """Simulated seconds since this clock was made."""
+        """Simulated seconds since this clock was created."""
         return (time.monotonic() - self._start) * self.rate
 
 
 BRUSH_ML = 0.5
-"""Ink that a dry brush takes up."""
+"""Volume of ink that a dry brush absorbs."""
 
 
 class Well:
@@ -61,11 +61,11 @@ class Well:
 
     @property
     def share(self) -> float:
-        """Filling, 0 to 1."""
+        """Fill level, 0 to 1."""
         return min(1.0, self.ml / self.capacity_ml)
 
     def add(self, volume_ml: float) -> None:
-        """Add a dose; what does not fit runs over."""
+        """Add a dose; any excess is lost."""
         self.ml = min(self.capacity_ml, self.ml + volume_ml)
 
     def dip(self, ink_load: float) -> float:
@@ -76,12 +76,12 @@ class Well:
 
 
 INK_PER_PRESS = 0.12
-"""Share of a full brush that one press takes, and the landing of a drag."""
+"""Share of a full brush's ink that a press uses, or the landing of a drag."""
 
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """One contact of brush and paper as it really happened, for tests to compare with."""
+    """One contact of brush and paper as it really happened: ground truth for tests."""
 
     index: int
     x_mm: float
@@ -91,7 +91,7 @@ class Press:
     heading_deg: float
     ink_load: float
     flaw: Flaw | None = None
-    """The flaw of the mark: scripted, a split that came by itself, or caused by the ink load."""
+    """The flaw of the mark: scripted, a spontaneous split, or caused by the ink load."""
     severity: float = 0.0
 
 
@@ -103,17 +103,17 @@ class Drag:
     path: tuple[Waypoint, ...]
     """The commanded tip in the paper frame, from touching to lifting off."""
     tilt_deg: float
-    """At the deepest point."""
+    """Tilt at the deepest point."""
     heading_deg: float
-    """Where the ferrule leaned, or would have leaned, when the tip landed."""
+    """Direction in which the ferrule leaned, or would have leaned, when the tip landed."""
     ink_load: float
-    """At landing."""
+    """Ink load at landing."""
 
 
 class World:
     """Tool, brush, ink and sheet under one clock.
 
-    The ink depends on where the tool went, not on when anyone looked: contact is followed along finished
+    The ink depends on the tool's path, not on when its pose is queried: contact is followed along finished
     stretches of the path, and a contact leaves its mark when the brush lifts off.
     """
 
@@ -125,41 +125,41 @@ class World:
         self.presses: list[Press] = []
         self.drags: list[Drag] = []
         self.flaws: dict[int, tuple[Flaw, float]] = {}
-        """Scripted flaw and severity by the index of the press; severity 0 rules out a split by itself."""
+        """Scripted flaw and severity by the index of the press; severity 0 rules out a spontaneous split."""
         self.ink_load = 0.0
         table = config.table
         self.well = Well.round(table.well_radius_mm, table.ink_level_mm, table.well_depth_mm)
         self.reaction = Reaction(self.brush, sensor_to_tip_mm=config.sensor_to_tip_mm, hanging_kg=config.hanging_kg)
         self.version = 0
-        """Counts changes of what the camera can see on the sheet."""
+        """Number of visible changes to the sheet so far."""
         self._watch = ContactWatch(self._above_mm)
         tool = np.eye(4)
         tool[2, 3] = config.tool_mm / 1e3
         self.motion = ArmQueue(brush_pose(*config.home_mm), self._travelled, tool)
 
     def flaw_next(self, flaw: Flaw, severity: float = 1.0) -> None:
-        """Give the next press to lift off a flaw; raises ValueError unless severity is in 0 .. 1."""
+        """Give a flaw to the next press that lifts off; raises ValueError unless severity is in 0 .. 1."""
         if not 0.0 <= severity <= 1.0:
             raise ValueError(f"severity = {severity:g} is outside 0 .. 1")
         self.flaws[len(self.presses)] = (flaw, severity)
 
     def fresh_sheet(self) -> None:
-        """Put a blank sheet in, as an operator would."""
+        """Replace the sheet by a blank one, as an operator would."""
         self.paper = Paper(*self.config.table.sheet_mm)
         self.version += 1
 
     def tool(self) -> Pose:
-        """The tip's pose now, in the base frame."""
+        """Current pose of the tip in the base frame."""
         return self.motion.pose(self.clock.now_s())
 
     def wrench(self) -> Wrench:
-        """Wrench on the force sensor now, in the tool's frame."""
+        """Current wrench on the force sensor, in the tool's frame."""
         tip = self.tool()
         x_mm, y_mm, depth_mm = self._on_sheet(tip)
         return self.reaction.wrench(tip, 0.0 if self._in_well(x_mm, y_mm) else depth_mm, self._normal)
 
     def to_paper(self, x_mm: float, y_mm: float) -> tuple[float, float]:
-        """Base frame to paper frame, in the plane."""
+        """Convert x and y from the base frame to the paper frame."""
         table = self.config.table
         dx, dy = x_mm - table.origin_mm[0], y_mm - table.origin_mm[1]
         yaw = math.radians(table.yaw_deg)
@@ -193,7 +193,7 @@ class World:
         deepest_mm = self.brush.deepest_mm(tilt_deg)
         make = functools.partial(
             self.brush.press,
-            min(depth_mm, deepest_mm),  # the ferrule stands on the paper
+            min(depth_mm, deepest_mm),  # at most until the ferrule stands on the paper
             min(tilt_deg, MAX_TILT_DEG),
             ink_load=self.ink_load,
             press_seed=self.config.seed * 100_003 + index,
@@ -203,7 +203,7 @@ class World:
         self.paper.lay_later(make, x_mm, y_mm, heading_deg)
         want = flaw_of_load(self.ink_load)
         if want is Flaw.BLANK or (flaw is None and want is not None):
-            # there is no ink on the hairs, or too little for the mark
+            # no ink on the hairs, or too little for the mark
             flaw, severity = want, 1.0 - self.ink_load
         self.presses.append(Press(index, x_mm, y_mm, depth_mm, tilt_deg, heading_deg, self.ink_load, flaw, severity))
         self.ink_load = max(0.0, self.ink_load - INK_PER_PRESS)
@@ -222,7 +222,7 @@ class World:
             min(tilt_deg, MAX_TILT_DEG),
             heading_deg,
             ink_load=self.ink_load,
-            # far from the seeds of presses
+            # an offset keeps it apart from the seeds of presses
             press_seed=2**40 + self.config.seed * 100_003 + index,
         )
         self.paper.lay_later(make, path[0].x_mm, path[0].y_mm, 0.0)
@@ -232,7 +232,7 @@ class World:
         self.version += 1
 
     def _flaw(self, index: int, depth_mm: float) -> tuple[Flaw | None, float]:
-        """The flaw of this press: the scripted one, or a split that comes by itself."""
+        """The flaw of this press: the scripted one, or a spontaneous split."""
         if index in self.flaws:
             flaw, severity = self.flaws[index]
         else:

@@ -1,9 +1,9 @@
-"""What the brush and the arm can do along a trajectory, and the depth that gives a width.
+"""Limits of brush and arm along a trajectory, and the depth that gives a stroke width.
 
 Convention: a point is x, y, H, alpha, heading. x and y are where the tip would meet the paper, in mm from the lower
 left corner of the cell, y upward. H is the depth below the touch height. The ferrule leans by alpha toward `heading`,
-counter-clockwise from x. The brush is pulled: heading is where the stroke goes, so the ferrule leads and the tip
-trails behind; the mark's widest place then lies at the brush axis, H tan(alpha) ahead of the point.
+counter-clockwise from x. The brush is pulled: heading is the direction of the stroke, so the ferrule leads and the
+tip trails; the mark's widest place then lies at the brush axis, H tan(alpha) ahead of the point.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ class Reach:
     height_mm: tuple[float, float] = (0.5, 20.0)
     tilt_deg: tuple[float, float] = (0.0, 10.0)
     plunge: float = 1.0
-    """Change of depth per mm of path: 1 goes down at 45 degrees."""
+    """Greatest change of depth per mm of path: 1 is a descent at 45 degrees."""
     turn_deg_mm: float = 12.0
-    """Turn of the wrist per mm of path: 180 deg/s at 15 mm/s."""
+    """Greatest turn of the wrist per mm of path: 180 deg/s at 15 mm/s."""
     wrist_deg: float = 340.0
-    """The heading stays within so much of 0 either way, unwrapped along a stroke."""
+    """Greatest absolute heading, unwrapped along a stroke."""
     apart_mm: float = 1.0
-    """Least distance of neighbouring points: ARCS reads a shorter line as a turn on the spot."""
+    """Least distance between neighbouring points: ARCS treats a shorter line as a turn on the spot."""
 
     def __post_init__(self) -> None:
         bounds = (("height_mm", self.height_mm), ("tilt_deg", self.tilt_deg))
@@ -48,14 +48,14 @@ class Reach:
                 raise ValueError(f"{name} = {value:g}: expected more than 0")
 
     def within(self, points: Floats, side_mm: float) -> Floats:
-        """The nearest feasible trajectory to (N, 5) points on a cell of that side, found in one sweep each way."""
+        """The feasible trajectory nearest to (N, 5) points on a cell of that side, found in one sweep each way."""
         out = points.copy()
         out[:, :2] = np.clip(out[:, :2], 0, side_mm)
         out[:, 2] = np.clip(out[:, 2], *self.height_mm)
         out[:, 3] = np.clip(out[:, 3], *self.tilt_deg)
         out[:, 4] = np.clip(out[:, 4], -self.wrist_deg, self.wrist_deg)
         steps = np.linalg.norm(np.diff(out[:, :2], axis=0), axis=1)
-        # Depth: lower what stands out over its neighbours, from both ends; never press deeper than asked.
+        # Depth: limit it from both ends to what the neighbours allow; never press deeper than asked.
         for order in (range(1, len(out)), range(len(out) - 2, -1, -1)):
             for k in order:
                 other, step = (k - 1, steps[k - 1]) if order.step == 1 else (k + 1, steps[k])
@@ -66,7 +66,7 @@ class Reach:
         return out
 
     def spaced(self, points: Floats) -> Floats:
-        """Without points nearer to the one before than allowed, in x, y and depth; the last point stays."""
+        """Drop points closer than `apart_mm` to the previous one, in x, y and depth; the last point stays."""
         kept = [0]
         for k in range(1, len(points)):
             if np.linalg.norm(points[k, :3] - points[kept[-1], :3]) >= self.apart_mm * 1.02:
@@ -79,7 +79,7 @@ class Reach:
 
 
 def depth_of(model: StrokeModel, reach: Reach, tilt_deg: float, half_width_mm: Floats) -> Floats:
-    """The depth at which a press of the model is that wide, clipped to what is feasible, (N,) -> (N,) mm."""
+    """The depths at which presses have these half widths, clipped to the feasible range, (N,) -> (N,) mm."""
     heights = np.linspace(*reach.height_mm, _TABLE)
     with torch.no_grad():
         widths = model.profile(torch.from_numpy(heights), tilt_deg).width_mm.numpy()
@@ -87,13 +87,13 @@ def depth_of(model: StrokeModel, reach: Reach, tilt_deg: float, half_width_mm: F
 
 
 def dragged_depth_of(drag: DragModel, reach: Reach, half_width_mm: Floats) -> Floats:
-    """The same for a dragged mark, (N,) -> (N,) mm."""
+    """The depths at which dragged marks have these half widths, (N,) -> (N,) mm."""
     heights = np.linspace(*reach.height_mm, _TABLE)
     half = drag.half_mm + drag.half_per_mm * heights + drag.half_per_mm2 * heights**2
     return np.interp(half_width_mm, np.maximum.accumulate(half), heights)
 
 
 def behind_of(model: StrokeModel, tilt_deg: float, height_mm: float) -> float:
-    """How far a mark reaches back from the brush axis, per mm of depth."""
+    """How far a mark extends behind the brush axis, per mm of depth."""
     with torch.no_grad():
         return -float(model.profile(height_mm, tilt_deg).x_min_mm[0]) / height_mm

@@ -1,8 +1,8 @@
 """A dragged stroke with bristle lag, differentiable in its trajectory: `model.drag` in torch.
 
-The bristles trail, so ink cuts the corners that the command makes and begins and ends elsewhere. A plan that is refined
-through this image leads the brush ahead of where the ink is wanted. Points are those of `model.characters.brush`: x and
-y of the tip, H, alpha (of no effect here) and heading, which turns the model's drift.
+The bristles trail, so the ink cuts the corners of the commanded path and begins and ends elsewhere. A plan that is
+refined through this image leads the brush ahead of where the ink is wanted. Points are those of
+`model.characters.brush`: x and y of the tip, H, alpha (of no effect here) and heading, which turns the model's drift.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch import Tensor
 from model.drag import DragModel
 
 LEAST_TRAVEL_MM = 0.5
-"""A stroke that travels less is a press."""
+"""A stroke that travels less than this is a press."""
 
 
 def is_dragged(points: Tensor) -> bool:
@@ -22,7 +22,7 @@ def is_dragged(points: Tensor) -> bool:
 
 
 def trail(model: DragModel, points: Tensor) -> Tensor:
-    """Where the footprint goes: (N, 5) points -> (N + 2, 3) x, y, half width in mm, as `DragModel.trail` has it.
+    """Trail of the footprint, as `DragModel.trail`: (N, 5) points -> (N + 2, 3) x, y, half width in mm.
 
     Raises ValueError for fewer than 2 points.
     """
@@ -39,7 +39,7 @@ def trail(model: DragModel, points: Tensor) -> Tensor:
         depth = depth + (depths[k] - depth) * (1.0 - torch.exp(-lengths[k - 1] / max(model.settle_mm, 0.05)))
         leash = (model.leash_mm + model.leash_per_mm * depth).clamp_min(0.05)
         lag = leash * ways[k - 1]
-        # The exact answer to a target that moves evenly: a steady gap of one leash, and what decays.
+        # Exact response to a target at constant speed: a steady lag of one leash, plus a decaying term.
         place = tip[k] - lag - (tip[k - 1] - place - lag) * torch.exp(-lengths[k - 1] / leash)
         places.append(place)
         settled.append(depth)
@@ -58,10 +58,10 @@ def trail(model: DragModel, points: Tensor) -> Tensor:
 
 
 def dragged(model: DragModel, points: Tensor, side_mm: float, size_px: int) -> Tensor:
-    """The image (size, size) of one stroke, (N, 5) points on a cell of that side; row 0 at its far edge.
+    """The image (size, size) of one stroke, given as (N, 5) points on a cell of that side; row 0 at its far edge.
 
-    Ink runs from 0 to 1 over one pixel about the edge. Differentiable in the points: each pixel through the disc that
-    reaches farthest over it.
+    Ink rises from 0 to 1 over one pixel at the edge. Differentiable in the points: each pixel depends on the disc that
+    covers it most deeply.
     """
     nodes = trail(model, points)
     middle = (torch.arange(size_px, dtype=nodes.dtype) + 0.5) * side_mm / size_px
@@ -73,9 +73,9 @@ def dragged(model: DragModel, points: Tensor, side_mm: float, size_px: int) -> T
 
 
 def _reach(start: Tensor, end: Tensor, at: Tensor) -> Tensor:
-    """How far the discs between two nodes reach over a point: (..., 3), (..., 3), (..., 2) -> (...) mm.
+    """How deep a point lies inside the discs between two nodes: (..., 3), (..., 3), (..., 2) -> (...) mm.
 
-    The disc at the point's foot on the way counts; its place is held while differentiating.
+    The disc at the point's projection onto the segment counts; its position is held constant in gradients.
     """
     way = (end - start)[..., :2]
     off = at - start[..., :2]

@@ -1,8 +1,8 @@
-"""A trajectory of the user's own: points with the width that the stroke should have there. Parsing only, no files.
+"""Parse a trajectory supplied by the user: points with the width that the stroke should have there. Reads no files.
 
-CSV with the columns `x_mm`, `y_mm`, `width_mm` and, for more than one stroke, `stroke` (a number that changes from one
-to the next); or JSON, `{"strokes": [[[x_mm, y_mm, width_mm], ...], ...]}`. Places count from the cell's lower left
-corner.
+CSV with the columns `x_mm`, `y_mm`, `width_mm` and, for several strokes, `stroke` (a number that changes from
+one stroke to the next); or JSON, `{"strokes": [[[x_mm, y_mm, width_mm], ...], ...]}`. Positions are relative to the
+cell's lower left corner.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Strokes = list[list[tuple[float, float, float]]]
 
 
 def parse_csv(text: str, cell: Cell, step_mm: float) -> list[Path]:
-    """The paths of a CSV; raises GlyphError that names line and column."""
+    """The paths of a CSV; raises GlyphError, which names line and column."""
     if len(text) > MAX_CHARS:
         raise GlyphError("", f"is longer than {MAX_CHARS} characters")
     rows = csv.reader(io.StringIO(text, newline=""), strict=True)
@@ -57,7 +57,7 @@ def parse_csv(text: str, cell: Cell, step_mm: float) -> list[Path]:
 
 
 def parse_json(text: str, cell: Cell, step_mm: float) -> list[Path]:
-    """The paths of a JSON trajectory; raises GlyphError that names stroke and point."""
+    """The paths of a JSON trajectory; raises GlyphError, which names stroke and point."""
     data = json_of(text, MAX_CHARS)
     given = cast("dict[str, Any]", data).get("strokes") if isinstance(data, dict) else None
     if not isinstance(given, list):

@@ -1,8 +1,8 @@
-"""Images of trajectories: marks of presses laid over each other along the way, and outlines of characters.
+"""Images of trajectories: overlaid marks of presses along the path, and outlines of characters.
 
 The image of the cell is square, row 0 at its far (upper) edge. A pixel is as dark as the darkest mark on it: ink on
 ink stays ink. With a stroke model, bristles do not lag; with a drag model (`model.drag`, fitted to dragged strokes)
-they do. Paint that runs dry is in neither.
+they do. Neither models a brush that runs dry.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Image = NDArray[np.float32]
 
 
 def dense(points: Tensor, per_step: int) -> Tensor:
-    """(N, 5) points with `per_step` - 1 more between neighbours, ((N - 1) per_step + 1, 5), straight between them."""
+    """(N, 5) points with `per_step` - 1 more interpolated linearly between neighbours, ((N - 1) per_step + 1, 5)."""
     share = torch.arange(per_step, dtype=points.dtype) / per_step
     between = points[:-1, None] + share[:, None] * (points[1:] - points[:-1])[:, None]
     return torch.cat((between.flatten(0, 1), points[-1:]))
@@ -45,7 +45,7 @@ def stamped(model: StrokeModel, points: Tensor, side_mm: float, size_px: int = S
     way = torch.stack((torch.cos(turn), -torch.sin(turn)), dim=-1)
     origin = torch.stack((x, side_mm - y), dim=-1) + (height * torch.tan(torch.deg2rad(tilt)))[:, None] * way
     with torch.no_grad():
-        # Each mark on a tile of its own, cut out of the image with a margin all around.
+        # Each mark is drawn on a separate tile, cut out of the image with a margin all around.
         reach = torch.maximum(-shape.x_min_mm, shape.x_max_mm) + 0.5 * shape.width_mm
         tile = min(math.ceil(2 * float(reach.max()) / px_mm) + 2, size_px)
         corner = (origin / px_mm - 0.5 * tile).round().clamp(-tile, size_px)
@@ -66,9 +66,9 @@ def written(
     *,
     drag: DragModel | None = None,
 ) -> Image:
-    """The image of whole trajectories, each (N, 5), marks so dense that their edges join to a tenth of a pixel.
+    """The image of whole trajectories, each (N, 5), with marks dense enough that edges join to a tenth of a pixel.
 
-    With `drag`, strokes that travel are drawn by it.
+    With `drag`, strokes that travel are drawn with that model.
     """
     image = np.zeros((size_px, size_px), np.float32)
     for points in strokes:
@@ -85,7 +85,7 @@ def written(
 
 
 def reference(glyph: Glyph, cell: Cell, size_px: int = SIZE_PX) -> Image:
-    """The image of a character's outlines, exact coverage of each stroke."""
+    """The image of a character's outlines, with the exact coverage of each stroke."""
     image = np.zeros((size_px, size_px), np.float32)
     for stroke in glyph.strokes:
         points = torch.from_numpy(cell.to_mm(stroke.arcs))[None]
@@ -96,7 +96,7 @@ def reference(glyph: Glyph, cell: Cell, size_px: int = SIZE_PX) -> Image:
 
 
 def swept(paths: Sequence[Path], side_mm: float, size_px: int = SIZE_PX) -> Image:
-    """The image of discs along paths: what a hand's trajectory with widths is meant to look like."""
+    """The image of discs along paths: the intended look of a user's trajectory with widths."""
     middle = (np.arange(size_px) + 0.5) * side_mm / size_px
     x, y = np.meshgrid(middle, side_mm - middle)
     image = np.zeros((size_px, size_px))

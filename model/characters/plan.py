@@ -1,4 +1,4 @@
-"""From a character to trajectories: along the median, as deep as the stroke is wide there, heading where it goes."""
+"""From a character to trajectories: along the median, with the depth that gives the stroke's width there."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Cell:
 
     @property
     def mm_per_unit(self) -> float:
-        """Size of a font unit."""
+        """Size of a font unit in mm."""
         return (self.side_mm - 2 * self.margin_mm) / SIDE_UNITS
 
     def to_mm(self, units: Floats) -> Floats:
@@ -39,14 +39,14 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """A way on the cell with a half width along it: `points` (N, 2) mm, `half_width_mm` (N,)."""
+    """A path on the cell with a half width along it: `points` (N, 2) mm, `half_width_mm` (N,)."""
 
     points: Floats
     half_width_mm: Floats
 
 
 def paths_of(glyph: Glyph, cell: Cell, step_mm: float) -> list[Path]:
-    """The medians of a character, resampled, each with the distance to its own outline."""
+    """The medians of a character, resampled, each with its distance to the stroke's outline."""
     out: list[Path] = []
     for stroke in glyph.strokes:
         points = resampled(cell.to_mm(stroke.median), step_mm)
@@ -59,8 +59,8 @@ def trajectory(
 ) -> Floats:
     """Points (N, 5) of x, y, H, alpha, heading along a path; the convention is in `model.characters.brush`.
 
-    The tip trails behind the axis, so near the beginning the depth is held so small that it stays within the stroke.
-    With `drag` a depth is that at which a dragged mark is as wide.
+    The tip trails behind the axis, so the depth near the beginning is limited to keep the tip within the stroke. With
+    `drag`, depths are those at which a dragged mark has the wanted width.
     """
     points, half = path.points, path.half_width_mm
     height = depth_of(model, reach, tilt_deg, half) if drag is None else dragged_depth_of(drag, reach, half)
@@ -76,14 +76,14 @@ def trajectory(
 
 
 def tangents(points: Floats) -> Floats:
-    """Headings along (N, 2) points in degrees, counter-clockwise from x, unwrapped, the first within 180 of 0."""
+    """Headings in degrees along (N, 2) points, counter-clockwise from x, unwrapped, the first within 180 of 0."""
     ahead = np.diff(points, axis=0)
     middle = np.concatenate((ahead[:1], ahead[1:] + ahead[:-1], ahead[-1:]))
     return np.degrees(np.unwrap(np.arctan2(middle[:, 1], middle[:, 0])))
 
 
 def resampled(points: Floats, step_mm: float) -> Floats:
-    """(N, 2) points at even steps along a polyline, near `step_mm`, both ends kept; at least three."""
+    """(N, 2) points at even steps of about `step_mm` along a polyline, both ends included; at least three."""
     along = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     count = max(3, round(along[-1] / step_mm) + 1)
     at = np.linspace(0, along[-1], count)
@@ -91,7 +91,7 @@ def resampled(points: Floats, step_mm: float) -> Floats:
 
 
 def distance_to(loop: Floats, points: Floats) -> Floats:
-    """The distance of (N, 2) points to a closed polyline (M, 2), (N,); 0 outside of it."""
+    """The distance of (N, 2) points to a closed polyline (M, 2), (N,); 0 outside it."""
     start, end = loop, np.roll(loop, -1, axis=0)
     side = end - start
     length = np.maximum(np.sum(side**2, axis=1), 1e-18)

@@ -1,7 +1,7 @@
-"""Trajectories adjusted until their image is the wanted one, within what brush and arm can do.
+"""Adjust trajectories until their image matches the wanted one, within the limits of brush and arm.
 
-Adam on the squared difference of the images, seen through a Gaussian that narrows, so that an edge that lies pixels off
-still pulls. After every step the trajectory is put back into `Reach.within`.
+Adam minimises the squared difference of the images, blurred by a Gaussian that narrows, so that an edge that is pixels
+off still has a gradient. After every step `Reach.within` makes the trajectory feasible again.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ def refine(
     *,
     drag: DragModel | None = None,
 ) -> Refined:
-    """Adjust trajectories to an image (N, N) of the cell. `steps` = 0 leaves them as they are.
+    """Adjust trajectories to an image (N, N) of the cell. `steps` = 0 leaves them unchanged.
 
-    With `drag`, strokes that travel are seen through it: the plan then makes up for bristles that lag.
+    With `drag`, strokes that travel are drawn with that model, so that the plan compensates for bristle lag.
     """
     size = wanted.shape[0]
     target = torch.from_numpy(wanted).double()
@@ -101,7 +101,7 @@ def _per_step(part: Tensor, px_mm: float) -> int:
 
 
 def _blurred(image: Tensor, width_px: float) -> Tensor:
-    """A Gaussian of that standard deviation over an image, zero outside."""
+    """An image blurred by a Gaussian of that standard deviation, zero outside."""
     reach = max(1, round(3 * width_px))
     at = torch.arange(-reach, reach + 1, dtype=image.dtype)
     kernel = torch.exp(-0.5 * (at / width_px) ** 2)

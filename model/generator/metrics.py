@@ -15,7 +15,7 @@ SSIM_SETTINGS = "scikit-image, data_range 1, gaussian weights, sigma 1.5, popula
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """Means over `images` images, and the worst SSIM. Ink is 1 on 0; IoU is of the pixels that are mostly ink."""
+    """Means over `images` images, and the worst SSIM. Ink is 1, paper 0; IoU counts the pixels that are mostly ink."""
 
     images: int
     mse: float
@@ -26,14 +26,14 @@ class Quality:
 
     @property
     def psnr_db(self) -> float:
-        """10 log10(1 / MSE), for images in [0, 1]; infinite for equal ones."""
+        """10 log10(1 / MSE), for images in [0, 1]; infinite for equal images."""
         return 10 * math.log10(1 / self.mse) if self.mse else math.inf
 
 
 def quality(pairs: Iterable[tuple[Tensor, Tensor]], *, with_ssim: bool = False) -> Quality:
-    """Compare (drawn, target) batches, each (B, N, N) in [0, 1]. SSIM takes some milliseconds an image.
+    """Compare (drawn, target) batches, each (B, N, N) in [0, 1]. SSIM takes some milliseconds per image.
 
-    Raises ValueError where there are none.
+    Raises ValueError if there are no images.
     """
     errors: list[Tensor] = []
     overlaps: list[Tensor] = []

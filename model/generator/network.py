@@ -1,9 +1,9 @@
 """The neural generator: fully connected layers, then convolution with pixel shuffle (the paper's section III-B).
 
-The paper gives no layer sizes. What is drawn here is not the coverage itself but a field: its value is about the
-signed distance to the stroke's boundary in pixels, positive inside, and coverage = clamp(1/2 + field, 0, 1). A field
+The paper gives no layer sizes. The network outputs not the coverage itself but a field: approximately the signed
+distance to the stroke's boundary in pixels, positive inside, with coverage = clamp(1/2 + field, 0, 1). The field
 changes smoothly with depth and tilt where coverage jumps, and pixels far from the boundary are exactly 0 or 1, so the
-network spends nothing on them.
+network spends no capacity on them.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from model.protocol import ParameterSpec
 
 
 class Inputs(nn.Module):
-    """P named inputs with ranges: (B, P) in their own units to (B, P) in [-1, 1].
+    """Scales P named inputs with ranges: (B, P) in their units to (B, P) in [-1, 1].
 
-    The ranges are buffers, so that they follow the network to a device and into an exported file. An input whose
-    range is one point becomes 0.
+    The ranges are buffers, so that they move with the network to a device and into an exported file. An input whose
+    range is a single point becomes 0.
     """
 
     low: Tensor
@@ -35,7 +35,7 @@ class Inputs(nn.Module):
         self.register_buffer("span", torch.tensor(widths), persistent=False)
 
     def forward(self, values: Tensor) -> Tensor:
-        """To [-1, 1]; nothing is clamped, so whoever asks outside the ranges gets what the polynomials say."""
+        """Scale to [-1, 1] without clamping: values outside the ranges are extrapolated by the polynomials."""
         return 2 * (values - self.low) / self.span - 1
 
     def check(self, values: Tensor) -> None:
@@ -53,7 +53,7 @@ def chebyshev(unit: Tensor, degree: int) -> Tensor:
 
 
 def nodes(degree: int) -> Tensor:
-    """The zeros of T_(degree + 1): where polynomials of that degree are best sampled, (degree + 1,) in (-1, 1)."""
+    """The zeros of T_(degree + 1), the best points to sample polynomials of that degree, (degree + 1,) in (-1, 1)."""
     k = torch.arange(degree + 1, dtype=torch.float64)
     return torch.cos(torch.pi * (k + 0.5) / (degree + 1))
 
@@ -62,9 +62,9 @@ def nodes(degree: int) -> Tensor:
 class Layers:
     """Sizes of a network.
 
-    `degree`: Chebyshev polynomials of each input. `width`, `depth`: fully connected layers. `channels`: of the
-    `side` x `side` map that they end in. `hidden_channels`: of a convolution between the map and the last one, 0
-    for none. `size_px`: the image, a multiple of `side`.
+    `degree`: of the Chebyshev polynomials of each input. `width`, `depth`: of the fully connected layers. `channels`:
+    of the `side` x `side` map that they output. `hidden_channels`: of a convolution between that map and the last
+    convolution, 0 for none. `size_px`: of the image, a multiple of `side`.
     """
 
     degree: int = 4
@@ -81,7 +81,7 @@ class Layers:
 
 
 class Generator(nn.Module):
-    """(B, P) inputs in their own units to (B, size_px, size_px) coverage in [0, 1]."""
+    """Maps (B, P) inputs in their units to (B, size_px, size_px) coverage in [0, 1]."""
 
     def __init__(self, specs: tuple[ParameterSpec, ...], layers: Layers) -> None:
         super().__init__()
@@ -105,7 +105,7 @@ class Generator(nn.Module):
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue, reportUnknownMemberType]
 
     def field(self, values: Tensor) -> Tensor:
-        """The field, about the signed distance in pixels, (B, P) -> (B, size_px, size_px)."""
+        """The field, approximately the signed distance in pixels, (B, P) -> (B, size_px, size_px)."""
         layers = self.layers
         terms = chebyshev(self.inputs(values), layers.degree)[..., 1:].flatten(1)
         map_ = self.fully_connected(terms).unflatten(1, (layers.channels, layers.side, layers.side))
@@ -117,12 +117,12 @@ class Generator(nn.Module):
 
 
 def covered(field: Tensor) -> Tensor:
-    """The coverage that a field stands for, any shape."""
+    """The coverage of a field, any shape."""
     return (field + 0.5).clamp(0, 1)
 
 
 def parameter_count(module: nn.Module) -> int:
-    """How many numbers are trained."""
+    """Number of trained parameters."""
     return sum(parameter.numel() for parameter in module.parameters())
 
 
@@ -130,9 +130,9 @@ class _WeightedError(torch.autograd.Function):
     """Sum of w (clamp(1/2 + field) - target)^2, with a gradient that also passes where the clamp is flat.
 
     A field that is far on the wrong side of the boundary has no gradient through clamp(1/2 + field). The gradient used
-    here is w (clamp(1/2 + field) - target), the residual itself: that of the convex function whose derivative the
-    clamp is, as cross-entropy is to the sigmoid. It is zero exactly where Eq. 6 is, and equals Eq. 6's own between 0
-    and 1. One pass over the images each way.
+    here is the residual w (clamp(1/2 + field) - target): that of the convex function whose derivative is the clamp,
+    as cross-entropy relates to the sigmoid. It is zero exactly where Eq. 6 is, and equals the gradient of Eq. 6
+    between 0 and 1. One pass over the images in each direction.
     """
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""A generator as a stroke model: what it draws, traced back to a shape that can be turned, scaled and compared."""
+"""A generator as a stroke model: its image, traced to a shape that can be turned, scaled and compared."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from model.protocol import Number, ParameterSpec, Values
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GeneratorModel:
-    """A `StrokeModel` that a trained generator draws; `fitted` where it was tuned on captures.
+    """A `StrokeModel` drawn by a trained generator; `fitted` if it was tuned on captures.
 
-    The parameters are the generator's inputs with their trained ranges; a base that is an input only places the
-    image and is not one of them. `shape` is the outline at half coverage of the drawn image, traced between pixel
-    centres, so it carries no gradient and its tip ends where the stroke is half a pixel wide; `images` are what the
-    network draws itself, and are differentiable.
+    The parameters are the generator's inputs with their trained ranges; a base that is an input only positions
+    the stroke and is not one of them. `shape` is the outline at half coverage of the drawn image, traced between
+    pixel centres, so it carries no gradient and its tip ends where the stroke is half a pixel wide; `images` are the
+    network's output, and are differentiable.
     """
 
     name: str
@@ -40,11 +40,11 @@ class GeneratorModel:
         return tuple(spec for spec in self.network.inputs.specs if not spec.name.startswith("base_"))
 
     def images(self, values: Mapping[str, Number]) -> Tensor:
-        """What the network draws in its own placement and scale, (B, N, N); see `StrokeModel.shape` for errors."""
+        """The network's images in its trained placement and scale, (B, N, N); see `StrokeModel.shape` for errors."""
         return self.network(self._inputs(values))
 
     def shape(self, values: Mapping[str, Number]) -> Outline:
-        """See `StrokeModel.shape`; ValueError besides, where the generator draws no ink."""
+        """See `StrokeModel.shape`; also raises ValueError if the generator draws no ink."""
         inputs = self._inputs(values)
         with torch.no_grad():
             drawn = self.network(inputs)
@@ -52,9 +52,9 @@ class GeneratorModel:
         return traced(drawn, origin, self.target.px_mm)
 
     def of_press(self, height_mm: Number, tilt_deg: Number) -> Values:
-        """See `StrokeModel.of_press`; DomainError outside the trained ranges, and where a fixed parameter is another.
+        """See `StrokeModel.of_press`; DomainError outside the trained ranges or if a fixed parameter differs.
 
-        A parameter that was fixed in training must be what the stroke model itself gives this press.
+        A parameter that was fixed in training must have the value that the stroke model gives this press.
         """
         values = self.target.model.of_press(height_mm, tilt_deg)
         trained = {spec.name for spec in self.network.inputs.specs}
@@ -110,13 +110,13 @@ def traced(images: Tensor, origin_mm: Tensor, px_mm: float) -> Outline:
         contours = untyped.find_contours(np.pad(image, 1), 0.5)
         if not contours:
             raise ValueError("the generator draws no ink for these parameters")
-        rows, columns = max(contours, key=len)[:-1].T - 0.5  # a pixel's centre is at one half; the padding takes one
+        rows, columns = max(contours, key=len)[:-1].T - 0.5  # a pixel's centre is at + 1/2; the padding shifts by 1
         x, y = columns * px_mm - float(origin[0]), float(origin[1]) - rows * px_mm
         if np.dot(x, np.roll(y, -1)) < np.dot(y, np.roll(x, -1)):
             x, y = x[::-1], y[::-1]
         polygons.append(torch.from_numpy(np.stack((x, y), axis=-1)))
     most = max(map(len, polygons))
-    # Arcs of no length at the end make all outlines equally long.
+    # Zero-length arcs at the end give all outlines the same number of arcs.
     ends = torch.stack([torch.cat((p, p[:1].expand(most + 1 - len(p), 2))) for p in polygons])
     start, end = ends[:, :-1], ends[:, 1:]
     points = torch.stack((start, 0.5 * (start + end), end), dim=2)

@@ -19,15 +19,15 @@ from model.raster.compiled import coverage_numpy
 from model.raster.frame import SIZE_PX
 
 ANCHOR_SHARE = (0.76, 0.5)
-"""Where a zero-touch point lies in the field, from the left and from the top: that of the validation's mm field."""
-_BLOCK = 64  # candidates that are tried at a time
+"""Position of the zero-touch point in the image, from the left and the top, as in the validation's mm field."""
+_BLOCK = 64  # candidates tried at a time
 
 
 class Placement(StrEnum):
     """How a stroke is put into the image, at heading 0."""
 
     CENTRED = "centred"
-    """The bounding box in the middle: the longest press of the paper's grid just fits at 0.2 mm/px."""
+    """Bounding box centred: the longest press of the paper's grid just fits at 0.2 mm/px."""
     ZERO_TOUCH = "zero-touch"
     """The zero-touch point at ANCHOR_SHARE; O3 lies H tan(alpha) from it. Needs height_mm and tilt_deg."""
     BASE = "base"
@@ -38,15 +38,15 @@ BASE_SPECS = (
     ParameterSpec("base_x_mm", "mm", -400, 400, 29.2, "x0, O3 from the image's left edge"),
     ParameterSpec("base_y_mm", "mm", -400, 400, 19.2, "y0, O3 from the image's top edge"),
 )
-"""The paper's starting point (x0, y0). Not called x0_mm: a QBC's first control point is."""
+"""The paper's starting point (x0, y0). Not called x0_mm, the name of a QBC's first control point."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
-    """A stroke model, the ranges of the inputs, what stays fixed, and where strokes are put.
+    """A stroke model, the ranges of the inputs, the fixed parameters, and the placement of strokes.
 
     `inputs` carry the trained ranges as low and high. Raises ValueError for an unknown parameter, a range outside
-    the model's own, or a placement without what it needs.
+    the model's, or a placement whose parameters are missing.
     """
 
     model: StrokeModel
@@ -115,9 +115,9 @@ class Target:
         return torch.from_numpy(images)
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """`count` inputs drawn evenly from the ranges, without those that the model refuses, (count, P) float32.
+        """`count` inputs drawn uniformly from the ranges, without those that the model rejects, (count, P) float32.
 
-        Raises ValueError where the model refuses more than nine of ten.
+        Raises ValueError if the model rejects more than nine in ten.
         """
         low = torch.tensor([spec.low for spec in self.inputs])
         span = torch.tensor([spec.high - spec.low for spec in self.inputs])
@@ -133,7 +133,7 @@ class Target:
         return torch.cat(found)[:count]
 
     def _accepted(self, inputs: Tensor) -> Tensor:
-        """Whether the model accepts each input, (N,) bool; halves refused batches until the bad inputs are found."""
+        """Whether the model accepts each input, (N,) bool; halves rejected batches until the bad inputs are found."""
         try:
             self.shape(inputs)
         except DomainError:
@@ -150,7 +150,7 @@ _PRESS = {"height_mm": (11.0, 20.0), "tilt_deg": (0.0, 10.0)}
 
 @dataclass(frozen=True, slots=True)
 class Preset:
-    """Defaults of a target, with a network that fits it."""
+    """Defaults of a target, with a suitable network."""
 
     model: str
     ranges: dict[str, tuple[float, float]]

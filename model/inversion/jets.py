@@ -83,7 +83,7 @@ _SPREAD = _spread()
 def of_model(model: StrokeModel) -> Jets:
     """The jets of any stroke model, by forward-mode differentiation of its outlines.
 
-    A model whose outlines carry no gradient, as a fitted brush in numpy, is differentiated by differences instead.
+    A model whose outlines carry no gradient, such as a fitted brush in numpy, uses finite differences instead.
     """
 
     def outline(height: Tensor, tilt: Tensor) -> Outline:
@@ -91,7 +91,7 @@ def of_model(model: StrokeModel) -> Jets:
 
     def jet(height_mm: Floats, tilt_deg: Floats) -> Jet:
         count = len(height_mm)
-        # Both derivatives in one pass: the batch twice, each half with a tangent of its own.
+        # Both derivatives in one pass: the batch is repeated, and each half has a different tangent.
         height, tilt = (torch.from_numpy(np.tile(part, 2)) for part in (height_mm, tilt_deg))
         along_h = torch.cat((torch.ones(count), torch.zeros(count))).double()
         with torch.no_grad(), forward_ad.dual_level():
@@ -106,7 +106,7 @@ def of_model(model: StrokeModel) -> Jets:
 
 
 def _differenced(outline: Callable[[Tensor, Tensor], Outline], height_mm: Floats, tilt_deg: Floats) -> Jet:
-    """A jet by differences: central in H, forward in alpha, which begins at 0."""
+    """A jet by finite differences: central in H, forward in alpha, which is never negative."""
     zero = np.zeros_like(height_mm)
     at = [(zero, zero), (zero + _STEP_MM, zero), (zero - _STEP_MM, zero), (zero, zero + _STEP_DEG)]
     made = [outline(torch.from_numpy(height_mm + dh), torch.from_numpy(tilt_deg + da)) for dh, da in at]

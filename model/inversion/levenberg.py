@@ -1,10 +1,10 @@
 """Levenberg-Marquardt for a batch, with bounded steps inside a box (K. Levenberg 1944, D. Marquardt 1963).
 
-Minimises cost / s^2 + sum ((value - mean) / sigma)^2, s^2 being the mean square residual of the current iterate, so
-that a prior weighs what it should whatever the noise is. Without priors this is plain least squares.
+Minimises cost / s^2 + sum ((value - mean) / sigma)^2, where s^2 is the mean square residual of the current iterate,
+so that a prior has the right weight at any noise level. Without priors this is plain least squares.
 
-Where a boundary lies pixels away from the target's, the cost grows only linearly and J'J overrates its curvature: steps
-come out short. So each step is stretched by the curvature that the last one met along its way, the secant's estimate.
+Where a boundary is pixels away from the target's, the cost grows only linearly and J'J overestimates its curvature:
+steps become too short. So each step is stretched by the curvature measured along the previous one, a secant estimate.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e9
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Of P parameters, each (P,): the box, the longest step, the step that counts as none, and prior precisions."""
+    """Limits of P parameters, each (P,): box, longest step, step that counts as converged, and prior precisions."""
 
     low: Floats
     high: Floats
     step: Floats
     still: Floats
     precision: Floats
-    """1 / sigma^2; 0 where nothing is known beforehand."""
+    """1 / sigma^2; 0 for no prior."""
     iterations: int = 40
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """Where B fits ended: values (B, P), the sums there, whether they converged, and how many iterations it took."""
+    """Results of B fits: values (B, P), the sums there, whether they converged, and the number of iterations."""
 
     values: Floats
     normal: Normal
@@ -69,7 +69,7 @@ def fit(forward: Forward, target: Images, start: Floats, limits: Limits, prior: 
         step = _step(hessian, gradient, damping[active], stretch[active], values[active], limits)
         tried = np.clip(values[active] + step, limits.low, limits.high)
         step = tried - values[active]
-        # Under noise a step of a thirtieth of the standard deviation is none; a clean image never gets there so.
+        # With noise, a step below a thirtieth of the standard deviation is convergence; a clean image never gets there.
         quadratic = np.einsum("bi,bij,bj->b", step, hessian, step)
         still = np.all(np.abs(step) < limits.still, axis=1) | (quadratic < _FRACTION**2 * noise)
         there = forward.of(active).normal(tried, target, active)
@@ -84,8 +84,8 @@ def fit(forward: Forward, target: Images, start: Floats, limits: Limits, prior: 
         left = np.sum((there.gradient + precision * (mean[active] - tried)) * step, axis=1)
         curved = 1.0 - left / np.maximum(np.sum(gradient * step, axis=1), 1e-300)
         longer = np.clip(stretch[active] / np.maximum(curved, 1e-3), 1.0, _MOST_STRETCH)
-        # A stretched step that failed says that it was stretched too far, not that more damping is needed: damping it
-        # as well would shorten the next one, whose secant then asks for the same stretch again.
+        # A stretched step that failed was stretched too far; it does not need more damping: damping it as well would
+        # shorten the next step, whose secant would then call for the same stretch again.
         change = np.where(better, 0.1, np.where(stretch[active] > 1, 1.0, 10.0))
         damping[active] = np.clip(damping[active] * change, _LEAST_DAMPING, _MOST_DAMPING)
         stretch[active] = np.where(better & (curved < _SHORT), longer, 1.0)
@@ -99,10 +99,10 @@ def fit(forward: Forward, target: Images, start: Floats, limits: Limits, prior: 
 def _step(
     hessian: Floats, gradient: Floats, damping: Floats, stretch: Floats, values: Floats, limits: Limits
 ) -> Floats:
-    """The damped Gauss-Newton step, no longer than allowed; parameters pressed against the box stay where they are."""
+    """The damped Gauss-Newton step, no longer than allowed; parameters pushed against the box do not move."""
     held = ((values <= limits.low) & (gradient < 0)) | ((values >= limits.high) & (gradient > 0))
     step = _solved(hessian, gradient, damping, held)
-    # One more look: a step that leaves the box at a parameter which the gradient alone would have let go.
+    # Check again: the step may leave the box at a parameter that the gradient alone would not have held.
     out = held | ((values <= limits.low) & (step < 0)) | ((values >= limits.high) & (step > 0))
     if (out & ~held).any():
         step = _solved(hessian, gradient, damping, out)
@@ -116,7 +116,7 @@ def _solved(hessian: Floats, gradient: Floats, damping: Floats, held: Flags) -> 
     matrix = hessian * (free[:, :, None] & free[:, None, :])
     diagonal = np.einsum("bii->bi", matrix)
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    # Scaled to a unit diagonal: millimetres beside degrees would cost digits.
+    # Scaled to a unit diagonal: mixing millimetres and degrees would lose precision.
     unit = matrix / (scale[:, :, None] * scale[:, None, :])
     at = np.arange(matrix.shape[1])
     unit[:, at, at] = 1.0 + damping[:, None]

@@ -1,15 +1,15 @@
-"""How sure a recovered press is: three models of what separates an image from the model's.
+"""Uncertainty of a recovered press, by three models of the difference between an image and the model's image.
 
-`pixel`      each pixel is off by independent noise of one variance, which the residuals tell: s^2 (J'J)^-1 with
+`pixel`      each pixel has independent noise of one variance, estimated from the residuals: s^2 (J'J)^-1 with
              s^2 = r'r / (N - P). For gray images with sensor noise.
-`quantised`  the image is whether a pixel is more than half covered. What rounding does to the estimate is computed:
-             presses near the estimate are drawn, rounded, and fitted again by two Gauss-Newton steps; the spread of
-             these errors is the covariance. Rounding errors are neither independent nor equal, as (J'J)^-1 would need.
-`blocks`     residuals may be correlated as they like within squares of 16 pixels, and are independent between them:
+`quantised`  each pixel says only whether it is more than half covered. The effect of rounding is computed: presses
+             near the estimate are drawn, rounded, and fitted again by two Gauss-Newton steps; the spread of these
+             errors is the covariance. Rounding errors are neither independent nor equal, as (J'J)^-1 would require.
+`blocks`     residuals may be arbitrarily correlated within squares of 16 pixels, and are independent between them:
              the sandwich (J'J)^-1 M (J'J)^-1 with M the sum over squares of (J'r)(J'r)' (K.-Y. Liang and S. Zeger,
              1986). For captures, where the model is wrong by more than noise.
 
-None of them knows an error of the brush's R, of lambda, or of the scale: those move every press of a session alike.
+None of them includes errors of the brush's R, of lambda, or of the scale: these shift every press of a session alike.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from model.inversion.levenberg import Fit, Limits
 
 Floats = NDArray[np.float64]
 LEAST_NOISE = 1e-6
-"""Error of the raster itself in a pixel: a clean image is not known better than it was drawn."""
+"""Error of the rasteriser in a pixel: a clean image is no more accurate than this."""
 REDRAWS = 12
-STEPS = 2
 """Presses drawn near each estimate for `quantised`."""
+STEPS = 2
 _FEW = 2.179 / 1.960
-"""Student's 97.5 % quantile for REDRAWS degrees of freedom over the normal one."""
+"""Ratio of Student's 97.5 % quantile for REDRAWS degrees of freedom to the normal one."""
 
 
 class Noise(StrEnum):
@@ -41,9 +41,9 @@ class Noise(StrEnum):
 
 
 def covariance(noise: Noise, forward: Forward, found: Fit, limits: Limits, near: Floats, seed: int = 0) -> Floats:
-    """The covariance of the values of a fit, (B, P, P); NaN where the images do not tell them apart.
+    """The covariance of the values of a fit, (B, P, P); NaN where the images do not determine them.
 
-    `near` (P,) is how far about the estimate a press is as likely as the estimate itself; only `quantised` uses it.
+    `near` (P,) is the distance within which a press is as likely as the estimate; only `quantised` uses it.
     """
     free = found.values.shape[1]
     variance = np.maximum(found.normal.cost / max(found.pixels - free, 1), LEAST_NOISE**2)
@@ -55,12 +55,12 @@ def covariance(noise: Noise, forward: Forward, found: Fit, limits: Limits, near:
             return variance[:, None, None] * bread
         case Noise.BLOCKS:
             side = -(-int(found.pixels**0.5) // BLOCK_PX)
-            # Only the blocks that the boundary passes say anything: about as many as two sides of the image have.
+            # Only blocks on the boundary carry information: about as many as lie along two sides of the image.
             few = 2 * side / max(2 * side - 1, 1)
             return bread @ (few * found.normal.meat + from_prior) @ bread
         case Noise.QUANTISED:
-            # The prior's own error and that of rounding are independent of each other.
-            # The spread of so few draws is itself uncertain: Student's quantile over the normal one.
+            # The errors of the prior and of rounding are independent.
+            # The spread of so few draws is itself uncertain, hence the ratio of quantiles.
             return _FEW**2 * _rounding(forward, found, limits, near, prior, seed) + bread @ from_prior @ bread
 
 
@@ -85,7 +85,7 @@ def _rounding(forward: Forward, found: Fit, limits: Limits, near: Floats, prior:
 
 
 def _inverse(matrix: Floats) -> Floats:
-    """Inverses scaled to a unit diagonal first; NaN for what is singular to rounding."""
+    """Inverses scaled to a unit diagonal first; NaN for matrices that are singular to rounding."""
     diagonal = np.einsum("bii->bi", matrix)
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scales = scale[:, :, None] * scale[:, None, :]

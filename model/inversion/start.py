@@ -1,6 +1,6 @@
-"""Where a fit starts: the press whose area, place and spread are nearest to the image's, out of a table.
+"""Starting point of a fit: the press in a table whose area, position and spread are nearest to the image's.
 
-From the middle of the range a fit can end in a wrong valley; area (A ~ H^2) and moments put it into the right one.
+From the middle of the range a fit can end in a wrong local minimum; area (A ~ H^2) and moments avoid this.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from model.inversion.forward import Forward, Images
 
 Floats = NDArray[np.float64]
 MIN_INK_MM2 = 0.5
-"""Less ink than this is no mark."""
+"""An image with less ink than this has no mark."""
 
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Of B images: area (mm^2), centroid (B, 2) as column and row (mm), and central second and third moments.
+    """Moments of B images: area (mm^2), centroid (B, 2) as column and row (mm), and central second and third moments.
 
     second (B, 3) holds xx, xy, yy and third (B, 4) xxx, xxy, xyy, yyy, both per area, x along columns, y along rows.
     """
@@ -30,7 +30,7 @@ class Moments:
     third: Floats
 
     def heading_deg(self) -> Floats:
-        """Where the thick end points, (B,): along the longer axis, away from the long thin tail."""
+        """Direction of the thick end, (B,): along the longer axis, away from the long thin tail."""
         xx, xy, yy = self.second.T
         angle = 0.5 * np.arctan2(2 * xy, xx - yy)
         c, s = np.cos(angle), np.sin(angle)
@@ -87,7 +87,7 @@ class Table:
         return cls(height, tilt, place_mm, moments_of(forward.predict(np.column_stack((height, tilt))), px_mm))
 
     def nearest(self, seen: Moments, place_mm: Floats | None, heading_deg: Floats) -> Floats:
-        """(H, alpha, x, y) to start B fits from, (B, 4). `place_mm` (B, 2): where the origin is known to be."""
+        """Starting points (H, alpha, x, y) of B fits, (B, 4). `place_mm` (B, 2): the origin, if known."""
         along, across = seen.spread(heading_deg)
         features = [np.sqrt(seen.area), along, across]
         mine = [np.sqrt(self.made.area), *self.made.spread(np.zeros(len(self.height_mm)))]
@@ -98,7 +98,7 @@ class Table:
             mine.append(ahead)
         distance = np.square(np.stack(features, -1)[:, None] - np.stack(mine, -1)[None]).sum(-1)
         best = np.argmin(distance, axis=1)
-        # Between two depths of the table area decides: it grows as H^2.
+        # Between two depths of the table, interpolate by area, which grows as H^2.
         height = self.height_mm[best] * np.sqrt(seen.area / np.maximum(self.made.area[best], 1e-12))
         if place_mm is None:
             reach = ahead[best] * height / self.height_mm[best]

@@ -1,7 +1,7 @@
 """Exact coverage on the CPU with compiled loops: for images in bulk, where no gradient is needed.
 
 Needs numba, which is imported at the first call; that call also compiles for some seconds, once per machine, as
-numba keeps the machine code beside the source or in its cache folder.
+numba caches the machine code next to the source or in its cache folder.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from model.outline import Shape
 from model.raster.frame import PX_MM, SIZE_PX, Place, check_raster, to_pixels
 
-_PER_THREAD = 64  # fewer images than this are not worth a thread
+_PER_THREAD = 64  # images; fewer are not worth a thread
 Images = NDArray[np.floating[Any]]
 
 
@@ -32,11 +32,11 @@ def coverage_numpy(
     threads: int | None = None,
     out: Images | None = None,
 ) -> Images:
-    """The covered share of every pixel, (B, size_px, size_px) in [0, 1], for B shapes; arguments as `coverage_at`.
+    """The covered share of every pixel, (B, size_px, size_px) in [0, 1], for B shapes; arguments as for `coverage_at`.
 
     float32 unless `out` is given: a C-contiguous float32 or float64 array of that shape, which is filled and
-    returned. `threads` is by default the number of cores for large batches and 1 for small. The error stays below
-    1e-6. Raises ValueError for a size, shape or `out` that makes no image.
+    returned. `threads` defaults to the number of cores for large batches and 1 for small ones. The error stays below
+    1e-6. Raises ValueError for an invalid size, shape or `out`.
     """
     from model.raster.kernel import rasterise  # numba takes a fifth of a second to import
 
@@ -54,7 +54,7 @@ def coverage_numpy(
         rasterise(points, weights, maps, out)
         return out
     parts = [slice(k * len(out) // count, (k + 1) * len(out) // count) for k in range(count)]
-    # The loops release the interpreter's lock, so plain threads run side by side.
+    # The loops release the interpreter's lock, so plain threads run in parallel.
     with ThreadPoolExecutor(count) as pool:
         for done in [pool.submit(rasterise, points[at], weights[at], maps[at], out[at]) for at in parts]:
             done.result()

@@ -1,9 +1,9 @@
-"""The compiled rasteriser: loops of conic arcs to exact area coverage, one image at a time (numba).
+"""The compiled rasteriser: from loops of conic arcs to exact area coverage, one image at a time (numba).
 
-A mark that lies inside the image goes by `octants` and `rows`, which is several times faster; any other outline is
-walked cell by cell (`walk`). Both are exact. Places are float64; the image is float32 or float64.
+A mark inside the image is drawn by `octants` and `rows`, which is several times faster; any other outline is walked
+cell by cell (`walk`). Both are exact. Coordinates are float64; the image is float32 or float64.
 
-numba compiles at the first call and keeps the machine code.
+numba compiles at the first call and caches the machine code.
 """
 
 import zlib
@@ -18,12 +18,12 @@ from model.raster.octants import FALLEN, OPTIONS, ellipse, parabola
 from model.raster.rows import add_steps, fill_rows, single
 from model.raster.walk import sum_rows, walk_ellipse, walk_parabola
 
-_MOST_ARCS = 16  # of an outline that is not walked: many arcs are short, and each costs as much as twenty pixels
+_MOST_ARCS = 16  # of an outline drawn by octants: many arcs are short, and each costs as much as twenty pixels
 _PAGE = 4096
 
 
 class Work(NamedTuple):
-    """Room for one image at a time; see `octants` and `rows`."""
+    """Scratch memory for one image at a time; see `octants` and `rows`."""
 
     cuts: np.ndarray
     low: np.ndarray
@@ -49,7 +49,7 @@ def rasterise(points, weights, placed, out):
 
 
 def _work(size, arcs, dtype):
-    """Every array on a page of its own: where they share pages the loops take half as long again."""
+    """Allocate `Work` with each array on separate pages: on shared pages the loops take half as long again."""
     layout, room = _layout(size, arcs, dtype)
     raw = np.empty(room + _PAGE, np.uint8)
     start = -raw.ctypes.data % _PAGE
@@ -60,7 +60,7 @@ def _work(size, arcs, dtype):
 
 @cache
 def _layout(size, arcs, dtype):
-    """Shapes, types and places of the arrays of `Work`, and the bytes that they take."""
+    """Shapes, types and offsets of the arrays of `Work`, and their total size in bytes."""
     steps, parts = 5 * arcs * (size + 8), 5 * arcs + 2
     shapes = (
         ((4,), np.float64),
@@ -91,9 +91,9 @@ def _pixels(q, p):
 
 @numba.njit(**OPTIONS)
 def _stepped(points, weights, placed, image, work):
-    """Draw a mark that lies inside the image; False, and nothing drawn, where it does not or is too tightly bent."""
+    """Draw a mark inside the image; draw nothing and return False if it is not inside or is too tightly bent."""
     size = image.shape[0]
-    used = np.int64(0)  # a literal would be a type of its own and compile everything twice
+    used = np.int64(0)  # a literal would have another type and compile everything twice
     for k in range(points.shape[0]):
         x0, y0, x1, y1, x2, y2 = _pixels(points[k], placed)
         if weights[k] == 1.0:
@@ -128,13 +128,13 @@ def _walked(points, weights, placed, out, n, spans):
 
 
 def _sources() -> int:
-    """A number that changes with any of the files that are compiled into one."""
+    """A checksum of all the files that are compiled together."""
     names = ("kernel.py", "octants.py", "rows.py", "walk.py")
     return zlib.crc32(b"".join(Path(__file__).with_name(name).read_bytes() for name in names))
 
 
 def _compiled(sources):
-    """numba keeps machine code by this file's date and by what a function closes over: so it hears of the others."""
+    """Compile; numba's cache depends on this file's date and on closure values, so `sources` covers the other files."""
 
     @numba.njit(**OPTIONS, cache=True)
     def rasterise_all(points, weights, placed, out, work):

@@ -1,15 +1,15 @@
-"""Steps to pixels: rows filled between the boundaries, and the boundary's pixels added up (see `octants`)."""
+"""From steps to pixels: fill rows between the boundaries and sum up the boundary's pixels (see `octants`)."""
 
 import numpy as np
 
 from model.raster.octants import inline
 
-ROUNDING = 5e-7  # a level this close to 0 or 1 is taken for it
+ROUNDING = 5e-7  # a level this close to 0 or 1 is taken as 0 or 1
 
 
 @inline
 def single(size, work):
-    """Whether no row is passed from edge to edge by two pieces of one sign, as in a shape with a gap."""
+    """Whether no row is crossed from edge to edge by two pieces of the same sign, as in a shape with a gap."""
     most = 0
     for r in range(size):
         most = max(most, max(work.passed[0, r], work.passed[1, r]))
@@ -18,7 +18,7 @@ def single(size, work):
 
 @inline
 def fill_rows(flat, size, work):
-    """Fill what lies between boundaries in each row of a blank image, and clear the notes for the next image."""
+    """Fill each row of a blank image between the boundaries, and clear the records for the next image."""
     begins, ends = work.ends[0], work.ends[1]
     for r in range(size):
         a, b, m = work.passed[0, r], work.passed[1, r], work.waiting[r]
@@ -56,7 +56,7 @@ def _mixed(flat, r, size, work):
 
 @inline
 def _run(flat, row, start, stop, level):
-    """Fill a stretch of a row: sixteen at a time, the last of them over what is filled already."""
+    """Fill a stretch of a row sixteen pixels at a time; the last sixteen may overlap pixels already filled."""
     value = flat.dtype.type(level)
     n = stop - start
     if n >= 16:
@@ -74,7 +74,7 @@ def _run(flat, row, start, stop, level):
 
 @inline
 def add_steps(flat, used, work):
-    """Add the steps' areas to their pixels and hold these to [0, 1]."""
+    """Add the steps' areas to their pixels and clamp these to [0, 1]."""
     at, next_, here, there = work.at, work.next, work.here, work.there
     for q in range(used):
         flat[np.uint64(at[q])] += here[q]

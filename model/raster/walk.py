@@ -1,13 +1,13 @@
-"""Conic arcs to pixels cell by cell: the compiled rasteriser's way with any outline, in and beyond the image (numba).
+"""From conic arcs to pixels, cell by cell: the compiled rasteriser's path for any outline, also outside the image.
 
 Everything is in pixels here: x is the column, y the row, both from the top left corner. A loop that runs
-counter-clockwise on the paper comes down on its left, so a piece that comes down adds the ink to its right and a
-piece that goes up takes it away again. Each piece is cut where it crosses pixel edges; what lies in one cell
-adds its area there and the rest of its height to the next cell, and a running sum along each row turns these
+counter-clockwise on the paper descends on its left side, so a descending piece adds the ink to its right and an
+ascending piece subtracts it again. Each piece is cut where it crosses pixel edges; the part in one cell adds its
+area there and the rest of its height to the next cell, and a running sum along each row turns these
 steps into coverage (the accumulation buffer of font rasterisers, with parabolas instead of chords).
 
-Scalars and explicit loops throughout, because that is what compiles to fast code. Measured and left out: a view of
-each row (slower); branches instead of min and max (slower: they are guessed wrong).
+Scalars and explicit loops throughout, because they compile to fast code. Measured and rejected: a view of each row
+(slower); branches instead of min and max (slower: they are mispredicted).
 """
 
 import math
@@ -17,13 +17,13 @@ import numba
 from model.raster.octants import OPTIONS, TINY
 
 _ROUGHNESS = 3e-4  # px: longer half axis times angle^4 of a piece stays below this; 6e-7 of a pixel at most (measured)
-_ROUNDING = 5e-7  # a running sum this close to 0 or 1 between two boundaries is taken for it
+_ROUNDING = 5e-7  # a running sum this close to 0 or 1 between boundaries is taken as 0 or 1
 walked = numba.njit(**OPTIONS)
 
 
 @walked
 def walk_ellipse(out, n, spans, x0, y0, x1, y1, x2, y2, w):
-    """An arc of an ellipse as parabolas that have the same ends and the same area under them."""
+    """Walk an arc of an ellipse as parabolas with the same ends and the same area under them."""
     angle = math.acos(w)
     sine = math.sin(angle)
     mx, my = 0.5 * (x0 + x2), 0.5 * (y0 + y2)
@@ -50,7 +50,7 @@ def walk_ellipse(out, n, spans, x0, y0, x1, y1, x2, y2, w):
 
 @walked
 def walk_parabola(out, n, spans, x0, y0, x1, y1, x2, y2):
-    """A quadratic Bezier curve, cut where it turns back in x or y."""
+    """Walk a quadratic Bezier curve, cut where it turns back in x or y."""
     turns_x, turns_y = (x1 - x0) * (x2 - x1) < 0, (y1 - y0) * (y2 - y1) < 0
     if not turns_x and not turns_y:
         _monotone(out, n, spans, x0, y0, x1, y1, x2, y2)
@@ -66,7 +66,7 @@ def walk_parabola(out, n, spans, x0, y0, x1, y1, x2, y2):
         qx, qy = h * xa + high * xb, h * ya + high * yb
         if high == 1.0:
             qx, qy = x2, y2
-        # The middle point of a monotone part lies between its ends; rounding must not undo that.
+        # The middle point of a monotone part lies between its ends; clamp it against rounding.
         mx = min(max(g * xa + low * xb, min(px, qx)), max(px, qx))
         my = min(max(g * ya + low * yb, min(py, qy)), max(py, qy))
         _monotone(out, n, spans, px, py, mx, my, qx, qy)
@@ -75,7 +75,7 @@ def walk_parabola(out, n, spans, x0, y0, x1, y1, x2, y2):
 
 @walked
 def _monotone(out, n, spans, x0, y0, x1, y1, x2, y2):
-    """A quadratic Bezier curve that turns back nowhere: row by row downwards, and in each row cell by cell."""
+    """Walk a quadratic Bezier curve that is monotone in x and y: row by row downwards, cell by cell in each row."""
     size = out.shape[1]
     sign, side = 1.0, 0
     if y2 < y0:
@@ -85,7 +85,7 @@ def _monotone(out, n, spans, x0, y0, x1, y1, x2, y2):
         return
     bx, by = 2 * (x1 - x0), 2 * (y1 - y0)
     ax, ay = x0 - 2 * x1 + x2, y0 - 2 * y1 + y2
-    # The integral of x dy between two t is that of the chord and this times the third power of their difference.
+    # The integral of x dy between two t is that of the chord plus this times the cube of their difference.
     bulge = sign * (bx * ay - ax * by) / 6
     right = x2 >= x0
     way = 1.0 if right else -1.0
@@ -103,7 +103,7 @@ def _monotone(out, n, spans, x0, y0, x1, y1, x2, y2):
         je = math.floor(xe)
         spans[i, side] = min(spans[i, side], min(j, je))
         spans[i, side + 1] = max(spans[i, side + 1], max(j, je, 0))
-        carry = 0.0  # what the cell left behind owes the cell on its right (going right), or its own (going left)
+        carry = 0.0  # step that the previous cell still adds: to its right neighbour (going right), to itself (left)
         while j != je:
             xc = j + 1.0 if right else float(j)
             tc = 2 * (xc - x0) / (bx + way * (math.sqrt(max(0.0, bx * bx + 4 * ax * (xc - x0))) + TINY))
@@ -132,14 +132,14 @@ def _monotone(out, n, spans, x0, y0, x1, y1, x2, y2):
 
 @walked
 def _add(out, n, i, j, step):
-    """Add a step of the running sum; what is left of the image steps up at its first column."""
+    """Add a step of the running sum; a step left of the image is added at its first column."""
     if j < out.shape[2]:
         out[n, i, max(j, 0)] += out.dtype.type(step)
 
 
 @walked
 def sum_rows(out, n, spans):
-    """Turn the steps of each row into coverage: cell by cell where pieces passed, in one go between and beyond."""
+    """Turn the steps of each row into coverage: cell by cell where pieces passed, as whole runs elsewhere."""
     size = out.shape[1]
     for i in range(size):
         a, b = max(spans[i, 0], 0), min(spans[i, 1] + 2, size)
@@ -167,9 +167,9 @@ def sum_rows(out, n, spans):
 
 @walked
 def _fill(out, n, i, start, stop, total):
-    """Fill a stretch of a row that no piece passes."""
+    """Fill a stretch of a row that no piece crosses."""
     if stop > start and total > _ROUNDING:
         value = out.dtype.type(total if total < 1 - _ROUNDING else 1.0)
-        part = out[n, i, start:stop]  # indices that cannot be negative become one wide store after another
+        part = out[n, i, start:stop]  # non-negative indices let the compiler use wide stores
         for k in range(len(part)):
             part[k] = value

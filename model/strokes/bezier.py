@@ -9,7 +9,7 @@ from model.outline import Outline, through
 from model.protocol import Basis, ParameterSpec, Parametric, StrokeModel, Values
 from model.regression import regressed
 
-PIECES = 128  # parabolas a side: below 1e-6 of a pixel for strokes of the default image
+PIECES = 128  # parabolas per side: error below 1e-6 of a pixel for strokes of the default image
 PARAMETERS = (
     ParameterSpec("tip_mm", "mm", 0.001, 400, 17, "from the origin to the end of the tip"),
     ParameterSpec("base_mm", "mm", 0.001, 400, 2, "from the origin to the end of the base"),
@@ -48,7 +48,7 @@ def bezier(values: Values) -> Outline:
 def lengths(mark: CcdBsm) -> Values:
     """Tip, base and belly of a CCD-BSM mark, and the shoulder that gives the Bezier stroke the mark's area.
 
-    With a share s the enclosed area is belly (tip + base) (4 - s) / 5.
+    For a share s, the enclosed area is belly (tip + base) (4 - s) / 5.
     """
     shoulder = 4 - 5 * mark.area_mm2 / (mark.width_mm * mark.length_mm)
     return {"tip_mm": mark.o4o3_mm, "base_mm": mark.o3a_mm, "belly_mm": mark.width_mm, "shoulder": shoulder.clamp(0, 1)}

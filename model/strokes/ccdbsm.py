@@ -17,10 +17,10 @@ PARAMETERS = (
 
 
 def models(basis: Basis) -> tuple[StrokeModel, ...]:
-    """CCD-BSM of the basis' brush and lambda."""
+    """CCD-BSM with the basis' brush and lambda."""
 
     def press(height_mm: Number, tilt_deg: Number) -> Values:
-        basis.mark(height_mm, tilt_deg)  # the exact domain, with a word of advice
+        basis.mark(height_mm, tilt_deg)  # checks the exact domain; its DomainError carries a hint
         batch = as_batch(height_mm, tilt_deg, basis.brush.radius_mm, basis.brush.length_mm, basis.lam)
         return {spec.name: value for spec, value in zip(PARAMETERS, batch, strict=True)}
 

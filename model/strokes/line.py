@@ -26,7 +26,7 @@ TAPERED = (
 
 
 def models(basis: Basis) -> tuple[StrokeModel, ...]:
-    """The capsule and the tapered line of the CCD-BSM mark's length and width."""
+    """The capsule and the tapered line, with the CCD-BSM mark's length and width."""
     capsule = "The capsule with the length and width of the CCD-BSM mark."
     tapered = "The hull of two discs with the CCD-BSM mark's length, width and area, regressed as Bezier is."
     press = regressed(basis, discs)
@@ -42,14 +42,14 @@ def models(basis: Basis) -> tuple[StrokeModel, ...]:
 
 
 def hull(values: Values) -> Outline:
-    """The convex hull of two discs on the axis; DomainError where one holds the other."""
+    """The convex hull of two discs on the axis; DomainError if one contains the other."""
     tip, heel = values["tip_mm"], values["heel_mm"]
     x = torch.stack((tip, 0.5 * (tip + heel), heel), dim=-1)
     return swept(torch.stack((x, torch.zeros_like(x)), dim=-1), values["tip_width_mm"], values["heel_width_mm"], 1)
 
 
 def discs(mark: CcdBsm) -> Values:
-    """The two discs of a mark: the heel as wide as the mark, the tip so wide that the areas agree."""
+    """The two discs of a mark: the heel as wide as the mark, the tip sized so that the areas agree."""
     heel = torch.minimum(mark.half_width_mm, 0.45 * mark.length_mm)
 
     def values(tip: torch.Tensor) -> Values:

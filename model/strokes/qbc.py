@@ -35,17 +35,17 @@ def models(basis: Basis) -> tuple[StrokeModel, ...]:
 
 
 def qbc(v: Values) -> Outline:
-    """The outline of the swept disc; DomainError where it folds over."""
+    """The outline of the swept disc; DomainError if it folds over."""
     nodes = torch.stack([torch.stack((v[f"x{k}_mm"], v[f"y{k}_mm"]), dim=-1) for k in range(3)], dim=1)
     return swept(nodes, v["start_width_mm"], v["end_width_mm"])
 
 
 def straight(mark: CcdBsm) -> Values:
-    """The straight QBC with a mark's length and width, the middle point where the areas agree best."""
-    end = torch.minimum(mark.half_width_mm, 0.36 * mark.length_mm)  # a wider disc would hold the start
+    """The straight QBC with a mark's length and width; its middle point is chosen so that the areas agree best."""
+    end = torch.minimum(mark.half_width_mm, 0.36 * mark.length_mm)  # a wider disc would contain the first one
     start, o = 0.05 * end, torch.zeros_like(end)
     first, last = mark.x_min_mm + start, mark.x_max_mm - end
-    most = 1 - 0.525 * (end - start) / (last - first)  # the curve outruns the width at both ends
+    most = 1 - 0.525 * (end - start) / (last - first)  # the curve advances faster than the width changes at both ends
 
     def values(share: torch.Tensor) -> Values:
         middle = last + share * (first - last)

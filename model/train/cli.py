@@ -94,7 +94,7 @@ def basis(
     validation_images: Annotated[int, typer.Option(min=1, max=100_000, help="Images to compare with.")] = 2000,
     out: Annotated[Path | None, typer.Option(help="Write its coefficients as safetensors here.")] = None,
 ) -> None:
-    """Fit the field basis, an interpolator beside the network, by least squares in seconds, and say how close it is."""
+    """Fit the field basis, an alternative to the network, by least squares in seconds, and report its accuracy."""
     import rich
 
     from model.train.export import fit_and_compare

@@ -1,11 +1,11 @@
 """Training and validation images by number: any step's batch follows from (seed, step) alone.
 
-So a resumed training needs no state of a random generator, and every process of a group can take its own share.
+So a resumed training needs no random-generator state, and every process of a group can take its share.
 
 Captured strokes to tune on come as one safetensors file. Tensors: `images` (n, N, N) uint8 (255 is ink) or float32 in
-[0, 1], and one (n,) float32 or float64 of each of the generator's inputs, by name, in its unit. Metadata: `format`
-(FORMAT), `px_mm`, `placement`, and `source`, what kind of ink it is. Scale and placement must be the generator's own,
-else its pixels would mean something else.
+[0, 1], and one (n,) float32 or float64 tensor for each of the generator's inputs, by name, in its unit. Metadata:
+`format` (FORMAT), `px_mm`, `placement`, and `source`, where the images come from. Scale and placement must be the
+generator's, else its pixels would mean something else.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Kept:
 
 
 def exact_sets(config: TrainConfig) -> tuple[Exact, Exact]:
-    """The training and the validation set of a configuration; raises ValueError where the target refuses nearly all."""
+    """The training and the validation set of a configuration; raises ValueError if the target rejects nearly all."""
     target = config.build_target()
     counts = ((config.training_images, _TRAINING), (config.validation_images, _VALIDATION))
     training, validation = (
@@ -92,9 +92,9 @@ def split(captures: Kept, seed: int, held_out: float) -> tuple[Kept, Kept]:
 
 
 def batch_numbers(count: int, batch: int, seed: int, step: int) -> Tensor:
-    """Which of `count` images are in a step's batch, (min(batch, count),): every epoch in another order.
+    """Numbers, out of `count`, of the images in a step's batch, (min(batch, count),); every epoch in another order.
 
-    What does not fill a batch at the end of an epoch is left out of it.
+    An incomplete batch at the end of an epoch is dropped.
     """
     batch = min(batch, count)
     epoch, position = divmod(step, count // batch)
@@ -103,7 +103,7 @@ def batch_numbers(count: int, batch: int, seed: int, step: int) -> Tensor:
 
 
 def _generator(seed: int, *stream: int) -> torch.Generator:
-    """A generator of its own for each stream of a seed."""
+    """An independent generator for each stream of a seed."""
     state = np.random.SeedSequence([seed, *stream]).generate_state(1, np.uint64)[0]
     return torch.Generator().manual_seed(int(state) & (2**63 - 1))
 
@@ -115,7 +115,7 @@ MAX_BYTES = 2**30
 def save_captures(
     path: Path, inputs: dict[str, Tensor], images: Tensor, px_mm: float, placement: str, source: str
 ) -> None:
-    """Write captures, `inputs` each (n,) by name, `images` (n, N, N) in [0, 1]; a source as `loopback rig`."""
+    """Write captures, `inputs` each (n,) by name, `images` (n, N, N) in [0, 1]; a source such as `loopback rig`."""
     pixels = (images.clamp(0, 1) * 255).round().to(torch.uint8)
     tensors = {"images": pixels.contiguous()} | {name: value.float().contiguous() for name, value in inputs.items()}
     metadata = {"format": FORMAT, "px_mm": repr(px_mm), "placement": placement, "source": source}
@@ -123,7 +123,7 @@ def save_captures(
 
 
 def load_captures(path: Path, config: TrainConfig) -> tuple[Kept, str]:
-    """Captures for a generator of this configuration, and their source. Raises TrainError for any that do not fit."""
+    """Captures for a generator of this configuration, and their source. Raises TrainError if any do not fit."""
     metadata, tensors = read_tensors(path, MAX_BYTES)
     if metadata.get("format") != FORMAT:
         raise TrainError(path, f"format is {metadata.get('format', 'missing')[:60]!r}, expected {FORMAT!r}")

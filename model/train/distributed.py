@@ -18,7 +18,7 @@ _TIMEOUT = timedelta(minutes=10)  # the first process also writes files while th
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """This process' place among `world`; alone when there is one."""
+    """This process' rank among `world` processes."""
 
     rank: int = 0
     world: int = 1
@@ -34,20 +34,20 @@ class Group:
         return numbers.tensor_split(self.world)[self.rank]
 
     def add(self, values: Tensor) -> Tensor:
-        """The sum of `values` over all processes, in place."""
+        """Sum `values` over all processes, in place."""
         if self.world > 1:
             torch.distributed.all_reduce(values)
         return values
 
     def wait(self) -> None:
-        """Wait until all processes arrive here."""
+        """Wait until all processes have called this."""
         if self.world > 1:
             torch.distributed.barrier()
 
 
 @contextmanager
 def joined(device: str) -> Iterator[Group]:
-    """The group that torchrun's environment describes, left again at the end.
+    """Join the group that torchrun's environment describes; leave it when the block ends.
 
     Raises TrainError for "cuda" without a GPU.
     """

@@ -2,7 +2,7 @@
 
 TrainError              a file or a setting cannot be used; nothing half-written is left
 TrainingStopped         the training cannot usefully continue
- +-- BlankOutput        the generator draws nothing, or ink everywhere, whatever its inputs
+ +-- BlankOutput        the generator draws nothing, or ink everywhere, for all inputs
  +-- Diverged           the loss became NaN or infinite
 MissingExtra            an optional package is not installed
 """
@@ -25,7 +25,7 @@ class TrainError(Exception):
 
 
 class TrainingStopped(Exception):
-    """Stopped at `step`; the last checkpoint is complete."""
+    """Training stopped at `step`; the last checkpoint is complete."""
 
     exit_code: ClassVar[int] = 4
 

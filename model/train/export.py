@@ -26,15 +26,15 @@ from model.train.errors import MissingExtra, TrainError
 from model.train.report import write_card
 
 TOLERANCE = 1e-4
-"""The most that any pixel of a check may differ; float32 sums in another order differ by less."""
+"""Greatest allowed difference of any pixel in a check; reordered float32 sums differ by less."""
 _CHECKED = (1, 5, 64)
 
 
 def export(path: Path, form: str) -> tuple[Path, float]:
-    """Write `<stem>.onnx` or `<stem>.pt2` beside a generator, with a card; returns it and the largest difference seen.
+    """Write `<stem>.onnx` or `<stem>.pt2`, and a card, next to a generator; return its path and the largest difference.
 
-    Any batch size goes in; inputs are in the units of the card. Raises TrainError for an unknown form or where the
-    exported file draws something else, which is then removed, and MissingExtra without onnx.
+    The exported file accepts any batch size; inputs are in the units of the card. Raises TrainError for an unknown form
+    or if the exported file, which is then removed, draws something else, and MissingExtra without onnx.
     """
     writers = {"onnx": _onnx, "pt2": _program}
     if form not in writers:
@@ -68,7 +68,7 @@ def _samples(config: TrainConfig, count: int) -> Tensor:
 
 
 def _program(network: Generator, inputs: Tensor, path: Path) -> Any:
-    """torch.export: the traced network with its weights; read back and run."""
+    """Export with torch.export: the traced network with its weights; return it as read back."""
     exported = torch.export.export(network, (inputs,), dynamic_shapes=({0: torch.export.Dim("batch")},))
     with warnings.catch_warnings():
         # Strided weights are views of one storage, all of them on the CPU.
@@ -78,7 +78,7 @@ def _program(network: Generator, inputs: Tensor, path: Path) -> Any:
 
 
 def _onnx(network: Generator, inputs: Tensor, path: Path) -> Any:
-    """ONNX, run by onnxruntime."""
+    """Export to ONNX; return the exported network, run by onnxruntime."""
     for package in ("onnx", "onnxscript", "onnxruntime"):
         if importlib.util.find_spec(package) is None:
             raise MissingExtra(package, "export")
@@ -103,7 +103,7 @@ def _onnx(network: Generator, inputs: Tensor, path: Path) -> Any:
 
 @contextmanager
 def _quiet(name: str) -> Iterator[None]:
-    """Hold a logger to errors: without torchvision, torch says for each of its operators that it skips it."""
+    """Limit a logger to errors: without torchvision, torch logs each of its operators that it skips."""
     logger = logging.getLogger(name)
     before = logger.level
     logger.setLevel(logging.ERROR)
@@ -114,7 +114,7 @@ def _quiet(name: str) -> Iterator[None]:
 
 
 def fit_and_compare(target: str, images: int, out: Path | None) -> str:
-    """A sentence with the figures. Raises TrainError for a target that has not two inputs."""
+    """Fit the field basis; return a sentence with the figures. Raises TrainError unless the target has two inputs."""
     config = preset(target, validation_images=images, training_images=1)
     strokes = config.build_target()
     if len(strokes.inputs) != 2:

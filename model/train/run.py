@@ -1,7 +1,7 @@
-"""One training in one folder: start or go on, write what Algorithm 1 puts out, finish with a generator and its card.
+"""One training in one folder: start or resume, write the outputs of Algorithm 1, finish with a generator and its card.
 
-A folder holds `checkpoint.safetensors` while and after training, `generator.safetensors` with `generator.md` at the
-end, `loss.png`, `loss.csv`, `validation.csv`, `pictures/`, and `tensorboard/` where asked for.
+A folder holds `checkpoint.safetensors` during and after training, `generator.safetensors` with `generator.md` at the
+end, `loss.png`, `loss.csv`, `validation.csv`, `pictures/`, and `tensorboard/` if requested.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ class Progress(Protocol):
     """Display of a training on the command line."""
 
     def stepped(self, step: int, loss: float) -> None:
-        """A step was done."""
+        """Report a finished step."""
         ...
 
     def validated(self, validation: Validation) -> None:
-        """A validation was done."""
+        """Report a finished validation."""
         ...
 
 
@@ -68,9 +68,9 @@ def run_training(
     tuning: Tuning | None = None,
     events: bool = False,
 ) -> Path:
-    """Train to the end, from the folder's checkpoint where there is one; returns the generator's path.
+    """Train to the end, from the folder's checkpoint if it has one; return the generator's path.
 
-    Raises TrainError where the folder holds another training, or is in use, and as `model.train.loop.train`.
+    Raises TrainError if the folder holds another training or is in use, and as `model.train.loop.train`.
     """
     with ExitStack() as held:
         if group.first:
@@ -84,7 +84,7 @@ def run_training(
         done = state.step == config.steps or converged(config, state.validations.tolist())
         path = folder / "generator.safetensors"
         finished = done and path.exists()
-        group.wait()  # nobody writes before all have read
+        group.wait()  # no process writes before all have read
         if finished:
             return path
         sets = _sets(config, tuning)
@@ -99,7 +99,7 @@ def run_training(
 
 
 def _start(config: TrainConfig, folder: Path, tuning: Tuning | None) -> State:
-    """The folder's checkpoint, the generator to tune, or step 0."""
+    """The state to start from: the folder's checkpoint, the generator to tune, or step 0."""
     path = folder / "checkpoint.safetensors"
     if path.exists():
         before, state = load_checkpoint(path)
@@ -186,7 +186,7 @@ def _finish(config: TrainConfig, folder: Path, state: State, images: Images, cpu
 
 
 class Bar:
-    """The bar, with the last losses beside it."""
+    """A progress bar that shows the latest losses."""
 
     def __init__(self, progress: ProgressBar, steps: int) -> None:
         self._progress = progress
@@ -207,7 +207,7 @@ class Bar:
 
 
 def train_with_bar(config: TrainConfig, folder: Path, tuning: Tuning | None, events: bool) -> None:
-    """Train with a bar in the first process. Raises as `run_training`."""
+    """Train with a progress bar in the first process. Raises as `run_training`."""
     with joined(config.device) as group, _asked_to_stop() as stopping:
         console = Console(quiet=not group.first)
         words = TextColumn("{task.fields[loss]} {task.fields[validation]}")
@@ -220,7 +220,7 @@ def train_with_bar(config: TrainConfig, folder: Path, tuning: Tuning | None, eve
 
 @contextmanager
 def _asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Turn SIGINT and SIGTERM into a request that the loop sees after the current step."""
+    """Turn SIGINT and SIGTERM into a request to stop after the current step."""
     requests: list[int] = []
     signals = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.signal(number, lambda number, _: requests.append(number)) for number in signals}
