@@ -9,28 +9,28 @@ from pathlib import Path
 from typing import Any, cast
 
 ABSENT = object()
-"""Value of a field that one of the two does not have."""
+"""Placeholder for the value of a field that one of the two configurations lacks."""
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One field, or a whole list where its length changed; an empty `field` means a file that cannot be compared."""
+    """One changed field, or a whole list if its length changed; `field` is empty if the file cannot be compared."""
 
     file: str
     field: tuple[str, ...]
-    """Path in the file: names, and numbers of items from 0."""
+    """Path of the field in the file: names, and indices of list items from 0."""
     old: Any
     new: Any
 
     def __str__(self) -> str:
-        """`paper.cell_mm: [80.0, 80.0] -> [40.0, 24.0]`."""
+        """Text such as `paper.cell_mm: [80.0, 80.0] -> [40.0, 24.0]`."""
         if not self.field:
             return "its earlier content is missing or damaged"
         return f"{'.'.join(self.field)}: {_short(self.old)} -> {_short(self.new)}"
 
 
 def differences(folder: Path, snapshots: Mapping[str, str]) -> list[Difference]:
-    """Compare the session's JSON files of these names with the given texts; empty where nothing changed."""
+    """Compare the session's JSON files with `snapshots` (file name -> text); empty if nothing changed."""
     found: list[Difference] = []
     for name, text in snapshots.items():
         try:

@@ -1,4 +1,4 @@
-"""Room on the disk, durable writes, and ways to put a file somewhere without ever losing the one that is there."""
+"""Disk space, durable writes, and ways to place a file without losing one that is already there."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import IO, Any
 from sessions.errors import DiskFull, SessionError, disk_error, in_one_line
 
 SPARE_BYTES = 16 * 1024 * 1024
-"""Kept free whatever is written, so that the journal's last lines always fit."""
+"""Space that is always kept free, so that the journal's last lines fit."""
 _PIECE_BYTES = 1 << 20
 
 
@@ -26,7 +26,7 @@ def free_bytes(folder: Path) -> int:
 
 
 def check_room(folder: Path, need_bytes: int) -> None:
-    """Raise `DiskFull` unless `need_bytes` and `SPARE_BYTES` more are free."""
+    """Raise `DiskFull` unless `need_bytes` plus `SPARE_BYTES` are free."""
     free = free_bytes(folder)
     if free < need_bytes + SPARE_BYTES:
         need_mb, free_mb = (need_bytes + SPARE_BYTES) / 1e6, free / 1e6
@@ -59,11 +59,11 @@ def write_durably(path: Path, data: bytes) -> None:
 def staged_folder(out: Path) -> Generator[Path]:
     """Yield a folder beside `out` to write into; it is renamed to `out` at the end, and removed after an exception.
 
-    Replaces an empty folder, and no other. Raises `OSError`.
+    An existing `out` is replaced only if it is an empty folder. Raises `OSError`.
     """
     stage = out.with_name(f".{out.name}.partial")
     try:
-        shutil.rmtree(stage, ignore_errors=True)  # left by a process that was killed: a copy, nothing recorded
+        shutil.rmtree(stage, ignore_errors=True)  # left by a killed process: only a copy
         stage.mkdir(parents=True)
         yield stage
         for path in (stage, *(inside for inside in stage.rglob("*") if inside.is_dir())):
@@ -75,9 +75,9 @@ def staged_folder(out: Path) -> Generator[Path]:
 
 
 def set_aside(path: Path, tag: str) -> Path:
-    """Give the file a second name beside the first (`x.mcap.damaged-1`), and return that name.
+    """Give the file a second name in its folder (`x.mcap.damaged-1`), and return that name.
 
-    The same bytes always get the same name. Raises `SessionError` where the disk fails.
+    A file with the same content gets the same name again. Raises `SessionError` where the disk fails.
     """
     try:
         for number in itertools.count(1):
@@ -106,7 +106,7 @@ def same_bytes(one: Path, other: Path) -> bool:
 
 
 def publish(part: Path, target: Path) -> None:
-    """Rename a finished file to `target`. Raises `FileExistsError` where there is one already, `OSError`."""
+    """Rename a finished file to `target`. Raises `FileExistsError` if `target` exists, or another `OSError`."""
     try:
         os.link(part, target)
     except FileExistsError:
@@ -131,7 +131,7 @@ def _link(path: Path, kept: Path) -> None:
 
 
 def unwritable(folder: Path) -> tuple[Path, str] | None:
-    """Path that prevents writing into a folder, or creating it, and the reason; None where nothing does."""
+    """Path that prevents writing into a folder, or creating it, and the reason; None if it can be written."""
     there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     if not there.is_dir():
         return there, "is a file; a folder is needed"

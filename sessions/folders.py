@@ -1,4 +1,4 @@
-"""Folders of sessions: which are open, which names are free, and what to do about one that was renamed."""
+"""Session folders: find those that are open, choose a free name, and report one that was renamed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sessions.names import SEGMENT_NAME, check_folder
 
 
 def check_name(folder: Path) -> None:
-    """Raise `InputError` for a folder that was renamed or holds links, and for an unfinished file; says what to do."""
+    """Raise `InputError`, with advice, for a folder that was renamed or holds links, and for an unfinished file."""
     if folder.suffix == ".part" and folder.is_file():
         what = "was never finished, a step or a merge was cut: it is kept as evidence and is no recording"
         raise InputError(folder, f"{what}. Give the session's folder, {folder.parent}")
@@ -27,7 +27,7 @@ def check_name(folder: Path) -> None:
 
 
 def recording_of_renamed(folder: Path) -> Path | None:
-    """Return the only recording in a folder that has another name than the folder; None otherwise.
+    """Return the only recording in a folder if its name differs from the folder's; None otherwise.
 
     Also None for an open session, which may be renamed: the files of its steps do not carry its name.
     """
@@ -39,7 +39,7 @@ def recording_of_renamed(folder: Path) -> Path | None:
 
 
 def not_a_session(folder: Path) -> InputError:
-    """Make the error for a folder without a recording of its name; it says what to give instead."""
+    """Make the error for a folder without a recording of its name; the message says what to give instead."""
     name = f"{folder.resolve().name}.mcap"
     if (folder / JOURNAL_NAME).is_file():
         return InputError(folder, f"has lost its recording {name}: `brushloop sessions repair {folder}` makes it again")

@@ -25,16 +25,16 @@ PARTS_NOTE = "brushloop.parts"
 """Note in a file merged from recordings: file, SHA-256, header and own notes of each, and how it was renumbered."""
 JOINED = ("software", "robot_firmware", "camera", "origin", "licence")
 MAY_DIFFER = {"session_id", "protocol", *JOINED}
-"""Header fields that may differ between parts; all others must agree: they describe the one setup."""
+"""Header fields that may differ between parts; all others describe the setup and must agree."""
 MUST_AGREE = ("rig.effective.json", "rig.toml")
-"""The first of these that a part carries must be the same in all parts: another camera pose means another scale."""
+"""The first of these that is attached must be the same in all parts: another camera pose means another scale."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Part:
     recording: Recording
     prefix: str
-    """Prefix of its strokes' names."""
+    """Prefix added to the names of its strokes."""
     offset: int
     """Added to the numbers of its stills."""
 
@@ -42,8 +42,8 @@ class _Part:
 def merge_session(folder: Path, state: Replay, header: Header, tag: str = "superseded") -> Path:
     """Merge the finished steps of a session into its one MCAP file, in the order of the journal.
 
-    The configuration and what repairs did travel inside, so that this file is all that need be shared. It gets its
-    name once it reads back with CRCs checked and the journal's counts. A file of that name, from a close that was cut,
+    The file includes the configuration and a note of any repairs, so that it can be shared alone. It gets its name
+    once it was read back with correct CRCs and the journal's counts. A file of that name, left by an interrupted close,
     is kept beside it under `tag`. Raises `SessionDamaged` naming the step that cannot be read, or the wrong counts.
     """
     final = folder / f"{folder.name}.mcap"
@@ -52,7 +52,7 @@ def merge_session(folder: Path, state: Replay, header: Header, tag: str = "super
     part = final.with_name(final.name + ".part")
     expected = state.counts()
     try:
-        part.unlink(missing_ok=True)  # a copy of steps that are still there
+        part.unlink(missing_ok=True)  # only a copy of steps that still exist
         notes = {REPAIRS_NOTE: {"repairs": list(state.repairs)}} if state.repairs else {}
         snapshots = [path for name in SNAPSHOT_NAMES if (path := folder / name).is_file()]
         attachments = {path.name: path.read_bytes() for path in snapshots}
@@ -72,11 +72,11 @@ def merge_session(folder: Path, state: Replay, header: Header, tag: str = "super
 def merge_recordings(sources: list[Path], out: Path) -> Path:
     """Merge session folders or MCAP files into `out` (a new .mcap file), read it back, and return it.
 
-    It holds every message of every part, in the order of the parts; strokes are named `<session>/<stroke>` where the
-    parts are of several sessions, and stills are renumbered so that no number appears twice.
+    It holds every message of every part, in the order of the parts; strokes are named `<session>/<stroke>` if the
+    parts come from several sessions, and stills are renumbered so that no number appears twice.
 
     Raises `InputError` for parts of different setups, for a stroke that appears twice, or where `out` exists;
-    `SessionDamaged` naming a part that cannot be read. Nothing half-written is left.
+    `SessionDamaged` naming a part that cannot be read. No unfinished file is left.
     """
     if out.suffix != ".mcap" or not SESSION_ID.fullmatch(out.stem):
         raise InputError(out, "give the new file a name of letters, digits, '.', '_' and '-' that ends in .mcap")
@@ -91,7 +91,7 @@ def merge_recordings(sources: list[Path], out: Path) -> Path:
     check_room(out.parent, sum(recording.path.stat().st_size for recording in recordings))
     part = out.with_name(f".{out.name}.partial")
     try:
-        part.unlink(missing_ok=True)  # left by a merge that was killed: a copy
+        part.unlink(missing_ok=True)  # left by a killed merge: only a copy
         notes = {PARTS_NOTE: {"parts": [_provenance(one) for one in parts]}}
         records = (record for one in parts for record in _renumbered(one))
         written = write_mcap(part, header, notes, attachments, records)
@@ -131,7 +131,7 @@ def _one_header(recordings: list[Recording], session_id: str) -> Header:
 def _attachments(recordings: list[Recording]) -> dict[str, bytes]:
     """Configuration that all parts share, and each part's own protocol under the name of its session."""
     carried = [{a.name: a.data for a in container.attachments(recording.path)} for recording in recordings]
-    first = next((files for files in carried if files), carried[0])  # the file of a single step carries none
+    first = next((files for files in carried if files), carried[0])  # the file of a single step has none
     for recording, other in zip(recordings, carried, strict=True):
         name = next((name for name in MUST_AGREE if name in first or name in other), None)
         if other and name is not None and first.get(name) != other.get(name):
@@ -177,7 +177,7 @@ class _Merged:
 
 
 def _merged(recording: Recording) -> list[_Merged]:
-    """Recordings that this one was merged from, and theirs in turn, outermost first."""
+    """Recordings that this one was merged from, recursively, outermost first."""
     try:
         notes = {record.name: record.metadata for record in container.metadata(recording.path)}
         return list(_parts_in(notes, ""))

@@ -1,7 +1,7 @@
-"""Names of sessions and files, and the checks that keep a session from elsewhere within its own folder.
+"""Names of sessions and files, and checks that keep a session received from elsewhere within its own folder.
 
-Whoever hands a session on may write any name into its journal, and may put links where files should be. Every name
-that is read from a session goes through `bare_name`, and every folder through `check_folder`, before it is used.
+The journal of such a session may contain any name, and its folder may contain links in place of files. Every name
+that is read from a session is checked by `bare_name`, and every folder by `check_folder`, before it is used.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ COMPANIONS = (
     "loop",
     "written",
 )
-"""Files and folders that belong to a recording which lies among other things."""
+"""Files and folders that belong to a recording whose folder may also hold unrelated files."""
 
 
 def bare_name(value: object) -> str:
@@ -61,7 +61,7 @@ def check_folder(folder: Path) -> None:
 
 
 def check_companions(folder: Path) -> None:
-    """Check, as `check_folder` does, only the `COMPANIONS` of a recording in a folder of other things."""
+    """Like `check_folder`, but only for the `COMPANIONS` of a recording; unrelated files are not checked."""
     for name in COMPANIONS:
         path = folder / name
         if check_file(path) and path.is_dir():

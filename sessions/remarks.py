@@ -1,7 +1,7 @@
-"""Remarks on captures made afterwards (bad, good again, a note), kept beside the recording and never inside it.
+"""Remarks added to captures afterwards (bad, good again, a note), kept beside the recording and never inside it.
 
 `remarks.jsonl` holds one line per remark, with a CRC as in the journal; the latest remark on a still counts. The
-recording itself is never changed, so that a closed session stays byte for byte what was recorded.
+recording itself is never changed, so that a closed session stays byte for byte as recorded.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""What is in one session (steps, strokes per cell of the grid, sheets, files, devices), and which sessions there are.
+"""Contents of one session (steps, strokes per cell of the grid, sheets, files, devices), and lists of sessions.
 
-Reads journals and headers, and no photograph.
+Only journals and headers are read, no photographs.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Segment:
     file: str
     step: str
     size_bytes: int | None
-    """None where the file is not there."""
+    """None if the file is missing."""
     messages: dict[str, int]
 
 
@@ -49,7 +49,7 @@ class Sheet:
 
 @dataclass(frozen=True, slots=True)
 class GridCell:
-    """How many strokes of one (H, alpha) there are; `planned` is None where the protocol does not say."""
+    """Number of strokes of one (H, alpha); `planned` is None if the protocol does not state it."""
 
     height_mm: float | None
     tilt_deg: float | None
@@ -59,7 +59,7 @@ class GridCell:
 
 @dataclass(slots=True)
 class Details:
-    """A session in full, fit for JSON."""
+    """Everything known about a session; can be written as JSON."""
 
     session_id: str
     state: str
@@ -75,7 +75,7 @@ class Details:
     next: str = ""
     """Step under way when the last process ended; empty where none was."""
     strokes: int = 0
-    """Kept by the run, and not marked bad since."""
+    """Number of strokes that the run kept and that were not marked bad since."""
     marked_bad: int = 0
     planned: int | None = None
     grid: list[GridCell] = field(default_factory=list[GridCell])
@@ -90,7 +90,7 @@ class Details:
 
 
 def details(path: Path) -> Details:
-    """Look at a session's folder or an MCAP file. Raises `InputError`, `SessionDamaged`."""
+    """Describe a session's folder or an MCAP file. Raises `InputError`, `SessionDamaged`."""
     if (path / JOURNAL_NAME).is_file():
         check_name(path)
         return _of_journal(path.resolve())
@@ -112,7 +112,7 @@ def _of_header(header: Header, state: str) -> Details:
 
 
 def _of_journal(folder: Path) -> Details:
-    """Raises `SessionDamaged` also for lines that read well and make no sense, as a grid without numbers."""
+    """Raise `SessionDamaged` also for well-formed lines that make no sense, such as a grid without numbers."""
     state, lines = replay_lines(folder / JOURNAL_NAME)
     try:
         return _read(folder, state, lines)

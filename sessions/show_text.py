@@ -71,7 +71,7 @@ def _segments(details: Details) -> Table:
 
 
 def _files(details: Details) -> str:
-    """`2 of finished steps, 0.01 MB, 1 missing`."""
+    """Text such as `2 of finished steps, 0.01 MB, 1 missing`."""
     sizes = [segment.size_bytes for segment in details.segments]
     missing = f", {sizes.count(None)} missing" if None in sizes else ""
     return f"{len(sizes)} of finished steps, {_size(sum(size or 0 for size in sizes))}{missing}"

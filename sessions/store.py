@@ -32,17 +32,17 @@ class Attempt:
     key: str
     kind: str
     serial: int
-    """Unique in the session."""
+    """Number of the attempt, unique in the session."""
     attempt: int
     writer: SegmentWriter
     cell: int | None
 
 
 class SessionStore:
-    """One session open for writing, under its lock. Raises `InputError` where no session can be resumed.
+    """One session open for writing, under its lock; without a header, an existing one is resumed.
 
-    A new session is given a header and `snapshots`, the texts of its configuration, which the journal keeps as well.
-    Raises `SessionDamaged` for a damaged session; its note names `brushloop sessions repair`.
+    A new session needs a header and `snapshots`, the texts of its configuration, which the journal keeps as well.
+    Raises `InputError` if no session can be resumed, and `SessionDamaged` (its note names `brushloop sessions repair`).
     """
 
     def __init__(
@@ -100,8 +100,8 @@ class SessionStore:
     def begin(self, key: str, kind: str, *, cell: int | None, notes: Line) -> Attempt:
         """Journal that an attempt starts, then open its file.
 
-        Raises `DiskFull`, or `SessionError` for a press on a sheet that may hold an unrecorded one; nothing has
-        happened then.
+        Raises `DiskFull`, or `SessionError` for a press on a sheet that may hold an unrecorded one, before anything
+        is written.
         """
         self.check_room()
         if cell is not None and self.state.sheet in self.state.doubtful_sheets:
@@ -194,7 +194,7 @@ class SessionStore:
         return t_ns
 
     def _check_serials(self) -> None:
-        """Refuse a journal that lost its last lines: their numbers, and their cells, would be used again."""
+        """Raise `SessionDamaged` if the journal lost its last lines: their numbers and cells would be used again."""
         for path in sorted(self.folder.glob("*.mcap*")):
             serial = SEGMENT_NAME.fullmatch(path.name)
             if serial and int(serial[1]) >= self.state.begun:

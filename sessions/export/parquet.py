@@ -1,12 +1,12 @@
-"""Parquet that Hugging Face `datasets` loads: one file of strokes with images, one of poses as a time series.
+"""Parquet files that Hugging Face `datasets` loads: strokes with images, and poses as a time series.
 
     README.md                                  data set card: two configurations, `strokes` and `poses`
     strokes/train-00000-of-00001.parquet       one row a stroke; `image` is a struct {bytes, path}, feature `Image`
     poses/train-00000-of-00001.parquet         one row a pose, columns named as LeRobot names them
     header.json
 
-`episode_index` joins the two: a stroke is an episode. `timestamp` counts seconds from the first pose of the stroke, as
-it was measured; nothing is spaced by a frame rate. It is not a whole LeRobotDataset, which wants a fixed rate.
+`episode_index` joins the two: a stroke is an episode. `timestamp` is the measured time in seconds
+since the first pose of the stroke; there is no fixed frame rate, which a complete LeRobotDataset would require.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ STATE_NAMES = ["x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw"]
 
 
 def write_parquet(export: Export, folder: Path) -> None:
-    """Write the files listed above. Raises `InputError` where pyarrow is not installed."""
+    """Write the files listed in this module's docstring. Raises `InputError` where pyarrow is not installed."""
     try:
         pa: Any = importlib.import_module("pyarrow")  # without type stubs
         pq: Any = importlib.import_module("pyarrow.parquet")
@@ -75,7 +75,7 @@ def write_parquet(export: Export, folder: Path) -> None:
 
 
 def _number_columns(export: Export) -> list[str]:
-    """Columns of numbers that any stroke has: the file has one schema."""
+    """Names of the numeric columns that any stroke has: the file has one schema."""
     names: dict[str, None] = {}
     for stroke in export.recording.stroke_records():
         names |= dict.fromkeys(f"commanded_{name}" for name in stroke.commanded)
@@ -123,7 +123,7 @@ def _pose_row(pose: PoseRow, index: int, start_ns: int) -> Row:
 
 
 def _features(pa: Any, schema: Any) -> Row:
-    """Schema as `datasets` writes it into the file's metadata."""
+    """Description of the schema as `datasets` stores it in the file's metadata."""
     features: Row = {}
     for field in schema:
         if field.name == "image":

@@ -43,7 +43,7 @@ class PoseRow:
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """Recording to export, as rows that every format is written from."""
+    """Recording to export, and the rows from which every format is written."""
 
     recording: Recording
     names: dict[str, str]

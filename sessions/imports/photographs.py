@@ -26,19 +26,19 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 QUEUE_LIMIT = 16
-"""Photographs that may wait for the disk: an import can wait, and so never holds a whole folder in memory."""
+"""Most photographs queued for writing; an import waits when the queue is full, and memory stays bounded."""
 WAIT_S = 60.0
 MM_PER_INCH = 25.4
 LEAST_DPI, MOST_DPI = 20.0, 10_000.0
 BOX = ("left_px", "top_px", "width_px", "height_px")
 LEAST_BOX_PX = 8
 SCANS_KEPT = 2
-"""A table goes through its sheets one after the other; a decoded sheet is tens of megabytes."""
+"""Decoded scans kept in memory, tens of megabytes each; a table lists its strokes sheet by sheet."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImportOptions:
-    """What the table does not contain."""
+    """Facts about an import that its table does not contain."""
 
     kind: str = "drag"
     """`press` for vertical presses, `drag` for strokes with travel along the paper."""
@@ -55,7 +55,7 @@ class ImportOptions:
 def import_photographs(
     folder: Path, table: Path, out: Path, options: ImportOptions, software: str, now_ns: Callable[[], int]
 ) -> Path:
-    """Import into the new session folder `out` and return its MCAP file. Raises `InputError`, leaving nothing."""
+    """Import into the new session folder `out`; return its MCAP file. Raises `InputError`, leaving nothing behind."""
     check_target(folder, table, out, options)
     rows = read_table(folder, table, "press" if options.kind == "press" else "drag", options.px_per_mm)
     protocol = f"import of {len(rows)} {options.kind} strokes"
@@ -71,10 +71,10 @@ def import_scans(
     now_ns: Callable[[], int],
     dpi: float | None = None,
 ) -> Path:
-    """Import scans into the new session folder `out` and return its MCAP file. Raises `InputError`, leaving nothing.
+    """Import scans into a new session folder `out`; return its MCAP file. Raises `InputError`, leaving nothing behind.
 
-    The table is that of any import, without px_per_mm: the scale is `dpi`, or the one in the files. Where it has the
-    columns `BOX` (pixels of the scan, from its upper left corner) and `name`, each line is the stroke in that box.
+    The table is that of any import, without px_per_mm: the scale is `dpi`, or else the dpi stored in each file. If it
+    has the columns `BOX` (in pixels from the scan's upper left corner) and `name`, each line is the stroke in that box.
     """
     check_target(folder, table, out, options)
     text = read_text(table)
@@ -167,7 +167,7 @@ def store_rows(
 ) -> Path:
     """Write strokes with their photographs into the session folder `out` and return its MCAP file.
 
-    `opening` is a photograph without a stroke that comes first. `encoded` returns a stroke's PNG or JPEG, by default
+    `opening` is a photograph that comes first and has no stroke. `encoded` returns a stroke's PNG or JPEG, by default
     its file unchanged. Raises `InputError`, leaving nothing behind.
     """
     encoded = encoded or _whole
@@ -230,7 +230,7 @@ def _whole(row: Row) -> bytes:
 
 
 def _check(data: bytes, path: Path) -> bytes:
-    """Decode a photograph once and return its digest, which is all that is checked later. Raises `InputError`."""
+    """Check that a photograph can be decoded, and return its digest for later checks. Raises `InputError`."""
     try:
         decode_gray(data, str(path))
     except SessionDamaged as error:
@@ -239,7 +239,7 @@ def _check(data: bytes, path: Path) -> bytes:
 
 
 def read_bounded(path: Path) -> bytes:
-    """Bytes of a photograph. Raises `InputError` where there are too many, or they cannot be read."""
+    """Bytes of a photograph. Raises `InputError` if it is too large or cannot be read."""
     try:
         size = path.stat().st_size
         if size > MAX_IMAGE_BYTES:

@@ -1,7 +1,7 @@
 """Import a page that was photographed after every stroke: frame k + 1 shows one stroke more than frame k.
 
-Every frame is a still. Stroke k refers to the still after it; the still before it has the sequence number one less.
-The reader of the session finds the stroke's ink by comparing the two.
+Every frame is a still. Stroke k refers to the still taken after it; the still taken before it has the
+previous sequence number. A reader of the session finds the stroke's ink by comparing the two.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ def import_sequence(
     now_ns: Callable[[], int],
     page_mm: tuple[float, float] | None = None,
 ) -> Path:
-    """Import frames into the new session folder `out` and return its MCAP file. Raises `InputError`, leaving nothing.
+    """Import frames into a new session folder `out`; return its MCAP file. Raises `InputError`, leaving nothing behind.
 
-    The table has the columns `before` and `after`, and whatever was commanded; each line's `after` is the next line's
-    `before`. Without a table the frames are taken in the order of their names, and nothing is known of the strokes.
-    `page_mm` (width and height of what a photograph shows) sets the scale where the table has none.
+    The table has the columns `before` and `after`, and any commanded values; each line's `after` is the next line's
+    `before`. Without a table the frames are taken in the order of their names, and no commanded values are known.
+    `page_mm` (width and height of the area that a photograph shows) sets the scale where the table has none.
     """
     named = table or folder
     check_target(folder, named, out, options)
@@ -56,7 +56,7 @@ def import_sequence(
 
 
 def _by_table(table: Path) -> tuple[list[str], str]:
-    """Return the frames in order, and the table with `file` for `after`; check that the frames form one chain."""
+    """Return the frames in order, and the table with `after` renamed `file`; check that the frames form one chain."""
     try:
         lines = [[cell.strip() for cell in line] for line in csv.reader(io.StringIO(read_text(table)), strict=True)]
     except csv.Error as error:
@@ -101,7 +101,7 @@ def _with_scale(text: str, px_per_mm: tuple[float, float]) -> str:
 
 def _text(lines: list[list[str]]) -> str:
     out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows(lines)  # noqa: TID251 - read again at once
+    csv.writer(out, lineterminator="\n").writerows(lines)  # noqa: TID251 - parsed again by this module, never saved
     return out.getvalue()
 
 

@@ -19,12 +19,12 @@ MAX_ROWS = 100_000
 LENGTH_UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 ANGLE_UNITS = {"deg": 1.0, "rad": 180.0 / math.pi}
 FRACTIONS = ("frac", "px", "nominal", "ratio")
-"""Suffixes that are kept as they are: shares, pixels, and values that the source itself calls nominal."""
+"""Suffixes of columns that are not converted: shares, pixels, and values that the source itself calls nominal."""
 PAIRS = (("px_per_mm_x", "px_per_mm_y"), ("start_x_px", "start_y_px"))
 SPECIAL = {"file", "name", "px_per_mm", "height_mm", "tilt_deg", *PAIRS[0], *PAIRS[1]}
 """Columns that become fields of a stroke; all others are kept in `commanded`."""
 DEPTHS = ("height", "depth")
-"""Beginnings of the names of columns that hold a depth, measured downwards from the touch of the paper."""
+"""Prefixes of the names of columns that hold a depth, measured downwards from where the tip touches the paper."""
 DEEPEST_MM = 500.0
 STEEPEST_DEG = 90.0
 MOST = 1e6
@@ -42,7 +42,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """Header line of the table, and what holds for every line."""
+    """Header line of the table, and the settings that hold for every line."""
 
     table: Path
     folder: Path
@@ -50,7 +50,7 @@ class _Columns:
     px_per_mm: float | None
     names: list[str]
     commanded: dict[str, tuple[str, float]]
-    """Stored name and factor of each other column."""
+    """Stored name and unit factor of each column that is not in `SPECIAL`."""
 
 
 def read_table(folder: Path, table: Path, kind: Literal["press", "drag"], px_per_mm: float | None) -> list[Row]:
@@ -61,7 +61,7 @@ def read_table(folder: Path, table: Path, kind: Literal["press", "drag"], px_per
 def parse_table(
     folder: Path, table: Path, text: str, kind: Literal["press", "drag"], px_per_mm: float | None
 ) -> list[Row]:
-    """Read a table whose text is `text`; errors name the path `table`."""
+    """Parse the table in `text`; errors name the path `table`."""
     lines = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: list[Row] = []
     seen: set[str] = set()
@@ -126,7 +126,7 @@ def _columns(
 
 
 def _unit(table: Path, column: str) -> tuple[str, float]:
-    """Stored name and factor of a column `quantity_unit`; lengths are stored in mm and angles in deg."""
+    """Stored name and unit factor of a column `quantity_unit`; lengths are stored in mm and angles in deg."""
     stem, _, suffix = column.rpartition("_")
     if suffix in LENGTH_UNITS and stem:
         return f"{stem}_mm", LENGTH_UNITS[suffix]
@@ -182,7 +182,7 @@ def _row(columns: _Columns, line: int, cells: list[str], still: int) -> Row:
 
 
 def _range(column: str, kind: str) -> tuple[float, float]:
-    """Allowed range of a column, in the unit that is stored; a drag may lean to either side of its path."""
+    """Allowed range of a column, in its stored unit; a drag may lean to either side of its path."""
     if column.startswith(DEPTHS) and column.rpartition("_")[2] in LENGTH_UNITS:
         return 0.0, DEEPEST_MM
     if column == "tilt_deg":
@@ -198,7 +198,7 @@ def _name(columns: _Columns, line: int, name: str) -> str:
 
 
 def _image(columns: _Columns, line: int, name: str) -> Path:
-    """Path of the photograph, links followed. Raises `InputError` where it does not lie in the folder."""
+    """Path of the photograph, with links resolved. Raises `InputError` where it is not in the folder."""
     if not name.isprintable():
         raise InputError(columns.table, f"line {line}, column `file`: {name[:80]!r} holds control characters")
     image = columns.folder / name
@@ -206,7 +206,7 @@ def _image(columns: _Columns, line: int, name: str) -> Path:
         image = image.resolve()
         inside, there = image.is_relative_to(columns.folder), image.is_file()
     except (OSError, RuntimeError):
-        inside = there = False  # a name that is too long, or links in a circle
+        inside = there = False  # the name is too long, or links form a loop
     if not inside:
         raise InputError(columns.table, f"line {line}: file {name[:80]!r} lies outside {columns.folder.name}/")
     if not there:

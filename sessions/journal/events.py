@@ -11,13 +11,13 @@ from sessions.journal.codec import Line
 from sessions.names import bare_name
 
 NONSENSE = (KeyError, TypeError, ValueError, OverflowError, AttributeError)
-"""Exceptions that a line without sense may cause."""
+"""Exceptions that a malformed line may cause."""
 _SERIAL = re.compile(r"\d{1,9}(?=-)")
 MAX_NUMBER = 10**9
 
 
 def check_event(line: Line) -> None:
-    """Raise `ValueError`, naming the field, where one is missing or has a value of another kind."""
+    """Raise `ValueError`, naming the field, if one is missing or has an invalid value."""
     event = line["event"]
     required, optional = FIELDS.get(event, ({}, {}))
     for name, check in required.items():
@@ -30,7 +30,7 @@ def check_event(line: Line) -> None:
 
 
 def serial_of(line: Line) -> int | None:
-    """Number at the beginning of the name of a step's file; None for a line without one."""
+    """Serial number at the start of the name of a step's file; None for a line without one."""
     serial = _SERIAL.match(str(line.get("file", "")))
     return int(serial[0]) if serial else None
 

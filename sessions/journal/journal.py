@@ -1,6 +1,6 @@
 """The journal of a session: append-only JSON lines, one fsync each. What it says happened, happened.
 
-Events: `open` (header, configs), `process` (a process took the session), `begin` and `done` or `void` for a step
+Events: `open` (header, configs), `process` (a process opened the session), `begin` and `done` or `void` for a step
 attempt, `sheet` (a fresh sheet was put in), `torn` (a half-written line was found and set aside), `clock` (the host's
 clock was set back), `closed`. A repair adds `repaired`, `held`, `lost`, `doubt` and `journal`.
 """
@@ -26,10 +26,10 @@ JOURNAL_NAME = "journal.jsonl"
 
 
 class Journal:
-    """Appends to one journal file. One process at a time: the caller holds the session's lock.
+    """Writer that appends to one journal file. The caller holds the session's lock, so only one process writes.
 
-    `t_ns`, the time of opening, is for the note about a torn tail. With a `session` id, new lines are chained, even
-    after lines that are not. Raises `SessionError` where the disk fails, and `InputError` where the file is a link.
+    `t_ns`, the time of opening, dates the note about a torn tail. With a `session` id, new lines are chained, even
+    after unchained lines. Raises `SessionError` where the disk fails, and `InputError` where the file is a link.
     """
 
     def __init__(self, path: Path, t_ns: int, session: str = "") -> None:
@@ -68,7 +68,7 @@ class Journal:
 
 
 def next_chain(data: bytes, session: str) -> Chain | None:
-    """Chain of the next line after these bytes, which are whole lines; None without a session."""
+    """Chain of the line that follows `data`, which must consist of whole lines; None without a session."""
     if not session:
         return None
     *lines, _end = data.split(b"\n")
@@ -88,7 +88,7 @@ def _whole_lines(path: Path, t_ns: int, session: str) -> Chain | None:
         return next_chain(data, session)
     chain = next_chain(data[:keep], session)
     if read(data).torn:
-        # Longer than what it overwrites, and one single write: a crash leaves the old tail or the note, never neither.
+        # Longer than the tail that it overwrites, and written in one call: a crash leaves the tail or the note.
         note, at = encode_line(t_ns, TornTail(hex=data[keep:].hex()).model_dump(), chain), keep
     else:
         note, at = b"\n", len(data)  # only the newline was cut off
@@ -108,7 +108,7 @@ class Replay:
     done: dict[str, Line] = field(default_factory=dict[str, Line])
     """`done` events by step key."""
     segments: list[Line] = field(default_factory=list[Line])
-    """`done` events in order of time: what the merged file is made of."""
+    """`done` events in order of time; the merged file is made of their files."""
     attempts: dict[str, int] = field(default_factory=dict[str, int])
     used_cells: set[tuple[int, int]] = field(default_factory=set[tuple[int, int]])
     """(sheet, cell) of every press that was begun, finished or not: never pressed again."""
@@ -132,7 +132,7 @@ class Replay:
 
 @dataclass(slots=True)
 class Account:
-    """Everything read from a journal, with what is wrong in it."""
+    """Everything read from a journal, with its faults."""
 
     reading: Reading
     lines: list[Line] = field(default_factory=list[Line])
@@ -147,7 +147,7 @@ class Account:
 
 
 def account(data: bytes) -> Account:
-    """Read and fold the bytes of a journal. Raises nothing."""
+    """Read the bytes of a journal and apply its events to a new state. Never raises."""
     found = Account(read(data))
     found.faults += found.reading.faults
     found.spoilt += [span for _, span in found.reading.spoilt]
@@ -168,12 +168,12 @@ def account(data: bytes) -> Account:
 
 
 def replay(path: Path) -> Replay:
-    """Fold a journal. Raises `SessionDamaged` where anything in it is wrong."""
+    """State after all events of a journal. Raises `SessionDamaged` where anything in it is wrong."""
     return replay_lines(path)[0]
 
 
 def replay_lines(path: Path) -> tuple[Replay, list[Line]]:
-    """Fold a journal, and return its lines as well. Raises `SessionDamaged` where anything in it is wrong."""
+    """Return the state after all events of a journal, and its lines. Raises `SessionDamaged` as `replay` does."""
     found = account(read_journal(path))
     if found.faults:
         more = f" (and {len(found.faults) - 1} more)" if len(found.faults) > 1 else ""
@@ -201,7 +201,7 @@ class DoneTwice(ValueError):
 
 
 def fold(state: Replay, line: Line) -> None:
-    """Update the state by one line, or raise one of `NONSENSE` and leave the state unchanged."""
+    """Apply one line to the state, or raise one of `NONSENSE` and leave the state unchanged."""
     check_event(line)
     match line["event"]:
         case "open":
@@ -227,7 +227,7 @@ def fold(state: Replay, line: Line) -> None:
 
 
 def _check_once(state: Replay, line: Line) -> None:
-    """Raise `DoneTwice` unless this is a new attempt at a set-up step; a stroke is done only once."""
+    """Raise `DoneTwice` for a step that was done already, unless it is a new attempt at a set-up step."""
     for other in state.segments:
         same = other["key"] == line["key"] and other.get("attempt", 1) == line.get("attempt", 1)
         again = other["key"] == line["key"] and Topic.STROKE in {**other["counts"], **line["counts"]}
@@ -237,7 +237,7 @@ def _check_once(state: Replay, line: Line) -> None:
 
 def _begin(state: Replay, line: Line) -> None:
     key, sheet = line["key"], line["sheet"]
-    # The number of a lost line, which also numbers stills, must not be used again.
+    # Serials also number stills, so that of a lost line must not be used again.
     state.begun = max(state.begun + 1, _next_serial(line))
     state.attempts[key] = max(state.attempts.get(key, 0), line["attempt"])
     state.sheet = max(state.sheet, sheet)

@@ -1,7 +1,7 @@
 """Reading the lines of a journal: which can be trusted, and what is wrong with each of the others.
 
-A chained line is trusted where the next line holds its hash. Older journals have lines without a chain, and the oldest
-have no CRC either; these are read as well, and the first chained line holds the hash of all of them.
+A chained line is trusted if the next line holds its hash. Older journals have lines without a chain, and the oldest
+have no CRC either; these are read as well, and the first chained line holds the hash of all lines before it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Fault:
     what: str
 
     def __str__(self) -> str:
-        """`line 5 does not match its CRC`."""
+        """Text such as `line 5 does not match its CRC`."""
         return f"line {self.number} {self.what}"
 
 
@@ -50,7 +50,7 @@ class Reading:
 
     @property
     def unchained(self) -> int:
-        """Number of lines, at the beginning, written without a chain."""
+        """Number of lines at the beginning that were written without a chain."""
         return sum(entry.chain is None for entry in self.entries)
 
     def fault(self, number: int, what: str) -> None:
@@ -90,7 +90,7 @@ def read(data: bytes) -> Reading:
 
 
 def accounts_for(spoilt: bytes, rebuilt: bytes) -> bool:
-    """Whether a damaged line, cut short or with wrong bytes, was the rebuilt one; `rebuilt` has no chain."""
+    """Whether a damaged line (cut short, or with wrong bytes) is what is left of `rebuilt`, which has no chain."""
     body = rebuilt[: rebuilt.rindex(b',"crc":"')]
     if len(spoilt) < len(body) // 2:
         return False
@@ -99,7 +99,7 @@ def accounts_for(spoilt: bytes, rebuilt: bytes) -> bool:
 
 
 def _decoded(reading: Reading, pieces: list[bytes], tail: bytes) -> list[Entry]:
-    """Lines that match their CRC, also where the newline between two of them is damaged."""
+    """Lines that match their CRC, even if the newline between two of them is damaged."""
     chained_at = next((at for at, raw in enumerate(pieces) if _is_chained(raw)), len(pieces))
     protected = any(has_crc(raw) for raw in pieces[:chained_at])
     entries: list[Entry] = []
@@ -144,7 +144,7 @@ def _is_perfect(entries: list[Entry], first: Entry, data: bytes) -> bool:
 
 
 def _before(entry: Entry, data: bytes) -> bytes:
-    """Everything in front of a line."""
+    """All bytes before a line."""
     at = 0
     for _ in range(entry.number - 1):
         at = data.index(b"\n", at) + 1
@@ -178,7 +178,7 @@ def _link(reading: Reading, entries: list[Entry], data: bytes) -> None:
 
 
 def _vouched(reading: Reading, by_seq: dict[int, list[Entry]]) -> list[Entry]:
-    """Choose one entry for each number, the one whose hash the next line holds; in the order of the numbers."""
+    """Choose for each sequence number the entry whose hash the next line holds; return them in order."""
     held: list[Entry] = []
     for seq in sorted(by_seq, reverse=True):
         after = held[-1] if held else None
@@ -216,7 +216,7 @@ def _misplaced(reading: Reading, held: list[Entry]) -> None:
 
 
 def _missing(reading: Reading, held: list[Entry], before: int) -> None:
-    """Report numbers that no line has, except those of lines that cannot be trusted."""
+    """Report sequence numbers that no line has, except those of lines that cannot be trusted."""
     spoilt = {number for number, _ in reading.spoilt}
     known, at = before, 0
     for entry in held:

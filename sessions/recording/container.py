@@ -25,7 +25,7 @@ from mcap.writer import MCAP0_MAGIC
 from sessions.errors import InputError, SessionDamaged, in_one_line
 
 MAX_RECORD_BYTES = 512 * 1024 * 1024
-"""A chunk holds 256 KiB and then one message more: the largest image allowed, with room to spare."""
+"""Largest record that is read: a chunk is 256 KiB plus one message, the largest image allowed, with room to spare."""
 UNREADABLE = (
     McapError,
     struct.error,
@@ -47,7 +47,7 @@ _T = TypeVar("_T")
 def messages(path: Path, topics: list[str] | None = None) -> Iterator[Record]:
     """Messages in the order in which they were written, every CRC checked. Raises `SessionDamaged`.
 
-    Not by log time: a stroke would come before its still where the host's clock was set back between the two.
+    They are not sorted by log time: a stroke would precede its still if the host's clock was set back between the two.
     """
     return _guarded(path, lambda file: _messages(file, topics))
 
@@ -68,7 +68,7 @@ def indexed_counts(path: Path) -> dict[str, int]:
 
 
 class BoundedFile(io.BufferedReader):
-    """Reads at most what the file holds, whatever length a damaged record states."""
+    """File whose reads are limited to what it holds, whatever length a damaged record states."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(path))
@@ -81,7 +81,7 @@ class BoundedFile(io.BufferedReader):
 
 
 def _guarded(path: Path, read: Callable[[BoundedFile], Iterator[_T]]) -> Iterator[_T]:
-    """Guard the library's own steps only: an exception in the code that uses an item is not damage of the file."""
+    """Yield items; turn the library's exceptions into `SessionDamaged`, but not those of the code that uses an item."""
     try:
         file = BoundedFile(path)
     except OSError as error:
@@ -103,7 +103,7 @@ def _guarded(path: Path, read: Callable[[BoundedFile], Iterator[_T]]) -> Iterato
 
 
 def indexed(file: BoundedFile) -> tuple[SeekingReader, Summary]:
-    """A reader, and the index at the end of the file, its CRC checked. Raises any of `UNREADABLE`."""
+    """Return a reader, and the index at the end of the file with its CRC checked. Raises any of `UNREADABLE`."""
     file.seek(0)
     reader = SeekingReader(file, validate_crcs=True, record_size_limit=MAX_RECORD_BYTES)
     _check_summary_crc(file)
@@ -114,7 +114,7 @@ def indexed(file: BoundedFile) -> tuple[SeekingReader, Summary]:
 
 
 def _check_summary_crc(file: BoundedFile) -> None:
-    """Check the index, which says where each topic is: otherwise one wrong bit could silently hide strokes."""
+    """Check the CRC of the index: otherwise one wrong bit in it could silently hide strokes."""
     footer_at = file.size - FOOTER_SIZE - len(MCAP0_MAGIC)
     file.seek(footer_at)
     _opcode, _length, summary_start, _offsets, expected = struct.unpack("<BQQQI", file.read(FOOTER_SIZE))
@@ -141,7 +141,7 @@ def _messages(file: BoundedFile, topics: list[str] | None) -> Iterator[Record]:
 
 
 def check_chunk_at(file: BoundedFile, offset: int) -> None:
-    """Raise `McapError` for a chunk that any of its three lengths puts above `MAX_RECORD_BYTES`."""
+    """Raise `McapError` for a chunk if any of its three lengths exceeds `MAX_RECORD_BYTES`."""
     file.seek(offset + 1 + 8 + 8 + 8)
     stream = ReadDataStream(file)
     size = stream.read8()

@@ -1,6 +1,6 @@
-"""What every MCAP file of ours holds before its messages (header, notes, attachments), and writing one from messages.
+"""Write MCAP files: what comes before the messages (header, notes, attachments), and the messages themselves.
 
-MCAP gives metadata no CRC, so that the header and the notes carry one of their own.
+Metadata has no CRC in MCAP, so the header and each note include one.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def write_mcap(
     attachments: Mapping[str, bytes],
     records: Iterable[Record],
 ) -> Counter[str]:
-    """Write a new file, durable on return, and return its messages by topic. Raises `OSError`."""
+    """Write a new file, durable on return, and return its number of messages by topic. Raises `OSError`."""
     written: Counter[str] = Counter()
     with path.open("xb") as file:
         writer = start_mcap(file, header, notes, attachments)
@@ -74,7 +74,7 @@ def _register(writer: Writer, schema: Schema | None, channel: Channel) -> int:
 
 
 def _copy(writer: Writer, channel_id: int, channel: Channel, message: Message) -> None:
-    """Write one message with its own times and sequence."""
+    """Write one message, keeping its times and sequence number."""
     writer.add_message(
         channel_id=channel_id,
         log_time=message.log_time,
@@ -105,7 +105,7 @@ def note(values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def read_note(metadata: dict[str, str]) -> dict[str, Any] | None:
-    """Values of a note; None where it does not match its CRC. Raises `ValueError` where it is no note."""
+    """Values of a note; None where it does not match its CRC. Raises `ValueError` where it is not a note."""
     text = metadata.get("json", "")
     if metadata.get("crc") != f"{zlib.crc32(text.encode()):08x}":
         return None
@@ -116,7 +116,7 @@ def read_note(metadata: dict[str, str]) -> dict[str, Any] | None:
 
 
 def count_messages(path: Path) -> dict[str, int]:
-    """Messages by topic, every chunk's CRC checked. Raises `SessionDamaged`."""
+    """Number of messages by topic, with every chunk's CRC checked. Raises `SessionDamaged`."""
     return dict(Counter(channel.topic for _schema, channel, _message in messages(path)))
 
 

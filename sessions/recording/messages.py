@@ -26,11 +26,11 @@ MAX_IMAGE_BYTES = 256 * 1024 * 1024
 MAX_IMAGE_PIXELS = 200_000_000
 MAX_JPEG_SCANS = 100
 MAX_SCANNED_PIXELS = 4_000_000_000
-"""Pixels times scans of a JPEG: each scan of a progressive one goes over the whole image, at about 1 ns a pixel."""
+"""Limit of pixels times scans: each scan of a progressive JPEG covers the whole image, at about 1 ns a pixel."""
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 JPEG_START = b"\xff\xd8"
 _MARKER = re.compile(rb"\xff+([^\x00\x01\xd0-\xd8\xff])")
-"""Marker that begins a segment or ends the file; within a scan 0xFF stands only before 0 or a restart."""
+"""Marker that begins a segment or ends the file; within a scan 0xFF is followed only by 0 or a restart marker."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ def calibration_message(
     distortion: Sequence[float],
     model: str = "plumb_bob",
 ) -> CameraCalibration:
-    """Intrinsics of a camera that is alone and not rectified: R is the identity, P is [K | 0].
+    """Intrinsics of a single, unrectified camera: R is the identity, P is [K | 0].
 
     `camera_matrix` is K, 3 x 3 in pixels; `distortion` is k1, k2, p1, p2, k3 for `plumb_bob`. Raises `ValueError`.
     """
@@ -138,7 +138,7 @@ def decode_still(data: bytes) -> bytes:
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:
-    """Lossless PNG at cv2's default strategy: naming a level makes it twice as slow."""
+    """Lossless PNG at cv2's default strategy; setting a compression level makes it twice as slow."""
     import cv2
 
     ok, data = cv2.imencode(".png", image)
@@ -148,7 +148,7 @@ def encode_png(image: NDArray[np.uint8]) -> bytes:
 
 
 def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
-    """(h, w) uint8 gray. Raises `SessionDamaged` for other formats, and for images cut short or absurdly large."""
+    """Decode to (h, w) uint8 gray. Raises `SessionDamaged` for other formats, and for cut or absurdly large images."""
     import cv2
     import numpy as np
 
@@ -161,7 +161,7 @@ def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
     width, height, scans = size
     if width * height > MAX_IMAGE_PIXELS:
         raise SessionDamaged(where, f"image of {width} x {height} pixels exceeds {MAX_IMAGE_PIXELS}")
-    # An empty scan takes ten bytes, so that a small file could take minutes to decode.
+    # An empty scan takes ten bytes, so a small file could take minutes to decode.
     most = min(MAX_JPEG_SCANS, MAX_SCANNED_PIXELS // max(width * height, 1))
     if scans > most:
         raise SessionDamaged(where, f"JPEG of {width} x {height} pixels in more than {most} scans")
@@ -194,7 +194,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int, int] | None:
     size, scans, at = None, 0, len(JPEG_START)
     while data.startswith(JPEG_START) and (found := _MARKER.search(data, at)) and scans <= MAX_JPEG_SCANS:
         marker, at = found[1][0], found.end()
-        if marker == 0xD9:  # not a thumbnail's, which lies inside a segment
+        if marker == 0xD9:  # end of the image; a thumbnail's lies inside a segment
             break
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC) and len(data) >= at + 7:
             size = struct.unpack_from(">HH", data, at + 3)

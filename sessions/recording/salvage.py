@@ -1,6 +1,6 @@
-"""What can still be read of a damaged MCAP file: every chunk that matches its CRC, and nothing else.
+"""Read what is intact in a damaged MCAP file: every chunk that matches its CRC, and nothing else.
 
-The file is read record by record. Where a wrong length breaks that off, the index at the end, if it is sound, gives
+The file is read record by record. If a wrong length stops this, the index at the end, if it is intact, gives
 the offsets of the other chunks. A torn tail never yields a wrong record.
 """
 
@@ -40,9 +40,9 @@ class Part:
 
     offset: int
     counts: Counter[str] | None
-    """Messages by topic; None where they are unknown."""
+    """Number of messages by topic; None if unknown."""
     sound: bool
-    """Whether it reads back with its CRC."""
+    """Whether it can be read and matches its CRC."""
 
 
 @dataclass(slots=True)
@@ -53,9 +53,9 @@ class Scan:
     parts: list[Part] = field(default_factory=list[Part])
     """Known chunks, in order."""
     complete: bool = False
-    """Whether no other chunk can exist: the walk reached the end, or the index is sound."""
+    """Whether all chunks are known: the walk reached the end, or the index is intact."""
     indexed: dict[int, dict[int, int]] = field(default_factory=dict[int, dict[int, int]])
-    """Messages by offset of the chunk and number of the channel, from the index records behind each chunk."""
+    """Number of messages by chunk offset and channel number, from the index records after each chunk."""
     schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
     channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
     notes: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
@@ -65,12 +65,12 @@ class Scan:
     attachments: list[Attachment] = field(default_factory=list[Attachment])
     counts: Counter[str] = field(default_factory=Counter[str])
     stated: dict[str, int] | None = None
-    """Messages by topic according to the index; None where it is damaged."""
+    """Number of messages by topic according to the index; None if it is damaged."""
     stated_attachments: int = 0
     stated_notes: int = 0
     """Notes listed in the index, without the header."""
     damage: list[str] = field(default_factory=list[str])
-    """Descriptions; empty for an intact file."""
+    """Descriptions of the damage; empty for an intact file."""
 
 
 def scan(path: Path) -> Scan:
@@ -103,7 +103,7 @@ def scan(path: Path) -> Scan:
 
 
 def _indexed_counts(found: Scan, offset: int) -> Counter[str] | None:
-    """Messages by topic of a chunk, from the index records behind it; None without them."""
+    """Number of messages in a chunk by topic, from the index records after it; None without them."""
     by_channel = found.indexed.get(offset)
     if not by_channel or not by_channel.keys() <= found.channels.keys():
         return None
@@ -149,12 +149,12 @@ def _unpacked(data: bytes) -> bytes:
         for at in range(0, len(data), _PIECE_BYTES):
             unpacked += stream.decompress(data[at : at + _PIECE_BYTES])
     except zstandard.ZstdError:
-        pass  # what came before is worth showing
+        pass  # keep what was unpacked before the error
     return bytes(unpacked)
 
 
 def _walk(file: BoundedFile, found: Scan) -> list[int]:
-    """Offsets of possible chunks, up to the end or to the first record that cannot be followed."""
+    """Offsets of possible chunks, up to the end or to the first record that cannot be read."""
     offsets: list[int] = []
     if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         found.damage.append("does not begin as an MCAP file does")
@@ -185,7 +185,7 @@ def _walk(file: BoundedFile, found: Scan) -> list[int]:
 
 
 def _message_index(file: BoundedFile, found: Scan, chunk: int) -> None:
-    """Count a channel's messages in the chunk: the record holds its number and 16 bytes for each message."""
+    """Count a channel's messages in the chunk: the record holds the channel's number and 16 bytes a message."""
     start = file.read(_MESSAGE_INDEX.size)
     if len(start) == _MESSAGE_INDEX.size:
         channel, length = _MESSAGE_INDEX.unpack(start)
@@ -230,7 +230,7 @@ def _metadata(record: Metadata, found: Scan) -> None:
 
 
 def _from_index(file: BoundedFile, found: Scan, known: set[int]) -> list[int]:
-    """Offsets of chunks that only the index lists; its channels replace those of a lost chunk."""
+    """Return offsets of chunks that only the index lists, and add its channels, which a lost chunk may have held."""
     try:
         _reader, summary = indexed(file)
     except UNREADABLE as error:
@@ -258,7 +258,7 @@ def _from_index(file: BoundedFile, found: Scan, known: set[int]) -> list[int]:
 
 
 def _chunk(file: BoundedFile, offset: int, found: Scan) -> Iterator[Record]:
-    """Messages of one chunk, all of them or an error."""
+    """Return all messages of one chunk, or raise one of `UNREADABLE`."""
     check_chunk_at(file, offset)
     file.seek(offset)
     opcode, length = _START.unpack(file.read(_START.size))

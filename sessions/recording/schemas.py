@@ -21,7 +21,7 @@ def _bare_or_empty(value: str) -> str:
 
 
 BareName = Annotated[str, AfterValidator(_bare_or_empty)]
-"""Name used for a file or folder, which must not lead to another one; empty before it is known."""
+"""Name of a file or folder that cannot lead to another folder; empty until it is known."""
 
 
 class Topic(StrEnum):
@@ -61,7 +61,7 @@ class Event(BaseModel):
 
 
 class StepEvent(Event):
-    """A step began or ended. The journal holds the same; this copy travels with the file."""
+    """A step began or ended. The journal holds the same event; this copy is part of the recording."""
 
     key: str
     kind: str
@@ -94,9 +94,9 @@ class Stroke(Event):
     again_of: str | None = None
     """The stroke of an earlier session that this one repeats."""
     dip_to_touch_s: float | None = Field(default=None, ge=0.0)
-    """From the brush leaving the ink to its tip on the paper; of a figure that dips several times, the longest."""
+    """Time from the brush leaving the ink to its tip touching the paper; the longest if a figure has several dips."""
     commanded: dict[str, float] = Field(default_factory=dict[str, float])
-    """Whatever else the source commanded, by name with unit (`length_mm`, `bend_mm`, ...)."""
+    """Other commanded values, by name with unit (`length_mm`, `bend_mm`, ...)."""
 
 
 class Wrench(Event):
@@ -116,7 +116,7 @@ class InkState(Event):
     level: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
     """Fill of the well."""
     dosed_ml: Annotated[float, Field(ge=0.0)] | None = None
-    """Pumped since the session's process began."""
+    """Volume pumped since the session's process began."""
     light: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
 
 
@@ -125,11 +125,11 @@ class Check(Event):
 
     name: str
     score: float | None = None
-    """What was measured; None where it could not be."""
+    """Measured value; None if it could not be measured."""
     threshold: float | None = None
     passed: bool
     reason: str = ""
-    """Reason for the operator; empty where the check passed."""
+    """Why the check failed, for the operator; empty if it passed."""
 
 
 class Quality(Event):
@@ -192,7 +192,7 @@ class Header(Event):
 
 
 class TornTail(Event):
-    """Bytes of a journal line that a crash cut off, kept so that nothing written is ever lost."""
+    """Bytes of an incomplete journal line, left by a crash and kept so that nothing written is ever lost."""
 
     event: Literal["torn"] = "torn"
     hex: str
@@ -200,7 +200,7 @@ class TornTail(Event):
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """Counts of messages by topic, and the digest of the file that holds them."""
+    """Number of messages by topic, and the digest of the file that holds them."""
 
     counts: dict[str, int]
     sha256: str

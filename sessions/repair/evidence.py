@@ -1,7 +1,7 @@
-"""What can still be known of a damaged session from its journal and its files together; changes nothing.
+"""Find out what a damaged session contained, from its journal and its files together; changes nothing.
 
-The file of every step carries the journal's `begin` line, and once finished its `done` line. Lost lines of a journal
-are rebuilt from these word for word, and put back in their place.
+The file of every step holds a copy of the journal's `begin` line and, once finished, of its `done` line. Lost lines
+of the journal are rebuilt from these word for word, and put back in their place.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from sessions.store import closed_line, done_line, open_line
 
 @dataclass(slots=True)
 class Evidence:
-    """Journal as it is, and as it must have been."""
+    """Journal of a session as it is, and as it must have been."""
 
     folder: Path
     data: bytes | None
-    """The journal's bytes; None where there is none."""
+    """The journal's bytes; None if the file is missing."""
     lines: list[Line]
     """Lines that can be trusted, in order."""
     faults: list[Fault]
-    """What is wrong with the journal, line by line; the same list as for every other command."""
+    """Problems of the journal, line by line; every command uses this list."""
     torn: bytes
     unchained: int
     """Number of lines written before lines were chained."""
     rebuilt: list[Line] = field(default_factory=list[Line])
     """Lines missing from the journal and found in the files."""
     lost: int = 0
-    """Number of lines that are damaged or missing, and in no file."""
+    """Number of damaged or missing lines of which no file holds a copy."""
     doubtful: list[str] = field(default_factory=list[str])
     """Files of attempts whose sheet and cell are unknown."""
     strays: list[str] = field(default_factory=list[str])
@@ -61,12 +61,12 @@ class Evidence:
 
     @property
     def intact(self) -> bool:
-        """Whether the journal can stay as it is, with lines added."""
+        """Whether the journal can be kept; lines may still be added."""
         return self.data is not None and not self.faults
 
 
 def gather(folder: Path) -> Evidence:
-    """Read journal and files. Raises `SessionDamaged` where not even a header is left."""
+    """Read the journal and the files. Raises `SessionDamaged` if not even a header is left."""
     path = folder / JOURNAL_NAME
     data = read_journal(path) if check_file(path) else None
     journal = account(data or b"")
@@ -89,7 +89,7 @@ def _fold(found: Evidence) -> None:
         try:
             fold(found.state, line)
         except DoneTwice:
-            # Only a rebuilt line can raise this: the journal's own lines were folded before.
+            # Only a rebuilt line can raise this: the journal's own lines were applied before.
             found.rebuilt = [other for other in found.rebuilt if other is not line]
 
 
@@ -160,7 +160,7 @@ def _from_files(found: Evidence, live: dict[str, Line]) -> Header | None:
             found.rebuilt.append(line)
         finish = _done_line(seen.notes.get(DONE_NOTE, {}), name)
         if finished and name not in done and finish is not None and not _superseded(found, finish, live):
-            # An empty digest matches no file, so that a damaged one is found and repaired like any other.
+            # An empty digest matches no file, so a damaged file is found and repaired like any other.
             whole = path.name == name and not seen.damage and dict(seen.counts) == finish["counts"]
             found.rebuilt.append({**finish, "sha256": file_sha256(path) if whole else ""})
     begun |= {line["file"] for line in found.rebuilt if line["event"] == "begin"}
@@ -183,7 +183,7 @@ def _uncovered(folder: Path, begun: set[str], done: set[str]) -> Iterator[tuple[
         name: str = path.name if line is None else line["file"]
         if name.removesuffix(".part") != path.name.removesuffix(".part") and not exchanged:
             exchanged = True
-            others += covered  # its own content may be in a file that has the name of another
+            others += covered  # files were exchanged: a covered one may hold another step
         yield path, name.removesuffix(".part"), seen
 
 
@@ -257,7 +257,7 @@ def _snapshots(folder: Path) -> dict[str, str]:
 
 
 def _closed(found: Evidence) -> None:
-    """Rebuild the `closed` line where the merged file holds exactly what the journal counts."""
+    """Rebuild the `closed` line if the merged file holds exactly the messages that the journal counts."""
     final = found.folder / f"{found.folder.name}.mcap"
     if found.state.closed is not None or not final.is_file() or not found.state.segments:
         return

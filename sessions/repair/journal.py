@@ -1,4 +1,4 @@
-"""Repair of a journal: rewritten from its trusted lines and those found in the files, or only added to."""
+"""Repair a journal: rewrite it from its trusted lines and those found in the files, or only add lines."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def repaired_journal(evidence: Evidence, session: str, now_ns: Callable[[], int]
 
 
 def write_anew(path: Path, data: bytes) -> str:
-    """Replace a file, keep the old one, and return the name of the old one. Raises `OSError`."""
+    """Replace a file; return the name under which the old one is kept, or an empty string. Raises `OSError`."""
     kept = set_aside(path, "damaged").name if path.exists() else ""
     fresh = path.with_name(path.name + ".repair")
     with fresh.open("wb") as file:

@@ -1,4 +1,4 @@
-"""Rewriting a damaged file: what can be read is written beside it, read back, and only then takes its place."""
+"""Rewrite a damaged file: what can be read is written to a new file, which replaces the old one once read back."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def replace_damaged(
     """
     fresh = path.with_name(path.name + ".repair")
     try:
-        fresh.unlink(missing_ok=True)  # left by a repair that was killed: a copy
+        fresh.unlink(missing_ok=True)  # left by a killed repair: only a copy
         write_mcap(fresh, header, notes, attachments, messages)
         counts = count_messages(fresh)
         kept = set_aside(path, "damaged").name if path.exists() else ""
@@ -47,7 +47,7 @@ def replace_damaged(
 
 @dataclass(frozen=True, slots=True)
 class Strokes:
-    """Strokes that can be recovered from one file with their photographs, each once."""
+    """Strokes of a damaged file: those recovered with their photographs, each once, and those that are lost."""
 
     found: Scan
     kept: tuple[str, ...]
@@ -92,7 +92,7 @@ def with_their_stills(found: Scan) -> Strokes:
 
 
 def lost_words(strokes: Strokes, before: Counter[str], now: dict[str, int]) -> list[str]:
-    """Describe what was lost: each stroke by its name, or by its number without one, then other messages."""
+    """Describe what was lost: each stroke by its name, or by its number if the name is lost, then other messages."""
     lost = [f"stroke {name}: its photograph is lost" for name in strokes.photograph_lost]
     named = len(strokes.names_lost) == len(strokes.numbers_lost)
     for at, number in enumerate(strokes.numbers_lost):

@@ -42,7 +42,7 @@ class Verdict:
     """`closed`, `open`, or `recording` for a file or folder without a journal."""
     findings: list[Finding] = field(default_factory=list[Finding])
     notes: list[str] = field(default_factory=list[str])
-    """Remarks that are no damage."""
+    """Observations that are not damage."""
     files: int = 0
     """Number of files read in full."""
     strokes: int = 0
@@ -114,7 +114,7 @@ def _verify_folder(folder: Path) -> Verdict:
         verdict.state = "closed"
         _final(verdict, folder, evidence)
     elif (final := folder / f"{folder.name}.mcap").is_file():
-        # Left by a close that was cut, or whose line is lost.
+        # Left by an interrupted close, or by one whose line in the journal is lost.
         verdict.files += 1
         verdict.findings += [Finding(final.name, problem) for problem in file_problems(final)[1]]
     if verdict.sound:
@@ -139,7 +139,7 @@ def _repair_words(line: Line) -> str:
 
 
 def _shown(verdict: Verdict, folder: Path) -> None:
-    """Note as damage whatever `show` or a reader refuses."""
+    """Report as damage any error that `show` or a reader raises."""
     try:
         details(folder)
         if verdict.state == "closed":
