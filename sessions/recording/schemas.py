@@ -61,7 +61,7 @@ class Event(BaseModel):
 
 
 class StepEvent(Event):
-    """A step began or ended. The journal holds the same event; this copy is part of the recording."""
+    """A step began or ended. The journal holds the same; this copy travels with the file."""
 
     key: str
     kind: str
