@@ -52,7 +52,7 @@ def collect(
     live: Annotated[bool, typer.Option("--live", help="Let a Foxglove viewer on this machine look on.")] = False,
     live_port: Annotated[int, typer.Option(min=0, max=65535, help="Port that it listens on; 0: any.")] = 8765,
 ) -> None:
-    """Collect strokes. Ctrl-C stops the arm; the same command goes on where it stopped."""
+    """Collect strokes. Ctrl-C stops the arm; run the same command again to resume."""
     if ctx.invoked_subcommand is not None:
         return
     if config is None or protocol is None:
@@ -81,7 +81,7 @@ def collect(
 
 
 def browse() -> None:
-    """Open the start screen: `brushloop` without arguments. The screen is up before the engine is imported."""
+    """Open the start screen: `brushloop` without arguments. The screen appears before the engine is imported."""
     from collect.tui.browser import Paths, SessionBrowser
     from collect.tui.runner import run_browser
 
@@ -108,7 +108,7 @@ def plan(
         bool, typer.Option("--ask", help="Ask the arm's controller whether it reaches every pose; moves nothing.")
     ] = False,
 ) -> None:
-    """Walk a protocol without moving: limits, sheets, dips, ink, time, and a picture of the sheets."""
+    """Walk through a protocol without moving the arm: limits, sheets, dips, ink, time, and a picture of the sheets."""
     import asyncio
     import json
 
@@ -149,7 +149,7 @@ def doctor(
     config: Rig,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object per device.")] = False,
 ) -> None:
-    """Ask every configured device who it is and what is wrong. Powers nothing and moves nothing."""
+    """Ask every configured device for its identity and its faults. Powers nothing and moves nothing."""
     import asyncio
     import json
 
@@ -179,7 +179,7 @@ def loop(
     arm: Arm = False,
     tui: Tui = None,
 ) -> None:
-    """Recover every press from its image, press it again, compare. The same command goes on where it stopped."""
+    """Recover every press from its image, press it again, compare. Run the same command again to resume."""
     from collect.chains.commands import CommandFailed
     from collect.chains.loop import LoopRequest, run_loop
     from sessions.reader import Recording
@@ -209,7 +209,7 @@ def write(
     arm: Arm = False,
     tui: Tui = None,
 ) -> None:
-    """Plan characters, write them on the rig, compare with simulation and reference. The same command goes on."""
+    """Plan characters, write them on the rig, compare with simulation and reference. Run it again to resume."""
     from collect.chains.commands import CommandFailed
     from collect.chains.writing import Writing, WritingRequest
 
@@ -235,5 +235,5 @@ def write(
 
 
 def _collect_options(*, arm: bool, tui: bool | None) -> list[str]:
-    """Options of a chain that are passed on to `brushloop collect`."""
+    """Return the options of a chain that are passed on to `brushloop collect`."""
     return ["--arm"] * arm + ([] if tui is None else ["--tui" if tui else "--no-tui"])

@@ -33,16 +33,16 @@ class RunnableEngine(EngineView, Protocol):
         ...
 
     def join(self) -> None:
-        """Wait for the end; raises what ended the run."""
+        """Wait for the end; raise the error that ended the run."""
         ...
 
 
 def run_headless(engine: RunnableEngine) -> None:
-    """Run to the end; raises what ended the run. If the screen goes away, the arm is stopped."""
+    """Run to the end; raise the error that ended the run. If the screen goes away, the arm is stopped."""
     with stop_signals(lambda _number: engine.stop()):
         engine.start()
         try:
-            # A terminal or a pipe that is gone; rich makes a broken pipe a SystemExit.
+            # The terminal or pipe may be gone; rich turns a broken pipe into a SystemExit.
             with contextlib.suppress(OSError, SystemExit):
                 _show(engine)
         finally:
@@ -107,10 +107,10 @@ def no_pose_text(now: Snapshot) -> str:
 
 @contextmanager
 def stop_signals(handle: Callable[[int], None]) -> Generator[None]:
-    """Call `handle` with the number of each SIGINT, SIGTERM and SIGHUP, in a thread of its own."""
+    """Call `handle` with the number of each SIGINT, SIGTERM and SIGHUP, in a separate thread."""
 
     def on_signal(number: int, _frame: FrameType | None) -> None:
-        # Not from the handler itself: it may have interrupted a holder of the engine's lock.
+        # Not from the handler itself: it may have interrupted code that holds the engine's lock.
         threading.Thread(target=handle, args=(number,), name="stop key").start()
 
     before = {number: signal.signal(number, on_signal) for number in STOP_SIGNALS}

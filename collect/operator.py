@@ -1,4 +1,4 @@
-"""Between a run and its operator: questions that the run asks, and requests that the operator makes by key."""
+"""Questions that a run asks its operator, and requests that the operator makes by key."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Choice:
     """One answer to a question."""
 
     key: str
-    """On the keyboard."""
+    """Key on the keyboard."""
     label: str
     """What the answer means."""
 
@@ -35,13 +35,13 @@ class Prompt:
     default: str
     """Key of the answer that is taken at the time limit."""
     timeout_s: float | None = None
-    """None waits for ever."""
+    """Time limit; None to wait for ever."""
     image: NDArray[np.uint8] | None = field(default=None, compare=False)
     """Gray picture of what the question is about."""
     number: int = 0
-    """Counts the questions of one run, from 1; set by `Asker.ask`."""
+    """Number of the question in its run, from 1; set by `Asker.ask`."""
     asked_s: float = 0.0
-    """By `time.monotonic`: setting the computer's clock must not change the time limit. Set by `Asker.ask`."""
+    """Time by `time.monotonic`: setting the computer's clock must not change the time limit. Set by `Asker.ask`."""
 
 
 class Asker:
@@ -73,7 +73,7 @@ class Asker:
                 loop.call_soon_threadsafe(_give_up, answered)
 
     async def ask(self, prompt: Prompt) -> str:
-        """Return the key of the answer. Raises `NeedsOperator` where nobody can answer."""
+        """Return the key of the answer. Raises `NeedsOperator` if nobody can answer."""
         if not self._watched:
             raise NeedsOperator(prompt.question)
         loop = asyncio.get_running_loop()
@@ -92,7 +92,7 @@ class Asker:
                 self._open = None
 
     def answer(self, number: int, key: str) -> bool:
-        """Answer question `number`; False where it is closed or has no such choice. From any thread."""
+        """Answer question `number`; False if it is closed or has no such choice. From any thread."""
         with self._lock:
             if self._open is None or self._open[0].number != number:
                 return False
@@ -114,7 +114,7 @@ def _settle(answered: asyncio.Future[str], key: str) -> None:
 
 
 class OperatorRequest(StrEnum):
-    """What an operator can ask of a run by key; the same key again withdraws it."""
+    """Request that an operator can make by key; the same key again withdraws it."""
 
     RETAKE = "press this stroke again"
     SKIP = "leave this stroke out"
@@ -128,7 +128,7 @@ class OperatorRequest(StrEnum):
 
 
 class OperatorRequests:
-    """Requests that wait until the arm is at a point where they can be carried out. Made from any thread."""
+    """Requests that wait until they can be carried out. Any thread may make them."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -136,12 +136,12 @@ class OperatorRequests:
 
     @property
     def open(self) -> tuple[OperatorRequest, ...]:
-        """Requests that still wait."""
+        """Requests that are still pending."""
         with self._lock:
             return tuple(request for request in OperatorRequest if request in self._open)
 
     def toggle(self, request: OperatorRequest) -> bool:
-        """Make or withdraw a request; True where it now waits. Retake and skip exclude each other."""
+        """Make or withdraw a request; True if it is now pending. Retake and skip exclude each other."""
         with self._lock:
             if request in self._open:
                 self._open.remove(request)
@@ -152,7 +152,7 @@ class OperatorRequests:
             return True
 
     def take(self, request: OperatorRequest) -> bool:
-        """Remove a request that is about to be carried out; False where it was not made."""
+        """Remove a request that is about to be carried out; False if it was not made."""
         with self._lock:
             if request not in self._open:
                 return False

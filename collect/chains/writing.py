@@ -1,6 +1,6 @@
-"""`brushloop write 字`, stage by stage: plan, write on the rig, calibrate, compare; if asked, learn before that.
+"""Stages of `brushloop write 字`: plan, write on the rig, calibrate, compare; optionally, learn first.
 
-What a stage has finished is kept on disk and found again. Every round is an ordinary session of `brushloop collect`.
+Results of finished stages stay on disk and are reused. Every round is an ordinary session of `brushloop collect`.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ class WritingRequest:
     """Folder that holds sessions."""
     count: int = 10
     learn: int = 0
-    """Rounds of writing a few and correcting the plan by them, before the writings that count."""
+    """Rounds before the writings that count; each writes a few copies and corrects the plan by them."""
     learn_count: int = 2
-    """Writings of each character in such a round."""
+    """How often each character is written in such a round."""
     sheet: int | None = None
-    """Number of the sheet that the operator has put in: for one collection, as the next needs a fresh sheet."""
+    """Number of the sheet that the operator has put in; valid for one collection, as the next needs a fresh sheet."""
     plan_options: tuple[str, ...] = ()
     """Passed on to `brushloop write plan`."""
     references: tuple[str, ...] = ()
@@ -73,7 +73,7 @@ class Writing:
         return plan
 
     def _learn(self, plan: Path, number: int) -> Path:
-        """The plan of the next round."""
+        """Write one round and learn from it; return the folder of the next plan."""
         after = self._request.out / f"plan-{number}"
         if not (after / PROTOCOL).exists():
             _check_plan(plan / PROTOCOL, self._request, self._repeats(number))
@@ -84,7 +84,7 @@ class Writing:
         return after
 
     def _repeats(self, number: int) -> int:
-        """How often each character is written in that round, from 1; the last round is the one that counts."""
+        """How often each character is written in round `number`, from 1; the last round is the one that counts."""
         return self._request.count if number > self._request.learn else self._request.learn_count
 
     def _written(self, protocol: Path) -> Path:
@@ -100,7 +100,7 @@ class Writing:
 
 
 def _check_plan(path: Path, request: WritingRequest, repeats: int) -> None:
-    """Refuse a plan, made before, of other characters or another count."""
+    """Raise `ConfigError` if the plan on disk is for other characters or another count."""
     plan = load_protocol(path)
     assert isinstance(plan, WriteConfig)
     names = "".join(figure.name for figure in plan.figures)

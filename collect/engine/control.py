@@ -1,4 +1,4 @@
-"""The state of a run, and what pause, park and stop keys ask of it, from any thread."""
+"""The state of a run, and the pause, park and stop requests that any thread may make."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ FINAL = frozenset({State.STOPPED, State.FAILED, State.DONE})
 
 
 class IllegalTransition(Exception):
-    """The engine tried a transition that is not in the table: a defect."""
+    """The engine tried a transition that is not in the table, which is a bug."""
 
 
 def check_transition(old: State, new: State) -> None:
@@ -54,7 +54,7 @@ def check_transition(old: State, new: State) -> None:
 
 
 class RunControl:
-    """One lock over the state and what the keys asked for. Talks to no device."""
+    """State of a run and what the keys asked for, under one lock. Talks to no device."""
 
     def __init__(self, doing: Callable[[str], None]) -> None:
         """`doing` is called with what the run is doing, in words."""
@@ -84,14 +84,14 @@ class RunControl:
         return self._closing
 
     def entered(self, task: asyncio.Task[None]) -> None:
-        """Take note that the engine's event loop runs `task`; cancels it where a stop came before."""
+        """Note that the engine's event loop runs `task`; cancel it if a stop was requested before."""
         with self._lock:
             self._loop = asyncio.get_running_loop()
             if self._stop_wanted:
                 task.cancel()
 
     def left(self) -> None:
-        """Take note that the engine's event loop ends; keys have no effect any more."""
+        """Note that the engine's event loop ends; from then on, keys have no effect."""
         with self._lock:
             self._loop = None
 
@@ -113,7 +113,7 @@ class RunControl:
                 self._set(State.PAUSING)
 
     def resume(self) -> None:
-        """Go on after a pause, or drop one that has not begun; from any thread."""
+        """Go on after a pause, or cancel one that has not begun; from any thread."""
         with self._lock:
             self._pause_wanted = False
             if self._state == State.PAUSING:
@@ -139,18 +139,18 @@ class RunControl:
         self.move_to(State.RUNNING)
 
     def running(self) -> State:
-        """The state to go on in: running, or pausing where that was asked for."""
+        """The state to go on in: running, or pausing if a pause was requested."""
         return State.PAUSING if self._pause_wanted else State.RUNNING
 
     def move_to(self, new: State) -> None:
-        """Change the state. Raises `CancelledError` once a stop was asked for."""
+        """Change the state. Raises `CancelledError` once a stop was requested."""
         with self._lock:
             self._refuse_after_a_stop()
-            if new is not self._state:  # one question after another
+            if new is not self._state:  # unchanged if one question follows another
                 self._set(new)
 
     def begin_closing(self) -> None:
-        """From now on ignore a stop, which would lose the merge. Raises `CancelledError` where one was asked for."""
+        """Ignore stops from now on: one would lose the merge. Raises `CancelledError` if one was already requested."""
         with self._lock:
             self._refuse_after_a_stop()
             self._closing = True

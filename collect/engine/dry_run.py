@@ -17,7 +17,7 @@ OVER = "dry run: every move was made"
 
 
 class DryRunEngine(Engine):
-    """Makes every move of a run, lifted. Its log does not name the session folder, which will be deleted."""
+    """Engine that makes each move of a run, lifted. Its log does not name the session folder, which will be deleted."""
 
     presses = False
 
@@ -36,7 +36,7 @@ def _without_path(line: str, folder: str) -> str:
 def lifted(rig: RigConfig, protocol: ProtocolConfig, by_mm: float) -> RigConfig:
     """The rig with paper and ink `by_mm` higher, and without touch, doses, self-check or judgement of captures.
 
-    Raises `ConfigError`, with the allowed range, where the brush would still meet the paper or travel too low.
+    Raises `ConfigError`, with the allowed range, if the brush would still meet the paper or travel too low.
     """
     deepest_mm = max((stroke.height_mm for stroke in protocol.planned()), default=0.0)
     low_mm = deepest_mm + CLEAR_MM

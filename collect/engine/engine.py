@@ -1,5 +1,5 @@
-"""The engine: runs a protocol on a rig in a thread and event loop of its own, so that each stroke is pressed exactly
-once. Screens see `Snapshot`s.
+"""The engine: runs a protocol on a rig in its own thread and event loop, and presses each stroke exactly once. Screens
+read `Snapshot`s.
 
 To resume, the protocol runs from its first step, and every step that is done in the journal returns its stored result
 without any motion (see `run.py`).
@@ -145,16 +145,16 @@ class Engine:
         return listed(self._rig_config, self._progress.found, self._progress.set_up)
 
     def request(self, request: OperatorRequest) -> None:
-        """Make a request, or withdraw it; carried out between steps. From any thread."""
+        """Make or withdraw a request; requests are carried out between steps. From any thread."""
         self._requests.toggle(request)
 
     def park(self) -> None:
-        """End the run after this step with the arm lifted and parked; nobody is asked any more. From any thread."""
+        """End the run after this step with the arm lifted and parked; no more questions are asked. From any thread."""
         self._control.park()
         self._asker.abandon()
 
     def answer(self, number: int, key: str) -> bool:
-        """Answer question `number`; False where it is closed. From any thread."""
+        """Answer question `number`; False if it is closed. From any thread."""
         return self._asker.answer(number, key)
 
     def pause(self) -> None:
@@ -162,7 +162,7 @@ class Engine:
         self._control.pause()
 
     def resume(self) -> None:
-        """Go on after a pause, or drop one that has not begun."""
+        """Go on after a pause, or cancel one that has not begun."""
         self._control.resume()
 
     def stop(self) -> None:
@@ -177,7 +177,7 @@ class Engine:
             self._task.cancel()
 
     async def _stop_arm(self) -> None:
-        # Stop uses a socket of its own: it waits neither for the session's task nor for what that waits for.
+        # Stop uses its own socket: it waits neither for the session's task nor for anything that blocks that task.
         if self._rig is not None:
             try:
                 await self._rig.robot.stop()
@@ -248,9 +248,9 @@ class Engine:
         self._control.end(State.DONE)
 
     async def _arm(self, rig: Rig) -> None:
-        """Ask whether real hardware may move, unless the command line said so. Nothing was powered and nothing moved.
+        """Ask whether real hardware may move, unless the command line allows it. Nothing has been powered or moved yet.
 
-        Raises `ConfigError` where nobody can answer, `CollectAborted` for a no.
+        Raises `ConfigError` if nobody can answer, `CollectAborted` if the answer is no.
         """
         if self._armed or rig.robot_identity.simulated:
             return

@@ -13,7 +13,7 @@ from collect.rig.devices import Rig
 from drivers.samples import ForceSample
 
 CHECK_S = 0.02
-"""How often the sensor is checked for silence, which must not be taken for zero force."""
+"""Time between checks that the sensor is not silent: silence must not be taken for zero force."""
 
 _R = TypeVar("_R")
 
@@ -51,8 +51,8 @@ class ForceGuard:
     async def guarded(self, procedure: Coroutine[Any, Any, _R]) -> _R:
         """Run the procedure while the force is watched.
 
-        Raises `ForceTooHigh` above the ceiling, and `Stale` or `ConnectionLost` where the sensor falls silent; in each
-        case the arm was stopped before.
+        Raises `ForceTooHigh` above the ceiling, and `Stale` or `ConnectionLost` if the sensor falls silent; in each
+        case the arm is stopped first.
         """
         if self._rig.force is None or self._guarding:
             return await procedure

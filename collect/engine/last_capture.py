@@ -44,11 +44,11 @@ class LastCapture:
     binary: NDArray[np.bool_] | None = None
     """(128, 128), true where there is ink: the image that a validation compares, in the millimetre alignment."""
     model: NDArray[np.bool_] | None = None
-    """(128, 128) mark of CCD-BSM as published for the same H and alpha; None for a figure, or where it draws none."""
+    """(128, 128) mark of CCD-BSM as published for the same H and alpha; None for a figure, or if it gives none."""
 
     @property
     def likeness(self) -> float | None:
-        """CSIM of `binary` and `model`, 0 to 1; None where one of them shows no ink."""
+        """CSIM of `binary` and `model`, 0 to 1; None if either shows no ink."""
         if self.binary is None or self.model is None or not (self.binary.any() and self.model.any()):
             return None
         return csim(self.binary.astype(float), self.model.astype(float))
@@ -57,7 +57,7 @@ class LastCapture:
 def published_mark(
     height_mm: float, tilt_deg: float, *, radius_mm: float, length_mm: float
 ) -> NDArray[np.bool_] | None:
-    """Mark of CCD-BSM as published, (128, 128) on the default field; None where it draws none. Takes a few ms."""
+    """Mark of CCD-BSM as published, (128, 128) on the default field; None if the model gives none. Takes a few ms."""
     press, (left, top) = FittedPress(radius_mm, length_mm), FIELD.anchor_mm
     centres = (np.arange(FINE * SIZE_PX) + 0.5) * (FIELD.mm_per_px / FINE)
     try:
@@ -85,7 +85,7 @@ def cell_raster(image: Gray, plane: Plane, cell: Cell) -> tuple[Gray, tuple[floa
 
 
 def pictures_of(image: Gray, plane: Plane, cell: Cell) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """The field around the cell's zero-touch point, and its ink on 128 x 128 px; None where no ink is found."""
+    """The field around the cell's zero-touch point, and its ink on 128 x 128 px, or None if there is no ink."""
     raster, anchor_px, cell_px = cell_raster(image, plane, cell)
     try:
         prepared = prepare(raster, anchor_px, "the capture", Params(), cell_px)

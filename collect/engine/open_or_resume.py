@@ -1,4 +1,4 @@
-"""Decides which session a command works on: the open one that began with the same files, or a new one."""
+"""Decides which session a command works on: an open one that was begun with the same files, or a new one."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from sessions.store import SessionStore, Snapshots
 RIG_EFFECTIVE = "rig.effective.json"
 COMPARED = (RIG_EFFECTIVE, "protocol.effective.json")
 FILES = {"rig.effective.json": "rig.toml", "protocol.effective.json": "protocol.toml"}
-"""Name by which the user knows each compared file; compared are its values, with the environment and side files."""
+"""Name by which the user knows each compared file. Its values are compared, environment and side files included."""
 OPTIONS = {"rig.toml": "--config", "protocol.toml": "--protocol"}
 MOST_SHOWN = 5
-"""Differences that are listed; with more, the way out would not fit on a screen of 24 lines."""
+"""Most differences that are listed; with more, the advice below them would not fit on a screen of 24 lines."""
 SIDE_FILE = re.compile(r"^\s*(lens_)?file\s*=|\{\s*file\s*=", re.MULTILINE)
 MACHINE_NAMES = {
     "robot": {"host", "port", "rtde_port"},
@@ -60,7 +60,7 @@ class Opening:
     armed: bool = False
     """The operator has looked at the robot cell: real hardware may move."""
     self_check_left_out: bool = False
-    """rig.toml does not say whether there is a self-check: `armed` decides, or for an open session how it began."""
+    """rig.toml does not say whether there is a self-check: `armed` decides, but an open session keeps its setting."""
 
     @classmethod
     def load(
@@ -84,13 +84,13 @@ class Opening:
             "protocol.toml": protocol_path.read_text(encoding="utf-8"),
             # The effective values: a touch height from the environment is part of the record.
             RIG_EFFECTIVE: _effective(rig),
-            # With the rows of the tables that the protocol names.
+            # Includes the rows of the tables that the protocol names.
             "protocol.effective.json": protocol.model_dump_json(indent=2) + "\n",
         }
         return cls(root, rig_path, protocol_path, rig, protocol, snapshots, new, sheet, armed, left_out)
 
     def as_begun(self, folder: Path) -> Opening:
-        """The same, to resume that session: where rig.toml leaves the self-check out, as the session began."""
+        """Return a copy to resume that session: if rig.toml omits the self-check, the session's setting applies."""
         if not self.self_check_left_out:
             return self
         try:
@@ -106,9 +106,9 @@ def _effective(rig: RigConfig) -> str:
 
 
 def find_resumable(opening: Opening) -> Path | None:
-    """The open session to resume, None for a new one.
+    """Return the open session to resume, or None to start a new one.
 
-    Raises `ConfigError` where the configuration changed, or where a new session might press on a used sheet.
+    Raises `ConfigError` if the configuration changed, or if a new session might press on a used sheet.
     """
     if not opening.root.is_dir():
         return None
@@ -134,7 +134,7 @@ def find_resumable(opening: Opening) -> Path | None:
 
 
 def _changed(folder: Path, found: Sequence[Difference], given: dict[str, Path], texts: dict[str, str]) -> ConfigError:
-    """The refusal to resume a session whose configuration was another: each difference on a line, then what to do.
+    """The refusal to resume a session with another configuration: each difference on a line, then what to do.
 
     `given` and `texts` are paths and contents of this run's `rig.toml` and `protocol.toml`.
     """
@@ -165,7 +165,7 @@ def _changed(folder: Path, found: Sequence[Difference], given: dict[str, Path], 
 
 
 def _of_this_version(one: Difference, found: Sequence[Difference]) -> bool:
-    """Whether only the software version differs: one of the two lacks the field, in a table of the same kind."""
+    """Whether the software version alone explains `one`: a side lacks the field, in a table of the same kind."""
     kind = (*one.field[:-1], "kind")
     known = ABSENT not in (one.old, one.new)
     return bool(one.field) and not known and not any((o.file, o.field) == (one.file, kind) for o in found)
@@ -178,7 +178,7 @@ def _option(old: Path, given: Path) -> str:
 
 
 def check_writable(folder: Path) -> None:
-    """Raise `ConfigError` unless sessions can be written there, or made; before anything is connected."""
+    """Raise `ConfigError` unless `folder` can be written to or created. Called before anything is connected."""
     if (found := unwritable(folder)) is not None:
         raise ConfigError(found[0], "", found[1])
 
@@ -214,7 +214,7 @@ def put_in_sheet(store: SessionStore, sheet: int | None) -> None:
 
 
 def open_store(opening: Opening, resume: Path | None, rig: Rig, clock: Clock) -> SessionStore:
-    """Make or resume the session. Raises `ConfigError` for another robot than before."""
+    """Make or resume the session. Raises `ConfigError` if it was begun on another robot."""
     header = _header(opening, rig)
     if resume is None:
         session_id = next_session_id(opening.root, opening.protocol.kind, dt.date.today())
@@ -222,7 +222,7 @@ def open_store(opening: Opening, resume: Path | None, rig: Rig, clock: Clock) ->
         return SessionStore.create(opening.root / session_id, header, opening.snapshots, clock.now_ns)
     store = SessionStore(resume, None, clock.now_ns)
     try:
-        # Before anything moves: a damaged step would otherwise show only when all is collected.
+        # Before anything moves: damage to a step would otherwise show only when everything is collected.
         store.verify()
         if (store.header.source, store.header.robot) != (header.source, header.robot):
             raise ConfigError(

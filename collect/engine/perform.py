@@ -47,7 +47,7 @@ class Performer:
         progress.doing(_in_words(step))
         used = run.used_cells()
         marks = step.kind in MARKING
-        # Before the dip as well: a brush full of ink does not wait for a fresh sheet.
+        # Checked before the dip too, so that a brush full of ink does not wait for a fresh sheet.
         free = run.sheet.free(used, store.state.sheet + 1) if marks or step.kind == StepKind.DIP else None
         cell = free if marks else None
         more = partners(run.sheet, cell, used) if cell is not None and step.kind == StepKind.SELF_CHECK else ()

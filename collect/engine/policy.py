@@ -24,7 +24,7 @@ class Action(StrEnum):
     RETRY = "again"
     """Retreat, then do the step again; a press takes a new cell."""
     ASK = "ask"
-    """Let a person decide; where nobody watches, stop the run."""
+    """Let a person decide; if nobody watches, stop the run."""
     ABORT = "stop the run"
     """Leave the session open; the same command goes on from there."""
 
@@ -58,7 +58,7 @@ def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
 
 def question(error: StepError | DeviceError, sheet: int) -> Prompt:
     """The question that `error` leads to, while sheet `sheet` (from 0) is in. The default is always to stop: nothing
-    moves because nobody answered."""
+    moves without an answer."""
     text = describe(error)
     match error:
         case SheetFull():

@@ -25,7 +25,7 @@ LOG_LINES = 200
 
 
 class Progress:
-    """Written by the engine's thread, read from any."""
+    """Progress of one run; written by the engine's thread, read from any."""
 
     def __init__(self, protocol: ProtocolConfig, clock: Clock, layout: Layout | None = None) -> None:
         """`layout` is that of the sheet; it determines the order of the strokes."""
@@ -53,7 +53,7 @@ class Progress:
         self._messages: deque[str] = deque(maxlen=LOG_LINES)
         self._last: LastCapture | None = None
         self.found: dict[StepKind, Result] = {}
-        """Results of the set-up steps of this process; of the board also one from before it."""
+        """Results of the set-up steps of this process; the board's may be from an earlier process."""
         self.set_up: StepKind | None = None
         """Set-up step in progress."""
 
@@ -93,7 +93,7 @@ class Progress:
         self.doing(before)
 
     def begun(self, step: Step, place: Place | None) -> None:
-        """A step begins; `place` is the sheet and cell that it marks."""
+        """Note that a step begins; `place` is the sheet and cell that it marks."""
         with self._lock:
             self._tally.begun(step, place)
             if step.kind in SET_UP:
@@ -102,7 +102,7 @@ class Progress:
                 self._index = step.index
 
     def finished(self, step: Step, result: Result) -> None:
-        """A step is done."""
+        """Note that a step is done."""
         with self._lock:
             self._count(step.kind, result)
             self.set_up = None
@@ -113,7 +113,7 @@ class Progress:
                 self._first_stroke_ns = self._first_stroke_ns or self._last_stroke_ns
 
     def cut(self, place: Place | None) -> None:
-        """A step was cut short."""
+        """Note that a step was cut short."""
         with self._lock:
             self._tally.voided(place)
             self.set_up = None
@@ -121,11 +121,11 @@ class Progress:
 
     @property
     def first_free_index(self) -> int:
-        """The lowest index above all steps of the protocol: steps of strokes that are made again begin there."""
+        """The lowest index above all steps of the protocol; the steps of repeated strokes begin there."""
         return self._first_free_index
 
     def made_again(self, stroke_id: str) -> Planned:
-        """The stroke that is made in place of `stroke_id`."""
+        """Return the stroke that replaces `stroke_id`."""
         with self._lock:
             return next(p for p in self._plan if p.stroke_id == f"{stroke_id}{AGAIN}")
 
@@ -136,7 +136,7 @@ class Progress:
         return {"skipped": True, **named}
 
     def sheet_in(self, sheet: int) -> None:
-        """A sheet was put in; counted from 0."""
+        """Note that `sheet`, counted from 0, was put in."""
         with self._lock:
             self._sheet = sheet
 
@@ -151,7 +151,7 @@ class Progress:
             self._last = None if self._last is None else replace(self._last, kept=kept)
 
     def inked(self, level: float | None) -> None:
-        """Show the level of the well before a dip, 0 to 1; None where nothing measures it."""
+        """Show the level of the well before a dip, 0 to 1; None if nothing measures it."""
         with self._lock:
             self._ink_level = level
 
@@ -162,13 +162,13 @@ class Progress:
             self._messages.append(f"warning: {text}" if warning else text)
 
     def ended(self, why: str) -> None:
-        """The run is over before it was done."""
+        """Note that the run ended before it was done."""
         with self._lock:
             self._error = why
             self._over_ns = self._clock.now_ns()
 
     def closed(self, text: str) -> None:
-        """The run is done."""
+        """Note that the run is done."""
         with self._lock:
             self._over_ns = self._clock.now_ns()
         self.log(text)
@@ -226,8 +226,8 @@ class Progress:
 
     def _count(self, kind: str, result: Result) -> None:
         self._tally.finished(kind, result)
-        # Until a choice the plan of an adaptive protocol is the worst case; a stroke that is marked bad in review gives
-        # its place to the one that is made again.
+        # Until a choice is made, the plan of an adaptive protocol is the worst case; a stroke that is marked bad in
+        # review is replaced by its repeat.
         if kind == StepKind.CHOOSE:
             self._plan = with_choice(self._plan, result)
         elif kind == StepKind.REVIEW:

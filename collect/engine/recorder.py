@@ -1,4 +1,4 @@
-"""Writes what happens during one attempt at a step into its file, and how steadily the samples came."""
+"""Writes the events and samples of one attempt at a step into its file, and how steadily the samples came."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 POSE_HZ = 100.0
 """Rate at which the driver asks the arm for its pose."""
 SLOW_MS = 250.0
-"""Sections that take longer are recorded: an operator waits for them."""
+"""Sections that take longer are recorded, because an operator has to wait for them."""
 
 
 class Recorder:
@@ -74,7 +74,7 @@ class Recorder:
             self._listeners.remove(on_sample)
 
     def pose(self, sample: PoseSample) -> None:
-        """Record a pose, and the joint angles where they came with it, stamped when the host got them."""
+        """Record a pose, and the joint angles if they came with it, stamped when the host received them."""
         stamp = sample.stamp
         for listener in self._listeners:
             listener(sample)
@@ -85,7 +85,7 @@ class Recorder:
             self._sample(Topic.JOINTS, stamp, joints_message(stamp.host_ns, names, sample.joints_rad))
 
     def force(self, sample: ForceSample) -> None:
-        """Record a sample of the force sensor, stamped when the host got it."""
+        """Record a sample of the force sensor, stamped when the host received it."""
         if self._forces is not None:
             self._forces.arrived(sample.stamp.host_ns)
         (fx, fy, fz), (mx, my, mz) = sample.force_n, sample.torque_nm
@@ -102,7 +102,7 @@ class Recorder:
         self._put(Topic.TRANSFORMS, now_ns, now_ns, 0, transforms_message(now_ns, transforms))
 
     def optics(self, used: LensUsed) -> None:
-        """Record the lens by which photographs are undistorted before they are judged."""
+        """Record the lens with which photographs are undistorted before they are judged."""
         now_ns = self._clock.now_ns()
         message = calibration_message(now_ns, used.size_px, used.lens().matrix.tolist(), used.distortion)
         self._put(Topic.CALIBRATION, now_ns, now_ns, 0, message)
@@ -131,7 +131,7 @@ class Recorder:
         self._now(Topic.STROKE, stroke, stroke.still)
 
     def step(self, event: StepEvent) -> None:
-        """Record the begin or the end of the step."""
+        """Record the beginning or the end of the step."""
         self._now(Topic.STEP, event, event.index)
 
     def log(self, text: str, *, warning: bool = False) -> None:
@@ -144,7 +144,7 @@ class Recorder:
         self._put(topic, now_ns, now_ns, sequence, event)
 
     def _sample(self, topic: Topic, stamp: Stamp, message: Event | Message) -> None:
-        # A failed disk must not end the telemetry that raised this; the step's next event fails on it.
+        # A failed disk must not end the telemetry that calls this; the step's next event raises the error.
         with contextlib.suppress(SessionError):
             self._put(topic, stamp.host_ns, stamp.device_ns or stamp.host_ns, stamp.seq, message)
 
@@ -177,7 +177,7 @@ class Arrivals:
         self._last_ns = host_ns
 
     def report(self, slow: tuple[SlowSection, ...] = ()) -> Cadence | None:
-        """The counts, to be recorded with `slow`; None where no sample came."""
+        """The counts, to be recorded with `slow`; None if no sample came."""
         if not self._received:
             return None
         return Cadence(

@@ -38,8 +38,7 @@ class Run:
     """A person accepts what each set-up step measured before it counts."""
 
     async def protocol(self, protocol: Protocol) -> None:
-        """Power on and retreat, then do every step that the journal does not hold yet, then press strokes that were
-        marked bad again."""
+        """Power on, retreat, do every step that is not in the journal yet, then repeat strokes that were marked bad."""
         self.context.progress.doing("power on")
         await self._once_arm_is_free(self.context.rig.robot.enable)
         await self._once_arm_is_free(self._recover)
@@ -61,7 +60,7 @@ class Run:
         """Run `act` between steps. If the arm is stopped, was moved by another client or is outside the limits, ask a
         watching person to release it, and try again.
 
-        `released`: a person had the arm; set its power and tool anew before anything else.
+        `released`: a person has handled the arm; first set its power and tool again.
         """
         while True:
             try:
@@ -75,7 +74,7 @@ class Run:
                 released = True
 
     async def _result(self, step: Step) -> Result:
-        """The result of a step: from the journal if it is done, else from doing it until it succeeds."""
+        """Return the result of a step: from the journal if it is done, else by doing it until it succeeds."""
         known = self.context.store.state.done.get(step.key)
         if known is not None and not step.run_scoped:
             return known["result"]
@@ -124,8 +123,8 @@ class Run:
             await self._touch_again(step)
 
     async def _back_in_control(self) -> None:
-        """Retreat along the tool axis if the arm is not where it was left: in a pause, during a question, or with a
-        client of their own, somebody else may have moved it."""
+        """Retreat along the tool axis if the arm is not where it was left: somebody may have moved it during a pause
+        or a question, or with another client."""
         released = False
         try:
             return await self.context.rig.robot.confirm()
@@ -163,7 +162,7 @@ class Run:
         await self._once_arm_is_free(self._recover)
 
     async def _ask_about(self, step: Step, result: Result) -> str:
-        """Let a person accept what a set-up step measured. Raises `Parked` where the answer is to stop."""
+        """Let a person accept what a set-up step measured. Raises `Parked` if the answer is to stop."""
         answer = await self._answer(set_up_question(step.kind, result, self.context.rig.config))
         self.control.move_to(self.control.running())
         if answer == STOP.key:
@@ -171,7 +170,7 @@ class Run:
         return answer
 
     async def _ask(self, error: StepError | DeviceError) -> str:
-        """Let a person decide after `error`; returns the answer, and raises `error` where it is to stop."""
+        """Let a person decide after `error`; return the answer, or raise an error if it is to stop."""
         in_order = False
         if not isinstance(error, ITS_OWN_TROUBLE):
             with contextlib.suppress(StepError, DeviceError):
@@ -211,6 +210,6 @@ class Run:
         try:
             await self.context.rig.robot.confirm()
         except ArmMoved as moved:
-            self.context.progress.log(describe(moved), warning=True)  # said before the arm moves
+            self.context.progress.log(describe(moved), warning=True)  # logged before the arm moves
         await self.performer.retreat()
         self.control.move_to(self.control.running())

@@ -36,7 +36,7 @@ def listed(config: RigConfig, found: dict[StepKind, Result], now: StepKind | Non
 
 
 def question(kind: StepKind, result: Result, config: RigConfig) -> Prompt:
-    """Ask whether the result is good enough. The default is to stop: nothing goes on because nobody answered."""
+    """Ask whether the result is good enough. The default is to stop: nothing goes on without an answer."""
     facts = facts_of(kind, result, config)
     good = all(fact.good is not False for fact in facts)
     text = f"{TITLES[kind]}: " + ("all within limits." if good else "not all is within limits.")
@@ -47,13 +47,13 @@ def question(kind: StepKind, result: Result, config: RigConfig) -> Prompt:
 
 
 def again(step: Step, answer: str) -> Step:
-    """The same step, by the method that the answer names."""
+    """Return the same step, with the method that the answer names, if any."""
     return replace(step, params={**step.params, "method": METHODS[answer]}) if answer in METHODS else step
 
 
 def board_first(protocol: Protocol) -> Protocol:
-    """The same steps, but the board is looked at before the brush comes down. The step has the key of the later board
-    step, which is then already done."""
+    """Yield a board step, then the same steps, so that the board is seen before the brush comes down. Both board steps
+    have the same key, so the later one is then already done."""
     yield Step(StepKind.BOARD, 0)
     yield from protocol
 

@@ -149,7 +149,7 @@ class Snapshot:
     force_n: float | None = None
     """Force less the sensor's bias; None without a sensor or a fresh sample."""
     ink_level: float | None = None
-    """Level of the well before the last dip, 0 to 1; None where nothing measures it."""
+    """Level of the well before the last dip, 0 to 1; None if nothing measures it."""
     prompt: Prompt | None = None
     """Question that waits for an answer."""
     messages_before: int = 0
@@ -170,13 +170,13 @@ class Snapshot:
     stroke: str = ""
     """Name of the stroke in progress."""
     requests: tuple[OperatorRequest, ...] = ()
-    """Requests by key that still wait."""
+    """Key requests that are still pending."""
     set_up: tuple[SetUpStep, ...] = ()
     """Steps of a guided set-up; empty once it is over, and in a run without one."""
     folder: str = ""
     """Folder of the session; empty until there is one."""
     no_pose_s: float | None = None
-    """Time since the arm last sent a pose; None below a second. Meanwhile no value on the screen is live."""
+    """Time since the arm last sent a pose; None below a second. While it is set, no value on the screen is live."""
 
 
 class EngineView(Protocol):
@@ -195,15 +195,15 @@ class EngineView(Protocol):
         ...
 
     def answer(self, number: int, key: str) -> bool:
-        """Answer question `number`; False where it is closed."""
+        """Answer question `number`; False if it is closed."""
         ...
 
     def request(self, request: OperatorRequest) -> None:
-        """Make a request, or withdraw it."""
+        """Make or withdraw a request."""
         ...
 
     def park(self) -> None:
-        """End the run after this step with the arm lifted and parked; nobody is asked any more."""
+        """End the run after this step with the arm lifted and parked; no more questions are asked."""
         ...
 
     def stop(self) -> None:

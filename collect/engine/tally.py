@@ -1,4 +1,4 @@
-"""Counts of a session's strokes and the state of its paper cells, folded from the results of its steps."""
+"""Counts of a session's strokes and the state of its paper cells, computed from the results of its steps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ GridCell = tuple[float, float]
 
 
 class Tally:
-    """Not thread-safe: `Progress` holds its lock around every call."""
+    """Counts of strokes and marks of paper cells. Not thread-safe: `Progress` holds its lock around every call."""
 
     def __init__(self) -> None:
         self._marks: dict[Place, Mark] = {}
@@ -35,22 +35,22 @@ class Tally:
         """Names of finished strokes, kept or given up."""
 
     def opened(self, state: Replay, columns: int, rows: int) -> None:
-        """Begin with the used cells of a session, on sheets of that shape; its results follow by `finished`."""
+        """Begin with the used cells of a session, on sheets of that shape; then pass its results to `finished`."""
         self._shape = (columns, rows)
         self._marks = dict.fromkeys(state.used_cells, Mark.VOID)
 
     def begun(self, step: Step, place: Place | None) -> None:
-        """A step begins; `place` is where it marks the paper."""
+        """Note that a step begins; `place` is where it marks the paper."""
         if place is not None and step.kind in MARKING:
             self._marks[place] = Mark.NOW
 
     def voided(self, place: Place | None) -> None:
-        """A step was cut short; its cell stays used."""
+        """Note that a step was cut short; its cell stays used."""
         if place is not None and self._marks.get(place) is Mark.NOW:
             self._marks[place] = Mark.VOID
 
     def finished(self, kind: str, result: Result) -> None:
-        """A step is done."""
+        """Note that a step is done."""
         match kind:
             case StepKind.PRESS | StepKind.DRAW:
                 place = (int(result["sheet"]), int(result["cell"]))
@@ -69,7 +69,7 @@ class Tally:
             self._leave_out(result)
 
     def sheet(self, number: int) -> SheetMap:
-        """The sheet of that number, from 0."""
+        """Return the map of sheet `number`, counted from 0."""
         columns, rows = self._shape
         marks = tuple(self._marks.get((number, cell)) for cell in range(columns * rows))
         return SheetMap(number + 1, columns, rows, marks)
@@ -90,7 +90,7 @@ class Tally:
                 self._leave_out(result)
 
     def _reviewed(self, result: Result) -> None:
-        """Captures marked bad count no longer. Their strokes stay over: others are made in their place."""
+        """Stop counting captures that were marked bad. Their strokes stay finished; others replace them."""
         for name, _index in result["again"]:
             stroke_id = str(name)
             self._marks[self._stroke_at[stroke_id]] = Mark.BAD

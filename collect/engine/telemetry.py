@@ -23,7 +23,7 @@ from drivers.protocols import Camera, Robot
 from drivers.samples import ForceSample, Frame, Pose, QueuedLine, Stamp
 
 SLOT_NS = 100_000_000
-"""Time that one value of the trace covers. It holds the peak force, so that a short peak is seen."""
+"""Time that one value of the trace covers. The value is the peak force, so that a short peak is seen."""
 TRACE_SLOTS = 300
 FRAME_PERIOD_S = 0.2
 """Time between two pictures of the camera."""
@@ -50,7 +50,7 @@ class Telemetry:
         self.note_force(math.hypot(*sample.force_n), sample.stamp.host_ns)
 
     def note_force(self, force_n: float, t_ns: int) -> None:
-        """Take a force in N at a time of the host."""
+        """Take a force in N at host time `t_ns`."""
         slot = t_ns // SLOT_NS
         with self._lock:
             if slot != self._slot:
@@ -66,12 +66,12 @@ class Telemetry:
 
 
 def noting_targets(robot: Robot, telemetry: Telemetry) -> Robot:
-    """The same robot; where it is sent is noted in `telemetry`."""
+    """Return the same robot, with its targets noted in `telemetry`."""
     return cast("Robot", _NotedRobot(robot, telemetry))
 
 
 class _NotedRobot:
-    """Notes targets; every method that gives none is the robot's own."""
+    """Notes targets; passes every method without a target on to the robot."""
 
     def __init__(self, robot: Robot, telemetry: Telemetry) -> None:
         self._robot = robot

@@ -26,7 +26,7 @@ from drivers.protocols import Robot
 from drivers.samples import Frame, QueuedLine
 
 DEPTH_TOLERANCE_MM = 0.1
-"""How far the depth at the end of the dwell may be from the one asked for."""
+"""How far the depth at the end of the dwell may be from the requested one."""
 TOUCH_TOLERANCE_MM = 0.1
 """How far the arm may rest from the taught height at zero touch."""
 
@@ -38,7 +38,7 @@ class Procedures:
         self._rig = rig
         self._config = rig.config
         self.plane = PaperPlane(rig.config.paper.touch_z_mm)
-        """At the taught height and level, until touches have measured it."""
+        """Level, at the taught height, until touches have measured it."""
         self._dips = 0
         over = over_sheet_move(rig.config)
         self.photographer = Photographer(
@@ -78,7 +78,7 @@ class Procedures:
         return rests_mm
 
     async def dip(self) -> None:
-        """Dip into the well and wipe, after a wash where one is due."""
+        """Dip into the well and wipe; wash first if a wash is due."""
         for move in inking_moves(self._config, self._dips):
             await self.go(move)
         self._dips += 1
@@ -111,7 +111,7 @@ class Procedures:
         return 0.0 <= x_mm <= width_mm and 0.0 <= y_mm <= height_mm
 
     async def go(self, move: Move) -> None:
-        """Make one move, to its end."""
+        """Make one move and wait for its end."""
         motion = self._config.motion
         await self._rig.robot.move(move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=motion.acc_mm_s2)
 
@@ -136,7 +136,7 @@ async def draw_stroke(
 ) -> float:
     """Draw one stroke; begins and ends at safe height. Returns the depth at which the brush landed, in mm.
 
-    All of it is checked before the arm moves. Raises `LimitExceeded` and what `Robot.move` and `Robot.follow` raise.
+    All poses are checked before the arm moves. Raises `LimitExceeded` and what `Robot.move` and `Robot.follow` raise.
     """
     acc_mm_s2 = config.motion.acc_mm_s2
     moves = stroke_moves(config, plane, cell, points, speed_mm_s)

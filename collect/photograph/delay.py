@@ -1,7 +1,7 @@
-"""Measures the camera's delay: the arm goes over the sheet and back, and the picture shows it later than it was.
+"""Measures the camera's delay: the arm moves over the sheet and back, and the picture shows it later.
 
-The point of its way at which the arm comes into the picture is not known. But it enters and leaves at the same point:
-how long it was seen, compared with where it was when, gives that point, and with it the delay.
+It is not known where on its path the arm comes into the picture, but it enters and leaves at the same point. The time
+for which it was seen, compared with its recorded positions, gives that point and so the delay.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ GOOD_SHARE, GOOD_S = 0.1, 0.03
 MOST_GAP_S = 1.0
 """A longer silence of camera or arm hides when something happened."""
 SLACK_S = 0.05
-"""By so much a busy computer may shift the times of single poses and frames."""
+"""How far a busy computer may shift the times of single poses and frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,32 +36,32 @@ class ArmPlace:
 
     t_s: float
     way: float
-    """0 at its place out of the picture, 1 over the sheet."""
+    """0 at its position outside the picture, 1 over the sheet."""
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """The delay by one trip over the sheet and back."""
+    """The delay measured on one trip over the sheet and back."""
 
     delay_s: float
     resolution_s: float
-    """Uncertainty of the delay: camera and arm are only heard from once a period."""
+    """Uncertainty of the delay, as camera and arm report only once per period."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraDelay:
-    """The delay by several trips."""
+    """The delay measured on several trips."""
 
     looks: tuple[Look, ...]
 
     @property
     def delay_s(self) -> float:
-        """From an event to the arrival of the first frame that shows it."""
+        """Mean time from an event to the arrival of the first frame that shows it."""
         return float(np.mean([look.delay_s for look in self.looks]))
 
     @property
     def spread_s(self) -> float:
-        """Between the shortest and the longest."""
+        """Difference between the longest and the shortest delay."""
         delays_s = [look.delay_s for look in self.looks]
         return max(delays_s) - min(delays_s)
 
@@ -72,12 +72,12 @@ class CameraDelay:
 
     @property
     def bound_s(self) -> float:
-        """The longest delay of a trip, with its uncertainty."""
+        """The largest sum of a trip's delay and its uncertainty."""
         return max(look.delay_s + look.resolution_s for look in self.looks)
 
     @property
     def known(self) -> bool:
-        """Whether the trips differ by no more than the camera's period explains, and are enough to average that out."""
+        """Whether the trips differ by no more than the camera's period explains, and suffice to average that out."""
         good_s = max(GOOD_SHARE * self.delay_s, GOOD_S)
         coarsest_s = max(look.resolution_s for look in self.looks)
         return self.spread_s <= max(2.0 * coarsest_s, good_s) and self.resolution_s <= good_s
@@ -88,7 +88,7 @@ class CameraDelay:
 
 
 def look(seen: Sequence[FrameChange], placed: Sequence[ArmPlace]) -> Look | None:
-    """The delay by one trip; None where a silence, or a picture that does not fit the trip, leaves it unknown.
+    """Return the delay of one trip; None if a silence, or a picture that does not fit the trip, leaves it unknown.
 
     `seen` begins and ends without the arm; `placed` goes from 0 to 1 and back.
     """
@@ -108,11 +108,11 @@ def look(seen: Sequence[FrameChange], placed: Sequence[ArmPlace]) -> Look | None
     points = np.linspace(0.02, 0.98, 97)
     there_s = np.interp(points, np.maximum.accumulate(way[: turn + 1]), t_s[: turn + 1])
     back_s = np.interp(points, np.maximum.accumulate(way[turn:][::-1]), t_s[turn:][::-1])
-    # The farther the point, the shorter the arm is beyond it: take the point where that is as long as it was seen.
+    # The farther out a point, the less time the arm is beyond it: take the point where that is how long it was seen.
     misfit_s = np.abs((back_s - there_s) - (left_s - entered_s))
     at = int(np.argmin(misfit_s))
     if float(misfit_s[at]) > coarse_in + coarse_out + SLACK_S:
-        return None  # seen for longer, or shorter, than it was there: the frames show another trip
+        return None  # the arm was seen for longer or shorter than it was there: the frames show another trip
     delay_s = 0.5 * float((entered_s - there_s[at]) + (left_s - back_s[at]))
     coarse_s = 0.5 * (coarse_in + coarse_out + _gap(t_s, there_s[at]) + _gap(t_s, back_s[at]))
     return Look(max(delay_s, 0.0), coarse_s)
@@ -124,7 +124,7 @@ def _crossing(arrival_s: Floats, changed: Floats, first: int, half: float) -> tu
     share = (half - before) / (after - before)
     gap_s = abs(float(arrival_s[first] - arrival_s[first - 1]))
     at_s = float(arrival_s[first - 1] + share * (arrival_s[first] - arrival_s[first - 1]))
-    # Frames on the way show where the arm was; a jump from nothing to all leaves the whole gap open.
+    # Frames during the change narrow the time down; a jump from none to all leaves the whole gap uncertain.
     return at_s, 0.5 * gap_s * min(1.0, (after - before) / (2.0 * half))
 
 

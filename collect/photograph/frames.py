@@ -18,9 +18,9 @@ from drivers.samples import Frame, Stamp
 
 Thumbnail = NDArray[np.float32]
 WIDTH_PX = 160
-"""Each pixel averages over some 2 mm of a sheet: noise is gone, and an arm is tens of pixels wide."""
+"""Width of a thumbnail. A pixel averages some 2 mm of a sheet: noise is gone, and an arm is tens of pixels wide."""
 CHANGED_LEVELS = 25.0
-"""Difference in gray levels, the light taken out, from which a pixel counts as changed."""
+"""Difference in gray levels, corrected for the light, from which a pixel counts as changed."""
 
 
 def thumbnail(image: NDArray[np.uint8]) -> Thumbnail:
@@ -31,7 +31,7 @@ def thumbnail(image: NDArray[np.uint8]) -> Thumbnail:
 
 
 def changed_share(now: Thumbnail, before: Thumbnail) -> float:
-    """Share of the pixels that differ, 0 to 1, apart from the light as a whole; 1 for frames of another size."""
+    """Share of the pixels that differ, 0 to 1, corrected for the overall light; 1 for frames of different sizes."""
     if now.shape != before.shape:
         return 1.0
     light = float(np.median((now + 1.0) / (before + 1.0)))
@@ -41,7 +41,7 @@ def changed_share(now: Thumbnail, before: Thumbnail) -> float:
 ARM_SHARE = 0.02
 """An arm over the sheet hides a far larger share of the picture than a stroke, or a drawn figure, covers with ink."""
 STILL_SHARE = 0.005
-"""Two frames that differ by less show nothing that moves; a clock that a camera writes into its picture is less."""
+"""Two frames that differ by less show no motion; a clock that a camera writes into its picture changes less."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class View:
     frame: Frame
     small: Thumbnail
     changed: float
-    """Share of the picture that differs from the reference; 0 where there is none yet."""
+    """Share of the picture that differs from the reference; 0 while there is none yet."""
     moved: float
     """Share that differs from the frame before; 1 for the first."""
 
@@ -88,9 +88,9 @@ class Frames:
         """Every frame so far."""
 
     async def first(self, condition: Condition, *, within_s: float) -> View | None:
-        """The first frame from now on that meets `condition`; None where none does within `within_s`.
+        """The first frame from now on that meets `condition`; None if none does within `within_s`.
 
-        Raises `DeviceError` where no frame comes.
+        Raises `DeviceError` if no frame comes.
         """
         if self._failure is not None:
             raise self._failure

@@ -1,6 +1,6 @@
-"""Ink that came between two photographs of a sheet: how much at given places, and which marks anywhere in view.
+"""New ink between two photographs of a sheet: its amount at given places, and its marks anywhere in view.
 
-Sums over an area are unbiased: nothing is clipped or thresholded before them, since zero touch rests on fractions of
+Sums over an area are unbiased: nothing is clipped or thresholded before them, since zero touch relies on fractions of
 a square millimetre. `quality.ink` compares masks of ink instead, and `calibrate.stroke.difference` cuts out one stroke.
 """
 
@@ -24,17 +24,17 @@ from collect.rig.optics import Gray, undistorted
 from drivers.samples import Frame
 
 DARK_SHARE = 0.5
-"""Pixels darker than this share of the paper are not paper: they do not count for how the light changed."""
+"""Pixels darker than this share of the paper are not paper, and are ignored in measuring the change of light."""
 DARKER = 0.2
 """Share of the paper's brightness that a pixel must have lost to belong to a mark."""
 JOIN_MM = 1.5
-"""Parts of a mark that lie closer are one."""
+"""Parts that lie closer together belong to one mark."""
 
 
 def before_and_after(config: RigConfig, before: Frame, after: Frame) -> tuple[Gray, Gray, Floats]:
-    """Both photographs, gray and undistorted, and the (3, 3) map from the second one to the paper frame.
+    """Return both photographs, gray and undistorted, and the (3, 3) map from the second one to the paper frame.
 
-    Raises `StepError` where the board is not seen.
+    Raises `StepError` if the board is not seen.
     """
     first, second = (undistorted(config.camera, frame.image) for frame in (before, after))
     try:
@@ -44,7 +44,7 @@ def before_and_after(config: RigConfig, before: Frame, after: Frame) -> tuple[Gr
 
 
 def _darkening(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[NDArray[np.float32], float] | None:
-    """(how many gray levels darker each pixel became, level of the paper), a change of the light taken out.
+    """Return (gray levels by which each pixel became darker, level of the paper), corrected for the light.
 
     None for pictures that show no paper.
     """
@@ -59,9 +59,9 @@ def _darkening(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple
 def new_ink(
     before: Gray, after: Gray, image_to_paper: Floats, window_mm: tuple[float, float, float, float]
 ) -> NDArray[np.float32]:
-    """(h, w) at 20 px/mm over a window (x, y, width, height in the paper frame): how much darker it became.
+    """How much darker a window (x, y, width, height in the paper frame) became, (h, w) at 20 px/mm.
 
-    In shares of the paper's brightness: 1 is paper turned black. Noise averages to 0.
+    As a share of the paper's brightness: 1 is paper turned black. Noise averages to 0.
     """
     first, second = (rectify(image, image_to_paper, window_mm).astype(np.float32) for image in (before, after))
     found = _darkening(first, second)
@@ -74,10 +74,10 @@ def new_ink(
 def ink_at(
     before: Gray, after: Gray, image_to_paper: Floats, spots_mm: list[tuple[float, float]], side_mm: float
 ) -> Floats:
-    """(n,) mm2 of black that came in a square around each spot."""
+    """New ink in a square around each spot, (n,) in mm2 of black."""
     amounts: list[float] = []
     for x, y in spots_mm:
-        # One more side all around, so that the median sees paper.
+        # Larger by one side all around, so that the median sees paper.
         window = (x - 1.5 * side_mm, y - 1.5 * side_mm, 3.0 * side_mm, 3.0 * side_mm)
         darker = new_ink(before, after, image_to_paper, window)
         third = darker.shape[0] // 3
@@ -87,7 +87,7 @@ def ink_at(
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """New ink: its centre of darkness in the paper frame, and mm2 of black."""
+    """A mark of new ink: its centroid, weighted by darkness, in the paper frame, and its mm2 of black."""
 
     x_mm: float
     y_mm: float
@@ -118,7 +118,7 @@ def _mark(
 ) -> Mark:
     x, y, width, height = (int(v) for v in box[:4])
     part = (slice(y, y + height), slice(x, x + width))
-    # Noise is brighter as often as darker: without clipping, the margin that joining added has no weight.
+    # Noise averages to 0: without clipping, the margin that joining added has no weight.
     weights = np.where(labels[part] == label, darker[part], 0.0).astype(np.float64)
     total = float(weights.sum())
     if total <= 0.0:

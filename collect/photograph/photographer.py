@@ -1,8 +1,8 @@
-"""Takes photographs of the sheet that are known to show it as it is, without the arm.
+"""Takes photographs that are known to show the sheet as it is now, without the arm.
 
-A camera's delay is not in its data sheet, and changes with the load of the computer. So no frame is trusted for the
-time of its arrival: first the camera must show the arm over the sheet, then the arm parks, and only a frame after one
-that shows the arm gone is a photograph of what lies there now.
+A camera's delay is not in its data sheet, and changes with the load of the computer. So the time at which a frame
+arrives is not trusted: first the camera must show the arm over the sheet, then the arm parks, and only a frame after
+one that shows the arm gone is a photograph of the sheet as it is now.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from drivers.samples import Frame
 
 FEWEST_LOOKS, MOST_LOOKS = 2, 6
 ATTEMPTS = 3
-"""Attempts at the measurement, each after one that a stall or an old picture has spoilt."""
+"""Most attempts at the measurement; another follows if a stall or an old picture has spoilt the previous one."""
 PATIENCE_S = 1.5
 """Waiting time beyond the longest allowed delay: distinguishes a camera that is late from one that shows nothing."""
 STAY_S = 0.15
@@ -37,7 +37,7 @@ class ArmTrips:
     """How the arm gets over the sheet and away again."""
 
     over_mm: tuple[float, float, float]
-    """Where the tip is over the middle of the sheet, in the base frame."""
+    """Position of the tip over the middle of the sheet, in the base frame."""
     park_mm: tuple[float, float, float]
     over: Callable[[], Awaitable[None]]
     """Go over the middle of the sheet at travel height."""
@@ -62,18 +62,18 @@ class Photographer:
         """Measured in this process; None until then."""
 
     def forget(self) -> None:
-        """Forget delay and view: somebody has been at the rig."""
+        """Forget delay and view, after somebody has been at the rig."""
         self._reference = self.delay = None
 
     async def photograph(self) -> Frame:
         """Park, and return the first frame that was exposed after the arm was gone.
 
-        Raises `CameraLate`, `ArmInPicture`, or `DeviceError` where the camera shows nothing.
+        Raises `CameraLate`, `ArmInPicture`, or `DeviceError` if the camera shows nothing.
         """
         delay, reference = self.delay, self._reference
         if delay is None or reference is None:
             delay, reference = self.delay, self._reference = await self._measured()
-            # The arm has just been seen to go: only a frame from after that is missing.
+            # The arm was just seen to leave: only a frame from after that is still needed.
             async with watching(self._camera, reference) as frames:
                 return await self._clear(frames, delay, self._clock.now_ns())
         async with watching(self._camera, reference) as frames:
@@ -102,7 +102,7 @@ class Photographer:
         return replace(clear.frame, exposed_after_ns=parked_ns)
 
     def _check_drift(self, frames: Frames, delay: CameraDelay, parked_s: float) -> None:
-        """A frame that shows the arm after it parked is at least that old. Raises `CameraLate` beyond the limit."""
+        """Correct the delay if frames show the arm for longer after it parked. Raises `CameraLate` beyond the limit."""
         late_s = max((one.arrival_s for one in frames.seen if one.changed >= ARM_SHARE), default=parked_s) - parked_s
         if late_s > self._config.max_delay_ms / 1e3:
             self.forget()
@@ -143,9 +143,9 @@ class Photographer:
         return delay
 
     async def _trip(self, without_arm: Thumbnail, *, stay_s: float) -> tuple[Thumbnail, Look | None] | None:
-        """Go over the sheet and back: (the view afterwards, the delay where no silence has spoilt it).
+        """Go over the sheet and back; return the view afterwards, and the delay, or None if a silence has spoilt it.
 
-        None where the picture did not change when the arm came, or not back when it went.
+        None if the picture did not change when the arm came, or did not change back when it left.
         """
         within_s = self._patience_s
         async with watching(self._camera, without_arm) as frames, self._placed() as placed:

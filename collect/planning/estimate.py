@@ -1,4 +1,4 @@
-"""What a plan takes, estimated: time, ink, and how far a mark is likely to reach."""
+"""Estimates of a plan's time and ink, and of how far a mark is likely to reach."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from drivers.limits import Limits
 from drivers.samples import Pose
 
 SETTLE_S = 0.12
-"""From the end of a ramp to the next command: the controller's lag in reporting that it rests, half a poll, the calls.
-Measured on the loopback rig; that of a cabinet is not known."""
+"""Time from the end of a ramp to the next command: the controller's lag in reporting rest, half a poll, the calls.
+Measured on the loopback rig; for a real controller it is not known."""
 FRAME_S = 0.1
 """Period of 10 frames a second: a photograph is the second frame that begins after the arm rests."""
 IN_PLACE_MM = 1.0
-"""ARCS reads the speed of a shorter line as that of its turn: mm/s as thousandths of rad/s."""
+"""For a shorter line, ARCS takes the speed as that of the rotation: mm/s as thousandths of rad/s."""
 OMITTED = (
     "connecting, power on, doses of ink, a touch that is measured instead of visited, quality checks, writing to disk, "
     "sheet changes, pauses, and presses made again"
@@ -27,7 +27,7 @@ OMITTED = (
 
 
 def trapezoid_s(way: float, speed: float, acc: float) -> float:
-    """Seconds from rest to rest; a triangle where the speed is not reached."""
+    """Seconds of a trapezoidal speed profile from rest to rest; triangular if the speed is not reached."""
     return way / speed + speed / acc if way * acc >= speed * speed else 2.0 * math.sqrt(way / acc)
 
 
@@ -51,7 +51,7 @@ def way_s(start: Pose, way: Way, acc_mm_s2: float, limits: Limits) -> float:
 
 
 def _apart(a: Pose, b: Pose) -> tuple[float, float]:
-    """(mm, deg) between two poses: `drivers.geometry.distance` for the ten thousands of moves of a long plan."""
+    """(mm, deg) between two poses: `drivers.geometry.distance` for the tens of thousands of moves of a long plan."""
     cosine = abs(sum(p * q for p, q in zip(a.quaternion, b.quaternion, strict=True)))
     return math.dist(a.position_mm, b.position_mm), math.degrees(2.0 * math.acos(min(1.0, cosine)))
 
@@ -69,7 +69,7 @@ def step_s(config: RigConfig, here: Pose, moves: StepMoves) -> tuple[float, Pose
                 took_s = way_s(here, part, acc_mm_s2, limits)
                 here = part.poses[-1]
             case Room():
-                # Once down: how often a measured touch comes down is not known beforehand.
+                # One descent: how often a measured touch comes down is not known beforehand.
                 took_s = move_s(here, part.poses[0], part.speed_mm_s, acc_mm_s2, limits)
                 here = part.poses[0]
         total_s += took_s + SETTLE_S
@@ -82,7 +82,7 @@ HELD_SHARE = 0.3
 
 @dataclass(frozen=True, slots=True)
 class InkNeed:
-    """An upper estimate, and what it is based on."""
+    """Upper estimate of the ink, and what it is based on."""
 
     ml: float
     why: str
@@ -94,7 +94,7 @@ def bundle_ml(brush: BrushConfig) -> float:
 
 
 def ink_need(config: RigConfig, dips: int) -> InkNeed:
-    """Count every dip as a full load, as if each mark emptied the brush; with a pump that doses by count, its doses."""
+    """Count a full load per dip, as if each mark emptied the brush; for a pump that doses by count, its doses."""
     device = config.ink.device
     if isinstance(device, ModbusPumpConfig):
         doses = dips // device.every_dips
@@ -119,7 +119,7 @@ class Reach:
 
 
 def reach_of(brush: BrushConfig, depth_mm: float, tilt_deg: float) -> Reach:
-    """By the closed-form stroke model (CCD-BSM), Eq. 1-5, with lambda = pi: good for a warning, not a measurement.
+    """Estimate by the closed-form stroke model (CCD-BSM), Eq. 1-5, lambda = pi: good for a warning, not a measurement.
 
     theta = atan(R / L), O3A = H (tan a - tan(a - theta)), O4O3 = H / cos(a - theta) + O3A, O3C = H R / (L cos a).
     The mark lies from -O4O3 to O3A, pi O3C to each side.

@@ -21,13 +21,13 @@ Axes = Any
 """Axes of matplotlib, whose types are incomplete."""
 ENDINGS = (".png", ".svg", ".pdf", ".jpg")
 MOST_SHEETS = 11
-"""With the view of the whole table, twelve panels."""
+"""Most sheets drawn: with the view of the whole table, twelve panels."""
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 """From the palette of Okabe and Ito, which colour-blind people can tell apart; the marks differ in shape too."""
 
 
 def check_picture(path: Path) -> None:
-    """Raise `ConfigError` where no picture can be made at this path, before a plan is worked out in vain."""
+    """Raise `ConfigError` if no picture can be written to this path. Called before the plan is computed."""
     if path.suffix.lower() not in ENDINGS:
         raise ConfigError("--picture", "", f"{path} must end in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
     if not path.parent.is_dir():
@@ -39,7 +39,7 @@ def check_picture(path: Path) -> None:
 def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Path) -> None:
     """Write the picture, in the format of the file's ending. `check_picture` must have passed.
 
-    Raises OSError where it cannot be written.
+    Raises OSError if it cannot be written.
     """
     from matplotlib.figure import Figure as Picture
 

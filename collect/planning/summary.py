@@ -1,4 +1,4 @@
-"""A whole plan: what is done where, in what order, and what it takes; and its tables."""
+"""A whole plan: what is done where and in what order, its ink and time; and its tables."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ class PlacedStroke:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A walk through a protocol in numbers."""
+    """Steps, strokes, sheets, ink and time of a protocol."""
 
     kind: str
     steps: dict[str, int]
-    """By kind."""
+    """Number of steps of each kind."""
     placed: tuple[PlacedStroke, ...]
     cells_per_sheet: int
     sheets: int
@@ -59,11 +59,11 @@ class Plan:
     seconds: float
     seconds_by_kind: dict[str, float]
     touches_mm: tuple[tuple[float, float], ...]
-    """In the paper frame, those of zero touch first."""
+    """Touch points in the paper frame, those of zero touch first."""
     warnings: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """Every field, for a file."""
+        """Return every field, to be written as JSON."""
         return asdict(self) | {"seconds_omit": OMITTED}
 
 
@@ -151,7 +151,7 @@ def _warnings(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list
 
 
 def _armed(config: RigConfig, protocol: ProtocolConfig) -> str | None:
-    """Warning of what the self-check, which `--arm` switches on, adds to this plan; None where it adds nothing."""
+    """Warning of what the self-check, which `--arm` switches on, adds to this plan; None if it adds nothing."""
     if config.self_check.enabled is not None or not protocol.planned():
         return None
     armed = config.checking_itself(True)
@@ -167,7 +167,7 @@ def _armed(config: RigConfig, protocol: ProtocolConfig) -> str | None:
 
 
 def _sheets(config: RigConfig, protocol: ProtocolConfig) -> tuple[int, int]:
-    """(sheets that are marked, cells of the first that the self-check takes)."""
+    """(sheets that are marked, cells of the first sheet that the self-check takes)."""
     sheets, taken = 1, 0
     for walked in walk(config, protocol):
         if walked.cell is not None and walked.step.kind in MARKING:
@@ -201,7 +201,7 @@ def _overhangs(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> lis
 
 
 def _figure_overhang(config: RigConfig, cell: Cell, point: tuple[float, float, float, float, float]) -> float:
-    """How far half the width of the line at a drawn point reaches beyond the cell."""
+    """How far the line, half its width to either side of a drawn point, reaches beyond the cell."""
     x_mm, y_mm, depth_mm, tilt_deg, _ = point
     side_mm = reach_of(config.brush, depth_mm, tilt_deg).side_mm
     return side_mm - min(x_mm, y_mm, cell.width_mm - x_mm, cell.height_mm - y_mm)
@@ -212,7 +212,7 @@ MOST_ROWS = 40
 
 
 def plan_table(plan: Plan) -> Group:
-    """What the plan takes, what is pressed where, and its warnings."""
+    """Return the plan's totals, what is pressed where, and its warnings, as tables and text."""
     totals = Table(title=f"plan of {plan.kind}", show_header=False)
     changes = f", a fresh one before {', '.join(plan.sheet_changes)}" if plan.sheet_changes else ""
     totals.add_row("strokes", str(len(plan.placed)))

@@ -24,7 +24,7 @@ class AdaptiveConfig(ProtocolBase):
     tilts_deg: Annotated[list[TiltDeg], Field(min_length=1, max_length=100)]
     """Tilts alpha from the paper's normal."""
     repeats: Repeats = 10
-    """Rounds of the grid that it replaces; the presses that it saved are counted against that grid."""
+    """Rounds of the grid that this protocol replaces; saved presses are counted against that grid."""
     most_presses: Annotated[int, Field(ge=1, le=MAX_STROKES)] | None = None
     """Stop after this many at the latest; left out, as many as the grid has. No fewer than the cells: limits, ink and
     sheets are planned for the worst case, in which every cell is chosen."""
@@ -48,7 +48,7 @@ class AdaptiveConfig(ProtocolBase):
 
     @property
     def whole_grid(self) -> int:
-        """Presses of the grid that it replaces."""
+        """Presses of the grid that this protocol replaces."""
         return len(self.heights_mm) * len(self.tilts_deg) * self.repeats
 
     @property

@@ -1,4 +1,4 @@
-"""What every kind of protocol has: common fields, bounds, and the strokes and steps that it makes of them."""
+"""Base of every kind of protocol: common fields, bounds, and the strokes and steps that follow from them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from collect.rig.config_file import Config
 from collect.rig.paper import Layout
 
 MAX_STROKES = 10_000
-"""Of one protocol, repeats included: a month of pressing."""
+"""Most strokes of one protocol, repeats included: a month of pressing."""
 
 DeepMm = Annotated[float, Field(gt=0.0, le=100.0)]
 DwellS = Annotated[float, Field(ge=0.0, le=60.0)]
@@ -27,24 +27,24 @@ class ProtocolBase(Config):
     """Fields and methods of every kind. A kind adds its own fields, `kind` among them, and `planned`."""
 
     depths_field: ClassVar[str] = "presses"
-    """The field that a refusal names where a depth is more than the brush bears."""
+    """The field that the error names if a depth is more than the brush bears."""
     row: ClassVar[type[BaseModel] | None] = None
-    """A row of the CSV that `file` names; its rows become `presses`."""
+    """Model of a row of the CSV that `file` names; the rows become `presses`."""
     ignores_columns: ClassVar[bool] = False
     """Whether other columns of that CSV are noted in `ignored_columns` instead of refused."""
 
     board_every: Annotated[int, Field(ge=1, le=MAX_STROKES)] | None = None
-    """Look at the board again after so many strokes, to see whether camera or sheet moved; left out, only at the
+    """Look at the board again after this many strokes, to see whether camera or sheet moved; left out, only at the
     start."""
     wait_after_dip_s: Annotated[float, Field(ge=0.0, le=600.0)] | None = Field(
         default=None, exclude_if=lambda wait_s: wait_s is None
     )
-    """Wait over the cell until so much time has passed since the brush left the ink. Left out, it presses at once, and
-    the field is left out of what is written: protocols written before it existed stay the same."""
+    """Wait over the cell until this much time has passed since the brush left the ink. Left out, it presses at once and
+    the field is not written, so that protocols written before it existed stay the same."""
 
     @property
     def own_cell_mm(self) -> tuple[float, float] | None:
-        """Size of the paper cell that each stroke needs; None is the rig's own, `paper.cell_mm`."""
+        """Size of the paper cell that each stroke needs; None for that of the rig, `paper.cell_mm`."""
         return None
 
     def planned(self, layout: Layout | None = None) -> list[Planned]:
@@ -55,7 +55,7 @@ class ProtocolBase(Config):
         return []
 
     def steps(self, layout: Layout | None = None) -> Protocol:
-        """The generator to run. The layout changes the order of the steps, never their keys."""
+        """Return the generator of steps. The layout changes the order of the steps, never their keys."""
         return stroke_steps(self.planned(layout), board_every=self.board_every)
 
 
@@ -66,14 +66,14 @@ def check_count(strokes: int) -> None:
 
 
 def check_axes(heights_mm: list[float], tilts_deg: list[float]) -> None:
-    """Raise ValueError where an axis of a grid has a value twice."""
+    """Raise ValueError if an axis of a grid has a value twice."""
     for name, values in (("heights_mm", heights_mm), ("tilts_deg", tilts_deg)):
         if len(set(values)) != len(values):
             raise ValueError(f"{name} has the same value twice: {values}")
 
 
 def check_distinct(field: str, values: Iterable[object]) -> None:
-    """Raise ValueError where a value is there twice."""
+    """Raise ValueError if a value occurs twice."""
     seen: set[object] = set()
     for value in values:
         if value in seen:
@@ -82,7 +82,7 @@ def check_distinct(field: str, values: Iterable[object]) -> None:
 
 
 def stroke_id_problem(ident: str) -> str:
-    """Why this may not be a stroke's id, which names files and is shown on terminals; empty where it may."""
+    """Reason why this is no valid stroke id, which names files and is shown on terminals; empty if it is valid."""
     if not 1 <= len(ident) <= MAX_ID:
         return f"a name has 1 to {MAX_ID} characters"
     if not ident.isprintable() or any(c in ' /\\<>:"|?*' for c in ident) or ident[0] in ".-~":

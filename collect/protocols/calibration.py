@@ -17,7 +17,7 @@ class CalibrationConfig(ProtocolBase):
 
     kind: Literal["calibration"]
     touches_mm: Annotated[tuple[tuple[Finite, Finite], ...], Field(max_length=200)] = ()
-    """Points of the sheet to touch, x and y in the paper frame. Three that are not on a line give the sheet's lean."""
+    """Points of the sheet to touch, x and y in the paper frame. Three that are not on a line give the sheet's slope."""
     rounds: Annotated[int, Field(ge=1, le=100)] = 1
     """How often all of them are touched: the spread of a point over the rounds shows how well a touch repeats."""
     board_views: Annotated[int, Field(ge=1, le=1000)] = 1

@@ -1,4 +1,4 @@
-"""`protocol.toml`, a frozen union by `kind`, and its CSV files, whose rows become part of it.
+"""Reads `protocol.toml`, a frozen union by `kind`, and its CSV files, whose rows become part of it.
 
 Bad input is refused in one line: file, line, field, allowed range. A new kind is a subclass of `ProtocolBase` in a
 module of its own, and a member of `ProtocolConfig`.
@@ -83,7 +83,7 @@ _R = TypeVar("_R", bound=BaseModel)
 def read_rows(
     protocol: Path, field: str, name: object, row: type[_R], at_most: int, *, ignore_others: bool = False
 ) -> tuple[tuple[_R, ...], tuple[str, ...]]:
-    """(rows, names of the ignored columns) of the CSV called `name` beside `protocol`.
+    """Return (rows, names of the ignored columns) of the CSV file `name` in the folder of `protocol`.
 
     The first line names the columns; an empty cell counts as left out. `field` is where the protocol names the file.
     Raises `ConfigError`.

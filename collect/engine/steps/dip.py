@@ -22,14 +22,14 @@ STALE_INK_S = 5.0
 
 
 async def dip(context: StepContext) -> Result:
-    """The DIP step. Looks at the sheet first, so that the ink does not wait for that."""
+    """The DIP step. Looks at the sheet first, so that the filled brush does not wait for it."""
     await look_at_sheet(context)
     level = await fill_brush(context)
     return {} if level is None else {"ink_level": level, "dosed_ml": context.run.memory.dosed_ml}
 
 
 async def fill_brush(context: StepContext) -> float | None:
-    """Fill up the well if need be, then dip. Returns the level of the well, 0 to 1; None where nothing measures it."""
+    """Fill up the well if needed, then dip. Return the level of the well, 0 to 1; None if nothing measures it."""
     run, memory = context.run, context.run.memory
     with run.progress.meanwhile("dip"):
         level = await fill_well(run)
@@ -50,9 +50,9 @@ async def set_light(run: RunContext) -> None:
 
 
 async def fill_well(run: RunContext) -> float | None:
-    """Dose ink where the gauge or the number of dips calls for it; returns the level, None without a gauge.
+    """Dose ink when the gauge or the number of dips calls for it; return the level, None without a gauge.
 
-    Raises `NeedsOperator` where a dose does not arrive, and `DeviceError`.
+    Raises `NeedsOperator` if a dose does not arrive, and `DeviceError`.
     """
     ink, config, memory = run.rig.ink, run.rig.config.ink.device, run.memory
     match config:
@@ -84,13 +84,13 @@ async def _dose(run: RunContext, dose_ml: float) -> None:
 
 
 def must_dip(context: StepContext) -> bool:
-    """Whether the brush must dip before it may press: it has no known ink, or the ink waited too long."""
+    """Whether the brush must dip before it may press: it is not known to hold ink, or the ink has waited too long."""
     left_ns = context.run.memory.left_ink_ns
     return left_ns is None or context.run.rig.clock.now_ns() - left_ns > STALE_INK_S * 1e9
 
 
 class DipToTouch:
-    """Times from dip to touch within one step: one of a press, one or more of a figure that dips between strokes."""
+    """Times from dip to touch within one step: one for a press, one or more for a figure that dips between strokes."""
 
     def __init__(self, context: StepContext) -> None:
         self._context = context
@@ -99,7 +99,7 @@ class DipToTouch:
 
     @property
     def longest_s(self) -> float | None:
-        """The longest time; None where no pose showed the brush on the paper."""
+        """The longest time; None if no pose showed the brush on the paper."""
         return max(self._waits_s, default=None)
 
     @contextmanager
@@ -109,7 +109,7 @@ class DipToTouch:
             yield self
 
     async def begin(self, first: Move) -> None:
-        """Start timing a stroke that begins with the move `first`; wait above the cell where the protocol asks for a
+        """Start timing a stroke that begins with the move `first`; wait above the cell if the protocol asks for a
         fixed time after the dip."""
         run = self._context.run
         left_ns, run.memory.left_ink_ns = run.memory.left_ink_ns, None

@@ -29,7 +29,7 @@ async def press(context: StepContext) -> Result:
 
 
 async def draw(context: StepContext) -> Result:
-    """The DRAW step: every stroke of a figure, with dips in between where the protocol asks for them."""
+    """The DRAW step: every stroke of a figure, with dips in between if the protocol asks for them."""
     run, drawn = context.run, Drawn.of(context.step)
     cell = await _ready(context)
     plane = run.procedures.plane
@@ -56,7 +56,7 @@ async def draw(context: StepContext) -> Result:
 
 
 async def _ready(context: StepContext) -> Cell:
-    """Fill the brush if its ink is old, and return the cell to press, which was seen to be blank."""
+    """Check the sheet, fill the brush if its ink is old, and return the cell to press, which was seen to be blank."""
     assert context.cell is not None
     await look_at_sheet(context)
     if must_dip(context):

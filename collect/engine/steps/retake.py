@@ -1,4 +1,4 @@
-"""Whether a stroke counts, is pressed again on another cell, or is left out."""
+"""Decides whether a stroke counts, is pressed again on another cell, or is left out."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PICTURE_MARGIN_PX = 40
 
 
 async def decide(context: StepContext, verdict: Verdict | None, image: Gray, cell: Cell) -> tuple[bool, bool]:
-    """(kept, retake) of the stroke in `image`: by the operator's request if there is one, else by the verdict."""
+    """Return (kept, retake) of the stroke in `image`, by the operator's request if there is one, else the verdict."""
     run, stroke_id = context.run, str(context.step.params["stroke_id"])
     if run.requests.take(OperatorRequest.RETAKE):
         run.progress.log(f"{stroke_id}: is pressed again, as the operator asked")
@@ -31,7 +31,7 @@ async def decide(context: StepContext, verdict: Verdict | None, image: Gray, cel
 
 
 async def _after_failure(context: StepContext, verdict: Verdict, image: Gray, cell: Cell) -> tuple[bool, bool]:
-    """Retake while takes are left, then a person decides; unwatched, the stroke is given up."""
+    """Retake while takes are left, then let a person decide; if nobody watches, give the stroke up."""
     run = context.run
     take = int(context.step.params.get("take") or 1)
     if take <= run.rig.config.quality.retakes:

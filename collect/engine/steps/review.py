@@ -1,4 +1,4 @@
-"""Presses strokes again whose captures a person has marked bad while the session was open."""
+"""Finds strokes to press again, because a person marked their captures bad while the session was open."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ def _moved_mm(found: PlaneResult, before: PaperPlane) -> float:
 
 
 async def _accepted(context: StepContext, moved_mm: float) -> None:
-    """Ask a person before strokes are pressed from another height than those before. Raises `StepError` for a no."""
+    """Ask a person before strokes are pressed from a new height. Raises `StepError` if the answer is no."""
     text = f"The paper was found {moved_mm:+.2f} mm from where it was. Strokes from here on are pressed from there."
     choices = (Choice("g", "good, go on from the new height"), Choice("k", "keep the height as it was"))
     if await context.run.asker.ask(Prompt(text, choices, "k")) != "g":
@@ -92,7 +92,7 @@ async def _visited(run: RunContext, point: tuple[float, float]) -> float:
 
 
 async def check_rig(context: StepContext) -> Result:
-    """The SELF_CHECK step: an uneven triangle of marks shows whether the rig is mirrored, turned or stretched."""
+    """The SELF_CHECK step: a scalene triangle of marks shows whether the rig is mirrored, turned or stretched."""
     run, cell = context.run, context.cell
     assert cell is not None
     cells = (cell, *context.more_cells)
@@ -103,7 +103,7 @@ async def check_rig(context: StepContext) -> Result:
 
 
 class _Effector:
-    """The rig's procedures as touches and the self-check use them; a dip keeps the well filled."""
+    """The rig's procedures as touches and the self-check use them; a dip also keeps the well filled."""
 
     def __init__(self, context: StepContext) -> None:
         self._context = context
@@ -144,7 +144,7 @@ def _height(run: RunContext) -> str:
 
 async def _check(check: Callable[..., None], where: str, *checked: object) -> None:
     try:
-        # Takes seconds for a long protocol: in a thread, so that a stop takes effect meanwhile.
+        # Takes seconds for a long protocol; runs in a thread, so that a stop takes effect meanwhile.
         await asyncio.to_thread(check, Path("rig.toml"), *checked)
     except ConfigError as error:
         raise StepError(f"{where}{error.what}") from None
