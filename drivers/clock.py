@@ -24,5 +24,5 @@ class HostClock:
         self._offset_ns = time.time_ns() - time.monotonic_ns()
 
     def now_ns(self) -> int:
-        """Nanoseconds since the epoch as of the start of this clock, plus monotonic time since."""
+        """Nanoseconds since the epoch: wall time when this clock was created, plus monotonic time since."""
         return self._offset_ns + time.monotonic_ns()

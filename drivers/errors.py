@@ -1,4 +1,4 @@
-"""Errors of devices. Each names the device, the operation, the condition that it leaves, and what to do.
+"""Errors of devices. Each names the device, the operation, the physical state that it leaves, and what to do.
 
 DeviceError
  +-- NotConnected           never connected, or closed
@@ -14,7 +14,7 @@ DeviceError
       +-- MotionRefused     the controller did not accept the command
       +-- MotionFailed      accepted, but the arm did not arrive
       +-- RobotNotSafe      protective, safeguard or emergency stop, violation or fault
-      +-- ArmMoved          another client or a person has moved the arm, or moves it now
+      +-- ArmMoved          another client or a person has moved the arm, or is moving it
       +-- SettingsChanged   the tool offset, or another setting that a press depends on, has changed
 """
 
@@ -42,7 +42,7 @@ class NotConnected(DeviceError):
 
 
 class ConnectionLost(DeviceError, ConnectionError):
-    """The peer closed the connection or the cable went."""
+    """The peer closed the connection, or the cable was disconnected."""
 
 
 class DeviceTimeout(DeviceError, TimeoutError):
@@ -50,7 +50,7 @@ class DeviceTimeout(DeviceError, TimeoutError):
 
 
 class Stale(DeviceTimeout):
-    """The newest sample is older than allowed; `age_ms` says by how much."""
+    """The newest sample is older than allowed; `age_ms` is its age."""
 
     def __init__(self, device: str, age_ms: float, limit_ms: float) -> None:
         self.age_ms = age_ms
@@ -119,7 +119,7 @@ class MotionFailed(MotionError):
 
 
 class RobotNotSafe(MotionError):
-    """The safety mode forbids motion; `mode` is the controller's name of it."""
+    """The safety mode forbids motion; `mode` is the controller's name for it."""
 
     def __init__(self, device: str, op: str, mode: str, condition: str, remedy: str) -> None:
         self.mode = mode
@@ -127,7 +127,7 @@ class RobotNotSafe(MotionError):
 
 
 class ArmMoved(MotionError):
-    """The arm is not where it was left: `off_mm` and `off_deg` from there, and `moving` still."""
+    """The arm is not where it was left but `off_mm` and `off_deg` away; `moving` is True if it still moves."""
 
     def __init__(self, device: str, op: str, off_mm: float, off_deg: float, *, moving: bool = False) -> None:
         self.off_mm = off_mm
@@ -147,7 +147,7 @@ class ArmMoved(MotionError):
 
 
 class SettingsChanged(MotionError):
-    """Settings of the controller have changed; `changes` names each as found and as it was set."""
+    """Settings of the controller have changed; `changes` gives each as found and as it was set."""
 
     def __init__(self, device: str, op: str, changes: tuple[str, ...]) -> None:
         self.changes = changes

@@ -1,8 +1,8 @@
-"""One driver per device on a machine, whichever user runs it.
+"""Allow only one driver per device on a machine, across all users.
 
-On Linux a claim is a name that the kernel keeps (an abstract socket): it leaves no file behind, ends with its process
-however that ends, and every user of the machine sees it; a container with a network of its own does not. On other
-systems it is a lock on a file that every user may open, in a folder that is the same for all of them.
+On Linux a claim is an abstract socket, a name that the kernel keeps: it leaves no file behind, ends with its process in
+any case, and is visible to every user of the machine, but not in a container with a separate network. On other systems
+it is a lock on a file that every user may open, in a folder shared by all users.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 WAITING = 64
-"""Length of the backlog: refused processes that may connect to learn the holder. Their connections are never served."""
+"""Length of the backlog: refused processes connect to learn who holds the name, and are never served."""
 
 
 class Claimed(Exception):
@@ -54,7 +54,7 @@ def _named_socket(name: str) -> Generator[None]:
 
 
 def _holder(address: str) -> tuple[int | None, int | None]:
-    """Process and user who listen there, as the kernel knows them."""
+    """(pid, uid) of the listener at `address`, as the kernel reports them; (None, None) if unknown."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
         asking.setblocking(False)
         try:

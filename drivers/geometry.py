@@ -43,7 +43,7 @@ def to_wire(pose: Pose) -> list[float]:
 
 
 def from_wire(values: list[float]) -> Pose:
-    """The inverse of `to_wire`. Raises ValueError unless there are six finite numbers."""
+    """The inverse of `to_wire`. Raises ValueError unless given six finite numbers."""
     if len(values) != 6 or not all(math.isfinite(v) for v in values):
         raise ValueError(f"a pose is six finite numbers, got {values!r}")
     x, y, z, rx, ry, rz = values
@@ -68,7 +68,7 @@ def interpolate(a: Pose, b: Pose, s: float) -> Pose:
 
 
 def steepest_deg(a: Pose, b: Pose) -> float:
-    """The largest tilt between a and b, in deg: two poses within a cone may have steeper ones between them."""
+    """The largest tilt on the way from a to b, in deg: it may exceed the tilt of both ends."""
     start = Rotation.from_quat(a.quaternion)
     turn = (Rotation.from_quat(b.quaternion) * start.inv()).as_rotvec()
     ferrule = -start.as_matrix()[:, 2]

@@ -10,7 +10,7 @@ from drivers.geometry import distance, lean, steepest_deg
 from drivers.samples import Pose
 
 TILT_SLACK_DEG = 1e-6
-"""Rounding of a pose that goes through Euler angles must not refuse a tilt that equals the limit."""
+"""Tolerance for rounding in Euler angles: a tilt equal to the limit must not be refused."""
 REST_SLACK_MM, REST_SLACK_DEG = 0.1, 0.2
 """An arm that was sent to a limit may rest a little beyond it."""
 ALONG_DEG = 1.0
@@ -39,9 +39,9 @@ class Limits:
         return max(min(speed_mm_s, self.turn_deg_s * travel_mm / turn_deg), 0.1)
 
     def check_start(self, device: str, here: Pose) -> None:
-        """Raise `LimitExceeded` where the arm stands outside the box or the cone: no line from there is known.
+        """Raise `LimitExceeded` if the arm stands outside the box or the cone: no line from there is known to be safe.
 
-        Below the floor is allowed: up along the tool axis is a way out.
+        A start below the floor is allowed: up along the tool axis is a way out.
         """
         for field, value, (low, high), slack, unit in (
             ("x", here.x_mm, self.x_mm, REST_SLACK_MM, "mm"),
@@ -53,9 +53,9 @@ class Limits:
                 raise _stands_outside(device, field, value, low, high, unit)
 
     def check_way(self, device: str, start: Pose, target: Pose) -> None:
-        """Raise `LimitExceeded` unless the whole line to a target that was checked before is within the limits.
+        """Raise `LimitExceeded` unless the whole line to an already checked target is within the limits.
 
-        A box that holds both ends holds the line; a tilt cone may not. From below the floor only a
+        A box that contains both ends contains the line; a tilt cone may not. From below the floor only a
         line up along the tool axis is allowed.
         """
         self.check_start(device, start)
@@ -69,7 +69,7 @@ class Limits:
         """Raise `LimitExceeded` naming the first field that is out of range; NaN is out of every range."""
         try:
             tilt_deg, _ = lean(target)
-        except ValueError:  # a quaternion without length has no tilt
+        except ValueError:  # a zero quaternion has no tilt
             tilt_deg = math.nan
         checks = (
             ("x", target.x_mm, *self.x_mm, "mm"),

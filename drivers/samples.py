@@ -58,7 +58,7 @@ class PoseSample:
     stamp: Stamp
     pose: Pose
     joints_rad: tuple[float, ...] | None = None
-    """Joint positions of the same moment; None where they do not come with the pose."""
+    """Joint positions at the same moment; None if they do not come with the pose."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,10 +84,10 @@ class ForceSample:
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who answered: goes into the header of every recording, so that each number can be traced to its source."""
+    """The device that answered: in the header of every recording, so that each number can be traced to its source."""
 
     device: str
     model: str
     firmware: str
     simulated: bool
-    """True where the device itself says that it is the loopback rig, or shows a recording; never from configuration."""
+    """True if the device itself says that it is the loopback rig, or shows a recording; never from configuration."""

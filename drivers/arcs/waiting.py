@@ -1,4 +1,4 @@
-"""Waiting for the arm: until it is powered, until it has settled, and why it did not. Each poll checks safety first."""
+"""Wait until the arm is powered or has settled, and explain why it did not. Each poll checks safety first."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from drivers.geometry import distance
 from drivers.samples import Pose
 
 RESTS_ELSEWHERE_S = 1.0
-"""An accepted move may not have started yet; an arm that rests elsewhere for this long will not start."""
+"""How long the arm may rest away from its target: an accepted move may start late, but not later than this."""
 
 STUCK_S = 3.0
 PROGRESS = 0.05
-"""mm or deg by which the arm must come nearer to count as moving on."""
+"""Smallest approach to the target that counts as progress, mm or deg."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +59,8 @@ async def until_settled(
 ) -> None:
     """Return once the queue is empty, the arm steady and the pose within tolerance.
 
-    Raises `RobotNotSafe`, or `MotionFailed` where the arm rests elsewhere, or where twice the planned time has passed
-    and it comes no nearer: a pendant whose speed is turned down is slow, not stuck.
+    Raises `RobotNotSafe`; `MotionFailed` if the arm rests elsewhere, or if twice the planned time has passed and it
+    comes no nearer. An arm whose speed was turned down on the pendant is slow, not stuck.
     """
     loop = asyncio.get_running_loop()
     allowed_s = 2.0 * planned_s + 3.0
@@ -85,9 +85,9 @@ async def until_settled(
 
 
 def planned_s(start: Pose, target: Pose, speed_mm_s: float, acc_mm_s2: float) -> float:
-    """An upper estimate of the move: the line at speed plus one ramp, or the turn at half a radian per second.
+    """Upper estimate of a move's duration: the line at speed plus one ramp, or the turn at half a radian per second.
 
-    Where the tip stays within a millimetre, ARCS reads m/s as rad/s.
+    If the tip moves less than a millimetre, ARCS reads m/s as rad/s.
     """
     translation_mm, rotation_deg = distance(start, target)
     ramp_s = speed_mm_s / acc_mm_s2
@@ -115,21 +115,21 @@ class Messages:
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
         self._seen = 0
-        """The controller's own stamp; its unit is unknown, but it rises."""
+        """Newest timestamp of the controller seen so far; its unit is unknown, but it increases."""
 
     async def begin(self) -> None:
         """Skip the messages that are already there; they concern earlier motion."""
         await self._new()
 
     async def explain(self, error: MotionFailed) -> MotionFailed:
-        """`OutOfReach` where a new message reports it, else the error itself."""
+        """`OutOfReach` if a new message reports it, else the error itself."""
         for code in await self._new():
             if code in PLANNING_FAILED:
                 return OutOfReach(DEVICE, error.op, code, PLANNING_FAILED[code])
         return error
 
     async def _new(self) -> list[int]:
-        """Codes of the messages that were not seen before; none where the controller does not answer."""
+        """Codes of the messages not seen before; empty if the controller does not answer."""
         found: Any = []
         with contextlib.suppress(DeviceError):
             found = await self._controller.ask("Trace.peek", num=NEWEST, last_time=self._seen)

@@ -1,4 +1,4 @@
-"""Whether a frame is valid: black, saturated, torn, frozen and late ones are named and skipped."""
+"""Decide whether a frame is valid: black, saturated, torn, frozen and late frames are named and skipped."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ SAMPLE_STEP = 7
 BLACK_BELOW = 25
 SATURATED_SHARE = 0.5
 TORN_BAND_SHARE = 0.02
-"""A band of this share of the rows at the bottom without any change: the decoder ran out of data."""
+"""Share of the rows, at the bottom, that are uniform if the decoder ran out of data."""
 END_ROWS = 16
-"""The last row of blocks of a JPEG."""
+"""Height of the last row of blocks of a JPEG."""
 BURST_SHARE = 0.5
-"""Frames that come faster than this share of the usual period are a backlog."""
+"""Frames that arrive within less than this share of the usual period are a backlog."""
 PERIODS_KEPT = 31
 
 
@@ -45,7 +45,7 @@ class FrameHealth:
     """Judges the frames of one camera in the order in which they arrive."""
 
     def __init__(self, *, latency_ns: int, frozen_after: int, live: bool, independent: bool = False) -> None:
-        """`independent`: each frame is coded by itself; pixels of the one before then come from the decoder."""
+        """`independent`: each frame is coded by itself, so pixels of the previous frame come from the decoder."""
         self._latency_ns = latency_ns
         self._frozen_after = frozen_after
         self._live = live
@@ -56,7 +56,7 @@ class FrameHealth:
         self._last_ns: int | None = None
         self._periods: deque[int] = deque(maxlen=PERIODS_KEPT)
         self._backlog = 0
-        """How many frames may still have waited in a buffer."""
+        """Number of coming frames that may have waited in a buffer."""
         self.counts: Counter[Fault] = Counter()
         self.repeated = False
         """Whether the last frame equals the one before it: nothing new, though not yet a fault."""
@@ -79,7 +79,7 @@ class FrameHealth:
         return fault
 
     def summary(self) -> str:
-        """`3 black, 1 torn`, or empty."""
+        """Counts by fault, such as `3 black, 1 torn`; empty if there were none."""
         return ", ".join(f"{count} {fault}" for fault, count in sorted(self.counts.items()))
 
     def describe(self, fault: Fault) -> str:
@@ -100,9 +100,9 @@ class FrameHealth:
         return None
 
     def _is_patched(self, image: NDArray[np.uint8], same: bool) -> bool:
-        """True where the end of the frame equals that of the last whole one bit for bit, while the rest differs.
+        """True if the end of the frame equals that of the last whole frame bit for bit, while the rest differs.
 
-        FFmpeg fills what is missing of a JPEG with the picture before: half of a photograph would be an old one.
+        FFmpeg fills the missing part of a JPEG from the previous picture: half of the photograph would be old.
         """
         if not self._independent:
             return False
@@ -127,7 +127,7 @@ class FrameHealth:
         usual_ns = max(sorted(self._periods)[len(self._periods) // 2], 1)
         stalled = gap_ns > max(3 * usual_ns, self._latency_ns)
         if stalled:
-            # No more can have waited than came in the gap: so a camera whose period was misjudged recovers.
+            # No more frames can have waited than came in the gap, so a camera with a misjudged period recovers.
             self._backlog = 1 + gap_ns // usual_ns
         if self._backlog == 0:
             self._periods.append(gap_ns)

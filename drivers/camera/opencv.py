@@ -41,7 +41,7 @@ class OpenCvCamera:
         """Why no valid frame arrives, for the message of a timeout."""
         self._reported = False
         self._ended: DeviceError | None = None
-        self._closing = threading.Event()  # one for each grabber: an old one that hangs must not wake up again
+        self._closing = threading.Event()  # one for each grabber: an old grabber that hangs must not resume
         self._thread: threading.Thread | None = None
         self.settings: dict[str, float] = {}
         self._simulated = False
@@ -152,7 +152,7 @@ class OpenCvCamera:
                 image = cast("NDArray[np.uint8]", cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
             fault = health.judge(image, arrival_ns)
             if fault is not None:
-                # Single ones happen; a second without a valid frame is reported.
+                # Single faulty frames happen; one second without a valid frame is reported.
                 self._report(health.describe(fault), aloud=arrival_ns - valid_ns > LASTING_NS)
                 continue
             valid_ns = arrival_ns

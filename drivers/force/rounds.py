@@ -1,4 +1,4 @@
-"""The frames of a Sunrise SRI M8123B2 board: three a round, two float32 each, low byte first.
+"""The frames of a Sunrise SRI M8123B2 board: three per round, two float32 each, low byte first.
 
 | id | direction | bytes |
 |---|---|---|
@@ -7,7 +7,7 @@
 | 0x292 | from the board | Fz in N, Mx in Nm |
 | 0x293 | from the board | My, Mz in Nm |
 
-The frames carry no counter: that three belong together shows only in their order and in how close they follow.
+The frames carry no counter: only their order and timing show which three belong together.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def encode_round(wrench: Wrench) -> tuple[tuple[int, bytes], ...]:
 
 
 class RoundAssembler:
-    """Turns frames into wrenches; a round that is not whole, or not plausible, is dropped and counted."""
+    """Turns frames into wrenches; incomplete and implausible rounds are dropped and counted."""
 
     def __init__(self, *, round_ms: float, max_n: float, max_nm: float) -> None:
         self._round_s = round_ms / 1e3
@@ -45,17 +45,17 @@ class RoundAssembler:
         self._values: list[float] = []
         self._began_s: float | None = None
         self._last_place = -1
-        self._spoiled = True  # until a round begins; joining in mid-round is no fault
+        self._spoiled = True  # until a round begins; joining in mid-round is not a fault
         self.torn = 0
         self.refused = 0
 
     def feed(self, can_id: int, data: bytes, at_s: float) -> Wrench | None:
-        """The wrench that this frame, received at `at_s`, completes; None for every other frame."""
+        """Take a frame received at `at_s`; return the wrench that it completes, else None."""
         place = can_id - FIRST_ID
         if not 0 <= place < 3:
             return None
         late = self._began_s is not None and not abs(at_s - self._began_s) <= self._round_s
-        if place == 0 or place <= self._last_place or late:  # another round, whether or not it has its beginning
+        if place == 0 or place <= self._last_place or late:  # a new round, even if its first frame was lost
             if self._values:
                 self._tear()
             self._began_s, self._spoiled = at_s, False
@@ -72,7 +72,7 @@ class RoundAssembler:
         fx, fy, fz, mx, my, mz = self._values
         self._values = []
         wrench = (fx, fy, fz, mx, my, mz)
-        # Written so that NaN fails it.
+        # Written so that NaN fails the check.
         if not all(abs(value) <= limit for value, limit in zip(wrench, self._limits, strict=True)):
             self.refused += 1
             return None

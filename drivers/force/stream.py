@@ -26,27 +26,27 @@ SILENT_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class BusSettings:
-    """What python-can opens."""
+    """Settings of the bus that python-can opens."""
 
     interface: str
     channel: str
     bitrate: int
     host: str | None = None
-    """Of a gateway (`socketcand`); None where the adapter is in this machine."""
+    """Host of a gateway (`socketcand`); None if the adapter is in this machine."""
     port: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class ForceHealth:
-    """How the stream has been since `connect`."""
+    """Statistics of the stream since `connect`."""
 
     rate_hz: float
-    """Measured over the newest rounds; 0 before the second."""
+    """Rate of the newest rounds; 0 before the second round."""
     rounds: int
     torn: int
-    """Rounds of which a frame was missing, late or malformed; dropped."""
+    """Dropped rounds in which a frame was missing, late or malformed."""
     refused: int
-    """Whole rounds with NaN, inf or more than the sensor's range; dropped."""
+    """Dropped complete rounds with NaN, inf or a value beyond the sensor's range."""
     gaps: int
     """Pauses between good rounds longer than `gap_ms`."""
     bus_errors: int
@@ -84,9 +84,9 @@ class RoundStream:
         self._rounds = self._gaps = self._bus_errors = 0
         self.newest: tuple[Stamp, Wrench] | None = None
         self.alike = 0
-        """Newest rounds in a row that equal the one before exactly; a strain gauge is never that still."""
+        """Number of newest rounds in a row that exactly equal the one before; a strain gauge is never that still."""
         self.alike_since_ns = 0
-        """When the first round equal to the newest came."""
+        """Time at which the first round equal to the newest arrived."""
         self.loss: Loss | None = None
         self.channel_info = ""
         self.virtual = False
@@ -95,7 +95,7 @@ class RoundStream:
         self._thread = threading.Thread(target=self._run, name="force reader", daemon=True)
 
     def start(self) -> None:
-        """Open the bus and read, in a thread; a failure shows in `loss`."""
+        """Open the bus and read it, in a thread; a failure is stored in `loss`."""
         self._thread.start()
 
     def stop(self, timeout_s: float = 5.0) -> None:
@@ -115,7 +115,7 @@ class RoundStream:
         try:
             bus = self._open()
         except Exception as error:
-            # Adapters' back ends raise what they like where a library or a package is missing.
+            # Back ends raise arbitrary exceptions if a library or a package is missing.
             self._lose(f"cannot open {self._name}: {error}", "Check the adapter and that its interface is up.")
             return
         try:
@@ -142,8 +142,8 @@ class RoundStream:
 
     def _open(self) -> can.BusABC:
         settings = self._settings
-        # Only what was asked for: python-can would also read can.ini, the environment and the home folder.
-        # The library warns of frames that come in two pieces, which are harmless; a lost one shows in the counts.
+        # Use these settings only: python-can would also read can.ini, the environment and the home folder.
+        # The library warns of frames that arrive in two pieces, which is harmless; a lost frame shows in the counts.
         logging.getLogger("can").setLevel(logging.ERROR)
         gateway: dict[str, Any] = {} if settings.host is None else {"host": settings.host, "port": settings.port}
         return can.Bus(settings.channel, settings.interface, ignore_config=True, bitrate=settings.bitrate, **gateway)
@@ -192,7 +192,7 @@ class RoundStream:
 
 
 def command(data: bytes) -> can.Message:
-    """A frame to the board."""
+    """A command frame to the board."""
     return can.Message(arbitration_id=COMMAND_ID, is_extended_id=False, data=data)
 
 

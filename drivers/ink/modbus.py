@@ -1,4 +1,4 @@
-"""Modbus RTU, as far as a pump needs it: write one register, and the exceptions.
+"""The part of Modbus RTU that a pump needs: writing one register, and exceptions.
 
 | frame | bytes |
 |---|---|
@@ -35,7 +35,7 @@ def seal(body: bytes) -> bytes:
 
 
 def unseal(frame: bytes) -> bytes:
-    """The body of a frame. Raises `ProtocolViolation` where it is too short or the CRC is wrong."""
+    """The body of a frame. Raises `ProtocolViolation` if it is too short or the CRC is wrong."""
     if len(frame) < 4:
         raise ProtocolViolation(DEVICE, "decode", f"{len(frame)} bytes are no frame")
     body = frame[:-2]
@@ -45,14 +45,14 @@ def unseal(frame: bytes) -> bytes:
 
 
 def write_register(unit: int, register: int, value: int) -> bytes:
-    """The request to write one register. Raises ValueError where a field does not fit."""
+    """The request to write one register. Raises ValueError if a field does not fit."""
     if not (1 <= unit <= 247 and 0 <= register <= 0xFFFF and 0 <= value <= 0xFFFF):
         raise ValueError(f"unit {unit}, register {register}, value {value} do not fit a frame")
     return seal(struct.pack(">BBHH", unit, WRITE_REGISTER, register, value))
 
 
 def exception(unit: int, function: int, code: int) -> bytes:
-    """The reply of a unit that will not do as asked."""
+    """The exception reply of a unit that refuses a request."""
     return seal(bytes([unit, function | EXCEPTION_BIT, code]))
 
 
@@ -66,10 +66,10 @@ def read_write(frame: bytes) -> tuple[int, int, int]:
 
 
 def find_reply(received: bytes, request: bytes) -> int | None:
-    """0 where `received` confirms `request`, the code where it is an exception, None while it is neither.
+    """0 if `received` confirms `request`, the code if it is an exception, None while it is neither.
 
-    Noise before the reply is passed over: the CRC decides where a frame is. Of two replies the one that ends first
-    counts, so that it does not matter in which pieces they came.
+    Noise before the reply is skipped: the CRC decides where a frame is. Of two replies the one that ends first
+    counts, so the result does not depend on how the bytes were split.
     """
     confirmed = received.find(request)
     before = received if confirmed < 0 else received[: confirmed + len(request) - 1]

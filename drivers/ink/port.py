@@ -1,4 +1,4 @@
-"""What both ink devices share: the serial line, its checksum, limits on doses, and the error of a refusal.
+"""What both ink devices share: the serial line, its checksum, limits on doses, and the error for a refused request.
 
 One worker thread owns the port from open to close, so that an exchange whose caller was cancelled still ends before
 the next begins: two requests at once on a half-duplex line would destroy each other.
@@ -58,7 +58,7 @@ class DoseBudget:
         self._given: deque[tuple[int, float]] = deque()
 
     def take(self, volume_ml: float, now_ns: int) -> None:
-        """Count a dose at `now_ns`. Raises `LimitExceeded`, and then counts nothing."""
+        """Count a dose at `now_ns`. Raises `LimitExceeded` without counting it."""
         if not math.isfinite(volume_ml) or not self._smallest_ml * (1 - 1e-9) <= volume_ml <= self._max_dose_ml:
             raise LimitExceeded(self._device, "dose", volume_ml, self._smallest_ml, self._max_dose_ml, "ml")
         while self._given and now_ns - self._given[0][0] >= MINUTE_NS:
@@ -79,7 +79,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class SerialSettings:
-    """`path` is the device file or COM port."""
+    """Settings of a serial port; `path` is the device file or COM port."""
 
     path: str
     baud: int
@@ -87,11 +87,11 @@ class SerialSettings:
     parity: Literal["N", "E", "O"] = "N"
     stopbits: Literal[1, 2] = 1
     gap_s: float = 0.0
-    """Silence before each request; Modbus RTU tells frames apart by it."""
+    """Silence before each request, which separates frames in Modbus RTU."""
 
 
 class _Port(Protocol):
-    """What is used of pyserial, which ships no types."""
+    """The part of pyserial's API that is used; pyserial ships no types."""
 
     @property
     def in_waiting(self) -> int: ...
@@ -127,7 +127,7 @@ class SerialPort:
     ) -> T:
         """Send `request`, then pass all bytes received so far to `find` until it returns a reply.
 
-        Raises `DeviceTimeout` where nothing came, `ProtocolViolation` where something else came, `ConnectionLost`,
+        Raises `DeviceTimeout` if nothing arrived, `ProtocolViolation` if something else arrived, `ConnectionLost`,
         `NotConnected`, each with `condition`.
         """
         if self._worker is None:
@@ -220,5 +220,5 @@ class SerialPort:
 
 
 def shown(data: bytes) -> str:
-    """The first bytes, as a message can carry them."""
+    """The first bytes of `data`, formatted for a message."""
     return f"{data[:48]!r}{'...' if len(data) > 48 else ''}"

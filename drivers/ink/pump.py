@@ -1,8 +1,8 @@
 """A peristaltic pump on Modbus RTU (RS-485).
 
 The register map is from public third-party code, not from the maker's manual, and no pump has confirmed it yet:
-register 1 is the speed in 0.01 rpm, register 4 is 1 to start, 0 to stop, 2 for full speed. Only writes are known to
-be answered, so nothing is read: the pump can tell neither who it is nor how full the well is.
+register 1 is the speed in 0.01 rpm, register 4 is 1 to start, 0 to stop, 2 for full speed. The pump is known
+to answer only writes, so nothing is read: neither the pump's identity nor the level of the well is known.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ RUN_REGISTER = 4
 STOP, START = 0, 1
 STOP_ATTEMPTS = 3
 MAX_RPM = 600.0
-"""The speed register would hold 655.35."""
+"""The speed register could hold up to 655.35."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +45,10 @@ class PumpOptions:
     echo_s: float = 0.15
     """How long `connect` waits for an echo: longer than eight characters and the adapter's own delay."""
     max_overrun_s: float = 0.5
-    """A stop that comes later than this after its time is reported: the well got more than was asked for."""
+    """A stop that is later than this is reported: the well got more than was asked for."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError where the pump could not run like that."""
+        """Raise ValueError if the pump cannot run with these options."""
         if not (0.0 < self.rpm <= MAX_RPM and 0.0 < self.ml_per_revolution < 100.0):
             raise ValueError(f"cannot pump {self.ml_per_revolution} ml per revolution at {self.rpm} rpm")
 
@@ -59,7 +59,7 @@ class PumpOptions:
 
 
 class ModbusPump:
-    """`Ink` by time: so many revolutions at so many rpm; a running pump is always stopped."""
+    """`Ink` that doses by time at a fixed speed; a running pump is always stopped."""
 
     def __init__(self, options: PumpOptions, clock: Clock) -> None:
         self._options = options
@@ -83,7 +83,7 @@ class ModbusPump:
         self._may_run = False
 
     async def connect(self) -> Identity:
-        """Open the port, make sure of a line without echo, and stop the pump. Raises `DeviceError`; closed then."""
+        """Open the port, check that the line does not echo, and stop the pump. `DeviceError` leaves the port closed."""
         self._connected = False
         await self._port.open()
         try:
@@ -99,7 +99,7 @@ class ModbusPump:
     async def dose(self, volume_ml: float) -> None:
         """Pump for as long as `volume_ml` takes, then stop. Raises `LimitExceeded`, `InkRefused`, `DeviceError`.
 
-        Whatever goes wrong in between, cancellation included, the pump is stopped before it is passed on.
+        On any error, including cancellation, the pump is stopped before the error is passed on.
         """
         if not self._connected:
             raise NotConnected(DEVICE, "dose", "not connected")
@@ -108,7 +108,7 @@ class ModbusPump:
             speed = round(self._options.rpm * 100)
             await self._write(SPEED_REGISTER, speed, "set speed", "The pump was not started.")
             planned_s = volume_ml / self._ml_per_s
-            if not self._connected:  # closed meanwhile: its stop has been sent, and no start may follow it
+            if not self._connected:  # closed meanwhile: the stop has been sent, and no start may follow
                 raise NotConnected(DEVICE, "dose", "closed while waiting", condition="The pump was not started.")
             try:
                 self._may_run = True
@@ -153,7 +153,7 @@ class ModbusPump:
             await self._port.close()
 
     async def _halt(self) -> None:
-        """Stop, and try again: a pump that runs on is worse than a late error."""
+        """Stop the pump, with retries: a pump that runs on is worse than a late error."""
         for left in reversed(range(STOP_ATTEMPTS)):
             try:
                 await self._write(RUN_REGISTER, STOP, "stop", "The pump may still be running.")
@@ -189,9 +189,9 @@ class ModbusPump:
             raise InkRefused(DEVICE, op, code, text, condition=condition, remedy="Is this the pump's register map?")
 
     async def _refuse_echo(self) -> None:
-        """Send a stop with a wrong CRC, which no device answers: only an adapter hands it back.
+        """Send a stop with a wrong CRC, which no device answers, and raise if the adapter returns it.
 
-        The reply to a write is the request itself, so an echo would pass for a pump that obeys.
+        The reply to a write is the request itself, so an echo would look like a pump that obeys.
         """
         intact = write_register(self._options.unit, RUN_REGISTER, STOP)
         damaged = intact[:-2] + bytes(byte ^ 0xFF for byte in intact[-2:])
@@ -213,7 +213,7 @@ class ModbusPump:
 
 
 async def finished(work: Coroutine[Any, Any, None]) -> None:
-    """Run `work` to its end even where the caller is cancelled meanwhile, once or many times; then pass that on."""
+    """Run `work` to its end even if the caller is cancelled meanwhile, once or more; then raise that cancellation."""
     task = asyncio.ensure_future(work)
     cancelled: asyncio.CancelledError | None = None
     while not task.done():

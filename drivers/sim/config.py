@@ -1,4 +1,4 @@
-"""Configuration of the loopback rig: its truth, which the software under test may only find out by measuring."""
+"""Configuration of the loopback rig: the true values, which the software under test may learn only by measuring."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ class Table:
     origin_mm: tuple[float, float] = (460.0, -110.0)
     """Lower left corner of the sheet in the robot's base frame."""
     yaw_deg: float = 90.0
-    """From base x to paper x. Not zero, so that a forgotten rotation shows at once."""
+    """Angle from base x to paper x. Not zero, so that a forgotten rotation shows at once."""
     paper_z_mm: float = 120.0
-    """Of the sheet at its origin; the well stands at this height too."""
+    """Height of the sheet at its origin; the well stands at this height too."""
     slope_deg: tuple[float, float] = (0.0, 0.0)
     """Rotation of the sheet about paper x (its far edge rises) and about paper y (its right edge falls)."""
     sheet_mm: tuple[float, float] = (244.0, 172.0)
     board_origin_mm: tuple[float, float] = (-34.0, -34.0)
-    """Lower left corner of the ChArUco board, in the paper frame. The sheet lies on it, so that corners are seen all
-    round: a plane fitted to a strip at one side would be extrapolated over the whole sheet."""
+    """Lower left corner of the ChArUco board, in the paper frame. The sheet lies on it, so that corners are seen on
+    all sides: a plane fitted to a strip at one side would be extrapolated over the whole sheet."""
     board_squares: tuple[int, int] = (26, 20)
     board_square_mm: float = 12.0
     board_marker_mm: float = 9.0
@@ -33,7 +33,7 @@ class Table:
     """Centre of the ink well, in the paper frame."""
     well_radius_mm: float = 15.0
     well_depth_mm: float = 14.0
-    """From its bottom, which stands on the table at the height of the paper, to its rim."""
+    """Depth from its rim to its bottom, which stands on the table at the height of the paper."""
     ink_level_mm: float = 10.0
     """Ink surface above the paper plane when the rig starts."""
 
@@ -67,7 +67,7 @@ class View:
     centre_mm: tuple[float, float] = (122.0, 86.0)
     """The point of the paper plane in the middle of the image, in the paper frame."""
     noise: float = 2.0
-    """Standard deviation in gray levels."""
+    """Standard deviation of the noise, in gray levels."""
     shade: float = 0.18
     """Fall-off of the light toward one corner."""
     shadow: float = 0.0
@@ -75,18 +75,18 @@ class View:
     glare: float = 0.0
     """Gray levels that the reflection of a lamp adds where it is brightest; wet ink reflects it as paper does."""
     glare_mm: tuple[float, float] = (122.0, 86.0)
-    """Where it lies, in the paper frame."""
+    """Centre of the reflection, in the paper frame."""
     glare_sigma_mm: float = 6.0
-    """Standard deviation of its bell."""
+    """Standard deviation of the reflection's Gaussian profile."""
     k1: float = 0.0
-    """Radial distortion in OpenCV's model with a focal length of one image width; none until calibration undoes it."""
+    """Radial distortion in OpenCV's model with a focal length of one image width; 0 until calibration corrects it."""
     blur_px: float = 0.7
     fps: float = 8.0
     jpeg_quality: int = 95
     delay_s: float = 0.0
     """Real seconds that a picture waits before it is sent, on top of drawing and coding it."""
     delay_jitter_s: float = 0.0
-    """Largest extra delay, at random; pictures never overtake each other."""
+    """Largest random extra delay; pictures never overtake each other."""
     delay_drift: float = 0.0
     """Seconds by which the delay grows in each second of the stream."""
     stamp_strip: bool = False
@@ -116,13 +116,13 @@ class SimConfig:
     force_hz: float = 200.0
     """Rounds per real second."""
     force_noise_n: float = 0.002
-    """Standard deviation of each round: a sensor of a few N, as a soft brush needs one."""
+    """Standard deviation of each round, as of a sensor for a few N, which a soft brush needs."""
     force_noise_nm: float = 2e-4
     sensor_to_tip_mm: float = 180.0
     hanging_kg: float = 0.12
-    """Holder and brush below the sensor."""
+    """Mass of holder and brush below the sensor."""
     tool_mm: float = 180.0
-    """True length from the flange to the tip, along the flange's z: which an operator measures and configures."""
+    """True length from the flange to the tip, along the flange's z; an operator measures and configures it."""
     brush: BrushSpec = field(default_factory=BrushSpec)
     table: Table = field(default_factory=Table)
     view: View = field(default_factory=View)

@@ -20,7 +20,7 @@ class FaultRefused(Exception):
 
 
 def request_of(what: str, kind: str | None, options: Mapping[str, object]) -> dict[str, Any]:
-    """The request for the words of a command line. Raises `FaultRefused`."""
+    """The request that the words of a command line ask for. Raises `FaultRefused`."""
     given = {name: value for name, value in options.items() if value is not None}
     if what not in PLAIN:
         if kind is None:
@@ -33,7 +33,7 @@ def request_of(what: str, kind: str | None, options: Mapping[str, object]) -> di
 
 
 def ask(path: Path, request: Mapping[str, object]) -> dict[str, Any]:
-    """The rig's answer. Raises `FaultRefused` with one line where there is none, or where it is a refusal."""
+    """Send a request; return the rig's answer. Raises `FaultRefused`, with one line, if it is missing or a refusal."""
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
             client.settimeout(TIMEOUT_S)

@@ -1,4 +1,4 @@
-"""The loopback cabinet: an arm's motion, tool, safety and watchdogs, independent of the wire.
+"""The loopback cabinet: an arm's motion, tool, safety and watchdogs, independent of the wire protocol.
 
 It simulates what a driver can get wrong: refusals by return code, poses that are accepted first and fail in planning, a
 path that a protective stop keeps. It simulates neither accuracy nor safety functions.
@@ -21,7 +21,7 @@ from drivers.sim.world import World
 ROBOT = "rob1"
 IK_NO_CONVERGE = -23
 OUTPUTS = {"Standard": 8, "Configurable": 16, "Tool": 4}
-"""Digital outputs by place, as many as in the examples of the SDK's headers."""
+"""Number of digital outputs by place, as in the examples of the SDK's headers."""
 HARD_STOP_M_S2 = 10.0
 SOFT_STOP_M_S2 = 2.0
 
@@ -36,7 +36,7 @@ class Cabinet:
         self.motion = world.motion
         self.power = Power(self.now_s)
         self.outputs = {place: [False] * count for place, count in OUTPUTS.items()}
-        """Digital outputs by place. They stay where they are put and drive nothing."""
+        """Digital outputs by place. They keep their levels and drive nothing."""
         self.tcp_offset = [0.0] * 6
         self.payload: list[Any] = [0.0, [0.0] * 3, [0.0] * 3, [0.0] * 6]
         self.collision_level = 6
@@ -56,12 +56,12 @@ class Cabinet:
         self.messages.append({"code": code, "level": "ERROR", "source": ROBOT, "args": list(args), "timestamp": stamp})
 
     def safety_stop(self, mode: SafetyMode) -> None:
-        """Enter a safety stop where the arm is. A protective stop keeps the path; only a person clears any of them."""
+        """Enter a safety stop where the arm is. A protective stop keeps the path; only a person can clear a stop."""
         if mode in EMERGENCY_STOPS:
             self.emergency_stop(mode)
             return
         if self.power.safety in EMERGENCY_STOPS:
-            return  # nothing less takes its place
+            return  # no lesser stop replaces it
         self.power.safety = mode
         if mode == SafetyMode.PROTECTIVE_STOP:
             self.hold(HARD_STOP_M_S2)
@@ -69,12 +69,12 @@ class Cabinet:
             self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
 
     def emergency_stop(self, mode: SafetyMode = SafetyMode.ROBOT_EMERGENCY_STOP) -> None:
-        """A person pushes the button."""
+        """Stop as if a person had pushed the emergency stop button."""
         self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
         self.power.press_emergency_stop(mode)
 
     def power_off(self) -> int:
-        """Stop, then take the power away."""
+        """Stop the arm, then switch its power off."""
         self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
         return self.power.power_off()
 
@@ -89,7 +89,7 @@ class Cabinet:
         tool = matrix_of(from_wire(offset))
         fix = inverted(tool) @ self.motion.tool
         self.fix = None if np.allclose(fix, np.eye(4), rtol=0.0, atol=1e-9) else fix
-        """From the configured tool centre point to the true tip; None where they are one."""
+        """From the configured tool centre point to the true tip; None if they are the same."""
         self._tool = tool
 
     def tool(self) -> Matrix:
@@ -110,7 +110,7 @@ class Cabinet:
         return [*(v / 1e3 for v in velocity[:3]), *velocity[3:]]
 
     def joints(self) -> Joints:
-        """The joints that put the tip where it is."""
+        """Joint positions for the present pose of the tip."""
         return self.motion.joints(self.now_s())
 
     def fk(self, q: list[float]) -> list[Any]:
@@ -118,7 +118,7 @@ class Cabinet:
         return [to_wire(pose_of(forward([float(v) for v in q]) @ self.tool())), 0]
 
     def ik(self, near: list[float], pose: list[float]) -> list[Any]:
-        """[joints, return code]; the joints are `near` where there is no solution."""
+        """[joints, return code]; the joints are `near` if there is no solution."""
         target = matrix_of(from_wire([float(v) for v in pose]))
         found = inverse(target @ inverted(self.tool()), near)
         return [list(near), IK_NO_CONVERGE] if found is None else [list(found), 0]
@@ -144,7 +144,7 @@ class Cabinet:
         return ReturnCode.OK
 
     def resume(self) -> int:
-        """Go on with a path that was held. Refused while a safety stop lasts."""
+        """Resume a path that was held. Refused while a safety stop lasts."""
         if self.power.mode != RobotMode.RUNNING:
             return -1
         if self.power.safety not in MOVING_ALLOWED:
@@ -153,14 +153,14 @@ class Cabinet:
         return ReturnCode.OK
 
     def set_speed_fraction(self, fraction: float) -> int:
-        """For every move that has not begun."""
+        """Scale the speed of every move that has not begun."""
         if not 0.0 < fraction <= 1.0:
             return -ReturnCode.INVALID_ARGUMENT
         self.motion.set_fraction(fraction, self.now_s())
         return ReturnCode.OK
 
     def set_watchdog(self, key: str, timeout_s: float, action: int) -> int:
-        """Start it again from now; action 0 ends it. It counts real time, as its client does."""
+        """Restart the watchdog `key` from now; action 0 ends it. It counts real time, as its client does."""
         if action not in (0, 1, 2, 3) or not timeout_s >= 0.1:
             return -ReturnCode.INVALID_ARGUMENT
         if (timer := self._timers.pop(key, None)) is not None:

@@ -1,7 +1,7 @@
 """The methods of the loopback controller by their names on the wire: those that it simulates, and those it refuses.
 
-A method that is known and not simulated answers the controller's own NOT_IMPLEMENTED. One whose answer is no return
-code is unknown here (-32601).
+A known method that is not simulated answers with the controller's own NOT_IMPLEMENTED. If its answer would not be a
+return code, it is unknown here (-32601).
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def methods(cabinet: Cabinet) -> Table:
 
 
 def refuse(_: Params) -> int:
-    """What a method answers that is not simulated, whatever its params."""
+    """Answer of a method that is not simulated, whatever its params."""
     return -ReturnCode.NOT_IMPLEMENTED
 
 

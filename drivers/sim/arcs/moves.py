@@ -1,7 +1,7 @@
-"""Moves of the loopback arm as clients queue them: who may move it, how fast and how far.
+"""Moves that clients queue for the loopback arm: when it may move, how fast and how far.
 
-A pose out of reach is accepted first and fails in planning, as in a controller. Speeds above what the arm allows are
-clipped. The joints' speeds are those of the maker's URDF for the i5; the other maxima are the examples of the SDK's
+A pose out of reach is accepted first and fails in planning, as on a controller. Speeds above what the arm allows are
+clipped. The joints' speeds are those of the maker's URDF for the i5; the other maxima are the examples in the SDK's
 headers, which are for an i5H. A real cabinet reports its own.
 """
 
@@ -22,10 +22,10 @@ JOINT_ACCS_RAD_S2 = (31.1, 31.1, 31.1, 20.7, 20.7, 20.7)
 TCP_SPEED_M_S, TCP_TURN_RAD_S = 2.0, 5.0
 TCP_ACC_M_S2, TCP_TURN_RAD_S2 = 10.0, 10.0
 REDUCED_M_S = 0.25
-"""Reduced mode and manual operation: ISO 10218-1 calls 250 mm/s reduced speed. A real cabinet is configured."""
+"""Limit in reduced mode and manual operation: ISO 10218-1 calls 250 mm/s reduced speed. Configurable in reality."""
 REACH_M = 0.8865
 REDUCED_RAD_S = REDUCED_M_S / REACH_M
-"""So slow that the tip of the stretched arm stays below `REDUCED_M_S`."""
+"""Joint speed at which the tip of the stretched arm stays below `REDUCED_M_S`."""
 POSE_OUT_OF_REACH = 30047
 BLEND_M = (0.001, 1.0)
 
@@ -41,7 +41,7 @@ class Moves:
         """Joints of the last pose that was asked for: the next one is likely to be near."""
 
     def methods(self) -> dict[str, Callable[[Params], Any]]:
-        """By `Class.method`, without the robot's name."""
+        """The methods by `Class.method`, without the robot's name."""
         cabinet, motion = self._cabinet, self._cabinet.motion
         positions = [math.radians(v) for v in LIMITS_DEG]
         return {
@@ -100,7 +100,7 @@ class Moves:
         return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
 
     def _admit(self, p: Params) -> int:
-        """Whether a move may be queued."""
+        """Return code for queueing a move: OK if it may be queued."""
         if self._cabinet.power.mode != RobotMode.RUNNING:
             return -1
         if self._cabinet.power.safety not in MOVING_ALLOWED:
@@ -115,21 +115,21 @@ class Moves:
         return ReturnCode.QUEUE_FULL if self._cabinet.motion.full else ReturnCode.OK
 
     def _pace(self, p: Params, fastest: float, hardest: float, reduced: float) -> tuple[float, float]:
-        """Speed and acceleration, clipped to what the arm allows; the maxima where only a duration was given."""
+        """Speed and acceleration, clipped to what the arm allows; the maxima if only a duration was given."""
         speed, acc = float(p["v"]), float(p["a"])
         slow = self._cabinet.power.safety == SafetyMode.REDUCED or self._cabinet.operational_mode == "Manual"
         limit = reduced if slow else fastest
         return min(speed, limit) if speed > 0.0 else limit, min(acc, hardest) if acc > 0.0 else hardest
 
     def _reachable(self, target: Pose) -> bool:
-        """Whether there are joints for a pose of the configured tool centre point."""
+        """Whether the arm can reach a pose of the configured tool centre point."""
         flange = matrix_of(target) @ inverted(self._cabinet.tool())
         found = inverse(flange, self._near) or inverse(flange, self._cabinet.motion.near)
         self._near = found or self._near
         return found is not None
 
     def _out_of_reach(self) -> int:
-        """Accepted, then found to be out of reach: the arm stops and a message says why."""
+        """Accept a move that then proves to be out of reach: the arm stops and a message says why."""
         self._cabinet.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2)
         self._cabinet.tell(POSE_OUT_OF_REACH)
         return ReturnCode.OK

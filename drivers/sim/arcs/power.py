@@ -8,7 +8,7 @@ from drivers.arcs.codes import MOVING_ALLOWED, ReturnCode, RobotMode, SafetyMode
 
 BOOT_S = 0.7
 POWER_ON_S = 1.0
-"""From `poweron` to Idle."""
+"""Time from `poweron` to Idle."""
 BRAKE_RELEASE_S = 1.0
 POWER_OFF_S = 0.3
 
@@ -16,14 +16,14 @@ EMERGENCY_STOPS = frozenset({SafetyMode.SYSTEM_EMERGENCY_STOP, SafetyMode.ROBOT_
 
 
 class Power:
-    """`now_s` is simulated time; transitions become true when their time has come."""
+    """Power and safety state. `now_s` is simulated time; each transition takes effect when it is due."""
 
     def __init__(self, now_s: Callable[[], float]) -> None:
         self._now_s = now_s
         self._steps: list[tuple[float, RobotMode]] = [(-1.0, RobotMode.POWER_OFF)]
         self.safety = SafetyMode.NORMAL
         self.button_down = False
-        """The emergency stop button: a person pushes and releases it."""
+        """Whether the emergency stop button is down; a person pushes and releases it."""
 
     @property
     def mode(self) -> RobotMode:
@@ -61,33 +61,33 @@ class Power:
         return ReturnCode.OK
 
     def press_emergency_stop(self, mode: SafetyMode) -> None:
-        """A person pushes the button: power is gone at once."""
+        """Push the button, as a person would: the power is off at once."""
         self.safety, self.button_down = mode, True
         self._then((0.0, RobotMode.POWER_OFF))
 
     def release_emergency_stop(self) -> None:
-        """A person releases the button. The board must then be restarted, then the power."""
+        """Release the button, as a person would. The board must then be restarted, then the power."""
         self.button_down = False
 
     def reset_safeguard(self) -> None:
-        """A person closes the safeguard and resets it at its own input; no method on the wire does."""
+        """Close and reset the safeguard at its input, as a person would; no method on the wire does this."""
         if self.safety == SafetyMode.SAFEGUARD_STOP:
             self.safety = SafetyMode.NORMAL
 
     def reduce(self, reduced: bool) -> None:
-        """The input for reduced mode opens or closes; a stop of any kind outlasts it."""
+        """Switch reduced mode on or off by its input; ignored during a stop of any kind."""
         if self.safety in MOVING_ALLOWED:
             self.safety = SafetyMode.REDUCED if reduced else SafetyMode.NORMAL
 
     def unlock(self) -> int:
-        """Clear a protective stop and nothing else. The arm does not go on by itself."""
+        """Clear a protective stop and nothing else. The arm does not resume by itself."""
         if self.safety != SafetyMode.PROTECTIVE_STOP:
             return ReturnCode.REQUEST_IGNORED if self.safety == SafetyMode.NORMAL else ReturnCode.BAD_STATE
         self.safety = SafetyMode.NORMAL
         return ReturnCode.OK
 
     def restart_interface_board(self) -> int:
-        """After an emergency stop, once the button is released and the power is off."""
+        """Clear an emergency stop or a fault, once the button is released and the power is off."""
         if self.button_down or self.mode != RobotMode.POWER_OFF:
             return ReturnCode.BAD_STATE
         if self.safety in EMERGENCY_STOPS or self.safety == SafetyMode.FAULT:

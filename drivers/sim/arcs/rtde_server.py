@@ -56,7 +56,7 @@ class RtdeServer(LoopbackServer):
 
     @property
     def mute(self) -> bool:
-        """While True, nothing is pushed (a fault that tests script)."""
+        """While True, nothing is pushed (a fault for tests)."""
         return self._muted is not None
 
     @mute.setter
@@ -68,7 +68,7 @@ class RtdeServer(LoopbackServer):
             self._muted = None
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Greet, then follow the client's topics until it goes."""
+        """Greet the client, then serve its topics until it disconnects."""
         outputs = {name: ident for name, (ident, _) in self._outputs.items()}
         hello = {"protocol": "rtde", "version": 1, "input": {"set_recipe": SET_RECIPE}, "output": outputs}
         writer.write(json.dumps(hello, separators=(",", ":")).encode() + b"\n\n")
@@ -102,8 +102,7 @@ class RtdeServer(LoopbackServer):
             await asyncio.sleep(due - loop.time())
 
     def _rests(self, after_s: float, until_s: float) -> list[Rest]:
-        """Where the arm rested between two pushes. With fast simulated time a whole
-        press might otherwise pass between two pushes."""
+        """Rests of the arm between two pushes. With fast simulated time a whole press might pass between them."""
         world = self._cabinet.world
         world.motion.advance(until_s)
         return [rest for rest in world.motion.rests if after_s < rest.at_s <= until_s] if world.clock.rate > 1.0 else []
@@ -135,7 +134,7 @@ class RtdeServer(LoopbackServer):
 
 
 def topic_of(payload: bytes) -> Topic:
-    """The subscription in a payload; a period of 0 where the client unsubscribes. Raises `ProtocolViolation`."""
+    """The subscription in a payload; a period of 0 if the client unsubscribes. Raises `ProtocolViolation`."""
     match decode_message(payload, "rtde"):
         case (100, [{"chanel": int(chanel), "frequency": float() | int() as hz, "segments": list(names)}]):  # pyright: ignore[reportUnknownVariableType]
             wanted = tuple(str(name) for name in names)  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]

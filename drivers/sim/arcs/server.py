@@ -1,4 +1,4 @@
-"""The loopback controller on the wire: ARCS JSON-RPC over TCP, written from what the maker's client was seen to do.
+"""The loopback controller on the wire: ARCS JSON-RPC over TCP, written from observations of the maker's client.
 
 One port takes SOF frames and bare JSON, named and positional params, ids of any kind; a connection's first byte decides
 its framing.
@@ -26,16 +26,16 @@ from drivers.sim.world import World
 
 PIECE_S = 0.001
 CUTS = (2, 6, 9)
-"""Cuts within the magic bytes, within the length, and just after the head of a frame."""
+"""Offsets at which a frame is split: in the magic bytes, in the length, and just after the head."""
 GARBAGE = b"\x00\xffnothing that anyone speaks\r\n"
 
 
 class Dropped(ConnectionError):
-    """The connection is to be closed instead of an answer."""
+    """The connection is to be closed without an answer."""
 
 
 class Replies:
-    """Replies of one connection on their way to the client, faults included."""
+    """Sends the replies of one connection, with faults applied to them."""
 
     def __init__(self, writer: asyncio.StreamWriter, frame: Callable[[bytes], bytes]) -> None:
         self._writer = writer
@@ -63,12 +63,12 @@ class Replies:
             case "garbage":
                 self._writer.write(GARBAGE)
             case _:
-                # In one piece: the vendor's client never recovers from a header that comes in two.
+                # In one piece: the vendor's client never recovers from a header that arrives in two.
                 self._writer.write(self._frame(answer))
         await self._writer.drain()
 
     def close(self) -> None:
-        """Forget replies that have not gone out yet."""
+        """Cancel replies that have not been sent yet."""
         for handle in self._late:
             handle.cancel()
         self._late.clear()
@@ -114,7 +114,7 @@ class ArcsServer(LoopbackServer):
         self.faults = FaultBoard(Truth(world))
         """Faults of this server; a rig shares one board among all its servers."""
         self._mutes: dict[str, int] = {}
-        """Faults that `mute` and `mute_to` have added, by method; "" is any."""
+        """Faults that `mute` and `mute_to` have added, by method; "" means any."""
         self._methods = methods(self.cabinet)
 
     async def stop(self) -> None:
@@ -123,11 +123,11 @@ class ArcsServer(LoopbackServer):
         await super().stop()
 
     def protective_stop(self, mode: SafetyMode = SafetyMode.PROTECTIVE_STOP) -> None:
-        """Enter a safety stop where the arm is (a fault that tests script); only a person clears it."""
+        """Enter a safety stop where the arm is (a fault for tests); only a person can clear it."""
         self.cabinet.safety_stop(mode)
 
     def stop_as(self, kind: str) -> None:
-        """Enter the safety stop that a fault of this kind asks for; `emergency-stop` takes the power too."""
+        """Enter the safety stop that a fault of this kind asks for; `emergency-stop` also switches the power off."""
         match kind:
             case "protective-stop":
                 self.cabinet.safety_stop(SafetyMode.PROTECTIVE_STOP)
@@ -138,7 +138,7 @@ class ArcsServer(LoopbackServer):
 
     @property
     def mute(self) -> bool:
-        """While True, requests are lost: neither carried out nor answered (a fault that tests script)."""
+        """While True, requests are lost: neither carried out nor answered (a fault for tests)."""
         return "" in self._mutes
 
     @mute.setter
@@ -150,7 +150,7 @@ class ArcsServer(LoopbackServer):
 
     @property
     def mute_to(self) -> set[str]:
-        """Methods that are carried out but never answered (a fault that tests script); set it as a whole."""
+        """Methods that are carried out but never answered (a fault for tests); assign a whole set."""
         return set(self._mutes) - {""}
 
     @mute_to.setter
@@ -182,7 +182,7 @@ class ArcsServer(LoopbackServer):
 
     @property
     def messages(self) -> list[dict[str, Any]]:
-        """What `Trace.peek` answers from."""
+        """The messages that `Trace.peek` returns."""
         return self.cabinet.messages
 
     @property
@@ -190,7 +190,7 @@ class ArcsServer(LoopbackServer):
         return self.cabinet.now_s()
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Answer requests in order. The motion queue goes on when the client has gone, as a cabinet's would."""
+        """Answer requests in order. The motion queue continues after the client disconnects, as a cabinet's would."""
         data = await reader.read(65536)
         bare = data[:1] in (b"{", b"[", b" ", b"\t", b"\r", b"\n")
         decoder = BareDecoder() if bare else FrameDecoder()
@@ -243,7 +243,7 @@ class ArcsServer(LoopbackServer):
 
 
 def _parsed(payload: bytes) -> Any:
-    """The request; where it is none that has a method, the reply as bytes."""
+    """The request; for a login or invalid JSON, the reply as bytes."""
     if payload.startswith(b"__login__"):
         return b"SUCCEED"
     try:
@@ -253,7 +253,7 @@ def _parsed(payload: bytes) -> Any:
 
 
 def _op(request: Any) -> str:
-    """The method's name, as faults know it."""
+    """The method's name, as faults refer to it."""
     match request:
         case b"SUCCEED":
             return "login"

@@ -1,4 +1,4 @@
-"""The i5's kinematics by its nominal table (modified DH): what the loopback controller answers for FK and IK.
+"""Kinematics of the i5 from its nominal table (modified DH), with which the loopback controller answers FK and IK.
 
 A real arm is calibrated and differs by most of a millimetre, so the driver always asks the controller.
 """
@@ -22,7 +22,7 @@ ALPHA_DEG = (0.0, -90.0, 180.0, 180.0, -90.0, 90.0)
 D_M = (0.122, 0.1215, 0.0, 0.0, 0.1025, 0.094)
 THETA_DEG = (180.0, -90.0, 0.0, -90.0, 0.0, 0.0)
 LIMITS_DEG: Joints = (175.0, 175.0, 175.0, 175.0, 175.0, 360.0)
-"""Either way from zero."""
+"""Limits of the joints in both directions from zero."""
 HOME: Joints = (0.0, math.radians(-15.0), math.radians(100.0), math.radians(25.0), math.radians(90.0), 0.0)
 
 CLOSE_M, CLOSE_RAD = 1e-7, 1e-7
@@ -52,16 +52,16 @@ def _frames(q: Sequence[float]) -> list[Matrix]:
 
 
 def forward(q: Sequence[float]) -> Matrix:
-    """The flange in the base frame, metres, as a 4x4 matrix. Raises ValueError unless there are six finite joints."""
+    """The flange in the base frame, metres, as a 4x4 matrix. Raises ValueError unless given six finite joints."""
     if len(q) != 6 or not all(math.isfinite(v) for v in q):
         raise ValueError(f"joints are six finite numbers, got {q!r}")
     return _frames(q)[-1]
 
 
 def inverse(target: Matrix, near: Sequence[float]) -> Joints | None:
-    """Joints that bring the flange to `target`, found from `near`, then from home turned toward the target.
+    """Joints that bring the flange to `target`, searched from `near`, then from home turned toward the target.
 
-    None where that does not converge within the joint limits.
+    None if the search does not converge within the joint limits.
     """
     toward = math.atan2(target[1, 3], target[0, 3])
     for seed in (near, (toward, *HOME[1:]), (toward + 0.3, *HOME[1:])):
@@ -72,7 +72,7 @@ def inverse(target: Matrix, near: Sequence[float]) -> Joints | None:
 
 
 def _descend(target: Matrix, q: Matrix) -> Matrix | None:
-    """Damped least squares; None where it has not arrived after `ITERATIONS`."""
+    """Solve by damped least squares; None if not converged after `ITERATIONS`."""
     for _ in range(ITERATIONS):
         frames = _frames(q.tolist())
         flange = frames[-1]
@@ -92,7 +92,7 @@ def _descend(target: Matrix, q: Matrix) -> Matrix | None:
 
 
 def _within(q: Matrix, near: Sequence[float]) -> Joints | None:
-    """Each joint by whole turns as near to `near` as its limit allows."""
+    """Shift each joint by whole turns, as near to `near` as its limit allows."""
     found: list[float] = []
     for value, close, limit_deg in zip(q.tolist(), near, LIMITS_DEG, strict=True):
         turns = [math.remainder(value, 2 * math.pi) + 2 * math.pi * k for k in (-1, 0, 1)]
@@ -119,6 +119,6 @@ def pose_of(matrix: Matrix) -> Pose:
 
 
 def inverted(matrix: Matrix) -> Matrix:
-    """The other way round."""
+    """The inverse transformation."""
     inverse_of: Matrix = np.linalg.inv(matrix).astype(np.float64)
     return inverse_of

@@ -1,6 +1,6 @@
-"""The loopback arm's motion: a queue of moves with trapezoidal timing and rounded corners, evaluated when asked.
+"""The loopback arm's motion: a queue of moves with trapezoidal timing and rounded corners, evaluated on demand.
 
-The result does not depend on when it is asked for. A later move may change how an earlier one ends, but only where that
+The result does not depend on when it is evaluated. A later move may change how an earlier one ends, but only if that
 agrees with the motion so far; otherwise the arm comes to rest between the two.
 """
 
@@ -26,12 +26,12 @@ SAME_POSE_MM = 1e-4
 SAME_POSE_DEG = 1e-4
 RESTS_KEPT = 64
 AGREES = 1e-6
-"""mm, rad or those per second: two timings that differ by less count as equal."""
+"""Two timings that differ by less count as equal; in mm, rad, mm/s or rad/s."""
 
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A piece of a move, with its time. `stop_s` cuts it: from then on it decelerates instead."""
+    """A timed piece of a move. If `stop_s` is set, it decelerates from then on instead."""
 
     ident: int
     path: Path
@@ -46,7 +46,7 @@ class Segment:
 
     @property
     def end_s(self) -> float:
-        """When it is over."""
+        """Time at which the piece ends."""
         if self.stop_s is None:
             return self.begin_s + self.ramp.duration_s
         done, speed = self.ramp.at(self.stop_s - self.begin_s)
@@ -66,11 +66,11 @@ class Segment:
         return self.path.pose(self.enter + self.at(now_s)[0])
 
     def joints(self, now_s: float) -> Joints | None:
-        """The joints at `now_s`, where the path is given in joints."""
+        """The joints at `now_s`; None if the path is not given in joints."""
         return self.path.joints(self.enter + self.at(now_s)[0])
 
     def way(self) -> list[Pose]:
-        """The travelled path as the ends of straight stretches."""
+        """The travelled path, as the vertices of a polyline."""
         total = self.at(self.end_s)[0]
         pieces = self.path.stretches
         return [self.path.pose(self.enter + total * k / pieces) for k in range(pieces + 1)]
@@ -89,20 +89,20 @@ class MotionQueue:
 
     def __init__(self, home: Pose, on_path: Callable[[Pose, Pose], None], capacity: int = 64) -> None:
         self.fraction = 1.0
-        """Share of its speed for every move that has not begun."""
+        """Speed factor for every move that has not begun."""
         self.near: Joints = HOME
-        """The joints where the arm was last seen: where inverse kinematics begins."""
+        """The last known joints, from which inverse kinematics starts."""
         self._rest = home
         self._rest_since_s = -1.0
         self._on_path = on_path
         self._capacity = capacity
         self._queue: deque[Segment] = deque()
         self._moves: list[Move] = []
-        """Every move that is not over, in order."""
+        """Every unfinished move, in order."""
         self._corners: Corners = {}
         self._next_id: int = 0
         self.rests: deque[Rest] = deque(maxlen=RESTS_KEPT)
-        """Where and when the arm came to rest, the newest ones."""
+        """The newest places and times at which the arm came to rest."""
 
     @property
     def full(self) -> bool:
@@ -111,12 +111,12 @@ class MotionQueue:
 
     @property
     def size(self) -> int:
-        """Moves that are queued or running; one that decelerates to a stop counts."""
+        """Number of moves queued or running, including one that decelerates to a stop."""
         return len({segment.ident for segment in self._queue})
 
     @property
     def running(self) -> Segment | None:
-        """The piece of the path that runs now; None at rest."""
+        """The piece of the path that is being travelled; None at rest."""
         return self._queue[0] if self._queue else None
 
     def add(
@@ -130,9 +130,9 @@ class MotionQueue:
         blend_mm: float = 0.0,
         fix: Matrix | None = None,
     ) -> bool:
-        """Append a line; False where the target is where the last move ends.
+        """Append a line; return False if the last move already ends at the target.
 
-        `target` is for the tool centre point that was configured, and `fix` leads from there to the true tip.
+        `target` is a pose of the configured tool centre point, and `fix` leads from there to the true tip.
         """
         self.advance(now_s)
         start = self._last() if fix is None else fixed(self._last(), inverted(fix))
@@ -204,7 +204,7 @@ class MotionQueue:
         self._replan(0, now_s)
 
     def _replan(self, first: int, now_s: float) -> None:
-        """Time anew what can still be changed, from the move at index `first` on or a later one."""
+        """Replan the timing that can still change, from the move at index `first` or a later one."""
         queue = list(self._queue)
         for k in range(first, len(self._moves)):
             chain = self._moves[k:]
@@ -233,7 +233,7 @@ class MotionQueue:
         self._queue = deque(queue)
 
     def _brake(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> tuple[Segment, float] | None:
-        """Come to rest on the path; (piece, distance within it) where that is, None where nothing was under way."""
+        """Come to rest on the path; return (piece, distance within it) of that place, or None if nothing was moving."""
         queue, self._moves = list(self._queue), []
         if not queue or queue[0].stops:
             self._queue = deque(s for s in queue if s.stops)
@@ -262,5 +262,5 @@ class MotionQueue:
 
 
 def _agree(old: Ramp, new: Ramp, t: float) -> bool:
-    """Whether the two timings have done the same by `t`."""
+    """Whether the two timings have the same distance and speed at `t`."""
     return all(abs(a - b) <= AGREES for a, b in zip(old.at(t), new.at(t), strict=True))

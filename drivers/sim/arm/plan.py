@@ -12,9 +12,9 @@ from drivers.sim.arm.paths import Corner, Line, Path
 
 @dataclass(frozen=True, slots=True)
 class Ramp:
-    """From `v_in` at `acc` to `speed`, along, at `acc` to `v_out`; `speed` is not reached where the way is short.
+    """A speed profile: from `v_in` at `acc` to `speed`, then at `acc` to `v_out`; a short path does not reach `speed`.
 
-    Lengths are in mm, or in rad where `angular`; time is in s. `v_in` and `v_out` must be within reach of each other.
+    Lengths are in mm, or in rad if `angular`; time is in s. `v_in` and `v_out` must be within reach of each other.
     """
 
     length: float
@@ -40,7 +40,7 @@ class Ramp:
         return sum(self._times())
 
     def at(self, t: float) -> tuple[float, float]:
-        """(distance, speed) at time `t`, held at the ends."""
+        """(distance, speed) at time `t`, clamped to the ends."""
         if t <= 0.0:
             return 0.0, self.v_in
         up_s, along_s, down_s = self._times()
@@ -65,9 +65,9 @@ class Ramp:
 
 
 def paced(length: float, speed: float, acc: float, duration_s: float, rests: int) -> float:
-    """The speed at which a way of `length` takes `duration_s`, and never more than `speed`.
+    """The speed at which a path of `length` takes `duration_s`, but at most `speed`.
 
-    `rests` counts the ends at which it is at rest. T(v) = length / v + rests v / (2 acc), solved for v.
+    `rests` is the number of ends at rest. T(v) = length / v + rests v / (2 acc), solved for v.
     """
     fastest = min(speed, math.sqrt(2.0 * acc * length / rests)) if rests else speed
     if not length or duration_s <= length / fastest + 0.5 * rests * fastest / acc:
@@ -80,7 +80,7 @@ def paced(length: float, speed: float, acc: float, duration_s: float, rests: int
 
 SHORTEST_CUT = 1e-6
 SLACK = 1e-9
-"""Tolerance of speeds for rounding."""
+"""Tolerance for rounding of speeds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,38 +93,38 @@ class Move:
     acc: float
     duration_s: float = 0.0
     blend_mm: float = 0.0
-    """How near to its end the tip may leave it for the next one; 0 ends at rest."""
+    """Distance from its end at which the tip may turn into the next move; 0 ends at rest."""
     enter: float = 0.0
-    """Where on its path it begins: after the corner that leads into it."""
+    """Distance along its path at which it begins: after the corner that leads into it."""
     lead: tuple[Path, float] | None = None
-    """What is left of that corner, and its speed, where the path was held in the middle of it."""
+    """Rest of that corner, and its speed, if the path was held within it."""
     held: bool = False
-    """Begins at rest at `enter`: the path was held there."""
+    """Whether it begins at rest at `enter`, because the path was held there."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A stretch of one move between two joints at which speeds are matched."""
+    """A stretch of one move between two junctions at which speeds are matched."""
 
     ident: int
     path: Path
     begin: float
-    """Where on the path it begins."""
+    """Distance along the path at which it begins."""
     length: float
     cap: float
     acc: float
     corner: bool = False
     even: bool = False
-    """A whole corner is taken at one speed: its acceleration is all needed for the bend."""
+    """True for a whole corner, taken at constant speed: the bend needs all of the acceleration."""
     from_rest: bool = False
 
 
 Corners = dict[tuple[int, int, float], Corner | None]
-"""By the two moves, and by where the first was held."""
+"""Corners by their two moves and the place where the first was held."""
 
 
 def corner_of(a: Move, b: Move) -> Corner | None:
-    """The corner between two moves, or None where the arm comes to rest between them."""
+    """The corner between two moves, or None if the arm comes to rest between them."""
     if a.blend_mm <= 0.0:
         return None
     match a.path, b.path:
@@ -138,7 +138,7 @@ def corner_of(a: Move, b: Move) -> Corner | None:
 def pieces_of(
     moves: Sequence[Move], fraction: float, corners_known: Corners, first_cap: float | None = None
 ) -> list[Piece]:
-    """The moves with their corners, in order. `first_cap` is the speed of a first move that has begun already.
+    """The pieces of the moves and their corners, in order. `first_cap` is the speed of a first move that has begun.
 
     `corners_known` is read and extended.
     """
@@ -176,9 +176,9 @@ def pieces_of(
 
 
 def speeds_of(pieces: Sequence[Piece], v_in: float) -> list[float] | None:
-    """Speeds at the joints, ends included, each as high as caps and accelerations allow; it ends at rest.
+    """Speeds at the junctions, ends included, each as high as caps and accelerations allow; the last is 0.
 
-    None where the arm, arriving with `v_in`, could not slow down in time.
+    None if the arm, arriving with `v_in`, could not slow down in time.
     """
     speeds = [0.0] * (len(pieces) + 1)
     for i in range(len(pieces) - 1, -1, -1):
@@ -198,7 +198,7 @@ def speeds_of(pieces: Sequence[Piece], v_in: float) -> list[float] | None:
 
 
 def ramps_of(pieces: Sequence[Piece], v_in: float) -> list[Ramp] | None:
-    """The timing of every piece, or None where there is none."""
+    """The timing of every piece, or None if the arm could not slow down in time."""
     speeds = speeds_of(pieces, v_in)
     if speeds is None:
         return None
@@ -209,5 +209,5 @@ def ramps_of(pieces: Sequence[Piece], v_in: float) -> list[Ramp] | None:
 
 
 def _rests(move: Move, enter: float) -> int:
-    """At how many of its ends the move is meant to be at rest."""
+    """Number of its ends at which the move is meant to be at rest."""
     return 2 - (enter > 0.0 and not move.held) - (move.blend_mm > 0.0)

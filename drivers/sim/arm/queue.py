@@ -1,4 +1,4 @@
-"""The arm's queue as a controller knows it: it also takes moves in joints, and can hold its path and go on."""
+"""The arm's queue with what a controller adds: moves in joints, and holding and resuming the path."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DT_S = 1e-3
 
 
 class ArmQueue(MotionQueue):
-    """A `MotionQueue` that knows joints, and can hold its path and go on with it. `tool` is the true flange to tip."""
+    """A `MotionQueue` with moves in joints, which can hold and resume its path. `tool` is the true flange to tip."""
 
     def __init__(
         self, home: Pose, on_path: Callable[[Pose, Pose], None], tool: Matrix | None = None, capacity: int = 64
@@ -31,16 +31,16 @@ class ArmQueue(MotionQueue):
 
     @property
     def size(self) -> int:
-        """Moves that are queued, running or held; one that decelerates into a hold counts once."""
+        """Number of moves queued, running or held; one that decelerates into a hold counts once."""
         return len(self._held) if self._held is not None else super().size
 
     @property
     def held(self) -> bool:
-        """True between `hold` and `resume`, also where nothing was under way."""
+        """True between `hold` and `resume`, even if nothing was moving."""
         return self._held is not None
 
     def add_joints(self, joints: Joints, speed_rad_s: float, acc_rad_s2: float, now_s: float, least_s: float) -> bool:
-        """Append a move that is straight in joints, from rest to rest; False where the arm will be there already."""
+        """Append a move that is straight in joints, from rest to rest; False if the arm will be there already."""
         self.advance(now_s)
         target = pose_of(forward(joints) @ self.tool)
         travel_mm, turn_deg = distance(self._last(), target)
@@ -58,7 +58,7 @@ class ArmQueue(MotionQueue):
         self._held = None
 
     def hold(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
-        """Decelerate on the path and keep it; the id stays that of the move in which the arm comes to rest."""
+        """Decelerate on the path and keep it; `exec_id` stays that of the move in which the arm comes to rest."""
         self.advance(now_s)
         if self._held is not None:
             return
@@ -80,7 +80,7 @@ class ArmQueue(MotionQueue):
         self._held = [first, *moves[rest + 1 :]]
 
     def resume(self, now_s: float) -> None:
-        """Go on with the path that was held, from where the arm came to rest."""
+        """Resume the path that was held, from where the arm came to rest."""
         self.advance(now_s)
         held, self._held = self._held, None
         if held:
@@ -101,7 +101,7 @@ class ArmQueue(MotionQueue):
         return self._held[0].ident if ident == -1 and self._held else ident
 
     def joints(self, now_s: float) -> Joints:
-        """The joints that put the tip where it is."""
+        """Joint positions for the present pose of the tip."""
         self.advance(now_s)
         exact = self._queue[0].joints(now_s) if self._queue else None
         return exact or self.near_joints(self.pose(now_s))
@@ -123,7 +123,7 @@ class ArmQueue(MotionQueue):
         return tuple(float(v) / DT_S for v in (*way, *turn.as_rotvec()))
 
     def joint_velocity(self, now_s: float) -> tuple[float, ...]:
-        """Of every joint in rad/s, over the next millisecond."""
+        """Velocity of every joint in rad/s, over the next millisecond."""
         self.advance(now_s)
         if not self._queue:
             return (0.0,) * 6
@@ -133,7 +133,7 @@ class ArmQueue(MotionQueue):
         return tuple((q - p) / DT_S for p, q in zip(a, b, strict=True))
 
     def near_joints(self, tip: Pose) -> Joints:
-        """The joints for a tip pose, near those seen last; those themselves where no solution is found."""
+        """The joints for a tip pose, near the last known ones; the last known ones if no solution is found."""
         self.near = inverse(matrix_of(tip) @ inverted(self.tool), self.near) or self.near
         return self.near
 

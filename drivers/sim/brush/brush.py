@@ -1,4 +1,4 @@
-"""The simulated brush: one individual brush, pressed on paper by mechanics and not by a stroke model.
+"""The simulated brush: one individual brush, whose marks come from mechanics and not from a stroke model.
 
 `docs/loopback-brush.md` gives the equations and their sources, and says what this brush is not.
 """
@@ -21,7 +21,7 @@ __all__ = ["Brush", "BrushSpec", "Flaw", "Footprint", "Waypoint"]
 
 LINKS = 48
 LEAST_DEPTH_MM = 1e-6
-"""A drag less deep leaves nothing."""
+"""A drag no deeper than this leaves no mark."""
 MAX_TILT_DEG = 30.0
 MAX_DEPTH = 0.9
 """Deepest press as a fraction of the ferrule's height at zero touch; beyond it the ferrule hits the paper."""
@@ -32,7 +32,7 @@ REMEMBERED_STANCES = 8
 
 @dataclass(frozen=True, slots=True)
 class BrushSpec:
-    """What one individual brush is made of; raises ValueError, naming value and range, if it is no brush."""
+    """Properties of one individual brush; raises ValueError, naming value and range, if one is out of range."""
 
     radius_mm: float = 6.0
     """Largest radius of the bundle."""
@@ -51,9 +51,9 @@ class BrushSpec:
     set_deg: float = 8.0
     """Set of the tip half toward -x, from the last wipe; never 0, or an upright brush stands on its tip."""
     bristles: int = 400
-    """Hairs that are followed one by one; each stands for several real ones."""
+    """Number of hairs simulated one by one; each stands for several real ones."""
     seed: int = 1
-    """The individual: its bristles and how they clump."""
+    """Seed of the individual: its bristles and how they clump."""
 
     def __post_init__(self) -> None:
         _within("radius_mm", self.radius_mm, 1.0, 20.0)
@@ -90,12 +90,11 @@ class Brush:
         flaw: Flaw | None = None,
         severity: float = 1.0,
     ) -> Footprint:
-        """Press once on fresh paper; equal arguments give equal bytes, another `press_seed` another natural
-        repeat.
+        """Press once on fresh paper; equal arguments give equal bytes, another `press_seed` another natural repeat.
 
         The frame's origin is where the tip touched; the brush tilts about it until the ferrule leans toward
         +x by `tilt_deg` and then descends. Columns grow with +x, rows with -y. The upright bundle bends
-        toward -x, its set. A depth of 0 or less leaves the paper blank; a flaw of severity 0 is none. Raises
+        toward -x, its set. A depth of 0 or less leaves the paper blank; a flaw of severity 0 has no effect. Raises
         ValueError, naming value and range, if `depth_mm` exceeds 0.9 length cos(tilt), or tilt is outside
         0 .. 30 deg, `ink_load` or `severity` outside 0 .. 1 (1 = freshly dipped), `px_per_mm` outside 2 .. 40,
         or `press_seed` is negative.
@@ -112,7 +111,7 @@ class Brush:
         return print_footprint(spine, self._tuft(press_seed, trouble), ink_load, px_per_mm, self._paper(press_seed))
 
     def deepest_mm(self, tilt_deg: float) -> float:
-        """Where the ferrule is about to hit the paper."""
+        """Depth at which the ferrule is about to hit the paper."""
         return MAX_DEPTH * self.spec.length_mm * math.cos(math.radians(min(tilt_deg, MAX_TILT_DEG)))
 
     def push_n(self, depth_mm: float, tilt_deg: float) -> Vector:
@@ -134,7 +133,7 @@ class Brush:
 
         The mark's frame lies along the paper's: its origin is the first waypoint, columns grow with +x, rows with -y.
         `heading_deg` is where the ferrule leans, or would lean, when the tip lands; from there on the bundle trails.
-        Raises ValueError as `press` does, and where there is no waypoint. No depth above 0 leaves the paper blank.
+        Raises ValueError as `press` does, and if there is no waypoint. If no depth exceeds 0, the paper stays blank.
         """
         if not path:
             raise ValueError("a drag needs at least one waypoint")
@@ -159,7 +158,7 @@ class Brush:
         _within("press_seed", press_seed, 0, 2**63 - 1)
         _within("depth_mm", depth_mm, -math.inf, self.deepest_mm(tilt_deg))
 
-    # two streams, so that the paper does not shift when the number of bristles changes
+    # two random streams, so that the paper does not change with the number of bristles
     def _tuft(self, press_seed: int, trouble: Trouble | None) -> Tuft:
         lie_rng = np.random.default_rng([self.spec.seed, press_seed, 0])
         return Tuft(self._bundle, self._bristles, draw_wander(self.spec.bristles, lie_rng), trouble)
@@ -197,8 +196,7 @@ def _bundle(spec: BrushSpec) -> Bundle:
 
 
 def _profile(spec: BrushSpec, from_ferrule_mm: NDArray[np.floating]) -> Vector:
-    """Free radius along the bundle: a slight belly at 0.3 of the length, then a hollow taper to a fine
-    tip."""
+    """Free radius along the bundle: a slight belly at 0.3 of the length, then a hollow taper to a fine tip."""
     u = np.asarray(from_ferrule_mm / spec.length_mm, np.float64)
     root = 0.95 + 0.05 * np.sin(0.5 * np.pi * np.minimum(u / 0.3, 1.0))
     taper = 1.0 - np.clip((u - 0.3) / 0.7, 0.0, 1.0) ** 0.85

@@ -1,4 +1,4 @@
-"""Contact of brush and paper: each one from touching to lifting off, and the wrench on the force sensor meanwhile."""
+"""Contacts of brush and paper, each from touch to lift-off, and the wrench on the force sensor meanwhile."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Contact:
 
     poses: tuple[Pose, ...]
     deepest: Pose
-    """The first of those farthest below the plane."""
+    """The pose farthest below the plane; the first if there are several."""
 
     @property
     def dragged(self) -> bool:
-        """False for a press. Withdrawing along the brush's own axis is no drag, be it tilted."""
+        """False for a press. Withdrawing along the brush's own axis is not a drag, even if it is tilted."""
         return sum(_sideways_mm(a, b) for a, b in itertools.pairwise(self.poses)) > SIDEWAYS_MM
 
 
@@ -46,7 +46,7 @@ class ContactWatch:
         self._poses: list[Pose] = []
 
     def travelled(self, start: Pose, end: Pose) -> Contact | None:
-        """Take one straight stretch; the contact that it ended, if it ended one."""
+        """Add one straight stretch; return the contact that it ended, or None."""
         high, low = self._above_mm(start), self._above_mm(end)
         if high < 0.0 or low < 0.0:
             if not self._poses:
@@ -67,7 +67,7 @@ def _sideways_mm(a: Pose, b: Pose) -> float:
 
 
 TILTS_DEG = (0.0, 7.5, 15.0, 30.0)
-"""Where the push is solved for; between them it is interpolated."""
+"""Tilts for which the push is solved; between them it is interpolated."""
 GRAVITY_M_S2 = 9.81
 LEVEL = (0.0, 0.0, 1.0)
 
@@ -86,7 +86,7 @@ class Reaction:
         self._table: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
     def prepare(self) -> None:
-        """Solve the spines; takes some tenths of a second, so call it off the loop. Once is enough."""
+        """Solve the spines; takes some tenths of a second, so call it outside the event loop. Once is enough."""
         if self._table is not None:
             return
         self._table = _pushes(self._brush.spec)
@@ -113,7 +113,7 @@ class Reaction:
 
 
 def leaning_with(pose: Pose, normal: tuple[float, float, float]) -> Pose:
-    """The pose in a frame whose z is the paper's normal, turned out of the base frame by the least angle."""
+    """The pose in a frame whose z is the paper's normal, rotated from the base frame by the least angle."""
     if normal == LEVEL:
         return pose
     axis = np.cross(normal, LEVEL)  # its length is the sine of the angle

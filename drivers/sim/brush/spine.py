@@ -67,7 +67,7 @@ class SpineShape:
     phi_rad: Vector
     """(n,) link angles from straight down, positive toward -x."""
     squash_mm: Vector
-    """(n,) how far the free cross-section would reach below the paper; negative where it is clear of it."""
+    """(n,) how far the free cross-section would reach below the paper; negative where it is clear."""
     normal_n: Vector
     """(n,) contact force on each node, upward, without the pull of the menisci."""
 
@@ -98,8 +98,8 @@ def rest_spine(bundle: Bundle, tilt_rad: float) -> SpineShape:
 def pull_spine(bundle: Bundle, depth_mm: int, tilt_rad: float) -> tuple[SpineShape, ...]:
     """The spine while the ferrule is drawn toward +x at depths of 1, 2 .. `depth_mm` mm.
 
-    Positions are relative to the ferrule as in `press_spine`. The bundle slides all the time, so friction forgets how
-    it came down; the ferrule advances half a mm with each load step, and once more on the level.
+    Positions are relative to the ferrule as in `press_spine`. The bundle slides all the time, so the result does
+    not depend on how it came down; the ferrule advances half a mm with each load step, and once more at each depth.
     """
     start = _unloaded(bundle, tilt_rad)
     phi, last_x, last_normal = tilt_rad + np.cumsum(bundle.rest_bend_rad), start.last_x, start.last_normal
@@ -136,7 +136,7 @@ class _LoadStep:
     last_normal: Vector
 
     def moved(self, gone_mm: float, lowered_mm: float, last_x: Vector, last_normal: Vector) -> _LoadStep:
-        """The next load step: the ferrule that far along +x and down, after the given positions and forces."""
+        """The next load step, the ferrule moved along +x and down; positions and forces are those of the last step."""
         clamp_x, clamp_z = self.clamp_x + gone_mm, self.clamp_z - lowered_mm
         return _LoadStep(self.bundle, self.tilt_rad, clamp_x, clamp_z, last_x, last_normal)
 
@@ -172,7 +172,7 @@ class _LoadStep:
         return float(stored + self.bundle.friction * self.last_normal @ slid)
 
     def derivatives(self, phi: Vector) -> tuple[float, Vector, Vector]:
-        """Energy, its gradient (n,) and a Hessian (n, n) rid of concave terms if need be."""
+        """Energy, its gradient (n,) and a Hessian (n, n), without its concave terms if it is not convex."""
         b, ds, n = self.bundle, self.bundle.link_mm, phi.size
         x, z = self._nodes(phi)
         sin, cos = np.sin(phi), np.cos(phi)

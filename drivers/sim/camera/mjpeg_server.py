@@ -21,16 +21,16 @@ from drivers.sim.faults.kinds import KINDS, Device
 from drivers.sim.server import LoopbackServer
 
 NOISE_LEVELS = 6
-"""A covered sensor is not quite zero."""
+"""Number of gray levels of a covered sensor, which is not quite black."""
 
 
 def dark(shape: tuple[int, ...], seed: int) -> NDArray[np.uint8]:
-    """An image of this shape from under a lens cap."""
+    """An image of this shape as taken with the lens cap on."""
     return np.random.default_rng(seed).integers(0, NOISE_LEVELS, shape, np.uint8)
 
 
 def renumbered(jpeg: bytes, number: int) -> bytes:
-    """The same picture in other bytes: a JPEG comment with a number, after the two bytes of the start."""
+    """The same picture with other bytes: a JPEG comment with a number is inserted after the two start bytes."""
     text = b"%d" % number
     comment = b"\xff\xfe" + (len(text) + 2).to_bytes(2, "big") + text
     return jpeg[:2] + comment + jpeg[2:]
@@ -75,7 +75,7 @@ class _Line:
 
 
 class MjpegServer(LoopbackServer):
-    """Serves `/stream.mjpg`. A client that does not drain is sent the newest image next, never a backlog."""
+    """Serves `/stream.mjpg`. A client that reads too slowly is sent the newest image next, never a backlog."""
 
     def __init__(self, scene: Scene, *, fps: float, jpeg_quality: int, view: View | None = None) -> None:
         """`view` gives the delay of pictures; without it they are sent at once."""
@@ -86,7 +86,7 @@ class MjpegServer(LoopbackServer):
         self._quality = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
         self._rendering = asyncio.Lock()
         self._coded: deque[tuple[NDArray[np.uint8], bytes]] = deque(maxlen=NOISE_FIELDS)
-        """The newest images of the scene, which are handed out again while nothing changes, and their JPEGs."""
+        """The newest images of the scene and their JPEGs, reused while nothing changes."""
         self.faults: FaultBoard | None = None
         """Faults of this server; a rig shares one board among all its servers."""
 
@@ -134,7 +134,7 @@ class MjpegServer(LoopbackServer):
         return fault.kind if fault is not None else ""
 
     async def _send(self, held: deque[bytes], line: _Line) -> bytes:
-        """Everything that is held, oldest first; returns the last."""
+        """Send everything that is held, oldest first; return the last image."""
         image = b""
         while held:
             image = held.popleft()
@@ -144,8 +144,8 @@ class MjpegServer(LoopbackServer):
 
     async def _jpeg(self, *, black: bool = False) -> bytes:
         async with self._rendering:  # the scene keeps a cache: one thread at a time
-            # The stamp first, so that no frame shows anything older than it says; the tool here, because the
-            # motion queue belongs to the event loop's thread.
+            # Read the time first, so that no frame shows anything older than its stamp. Read the tool here, because
+            # the motion queue belongs to the event loop's thread.
             host_ns, tool = time.time_ns(), self._scene.tool()
             return await asyncio.to_thread(self._encode, host_ns, tool, black)
 

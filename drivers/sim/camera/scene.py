@@ -21,7 +21,7 @@ SHADOW_SOFTNESS = 0.02
 
 
 class Optics:
-    """From the paper plane to pixels, and from even light to what falls on the sheet."""
+    """Projection of the paper plane to pixels, and the uneven light on the sheet."""
 
     def __init__(self, view: View, seed: int) -> None:
         self.homography = homography(view)
@@ -42,7 +42,7 @@ class Optics:
         return np.asarray(distorted, np.float64).reshape(-1, 2)
 
     def distort(self, undistorted: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """An image as this lens would have taken it; the same where the lens is perfect."""
+        """An image as this lens would have taken it; the same if the lens is perfect."""
         if self._map is None:
             return undistorted
         distorted = cv2.remap(undistorted, self._map, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -90,10 +90,10 @@ TABLE_GRAY = 120
 PAPER_GRAY = 228
 INK_REFLECTANCE = 0.06
 TOOL_CLEAR_MM = 60.0
-"""Half the width of what the arm hides when it is over the sheet."""
+"""Radius of the disc that the arm hides when it is over the sheet."""
 NOISE_FIELDS = 4
 MARGIN_MM = 15.0
-"""Table around the board."""
+"""Width of the strip of table drawn around the board."""
 
 
 def board(table: Table) -> cv2.aruco.CharucoBoard:
@@ -105,7 +105,7 @@ def board(table: Table) -> cv2.aruco.CharucoBoard:
 class Scene:
     """Renders the world. The sheet is warped only when it has changed; each frame's noise differs from the last one's.
 
-    While nothing changes in view, one of `NOISE_FIELDS` finished frames is handed out again.
+    While nothing changes in view, one of `NOISE_FIELDS` finished frames is reused.
     """
 
     def __init__(self, world: World) -> None:
@@ -117,20 +117,20 @@ class Scene:
         self.paper_to_image = self.optics.homography
         self._plane_to_image = self._raster_to_image()
         self._finished: dict[int, tuple[tuple[int, int] | None, NDArray[np.uint8]]] = {}
-        """By noise field: where the tool's disc lay, and the frame. For the sheet as it is lit now."""
+        """By noise field: the place of the tool's disc, and the frame. Valid for the sheet as it is lit now."""
         self._lit: NDArray[np.float32] | None = None
         self._lit_version = -1
         self._count = 0
 
     def tool(self) -> Pose:
-        """Where the tool is now. Moves the world on, so only the thread that owns the world may ask."""
+        """Pose of the tool now. Advances the world, so only the thread that owns the world may call it."""
         return self._world.tool()
 
     def render(self, host_ns: int = 0, tool: Pose | None = None) -> NDArray[np.uint8]:
-        """A (height, width) gray image of the world now; `host_ns` goes into the strip where the view has one.
+        """A (height, width) gray image of the world now; `host_ns` goes into the strip if the view has one.
 
-        With `tool` given it only reads, and may run in another thread. The same array, which nobody may write to, is
-        returned again for as long as it shows the same.
+        With `tool` given it only reads the world, and may run in another thread. Do not write to the array: it is
+        returned again while the picture does not change.
         """
         tool = tool or self.tool()
         if self._lit is None or self._lit_version != self._world.version:
@@ -182,7 +182,7 @@ class Scene:
         return round(TOOL_CLEAR_MM * self._world.config.view.px_per_mm)
 
     def _tool_disc(self, tool: Pose) -> tuple[int, int] | None:
-        """Pixel at the centre of the disc that the arm hides; None where all of it lies outside the image."""
+        """Pixel at the centre of the disc that the arm hides; None if all of it lies outside the image."""
         view, radius_px = self._world.config.view, self._disc_radius_px
         x_mm, y_mm = self._world.to_paper(tool.x_mm, tool.y_mm)
         [[u, v]] = self.optics.image_of(np.array([[x_mm, y_mm]]))
@@ -211,7 +211,7 @@ def _sheet_slices(table: Table) -> tuple[slice, slice]:
 def _draw(
     table: Table, seed: int, noise: float, shape: tuple[int, int]
 ) -> tuple[NDArray[np.uint8], list[NDArray[np.float32]]]:
-    """The blank sheet on its board, and fields of noise in `shape`: the same for every rig of this configuration."""
+    """The blank sheet on its board, and fields of noise of `shape`: the same for every rig of this configuration."""
     rng = np.random.default_rng([seed, 7])
     (left_mm, bottom_mm), size_mm = _extent(table)
     width, height = (round(v * PX_PER_MM) for v in size_mm)
@@ -242,7 +242,7 @@ def draw_strip(frame: NDArray[np.uint8], host_ns: int) -> None:
 
 
 def read_strip(frame: NDArray[np.uint8]) -> int:
-    """The inverse of `draw_strip`, through JPEG."""
+    """Read the number that `draw_strip` wrote, also after JPEG compression."""
     row = frame[STRIP_PX // 2 : STRIP_PX * 3 // 2, : STRIP_BITS * STRIP_PX].mean(axis=0)
     blocks = row.reshape(STRIP_BITS, STRIP_PX)[:, 2:-2].mean(axis=1) > 127
     return sum(1 << i for i, bit in enumerate(blocks) if bit)

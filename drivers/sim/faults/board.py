@@ -19,7 +19,7 @@ MOST = 1000
 
 
 class Watched(Protocol):
-    """What triggers look at; `drivers.sim.faults.truth.Truth` in a rig."""
+    """State that triggers depend on; `drivers.sim.faults.truth.Truth` in a rig."""
 
     @property
     def presses(self) -> int:
@@ -60,7 +60,7 @@ class FaultBoard:
         self._idents = itertools.count(1)
         self._hanging: tuple[Hung, ...] = ()
         self.over: deque[Hung] = deque(maxlen=KEPT)
-        """The newest faults whose extent is over."""
+        """The newest finished faults."""
 
     def hang(self, fault: Fault) -> int:
         """Add a fault; return the number by which it can be removed. Raises ValueError above `MOST`."""
@@ -71,7 +71,7 @@ class FaultBoard:
         return hung.ident
 
     def take(self, ident: int) -> bool:
-        """Remove one; False where there is none of that number."""
+        """Remove a fault; return False if none has that number."""
         before = self._hanging
         self._hanging = tuple(hung for hung in before if hung.ident != ident)
         return len(self._hanging) < len(before)
@@ -83,7 +83,7 @@ class FaultBoard:
 
     @property
     def hanging(self) -> tuple[Hung, ...]:
-        """Faults that wait or strike."""
+        """Faults that are waiting or active."""
         self._expire()
         return self._hanging
 
@@ -101,7 +101,7 @@ class FaultBoard:
         return None
 
     def due(self) -> list[Fault]:
-        """Faults that begin by themselves and do so now; they are finished with that."""
+        """Faults that begin by themselves and are due now; they count as finished."""
         begun = [hung for hung in self._hanging if hung.fault.by_itself and self._holds(hung.fault)]
         for hung in begun:
             hung.struck = hung.fault.strikes or 1

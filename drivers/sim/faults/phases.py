@@ -1,4 +1,4 @@
-"""The phase of the arm, from where its tip really is and where it goes, not from what a client asked for."""
+"""The phase of the arm, from the true place and motion of its tip, not from what a client asked for."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from drivers.sim.config import Table
 from drivers.sim.world import World
 
 ON_PAPER_MM = 0.1
-"""The paper's height is taught with an error: a tip that ends or rests this little above it counts as on it."""
+"""A tip that ends or rests no higher than this counts as on the paper, whose height is taught with an error."""
 ALL_BUT_THERE_MM = 0.1
-"""A dwell is the very slow end of a descent."""
+"""Remaining descent that counts as pressed: a dwell is the very slow end of a descent."""
 LIFT_MM = 10.0
 """Height below which rising counts as lifting."""
 HOME_MM = 1.0
@@ -52,7 +52,7 @@ class Spot:
 
 
 def phase_of(table: Table, home: Spot, here: Spot, to: Spot | None) -> Phase:
-    """The phase of a tip at `here`, on its way to `to`; None where it rests."""
+    """The phase of a tip at `here`, on its way to `to`, which is None at rest."""
     heights = [spot.height_mm for spot in (here, to) if spot is not None]
     if _over_well(table, here) and min(heights) < table.well_depth_mm:
         return Phase.DIPPING
@@ -94,7 +94,7 @@ class Truth:
         return len(self._world.presses)
 
     def target(self) -> Pose | None:
-        """Where the piece of the path that runs now ends; None at rest."""
+        """End of the piece of the path that is being travelled; None at rest."""
         queue = self._world.motion
         queue.advance(self.now_s())
         line = queue.running

@@ -57,7 +57,7 @@ class ForceBoard:
         self._faults.extend(faults)
 
     def obey(self, frame: CanFrame) -> None:
-        """Obey one frame from the bus; other frames than commands are ignored."""
+        """Carry out a command frame from the bus; ignore other frames."""
         if frame.can_id == COMMAND_ID and not frame.error:
             self.commands.append(frame.data)
             if frame.data in (START, STOP):
@@ -118,7 +118,7 @@ class SocketcandServer(LoopbackServer):
             self._streaming = None
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Greet, then carry frames both ways until the client goes."""
+        """Greet the client, then relay frames both ways until it disconnects."""
         writer.write(b"< hi >")
         try:
             while True:
@@ -155,7 +155,7 @@ class SocketcandServer(LoopbackServer):
 
 
 async def _command(reader: asyncio.StreamReader) -> str:
-    """The words between `<` and `>`. Raises `ProtocolViolation`, `IncompleteReadError` where the client went."""
+    """The words between `<` and `>`. Raises `ProtocolViolation`, `IncompleteReadError` if the client disconnected."""
     try:
         raw = await reader.readuntil(b">")
     except asyncio.LimitOverrunError:
@@ -176,7 +176,7 @@ def _frame(can_id: str, length: str, data: list[str]) -> CanFrame:
 
 
 def _ascii(frame: CanFrame) -> str:
-    # Real time: it stands for the adapter's clock, whatever the pace of the simulated world.
+    # Real time, as of the adapter's clock, whatever the rate of the simulated world.
     if frame.error:
         return f"< error {frame.can_id:03X} {time.time():.6f} >"
     return f"< frame {frame.can_id:03X} {time.time():.6f} {frame.data.hex().upper()} >"

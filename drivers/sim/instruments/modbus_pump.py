@@ -14,7 +14,7 @@ FULL_SPEED = 2
 
 
 class PumpFirmware:
-    """A simulated pump that turns by `now_s`; its delivery can be read at any time."""
+    """A simulated pump with `now_s` as its clock; the pumped volume can be read at any time."""
 
     def __init__(
         self,
@@ -48,7 +48,7 @@ class PumpFirmware:
         return self._pumped_ml
 
     def take(self, buffer: bytearray) -> bytes | None:
-        """Eight bytes, the length of every request that it knows."""
+        """Take eight bytes, the length of every known request; None if there are fewer."""
         if len(buffer) < WRITE_BYTES:
             return None
         frame = bytes(buffer[:WRITE_BYTES])
@@ -56,7 +56,7 @@ class PumpFirmware:
         return frame
 
     def answer(self, request: bytes) -> bytes | None:
-        """Silence for a wrong CRC or another unit, as Modbus wants it."""
+        """The reply; None for a wrong CRC or another unit, as Modbus requires."""
         try:
             unit, function, *_ = unseal(request)
         except ProtocolViolation:
@@ -79,7 +79,7 @@ class PumpFirmware:
         return request
 
     def damage(self, reply: bytes) -> bytes:
-        """The last byte of the CRC changed."""
+        """The reply with the last byte of its CRC changed."""
         return reply[:-1] + bytes([reply[-1] ^ 0x55])
 
     def mistake(self, reply: bytes) -> bytes:
