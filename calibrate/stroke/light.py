@@ -1,4 +1,4 @@
-"""The light on the paper, taken out: reflectance relative to the paper around."""
+"""Removal of uneven lighting: reflectance relative to the surrounding paper."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ PAPER_ABOVE = 0.85
 
 
 def flatten(raster: Gray, params: Params) -> Soft:
-    """Reflectance relative to the paper around it: 1 is paper, whatever the light does."""
+    """Return reflectance relative to the surrounding paper: 1 is paper under any lighting."""
     # At an eighth of the size: the light is smooth, and a window of 32 mm is 640 px at full size.
     shrink = 8
     small = cv2.resize(raster, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
-    # The slope of the light first: closing alone would take the dark end of a slope for a stroke at the edge.
+    # Remove the gradient first: closing alone would mistake its dark end for a stroke at the edge.
     slope = light_surface(cast("Gray", small))
     level = (cv2.medianBlur(small, 5) / slope).astype(np.float32)
     side = round(params.background_mm * PX_PER_MM / shrink) | 1
@@ -33,7 +33,7 @@ def flatten(raster: Gray, params: Params) -> Soft:
 
 
 def light_surface(small: Gray) -> Floats:
-    """A quadratic surface through the paper, (h, w), at least 1: pixels well below it are ink and left out."""
+    """Fit a quadratic surface to the paper, (h, w), at least 1; pixels well below it are ink and are left out."""
     height, width = small.shape
     y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
     basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1).reshape(-1, 6)
@@ -41,7 +41,7 @@ def light_surface(small: Gray) -> Floats:
     paper = np.ones(values.size, np.bool_)
     surface = values
     for _ in range(LIGHT_ROUNDS):
-        # By the normal equations: six columns of order 1 are well conditioned, a tall solve would wake BLAS threads.
+        # Normal equations: six columns of order 1 are well conditioned, and a tall solve would start BLAS threads.
         kept = basis[paper]
         coefficients, *_rest = np.linalg.lstsq(kept.T @ kept, kept.T @ values[paper], rcond=None)
         surface = np.maximum(basis @ coefficients, 1.0)

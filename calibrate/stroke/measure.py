@@ -21,13 +21,13 @@ class Measured:
     length_mm: float
     """Extent along the heading."""
     width_mm: float
-    """Diameter of the largest circle that fits inside the outline: the width at its widest, bent or not."""
+    """Diameter of the largest circle that fits inside the outline: the greatest width, also of a bent stroke."""
     mid_width_mm: float
-    """The same over the middle third of the length: free of the blobs where a drag begins and ends."""
+    """The same over the middle third of the length, without the blobs where a drag begins and ends."""
     breadth_mm: float
-    """Greatest thickness across the heading; only for a straight stroke is this its width."""
+    """Greatest extent across the heading; equals the width only for a straight stroke."""
     area_mm2: float
-    """Ink, without the holes in it."""
+    """Area of the ink, without its holes."""
 
 
 def measure(mask: Mask) -> Measured:
@@ -60,5 +60,5 @@ def outline(mask: Mask) -> NDArray[np.uint8]:
 
 
 def _diameter_mm(reach_px: float) -> float:
-    # The transform measures from pixel centre to the nearest paper centre: half a pixel more than to the edge.
+    # The transform measures to the centre of the nearest paper pixel, half a pixel farther than the edge.
     return 2.0 * (reach_px - 0.5) / PX_PER_MM

@@ -1,4 +1,4 @@
-"""The raster that strokes are measured on, and the named parameters of how they get there."""
+"""The raster that strokes are measured on, and the parameters of the preprocessing."""
 
 from __future__ import annotations
 
@@ -12,21 +12,20 @@ Soft = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 PX_PER_MM = 20.0
-"""The raster that strokes are measured on (0.05 mm a pixel)."""
+"""Resolution of the raster that strokes are measured on (0.05 mm a pixel)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Params:
-    """Named parameters of the preprocessing; they go into the calibration's artefact."""
+    """Parameters of the preprocessing; they are stored in the calibration's artefact."""
 
     background_mm: float = 32.0
-    """Size of the window that follows the light; a stroke thicker than this would be taken for shadow."""
+    """Window for estimating the lighting; a stroke thicker than this would be mistaken for shadow."""
     contrast_gate: float = 0.25
-    """Darkest ink must lie this far below paper, else the capture is blank: Otsu would call paper ink."""
+    """Least contrast of the darkest ink; below it the capture is blank, and Otsu would call paper ink."""
     speck_share: float = 0.01
     """Components below this share of the main one are specks."""
     join_mm: float = 1.5
     """Components farther than this from the main one belong to other strokes."""
     hole_mm2: float = 0.0
-    """Holes in the stroke up to this area are filled, as glare on wet ink leaves them; 0 keeps them: dry ink has
-    holes too."""
+    """Largest hole to fill, such as glare on wet ink leaves; 0 keeps all holes, since dry ink has them too."""

@@ -1,6 +1,6 @@
-"""From a 20 px/mm raster to a stroke: flatten the light, gate the contrast, threshold, choose components.
+"""Extraction of a stroke from a 20 px/mm raster: flatten the light, gate the contrast, threshold, choose components.
 
-Everything after this works on `Prepared`: a binary mask and soft ink at 20 px/mm, with the anchor where it is known.
+All later steps work on `Prepared`: a binary mask and soft ink at 20 px/mm, with the anchor if it is known.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ GATE_MM2 = 1.0
 SATURATED = 254
 MOST_SATURATED = 0.5
 OTHER_MM2 = 2.0
-"""A component of this area that does not belong to the stroke is another stroke and no splash."""
+"""Least area of a further component that counts as another stroke, not as a splash."""
 GLARE_ABOVE, GLARE_MM2 = 1.12, 2.0
-"""Fibres, noise and the edge of a shadow stay below this share of the light; more of it is a lamp's reflection."""
+"""Brightness relative to paper, and area, above which glare is flagged; fibres, noise and shadow edges stay below."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,24 +39,24 @@ class Prepared:
     threshold: float
     """Reflectance below which a pixel counts as ink."""
     cut: bool
-    """True where the stroke reaches the edge of its photograph or cell: its length and area are lower bounds."""
+    """Whether the stroke reaches the edge of its photograph or cell; length and area are then lower bounds."""
     flags: tuple[str, ...] = ()
-    """What is wrong with the capture, though a stroke was found."""
+    """Defects of the capture, although a stroke was found."""
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """Where ink ends and paper begins, as fitted on one capture."""
+    """Threshold between ink and paper in one capture."""
 
     darkest: float
-    """Reflectance that `GATE_MM2` of ink stays under."""
+    """Highest reflectance within the darkest `GATE_MM2` of the capture."""
     threshold: float
-    """By Otsu's method, on 256 levels."""
+    """Threshold by Otsu's method, on 256 levels."""
 
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """Every intermediate result of the preprocessing, for looking at."""
+    """Every intermediate result of the preprocessing, for inspection."""
 
     window: tuple[slice, slice]
     """Rows and columns of the raster that show the paper cell; nothing outside is used."""
@@ -78,7 +78,7 @@ def prepare(
 ) -> Prepared:
     """Find the stroke on a 20 px/mm raster. `cell_px` (x, y, w, h) hides everything outside the paper cell.
 
-    Raises `CaptureRefused` for a blank raster, or where nothing is left after cleaning.
+    Raises `CaptureRefused` if the raster is blank or nothing is left after cleaning.
     """
     return preprocess(raster, anchor_px, where, params, cell_px).prepared
 
@@ -90,9 +90,9 @@ def preprocess(
     params: Params,
     cell_px: tuple[int, int, int, int] | None = None,
 ) -> Steps:
-    """The same, with all intermediate results."""
+    """Find the stroke as `prepare` does, and return all intermediate results."""
     window = _cell_window(raster, cell_px, where)
-    # Only the cell: neighbours' ink and the table's edge are no paper to measure the light by.
+    # Only the cell: neighbours' ink and the table's edge would distort the estimated lighting.
     reflectance = np.ones(raster.shape, np.float32)
     reflectance[window] = flatten(raster[window], params)
     level = _find_level(reflectance[window], where, params)
@@ -108,8 +108,8 @@ def preprocess(
 
 
 def _find_level(reflectance: Soft, where: str, params: Params) -> Level:
-    """The contrast gate, then Otsu's threshold. Raises `CaptureRefused` where there is no ink to speak of."""
-    # The reflectance that at least GATE_MM2 of ink stays under: an area, so that the picture's size does not matter.
+    """Check the contrast, then find Otsu's threshold. Raises `CaptureRefused` if the contrast is too low."""
+    # The darkest GATE_MM2 is an area rather than a share, so that the picture's size does not matter.
     pixels = reflectance.ravel()
     kth = min(round(GATE_MM2 * PX_PER_MM**2), pixels.size - 1)
     darkest = float(np.partition(pixels, kth)[kth])
@@ -122,7 +122,7 @@ def _find_level(reflectance: Soft, where: str, params: Params) -> Level:
 
 
 def to_levels(reflectance: Soft) -> Gray:
-    """Reflectance 0 to 1 on 256 levels."""
+    """Map reflectance from 0 to 1 to 256 levels."""
     return np.clip(reflectance * 255.0, 0.0, 255.0).astype(np.uint8)
 
 
@@ -155,7 +155,7 @@ def _flags(raster: Gray, mask: Mask, chosen: Chosen) -> tuple[str, ...]:
 
 
 def _cell_window(raster: Gray, cell_px: tuple[int, int, int, int] | None, where: str) -> tuple[slice, slice]:
-    """Rows and columns of the raster that show the paper cell; all where there is none. Raises `CaptureRefused`."""
+    """Rows and columns of the raster that show the paper cell; all of them without a cell. Raises `CaptureRefused`."""
     height, width = raster.shape
     x, y, w, h = cell_px if cell_px is not None else (0, 0, width, height)
     rows, columns = slice(max(y, 0), min(y + h, height)), slice(max(x, 0), min(x + w, width))

@@ -1,4 +1,4 @@
-"""Photographs on the 20 px/mm raster: rectified by a plane and undistorted in one interpolation, or rescaled."""
+"""Resampling of photographs to 20 px/mm: rectified and undistorted in one interpolation, or only rescaled."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from calibrate.stroke.params import PX_PER_MM, Floats, Gray
 
 MAX_RASTER_PX = 8192
 KNOTS = 8
-"""Distortion changes so slowly that its map is computed at every eighth pixel and interpolated."""
+"""Pixels between computed points of the distortion map; it changes slowly and is interpolated in between."""
 
 
 class SeenPlane(Protocol):
-    """Where places on the paper lie in a photograph."""
+    """Mapping from points on the paper to a photograph."""
 
     def to_image(self, paper_mm: Floats) -> Floats:
-        """(n, 2) mm in the paper frame -> (n, 2) pixels of the photograph as it was taken."""
+        """Map (n, 2) mm in the paper frame to (n, 2) pixels of the photograph as it was taken."""
         ...
 
 
 def rectify(image: Gray, image_to_paper: Floats, window_mm: tuple[float, float, float, float]) -> Gray:
-    """The window (x, y, width, height in the paper frame) at 20 px/mm, row 0 at its far edge (largest y).
+    """Rectify the window (x, y, width, height in the paper frame) to 20 px/mm, row 0 at its far edge (largest y).
 
     `image_to_paper` has pixel centres on integers, as cv2 does; the result's pixel (i, j) covers [j, j+1) x [i, i+1).
     """
@@ -40,7 +40,7 @@ def rectify(image: Gray, image_to_paper: Floats, window_mm: tuple[float, float, 
 
 
 def rescale(image: Gray, px_per_mm: tuple[float, float], where: str) -> Gray:
-    """A photograph of known scale on the 20 px/mm raster. Raises `CaptureRefused` where that would be huge."""
+    """Rescale a photograph of known scale to 20 px/mm. Raises `CaptureRefused` if the result would be too large."""
     height, width = image.shape
     size = (round(width * PX_PER_MM / px_per_mm[0]), round(height * PX_PER_MM / px_per_mm[1]))
     if not all(8 <= side <= MAX_RASTER_PX for side in size):
@@ -50,14 +50,14 @@ def rescale(image: Gray, px_per_mm: tuple[float, float], where: str) -> Gray:
 
 
 def on_raster(point_px: tuple[float, float], px_per_mm: tuple[float, float]) -> tuple[float, float]:
-    """A point of a photograph on the raster that `rescale` makes of it."""
+    """Convert a point of a photograph to the raster that `rescale` returns."""
     return point_px[0] * PX_PER_MM / px_per_mm[0], point_px[1] * PX_PER_MM / px_per_mm[1]
 
 
 def rectify_by(image: Gray, calibration: Calibration, window_mm: tuple[float, float, float, float], where: str) -> Gray:
-    """The window of the paper frame at 20 px/mm, by a calibration: undistorted where it names a lens.
+    """Rectify a window of the paper frame to 20 px/mm by a calibration, undistorted if it names a lens.
 
-    Raises `CaptureRefused` for a photograph of another size than the calibration's.
+    Raises `CaptureRefused` if the photograph's size differs from the calibration's.
     """
     if calibration.lens is None:
         return rectify(image, calibration.homography(), window_mm)
@@ -69,9 +69,9 @@ def rectify_by(image: Gray, calibration: Calibration, window_mm: tuple[float, fl
 
 
 def rectify_distorted(image: Gray, plane: SeenPlane, window_mm: tuple[float, float, float, float]) -> Gray:
-    """The window (x, y, width, height in the paper frame) at 20 px/mm, as `rectify` gives it.
+    """Rectify the window (x, y, width, height in the paper frame) to 20 px/mm, as `rectify` does.
 
-    The photograph is as it was taken: the lens is undone here.
+    The photograph is as it was taken; the lens distortion is removed here.
     """
     x, y, width, height = window_mm
     columns, rows = round(width * PX_PER_MM), round(height * PX_PER_MM)
@@ -79,7 +79,7 @@ def rectify_distorted(image: Gray, plane: SeenPlane, window_mm: tuple[float, flo
     grid = np.stack(np.meshgrid(across, along), axis=-1).reshape(-1, 2)
     paper_mm: Floats = np.array([x, y + height], np.float64) + np.array([1.0, -1.0]) * (grid + 0.5) / PX_PER_MM
     knots = plane.to_image(paper_mm).reshape(len(along), len(across), 2).astype(np.float32)
-    # Knot k lies at pixel 8 k: cv2's resize would put it at the middle of its eight.
+    # Knot k lies at pixel 8 k; cv2.resize would put it in the middle of its eight pixels.
     scale = np.array([[1.0 / KNOTS, 0.0, 0.0], [0.0, 1.0 / KNOTS, 0.0]])
     places = cv2.warpAffine(knots, scale, (columns, rows), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     sampled = cv2.remap(image, places, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -89,7 +89,7 @@ def rectify_distorted(image: Gray, plane: SeenPlane, window_mm: tuple[float, flo
 def on_window(
     cell_mm: tuple[float, float, float, float], window_mm: tuple[float, float, float, float]
 ) -> tuple[int, int, int, int]:
-    """A paper cell (x, y, width, height in mm) as pixels of the raster of a window: x, y, width, height."""
+    """Convert a paper cell (x, y, width, height in mm) to pixels of a window's raster: x, y, width, height."""
     x, y, width, height = cell_mm
     top = window_mm[1] + window_mm[3] - (y + height)
     scaled = ((x - window_mm[0]) * PX_PER_MM, top * PX_PER_MM, width * PX_PER_MM, height * PX_PER_MM)

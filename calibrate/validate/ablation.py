@@ -1,4 +1,4 @@
-"""Number of strokes against similarity: fits from a few presses, scored on all the others of their session."""
+"""Similarity by number of fitted strokes: fits from a few presses, scored on all others of their session."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from model.fitted_shape import fitted_model
 
 COUNTS = (1, 2, 3, 5, 9, 15, 30, 60)
 DRAWS = 2
-"""A fit from few presses depends on which they are: the average of two draws is shown."""
+"""Random draws to average, since a fit from few presses depends on which are drawn."""
 MAX_SCORED = 200
 MIN_LEFT = 5
 JUDGED = KEYS.index((Alignment.MM, Tone.BINARY))
@@ -30,7 +30,7 @@ JUDGED = KEYS.index((Alignment.MM, Tone.BINARY))
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One fit: the rows it is made of, and those it is scored on."""
+    """One fit: the rows it is fitted to, and those it is scored on."""
 
     session: int
     count: int
@@ -39,7 +39,7 @@ class Trial:
 
 
 def similarity_by_strokes(outcome: Outcome, scheduler: Scheduler, progress: Progress) -> tuple[Step, ...]:
-    """The steps of every session; empty for one that has too few presses."""
+    """Scores of each session by number of fitted strokes; none for a session with too few presses."""
     jobs: dict[str, tuple[Trial, RefitJob]] = {}
     for trial in _trials(outcome):
         brush = brush_of(outcome.sessions[trial.session].header)
@@ -67,7 +67,7 @@ def similarity_by_strokes(outcome: Outcome, scheduler: Scheduler, progress: Prog
 
 
 def fit_job(job: RefitJob) -> dict[str, Any]:
-    """Fit as `refit_job` does, but from the start: the fit itself finds what few strokes can determine."""
+    """Fit as `refit_job` does, but from scratch: the fit itself finds what few strokes can determine."""
     strokes, grid = cropped(job)
     press = fit_presses(strokes, grid, job.radius_mm, job.length_mm).press
     return {"fitted": press_body(press), "bezier": bezier_body(strokes, grid)}
@@ -81,7 +81,7 @@ def _trials(outcome: Outcome) -> Iterator[Trial]:
                 cells.setdefault(row.cell, []).append(k)
         for draw in range(DRAWS):
             rng = np.random.default_rng([draw, session])
-            # Every cell once before any twice: that is how one would choose.
+            # Every cell once before any cell twice, as a person would choose.
             groups = [[int(k) for k in rng.permutation(cells[cell])] for cell in sorted(cells)]
             groups = [groups[int(g)] for g in rng.permutation(len(groups))]
             deepest = max(map(len, groups), default=0)
@@ -96,7 +96,7 @@ def _trials(outcome: Outcome) -> Iterator[Trial]:
 def _scored(
     outcome: Outcome, trial: Trial, fit: dict[str, Any], scheduler: Scheduler
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """(model, (n, 2) CSIM and SSIM) in millimetres, binary."""
+    """Yield (model, (n, 2) CSIM and SSIM) in millimetres, binary."""
     brush, view = brush_of(outcome.sessions[trial.session].header), outcome.options.view
     press = fitted_press(fit["fitted"], float(brush.radius_mm), float(brush.length_mm))
     model = fitted_model(press)

@@ -24,22 +24,22 @@ FITTED_HELD_OUT, BEZIER_REFITTED = "ccd-bsm-heldout", "bezier-refitted"
 GENERATOR_HELD_OUT = "ccd-bsmg-heldout"
 HELD_OUT_NAMES = (FITTED_HELD_OUT, BEZIER_REFITTED, GENERATOR_HELD_OUT)
 LAMBDAS = {"ccd-bsm-lambda-1": 1.0, "ccd-bsm-lambda-pi/2": 0.5 * math.pi}
-"""In addition to lambda = pi, which is CCD-BSM itself: the paper's figure 3."""
+"""Values compared in addition to lambda = pi, which is CCD-BSM itself: the paper's figure 3."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One row of the tables, for one session."""
+    """A model to compare with one session: one row of the tables."""
 
     name: str
     label: str
     definition: str
     basis: str
-    """What it knows of these strokes: `as published`, `fitted, in sample`, `fitted, held-out cells`, ..."""
+    """What the model knows of these strokes: `as published`, `fitted, in sample`, `fitted, held-out cells`, ..."""
     predict: Callable[[float, float], Pixels]
-    """(H, alpha) -> (len(KEYS), 128, 128); raises `DomainError` for a press that it does not predict."""
+    """(H, alpha) -> (len(KEYS), 128, 128); raises `DomainError` for a press that the model does not predict."""
     file: Path | None = None
-    """Where a generator comes from."""
+    """File of a trained generator."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ def generators(session: LoadedSession, files: Sequence[Generator], view: Field) 
 
 
 def held_out(fits: dict[Cell, dict[str, Any]], brush: Brush, view: Field, *, fitted: bool) -> list[Candidate]:
-    """Fits that left out the cell that they predict; `fits` has a finished `refit_job` for each cell."""
+    """Models fitted without the cell they predict; `fits` holds the result of a `refit_job` for each cell."""
 
     def predict_fitted(height_mm: float, tilt_deg: float) -> Pixels:
         found = _of_cell(fits, height_mm, tilt_deg, "fitted")
@@ -115,7 +115,7 @@ def held_out(fits: dict[Cell, dict[str, Any]], brush: Brush, view: Field, *, fit
 
 
 def tuned(files: dict[Cell, Path], brush: Brush, view: Field, number: int) -> Candidate:
-    """A generator tuned on all cells but the one that it predicts."""
+    """A generator tuned on all cells except the one it predicts."""
     from model.train.checkpoint import load_generator
 
     loaded: dict[Path, StrokeModel] = {}

@@ -52,7 +52,7 @@ def validate(
     scheduler: Annotated[str, typer.Option(help="An existing Dask cluster, as tcp://host:8786.")] = "",
     workers: Annotated[int | None, typer.Option(min=1, max=1024, help="Threads; all cores by default.")] = None,
 ) -> None:
-    """Compare every model with every captured stroke; the same command goes on where it was stopped."""
+    """Compare every model with every captured stroke; run the same command again to resume."""
     import sys
 
     from calibrate.compare.field import Field
@@ -102,7 +102,7 @@ def diff(
     after: Annotated[Path, typer.Argument(help="Another.")],
     json: Annotated[bool, typer.Option("--json", help="Print every series as JSON.")] = False,
 ) -> None:
-    """What got better or worse between two reports, sessions or versions of the software: a paired test."""
+    """Show what got better or worse between two reports, sessions or software versions, by a paired test."""
     from calibrate.validate.diff import compare
 
     found = compare(before, after)
@@ -125,7 +125,7 @@ def captures(
     leave_out: Annotated[list[str] | None, typer.Option(help="A cell to keep for judging, H/alpha as 13/5.")] = None,
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
 ) -> None:
-    """Write captured presses as `brushloop train tune` reads them."""
+    """Write captured presses in the format that `brushloop train tune` reads."""
     from calibrate.errors import CalibrationError
     from calibrate.files import check_target
     from calibrate.validate.sources import open_session
@@ -176,7 +176,7 @@ def _print_difference(found: Difference) -> None:
 
 @contextmanager
 def _progress_shown() -> Generator[Progress]:
-    """Progress on stderr: a bar on a terminal, a line a tenth elsewhere."""
+    """Show progress on stderr: a bar on a terminal, elsewhere a line for each tenth."""
     from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
@@ -199,7 +199,7 @@ def _progress_shown() -> Generator[Progress]:
 
 
 def _tenths_said() -> Progress:
-    """Progress as one line for each tenth of the work."""
+    """Print progress as one line for each tenth of the work."""
     said: dict[str, int] = {}
 
     def update(what: str, done: int, total: int) -> None:

@@ -1,7 +1,7 @@
-"""Two reports compared: what got better or worse, with a paired test.
+"""Comparison of two reports: what got better or worse, with a paired test.
 
-Pairs are, in this order: the same stroke of the same recording (two versions of the software, or of the options); a
-stroke and the one that repeats it in name; the same cell (two sessions), by its average.
+Pairs are, in order of preference: the same stroke of the same recording (two software versions, or two sets of
+options); a stroke and the one that repeats it by name; the averages of the same cell in two sessions.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Change:
     after: float
     test: Paired
     p_holm: float
-    """Corrected for all the series that are compared."""
+    """p-value corrected for the number of series compared."""
 
     @property
     def verdict(self) -> str:
@@ -56,12 +56,12 @@ class Difference:
     """`stroke` or `cell`."""
     changes: list[Change]
     only_before: list[str]
-    """Models that only one of the two has."""
+    """Models that only one of the two reports has."""
     only_after: list[str]
 
 
 def compare(before: Path, after: Path) -> Difference:
-    """Compare two reports, or two sessions that were validated. Raises `CalibrationError` where they cannot be."""
+    """Compare two reports, or two validated sessions. Raises `CalibrationError` if they are not comparable."""
     one, other = report_path(before), report_path(after)
     a, b = load_report(one), load_report(other)
     if a.source != b.source:
@@ -89,15 +89,15 @@ def compare(before: Path, after: Path) -> Difference:
 
 
 def report_path(given: Path) -> Path:
-    """A report.json, by itself, in a report's or a session's folder, or beside a recording.
+    """Find report.json: the file given, or the one in a report's or session's folder, or next to a recording.
 
-    Raises `CalibrationError` that names the command to run where there is none.
+    If there is none, raises `CalibrationError` that names the command to run.
     """
     if not given.exists():
         raise CalibrationError(str(given), "is not there: give a report.json, or a session that was validated")
     if given.is_file() and given.suffix == ".json":
         return given
-    # Only a recording's own folder is looked into: beside a folder of a session may lie a report of many.
+    # Search only a recording's own folder: a report next to a session's folder may be about several sessions.
     folder = given.parent if given.is_file() else given
     for place in (folder / "report.json", folder / "validation" / "report.json"):
         if place.is_file():
@@ -107,7 +107,7 @@ def report_path(given: Path) -> Path:
 
 
 def read_scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, Strokes]:
-    """Series -> score by (recording, stroke), or by cell on average. Raises `CalibrationError` for an edited table."""
+    """Read scores by (recording, stroke), or averaged by cell. Raises `CalibrationError` for an edited table."""
     table = path.with_name("scores.csv")
     try:
         with table.open("rb") as file:
@@ -130,7 +130,7 @@ def read_scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, 
 
 
 def sentences(found: Difference) -> Iterator[str]:
-    """What the comparison is of, in words."""
+    """Sentences that say what is compared."""
     versions = [side.software.get("brushloop", "?") for side in (found.before, found.after)]
     yield f"Before: {_named(found.before)}, brushloop {versions[0]}. After: {_named(found.after)}, {versions[1]}."
     what = "the same stroke" if found.paired_by == "stroke" else "the average of the same (H, α)"

@@ -1,7 +1,7 @@
 """Reports of `brushloop loop` and `brushloop write` that go into the tables: strokes pressed again, characters written.
 
-Each file names the recordings it was made from. It is used only where those are these sessions, or at least the same
-kind of ink; whatever is damaged, edited or of something else is refused by name, before hours of work.
+Each file names the recordings it was made from. It is used only if those are the sessions being validated, or at least
+have the same kind of ink; a damaged, edited or unrelated file is refused by name before hours of work begin.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from calibrate.writing.scores import FILE as WRITTEN_FILE
 from calibrate.writing.scores import PICTURE, WrittenRecord, read_written
 
 LOOP_FOLDER, WRITTEN_FOLDER = "loop", "written"
-"""Where those commands write by default: in the session, and beside the folder of sessions."""
+"""Default output folders of those commands: in the session, and next to the folder of sessions."""
 MAX_PICTURE_BYTES = 16 * 1024 * 1024
 MAX_SIDE_PX = 20_000
 PNG_HEAD = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"
@@ -31,7 +31,7 @@ PNG_HEAD = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"
 
 @dataclass(frozen=True, slots=True)
 class ExtrasRequest:
-    """These files or folders; where none are named, and with `look`, whatever lies beside the sessions."""
+    """Files or folders to use; if none are named and `look` is true, those found with the sessions."""
 
     loops: tuple[Path, ...] = ()
     written: tuple[Path, ...] = ()
@@ -45,13 +45,13 @@ class Extras:
     loops: tuple[LoopRecord, ...] = ()
     written: tuple[WrittenRecord, ...] = ()
     figures: tuple[str, ...] = ()
-    """Figure 13 of each of `written` as a data URI; empty where the picture is not there."""
+    """Figure 13 of each of `written` as a data URI; empty if the picture is missing."""
     notes: tuple[str, ...] = ()
     """What was found and left out, or is missing, and why."""
 
 
 def find_extras(sessions: Sequence[LoadedSession], request: ExtrasRequest) -> Extras:
-    """Read and check everything. Raises `CalibrationError` that names the file that cannot be used."""
+    """Read and check all extras. Raises `CalibrationError` that names an unusable file."""
     notes: list[str] = []
     loops: dict[str, LoopRecord] = {}
     for path in _files(request.loops, LOOP_FILE) or (_loops_beside(sessions) if request.look else ()):
@@ -76,7 +76,7 @@ def find_extras(sessions: Sequence[LoadedSession], request: ExtrasRequest) -> Ex
 
 
 def figure_13(path: Path, record: WrittenRecord) -> str:
-    """The picture as a data URI. Raises `CalibrationError` unless it is the PNG that the record was written with."""
+    """Figure 13 as a data URI. Raises `CalibrationError` unless it is the PNG written with the record."""
     data = read_bounded(path, MAX_PICTURE_BYTES)
     if not data.startswith(PNG_HEAD) or len(data) < len(PNG_HEAD) + 8:
         raise CalibrationError(str(path), "is not a PNG")
@@ -100,7 +100,7 @@ def _loops_beside(sessions: Sequence[LoadedSession]) -> Iterator[Path]:
 
 
 def _written_beside(sessions: Sequence[LoadedSession]) -> Iterator[Path]:
-    """In the session itself, or beside the folder of sessions; the same only once."""
+    """Yield reports of characters in a session or next to the folder of sessions, each once."""
     seen: set[Path] = set()
     for one in sessions:
         folder = one.recording.path.resolve().parent
@@ -112,7 +112,7 @@ def _written_beside(sessions: Sequence[LoadedSession]) -> Iterator[Path]:
 
 
 def _foreign(path: Path, record: WrittenRecord, sessions: Sequence[LoadedSession]) -> str:
-    """Why characters found beside the sessions are not these sessions' own; empty where they are."""
+    """Explain why characters found near the sessions do not belong to them; empty if they do."""
     folders = [one.recording.path.resolve().parent for one in sessions]
     if path.parent.parent in folders:
         return ""
@@ -155,7 +155,7 @@ def _check_source(path: Path, named: str, rows: Sequence[str], sessions: Sequenc
 
 @contextmanager
 def _naming_no_beside(*, requested: bool) -> Generator[None]:
-    """Add to an error about a file that was found, not requested, how to go without it."""
+    """Add a hint at --no-beside to an error about a file that was found, not requested."""
     try:
         yield
     except CalibrationError as error:

@@ -1,4 +1,4 @@
-"""Gates for scripts: what a score must reach, as `csim_avg>=0.90` or `ccd-bsm-heldout:mm:binary:csim_avg>=0.93`."""
+"""Gates for scripts: limits a score must meet, as `csim_avg>=0.90` or `ccd-bsm-heldout:mm:binary:csim_avg>=0.93`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FORM = re.compile(
 
 
 class GateMissed(Exception):
-    """A score does not reach its gate; the report is written all the same."""
+    """A score misses its gate; the report is still written."""
 
     exit_code: ClassVar[int] = 5
 
@@ -36,7 +36,7 @@ class GateMissed(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """One condition; without a model it applies to the report's calibrated one, else to the first."""
+    """One condition; without a model it applies to the report's calibrated model, or else to the first."""
 
     text: str
     model: str
@@ -75,7 +75,7 @@ def parse_gate(text: str) -> Gate:
 
 
 def check_gates(report: Report, gates: list[Gate]) -> None:
-    """Raises `GateMissed` with every gate that is missed, and `CalibrationError` for a model that has no score."""
+    """Check the gates. Raises `GateMissed` naming all missed ones, `CalibrationError` for a model without scores."""
     missed: list[str] = []
     for gate in gates:
         model = gate.model or report.shown

@@ -1,6 +1,6 @@
-"""Fits that have not seen what they predict: each cell left out in turn, CCD-BSM and a Bezier refitted to the others.
+"""Held-out fits: each cell is left out in turn, and CCD-BSM and a Bezier are refitted to the others.
 
-A job carries its strokes and returns numbers, so that it runs anywhere and can be stored.
+A job carries its strokes and returns numbers, so that it can run on any machine and its result can be stored.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from model.fitted import MODES, NAMES, TERMS, FittedPress
 
 Cell = tuple[float, float]
 MAX_FOLDS = 15
-"""The paper's grid leaves out one cell at a time; with more cells, as many as make so many folds."""
+"""Most folds: the paper's grid leaves out one cell at a time, a larger grid several."""
 PER_CELL = 3
-"""Presses of each other cell that a fit is made of: more did not change it."""
+"""Presses of each other cell that a fit uses; more did not change it."""
 MAX_STROKES = 60
 
 
@@ -37,16 +37,16 @@ class RefitJob:
     """Fit the brush and a Bezier to these presses."""
 
     strokes: tuple[tuple[float, float, bytes], ...]
-    """H, alpha, `Press.pixels`, of which the coverage is the last image."""
+    """H, alpha and `Press.pixels`, whose last image is the coverage."""
     radius_mm: float
     length_mm: float
     start: tuple[tuple[float, ...], tuple[str, ...]] | None
-    """Values, and the parameters that are free, from the session's fit; None fits no CCD-BSM."""
+    """Values, and names of the free parameters, from the session's fit; None fits no CCD-BSM."""
     view: Field
 
     @property
     def key(self) -> str:
-        """A hash of everything that the result follows from."""
+        """Hash of everything that determines the result."""
         digest = hashlib.sha256(
             f"refit {VERSION} {self.radius_mm} {self.length_mm} {self.start} {self.view} {len(self.strokes)}".encode()
         )
@@ -56,7 +56,7 @@ class RefitJob:
 
 
 def start_of(fit: BrushFit) -> tuple[tuple[float, ...], tuple[str, ...]]:
-    """Where a refit begins, and the parameters it frees: those which the whole session determines."""
+    """Initial values of a refit, and its free parameters: those that the whole session determines."""
     values = tuple(fit.parameters[name].value for name in NAMES)
     return values, tuple(name for name in NAMES if fit.parameters[name].low is not None)
 
@@ -69,7 +69,7 @@ def folds(cells: Sequence[Cell], most: int = MAX_FOLDS) -> list[list[Cell]]:
 
 
 def refit_job(job: RefitJob) -> dict[str, Any]:
-    """`fitted` (values, edges) and `bezier` (coefficients), each None where the strokes do not determine it."""
+    """Fit `fitted` (values, edges) and `bezier` (coefficients), each None if the strokes do not determine it."""
     strokes, grid = cropped(job)
     out: dict[str, Any] = {"fitted": None}
     if job.start is not None:
@@ -87,7 +87,7 @@ def press_body(press: FittedPress) -> dict[str, Any]:
 
 
 def bezier_body(strokes: Sequence[Pressed], grid: Grid) -> list[float] | None:
-    """A refitted Bezier as plain data; None where the cells span no plane."""
+    """A refitted Bezier as plain data; None if the cells do not span a plane."""
     try:
         coefficients = refit_bezier(strokes, grid).plane.coefficients
     except ValueError:
@@ -96,7 +96,7 @@ def bezier_body(strokes: Sequence[Pressed], grid: Grid) -> list[float] | None:
 
 
 def cropped(job: RefitJob) -> tuple[list[Pressed], Grid]:
-    """The strokes and their grid, cut to the rows that ink reaches and 2 mm more, as `brushloop fit` has them."""
+    """Crop the strokes and their grid to the inked rows and 2 mm more, as `brushloop fit` does."""
     inks = [unpack(pixels)[-1].astype(np.float64) / 255.0 for _, _, pixels in job.strokes]
     inked = np.flatnonzero(np.any([ink.any(axis=1) for ink in inks], axis=0))
     margin = round(MARGIN_MM / job.view.mm_per_px)
@@ -107,13 +107,13 @@ def cropped(job: RefitJob) -> tuple[list[Pressed], Grid]:
 
 
 def fitted_press(body: dict[str, Any], radius_mm: float, length_mm: float) -> FittedPress:
-    """The brush of a finished job."""
+    """The fitted brush in the result of a finished job."""
     edges = np.array(body["edges"]).reshape(2, MODES, TERMS)
     return FittedPress(radius_mm, length_mm, np.array(body["values"]), edges)
 
 
 def bezier_pixels(coefficients: Sequence[float], height_mm: float, tilt_deg: float, view: Field) -> Pixels:
-    """(len(KEYS), 128, 128) of a refitted Bezier."""
+    """Images of a refitted Bezier, (len(KEYS), 128, 128)."""
     import torch
 
     from model.regression import Plane
@@ -131,7 +131,7 @@ def refits_by_cell(
     progress: Progress,
     most_folds: int = MAX_FOLDS,
 ) -> dict[Cell, dict[str, Any]]:
-    """A finished refit for each cell, made of whole presses of other cells."""
+    """Refit for each cell to uncut presses of other cells; return the results by cell."""
     cells: dict[Cell, list[Row]] = {}
     for row in rows:
         cells.setdefault(row.cell, []).append(row)

@@ -1,6 +1,6 @@
-"""What workers do: pure functions of picklable jobs, here or on another machine; and the rows that preparing gives.
+"""Work of the workers: pure functions of picklable jobs, run here or on another machine; and the prepared rows.
 
-Nothing here loads torch: a worker that prepares or scores does without it.
+Nothing here imports torch, which preparing and scoring do not need.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     from calibrate.validate.sources import LoadedSession
 
 ABSENT = b""
-"""In place of the images of a model that does not predict this press."""
+"""Placeholder for the images of a model that does not predict this press."""
 Values = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class PrepareJob:
-    """Find the stroke on its photograph and lay it on the pixels that are compared."""
+    """Find the stroke in its photograph and resample it to the pixels that are compared."""
 
     capture: Capture
     calibration: Calibration | None
@@ -44,7 +44,7 @@ class PrepareJob:
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """A captured press on its way into the report; `pixels` is empty where it was refused."""
+    """A captured press after preparation; `pixels` is empty if it was refused."""
 
     stroke_id: str
     height_mm: float
@@ -58,7 +58,7 @@ class Press:
     refused: str
 
     def to_body(self) -> dict[str, Any]:
-        """As plain data."""
+        """Return the press as plain data."""
         return asdict(self)
 
 
@@ -110,7 +110,7 @@ class Row:
 def prepared_rows(
     number: int, session: LoadedSession, view: Field, scheduler: Scheduler, store: Store, progress: Progress
 ) -> Iterator[Row]:
-    """Every stroke of a session, in order of capture; what is not in the store yet is prepared first."""
+    """Every stroke of a session, in order of capture; those not yet in the store are prepared first."""
     calibration = session.calibration.digest if session.calibration is not None else ""
     bad = sorted(session.recording.marked_bad().items())
     base = hashlib.sha256(f"prepare {VERSION} {session.sha256} {calibration} {view} {bad}".encode()).hexdigest()
@@ -136,7 +136,7 @@ def prepared_rows(
 
 
 def pixels_of(store: Store, key: str) -> bytes:
-    """`Press.pixels` of a stroke that was prepared."""
+    """`Press.pixels` of a prepared stroke."""
     return store.get(key)["pixels"]
 
 
@@ -145,19 +145,19 @@ class ScoreJob:
     """Compare presses of one cell with every prediction, and with other presses."""
 
     presses: tuple[bytes, ...]
-    """`Press.pixels` of those that are scored."""
+    """`Press.pixels` of the presses to score."""
     predictions: tuple[bytes, ...]
-    """One a model, `pack` of (len(KEYS), 128, 128), or ABSENT."""
+    """One for each model: `pack` of (len(KEYS), 128, 128), or ABSENT."""
     others: tuple[bytes, ...]
-    """Presses of the same cell that predict others: `Press.pixels`."""
+    """`Press.pixels` of presses of the same cell that serve as predictions."""
     predicted_by: tuple[tuple[int, ...], ...]
-    """For each press, which of `others` predict it; empty where none does."""
+    """For each press, the indices of the `others` that predict it; empty if none does."""
     originals: tuple[bytes, ...]
-    """For each press, the one that it repeats, or ABSENT."""
+    """For each press, the press that it repeats, or ABSENT."""
 
     @property
     def key(self) -> str:
-        """A hash of everything that the scores follow from."""
+        """Hash of everything that determines the scores."""
         digest = hashlib.sha256(f"score {VERSION} {self.predicted_by}".encode())
         for group in (self.presses, self.predictions, self.others, self.originals):
             for item in group:
@@ -187,7 +187,7 @@ def score_job(job: ScoreJob) -> Values:
 
 
 def scores(captured: NDArray[np.uint8], predicted: Sequence[NDArray[np.uint8]]) -> Values:
-    """(M, KEYS, 2) CSIM and SSIM of one press, (at least KEYS, 128, 128), against M predictions alike.
+    """(M, KEYS, 2) CSIM and SSIM of one press, (at least KEYS, 128, 128), against M predictions of that shape.
 
     In the size-normalised alignment each prediction first takes its best shift. NaN where an image is blank.
     """

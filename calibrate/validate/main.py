@@ -1,4 +1,4 @@
-"""`brushloop validate`: from the places of sessions to the files of a report."""
+"""`brushloop validate`: from the locations of sessions to the files of a report."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Request:
     held_out: bool = True
     tune_steps: int = 0
     parquet: bool | None = None
-    """None writes it where pyarrow is there."""
+    """None writes it if pyarrow is installed."""
     extras: ExtrasRequest = field(default_factory=ExtrasRequest)
     out: Path | None = None
     scheduler: str = ""
@@ -61,7 +61,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class ValidationOutput:
-    """What was written: a report of presses, or one of each session of drags."""
+    """Written output: one report of presses, or one for each session of drags."""
 
     folder: Path
     report: Report | None = None
@@ -72,8 +72,8 @@ class ValidationOutput:
 def validate(request: Request, progress: Progress) -> ValidationOutput:
     """Validate and write every file of the report; gates are checked by `check`.
 
-    Raises `CalibrationError`, `ClusterError`, and what reading a recording does; whatever is finished is kept in the
-    folder's `work`, so that the same command goes on.
+    Raises `CalibrationError`, `ClusterError`, and what reading a recording raises. Finished work is kept in the
+    folder's `work`, so that the same command resumes.
     """
     for text in request.gates:
         parse_gate(text)
@@ -112,7 +112,7 @@ def validate(request: Request, progress: Progress) -> ValidationOutput:
 
 
 def check(output: ValidationOutput, request: Request) -> None:
-    """Raises `GateMissed` where a gate is missed."""
+    """Check the gates. Raises `GateMissed` if any is missed."""
     if request.gates and output.report is None:
         raise CalibrationError("--gate", "is about presses; these strokes travel")
     if output.report is not None:
@@ -127,7 +127,7 @@ def _drop_empty(folder: Path) -> None:
 
 
 def _kind(sessions: list[LoadedSession], request: Request) -> str:
-    """`press` or `drag`."""
+    """Kind of the strokes, `press` or `drag`."""
     kinds = {kind for session in sessions for kind in session.kinds}
     if len(kinds) > 1:
         raise CalibrationError(str(sessions[-1].recording.path), "mixes presses and drags: validate them separately")
@@ -160,7 +160,7 @@ def _write(
     if report.written:
         files[TABLE_3] = table_3_csv(report)
     else:
-        (folder / TABLE_3).unlink(missing_ok=True)  # of an earlier run that had characters
+        (folder / TABLE_3).unlink(missing_ok=True)  # left by an earlier run with characters
     refused = [(r.session_id, r.stroke_id, r.why) for r in report.refused]
     files["failures.csv"] = csv_text(("session_id", "stroke_id", "why"), refused)
     files["report.html"] = page_of(outcome, report, curves, extras.figures)

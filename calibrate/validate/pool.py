@@ -1,7 +1,7 @@
-"""Where jobs run: threads of this machine, or a Dask cluster. Both give the same results, in no order.
+"""Where jobs run: threads of this machine, or a Dask cluster. Both give the same results, in no fixed order.
 
-Threads, not processes: the work is OpenCV and compiled loops, which let other threads run, and a thread is there at
-once, while a process first imports for seconds (`bench validate` measures both).
+Threads, not processes: the work is OpenCV and compiled loops, which let other threads run, and a thread starts at once,
+while a process first spends seconds on imports (`bench validate` measures both).
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from typing import Any, ClassVar, Protocol, TypeVar
 from calibrate.validate import store
 
 Progress = Callable[[str, int, int], None]
-"""What is being done, how much of it is done, of how much."""
+"""Called with what is being done, the number done and the total."""
 J = TypeVar("J")
 R = TypeVar("R")
 AHEAD = 2
-"""Jobs a worker that wait: more would only hold photographs in memory."""
+"""Jobs submitted per worker; more would only hold photographs in memory."""
 BATCH = 4
-"""Jobs that a worker of a cluster is sent at a time: each message costs milliseconds."""
+"""Jobs in one message to a worker of a cluster, since each message costs milliseconds."""
 CONNECT_S = 10.0
 
 
@@ -35,27 +35,27 @@ class ClusterError(Exception):
 
 
 class Scheduler(Protocol):
-    """Runs a function over jobs that come with names."""
+    """Runs a function over named jobs."""
 
     @property
     def workers(self) -> int:
-        """How many jobs run at a time."""
+        """Number of jobs that run at a time."""
         ...
 
     def run(self, function: Callable[[J], R], jobs: Iterator[tuple[str, J]]) -> Iterator[tuple[str, R]]:
-        """(name, result) as they come. Jobs are taken from the iterator only as there is room for them."""
+        """Yield (name, result) as jobs finish. A job is taken from the iterator only when there is room for it."""
         ...
 
 
 class Threads(AbstractContextManager["Threads"]):
-    """This machine: as many threads as it has cores by default."""
+    """Threads on this machine, by default one for each core."""
 
     def __init__(self, workers: int | None = None) -> None:
         self.workers = workers or _cores()
         self._pool = ThreadPoolExecutor(self.workers)
         import cv2
 
-        # One job a core is what fills the cores; threads inside a job would only get in each other's way.
+        # One job per core keeps the cores busy; threads inside a job would only compete with each other.
         self._before = cv2.getNumThreads()
         cv2.setNumThreads(1)
 
@@ -89,9 +89,9 @@ def _finished(running: dict[Future[R], str]) -> Iterator[tuple[str, R]]:
 
 
 class Dask(AbstractContextManager["Dask"]):
-    """A Dask cluster that is there already. What a lost worker had is done again by another.
+    """A running Dask cluster. The jobs of a lost worker are repeated by another.
 
-    Raises ClusterError where it cannot be reached, or runs another version of this software.
+    Raises ClusterError if it cannot be reached or runs another version of this software.
     """
 
     def __init__(self, address: str) -> None:
@@ -141,7 +141,7 @@ class Dask(AbstractContextManager["Dask"]):
         completed: Any = as_completed
         going = completed(first, loop=self._client.loop, with_results=True)
         for future, found in going:
-            # The next batch is on its way before this one is written down.
+            # Submit the next batch before the results of this one are stored.
             more = submit()
             if more is not None:
                 going.add(more)
@@ -155,7 +155,7 @@ class Dask(AbstractContextManager["Dask"]):
 
 
 def _alone(function: Callable[[J], R], jobs: list[J]) -> list[R]:
-    """Jobs on a worker: OpenCV's own threads would take the cores of the workers beside it."""
+    """Run jobs on a worker without OpenCV's own threads, which would take the cores of other workers."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -163,7 +163,7 @@ def _alone(function: Callable[[J], R], jobs: list[J]) -> list[R]:
 
 
 def software() -> str:
-    """What runs here, as it must run on every worker."""
+    """Version of this software, which every worker must match."""
     return f"brushloop {version('brushloop')} (work {store.VERSION})"
 
 

@@ -1,7 +1,7 @@
-"""The run: prepare every capture, fit to other cells, score everything. Finished work is never done again.
+"""The run: prepare every capture, fit to other cells, score everything. Finished work is never repeated.
 
-Captures stream from the recording through the workers into the store; what stays in memory is the scores, a few hundred
-bytes a stroke. Each result follows only from its inputs, so neither the order nor the place of work changes it.
+Captures stream from the recording through the workers into the store; only the scores stay in memory, a few hundred
+bytes a stroke. Each result depends only on its inputs, so neither the order nor the place of work changes it.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from model.ccdbsm import DomainError
 CEILING = "another press"
 """A capture predicted by other captures of its cell, averaged: how well one press predicts another."""
 REPEATED = ROBOT_WRITING
-"""A press that repeats another session's stroke, against that stroke: the third row of the paper's Table 1."""
+"""A press compared with the stroke of another session that it repeats: the third row of the paper's Table 1."""
 MAX_OTHERS = 9
-"""Presses that predict one: all others of a cell with ten, as the paper has; the next nine where there are more."""
+"""Most presses that predict one: all others of a cell of ten, as in the paper, or the next nine of a larger one."""
 CHUNK = 16
 
 
@@ -47,7 +47,7 @@ class Options:
     ablations: bool = False
     held_out: bool = True
     tune_steps: int = 0
-    """Steps of the tuning of each generator on other cells; 0: none."""
+    """Tuning steps of each generator on other cells; 0 means no tuning."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,15 +57,15 @@ class Outcome:
     sessions: list[LoadedSession]
     options: Options
     candidates: list[list[Candidate]]
-    """Of each session."""
+    """Candidates of each session."""
     names: list[str]
-    """Columns: every candidate of any session, then the presses themselves."""
+    """Columns: every candidate of any session, then the comparisons with presses."""
     rows: list[Row]
-    """Strokes that are compared, by session and order of capture."""
+    """Compared strokes, by session and order of capture."""
     values: NDArray[np.float64]
     """(rows, names, KEYS, 2): CSIM and SSIM from 0 to 1; NaN where there is nothing to compare with."""
     refused: list[tuple[str, str, str]]
-    """(session, stroke, why): what could not be used, wholly or by one model. Nothing is dropped in silence."""
+    """(session, stroke, why) of strokes that could not be used, by all models or one. None is dropped silently."""
     store: Store
 
     def press(self, row: int) -> Press:
@@ -78,7 +78,7 @@ def validate_presses(
 ) -> Outcome:
     """Compare every candidate with every press. The caller closes `Outcome.store`.
 
-    Raises `CalibrationError` for a model that is not known, or where a name of a session stands for two.
+    Raises `CalibrationError` for an unknown model, or if two sessions have the same name.
     """
     idents = [session.header.session_id for session in sessions]
     for k, ident in enumerate(idents):
@@ -95,7 +95,7 @@ def validate_presses(
 def _validate(
     sessions: list[LoadedSession], options: Options, scheduler: Scheduler, store: Store, work: Path, progress: Progress
 ) -> Outcome:
-    # All that can be refused is refused before hours of work.
+    # Refuse whatever cannot be used before hours of work begin.
     known = [_known(session, options) for session in sessions]
     every = (*dict.fromkeys(one.name for group in known for one in group), *who.HELD_OUT_NAMES)
     for name in options.models:
@@ -165,7 +165,7 @@ def _held_out(
     work: Path,
     progress: Progress,
 ) -> Iterator[Candidate]:
-    """Whatever is fitted to the session without the cells that it then predicts."""
+    """Yield the candidates fitted to the session without the cells they predict."""
     names = options.models or who.HELD_OUT_NAMES
     brush, view = brush_of(session.header), options.view
     if options.held_out and (who.FITTED_HELD_OUT in names or who.BEZIER_REFITTED in names):
@@ -187,7 +187,7 @@ def _score_jobs(
     store: Store,
     refused: list[tuple[str, str, str]],
 ) -> Iterator[tuple[list[int], ScoreJob]]:
-    """(rows, job), cell by cell."""
+    """Yield (rows, job), cell by cell."""
     cells: dict[tuple[int, Cell], list[int]] = {}
     for k, row in enumerate(rows):
         cells.setdefault((row.session, row.cell), []).append(k)
@@ -219,7 +219,7 @@ def _score_jobs(
 
 
 def _originals(rows: list[Row]) -> dict[int, int]:
-    """Row -> the row of another session that it repeats, where that session is given too."""
+    """Map a row to the row of another session that it repeats, if that session is given too."""
     by_name: dict[str, list[int]] = {}
     for k, row in enumerate(rows):
         by_name.setdefault(row.press.stroke_id, []).append(k)
@@ -241,7 +241,7 @@ def _ordered_names(candidates: list[list[Candidate]]) -> list[str]:
 
 
 def _ordered(found: list[Candidate]) -> list[Candidate]:
-    """In the order of the paper's tables, calibrated beside uncalibrated; everything else comes after."""
+    """Sort in the order of the paper's tables, calibrated next to uncalibrated, all others last."""
     first = [
         "ccd-bsmg",
         who.GENERATOR_HELD_OUT,

@@ -1,7 +1,7 @@
-"""Finished work on disk, so that a killed run goes on where it was: one SQLite file of records by key.
+"""Finished work on disk, so that a killed run can resume: one SQLite file of records by key.
 
-A key is a hash of everything that its record follows from; the body is CBOR with a CRC-32. A record is written whole or
-not at all; one that does not match its CRC is dropped and done again.
+A key is a hash of everything that determines its record; the body is CBOR with a CRC-32. A record is written completely
+or not at all; one that does not match its CRC is dropped and computed again.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 import cbor2
 
 VERSION = "1"
-"""Of finished work. Raise it whenever a job gives another result for the same input: the work is then done again."""
+"""Version of the jobs. Increase it when a job's result for the same input changes, so that work is repeated."""
 TABLE = "CREATE TABLE IF NOT EXISTS work (number INTEGER PRIMARY KEY, key TEXT UNIQUE, crc INTEGER, body BLOB)"
 DAMAGED = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 Body = dict[str, Any]
@@ -36,7 +36,7 @@ class Store(AbstractContextManager["Store"]):
             except sqlite3.DatabaseError as error:
                 if error.sqlite_errorcode & 0xFF not in DAMAGED:
                     raise
-                path.unlink()  # what is lost is only done again
+                path.unlink()  # lost work is simply repeated
                 path.with_name(path.name + "-journal").unlink(missing_ok=True)
                 self._database = self._opened()
 
@@ -47,18 +47,18 @@ class Store(AbstractContextManager["Store"]):
         return self._database.execute("SELECT count(*) FROM work").fetchone()[0]
 
     def keys(self) -> list[str]:
-        """Of every record, in the order in which they were finished."""
+        """Keys of all records, in the order in which they were finished."""
         return [key for (key,) in self._database.execute("SELECT key FROM work ORDER BY number")]
 
     def put(self, key: str, body: Body) -> None:
-        """Add a record; after this returns a kill of the process does not lose it."""
+        """Add a record; once this returns, killing the process does not lose it."""
         packed = cbor2.dumps(body)
         with self._as_os_error(), self._database:
             row = (key, _crc(key, packed), packed)
             self._database.execute("INSERT OR REPLACE INTO work (key, crc, body) VALUES (?, ?, ?)", row)
 
     def get(self, key: str) -> Body:
-        """The body of a record. Raises KeyError where there is none."""
+        """The body of a record. Raises KeyError if there is none."""
         found = self._database.execute("SELECT body FROM work WHERE key = ?", (key,)).fetchone()
         if found is None:
             raise KeyError(key)
@@ -74,10 +74,10 @@ class Store(AbstractContextManager["Store"]):
         self.close()
 
     def _opened(self) -> sqlite3.Connection:
-        """The database, without the records that do not match their CRC."""
+        """Open the database and delete the records that do not match their CRC."""
         database = sqlite3.connect(self._path)
         try:
-            # A killed process loses nothing without waiting for the disk; a power cut may, and then it is done again.
+            # Not waiting for the disk loses nothing if the process is killed; work lost in a power cut is repeated.
             database.execute("PRAGMA synchronous = OFF")
             database.execute("PRAGMA journal_mode = TRUNCATE")
             database.execute(TABLE)
@@ -99,5 +99,5 @@ class Store(AbstractContextManager["Store"]):
 
 
 def _crc(key: object, body: object) -> int | None:
-    """Of a record; None for values of other types, which only damage leaves behind."""
+    """CRC of a record; None for values of other types, which occur only in a damaged file."""
     return zlib.crc32(key.encode() + body) if isinstance(key, str) and isinstance(body, bytes) else None

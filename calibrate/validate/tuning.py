@@ -1,9 +1,8 @@
-"""Captured presses as a generator draws them, for `brushloop train tune`, and a generator judged on unseen cells.
+"""Captured presses in a generator's image format, for `brushloop train tune`, and a generator judged on unseen cells.
 
-It is judged on cells that it was not tuned on: the tuning sees the captures of all other cells and, where the session
-was fitted, images of the CCD-BSM that was fitted to those same captures, as the paper's generator learns from CCD-BSM.
-Each fold of cells has a tuning of its own, in a folder named after everything that it follows from; a killed one goes
-on from its checkpoint.
+It is judged on cells that it was not tuned on: the tuning sees the captures of all other cells and, if the session was
+fitted, images of the CCD-BSM fitted to those same captures, as the paper's generator learns from CCD-BSM. Each fold of
+cells has its own tuning, in a folder named after a hash of its inputs; a killed one resumes from its checkpoint.
 """
 
 from __future__ import annotations
@@ -38,19 +37,19 @@ if TYPE_CHECKING:
 
 MAX_STROKES = 100_000
 FOLDS = 5
-"""A tuning takes a minute, so cells are left out by fifths."""
+"""Number of folds: cells are left out by fifths, since a tuning takes a minute."""
 LEARNING_RATE = 2e-3
 NO_CELL: Cell = (-1.0, -1.0)
-"""Of an image that is no capture, so that it is never left out."""
+"""Cell of an image that is not a capture, so that it is never left out."""
 IMAGES = 400
-"""Images of the fitted CCD-BSM, beside the captures; drawn evenly from the generator's ranges."""
+"""Number of images of the fitted CCD-BSM added to the captures; drawn evenly from the generator's ranges."""
 HELD_OUT = 0.1
-"""Share of the captures that is not tuned on; only the curve of the training needs it."""
+"""Share of the captures that is not tuned on; used only for the training's curve."""
 
 
 @dataclass(frozen=True, slots=True)
 class AlignedStrokes:
-    """Captured presses as a generator draws them."""
+    """Captured presses in a generator's image format."""
 
     px_mm: float
     placement: str
@@ -60,11 +59,11 @@ class AlignedStrokes:
     inputs: list[dict[str, float]]
     cells: list[Cell]
     left_out: list[tuple[str, str]]
-    """(stroke, why): what the generator does not draw, or cannot be used."""
+    """(stroke, why) of presses that the generator does not draw or that cannot be used."""
 
 
 def align_captures(sessions: list[LoadedSession], generator: Path) -> AlignedStrokes:
-    """Every press of some sessions as the generator's own images. Raises what `load_generator` does."""
+    """Convert the presses of sessions to the generator's image format. Raises what `load_generator` raises."""
     from model.train.checkpoint import load_generator
 
     target = load_generator(generator).target
@@ -97,9 +96,9 @@ def align_captures(sessions: list[LoadedSession], generator: Path) -> AlignedStr
 
 
 def write_captures(aligned: AlignedStrokes, out: Path, leave_out: Sequence[Cell] = ()) -> int:
-    """Write the file for `brushloop train tune`, without some cells; returns how many presses are in it.
+    """Write the file for `brushloop train tune`, without some cells; return the number of presses.
 
-    Raises `CalibrationError` where fewer than two are left.
+    Raises `CalibrationError` if fewer than two are left.
     """
     import torch
 
@@ -123,10 +122,10 @@ def tuned_by_cell(
     work: Path,
     progress: Progress,
 ) -> dict[Cell, Path]:
-    """The generator's file for each cell, tuned without it; empty for fewer than two cells.
+    """File of the generator tuned without each cell, by cell; empty for fewer than two cells.
 
-    `fits` has for each cell a finished `refit_job` that left out the same `FOLDS`. Raises what `load_generator` and a
-    training do.
+    `fits` has for each cell the result of a `refit_job` with the same `FOLDS`. Raises what `load_generator` and
+    training raise.
     """
     left_out = folds(list(fits), FOLDS)
     calibration = session.calibration.digest if session.calibration is not None else ""
@@ -152,7 +151,7 @@ def tuned_by_cell(
 
 @dataclass(slots=True)
 class _TrainingProgress:
-    """Passes the steps of a training on; see `model.train.run.Progress`."""
+    """Reports the steps of a training; see `model.train.run.Progress`."""
 
     progress: Progress
     what: str
@@ -222,7 +221,7 @@ def _with_images(
 
 
 def _inputs_of(model: GeneratorModel, height_mm: float, tilt_deg: float) -> dict[str, float]:
-    """The generator's inputs for a press of its brush. Raises DomainError for one outside its training."""
+    """The generator's inputs for a press of its brush. Raises DomainError outside its training range."""
     values = {name: float(value[0]) for name, value in model.of_press(height_mm, tilt_deg).items()}
     out: dict[str, float] = {}
     for spec in model.target.inputs:
@@ -236,12 +235,12 @@ def _inputs_of(model: GeneratorModel, height_mm: float, tilt_deg: float) -> dict
 def _placed(
     prepared: Prepared, model: GeneratorModel, values: dict[str, float], height_mm: float, tilt_deg: float
 ) -> Image:
-    """(N, N) share of each of the generator's pixels that is ink. Raises `CaptureRefused` where it does not fit."""
+    """(N, N) share of ink in each pixel of the generator. Raises `CaptureRefused` if the stroke does not fit."""
     from model.generator.targets import ANCHOR_SHARE, Placement
 
     target = model.target
     side_mm = target.size_px * target.px_mm
-    assert prepared.anchor_px is not None  # prepare_press lays every press on its point of touch
+    assert prepared.anchor_px is not None  # prepare_press aligns every press with its point of touch
     anchor = (prepared.anchor_px[0] / PX_PER_MM, prepared.anchor_px[1] / PX_PER_MM)
     match target.placement:
         case Placement.CENTRED:
@@ -262,7 +261,7 @@ def _placed(
 
 
 def _resampled(mask: NDArray[np.bool_], corner_mm: tuple[float, float], px_mm: float, size_px: int) -> Image:
-    """The window of the mask with this upper left corner, averaged over the pixels of a coarser raster."""
+    """Average the mask, from this upper left corner, over the pixels of a coarser raster."""
     # At least as fine as the mask itself, else thin ink would fall between the samples.
     fine_px = max(FINE, math.ceil(px_mm * PX_PER_MM))
     scale = fine_px / (px_mm * PX_PER_MM)

@@ -31,7 +31,7 @@ def plan(
     steps: Annotated[int, typer.Option(min=0, max=1000, help="Of refinement; 0 keeps the first plan.")] = 60,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written.")] = 1,
 ) -> None:
-    """Plan characters: depth from the stroke's width, heading along it, refined through the model's image."""
+    """Plan characters: depth from the stroke's width, heading along the stroke, refined by the model's image."""
     import math
 
     from calibrate.artefact import load_artefact
@@ -126,7 +126,7 @@ def learn(
     gain: Annotated[float, typer.Option(min=0.05, max=1.5, help="Share of the deviation that is corrected.")] = 0.8,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written next.")] = 1,
 ) -> None:
-    """Correct a plan's trajectories by how far off their ink was, for the next writing."""
+    """Correct a plan's trajectories by the deviation of their ink, for the next writing."""
     from calibrate.files import check_folder
     from calibrate.writing.compare import compare_written
     from calibrate.writing.learn import learned

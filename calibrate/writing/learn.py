@@ -1,9 +1,10 @@
-"""The next plan of characters, corrected by how the ink of the last one came out.
+"""The next plan of characters, corrected by the deviation of the last one's ink.
 
-The ink of a drag is not what presses along its way would leave. What is seen is therefore inverted as if it were: the
-intended trajectory is refined until its image is the mean of the captures. By how much that differs from the intention,
-point by point in x, y and depth, the command is moved the other way (iterative learning control with the model as its
-learning filter; D. A. Bristow, M. Tharayil, A. G. Alleyne, IEEE Control Systems 26(3), 2006). Tilt and heading stay.
+A drag does not leave the same ink as presses along its path. The captures are nevertheless inverted as if they were
+presses: the intended trajectory is refined until its image matches the mean of the captures. Point by point, the
+command is then moved opposite to the difference from the intention in x, y and depth (iterative learning control with
+the model as its learning filter; D. A. Bristow, M. Tharayil, A. G. Alleyne, IEEE Control Systems 26(3), 2006). Tilt and
+heading do not change.
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ from model.registry import UnknownModelError, stroke_model
 Floats = NDArray[np.float64]
 STEPS = 60
 MOST_MM = 3.0
-"""Longest step of a coordinate in one round: a larger one comes from ink that was not seen, or of another stroke."""
+"""Largest correction of a coordinate in one round; more comes from ink that is unseen or of another stroke."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lesson:
-    """One character's correction: rms of the correction, in mm."""
+    """Root mean square of one character's correction, in mm."""
 
     name: str
     sideways_mm: float
@@ -62,7 +63,7 @@ def reach_of(by: PlannedBy) -> Reach:
 
 
 def model_of(by: PlannedBy) -> StrokeModel:
-    """The model that a plan was made with. Raises `CalibrationError` where it is not known any more."""
+    """The model that a plan was made with. Raises `CalibrationError` if it is no longer known."""
     try:
         return stroke_model(by.model, Brush(by.radius_mm, by.length_mm), math.pi if by.lam is None else by.lam)
     except (UnknownModelError, DomainError) as error:
@@ -91,7 +92,7 @@ def _corrected(
 
 
 def smoothed(moves: Floats) -> Floats:
-    """(N, 3) averaged with their neighbours, weights 1 4 6 4 1: what one point alone is off by is noise."""
+    """Average (N, 3) with their neighbours, weights 1 4 6 4 1: a deviation of a single point is noise."""
     for _ in range(2):
         padded = np.concatenate((moves[:1], moves, moves[-1:]))
         moves = 0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:]

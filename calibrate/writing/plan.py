@@ -28,13 +28,13 @@ Floats = NDArray[np.float64]
 SHIPPED_SOURCE = "hanzi-writer-data 2.0.1, from Make Me a Hanzi; outlines of Arphic PL fonts, ARPHIC PUBLIC LICENSE"
 MAX_FILE_BYTES = 4 * 1024 * 1024
 MAX_GRAPHICS_BYTES = 64 * 1024 * 1024
-"""makemeahanzi's file has 30 MB."""
+"""makemeahanzi's file has a size of 30 MB."""
 MAX_FIGURES = 20
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How characters are written. `tilt_deg` is where the tilt starts from; refinement may change it within reach."""
+    """How characters are written. `tilt_deg` is the initial tilt; refinement may change it within reach."""
 
     cell: Cell = field(default_factory=Cell)
     reach: Reach = field(default_factory=Reach)
@@ -44,12 +44,12 @@ class Settings:
     steps: int = 60
     """Steps of refinement; 0 keeps the first plan."""
     drag: DragModel | None = None
-    """Draws strokes that travel, with bristle lag; None lays presses over each other."""
+    """Draws travelling strokes with bristle lag; None superimposes presses."""
 
 
 @dataclass(frozen=True, slots=True)
 class FigureRequest:
-    """A figure to write: a name, its ways with half widths, and the image that they should give."""
+    """A figure to write: its name, its paths with half widths, and the image they should produce."""
 
     name: str
     source: str
@@ -136,7 +136,7 @@ def _shipped(name: str) -> Glyph:
 
 
 def _from(data: Path, name: str) -> Glyph:
-    """Out of a folder of `字.json` files, one such file, or makemeahanzi's graphics.txt (a JSON object a line)."""
+    """Read from a folder of `字.json` files, one such file, or makemeahanzi's graphics.txt (a JSON object a line)."""
     if data.is_dir():
         path = data / f"{name}.json"
         return _parsed(str(path), _text(path, MAX_CHARS), name)

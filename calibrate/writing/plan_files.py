@@ -1,4 +1,4 @@
-"""The files of a plan: plan.json, with its images, for a later comparison with ink; the protocol; and a picture."""
+"""The files of a plan: plan.json with images for a later comparison with ink, the protocol, and a picture."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ class PlannedBy(BaseModel):
     radius_mm: Number
     length_mm: Number
     lam: Number | None
-    """None is pi."""
+    """None means pi."""
     height_range_mm: tuple[Number, Number]
     tilt_range_deg: tuple[Number, Number]
     turn_deg_mm: Number
     speed_mm_s: Number
     drag_fit: Annotated[str, Field(max_length=64)] = ""
-    """Digest of the drag fit that images were drawn with; empty: presses laid over each other."""
+    """Digest of the drag fit that images were drawn with; empty for superimposed presses."""
 
 
 class FigureRecord(BaseModel):
@@ -111,7 +111,7 @@ def figure_record(
     wanted: Image,
     simulated: Image,
 ) -> FigureRecord:
-    """Of a planned figure: trajectories (N, 5), images (128, 128)."""
+    """Record of a planned figure: trajectories (N, 5), images (128, 128)."""
     return FigureRecord(
         name=name,
         source=source,
@@ -123,7 +123,7 @@ def figure_record(
 
 
 def arrays(points: Points) -> list[Floats]:
-    """Trajectories (N, 5)."""
+    """Convert points to trajectories (N, 5)."""
     return [np.array(stroke, np.float64) for stroke in points]
 
 
@@ -141,7 +141,7 @@ def write_plan(
 ) -> Path:
     """Write picture, plan.json and protocol into a folder; returns the protocol's path. Raises OSError.
 
-    `label` is the planning model's name for people. The protocol is written last: where it is, the rest is.
+    `label` is the planning model's display name. The protocol is written last: if it exists, so do the others.
     """
     out.mkdir(parents=True, exist_ok=True)
     draw(figures, settings, out / PICTURE)
@@ -194,7 +194,7 @@ def write_toml(record: PlanRecord, repeats: int) -> str:
 
 
 def draw(figures: list[PlannedFigure], settings: Settings, path: Path) -> None:
-    """A row a figure: wanted, first plan, refined plan, and the axis of the brush over the wanted strokes."""
+    """Draw a row per figure: wanted, first plan, refined plan, and the brush axis over the wanted strokes."""
     side = settings.cell.side_mm
     picture, rows = picture_grid(len(figures), 4, (12.0, 3.4 * len(figures)))
     extent = (0.0, side, 0.0, side)
@@ -220,12 +220,12 @@ def draw(figures: list[PlannedFigure], settings: Settings, path: Path) -> None:
 
 
 def code_points(name: str) -> str:
-    """A name that any font can show: most machines have none with Chinese characters for a picture."""
+    """A name with code points for Chinese characters, since most machines have no font that shows them."""
     return " ".join(f"U+{ord(c):04X}" if ord(c) > 0x2E7F else c for c in name)
 
 
 def points_digest(strokes: Sequence[Any]) -> str:
-    """SHA-256 of trajectories [stroke][point][x, y, height, tilt, heading], to the micrometre of the protocol."""
+    """SHA-256 of trajectories [stroke][point][x, y, height, tilt, heading], rounded like the protocol to 0.001."""
     rounded = [[[round(float(value), 3) + 0.0 for value in point] for point in stroke] for stroke in strokes]
     return hashlib.sha256(json.dumps(rounded, separators=(",", ":")).encode()).hexdigest()
 

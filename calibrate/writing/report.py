@@ -1,4 +1,4 @@
-"""Writes what came of written characters: Figure 13, one HTML file that needs nothing else, CSV and JSON."""
+"""Writes the results of written characters: Figure 13, one self-contained HTML file, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def record_of(written: WritingComparison, command: str, picture: bytes) -> Writt
 
 
 def draw(written: WritingComparison, path: Path) -> None:
-    """Figure 13, a row a character: reference, simulated, best and worst writing, and all of them over the reference.
+    """Draw Figure 13, a row per character: reference, simulated, best and worst writing, all writings over reference.
 
     Raises OSError.
     """
@@ -130,7 +130,7 @@ def ranked(written: WritingComparison, one: Character) -> list[str]:
 
 
 def _tables(table: list[Table3Row]) -> list[dict[str, Any]]:
-    """A table for each alignment and tone, both polarities in it."""
+    """A table for each alignment and tone, with both polarities."""
     out: list[dict[str, Any]] = []
     for tone in (Tone.BINARY, Tone.GRAY):
         for alignment in (Alignment.SIZE_NORMALISED, Alignment.MM):

@@ -1,4 +1,4 @@
-"""How alike a written character is to its simulated image, to its reference, and to its own other writings: Table 3."""
+"""Similarity of a written character to its simulated image, its reference, and its other writings: Table 3."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ Ink = dict[Tone, Image]
 SIMULATED, REFERENCE = "captured, simulated", "captured, reference"
 PLANNED, ANOTHER = "simulated, reference", "captured, another writing"
 PAIRS = (SIMULATED, REFERENCE, PLANNED, ANOTHER)
-"""What is compared with what."""
+"""The comparisons made."""
 PAPER_ROWS = {SIMULATED: TABLE_3["ccd-bsmg"], REFERENCE: TABLE_3[ROBOT_WRITING]}
-"""The paper's row that stands beside a comparison: our reading, see `TABLE_3`."""
+"""The paper's row shown with a comparison: our reading, see `TABLE_3`."""
 NORMAL_SIDE_PX = 100
 MAX_OTHERS = 12
-"""Other writings that one is compared with: a hundred writings would make ten thousand pairs."""
+"""Most other writings that one is compared with; a hundred writings would make ten thousand pairs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,18 +46,18 @@ class Character:
     reference: Ink
     simulated: Ink
     captured: dict[str, Ink]
-    """By stroke id."""
+    """Ink by stroke id."""
     cut: tuple[str, ...] = ()
     """Writings whose ink reaches the edge of their cell."""
 
     def mean_ink(self) -> Image:
-        """(128, 128) share of the writings that inked each place."""
+        """(128, 128) share of the writings that inked each pixel."""
         return np.asarray(np.mean([ink[Tone.BINARY] for ink in self.captured.values()], axis=0), np.float32)
 
 
 @dataclass(frozen=True, slots=True)
 class WrittenScore:
-    """One comparison; `stroke_id` is empty where no writing takes part."""
+    """One comparison; `stroke_id` is empty if no writing is involved."""
 
     character: str
     stroke_id: str
@@ -125,7 +125,7 @@ class WrittenRecord(Sealed):
 
 
 def read_written(path: Path) -> WrittenRecord:
-    """A `written.json`, or the one in a report's folder. Raises `CalibrationError` if it is not one, or was edited."""
+    """Read `written.json`, or that in a report's folder. Raises `CalibrationError` if it is not one or was edited."""
     return load_sealed(path / FILE if path.is_dir() else path, WrittenRecord, MAX_BYTES)
 
 
@@ -214,9 +214,9 @@ def table_3(
 
 
 def _summary(values: list[float]) -> Summary:
-    """In percent."""
+    """Summary in percent."""
     percent = [100.0 * value for value in values]
     found = summarise(np.array(percent))
     assert found is not None, "only called with scores, which are finite"
-    # Added up in order: numpy's sum differs in the last bit from every written.json so far.
+    # Summed in order: numpy's sum would differ in the last bit from every existing written.json.
     return replace(found, avg=sum(percent) / len(percent))

@@ -1,4 +1,4 @@
-"""What chains of commands share: running another brushloop command, and finding or making a finished session."""
+"""Helpers for chains of commands: run another brushloop command, and find or make a finished session."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Say = Callable[[str], None]
 GIVEN_UP = 3
 """Exit code of a collection that finished but left strokes out."""
 PRESSES = frozenset({"grid", "adaptive", "list"})
-"""Protocols whose recording is calibrated and validated by itself; for others, what comes next is not one command."""
+"""Protocols whose recording is calibrated and validated alone; after others, the next step is not one command."""
 
 
 class CommandFailed(Exception):
@@ -44,7 +44,7 @@ def run_command(say: Say, *arguments: str | Path, accepts: tuple[int, ...] = (0,
             code = process.wait()
             break
         except KeyboardInterrupt:
-            continue  # the command got it too, stops the arm and says so
+            continue  # the command receives it too, stops the arm and reports it
     if code not in accepts:
         raise CommandFailed(words, code if code > 0 else 4)
     return code
@@ -64,7 +64,7 @@ def finished_session(root: Path, protocol: Path) -> Path | None:
 
 
 def collected_session(say: Say, config: Path, protocol: Path, root: Path, options: Sequence[str | Path]) -> Path:
-    """The finished and calibrated session of this protocol under `root`; collect and calibrate it where it is missing.
+    """The finished and calibrated session of this protocol under `root`; collected and calibrated if missing.
 
     Raises `ConfigError`, `CommandFailed`.
     """
@@ -81,10 +81,10 @@ def collected_session(say: Say, config: Path, protocol: Path, root: Path, option
 
 
 def ending(folder: Path, kind: str) -> str:
-    """Lines that name the recording of a finished session and the next command; `kind` is its protocol's."""
+    """Lines that name the recording of a finished session and the next command; `kind` is its protocol's kind."""
     lines = [f"recorded: {folder / folder.name}.mcap"]
     if kind in PRESSES:
-        # On the screen it may have been calibrated already.
+        # It may have been calibrated on the screen already.
         command = "validate" if (folder / "calibration").is_dir() else "calibrate"
         lines.append(f"next:     brushloop {command} {folder}")
     return "".join(f"{line}\n" for line in lines)

@@ -1,7 +1,7 @@
 """`brushloop loop SESSION`, stage by stage: calibrate and fit, recover, press again, calibrate, compare.
 
-What a stage has finished is kept on disk and found again, so that the same command goes on after kill -9. The session
-that presses again is an ordinary one of `brushloop collect`, with its safety, its questions and its own resume.
+The finished work of a stage is kept on disk, so that the same command resumes after kill -9. The session that presses
+again is an ordinary one of `brushloop collect`, with the same safety checks, questions and resume.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class LoopRequest:
     config: Path
     out: Path
     fit: Path | None = None
-    """By default the current fit of the session; fitted where there is none."""
+    """By default the current fit of the session; if there is none, it is fitted first."""
     repeats: int = 1
     seed: int = 1
     collect_options: tuple[str, ...] = ()
@@ -44,7 +44,7 @@ class LoopRequest:
 
 
 def run_loop(request: LoopRequest, say: Say) -> Path:
-    """Run what is not done yet; return the report's path. Raises `ConfigError`, `SessionError`, `CommandFailed`."""
+    """Run the unfinished stages; return the report's path. Raises `ConfigError`, `SessionError`, `CommandFailed`."""
     recording = Recording(request.session)
     folder, root = recording.path.parent, recording.path.parent.parent
     rig = load_rig(request.config)
@@ -79,7 +79,7 @@ def _fit(request: LoopRequest, recording: Recording, say: Say) -> Path:
     if request.fit is not None:
         return request.fit
     if (begun := begun_with(request.out)) is not None:
-        return folder / FITS / f"{begun.fit}.json"  # also where another was fitted since
+        return folder / FITS / f"{begun.fit}.json"  # even if another fit was made since
     if not artefacts(folder, FITS):
         run_command(say, "fit", folder)
     fit = current(folder, FITS)
@@ -111,7 +111,7 @@ def check_recovered(path: Path) -> None:
 
 
 class Settings(BaseModel):
-    """What the presses of a loop depend on, kept in its folder: a loop that goes on must be the same loop."""
+    """What the presses of a loop depend on, kept in its folder, since a resumed loop must have the same ones."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -25,14 +25,14 @@ class _Frozen(BaseModel):
 
 
 class Interval(_Frozen):
-    """95 %, by bootstrap over the presses of each cell, or over cells where they have few."""
+    """95 % interval by bootstrap over the presses of each cell, or over cells if these have few presses."""
 
     low: float
     high: float
 
 
 class Stat(_Frozen):
-    """One model's scores in one alignment and tone, in percent; `cell` is (H, alpha), None for all of them."""
+    """One model's scores in one alignment and tone, in percent; `cell` is (H, alpha), or None for all cells."""
 
     model: str
     alignment: Alignment
@@ -50,29 +50,29 @@ class Stat(_Frozen):
 
 
 class CandidateInfo(_Frozen):
-    """A row of the tables: what it is, and what it knew of the strokes."""
+    """A row of the tables: the model, and what it knew of the strokes."""
 
     name: str
     label: str
     definition: str
     basis: str
     sha256: str
-    """Of a generator's file; empty for others."""
+    """Hash of a generator's file; empty for other models."""
 
 
 class Collected(_Frozen):
     """How the strokes were collected, from the session's journal."""
 
     planned: int | None
-    """None where the protocol is no grid."""
+    """Number of strokes; None unless the protocol is a grid."""
     photographed: int
     pressed_again: tuple[str, ...]
-    """Stroke of each take that did not count and was made again."""
+    """Stroke of each take that did not count and was repeated."""
     left_out: tuple[str, ...]
     touches: tuple[str, ...]
     """Method and height of every zero touch."""
     moved_mm: float
-    """Highest less lowest paper."""
+    """Highest minus lowest height of the paper."""
 
 
 class Session(_Frozen):
@@ -102,13 +102,13 @@ class Session(_Frozen):
     fit: str
     length_ratio: float | None
     width_ratio: float | None
-    """Measured over CCD-BSM as published, on average over whole strokes."""
+    """Measured size divided by that of CCD-BSM as published, averaged over uncut strokes."""
     collected: Collected | None = None
-    """None where there is no journal: imports, and files that were sent alone."""
+    """None without a journal: for imports, and for recordings sent without it."""
 
 
 class Refused(_Frozen):
-    """A stroke that was not compared, or not by one model, and why."""
+    """A stroke that was not compared, or not with one of the models, and why."""
 
     session_id: str
     stroke_id: str
@@ -128,7 +128,7 @@ class Extreme(_Frozen):
 
 
 class Step(_Frozen):
-    """What a fit from so many presses scores on all other presses of the session."""
+    """Scores of a fit from this many presses on all other presses of the session."""
 
     session_id: str
     strokes: int
@@ -139,14 +139,14 @@ class Step(_Frozen):
 
 
 class Report(Sealed):
-    """Everything that was found."""
+    """All results of a validation."""
 
     FORMAT: ClassVar[str] = FORMAT
     MADE_BY: ClassVar[str] = "brushloop validate"
 
     format: str = FORMAT
     source: Source
-    """What kind of ink, from the recordings' own headers; all tables and figures carry it."""
+    """Kind of ink, from the recordings' own headers; shown on all tables and figures."""
     software: dict[str, str]
     command: str
     mm_per_px: float
@@ -154,21 +154,21 @@ class Report(Sealed):
     sessions: tuple[Session, ...]
     rivals: tuple[CandidateInfo, ...]
     shown: str
-    """The model of the pictures: the best calibrated one that has not seen what it predicts, if there is one."""
+    """Model shown in the pictures: the best calibrated one on held-out cells, if there is one."""
     stats: tuple[Stat, ...]
     cells_told: bool
-    """False where there are too many different (H, alpha) for a table of each."""
+    """False if there are too many different (H, alpha) for a table of each."""
     best: tuple[Extreme, ...]
     worst: tuple[Extreme, ...]
     refused: tuple[Refused, ...]
     by_strokes: tuple[Step, ...]
     """Similarity against number of strokes; empty without --ablations."""
     scores_sha256: str
-    """Of scores.csv beside it."""
+    """Hash of scores.csv in the same folder."""
     loops: tuple[LoopRecord, ...] = ()
-    """Strokes of these sessions that were pressed again: Table 1's third row."""
+    """Strokes of these sessions that were pressed again: the third row of Table 1."""
     written: tuple[WrittenRecord, ...] = ()
-    """Characters: Table 3. Both are sealed by themselves, as they were found."""
+    """Characters: Table 3. Each record here and in `loops` keeps its own digest."""
 
     def stat(
         self,
@@ -178,7 +178,7 @@ class Report(Sealed):
         measure: str,
         cell: tuple[float, float] | None = None,
     ) -> Stat | None:
-        """The scores of one model, or None where it has none."""
+        """The scores of one model, or None if it has none."""
         for one in self.stats:
             if (one.model, one.alignment, one.tone, one.measure, one.cell) == (model, alignment, tone, measure, cell):
                 return one
@@ -186,17 +186,17 @@ class Report(Sealed):
 
     @property
     def label(self) -> str:
-        """What stands on every table and figure."""
+        """Label of every table and figure."""
         return str(self.source)
 
 
 def load_report(path: Path) -> Report:
-    """A report.json. Raises `CalibrationError` where it is none, or was edited."""
+    """Read a report.json. Raises `CalibrationError` if it is not one or was edited."""
     return load_sealed(path, Report, MAX_BYTES)
 
 
 def software() -> dict[str, str]:
-    """Versions of what the numbers depend on."""
+    """Versions of the software that the numbers depend on."""
     return {"brushloop": version("brushloop"), "python": platform.python_version()} | {
         name: version(name) for name in PACKAGES
     }

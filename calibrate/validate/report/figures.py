@@ -1,4 +1,4 @@
-"""Pictures of a report of presses, as data URIs. Every plot carries its source in the picture itself."""
+"""Pictures of a report of presses, as data URIs. Every plot shows its source in the picture itself."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from calibrate.validate.run import Outcome
 from model.ccdbsm import DomainError
 
 ROWS = slice(32, 96)
-"""The middle half of a field: a press is at most half as thick as the field is high."""
+"""Rows to show: the middle half of a field, as a press is at most half as thick as the field is high."""
 MAX_POINTS = 200
 MAX_SAMPLES, MAX_CELLS = 15, 5
 GRAY_MM = KEYS.index((Alignment.MM, Tone.GRAY))
@@ -91,7 +91,7 @@ class Curve:
 
 
 def read_curve(text: str) -> Curve:
-    """`NAME=FOLDER`, a folder that `brushloop train` wrote. Raises `CalibrationError` where it holds no curve."""
+    """Read `NAME=FOLDER`, a folder that `brushloop train` wrote. Raises `CalibrationError` if it holds no curve."""
     name, _, folder = text.partition("=")
     if not name or not folder:
         raise CalibrationError(f"--curves {text}", "expected NAME=FOLDER")
@@ -121,7 +121,7 @@ def curves(given: Sequence[Curve]) -> str:
 
 
 def samples(outcome: Outcome, shown: str) -> list[dict[str, Any]]:
-    """The first capture of each cell above what one model predicts: the paper's figures 7 and 8."""
+    """The first capture of each cell above one model's prediction: the paper's figures 7 and 8."""
     figures: list[dict[str, Any]] = []
     for k in _first_of_cells(outcome, MAX_SAMPLES):
         row = outcome.rows[k]
@@ -133,7 +133,7 @@ def samples(outcome: Outcome, shown: str) -> list[dict[str, Any]]:
 
 
 def side_by_side(outcome: Outcome, leave_out: Sequence[str]) -> dict[str, Any]:
-    """Some captures beside what every contender predicts: the paper's figures 10 and 11."""
+    """Some captures next to the prediction of every candidate: the paper's figures 10 and 11."""
     chosen = _first_of_cells(outcome, MAX_CELLS)
     known = {one.name: one.label for group in outcome.candidates for one in group if one.name not in leave_out}
     lines: list[dict[str, Any]] = []
@@ -145,7 +145,7 @@ def side_by_side(outcome: Outcome, leave_out: Sequence[str]) -> dict[str, Any]:
 
 
 def of_one_cell(outcome: Outcome, names: Sequence[str]) -> list[tuple[str, str]]:
-    """(label, image) of a capture in the middle of the cells, and of these candidates for it."""
+    """(label, image) of a capture of the middle cell, and of these candidates' predictions."""
     chosen = _first_of_cells(outcome, MAX_SAMPLES)
     if not chosen:
         return []
@@ -160,7 +160,7 @@ def of_one_cell(outcome: Outcome, names: Sequence[str]) -> list[tuple[str, str]]
 
 
 def _first_of_cells(outcome: Outcome, most: int) -> list[int]:
-    """The first capture of each cell, of cells evenly chosen where there are more."""
+    """The first capture of each cell; with more than `most` cells, of evenly spaced ones."""
     first: dict[tuple[float, float], int] = {}
     for k, row in enumerate(outcome.rows):
         first.setdefault(row.cell, k)
@@ -183,7 +183,7 @@ def extreme(outcome: Outcome, session_id: str, stroke_id: str, model: str) -> di
 
 
 def predicted(outcome: Outcome, k: int, name: str) -> Pixels | None:
-    """(128, 128) gray on the millimetre field, or None where the model does not predict this press."""
+    """(128, 128) gray on the millimetre field, or None if the model does not predict this press."""
     row = outcome.rows[k]
     found = next((one for one in outcome.candidates[row.session] if one.name == name), None)
     if found is None:

@@ -1,4 +1,4 @@
-"""What a report says in sentences: what was measured, on what, how well, and whether to trust it."""
+"""Findings of a report in sentences: what was measured, how well models predict it, and whether to trust it."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from sessions.recording.schemas import Source
 CLOSE = 0.5
 """Points below which two models count as equal."""
 NEAR_CEILING = 1.5
-"""Points of average CSIM."""
+"""Distance from the ceiling that counts as near, in points of average CSIM."""
 FEW_REPEATS = 3
 WIDE_SCALE = 0.005
-"""Relative width of the interval of pix2len from which it matters: half a percent of every length."""
+"""Relative width of pix2len's interval above which it matters: half a percent of every length."""
 MUCH_REFUSED = 0.05
 MOVED_MM = 0.3
-"""Between two zero touches of one session: more than their repeatability together."""
+"""Difference between two zero touches of one session that exceeds their combined repeatability."""
 MAX_NAMED = 6
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One thing to know before trusting a number; `good` None where it is neither good nor bad."""
+    """One thing to know before trusting a number; `good` is None if it is neither good nor bad."""
 
     good: bool | None
     text: str
 
 
 def measured(report: Report) -> str:
-    """What was measured, on what."""
+    """Summary of the strokes and models that were compared."""
     cells = {one.cell for one in report.stats if one.cell is not None}
     compared, strokes = (sum(getattr(s, name) for s in report.sessions) for name in ("compared", "strokes"))
     many = f"{len(report.sessions)} sessions" if len(report.sessions) > 1 else "one session"
@@ -57,7 +57,7 @@ def measured(report: Report) -> str:
 
 
 def findings(report: Report) -> Iterator[str]:
-    """How well: the ceiling, the best model that had not seen the strokes, the published one."""
+    """How well the models predict: the ceiling, the best model that had not seen the strokes, the published one."""
     top = _avg(report, CEILING)
     if top is not None:
         yield (
@@ -123,7 +123,7 @@ def _sizes(report: Report) -> Iterator[str]:
 
 
 def order(report: Report) -> str:
-    """Whether the models stand in the paper's order, size-normalised and binary."""
+    """Whether the models rank in the paper's order, size-normalised and binary."""
     found = {
         name: stat.avg
         for name in ORDER
@@ -156,7 +156,7 @@ def order(report: Report) -> str:
 
 
 def trust(report: Report) -> Iterator[Point]:
-    """What to look at before believing the numbers."""
+    """Points to check before trusting the numbers."""
     match report.source:
         case Source.LOOPBACK:
             yield Point(None, "Loopback rig: the numbers test the software and the method. They say nothing about ink.")
@@ -203,7 +203,7 @@ def trust(report: Report) -> Iterator[Point]:
 
 
 def _collection(one: Session) -> Iterator[Point]:
-    """What the recording alone does not show: what was planned and never counted, and paper that moved."""
+    """What the recording alone does not show: planned strokes that never counted, and paper that moved."""
     collected = one.collected
     if collected is None:
         return

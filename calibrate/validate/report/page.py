@@ -1,4 +1,4 @@
-"""The HTML report of presses: one file that needs nothing else."""
+"""The HTML report of presses: one self-contained file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_REFUSED = 200
 
 
 def page_of(outcome: Outcome, report: Report, curves: Sequence[Curve], figures_13: Sequence[str] = ()) -> str:
-    """The whole page. `figures_13` are the pictures of written characters, data URIs, empty where there is none."""
+    """The whole page. `figures_13` are pictures of written characters as data URIs, empty if missing."""
     shown = tables.candidate(report, report.shown)
     normal, strict = (Alignment.SIZE_NORMALISED, Tone.BINARY), (Alignment.MM, Tone.BINARY)
     return render(

@@ -1,4 +1,4 @@
-"""From scores to a report: statistics per cell and overall, the best and worst strokes, and where it all comes from."""
+"""From scores to a report: statistics per cell and overall, the best and worst strokes, and their provenance."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MEASURES = ("csim", "ssim")
 MAX_CELLS = 60
 EXTREMES = 6
 JUDGED: Key = (Alignment.MM, Tone.BINARY)
-"""Best and worst are judged in millimetres: where a stroke lies and how large it is counts."""
+"""Best and worst are judged in millimetres, where place and size count."""
 PRESSES = {
     CEILING: (
         "another press",
@@ -47,7 +47,7 @@ PRESSES = {
 def report_of(
     outcome: Outcome, command: str, scores_sha256: str, by_strokes: tuple[Step, ...], extras: Extras
 ) -> Report:
-    """Everything of a run as one frozen report."""
+    """Build one frozen report of a whole run."""
     cells = sorted({row.cell for row in outcome.rows})
     each_cell = len(cells) <= MAX_CELLS
     shown = _shown(outcome)
@@ -219,7 +219,7 @@ def _collected(one: LoadedSession) -> Collected | None:
 
 
 def _ratios(one: LoadedSession, mine: list[Row]) -> tuple[float | None, float | None]:
-    """How much longer and wider whole marks are than CCD-BSM draws them for a brush of this size."""
+    """Mean ratio of length and width of uncut marks to those of CCD-BSM for a brush of this size."""
     brush = brush_of(one.header)
     drawn: dict[tuple[float, float], tuple[float, float]] = {}
     found: list[tuple[float, float]] = []
@@ -246,5 +246,5 @@ def _interval(ends: tuple[float, float] | None) -> Interval | None:
 
 
 def _round(value: float) -> float:
-    """Six digits behind the point: more would be another machine's rounding."""
+    """Round to six decimals; further digits would differ between machines."""
     return round(value, 6)

@@ -1,4 +1,4 @@
-"""The rows of every table, for terminal and page alike."""
+"""The rows of every table, for both terminal and page."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ WRITTEN_ROWS = {
     ANOTHER: ("another writing", "each writing against the others: how alike arm and brush write twice"),
     PLANNED: ("the plan", "simulated image against the reference: what the plan gives at best"),
 }
-"""Comparison -> its row of Table 3, and what it is."""
+"""Label and description of the row of Table 3 for each comparison."""
 
 
 @dataclass(frozen=True, slots=True)
 class PaperRow:
-    """One row as the paper lays it out: CSIM max, min, avg, then SSIM; None where one side has no such row."""
+    """One row in the paper's layout: CSIM max, min, avg, then SSIM; None if one side has no such row."""
 
     label: str
     basis: str
@@ -51,7 +51,7 @@ class FullRow:
 
 
 def table_1(report: Report, alignment: Alignment, tone: Tone) -> list[PaperRow]:
-    """The generated models and robot writing, calibrated ones beside, and the ceiling."""
+    """Rows of the generated models and robot writing, with calibrated models and the ceiling."""
     names = [*TABLE_1, *_present(report, (who.FITTED_HELD_OUT, who.GENERATOR_HELD_OUT)), CEILING]
     rows: list[PaperRow] = []
     for name in names:
@@ -61,7 +61,7 @@ def table_1(report: Report, alignment: Alignment, tone: Tone) -> list[PaperRow]:
 
 
 def robot_writing(report: Report, alignment: Alignment, tone: Tone) -> list[PaperRow]:
-    """Strokes that were pressed again: as scored in this run where both sessions are in it, else as each loop says."""
+    """Rows of strokes pressed again: scored in this run if it has both sessions, else taken from each loop."""
     scored = report.stat(REPEATED, alignment, tone, "csim") is not None
     rows = [_row(report, REPEATED, TABLE_1[REPEATED], alignment, tone)] if scored else []
     here = {session.recording_sha256 for session in report.sessions}
@@ -84,7 +84,7 @@ def _loop_row(loop: LoopRecord, report: Report, alignment: Alignment, tone: Tone
 
 
 def table_2(report: Report, alignment: Alignment, tone: Tone) -> list[PaperRow]:
-    """The paper's models in its order, then whatever else was compared."""
+    """Rows of the paper's models in its order, then of all others."""
     others = [rival.name for rival in report.rivals if rival.name not in (*TABLE_2, CEILING, REPEATED, *who.LAMBDAS)]
     names = [*TABLE_2, *others, CEILING]
     return [_row(report, name, TABLE_2.get(name), alignment, tone) for name in names]
@@ -98,13 +98,13 @@ class CharacterTables:
     title: str
     """Character, session, brush and cell."""
     paper_like: list[PaperRow]
-    """Size-normalised and binary, in both polarities, the paper's rows beside."""
+    """Size-normalised and binary, in both polarities, with the paper's rows."""
     strict: list[PaperRow]
     """In millimetres, binary, ink = 1."""
 
 
 def table_3(report: Report) -> list[CharacterTables]:
-    """Every character of every session of characters."""
+    """Tables of every character in every session of characters."""
     found: list[CharacterTables] = []
     for record in report.written:
         for name in record.characters:
@@ -145,7 +145,7 @@ def _written_row(row: Table3Row, *, beside: bool) -> PaperRow:
 
 
 def full(report: Report, alignment: Alignment, tone: Tone) -> list[FullRow]:
-    """Every model."""
+    """Rows of all models."""
     rows: list[FullRow] = []
     for rival in report.rivals:
         csim, ssim = (report.stat(rival.name, alignment, tone, measure) for measure in ("csim", "ssim"))
@@ -155,13 +155,13 @@ def full(report: Report, alignment: Alignment, tone: Tone) -> list[FullRow]:
 
 
 def pair(report: Report, name: str, alignment: Alignment) -> str:
-    """`CSIM / SSIM` on average, binary; empty where there is none."""
+    """Average `CSIM / SSIM`, binary; empty if there is none."""
     found = [report.stat(name, alignment, Tone.BINARY, measure) for measure in ("csim", "ssim")]
     return " / ".join(f"{stat.avg:.2f}" for stat in found if stat is not None)
 
 
 def candidate(report: Report, name: str) -> CandidateInfo | None:
-    """What a name stands for."""
+    """The candidate of that name, if there is one."""
     return next((one for one in report.rivals if one.name == name), None)
 
 
