@@ -1,8 +1,8 @@
 """A peristaltic pump on Modbus RTU (RS-485).
 
 The register map is from public third-party code, not from the maker's manual, and no pump has confirmed it yet:
-register 1 is the speed in 0.01 rpm, register 4 is 1 to start, 0 to stop, 2 for full speed. The pump is known
-to answer only writes, so nothing is read: neither the pump's identity nor the level of the well is known.
+register 1 is the speed in 0.01 rpm, register 4 is 1 to start, 0 to stop, 2 for full speed. Only replies
+to writes are certain, so nothing is read: neither the pump's identity nor the level of the well is known.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ JOINT_ACCS_RAD_S2 = (31.1, 31.1, 31.1, 20.7, 20.7, 20.7)
 TCP_SPEED_M_S, TCP_TURN_RAD_S = 2.0, 5.0
 TCP_ACC_M_S2, TCP_TURN_RAD_S2 = 10.0, 10.0
 REDUCED_M_S = 0.25
-"""Limit in reduced mode and manual operation: ISO 10218-1 calls 250 mm/s reduced speed. Configurable in reality."""
+"""Limit in reduced mode and manual operation: ISO 10218-1's reduced speed, 250 mm/s. Configurable on a real cabinet."""
 REACH_M = 0.8865
 REDUCED_RAD_S = REDUCED_M_S / REACH_M
 """Joint speed at which the tip of the stretched arm stays below `REDUCED_M_S`."""
