@@ -1,7 +1,7 @@
-"""Immutable files named after the hash of their contents, and the pointer that says which of a session's is in use.
+"""Immutable files named after the hash of their contents, and the pointer to the one that a session uses.
 
-`calibration/current` holds the name of one of `calibration/*.json`; every kind of artefact has a folder of its own.
-Sessions written before there were pointers have none: there the artefact that was written last is in use.
+`calibration/current` holds the name of one of `calibration/*.json`; every kind of artefact has its own folder.
+In sessions written before pointers existed, the artefact that was written last is in use.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from calibrate.errors import CalibrationError, invalid
 from calibrate.files import read_bounded, write_whole
 
 FOLDER = "calibration"
-"""Of a session: where its calibrations lie."""
+"""Folder of a session that holds its calibrations."""
 HASH_CHARS = 16
 POINTER = "current"
 NAME = re.compile(rb"([0-9a-f]{%d}\.json)\n?" % HASH_CHARS)
-"""File name of an artefact: nothing else is followed, least of all a path out of the folder."""
+"""File name of an artefact. A pointer that holds anything else, such as a path out of the folder, is refused."""
 MAX_POINTER_BYTES = 256
 
 _log = logging.getLogger(__name__)
 
 
 class Artefact(BaseModel):
-    """Base: frozen, unknown fields are refused, saved under the hash of its canonical JSON."""
+    """Base class of artefacts: frozen, without unknown fields, saved under the hash of its canonical JSON."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     versions: ClassVar[tuple[int, ...]] = (1,)
-    """Values of `schema_version` that are read."""
+    """Supported values of `schema_version`."""
 
     @property
     def digest(self) -> str:
@@ -45,7 +45,7 @@ class Artefact(BaseModel):
         return self.model_dump_json(indent=2).encode() + b"\n"
 
     def save(self, folder: Path) -> Path:
-        """Write `<digest>.json` into `folder`; a file of that name holds the same and stays. Raises OSError."""
+        """Write `<digest>.json` into `folder`; an existing one has the same contents and is kept. Raises OSError."""
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"{self.digest}.json"
         if not path.exists():
@@ -92,23 +92,23 @@ def _version(data: bytes) -> object:
 
 
 def put_to_use(artefact: Artefact, session: Path, folder: str = FOLDER) -> Path:
-    """Save an artefact in that folder of a session and point there; returns where it lies. Raises OSError."""
+    """Save an artefact in `folder` of a session and point to it; returns its path. Raises OSError."""
     path = artefact.save(session / folder)
     write_whole(path.with_name(POINTER), path.name + "\n")
     return path
 
 
 def artefacts(session: Path, folder: str = FOLDER) -> list[Path]:
-    """Every artefact in that folder of a session, the one written first in front."""
+    """Every artefact in `folder` of a session, oldest first."""
     found = (path for path in (session / folder).glob("*.json") if path.is_file())
     return sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name))
 
 
 def current(session: Path, folder: str = FOLDER) -> Path | None:
-    """The artefact in use in that folder of a session; None where there is none.
+    """Path of the artefact in use in `folder` of a session; None if it has no artefact.
 
-    Raises `CalibrationError` for a pointer that leads nowhere. Where there are several and no pointer, a warning says
-    which was taken.
+    Raises `CalibrationError` for a pointer that does not name an existing artefact. If there are several artefacts and
+    no pointer, a warning says which was taken.
     """
     pointer, found = session / folder / POINTER, artefacts(session, folder)
     if pointer.exists() or pointer.is_symlink():

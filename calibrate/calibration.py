@@ -1,4 +1,4 @@
-"""The calibration of a session: where the paper lies in its photographs, an immutable file."""
+"""The calibration of a session: an immutable file that says where the paper lies in its photographs."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from calibrate.board.pix2len import apply
 from calibrate.board.spec import BoardSpec
 
 SCHEMA_VERSION = 2
-"""2 names the lens, the board and the still, and says whether it was made for another session."""
+"""Version 2 adds the lens, the board, the still, and whether the calibration was made for another session."""
 
 
 class Foreign(BaseModel):
-    """Another session's calibration, applied by force: where it comes from, and how far off it is here."""
+    """Origin of a calibration that was made for another session and applied by force, and its error here."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     digest: str
-    """Of the artefact that was applied."""
+    """Digest of the applied artefact."""
     session_id: str
     source: str
     recording_sha256: str
     board_off_mm: float | None
-    """Root mean square by which this session's own board lies off under it; None where no board is seen."""
+    """Root mean square error of this session's own board under it; None if no board is seen."""
 
 
 class Calibration(Artefact):
@@ -55,7 +55,7 @@ class Calibration(Artefact):
     """Outliers: seen, but not on the plane of the others."""
     preprocess: dict[str, float]
     lens: LensUsed | None = None
-    """By which photographs are undistorted first; none in files of version 1, which had no lens."""
+    """Lens by which photographs are undistorted first; None in files of version 1."""
     middle_px: tuple[float, float] | None = None
     """Pixel at which `mm_per_px` holds, in the photograph as it was taken."""
     board: BoardSpec | None = None
@@ -80,7 +80,7 @@ class Calibration(Artefact):
 
     @property
     def named(self) -> str:
-        """For reports: the digest, and the label where there is one."""
+        """Name for reports: the digest, and the label if there is one."""
         return f"{self.digest}, {self.label}" if self.label else self.digest
 
     @property

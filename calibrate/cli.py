@@ -46,7 +46,7 @@ app.command("session")(calibrate)
 def show(
     artefact: Annotated[Path, typer.Argument(help="A calibration, lens, registration or brush fit, or a session.")],
 ) -> None:
-    """What an artefact holds, or the calibration that a session uses."""
+    """Show the contents of an artefact, or of the calibration that a session uses."""
     from calibrate.describe import described, read_any
 
     path, made = read_any(artefact)
@@ -58,7 +58,7 @@ def diff(
     one: Annotated[Path, typer.Argument(help="An artefact, or a session: the calibration that it uses.")],
     other: Annotated[Path, typer.Argument(help="Another of the same kind.")],
 ) -> None:
-    """What is different in another artefact, and for calibrations what that means on the paper."""
+    """Show how two artefacts differ, and for calibrations what that means on the paper."""
     from calibrate.describe import differences, read_any
 
     lines = differences(read_any(one)[1], read_any(other)[1])
@@ -71,7 +71,7 @@ def apply_to(
     session: Annotated[Path, typer.Argument(help="The session that it is to be used for.")],
     force: Annotated[bool, typer.Option(help="Also another session's; every result is then labelled.")] = False,
 ) -> None:
-    """Use a calibration for a session from now on; another session's only by force."""
+    """Use a calibration for a session from now on; another session's needs --force."""
     from calibrate.artefact import load_artefact
     from calibrate.calibration import Calibration
     from calibrate.session import apply_calibration
@@ -91,7 +91,7 @@ def preprocess(
     lens: Annotated[Path | None, typer.Option(help="Lens file; the session's own by default.")] = None,
     out: Annotated[Path, typer.Option(help="The picture; the numbers go beside it as .json.")] = Path("stages.png"),
 ) -> None:
-    """Show every stage of one capture as one picture, and write down each number that was fitted on the way."""
+    """Show every stage of one capture in one picture, and write each fitted number to a JSON file."""
     from calibrate.files import check_target
     from calibrate.show_stages import show_photograph, show_stroke
 

@@ -22,11 +22,11 @@ KINDS: dict[str, type[Artefact]] = {
     "robot_to_paper": RegistrationFile,
     "edges_mm": BrushFit,
 }
-"""Each kind by a field that no other kind has."""
+"""Each kind of artefact by a field that no other kind has."""
 
 
 def read_any(path: Path) -> tuple[Path, Artefact]:
-    """An artefact of any kind, or the calibration that a session uses, and where it lies. Raises `CalibrationError`."""
+    """Read an artefact, or the calibration that a session uses; returns its path too. Raises `CalibrationError`."""
     if path.is_dir():
         found = current(path)
         if found is None:
@@ -65,7 +65,7 @@ def differences(one: Artefact, other: Artefact) -> list[str]:
 
 
 def fields(artefact: Artefact) -> dict[str, object]:
-    """Every value that is no table, by dotted name."""
+    """Every value by its dotted name; tables are flattened."""
     return dict(_flat("", artefact.model_dump(mode="json")))
 
 

@@ -24,10 +24,10 @@ class CalibrationError(Exception):
 
 
 def invalid(where: str, error: ValidationError) -> CalibrationError:
-    """The first thing that is wrong with a file's contents, in one line that names the field."""
+    """An error for the first invalid field of a file, in one line that names the field."""
     first = error.errors()[0]
     return CalibrationError(where, f"{'.'.join(map(str, first['loc']))}: {first['msg']}")
 
 
 class CaptureRefused(CalibrationError):
-    """This capture cannot be compared; it is listed by name, never dropped in silence."""
+    """This capture cannot be compared; it is listed by name, never dropped silently."""

@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_BYTES = 1024 * 1024
-"""Of a file that people or this software write: a table, an artefact."""
+"""Largest file that people or this software write: a table, an artefact."""
 MAX_PHOTOGRAPH_BYTES = 256 * 1024 * 1024
 
 
 def check_target(path: Path, ending: str, *inputs: Path | None) -> None:
-    """Before any work: whether a file may be written there. Raises `CalibrationError`.
+    """Check before any work that a file may be written to `path`. Raises `CalibrationError`.
 
-    Another suffix might be a recording's or a photograph's, and inputs are never overwritten.
+    A file with another suffix might be a recording or a photograph; inputs are never overwritten.
     """
     if path.suffix.lower() != ending:
         raise CalibrationError(str(path), f"must end in {ending}")
@@ -33,15 +33,15 @@ def check_target(path: Path, ending: str, *inputs: Path | None) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Before any work: whether files can be written into a folder, or it can be made. Raises `CalibrationError`."""
+    """Check before any work that a folder is writable or can be created. Raises `CalibrationError`."""
     if (found := unwritable(folder)) is not None:
         raise CalibrationError(str(found[0]), found[1])
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write beside, then rename: a reader sees the old file or the new one. Raises OSError and removes the part.
+    """Write a temporary file, then rename it: a reader sees the old file or the new one. Raises OSError.
 
-    Line ends stay as they are, and who may read a file that was there already.
+    The temporary file is removed on failure. Line endings and the mode of an existing file are kept.
     """
     part = path.with_name(path.name + ".part")
     try:
@@ -55,9 +55,9 @@ def write_whole(path: Path, text: str) -> None:
 
 
 def read_bounded(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
-    """The bytes of a file of at most so many. Raises `CalibrationError` where it is larger or cannot be read.
+    """Read a file of at most `most_bytes` bytes. Raises `CalibrationError` if it is larger or cannot be read.
 
-    A file that grows while it is read, or a pipe without a size, is cut off at that length.
+    Reading stops at that length even if the file grows meanwhile, or has no size, like a pipe.
     """
     try:
         if not path.is_file() and path.exists():
@@ -72,7 +72,7 @@ def read_bounded(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
 
 
 def read_gray(path: Path) -> NDArray[np.uint8]:
-    """(h, w) gray of a photograph, PNG or JPEG. Raises `CalibrationError` for other files and larger ones."""
+    """Read a PNG or JPEG photograph as (h, w) gray. Raises `CalibrationError` for other files and larger ones."""
     from sessions.errors import SessionDamaged
     from sessions.recording.messages import decode_gray
 

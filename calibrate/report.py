@@ -1,4 +1,4 @@
-"""What every report is written with: pages from templates, pictures as data URIs, CSV, and JSON sealed by a digest."""
+"""Write reports: pages from templates, pictures as data URIs, CSV, and JSON sealed by a digest."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from sessions.recording.schemas import Source
 
 Image = NDArray[np.float32]
 PAPER = "#fbf9f4"
-"""Background of pictures that are files of their own."""
+"""Background of picture files."""
 
 
 def render(template: str, **values: Any) -> str:
-    """The page of `calibrate/templates/<template>`; an undefined name is an error.
+    """Render `calibrate/templates/<template>`; an undefined name is an error.
 
     Names, licences and origins come from other people's files, so everything is escaped.
     """
@@ -58,7 +58,7 @@ def write_files(folder: Path, texts: Mapping[str, str]) -> None:
 
 
 def source_note(source: Source) -> str:
-    """What kind of ink this is, in one sentence."""
+    """One sentence on where the ink comes from."""
     match source:
         case Source.LOOPBACK:
             return "loopback rig: simulated brush, ink and camera; not a result on paper"
@@ -145,10 +145,10 @@ def save_picture(figure: Any, path: Path) -> None:
 
 
 class Sealed(BaseModel):
-    """A report as data that carries a digest of its contents, so that an edited one is recognised.
+    """Base class of JSON reports with a digest of their contents, by which an edited one is recognised.
 
-    The digest is no signature: it guards what was measured, and on what kind of ink, against edits by accident.
-    Frozen, without unknown fields. A subclass gives `format` its FORMAT as default.
+    The digest is not a signature: it guards results and their source against accidental edits.
+    Frozen, without unknown fields. A subclass sets FORMAT and makes it the default of `format`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -178,7 +178,7 @@ S = TypeVar("S", bound=Sealed)
 
 
 def load_sealed(path: Path, kind: type[S], most_bytes: int) -> S:
-    """Read a report as data. Raises `CalibrationError`, naming the file, if it is not one, is too new or was edited."""
+    """Read a JSON report. Raises `CalibrationError`, naming the file, if it is not one, is too new or was edited."""
     data = read_bounded(path, most_bytes)
     fields: dict[str, Any] = {}
     digest = ""
@@ -186,7 +186,7 @@ def load_sealed(path: Path, kind: type[S], most_bytes: int) -> S:
         parsed: Any = json.loads(data)
         if isinstance(parsed, dict):
             fields = cast("dict[str, Any]", parsed)
-            # Of the file, not of the model: a field added since the file was written is no edit.
+            # Digest of the file, not of the model: a field that was added to the model later is not an edit.
             digest = _digest(fields)
     except (ValueError, RecursionError):  # no JSON, or text that is no Unicode: reported below
         fields = {}

@@ -25,10 +25,10 @@ FITTED = "k1 fitted on the board"
 
 
 def calibrate_session(session: Path, lens: Path | None = None) -> Path:
-    """Calibrate, save beside the recording and use it from now on; returns the artefact's path.
+    """Calibrate a session, save the result beside the recording and use it from now on; returns its path.
 
-    The lens is the file that is given, else the one that the session was collected with. Raises `CalibrationError`,
-    also for a lens that visibly distorts and is not known.
+    Without a lens file, the lens that the session was collected with is used. Raises `CalibrationError`, also for an
+    unknown lens that visibly distorts.
     """
     recording = Recording(session)
     if recording.header.source == Source.IMPORT:
@@ -64,10 +64,10 @@ def calibrate_session(session: Path, lens: Path | None = None) -> Path:
 
 
 def apply_calibration(path: Path, session: Path, *, force: bool = False) -> Path:
-    """Put the calibration to use for the session; returns where it lies.
+    """Use a calibration for a session from now on; returns its path.
 
-    Another recording's is refused unless forced; a new artefact then names its origin and how far off
-    this session's board lies under it. Raises `CalibrationError`.
+    A calibration of another recording is refused without `force`; with it, a new artefact names the origin and the
+    error of this session's board under it. Raises `CalibrationError`.
     """
     recording, given = Recording(session), load_artefact(path, Calibration)
     folder = recording.path.parent
@@ -132,7 +132,7 @@ def _labelled(given: Calibration, recording: Recording) -> Calibration:
 
 
 def _board_off_mm(given: Calibration, recording: Recording) -> float | None:
-    """How far off (rms) this session's last board lies under the calibration; None where none is seen."""
+    """Root mean square error of this session's last board under the calibration; None if none is seen."""
     spec, where = board_of(recording), str(recording.path)
     off_mm: float | None = None
     for _, image in board_stills(recording):

@@ -1,4 +1,4 @@
-"""One capture of a session, or one photograph, through all stages into a picture and a file of numbers."""
+"""Show every stage of one capture or photograph in a picture, and write its numbers to a file."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ PAPER = 255
 
 
 def show_stroke(session: Path, stroke: str, out: Path, params: Params | None = None, lens: Path | None = None) -> Trace:
-    """A stroke of a session by its name, the first where that is empty.
+    """Show a stroke of a session by its name, or the first one if the name is empty.
 
-    Rectified by the calibration that the session uses, as in a validation; with a lens file, or without a calibration,
-    by the session's last photograph of the board. Raises `CalibrationError`.
+    It is rectified by the calibration that the session uses, as in a validation; with a lens file, or without a
+    calibration, by the session's last photograph of the board. Raises `CalibrationError`.
     """
     recording = Recording(session)
     before: Capture | None = None
@@ -76,7 +76,7 @@ def _plane(recording: Recording, one: Stroke, image: Gray, lens: Path | None, wh
 def show_photograph(
     path: Path, px_per_mm: float | None, before: Path | None, out: Path, params: Params | None = None
 ) -> Trace:
-    """A flat photograph of known scale. Raises `CalibrationError`."""
+    """Show a flat photograph of known scale. Raises `CalibrationError`."""
     if px_per_mm is None:
         raise CalibrationError(str(path), "is a photograph: give --px-per-mm")
     image = read_gray(path)

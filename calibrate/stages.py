@@ -31,7 +31,7 @@ class Stage:
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """A capture on its way to a stroke."""
+    """The stages of a capture, and the resulting stroke image."""
 
     where: str
     stages: tuple[Stage, ...]
@@ -58,7 +58,7 @@ def trace_seen(
     params: Params,
     cell_mm: tuple[float, float, float, float] | None = None,
 ) -> Trace:
-    """A photograph of a sheet whose plane is known; `window_mm` (x, y, width, height) holds the stroke.
+    """Trace a photograph of a sheet whose plane is known; `window_mm` (x, y, width, height) holds the stroke.
 
     Everything outside the paper cell is hidden. Raises `CaptureRefused` as `prepare` does.
     """
@@ -80,7 +80,7 @@ def trace_seen(
 def trace_scaled(
     image: Gray, px_per_mm: tuple[float, float], anchor_px: tuple[float, float] | None, where: str, params: Params
 ) -> Trace:
-    """A flat photograph of known scale, as imported. Raises `CaptureRefused`."""
+    """Trace a flat photograph of known scale, as imported. Raises `CaptureRefused`."""
     raster = rescale(image, px_per_mm, where)
     scale = {"from_px_per_mm_x": px_per_mm[0], "from_px_per_mm_y": px_per_mm[1], "px_per_mm": PX_PER_MM}
     stages = (

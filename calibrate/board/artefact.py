@@ -1,4 +1,4 @@
-"""What was measured of a camera, as immutable files named after the hash of their contents."""
+"""Measurements of a camera, as immutable files named after the hash of their contents."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class LensFile(Artefact):
 
     kind: Literal["lens"] = "lens"
     schema_version: int = 2
-    """Version 1 took the standard errors from corners alone, as if no two views were alike."""
+    """In version 1 the standard errors came from the corners alone, as if no two views were alike."""
     software: str
     photographs: dict[str, str]
     """Name of every photograph that was given, and the sha256 of its bytes."""
@@ -30,14 +30,14 @@ class LensFile(Artefact):
     distortion: tuple[float, float, float, float, float]
     """k1, k2, p1, p2, k3 of OpenCV's model."""
     focal_se_px: tuple[float, float] | None
-    """By leaving out each way in which the board was held; None where there were too few."""
+    """Standard errors of fx and fy, by leaving out each orientation of the board; None with too few orientations."""
     rms_px: float
     rms_limit_px: float
     residuals_px: dict[str, float]
     dropped: dict[str, float]
     """Outlier views and their residuals."""
     unusable: dict[str, str]
-    """Photographs without a usable board, or that show nothing new, and the reason."""
+    """Photographs without a usable board or with nothing new, and the reason."""
     guidance: tuple[str, ...]
     warnings: tuple[str, ...]
 
@@ -53,7 +53,7 @@ def lens_file(
     rms_limit_px: float,
     software: str,
 ) -> LensFile:
-    """The file of a fitted lens."""
+    """The artefact of a fitted lens."""
     matrix, d = fitted.lens.matrix, fitted.lens.distortion
     return LensFile(
         software=software,
@@ -74,7 +74,7 @@ def lens_file(
 
 
 def read_lens(path: Path) -> LensUsed:
-    """A lens file of `camera intrinsics`. Raises `CalibrationError`."""
+    """Read a lens file written by `camera intrinsics`. Raises `CalibrationError`."""
     file = load_artefact(path, LensFile)
     source = f"lens file {file.digest}"
     return LensUsed(source=source, size_px=file.size_px, matrix=file.matrix, distortion=file.distortion)
@@ -95,16 +95,16 @@ class RegistrationFile(Artefact):
     robot_to_paper: tuple[float, float, float, float, float, float]
     """(2, 3) row by row: mm in the robot's base frame to mm in the paper frame."""
     turn_deg: float | None = None
-    """How far points turn on their way to the paper frame; in files of version 1 only."""
+    """Rotation of points from the base frame to the paper frame; in files of version 1 only."""
     board_origin_mm: tuple[float, float] | None = None
-    """Lower left corner of the board in the paper frame, as it was taken."""
+    """Lower left corner of the board in the paper frame, as it was assumed."""
     origin_mm: tuple[float, float] | None = None
     yaw_deg: float | None = None
-    """Of the paper frame in the base frame, as in `[paper]` of rig.toml."""
+    """Origin and yaw of the paper frame in the base frame, as in `[paper]` of rig.toml."""
     scale: float
     rms_mm: float
     left_out_rms_mm: float
-    """Of every point, predicted by the others."""
+    """Root mean square error of points that are each predicted by the others."""
     residuals_mm: dict[str, tuple[float, float]]
     dropped: dict[str, tuple[float, float]]
 

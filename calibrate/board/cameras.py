@@ -1,8 +1,8 @@
-"""The lens of a set of views by Zhang's method, and sets that mix two cameras.
+"""Fit a lens to a set of views by Zhang's method, and detect sets that mix two cameras.
 
-Two cameras are found where each part of the set fits its own lens far better than all fit one. The parts are sought
-without looking at file names: at the lens that fits all, each view pulls the lens in a direction of its own, and views
-of one camera pull alike. Names only confirm: parts that differ little count where files are named after them.
+A set mixes two cameras if two lenses, each fitted to one part of it, fit far better than one lens fitted to all. The
+parts are found without file names: starting from the lens fitted to all, each view pulls the lens in some direction,
+and views of one camera pull alike. Names only confirm: parts that differ little count if files are named after them.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from calibrate.board.lens import Floats, Lens
 from calibrate.errors import CalibrationError
 
 LEAST = 3
-"""Views of a camera: fewer are outliers and do not determine a lens."""
+"""Least number of views of a camera: fewer are outliers and do not determine a lens."""
 STARTS, ROUNDS = 60, 20
 APART = 0.65
-"""Share of the squared residuals that two lenses leave of one's, below which they are two. One camera with the best of
-all its partitions left 0.82 to 0.92 (8 to 13 real photographs), with a board curled by 1 mm 0.83 at least."""
+"""Largest share of one lens's squared residuals that two lenses may leave to count as two cameras. Photographs of one
+camera left 0.82 to 0.92 at the best partition (8 to 13 real photographs), at least 0.83 with a board curled by 1 mm."""
 WORSE = 1.5
-"""How much worse the views of one camera fit the other's lens: one bad view among good ones is no camera."""
+"""Least factor by which one camera's views fit the other's lens worse: one bad view does not make a camera."""
 NAMED_APART, ALIKE = 0.97, 0.9
-"""Where the files are named after the parts: of the residuals as above, and of the views that lie as they are named."""
+"""Limits if files are named after the parts: of the residuals as above, and of the views whose name fits their part."""
 LEAST_NAMED = 8
 """With fewer views, names and parts agree by chance."""
 UNITS = np.array([500.0, 500.0, 500.0, 500.0, 1.0, 1.0, 0.01, 0.01, 1.0])
-"""Of fx, fy, cx, cy, k1, k2, p1, p2, k3: scales that make all weigh alike."""
+"""Scales of fx, fy, cx, cy, k1, k2, p1, p2, k3 that give all of them similar weight."""
 
 Part = NDArray[np.bool_]
 
@@ -51,13 +51,13 @@ class Solved:
 
     @property
     def normals(self) -> Floats:
-        """(views, 3) unit vectors out of each board, toward the camera."""
+        """(views, 3) unit normals of the boards, toward the camera."""
         found = np.stack([np.asarray(cv2.Rodrigues(turn)[0], np.float64)[:, 2] for turn in self.turns])
         return np.asarray(np.where(found[:, 2:] < 0.0, -found, found), np.float64)
 
 
 def solve(views: Sequence[BoardView], where: str) -> Solved:
-    """`cv2.calibrateCamera` (k1, k2, p1, p2, k3). Raises `CalibrationError` where no lens explains the views."""
+    """Fit a lens by `cv2.calibrateCamera` (k1, k2, p1, p2, k3). Raises `CalibrationError` if none fits the views."""
     size = views[0].size_px
     objects = [flat(view).astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32).reshape(-1, 1, 2) for view in views]
@@ -77,12 +77,12 @@ def solve(views: Sequence[BoardView], where: str) -> Solved:
 
 
 def flat(view: BoardView) -> Floats:
-    """(n, 3) corners of a view on its board, which is flat."""
+    """(n, 3) corners of a view in its board's own plane, z = 0."""
     return np.column_stack([view.board_mm, np.zeros(len(view.board_mm))])
 
 
 def through(lens: Lens, view: BoardView) -> float:
-    """Residual of a view, root mean square in px, its board posed as well as this lens allows."""
+    """Root mean square residual of a view in px, at the pose of its board that fits this lens best."""
     board = flat(view)
     _, turn, shift = cv2.solvePnP(board, view.pixels, lens.matrix, lens.distortion)
     turn, shift = cv2.solvePnPRefineLM(board, view.pixels, lens.matrix, lens.distortion, turn, shift)
@@ -97,11 +97,11 @@ class TwoCameras:
     parts: tuple[tuple[str, ...], tuple[str, ...]]
     together_px: float
     apart_px: float
-    """Root mean square residual through one lens, and through two."""
+    """Root mean square residual with one lens, and with two."""
 
 
 def two_cameras(views: Sequence[BoardView], solved: Solved) -> TwoCameras | None:
-    """The two parts of a set that one lens does not explain as two do; None for one camera, or too few views."""
+    """Split a set of views that two lenses explain far better than one; None for one camera or too few views."""
     part = _best_part(views, solved)
     if part is None:
         return None
@@ -132,7 +132,7 @@ def _worse(half: Sequence[BoardView], own: Solved, other: Solved) -> bool:
 
 
 def _as_named(names: Sequence[str], part: Part) -> Part | None:
-    """The views with one name but for its digits (left01, left02), where they are this part or nearly so."""
+    """The views whose names differ only in digits (left01, left02), if they are this part or nearly so."""
     if len(names) < LEAST_NAMED:
         return None
     stems = [re.sub(r"\d+", "", name) for name in names]
@@ -145,9 +145,9 @@ def _as_named(names: Sequence[str], part: Part) -> Part | None:
 
 
 def _best_part(views: Sequence[BoardView], solved: Solved) -> Part | None:
-    """The views to give a lens of their own so that the squared residuals shrink most, to first order.
+    """The views whose separate lens reduces the squared residuals most, to first order.
 
-    From many random halves, each view goes to the lens that it pulls at least, until none moves.
+    Starts from many random halves; each view moves to the lens that fits it better, until none moves.
     """
     curves, pulls = _reduced(views, solved)
     rng, best_gain = np.random.default_rng(0), 0.0
@@ -174,14 +174,14 @@ def _large_enough(part: Part) -> bool:
 
 
 def _costs(curves: Floats, pulls: Floats, part: Part) -> Floats:
-    """(n,) how much each view's squared residuals change with the step of the lens that is best for one part."""
+    """(n,) change of each view's squared residuals with the lens step that is best for one part."""
     curve, pull = (np.asarray(v[part].sum(axis=0), np.float64) for v in (curves, pulls))
     step: Floats = np.linalg.pinv(curve) @ pull
     return np.asarray(np.einsum("i,nij,j->n", step, curves, step) - 2.0 * pulls @ step, np.float64)
 
 
 def _reduced(views: Sequence[BoardView], solved: Solved) -> tuple[Floats, Floats]:
-    """(n, 9, 9) and (n, 9): how each view holds the lens, and which way it pulls, its own board free to move."""
+    """Normal equations of each view for the lens, (n, 9, 9) and (n, 9), with its board's pose eliminated."""
     curves, pulls = list[Floats](), list[Floats]()
     for view, turn, shift in zip(views, solved.turns, solved.shifts_mm, strict=True):
         seen, slopes = cv2.projectPoints(flat(view), turn, shift, solved.lens.matrix, solved.lens.distortion)

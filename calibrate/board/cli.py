@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Kind(StrEnum):
-    """What a registration may fit."""
+    """Transformation that a registration fits."""
 
     RIGID = "rigid"
     SIMILARITY = "similarity"
@@ -64,7 +64,7 @@ def intrinsics(
     ] = False,
     out: Annotated[Path, typer.Option(help="Folder for the lens file.")] = Path("camera"),
 ) -> None:
-    """Fit the lens; says what each photograph contributes, which were dropped, and what else to photograph."""
+    """Fit the lens, and say what each photograph contributes, which were dropped, and what else to photograph."""
     import hashlib
     from importlib.metadata import version
 
@@ -115,7 +115,7 @@ def check(
     lens: LensOption = None,
     limit_px: Annotated[float, typer.Option(min=0.01, max=10.0, help="Residual above which it warns.")] = 0.5,
 ) -> None:
-    """Pre-flight: pix2len with its interval from one photograph of the board, and warnings. Exit code 5 with any."""
+    """Measure pix2len with its interval on one photograph of the board before a session. Exit code 5 on warnings."""
     from calibrate.artefact import load_artefact
     from calibrate.board.artefact import LensFile
     from calibrate.board.spec import BoardSpec
@@ -141,7 +141,7 @@ def drift(
     session: Annotated[Path, typer.Argument(help="A session's folder or its .mcap file.")],
     lens: LensOption = None,
 ) -> None:
-    """pix2len each time that the board was seen in a session, its trend, and warnings. Exit code 5 with any."""
+    """Show pix2len at each view of the board in a session, and its trend. Exit code 5 on warnings."""
     from calibrate.board.drift import board_over_session
     from calibrate.board.session import board_of, known_lens
     from sessions.reader import Recording
@@ -187,7 +187,7 @@ def register(
     ] = Kind.RIGID,
     out: Annotated[Path, typer.Option(help="Folder for the registration file.")] = Path("camera"),
 ) -> None:
-    """Where the paper lies before the robot, from marks that it touched or pressed: the lines for rig.toml."""
+    """Locate the paper in the robot's base frame from touched or pressed marks; prints the lines for rig.toml."""
     import hashlib
     from importlib.metadata import version
 

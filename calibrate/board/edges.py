@@ -20,9 +20,9 @@ ACROSS_SHARE = 0.6
 MOST_ACROSS_PX = 6
 LEAST_ACROSS_PX = 2.5
 CORNER_PX = 3
-"""Closer than this to the corner the two edges blur into each other."""
+"""Distance from the corner within which the two edges blur into each other."""
 LEAST_CONTRAST = 0.4
-"""Of the median edge: less is a shadow, a fold, or the edge of a sheet that lies on the board."""
+"""Least contrast, as a share of the median: less is a shadow, a fold, or the edge of a sheet on the board."""
 LEAST_SEEN = 0.6
 MOST_WALK_PX = 1.5
 
@@ -31,7 +31,7 @@ def on_edges(image: Gray, pixels: Floats, right_px: Floats, down_px: Floats, gap
     """(n, 2) corners moved to where their edges cross; those whose edges are not seen well enough stay.
 
     `right_px` and `down_px` are (n, 2): from each corner one square to the right and one down on the board. `gap_px` is
-    the way from an edge to whatever comes next to it (a marker, the next edge).
+    the distance from an edge to the nearest marker or edge.
     """
     across = min(MOST_ACROSS_PX, ACROSS_SHARE * gap_px)
     if across < LEAST_ACROSS_PX or not len(pixels):
@@ -81,7 +81,7 @@ def _edge(
     offsets = (steps * between).sum(axis=2) / np.where(good, contrast, 1.0)
     offset, slope = np.zeros(len(pixels)), np.zeros(len(pixels))
     seen = (good[:, t < 0].mean(axis=1) >= LEAST_SEEN) & (good[:, t > 0].mean(axis=1) >= LEAST_SEEN)
-    # A lens bends edges: the parabola's height at the corner is what is wanted.
+    # A lens bends edges, so a parabola is fitted; its value at the corner is the offset.
     terms = np.stack([np.ones_like(t), t, t * t], axis=1)
     for k in np.flatnonzero(seen):
         use = good[k]

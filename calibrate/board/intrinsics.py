@@ -20,16 +20,16 @@ Ways = NDArray[np.int64]
 LEAST_VIEWS = 4
 GOOD_VIEWS = 10
 EARNED_WAYS = 6
-"""Ways of holding the board from which an interval is given: with fewer, leaving one out changes the lens too much."""
+"""Least number of orientations of the board for an interval: with fewer, leaving one out changes the lens too much."""
 MOST_LEFT_OUT = 12
-"""At most so many are left out, several together if need be: more do not improve the estimate of the spread."""
+"""Most groups of orientations that are left out in turn: more do not improve the estimate of the spread."""
 OUTLIER_MEDIANS = 3.0
-"""A view whose residual is so many times the median's is dropped and named."""
+"""A view whose residual exceeds the median by this factor is dropped and named."""
 LEAST_OUTLIER_PX = 0.4
 RMS_LIMIT_PX = 0.5
 """Above this a pre-flight check warns: a flat, sharp, still board gives 0.1 to 0.3 px."""
 GRID = (3, 3)
-"""Coverage is judged on so many columns and rows of the image."""
+"""Columns and rows of the image on which coverage is judged."""
 GRID_WORDS = (
     ("upper left", "upper middle", "upper right"),
     ("left", "middle", "right"),
@@ -38,30 +38,30 @@ GRID_WORDS = (
 LEAST_SLANT_DEG = 15.0
 """Boards seen face on determine only the ratio of focal length and distance."""
 SAME_SHARE = 0.0015
-"""Of the image's longer side. Corners that lie nearer are the same but for noise: 1 px of 640."""
+"""Share of the image's longer side below which two corners differ only by noise: 1 px of 640."""
 DISTINCT_DEG = 5.0
-"""Boards less than this apart are held alike: parallel planes determine a focal length no better than one of them."""
+"""Boards turned by less count as one orientation: parallel planes determine a focal length no better than one does."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """A lens, how sure it is, and view by view how well it explains the photographs."""
+    """A lens, its uncertainty, and how well it explains each photograph."""
 
     lens: Lens
     focal_se_px: tuple[float, float] | None
-    """Standard errors of fx and fy, by leaving out each way in which the board was held; None with too few of them."""
+    """Standard errors of fx and fy, by leaving out each orientation of the board; None with too few orientations."""
     ways: int
-    """In how many ways the board was held."""
+    """Number of orientations of the board."""
     rms_px: float
-    """Over all corners of the views that were kept."""
+    """Root mean square residual over all corners of the kept views."""
     residuals_px: dict[str, float]
-    """Of each kept view by name."""
+    """Residual of each kept view, by name."""
     dropped: dict[str, float]
     """Views left out as outliers, with their residuals."""
     unusable: dict[str, str]
     """Photographs that show no board, or nothing new, and the reason."""
     slants_deg: dict[str, float]
-    """How far each kept board is turned from face on."""
+    """Angle of each kept board from face on."""
     guidance: tuple[str, ...]
     """What else to photograph; empty where the coverage is good."""
     warnings: tuple[str, ...]
@@ -69,7 +69,7 @@ class Fitted:
 
     @property
     def focal_reach_px(self) -> tuple[float, float] | None:
-        """Half of the 95 % intervals of fx and fy: of the noise in these views, not of a board that is not flat."""
+        """Half widths of the 95 % intervals of fx and fy: for noise in these views, not for a curved board."""
         if self.focal_se_px is None:
             return None
         reach = float(stdtrit(min(self.ways, MOST_LEFT_OUT) - 1, 0.975))
@@ -83,10 +83,10 @@ def fit_lens(
     *,
     one_camera: bool = False,
 ) -> Fitted:
-    """Zhang's method over the views that fit together; `unusable` names the photographs without one, and why.
+    """Fit a lens by Zhang's method to the views that fit together; `unusable` says why other photographs have no view.
 
-    Raises `CalibrationError` for fewer than `LEAST_VIEWS` views that differ, and for photographs of two cameras, by
-    their size or (unless they are said to be of `one_camera`) by the lens that they fit.
+    Raises `CalibrationError` for fewer than `LEAST_VIEWS` views that differ, and for photographs of two cameras,
+    recognised by their size or (without `one_camera`) by the lens that they fit.
     """
     seen, left_out = distinct_views(views)
     left_out = {**(unusable or {}), **left_out}
@@ -103,7 +103,7 @@ def fit_lens(
             raise CalibrationError(where, _two_cameras(two))
         residuals = solved.residuals_px
         worst = int(np.argmax(residuals))
-        # The median of the others: with four views one bad one would hide behind itself.
+        # The median of the others: one bad view of four would raise the median of all and be kept.
         others = float(np.median(np.delete(residuals, worst)))
         if residuals[worst] <= max(LEAST_OUTLIER_PX, OUTLIER_MEDIANS * others):
             break
@@ -151,9 +151,9 @@ def _two_cameras(two: TwoCameras) -> str:
 
 
 def _focal(views: Sequence[BoardView], ways: Ways, where: str) -> tuple[float, float] | None:
-    """Standard errors of fx and fy, by leaving out each way in which the board was held (jackknife).
+    """Standard errors of fx and fy, by leaving out each orientation of the board (jackknife).
 
-    Views that are held alike err alike, and so go together. None where too few ways do not earn an error.
+    Views of one orientation have similar errors, so they are left out together. None with too few orientations.
     """
     if ways.max() + 1 < EARNED_WAYS:
         return None
@@ -166,7 +166,7 @@ def _focal(views: Sequence[BoardView], ways: Ways, where: str) -> tuple[float, f
 
 
 def guidance(views: Sequence[BoardView], slants_deg: Sequence[float], ways: int = EARNED_WAYS) -> tuple[str, ...]:
-    """What is missing in these views, held in so many ways, as instructions."""
+    """Instructions for further photographs: what these views, in `ways` orientations of the board, do not cover."""
     wanted: list[str] = []
     if len(views) < GOOD_VIEWS:
         wanted.append(f"take {GOOD_VIEWS - len(views)} more photographs ({len(views)} used, {GOOD_VIEWS} are good)")
@@ -188,7 +188,7 @@ def guidance(views: Sequence[BoardView], slants_deg: Sequence[float], ways: int 
 
 
 def named(photographs: Sequence[Path]) -> dict[str, Path]:
-    """Each photograph by a unique name: the file's, with its folder where there are several, else numbered."""
+    """Photographs by unique name: the file's, with its folder if there are several, and a number if repeated."""
     folders = len({path.parent for path in photographs})
     found: dict[str, Path] = {}
     for path in photographs:
@@ -202,7 +202,7 @@ def named(photographs: Sequence[Path]) -> dict[str, Path]:
 
 
 def distinct_views(views: Iterable[BoardView]) -> tuple[list[BoardView], dict[str, str]]:
-    """The views that show the board in a new place, and for each other one the view that it repeats."""
+    """The views that show the board in a new place, and for every other view the one that it repeats."""
     kept, again = list[BoardView](), dict[str, str]()
     for view in views:
         twin = next((one for one in kept if _same(one, view)), None)
@@ -214,7 +214,7 @@ def distinct_views(views: Iterable[BoardView]) -> tuple[list[BoardView], dict[st
 
 
 def held(normals: Floats) -> Ways:
-    """(n,) number of the way in which each board is held, by the (n, 3) unit vectors out of them."""
+    """(n,) index of each board's orientation, from the (n, 3) unit normals of the boards."""
     first, ways = list[Floats](), list[int]()
     for normal in normals:
         near = [k for k, one in enumerate(first) if float(normal @ one) > np.cos(np.radians(DISTINCT_DEG))]
@@ -225,9 +225,9 @@ def held(normals: Floats) -> Ways:
 
 
 def nominal_normals(views: Sequence[BoardView]) -> Floats:
-    """(n, 3) unit vectors out of each board as seen by an undistorted lens of one image width.
+    """(n, 3) unit normals of the boards, for an undistorted lens whose focal length is one image width.
 
-    Rough, but no lens that was fitted to boards that are all held alike can tell them apart here.
+    They are rough, but a lens that was wrongly fitted to boards of one orientation cannot make them differ.
     """
     rays = np.linalg.inv(unknown_lens(views[0].size_px).matrix)
     found = list[Floats]()

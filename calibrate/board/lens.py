@@ -1,4 +1,4 @@
-"""A lens: where a pixel would lie without its distortion, and the way back (OpenCV's five-parameter model)."""
+"""A lens: remove its distortion from pixels and photographs, and add it again (OpenCV's five-parameter model)."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def lens_of(
 
 
 class LensUsed(BaseModel):
-    """The lens by which photographs are undistorted, as it stands in files, and its source."""
+    """The lens by which photographs are undistorted, as files store it, and its source."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -105,7 +105,7 @@ def distort(rays: Floats, distortion: Floats) -> Floats:
 
 
 def unknown_lens(size_px: tuple[int, int]) -> Lens:
-    """Assumed for a camera without intrinsics: no distortion, axis in the middle, focal length of one image width."""
+    """Lens assumed without intrinsics: no distortion, axis in the middle, focal length of one image width."""
     width, height = size_px
     focal = float(max(width, height))
     matrix = np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])

@@ -1,4 +1,4 @@
-"""A printable board: a PDF of filled rectangles at true scale, with rulers that show whether the printer kept it."""
+"""A printable board: a PDF of filled rectangles at true scale, with a ruler to check the print."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ Rectangle = tuple[float, float, float, float]
 
 
 def write_pdf(board: Board, path: Path, page: str = "a4") -> Path:
-    """Write the board on one page, turned where it fits only so.
+    """Write the board on one page, turned if it only fits that way.
 
-    Raises `CalibrationError` where it does not fit, and for a path that is no PDF's: nothing else is overwritten.
+    Raises `CalibrationError` if it does not fit, or if `path` is not that of a PDF: no other file is overwritten.
     """
     check_target(path, ".pdf")
     if not path.parent.is_dir():
@@ -37,7 +37,7 @@ def write_pdf(board: Board, path: Path, page: str = "a4") -> Path:
 
 
 def rectangles(board: Board) -> list[Rectangle]:
-    """What is black, x right and y down in mm from the board's upper left corner."""
+    """The black rectangles, x right and y down in mm from the board's upper left corner."""
     if isinstance(board, Checkerboard):
         columns, rows = (n + 1 for n in board.inner_corners)
         return _squares(columns, rows, board.square_mm)

@@ -1,4 +1,4 @@
-"""Where the robot's points lie on the paper: from marks that it touched or pressed, and where the camera saw them."""
+"""Register the robot to the paper, from marks that it touched or pressed and that the camera saw."""
 
 from __future__ import annotations
 
@@ -31,60 +31,60 @@ LEAST_OUTLIER_MM = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """From the robot's base frame to the paper frame, both in mm, in the plane."""
+    """The plane transformation from the robot's base frame to the paper frame, both in mm."""
 
     model: Model
     matrix: Floats
     """(2, 3)."""
     names: tuple[str, ...]
     residuals_mm: Floats
-    """(n, 2) seen minus predicted, of every point; also of those dropped."""
+    """(n, 2) seen minus predicted, of every point including dropped ones."""
     dropped: tuple[str, ...]
     rms_mm: float
     left_out_mm: Floats
-    """(n, 2) seen minus what the other kept points predict."""
+    """(n, 2) seen minus predicted by the other kept points."""
 
     @property
     def left_out_rms_mm(self) -> float:
-        """Of the kept points, each predicted by the others: what a new point may expect."""
+        """Root mean square error of the kept points, each predicted by the others: what to expect of a new point."""
         kept = np.array([name not in self.dropped for name in self.names])
         return _rms(self.left_out_mm[kept])
 
     @property
     def yaw_deg(self) -> float:
-        """Of the paper frame in the base frame, counter-clockwise from base x to paper x, as `paper.yaw_deg` has it.
+        """Yaw of the paper frame in the base frame, counter-clockwise from base x to paper x, as in `paper.yaw_deg`.
 
-        Points are turned the other way round on their way from the base frame to the paper frame.
+        The transformation from the base frame to the paper frame turns points the other way.
         """
         return float(np.degrees(np.arctan2(-self.matrix[1, 0], self.matrix[0, 0])))
 
     @property
     def origin_mm(self) -> tuple[float, float]:
-        """Of the paper frame in the base frame, as `paper.origin_mm` has it."""
+        """Origin of the paper frame in the base frame, as in `paper.origin_mm`."""
         x, y = self.to_robot(np.zeros((1, 2)))[0]
         return float(x), float(y)
 
     @property
     def scale(self) -> float:
-        """Paper mm per robot mm, the root of how areas grow; 1 for a rigid one."""
+        """Paper mm per robot mm, the square root of the ratio of areas; 1 for a rigid transformation."""
         return float(np.sqrt(abs(np.linalg.det(self.matrix[:, :2]))))
 
     def to_paper(self, robot_mm: Floats) -> Floats:
-        """(n, 2) of the base frame -> (n, 2) of the paper frame."""
+        """(n, 2) points in the base frame -> in the paper frame."""
         return robot_mm @ self.matrix[:, :2].T + self.matrix[:, 2]
 
     def to_robot(self, paper_mm: Floats) -> Floats:
-        """(n, 2) of the paper frame -> (n, 2) of the base frame."""
+        """(n, 2) points in the paper frame -> in the base frame."""
         return (paper_mm - self.matrix[:, 2]) @ np.linalg.inv(self.matrix[:, :2]).T
 
 
 def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats, model: Model = "rigid") -> Registration:
-    """Least squares over (n, 2) points of both frames, outliers dropped and named (Umeyama 1991, eq. 40-43).
+    """Fit by least squares to (n, 2) points of both frames, with outliers dropped and named (Umeyama 1991, eq. 40-43).
 
     Outliers are found by the few points (two, or three for an affine fit) that explain the others best. A similarity
-    also lets the scale go, where the board was not printed at true scale; an affine fit lets x and y go their own ways,
-    where a page was rectified to wrong proportions. Raises `CalibrationError` for
-    fewer than three points, points that are all in one place, or where most do not fit together.
+    also fits the scale, for a board that was not printed at true scale; an affine fit treats x and y independently, for
+    a page that was rectified to wrong proportions. Raises `CalibrationError` for fewer than three points, for points
+    that are all in one place, and if most do not fit together.
     """
     where = f"{len(names)} points"
     if not len(names) == len(robot_mm) == len(seen_mm):
@@ -123,7 +123,7 @@ def _agreeing(robot_mm: Floats, seen_mm: Floats, model: Model) -> NDArray[np.boo
     few = list(itertools.combinations(range(len(robot_mm)), 3 if model == "affine" else 2))
     for chosen in few[:: max(1, len(few) // TRIALS)]:
         points = robot_mm[list(chosen)]
-        # Points on a line fix no affine map, points in one place nothing at all.
+        # Points on a line do not determine an affine map, points in one place determine nothing.
         if np.linalg.svd(points - points.mean(axis=0))[1][1 if model == "affine" else 0] < 1.0:
             continue
         away = np.linalg.norm(seen_mm - _apply(_fit(points, seen_mm[list(chosen)], model), robot_mm), axis=1)
@@ -132,7 +132,7 @@ def _agreeing(robot_mm: Floats, seen_mm: Floats, model: Model) -> NDArray[np.boo
     if not np.isfinite(best).all():
         return np.zeros(len(robot_mm), np.bool_)
     rough = best <= max(LEAST_OUTLIER_MM, OUTLIER_MEDIANS * float(np.median(best)))
-    # Once more around the fit of all that agree: a few points are a poor ruler.
+    # Judge again by the fit to all that agree: a fit to two or three points is inaccurate.
     away = np.linalg.norm(seen_mm - _apply(_fit(robot_mm[rough], seen_mm[rough], model), robot_mm), axis=1)
     return away <= max(LEAST_OUTLIER_MM, OUTLIER_MEDIANS * float(np.median(away)))
 
@@ -173,7 +173,7 @@ class Points:
 
 
 def read_points(table: Path) -> Points:
-    """Read `COLUMNS`. Raises `CalibrationError` naming line and column."""
+    """Read a table with `COLUMNS`. Raises `CalibrationError` naming line and column."""
     data = read_bounded(table)
     try:
         rows = list(csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True))

@@ -1,6 +1,6 @@
-"""`rig.toml` as a registration needs it: board and lens read from it, and where the paper lies written into it.
+"""Read board and lens from `rig.toml` for a registration, and write where the paper lies into it.
 
-Only two values change in the text. Comments, order and everything else stay, and the file as it was is kept beside it.
+Only two values change in the text. Comments, order and everything else stay, and the old file is kept beside it.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ class PaperLines:
 
     @property
     def values(self) -> dict[str, str]:
-        """Each field and its value as TOML, to the micrometre and to the width of a hair on a sheet."""
+        """Each field and its value as TOML, rounded to 0.001 mm and 0.0001 deg."""
         x, y = (round(v, 3) + 0.0 for v in self.origin_mm)  # no -0.0
         return {"origin_mm": f"[{x}, {y}]", "yaw_deg": f"{round(self.yaw_deg, 4) + 0.0}"}
 
     @property
     def toml(self) -> str:
-        """To paste into rig.toml."""
+        """The lines to paste into rig.toml."""
         return "\n".join(f"{name} = {value}" for name, value in self.values.items())
 
 
 @dataclass(frozen=True, slots=True)
 class RigFile:
-    """A rig's configuration as text, and what it says of the camera."""
+    """A rig's configuration as text, with the board and the lens file that it names."""
 
     path: Path
     text: str
@@ -53,7 +53,7 @@ class RigFile:
     lens_file: Path | None
 
     def with_paper(self, lines: PaperLines) -> str:
-        """The text with these two values. Raises `CalibrationError` where they are not found, each on a line."""
+        """The text with these two values. Raises `CalibrationError` unless each of them is found on its own line."""
         rows, found = self.text.splitlines(keepends=True), dict[str, int]()
         start = next((k for k, row in enumerate(rows) if PAPER.match(row.rstrip("\r\n"))), None)
         if start is None:
@@ -75,7 +75,7 @@ class RigFile:
         return made
 
     def write(self, lines: PaperLines) -> Path:
-        """Write these two values; returns where the file as it was is kept. Raises `CalibrationError` and OSError."""
+        """Write these two values; returns the path of the old file. Raises `CalibrationError` and OSError."""
         made = self.with_paper(lines)
         kept = _free(self.path)
         with kept.open("xb") as file:
@@ -89,7 +89,7 @@ class RigFile:
 
 
 def read_rig(path: Path) -> RigFile:
-    """A rig's configuration. Raises `CalibrationError` that names file and field."""
+    """Read a rig's configuration. Raises `CalibrationError` that names file and field."""
     try:
         text = read_bounded(path).decode("utf-8")
     except UnicodeDecodeError as error:
@@ -119,7 +119,7 @@ def _changed(tables: dict[str, Any], lines: PaperLines) -> dict[str, Any]:
 
 
 def _free(path: Path) -> Path:
-    """A name beside the file that nothing has yet."""
+    """An unused name beside the file."""
     number, kept = 1, path.with_name(f"{path.name}.bak")
     while kept.exists() or kept.is_symlink():
         number += 1

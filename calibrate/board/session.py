@@ -20,7 +20,7 @@ from sessions.recording.messages import decode_gray, decode_still
 from sessions.recording.schemas import StepEvent, Topic
 
 EFFECTIVE = "rig.effective.json"
-"""The configuration with what the environment changed on top of rig.toml."""
+"""The configuration in effect: rig.toml, with the changes that the environment made."""
 NO_BOARD = "holds no view of the board (a `board` step)"
 
 

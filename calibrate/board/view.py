@@ -17,9 +17,9 @@ from calibrate.errors import CalibrationError
 VISIBLE_PX = 0.5
 """A lens that distorts the board by more (root mean square) needs a lens file: one flat view cannot calibrate it."""
 REMAINING_PX = 1.5
-"""A lens file that leaves more is of another camera; less is a focus that breathes: the view's own k1 describes it."""
+"""Distortion left by the lens file: more means another camera; less is a small change of focus, which k1 describes."""
 DISTORTED_SHARE = 0.85
-"""Of the squared residuals. One radial term explains 0.7 of a board that is curled along its length, more of a lens."""
+"""Share of squared residuals that one radial term explains: 0.7 for a board curled lengthwise, more for a lens."""
 NO_LENS_FILE = (
     "the lens bends straight lines: calibrate it with `brushloop camera intrinsics`, then name the lens file as "
     "camera.lens_file in rig.toml, or with --lens"
@@ -30,13 +30,13 @@ LEAST_PX_PER_MM = 4.0
 WORST_INTERVAL = 5e-4
 """Relative half width of pix2len's interval: 0.01 mm over 20 mm."""
 REFOCUSED = 0.02
-"""Difference of k1 from the calibrated one beyond which the lens is not as it was."""
+"""Difference of k1 from its calibrated value beyond which the lens has changed."""
 
 
 def see_board(image: Gray, spec: BoardSpec, where: str = "camera", lens: Lens | None = None) -> Plane:
-    """The paper plane in an undistorted photograph, or in one seen through a known lens, which stays as given.
+    """Fit the paper plane in an undistorted photograph, or in one seen through a known lens, which is not refitted.
 
-    Raises `CalibrationError`; where the lens distorts, it says what to do about it.
+    Raises `CalibrationError`; if the lens distorts, the message says what to do about it.
     """
     view, through = _find(image, spec, where, lens)
     corners_mm = paper_mm(view, spec)
@@ -55,9 +55,9 @@ def see_board_and_lens(
     where: str = "camera",
     sheet_mm: tuple[float, float] | None = None,
 ) -> Plane:
-    """The paper plane in a photograph as it was taken, with the lens's k1 fitted anew.
+    """Fit the paper plane and the lens's k1 in a photograph as it was taken.
 
-    A sheet of that size may lie on the board. Raises `CalibrationError`.
+    A sheet of `sheet_mm` may lie on the board. Raises `CalibrationError`.
     """
     view, through = _find(image, spec, where, lens, sheet_mm)
     return replace(fit_plane(view.pixels, paper_mm(view, spec), through, where), flags=view.flags)
@@ -66,7 +66,7 @@ def see_board_and_lens(
 def calibration_plane(
     image: Gray, spec: BoardSpec, lens: Lens | None, where: str, sheet_mm: tuple[float, float] | None = None
 ) -> Plane:
-    """The same, for measuring with. Raises `CalibrationError` also where the lens distorts more than is known of it."""
+    """`see_board_and_lens` for measuring: also raises `CalibrationError` if the lens distorts more than is known."""
     plane = see_board_and_lens(image, spec, lens, where, sheet_mm)
     if problem := lens_problem(plane, known=lens is not None):
         raise CalibrationError(where, problem)
@@ -74,7 +74,7 @@ def calibration_plane(
 
 
 def lens_problem(plane: Plane, *, known: bool) -> str:
-    """What to do about the lens; empty where it distorts little, or as its file says."""
+    """What to do about the lens; empty if it distorts little or as its file says."""
     if plane.distortion_px <= (REMAINING_PX if known else VISIBLE_PX):
         return ""
     advice = OTHER_LENS if known else NO_LENS_FILE
@@ -111,7 +111,7 @@ def preflight(
 
 
 def paper_mm(view: BoardView, spec: BoardSpec) -> Floats:
-    """(n, 2) the corners of a view in the paper frame."""
+    """(n, 2) corners of a view in the paper frame."""
     height_mm = spec.squares[1] * spec.square_mm
     # The board counts y downward from its upper left corner; the paper frame counts it upward.
     flip = np.array([1.0, -1.0])

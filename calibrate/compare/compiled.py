@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Pixels = NDArray[np.uint8]
 
 RADIUS = 5
-"""Of the Gaussian window: scikit-image truncates at 3.5 sigma, and leaves out so many pixels at the border."""
+"""Radius of the Gaussian window: scikit-image truncates at 3.5 sigma, and ignores a border of this width."""
 _X = np.arange(-RADIUS, RADIUS + 1)
 _WEIGHTS = np.exp(-0.5 / 1.5**2 * _X**2)
 _WEIGHTS /= _WEIGHTS.sum()
@@ -27,8 +27,8 @@ _reordered = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"
 def compare(captured: Pixels, predicted: Pixels, reach: int, out: NDArray[np.float64]) -> None:
     """Fill `out` (M, 2) with CSIM and SSIM of `captured` (h, w) uint8 against `predicted` (M, h, w) uint8.
 
-    Each predicted image is first shifted by at most `reach` px each way, to where the two overlap most. NaN where one
-    is blank.
+    Each predicted image is first shifted by at most `reach` px each way, to where the two overlap most. NaN if either
+    image is blank.
     """
     _compare(captured, predicted, reach, out)
 
@@ -97,7 +97,7 @@ def _box(image):
 def _best_shift(fixed, moving, box, reach):
     """(dr, dc) for which the sum of fixed[r, c] moving[r + dr, c + dc] is largest.
 
-    Of equals, as where one mark lies inside the other, the least shift, then the first.
+    Ties, as when one mark lies inside the other, go to the smallest shift, then to the first.
     """
     height, width = fixed.shape
     best, where, least = -1.0, (0, 0), 0
@@ -121,7 +121,7 @@ def _best_shift(fixed, moving, box, reach):
 
 @_compile
 def _blur(image, window, scratch, out):
-    """The Gaussian mean around each pixel of `window` (first row, end row, first column, end column) into `out`."""
+    """Write to `out` the Gaussian mean at each pixel of `window` (first row, end row, first column, end column)."""
     top, bottom, left, right = window
     width = right - left
     w0, w1, w2, w3, w4, w5 = _WEIGHTS[0], _WEIGHTS[1], _WEIGHTS[2], _WEIGHTS[3], _WEIGHTS[4], _WEIGHTS[5]

@@ -1,4 +1,4 @@
-"""The tables of the CCD-BSMG paper, shown beside ours: percent, of its own brush, ink and preprocessing."""
+"""The tables of the CCD-BSMG paper, in percent; the paper used its own brush, ink and preprocessing."""
 
 from __future__ import annotations
 
@@ -38,6 +38,6 @@ TABLE_3: dict[str, Printed] = {
     ROBOT_WRITING: Printed("robot writing", (95.82, 91.36, 93.59), (78.78, 70.42, 74.60)),
 }
 """The character zi. The paper does not say what each row was compared with, nor whether it wrote 字 or 子, nor its
-polarity: which of its rows stands beside which of ours is our reading."""
+polarity: the pairing of its rows with ours is our interpretation."""
 ORDER = ("ccd-bsmg", "ccd-bsm", "bezier", "ellipse", "line", "circle")
-"""By average CSIM and SSIM, best first, as the paper words it."""
+"""Models by average CSIM and SSIM, best first, as the paper states it."""

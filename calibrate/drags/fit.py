@@ -1,9 +1,9 @@
-"""Fit bristle lag and width of `model.drag` to dragged strokes, and what is left over by kernel ridge regression.
+"""Fit bristle lag and width of `model.drag` to dragged strokes, and the rest by kernel ridge regression.
 
-The fit minimises the squared difference between captured ink and the chance of ink that the model gives, where the
-edge strays by `SPREAD_MM` from stroke to stroke: the image that is best in the mean, and so in cosine similarity.
-Optional columns of the strokes (their place on the page) shift a whole stroke, which is how far the calibration of
-arm against camera is off there.
+The fit minimises the squared difference between captured ink and the model's probability of ink, with an edge that
+varies by `SPREAD_MM` from stroke to stroke. This gives the best image on average, and so the best cosine similarity.
+Optional columns for each stroke (its place on the page) shift the whole stroke, by the error of the calibration of
+arm against camera there.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 SPREAD_MM = 0.9
-"""Default scale of the logistic: an edge that strays by 1.6 mm (standard deviation)."""
+"""Default scale of the logistic: an edge that varies by 1.6 mm (standard deviation)."""
 INK_ABOVE = 0.42
-"""A pixel is called ink above this chance: half of the Dice score to be had maximises its expectation."""
+"""A pixel counts as ink above this probability: half of the attainable Dice score maximises its expectation."""
 PRIOR = (2.0, 0.2, 0.01, 3.0, 1.0, 4.0, 1.5, 1.5, 0.2, 0.2, 3.0, 3.0, 0.5, 0.5)
 """How far each parameter may be from its start before it costs as much as one pixel of wrong ink."""
 PLACE_PRIOR_MM = 1.5
@@ -36,16 +36,16 @@ class DragFit:
 
     model: DragModel
     place_mm: Floats
-    """(q, 2): shift in x and y of a stroke by each column of its place."""
+    """(q, 2) shift of a stroke in x and y for each column of its place."""
     condition: float
     """Condition number of the scaled normal equations: above about 1e4 the parameters cannot be told apart."""
     cost: float
     rounds: int
     spread_mm: float = SPREAD_MM
-    """How far an edge strays."""
+    """Variation of an edge from stroke to stroke (scale of the logistic)."""
 
     squares: Floats = field(default_factory=lambda: np.zeros((0, 0, 0)))
-    """(images, P, P): J'J of each image at the end, scaled; P is the parameters that were free."""
+    """(images, P, P) scaled J'J of each image at the end, for the P free parameters."""
     gradients: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     free: tuple[str, ...] = ()
 
@@ -76,12 +76,11 @@ def fit_drags(
     spread_mm: float = SPREAD_MM,
     groups: Indices | None = None,
 ) -> DragFit:
-    """Levenberg-Marquardt over (B, len(y_mm), len(x_mm)) ink; `place` (B, q). Paths `groups[i]` to `groups[i + 1]` are
-    the strokes of image i; left out, each image shows one.
+    """Fit by Levenberg-Marquardt to (B, len(y_mm), len(x_mm)) ink; `place` is (B, q).
 
-    Without `lag` the disc is at the tip, drift apart; its width still settles along the path.
-
-    Raises ValueError where paths, ink and place do not belong together.
+    Paths `groups[i]` to `groups[i + 1]` are the strokes of image i; without `groups` each image shows one stroke.
+    Without `lag` the disc stays at the tip, except for drift; its width still settles along the path.
+    Raises ValueError if the sizes of paths, ink and place do not match.
     """
     from model import drag_kernel
 
@@ -147,8 +146,10 @@ def fit_drags(
 
 
 def bootstrap(fit: DragFit, draws: int = 500, seed: int = 0, start: DragModel | None = None) -> Floats:
-    """(draws, P) values of the free parameters when the images are drawn again with replacement, one Gauss-Newton step
-    from the fit each. With fewer than some 8 images the intervals are too short."""
+    """(draws, P) values of the free parameters, by bootstrap over images; a draw is one Gauss-Newton step from the fit.
+
+    With fewer than some 8 images the intervals are too short.
+    """
     at = [DragModel.names().index(name) for name in fit.free]
     scale, found = np.array(PRIOR)[at], fit.model.vector()[at]
     off = (found - (start or DragModel()).vector()[at]) / scale
@@ -172,7 +173,7 @@ class Residual:
 
     @staticmethod
     def fit(commands: Floats, base_mm: Floats, captured_mm: Floats, scales: Floats, ridge: float = 1.0) -> Residual:
-        """From (B, d) commands, the model's and the captured signed distances (B, h, w)."""
+        """Fit to (B, d) commands and to the model's and the captured signed distances (B, h, w)."""
         scaled = commands / scales
         miss = (clipped(captured_mm) - clipped(base_mm)).reshape(len(commands), -1)
         kernel = _kernel(scaled, scaled) + ridge * np.eye(len(commands))
@@ -185,7 +186,7 @@ class Residual:
 
 
 def chance(distance_mm: Floats, spread_mm: float = SPREAD_MM) -> Floats:
-    """The chance of ink that a signed distance stands for."""
+    """The probability of ink at a signed distance from the edge."""
     return ink(distance_mm, spread_mm)
 
 

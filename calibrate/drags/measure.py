@@ -1,7 +1,7 @@
-"""Validate imported strokes that travel along the paper: measure them, and say what may be compared.
+"""Measure imported strokes that travel along the paper, and fit their width against depth.
 
-A press model does not predict a drag. What the two share is how wide the brush opens at a depth, so that is what is
-fitted: width against depth, beside the slope that CCD-BSM gives to a brush of known R and L.
+A press model does not predict a drag. Both depend on how wide the brush opens at a depth, so the fitted slope of width
+against depth can be compared with the one that CCD-BSM gives for a brush of known R and L.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ LENGTH_NAME = "length_mm"
 
 @dataclass(frozen=True, slots=True)
 class Drag:
-    """One stroke: what was commanded beside what was measured."""
+    """One drag, with its commanded and measured values."""
 
     stroke_id: str
     commanded: dict[str, float]

@@ -1,4 +1,4 @@
-"""The report of strokes that travel: one self-contained HTML file, a CSV of the measurements, a terminal summary."""
+"""The report of drags: one self-contained HTML file, a CSV of the measurements, a terminal summary."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LIMITS = (
 
 @dataclass(frozen=True, slots=True)
 class DragValidation:
-    """A recording of strokes that travel, and what was measured in it."""
+    """A recording of drags, and what was measured in it."""
 
     header: Header
     recording: Path
@@ -58,7 +58,7 @@ def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
 
 
 def drags_csv(results: DragResults, source: str) -> str:
-    """Commanded beside measured, one row a stroke."""
+    """CSV of commanded and measured values, one row per stroke."""
     names = sorted({name for drag in results.strokes for name in drag.commanded})
     sizes = ["measured_length_mm", "measured_width_mm", "measured_mid_width_mm", "measured_area_mm2", "cut", "source"]
     head = ["stroke_id", *(f"commanded_{name}" for name in names), *sizes]
@@ -72,7 +72,7 @@ def drags_csv(results: DragResults, source: str) -> str:
 
 
 def fit_sentences(results: DragResults) -> Iterator[str]:
-    """The fits of an imported session, and what CCD-BSM has to do with them."""
+    """Sentences on the fits of an imported session, and how they relate to CCD-BSM."""
     width, length = results.width_on_depth, results.length_on_commanded
     if width is None:
         yield "Width against depth: no fit (fewer than 3 whole strokes, or one depth only)."

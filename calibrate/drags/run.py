@@ -21,13 +21,13 @@ FOLDER = "dragfit"
 SCHEMA_VERSION = 1
 FOLDS = 5
 LEAST = 3
-"""Fewer images tell no lag from drift."""
+"""Least number of images: fewer do not distinguish lag from drift."""
 LAGGING, STAMPS = "bristle lag", "circle stamps"
 Floats = NDArray[np.float64]
 
 
 class DragScore(BaseModel):
-    """One model over images that it was not fitted to, ink as 0 or 1, where the command put it."""
+    """Score of one model on images that it was not fitted to, ink as 0 or 1, at the commanded place."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -50,15 +50,15 @@ class DragArtefact(Artefact):
     strokes: int
     mm_per_px: float
     spread_mm: float
-    """How far an edge strays."""
+    """Variation of an edge from stroke to stroke (scale of the logistic)."""
     parameters: dict[str, FittedValue]
     condition: float
-    """Of the scaled normal equations: above some 1e4 parameters stand in for each other."""
+    """Condition number of the scaled normal equations: above about 1e4 the parameters cannot be told apart."""
     held_out: dict[str, DragScore]
-    """By model; empty where there are too few images to leave any out."""
+    """Scores by model; empty with too few images to leave any out."""
 
     def model(self) -> DragModel:
-        """The brush drawn along the paper."""
+        """The fitted drag model."""
         return DragModel(**{name: value.value for name, value in self.parameters.items()})
 
     @model_validator(mode="after")
@@ -77,7 +77,7 @@ class FittedDrags:
 
 
 def fit_drawn(drawn: Drawn) -> FittedDrags:
-    """Fit all images, leave out a fifth of them in turn, and make the artefact.
+    """Fit all images, leave out each fifth of them in turn, and make the artefact.
 
     Raises `CalibrationError` for fewer than three images.
     """

@@ -25,7 +25,7 @@ class FittedStage(BaseModel):
 
 
 class BrushFit(Artefact):
-    """What was fitted, to which strokes, with which software. Equal inputs give an equal file."""
+    """A fitted brush, with its strokes and software. Equal inputs give an equal file."""
 
     schema_version: int = SCHEMA_VERSION
     session_id: str
@@ -42,13 +42,13 @@ class BrushFit(Artefact):
     edges_mm: tuple[tuple[tuple[float, ...], ...], ...]
     stages: tuple[FittedStage, ...]
     proportional_h0_mm: float
-    """Zero offset where every size is held proportional to depth: the absolute one, see docs/brushfit.md."""
+    """Absolute zero offset, with every size held proportional to depth; see docs/brushfit.md."""
     proportional_h0_se_mm: float
     csim_percent: dict[str, float]
     """Leave-cell-out CSIM by model."""
 
     def press(self) -> FittedPress:
-        """The brush."""
+        """The fitted brush."""
         values = np.array([self.parameters[name].value for name in NAMES])
         return FittedPress(self.radius_mm, self.length_mm, values, np.array(self.edges_mm))
 

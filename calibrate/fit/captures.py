@@ -24,7 +24,7 @@ MARGIN_MM = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Captures:
-    """What a fit is made of, and where it comes from."""
+    """The presses that a fit uses, and where they come from."""
 
     header: Header
     recording_sha256: str
@@ -32,12 +32,12 @@ class Captures:
     radius_mm: float
     length_mm: float
     rows: slice
-    """Of the field: those that ink reaches, and 2 mm more; the grid and the strokes are cut to them."""
+    """Rows of the field that ink reaches, and 2 mm more; the grid and the strokes are cut to them."""
     grid: Grid
     strokes: list[Pressed]
     stroke_ids: list[str]
     refused: list[tuple[str, str]]
-    """(stroke, why): captures that cannot be used, or that their photograph cuts."""
+    """(stroke, reason) of captures that cannot be used or are cut by the edge of their photograph."""
 
 
 def grid_of(view: Field) -> Grid:
@@ -48,7 +48,7 @@ def grid_of(view: Field) -> Grid:
 
 
 def read_presses(session: Path, view: Field, calibration_path: Path | None = None) -> Captures:
-    """Every usable press of a session. Raises `CalibrationError` where it holds none, or was not calibrated."""
+    """Read every usable press of a session. Raises `CalibrationError` where it holds none, or was not calibrated."""
     recording = Recording(session)
     digest = recording.sha256
     strokes = list(recording.stroke_records())

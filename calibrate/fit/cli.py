@@ -1,4 +1,4 @@
-"""`brushloop fit`: a brush's own stroke model. Heavy imports wait until the command runs."""
+"""`brushloop fit`: fit a stroke model to one brush. Heavy imports wait until the command runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from calibrate.fit.run import Correction, Fitted
 
 DRAG_MM_PER_PX = 0.6
-"""Scale of the images that strokes that travel are fitted to."""
+"""Scale of the images that drags are fitted to."""
 
 
 def fit(

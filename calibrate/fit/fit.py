@@ -13,7 +13,7 @@ from model.fitted import MODES, NAMES, PARAMETERS, FittedPress, command_terms, m
 Floats = NDArray[np.float64]
 
 SPREAD_MM = 0.15
-"""How far an edge strays from press to press (scale of a logistic)."""
+"""Variation of an edge from press to press (scale of a logistic)."""
 STAGES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("scale and place", ("lam", "tip_gain", "origin_mm")),
     ("heel", ("heel_gain",)),
@@ -23,12 +23,12 @@ STAGES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("tilt", ("width_tilt", "length_tilt")),
     ("lean", ("lean", "heel_tilt")),
 )
-"""Each stage frees its parameters beside all that were freed before."""
+"""Each stage frees its parameters in addition to all that were freed before."""
 WORST_CONDITION = 300.0
-"""Of the Jacobian with columns of unit length: beyond it, captures this noisy do not tell the parameters apart."""
+"""Condition number of the Jacobian with unit columns above which noisy captures do not separate the parameters."""
 ROUNDS = 40
 EDGE_SPREAD_MM = (1.2, 0.4, 0.3, 0.15, 0.15)
-"""How large an edge's terms may be; the k-th sine's share of it falls as 1 / k."""
+"""Expected size of an edge's terms; for the k-th sine it falls as 1 / k."""
 EDGE_NOISE_MM = 0.25
 
 
@@ -56,18 +56,18 @@ class Pressed:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """What became of one stage."""
+    """The outcome of one stage."""
 
     name: str
     parameters: tuple[str, ...]
     condition: float
-    """Of everything free in it; inf where a column of the Jacobian is zero."""
+    """Condition number over all free parameters; inf where a column of the Jacobian is zero."""
     refused: bool
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A brush fitted to presses, and the basis of its intervals and of the choice of the next press."""
+    """A brush fitted to presses, with the data for its intervals and for the choice of the next press."""
 
     press: FittedPress
     free: tuple[str, ...]
@@ -88,7 +88,7 @@ def fit_presses(
     edges: bool = True,
     stages: Sequence[tuple[str, tuple[str, ...]]] = STAGES,
 ) -> Fit:
-    """Fit all stages that the strokes can tell, then the edges. Raises ValueError without a stroke."""
+    """Fit all stages that the strokes determine, then the edges. Raises ValueError without a stroke."""
     if not strokes:
         raise ValueError("a fit needs at least one stroke")
     press = FittedPress(radius_mm, length_mm)
@@ -96,7 +96,7 @@ def fit_presses(
     made: list[Stage] = []
     for name, parameters in stages:
         wanted = (*free, *parameters)
-        # Judged where the stage's fit ends, as the published start is far from any brush.
+        # Judged at the end of the stage's fit, as the published start is far from any brush.
         fitted = _minimise(press, wanted, strokes, grid)
         condition = condition_number(_normal(fitted, wanted, strokes, grid)[0].sum(axis=0))
         refused = not condition <= WORST_CONDITION
@@ -110,8 +110,10 @@ def fit_presses(
 
 
 def refit(fit: Fit, strokes: Sequence[Pressed], grid: Grid) -> Fit:
-    """The same parameters fitted to other strokes of the same brush, from where the fit stands. Raises ValueError as
-    `fit_presses`."""
+    """Fit the same parameters to other strokes of the same brush, starting from the fit.
+
+    Raises ValueError as `fit_presses`.
+    """
     if not strokes:
         raise ValueError("a fit needs at least one stroke")
     bare = replace(fit.press, edges=FittedPress(fit.press.radius_mm, fit.press.length_mm).edges)
@@ -122,7 +124,7 @@ def refit(fit: Fit, strokes: Sequence[Pressed], grid: Grid) -> Fit:
 
 
 def zero_touch(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> tuple[FittedPress, Floats]:
-    """Only depth and place of the zero touch, all else of the brush held: what changed since `press` was fitted.
+    """Fit only depth and place of the zero touch, all else of the brush held: what changed since `press` was fitted.
 
     Returns the brush and the standard errors of (h0_mm, origin_mm), by bootstrap over strokes.
     """
@@ -137,7 +139,7 @@ def zero_touch(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> tu
 def bootstrap(
     press: FittedPress, free: Sequence[str], squares: Floats, gradients: Floats, draws: int = 500, seed: int = 0
 ) -> Floats:
-    """(draws, P) values of the free parameters when the strokes are drawn again with replacement.
+    """(draws, P) values of the free parameters, by bootstrap over strokes.
 
     Each draw takes one Gauss-Newton step from the fit instead of a whole fit, which keeps 500 of them within a
     second; with fewer than some 8 strokes the intervals are too short.
@@ -154,7 +156,7 @@ def bootstrap(
 
 
 def condition_number(square: Floats) -> float:
-    """Of a Jacobian with unit columns, from its J'J; inf where a column is zero."""
+    """Condition number of a Jacobian with unit columns, from its J'J; inf where a column is zero."""
     length = np.sqrt(np.diag(square))
     if not len(square) or not np.all(length > 1e-6):
         return float("inf")
@@ -165,7 +167,7 @@ def condition_number(square: Floats) -> float:
 def jacobian(
     press: FittedPress, free: Sequence[str], height_mm: float, tilt_deg: float, grid: Grid
 ) -> tuple[Floats, Floats]:
-    """The chance of ink (pixels,) and its derivatives by the free parameters over their spreads, (pixels, P)."""
+    """Probability of ink (pixels,), and its derivatives (pixels, P) by the free parameters over their spreads."""
     base = press.chance(height_mm, tilt_deg, grid.x_mm, grid.y_mm, SPREAD_MM).ravel()
     columns = np.empty((base.size, len(free)))
     for k, name in enumerate(free):
@@ -179,7 +181,7 @@ def jacobian(
 
 
 def fit_edges(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> Floats:
-    """(2, MODES, TERMS): what the captured edges leave of the profile, by ridge regression."""
+    """(2, MODES, TERMS) deviations of the captured edges from the profile, by ridge regression."""
     weights = np.outer(1.0 / np.arange(1, MODES + 1), EDGE_SPREAD_MM).ravel()
     square = np.eye(len(weights))
     right = np.zeros((len(weights), 2))
@@ -199,7 +201,7 @@ def fit_edges(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> Flo
 
 
 def _minimise(press: FittedPress, free: tuple[str, ...], strokes: Sequence[Pressed], grid: Grid) -> FittedPress:
-    """Levenberg-Marquardt from the brush given, each parameter held to its spread as by one pixel of ink."""
+    """Levenberg-Marquardt from `press`; a parameter one spread from its start costs as much as a pixel of wrong ink."""
     at = [NAMES.index(name) for name in free]
     spread = np.array([PARAMETERS[k].spread for k in at])
     start = np.array([PARAMETERS[k].start for k in at])

@@ -1,4 +1,4 @@
-"""How well a fit predicts cells that it has not seen, beside the ceiling and its peers."""
+"""How well a fit predicts cells that it has not seen, compared with the ceiling and with other models."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from model.regression import Plane, fit_plane
 from model.strokes.bezier import bezier
 
 TIP_SHARE = 0.9
-"""Where the shape's own origin lies along it; moved by as much when drawn, so any share gives the same mark."""
+"""Position of the shape's origin along it; drawing moves it back, so any share gives the same mark."""
 Cell = tuple[float, float]
 CEILING, FITTED, BEZIER, UNCALIBRATED = "same-cell template", "fitted", "refitted Bezier", "uncalibrated"
 Images = NDArray[np.floating]
@@ -27,7 +27,7 @@ Predict = Callable[[float, float], Images]
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """One model over held-out strokes, binary images, percent."""
+    """Scores of one model on held-out strokes, binary images, percent."""
 
     model: str
     csim: float
@@ -44,14 +44,14 @@ def by_cell(strokes: Sequence[Pressed]) -> dict[Cell, list[Pressed]]:
 
 
 def predictor(press: FittedPress, grid: Grid) -> Predict:
-    """A fitted brush as images, without torch."""
+    """A function that draws the presses of a fitted brush, without torch."""
     return lambda height, tilt: press.chance(height, tilt, grid.x_mm, grid.y_mm, SPREAD_MM)
 
 
 def leave_cell_out(fit: Fit, strokes: Sequence[Pressed], grid: Grid, uncalibrated: Predict) -> list[HeldOut]:
-    """Each cell predicted by fits to all other cells. Raises ValueError with fewer than two cells.
+    """Score each cell as predicted by fits to all other cells. Raises ValueError with fewer than two cells.
 
-    `uncalibrated` gives the image of a press before any fit. Peers that cannot be had are left out: a template needs
+    `uncalibrated` gives the image of a press before any fit. Models without enough data are left out: a template needs
     three strokes of a cell, a regressed Bezier two depths and two tilts among the others.
     """
     cells = by_cell(strokes)
@@ -79,12 +79,12 @@ def leave_cell_out(fit: Fit, strokes: Sequence[Pressed], grid: Grid, uncalibrate
 
 @dataclass(frozen=True, slots=True)
 class RefittedBezier:
-    """Ends, belly and shoulder as planes in (H, H alpha), as the paper's Bezier baseline has them."""
+    """The paper's Bezier baseline: ends, belly and shoulder as planes in (H, H alpha)."""
 
     plane: Plane
 
     def mark(self, height_mm: float, tilt_deg: float) -> tuple[Shape, float]:
-        """The stroke, and where its origin lies from the point of touch, mm."""
+        """The stroke, and the x of its origin from the point of touch, mm."""
         import torch
 
         left, right, belly, shoulder = (float(v) for v in self.plane.at(height_mm, tilt_deg).values())

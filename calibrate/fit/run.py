@@ -24,21 +24,21 @@ from model.registry import stroke_models
 
 NORMAL_95 = 1.96
 PROPORTIONAL = 3
-"""Stages in which every size is proportional to depth: scale and place, heel, zero offset."""
+"""Number of first stages in which every size is proportional to depth: scale and place, heel, zero offset."""
 
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """Where the ink says that the tip touched, against where the rig said so; 95 % intervals."""
+    """Difference between the zero touch that the ink shows and the rig's; 95 % intervals."""
 
     lift_mm: float
     """Add to `paper.touch_z_mm`: positive where the paper is met higher than the rig believes."""
     lift_interval_mm: tuple[float, float]
     along_mm: float
-    """How far along the heading the ink lies from where it should."""
+    """Offset of the ink along the heading from where it should lie."""
     along_interval_mm: tuple[float, float]
     reference: str
-    """The fit that it is measured against, or empty: against a brush whose sizes are proportional to depth."""
+    """The fit that it is measured against; empty for a brush whose sizes are proportional to depth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,7 @@ def fit_session(captures: Captures, view: Field) -> Fitted:
 
 
 def proportional_zero(strokes: list[Pressed], grid: Grid, radius_mm: float, length_mm: float) -> tuple[float, float]:
-    """(h0, its standard error) in mm where every size is proportional to depth; (0, inf) where one depth hides it."""
+    """(h0, its standard error) in mm with every size proportional to depth; (0, inf) if one depth leaves it open."""
     fit = fit_presses(strokes, grid, radius_mm, length_mm, edges=False, stages=STAGES[:PROPORTIONAL])
     if "h0_mm" not in fit.free:
         return 0.0, 1e9
@@ -111,7 +111,7 @@ def proportional_zero(strokes: list[Pressed], grid: Grid, radius_mm: float, leng
 
 
 def correction(captures: Captures, artefact: BrushFit, reference: BrushFit | None) -> Correction:
-    """What to correct of the rig's zero touch, against an earlier fit of the same brush, or absolutely."""
+    """The correction of the rig's zero touch, relative to an earlier fit of the same brush or absolute."""
     if reference is not None:
         before = reference.press()
         now, errors = zero_touch(before, captures.strokes, captures.grid)

@@ -20,7 +20,7 @@ COLUMNS = (
 
 
 def write_inversion(made: Inversion, out: Path, repeats: int = 1, seed: int = 1) -> Path:
-    """Write `out` and the protocol beside it, which presses each stroke `repeats` times in an order by `seed`.
+    """Write `out` and the protocol beside it, which presses each stroke `repeats` times in an order drawn with `seed`.
 
     Returns the protocol's path. Raises `CalibrationError` and OSError.
     """
@@ -40,7 +40,7 @@ def write_inversion(made: Inversion, out: Path, repeats: int = 1, seed: int = 1)
 
 
 def recovered_csv(made: Inversion) -> str:
-    """One row a stroke. Depths and tilts go to the hundredth that an arm can hold, deviations to three figures."""
+    """CSV, one row per stroke; depths and tilts to the hundredth that an arm can hold, deviations to three figures."""
     out = io.StringIO()
     writer = CsvWriter(out)
     writer.writerow(COLUMNS)
@@ -53,7 +53,7 @@ def recovered_csv(made: Inversion) -> str:
 
 
 def replay_toml(made: Inversion, name: str, repeats: int = 1, seed: int = 1) -> str:
-    """The `replay` protocol of that CSV."""
+    """The `replay` protocol for the CSV file `name`."""
     return (
         f"# Recovered by {made.settings.model} from {made.header.session_id} ({made.header.source}), "
         f"recording sha256 {made.recording_sha256}.\n"

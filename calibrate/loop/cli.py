@@ -20,7 +20,7 @@ def compare(
     mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = MM_PER_PX,
     out: Annotated[Path, typer.Option(help="Folder for loop.html, loop.png, loop.csv, loop.json.")] = Path("loop"),
 ) -> None:
-    """Compare re-pressed strokes with their originals, beside the brush's own repeatability."""
+    """Compare re-pressed strokes with their originals, and with the brush's own repeatability."""
     import sys
 
     from calibrate.compare.field import Field

@@ -1,4 +1,4 @@
-"""A session and the session that pressed its strokes again: paired by name, laid on the same fields, and scored."""
+"""Compare a session with the one that pressed its strokes again: paired by name, on the same fields, and scored."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Pairs:
     pairs: list[Pair] = field(default_factory=list[Pair])
     originals: dict[str, CapturedPress] = field(default_factory=dict[str, CapturedPress])
     refused: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
-    """(stroke, why), never dropped in silence."""
+    """(stroke, reason), never dropped silently."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +50,12 @@ class ComparedSession:
 
 @dataclass(frozen=True, slots=True)
 class LoopComparison:
-    """What came of pressing a session's strokes again."""
+    """The result of pressing a session's strokes again."""
 
     original: ComparedSession
     again: ComparedSession
     model: str
-    """What recovered, or is taken to have recovered, depth and tilt, and drew the images between."""
+    """The model that recovered, or is assumed to have recovered, depth and tilt, and drew the generated images."""
     in_sample: bool
     """Whether that model was fitted to the original presses themselves."""
     field: Field

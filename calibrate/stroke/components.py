@@ -1,4 +1,4 @@
-"""Which ink is the stroke: components, specks, neighbours and holes."""
+"""Select the ink of the stroke: components, specks, neighbours and holes."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class Chosen:
     parts: int
     specks: int
     others_mm2: tuple[float, ...]
-    """Areas of components that are no specks and belong to other strokes."""
+    """Areas of components that are not specks and belong to other strokes."""
 
 
 def components(ink: Mask, anchor_px: tuple[float, float] | None, params: Params) -> Chosen:
-    """The stroke among the components: the main one, and parts that are no specks and lie close to it.
+    """Select the stroke: the main component, and parts close to it that are not specks.
 
     The main component is the largest; with an anchor, the largest of those that come within `join_mm` of it, if any.
     """

@@ -1,4 +1,4 @@
-"""The stroke that is new between two photographs of one page that may already carry ink."""
+"""Find the new stroke between two photographs of one page that may already carry ink."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from calibrate.stroke.light import LIGHT_ROUNDS
 from calibrate.stroke.params import Floats, Gray, Mask, Soft
 
 DARK_SHARE = 0.6
-"""Darker than this share of the paper, a place held ink before: ink on top of it cannot be seen."""
+"""A pixel darker than this share of the paper held ink before: new ink on top of it cannot be seen."""
 SHRINK = 8
 MOST_SHIFT_PX = 8.0
 LEAST_RESPONSE = 0.05
 NOISE_SIGMAS = 6.0
 NEAR_MM = 10.0
-"""New ink so far from where the stroke should begin counts a third."""
+"""New ink at this distance from where the stroke should begin counts a third."""
 
 
 @dataclass(frozen=True, slots=True)
 class DifferenceParams:
-    """Named parameters of before and after; millimetres of the page."""
+    """Parameters of the comparison; lengths in millimetres on the page."""
 
     core: float = 0.35
     """Darkening, as a share of the paper's brightness, that a stroke must reach somewhere."""
     rim: float = 0.15
-    """Darkening down to which its neighbours belong to it."""
+    """Darkening above which its neighbours belong to it."""
     join_mm: float = 2.0
     """Parts that lie closer to the main part are the same stroke: bristles part, bubbles shine."""
     least_mm2: float = 2.0
@@ -43,11 +43,11 @@ class NewStroke:
     """The new stroke."""
 
     mask: Mask
-    """(h, w), True where ink came."""
+    """(h, w), True where ink is new."""
     soft: Soft
-    """(h, w) ink from 0 to 1 where it came, 0 elsewhere."""
+    """(h, w) ink from 0 to 1 where it is new, 0 elsewhere."""
     start_px: tuple[float, float]
-    """(x, y) of the end that lies against the heading: the middle of its outermost ink; pixel j covers [j, j + 1)."""
+    """(x, y) of the end opposite to the heading: the middle of its outermost ink; pixel j covers [j, j + 1)."""
     shift_px: tuple[float, float]
     """Shift of the page between the photographs, undone before comparing."""
     noise: float
@@ -64,10 +64,10 @@ def new_stroke(
     heading_deg: float = 0.0,
     near_px: tuple[float, float] | None = None,
 ) -> NewStroke:
-    """The stroke in `after` that is not in `before`, two gray photographs of one page and one size.
+    """Find the stroke in `after` that is not in `before`, two gray photographs of one page and one size.
 
     `near_px` is where it should begin; of several new components the one with the most ink near it is taken. Raises
-    `CaptureRefused` where nothing came, or the sizes differ.
+    `CaptureRefused` if there is no new stroke, or the sizes differ.
     """
     params = params or DifferenceParams()
     if before.shape != after.shape:
@@ -100,7 +100,7 @@ def new_stroke(
 
 
 def end_of(mask: Mask, heading_deg: float, px_per_mm: float, reach_mm: float = 1.0) -> tuple[float, float]:
-    """(x, y) px of the mask's end against the heading (deg, counter-clockwise, rows run down): where a stroke began.
+    """(x, y) px where a stroke began: the mask's end opposite to the heading (deg, counter-clockwise, rows run down).
 
     Along the heading it is where ink begins, leaving out the outermost 0.5 % as stray bristles; across it, the middle
     of the first `reach_mm`.
@@ -121,7 +121,7 @@ def _shift(before: Gray, after: Gray) -> tuple[float, float]:
     a, b = (cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float64) for image in (before, after))
     if float(a.std()) < 3.0:
         return 0.0, 0.0
-    # What is new must not pull: it is filled with what was there.
+    # New ink must not affect the shift, so it is replaced by what was there before.
     same = np.abs(a - b) < 40.0
     b = np.where(same, b, a)
     window = cv2.createHanningWindow((before.shape[1], before.shape[0]), cv2.CV_64F)
@@ -137,7 +137,7 @@ def _moved(image: Gray, by: tuple[float, float]) -> cv2.typing.MatLike:
 
 
 def _paper(first: Soft) -> Soft:
-    """Brightness of the paper everywhere: closing fills the ink, blurring takes the fibres out."""
+    """Brightness of the paper everywhere: closing fills the ink, blurring removes the fibres."""
     small = cv2.resize(first, None, fx=1 / SHRINK, fy=1 / SHRINK, interpolation=cv2.INTER_AREA)
     side = max(3, min(small.shape[:2]) // 4) | 1
     closed = cv2.morphologyEx(small, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8), borderType=cv2.BORDER_REPLICATE)
@@ -147,7 +147,7 @@ def _paper(first: Soft) -> Soft:
 
 
 def _gain(first: Soft, second: Soft, clean: Mask) -> Soft:
-    """How the light changed, a quadratic surface of second / first over paper that stayed paper."""
+    """Change of the light: a quadratic surface fitted to second / first where the paper stayed clean."""
     height, width = first.shape
     y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
     basis = np.asarray(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1), np.float64)
@@ -174,7 +174,7 @@ def _grown(
     params: DifferenceParams,
     near_px: tuple[float, float] | None,
 ) -> Mask:
-    """The main component above `rim` that holds some of `core`, with the parts that lie close to it."""
+    """The main component above `rim` that somewhere exceeds `core`, with the parts close to it."""
     candidate = (darker > rim).astype(np.uint8)
     side = max(1, round(params.sliver_mm * px_per_mm))
     if side > 1:
