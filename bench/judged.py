@@ -1,8 +1,8 @@
-"""`python -m bench.judged [SEED]`: whole sessions over late and stalling cameras, judged for ink (loopback rig).
+"""`python -m bench.judged [SEED [CAMERA...]]`: whole sessions over late and stalling cameras, judged for ink.
 
-Ten sessions of 30 strokes, one for each camera of `bench.photographs`, collected by `brushloop collect` in a process of
-its own. A photograph with the arm in it, or of the sheet as it was before, shows as a stroke that is misplaced or not
-there. A run that ends with a question is started again a few times, as an operator would.
+Ten sessions of 30 strokes on the loopback rig, one for each camera of `bench.photographs`, collected by `brushloop
+collect` in a process of its own. A photograph with the arm in it, or of the sheet as it was before, shows as a stroke
+that is misplaced or not there. A run that ends with a question is started again a few times, as an operator would.
 """
 
 from __future__ import annotations
@@ -100,13 +100,15 @@ def _limit_delay(path: Path) -> None:
     path.write_text(text)
 
 
-def main(seed: int) -> None:
-    """Measure and print the table."""
+def main(seed: int, only: list[int]) -> None:
+    """Measure the cameras with these numbers (all if there are none), and print the table."""
     tell(f"Judged captures on the loopback rig, {EACH} strokes a camera, seed {seed}, {machine()}")
     tell("| camera | captures | misplaced or empty | all findings | told delay, ms | s | runs that ended early |")
     tell("|---|---|---|---|---|---|---|")
     captures = wrong = 0
     for number, case in enumerate(cases()):
+        if only and number not in only:
+            continue
         line, done, bad = measure(number, case, seed)
         captures, wrong = captures + done, wrong + bad
         tell(line)
@@ -117,7 +119,6 @@ if __name__ == "__main__":
     match sys.argv[1:]:
         case ["rig", path, number]:
             asyncio.run(serve(Path(path), full_size(cases()[int(number)]).view))
-        case [] | [_]:
-            main(int(sys.argv[1]) if sys.argv[1:] else 0)
-        case other:
-            sys.exit(f"unknown arguments {other}")
+        case numbers:
+            seed, *only = map(int, numbers or ["0"])
+            main(seed, only)

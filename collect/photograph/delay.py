@@ -79,8 +79,8 @@ class CameraDelay:
     def known(self) -> bool:
         """Whether the trips differ by no more than the camera's period explains, and suffice to average that out."""
         good_s = max(GOOD_SHARE * self.delay_s, GOOD_S)
-        coarsest_s = max(look.resolution_s for look in self.looks)
-        return self.spread_s <= max(2.0 * coarsest_s, good_s) and self.resolution_s <= good_s
+        typical_s = float(np.median([look.resolution_s for look in self.looks]))
+        return self.spread_s <= max(2.0 * typical_s, good_s) and self.resolution_s <= good_s
 
     def __str__(self) -> str:
         delay_ms, resolution_ms, spread_ms = (1e3 * v for v in (self.delay_s, self.resolution_s, self.spread_s))

@@ -14,7 +14,7 @@ from collections.abc import AsyncGenerator, Awaitable, Callable
 from dataclasses import dataclass, replace
 
 from collect.errors import ArmInPicture, CameraLate
-from collect.photograph.delay import ArmPlace, CameraDelay, Look, look
+from collect.photograph.delay import GOOD_S, GOOD_SHARE, ArmPlace, CameraDelay, Look, look
 from collect.photograph.frames import ARM_SHARE, Frames, Thumbnail, View, watching
 from collect.rig.config_devices import CameraConfig
 from drivers.clock import Clock
@@ -107,7 +107,9 @@ class Photographer:
         if late_s > self._config.max_delay_ms / 1e3:
             self.forget()
             raise self._too_late(f"{1e3 * late_s:.0f} ms at least")
-        if late_s > delay.bound_s:
+        if late_s > delay.bound_s + max(GOOD_SHARE * delay.bound_s, GOOD_S):
+            self.forget()  # it has grown, or was measured wrongly: the next photograph measures it again
+        elif late_s > delay.bound_s:
             self.delay = CameraDelay((*delay.looks, Look(late_s, 0.0)))
 
     async def _measured(self) -> tuple[CameraDelay, Thumbnail]:
@@ -129,6 +131,9 @@ class Photographer:
                 view, found = seen
                 if found is not None:
                     looks.append(found)
+                elif attempt == 0:
+                    looks.clear()  # these pictures may all show what the arm did before
+                    break
                 if len(looks) >= FEWEST_LOOKS and CameraDelay(tuple(looks)).known:
                     break
             if len(looks) >= FEWEST_LOOKS:

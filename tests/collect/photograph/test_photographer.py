@@ -7,6 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from collect.errors import ArmInPicture, CameraLate
+from collect.photograph.delay import CameraDelay, Look
 from drivers.samples import Frame
 from tests.collect.photograph.theatre import OUT_MM, OVER_MM, PERIOD_S, Theatre
 
@@ -119,3 +120,26 @@ async def test_frames_that_waited_for_a_stalled_computer_are_not_taken_for_new()
         frame = await photographer.photograph()
         assert age_s(theatre, frame, inked_s) >= 0.0
         assert not arm_is_in(theatre, frame)
+
+
+async def test_pictures_of_what_the_arm_did_before_are_not_taken_for_the_first_trip():
+    theatre = Theatre(lambda _t_s: 0.4)
+    for way in (1.0, 0.0, 1.0, 0.0):
+        await theatre.go(way)
+    photographer = theatre.photographer()
+    await photographer.photograph()
+    assert photographer.delay is not None
+    assert photographer.delay.delay_s == pytest.approx(0.4, abs=max(0.08, 2.0 * PERIOD_S))
+
+
+async def test_a_delay_that_was_measured_wrongly_is_measured_again():
+    theatre = Theatre(lambda _t_s: 0.4)
+    photographer = theatre.photographer()
+    await photographer.photograph()
+    photographer.delay = CameraDelay((Look(0.02, 0.01), Look(0.03, 0.01)))
+    inked_s = theatre.clock.now_ns() / 1e9
+    assert age_s(theatre, await photographer.photograph(), inked_s) >= 0.0
+    assert photographer.delay is None
+    await photographer.photograph()
+    assert photographer.delay is not None
+    assert photographer.delay.delay_s == pytest.approx(0.4, abs=max(0.08, 2.0 * PERIOD_S))
