@@ -14,7 +14,7 @@ from collections.abc import AsyncGenerator, Awaitable, Callable
 from dataclasses import dataclass, replace
 
 from collect.errors import ArmInPicture, CameraLate
-from collect.photograph.delay import GOOD_S, GOOD_SHARE, ArmPlace, CameraDelay, Look, look
+from collect.photograph.delay import ArmPlace, CameraDelay, Look, look
 from collect.photograph.frames import ARM_SHARE, Frames, Thumbnail, View, watching
 from collect.rig.config_devices import CameraConfig
 from drivers.clock import Clock
@@ -23,12 +23,14 @@ from drivers.protocols import Camera, Robot
 from drivers.samples import Frame
 
 FEWEST_LOOKS, MOST_LOOKS = 2, 6
-ATTEMPTS = 3
+ATTEMPTS = 4
 """Most attempts at the measurement; another follows if a stall or an old picture has spoilt the previous one."""
 PATIENCE_S = 1.5
 """Waiting time beyond the longest allowed delay: distinguishes a camera that is late from one that shows nothing."""
 STAY_S = 0.15
 """How much longer each trip over the sheet is than the one before."""
+GROWN_SHARE, GROWN_S = 0.2, 0.1
+"""A delay that exceeds the known one by a fifth and by 0.1 s has to be measured again."""
 POSE_PERIOD_S = 0.005
 
 
@@ -107,7 +109,7 @@ class Photographer:
         if late_s > self._config.max_delay_ms / 1e3:
             self.forget()
             raise self._too_late(f"{1e3 * late_s:.0f} ms at least")
-        if late_s > delay.bound_s + max(GOOD_SHARE * delay.bound_s, GOOD_S):
+        if late_s > delay.bound_s + max(GROWN_SHARE * delay.bound_s, GROWN_S):
             self.forget()  # it has grown, or was measured wrongly: the next photograph measures it again
         elif late_s > delay.bound_s:
             self.delay = CameraDelay((*delay.looks, Look(late_s, 0.0)))

@@ -66,6 +66,8 @@ class _Line:
             self._writer.write(data)
             await self._writer.drain()
             return
+        if self._writer.is_closing():  # nothing is drained here that would notice
+            raise ConnectionResetError("the client has gone")
         self._last_s = max(self._last_s, now_s + late_s)
         self._loop.call_at(self._last_s, self._write, data)
 

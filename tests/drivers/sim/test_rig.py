@@ -128,3 +128,16 @@ async def test_the_motion_queue_belongs_to_the_event_loops_thread(rig: LoopbackR
     await camera.fresh(Stamp(clock.now_ns()))
     await camera.close()
     assert seen == {threading.current_thread().name}
+
+
+async def test_a_late_camera_notices_that_its_client_has_gone():
+    view = View(width_px=320, height_px=240, px_per_mm=0.9, fps=50.0, delay_s=0.05)
+    async with LoopbackRig(SimConfig(force_sensor=False, ink_device="none", view=view)) as rig:
+        reader, writer = await asyncio.open_connection(HOST, rig.camera.port)
+        writer.write(b"GET /stream.mjpg HTTP/1.0\r\n\r\n")
+        await reader.readexactly(2000)
+        assert rig.camera.clients == 1
+        writer.transport.abort()
+        async with asyncio.timeout(10.0):
+            while rig.camera.clients:
+                await asyncio.sleep(0.02)
