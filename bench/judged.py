@@ -85,10 +85,10 @@ def measure(number: int, case: Case, seed: int) -> tuple[str, int, int]:
         done = results(folder)
     verdicts = Counter(result["verdict"] for result in done)
     wrong = verdicts["misplaced"] + verdicts["blank"]
-    told = sorted({f"{result['camera_delay_ms']:.0f}" for result in done})
+    measured_ms = sorted({f"{result['camera_delay_ms']:.0f}" for result in done})
     others = ", ".join(f"{count} {name}" for name, count in verdicts.items() if name) or "none"
     refusals = "; ".join(f"{count} x {text}" for text, count in Counter(ended).most_common()) or "none"
-    line = f"| {case.name} | {len(done)} | {wrong} | {others} | {', '.join(told)} | {took_s:.0f} | {refusals} |"
+    line = f"| {case.name} | {len(done)} | {wrong} | {others} | {', '.join(measured_ms)} | {took_s:.0f} | {refusals} |"
     return line, len(done), wrong
 
 
@@ -103,7 +103,7 @@ def _limit_delay(path: Path) -> None:
 def main(seed: int, only: list[int]) -> None:
     """Measure the cameras with these numbers (all if there are none), and print the table."""
     tell(f"Judged captures on the loopback rig, {EACH} strokes a camera, seed {seed}, {machine()}")
-    tell("| camera | captures | misplaced or empty | all findings | told delay, ms | s | runs that ended early |")
+    tell("| camera | captures | misplaced or empty | all findings | measured delay, ms | s | runs that ended early |")
     tell("|---|---|---|---|---|---|---|")
     captures = wrong = 0
     for number, case in enumerate(cases()):
