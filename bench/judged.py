@@ -85,7 +85,7 @@ def measure(number: int, case: Case, seed: int) -> tuple[str, int, int]:
         done = results(folder)
     verdicts = Counter(result["verdict"] for result in done)
     wrong = verdicts["misplaced"] + verdicts["blank"]
-    measured_ms = sorted({f"{result['camera_delay_ms']:.0f}" for result in done})
+    measured_ms = sorted({f"{result['camera_delay_ms']:.0f}" for result in done if "camera_delay_ms" in result})
     others = ", ".join(f"{count} {name}" for name, count in verdicts.items() if name) or "none"
     refusals = "; ".join(f"{count} x {text}" for text, count in Counter(ended).most_common()) or "none"
     line = f"| {case.name} | {len(done)} | {wrong} | {others} | {', '.join(measured_ms)} | {took_s:.0f} | {refusals} |"
