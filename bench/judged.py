@@ -78,7 +78,6 @@ def measure(number: int, case: Case, seed: int) -> tuple[str, int, int]:
         folder = Path(name)
         (folder / "protocol.toml").write_text(PROTOCOL.format(seed=seed))
         with started("bench.judged", "rig", str(folder / "rig.toml"), str(number)) as rig:
-            _limit_delay(folder / "rig.toml")
             began = time.monotonic()
             ended = collect(folder, rig.pid, case.stops, seed)
             took_s = time.monotonic() - began
@@ -90,14 +89,6 @@ def measure(number: int, case: Case, seed: int) -> tuple[str, int, int]:
     refusals = "; ".join(f"{count} x {text}" for text, count in Counter(ended).most_common()) or "none"
     line = f"| {case.name} | {len(done)} | {wrong} | {others} | {', '.join(measured_ms)} | {took_s:.0f} | {refusals} |"
     return line, len(done), wrong
-
-
-def _limit_delay(path: Path) -> None:
-    text = path.read_text()
-    for name, value in (("max_delay_ms", 1500.0), ("max_jitter_ms", 500.0)):
-        lines = [line for line in text.split("\n") if not line.startswith(f"{name} =")]
-        text = "\n".join(f"{line}\n{name} = {value}" if line == "[camera]" else line for line in lines)
-    path.write_text(text)
 
 
 def main(seed: int, only: list[int]) -> None:

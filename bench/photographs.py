@@ -13,6 +13,7 @@ import contextlib
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -48,6 +49,8 @@ VIEW = View(width_px=1024, height_px=768, px_per_mm=3.12, fps=20.0, stamp_strip=
 RATE = 20.0
 OLD_RULE_S = 0.25
 STOP_S = 2.0
+LIMITS = {"max_delay_ms": 1500.0, "max_jitter_ms": 500.0}
+"""The defaults of a real camera; the loopback rig writes wider ones."""
 MOST_REFUSALS = 3
 """A run would have ended with the first."""
 
@@ -80,7 +83,10 @@ def cases() -> list[Case]:
 async def serve(path: Path, view: View) -> None:
     """The rig of one case, in a process of its own, until its input ends."""
     async with LoopbackRig(SimConfig(rate=RATE, force_sensor=False, ink_device="none", view=view)) as rig:
-        path.write_text(rig.toml(), encoding="utf-8")
+        text = rig.toml()
+        for name, value in LIMITS.items():
+            text = re.sub(rf"^{name} = .*$", f"{name} = {value}", text, flags=re.MULTILINE)
+        path.write_text(text, encoding="utf-8")
         asked = await lines_of_input()
         tell("ready")
         await asked.read()
@@ -89,8 +95,6 @@ async def serve(path: Path, view: View) -> None:
 async def photograph(path: Path, seed: int) -> None:
     """Presses and photographs, a line of JSON for each; in a process of its own."""
     config = RigConfig(**tomllib.loads(path.read_text(encoding="utf-8")))
-    limits = {"max_delay_ms": 1500.0, "max_jitter_ms": 500.0}
-    config = config.model_copy(update={"camera": config.camera.model_copy(update=limits)})
     cells, rng = Sheet(config.paper), random.Random(seed)
     seen: list[tuple[float, float]] = []
     _blind_to_the_strip(seen)

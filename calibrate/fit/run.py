@@ -101,7 +101,7 @@ def fit_session(captures: Captures, view: Field) -> Fitted:
 
 
 def proportional_zero(strokes: list[Pressed], grid: Grid, radius_mm: float, length_mm: float) -> tuple[float, float]:
-    """(h0, its standard error) in mm with every size proportional to depth; (0, inf) if one depth leaves it open."""
+    """(h0, its standard error) in mm with every size proportional to depth; (0, 1e9) if one depth leaves it open."""
     fit = fit_presses(strokes, grid, radius_mm, length_mm, edges=False, stages=STAGES[:PROPORTIONAL])
     if "h0_mm" not in fit.free:
         return 0.0, 1e9

@@ -40,7 +40,7 @@ def write_inversion(made: Inversion, out: Path, repeats: int = 1, seed: int = 1)
 
 
 def recovered_csv(made: Inversion) -> str:
-    """CSV, one row per stroke; depths and tilts to the hundredth that an arm can hold, deviations to three figures."""
+    """CSV, one row per stroke; depths and tilts to three decimals, deviations to three figures."""
     out = io.StringIO()
     writer = CsvWriter(out)
     writer.writerow(COLUMNS)

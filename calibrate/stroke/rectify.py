@@ -40,7 +40,7 @@ def rectify(image: Gray, image_to_paper: Floats, window_mm: tuple[float, float, 
 
 
 def rescale(image: Gray, px_per_mm: tuple[float, float], where: str) -> Gray:
-    """Rescale a photograph of known scale to 20 px/mm. Raises `CaptureRefused` if the result would be too large."""
+    """Rescale a photograph of known scale to 20 px/mm. Raises `CaptureRefused` if the result is too small or large."""
     height, width = image.shape
     size = (round(width * PX_PER_MM / px_per_mm[0]), round(height * PX_PER_MM / px_per_mm[1]))
     if not all(8 <= side <= MAX_RASTER_PX for side in size):

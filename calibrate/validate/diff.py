@@ -1,7 +1,7 @@
 """Comparison of two reports: what got better or worse, with a paired test.
 
 Pairs are, in order of preference: the same stroke of the same recording (two software versions, or two sets of
-options); a stroke and the one that repeats it by name; the averages of the same cell in two sessions.
+options); the averages of the same cell in two sessions.
 """
 
 from __future__ import annotations

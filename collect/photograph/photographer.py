@@ -110,7 +110,7 @@ class Photographer:
             self.forget()
             raise self._too_late(f"{1e3 * late_s:.0f} ms at least")
         if late_s > delay.bound_s + max(GROWN_SHARE * delay.bound_s, GROWN_S):
-            self.forget()  # it has grown, or was measured wrongly: the next photograph measures it again
+            self.delay = None  # it has grown, or was measured wrongly: the next photograph measures it again
         elif late_s > delay.bound_s:
             self.delay = CameraDelay((*delay.looks, Look(late_s, 0.0)))
 

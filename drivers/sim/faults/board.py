@@ -19,7 +19,7 @@ MOST = 1000
 
 
 class Watched(Protocol):
-    """State that triggers depend on; `drivers.sim.faults.truth.Truth` in a rig."""
+    """State that triggers depend on; `drivers.sim.faults.phases.Truth` in a rig."""
 
     @property
     def presses(self) -> int:
