@@ -250,6 +250,8 @@ class OperatorApp(PlainApp):
         self._main = screen
 
     def _poll(self) -> None:
+        if not self.is_running:
+            return  # the timer may tick once more while the app closes, when it has no screens left
         if self.leaving:
             self.exit()
         if self.engine is None or self._now is None:

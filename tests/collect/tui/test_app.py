@@ -13,6 +13,7 @@ from textual.pilot import Pilot
 from textual.widgets import Static
 
 from collect.engine.control import FINAL, State
+from collect.operator import OperatorRequest
 from collect.tui.app import OperatorApp
 from collect.tui.keys import RUN_KEYS, HelpScreen
 from collect.tui.question_screens import Confirm
@@ -61,6 +62,17 @@ async def test_space_pauses_and_resumes_and_says_which() -> None:
             assert "space resume" in await look(app, pilot)
             await pilot.press("space")
             assert engine.calls == ["resume"]
+
+
+async def test_a_poll_after_the_screens_have_closed_shows_nothing() -> None:
+    engine = FakeEngine(picture())
+    app = OperatorApp(engine)
+    async with app.run_test() as pilot:
+        await look(app, pilot)
+    engine.now = picture(state=State.ASKING, prompt=SPLIT)
+    app.action_request(OperatorRequest.RETAKE.name)  # sends the request, then polls
+    assert engine.calls[-1].startswith("request")
+    assert app.screen_stack == []
 
 
 async def test_space_does_nothing_once_the_end_has_begun() -> None:
