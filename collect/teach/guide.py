@@ -1,0 +1,137 @@
+"""What the first day asks of a person, and what it shows: one protocol for the terminal, the screen and the tests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from collect.operator import Choice
+
+Picture = NDArray[np.uint8]
+"""(h, w) gray or (h, w, 3) BGR."""
+
+TargetKind = Literal[
+    "pin",
+    "board-corner",
+    "sheet-corner",
+    "well",
+    "well-rim",
+    "wash-pot",
+    "park",
+    "hold-board",
+    "push-sensor",
+    "clear-view",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A physical thing that a person brings the tip to, or does something with."""
+
+    kind: TargetKind
+    index: int = 0
+    """Which one, from 0: the direction of the pin, the pose of a held board."""
+    corner: str = ""
+    """Which corner: `lower left`, `lower right`, `upper right` or `upper left`, as the print names it."""
+
+
+class Brought(StrEnum):
+    """How a person answered a request."""
+
+    DONE = "done"
+    BACK = "back"
+    """Leave this step; what it had measured so far is forgotten."""
+    SKIP = "skip"
+    """Go on without it, where the step can."""
+
+
+Tone = Literal["finding", "warning", "trouble"]
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """Something found, for the person to read and look at."""
+
+    lines: tuple[str, ...]
+    picture: Picture | None = None
+    tone: Tone = "finding"
+    """A warning can be gone on from; trouble ends the step, and its last line names the way out."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepState:
+    """One line of the overview of all steps."""
+
+    name: str
+    """As `brushloop rig teach NAME` takes it."""
+    title: str
+    minutes: int
+    """How long it takes a careful person."""
+    state: Literal["open", "current", "taught"]
+    summary: str = ""
+    """What was taught, in a few words."""
+
+
+@dataclass(frozen=True, slots=True)
+class JogView:
+    """Where the tip is while a person jogs it by keys."""
+
+    question: str
+    moved_mm: tuple[float, float, float]
+    """From where the jog began, along the axes of the base frame."""
+    steps_mm: tuple[float, ...]
+    """Sizes of a step that are allowed, smallest first."""
+    refused: str = ""
+    """Why the last step was not made; empty if it was."""
+
+
+@dataclass(frozen=True, slots=True)
+class JogStep:
+    """One step along an axis of the base frame."""
+
+    axis: Literal["x", "y", "z"]
+    mm: float
+
+
+class LeftOff(Exception):
+    """The person ended the session in the middle; everything taught so far is kept."""
+
+
+class WentBack(Exception):
+    """The person left a step from one of its questions; its unfinished values are forgotten."""
+
+
+class Guide(Protocol):
+    """A person at the rig. Every question may raise `WentBack` and `LeftOff`."""
+
+    async def overview(self, steps: tuple[StepState, ...]) -> None:
+        """Show which steps are taught and which one is current; called whenever that changes."""
+        ...
+
+    async def show(self, what: Shown) -> None:
+        """Show a finding."""
+        ...
+
+    async def choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
+        """The key of one of the choices."""
+        ...
+
+    async def number(self, question: str, unit: str, low: float, high: float, default: float | None) -> float:
+        """A number in [low, high]; `default` is taken for an empty answer, None allows no empty answer."""
+        ...
+
+    async def text(self, question: str, default: str) -> str:
+        """A line of text; `default` is taken for an empty answer."""
+        ...
+
+    async def bring(self, target: Target, how: str) -> Brought:
+        """Ask for the tip to be guided to a thing by hand, and wait until the person says that it is there."""
+        ...
+
+    async def jog(self, view: JogView) -> JogStep | Brought:
+        """The next step by key, or DONE where the tip is at its place. The caller checks the step and moves the arm."""
+        ...
