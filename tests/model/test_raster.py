@@ -13,9 +13,9 @@ from scipy.integrate import quad
 
 from model.ccdbsm import Brush, CcdBsm, ccdbsm
 from model.coverage import centred_origin, coverage
+from model.outline import cross, loop
 from model.raster.compiled import coverage_numpy
 from model.raster.exact import coverage_at
-from model.raster.frame import to_pixels
 from model.registry import stroke_models
 
 Array = NDArray[np.floating]
@@ -106,27 +106,30 @@ def test_both_exact_paths_agree_wherever_a_mark_lies(
     assert exact.max() <= 1
 
 
-def test_marks_on_pixel_edges_come_out_the_same_by_steps_and_cell_by_cell() -> None:
+def test_marks_on_pixel_edges_come_out_right() -> None:
     # Whole numbers of pixels and eighths of a turn put ends, turns and 45 degree points onto edges and corners.
-    from model.raster import kernel
-
     rng = np.random.default_rng(0)
     height_mm, tilt_deg = (
-        torch.from_numpy(rng.choice(of, 600)) for of in ((2.0, 8.0, 10.3125, 16.0), (0.0, 5.0, 20.0))
+        torch.from_numpy(rng.choice(of, 100)) for of in ((2.0, 8.0, 10.3125, 16.0), (0.0, 5.0, 20.0))
     )
-    heading_deg = torch.from_numpy(45.0 * rng.integers(-4, 5, 600))
-    outline = ccdbsm(Brush(), height_mm, tilt_deg).outline()
-    placed = to_pixels(torch.from_numpy(0.25 * rng.integers(24, 104, (600, 2))), heading_deg, 0.25, outline.weights)
-    points, weights, maps = (part.numpy() for part in (outline.points, outline.weights, placed))
-    stepped, walked = np.empty((600, 128, 128)), np.empty((600, 128, 128))
-    work = kernel._work(128, 4, walked.dtype)
-    quick = [kernel._stepped(points[n], weights[n], maps[n], stepped[n], work) for n in range(600)]
-    for n in range(600):
-        kernel._walked(points[n], weights[n], maps[n], walked, n, work.spans)
-    assert 100 < sum(quick) < 600  # the others reach beyond the image
-    assert abs(stepped - walked)[quick].max() < 1e-6
-    assert stepped[quick].min() >= 0
-    assert stepped[quick].max() <= 1
+    heading_deg = torch.from_numpy(45.0 * rng.integers(-4, 5, 100))
+    mark = ccdbsm(Brush(), height_mm, tilt_deg)
+    origin = torch.from_numpy(0.25 * rng.integers(24, 104, (100, 2)))
+    image = coverage_numpy(mark, origin, heading_deg, px_mm=0.25, out=np.empty((100, 128, 128)))
+    assert abs(image - coverage_at(mark, origin, heading_deg, px_mm=0.25).numpy()).max() < 1e-6
+    assert image.min() >= 0
+    assert image.max() <= 1
+
+
+@pytest.mark.parametrize("weight", [0.05, 0.2, 0.45, 0.6, 0.95])
+def test_arcs_of_any_span_and_shear_come_out_right(weight: float) -> None:
+    start, middle, end = torch.from_numpy(np.random.default_rng(0).uniform(2, 24, (20, 3, 2))).unbind(1)
+    flipped = cross(middle - start, end - start)[:, None] < 0
+    start, end = torch.where(flipped, end, start), torch.where(flipped, start, end)
+    chord = 0.5 * (start + end)
+    shape = loop(((*start.T, *middle.T, *end.T), weight), ((*end.T, *chord.T, *start.T), 1.0))
+    image = coverage_numpy(shape, (0.0, 25.6), out=np.empty((20, 128, 128)))
+    assert abs(image - coverage_at(shape, (0.0, 25.6)).numpy()).max() < 1e-6
 
 
 @given(presses, st.floats(-180, 180), st.sampled_from(sorted(MODELS)))
@@ -224,3 +227,6 @@ def test_what_makes_no_image_is_refused() -> None:
             draw(mark, torch.zeros(2, 2))
     with pytest.raises(ValueError, match=r"out is int64 \(3, 128, 128\)"):
         coverage_numpy(mark, (1.0, 1.0), out=np.zeros((3, 128, 128), np.int64))
+    for nowhere in (math.nan, math.inf, 1e30):
+        with pytest.raises(ValueError, match="shape 0 is not finite, or lies more than 1e"):
+            coverage_numpy(mark, (nowhere, 1.0))
