@@ -28,7 +28,7 @@ from drivers.arcs.controller import Controller
 from drivers.arcs.robot import AUBOPE_PORT
 from drivers.arcs.rpc import RpcConnection, open_arcs
 from drivers.errors import LimitExceeded, ProtocolViolation
-from drivers.geometry import to_wire
+from drivers.geometry import from_wire, to_wire
 from drivers.samples import Pose
 
 TOUCH_CLEAR_MM = 5.0
@@ -211,13 +211,14 @@ async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[tuple[Pos
         await controller.connection.login()
         [controller.robot, *_] = await controller.robot_names()
         offset = await _tool(controller)
+        ours = [*(v / 1e3 for v in robot.tcp_offset_mm), *map(math.radians, robot.tcp_rotation_deg)]
         near = await controller.joint_positions()
         asked: set[Pose] = set()
         for pose, _, where in poses:
             if pose in asked:
                 continue
             asked.add(pose)
-            wire = to_wire(_for_tool(pose, robot.tcp_offset_mm, offset))
+            wire = to_wire(_for_tool(pose, ours, offset))
             found = await _joints(controller, wire, near)
             if found is None:
                 raise ConfigError(
@@ -258,12 +259,11 @@ def _six(op: str, values: Any) -> list[float]:
     return numbers
 
 
-def _for_tool(tip: Pose, ours_mm: tuple[float, float, float], theirs: list[float]) -> Pose:
-    """Pose of the controller's tool while our tip is at `tip`: tip * ours^-1 * theirs."""
-    at = Rotation.from_quat(tip.quaternion)
-    x, y, z, rx, ry, rz = theirs
-    shift_mm = at.apply([1e3 * v - o for v, o in zip((x, y, z), ours_mm, strict=True)])
-    turned = at * Rotation.from_euler("ZYX", [rz, ry, rx])
-    qx, qy, qz, qw = (float(v) for v in turned.as_quat())
+def _for_tool(tip: Pose, ours: list[float], theirs: list[float]) -> Pose:
+    """Pose of the controller's tool while our tip is at `tip`: tip * ours^-1 * theirs. Tools as on the wire."""
+    our, their = from_wire(ours), from_wire(theirs)
+    flange = Rotation.from_quat(tip.quaternion) * Rotation.from_quat(our.quaternion).inv()
+    shift_mm = flange.apply([t - o for t, o in zip(their.position_mm, our.position_mm, strict=True)])
+    qx, qy, qz, qw = (float(v) for v in (flange * Rotation.from_quat(their.quaternion)).as_quat())
     px, py, pz = (p + float(s) for p, s in zip(tip.position_mm, shift_mm, strict=True))
     return Pose(px, py, pz, qx, qy, qz, qw)

@@ -11,6 +11,7 @@ from calibrate.board.lens import LensUsed
 from collect.rig.config_file import Config, Finite, Positive, Range
 from drivers.force.rounds import LOOPBACK_CHANNEL
 
+Turn = Annotated[float, Field(ge=-180.0, le=180.0)]
 MOST_STALE_MS = 100.0
 """Longest silence allowed: at 20 mm/s the brush goes down 2 mm in this time without being felt."""
 MOST_STALE_LOOPBACK_MS = 2000.0
@@ -44,7 +45,10 @@ class RobotConfig(Config):
     host: str = Field(min_length=1)
     port: int = Field(30004, ge=1, le=65535)
     tcp_offset_mm: tuple[Finite, Finite, Finite]
-    """Flange to brush tip."""
+    """Flange to brush tip, along the flange's axes."""
+    tcp_rotation_deg: Annotated[tuple[Turn, Turn, Turn], Field(exclude_if=lambda turn: not any(turn))] = (0.0, 0.0, 0.0)
+    """Turn from the flange's axes to the brush's: about x, then y, then z of the flange. The brush is along its z.
+    Not written where it is zero, so that a session from before there was this field can be resumed."""
     framing: Literal["sof", "bare"] = "sof"
     """`sof` as in the maker's client, `bare` as in the maker's documentation."""
     rtde_port: int | None = Field(None, ge=1, le=65535)

@@ -62,6 +62,7 @@ def make_robot(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]
         robot.host,
         robot.port,
         robot.tcp_offset_mm,
+        robot.tcp_rotation_deg,
         framing=robot.framing,
         rtde_port=robot.rtde_port,
         watchdog_s=robot.watchdog_s,

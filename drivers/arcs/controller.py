@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ from drivers.arcs.rpc import DEVICE, RpcConnection
 from drivers.errors import DeviceError, MotionRefused, ProtocolViolation, RobotNotSafe
 from drivers.geometry import from_wire, to_wire
 from drivers.samples import Pose
+
+Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +57,10 @@ class Controller:
             raise ProtocolViolation(DEVICE, "getRobotNames", f"expected a list of names, got {names!r}")
         return [str(name) for name in names]  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
 
-    async def set_tcp_offset(self, offset_mm: tuple[float, float, float]) -> None:
-        """Set the offset from flange to brush tip. Raises `MotionRefused`: every height depends on the offset."""
-        x, y, z = (v / 1e3 for v in offset_mm)
-        accepted("setTcpOffset", await self.ask("RobotConfig.setTcpOffset", offset=[x, y, z, 0.0, 0.0, 0.0]))
+    async def set_tcp_offset(self, offset_mm: Triple, rotation_deg: Triple) -> None:
+        """Set the frame of the brush in the flange's. Raises `MotionRefused`: every height depends on it."""
+        offset = [*(v / 1e3 for v in offset_mm), *map(math.radians, rotation_deg)]
+        accepted("setTcpOffset", await self.ask("RobotConfig.setTcpOffset", offset=offset))
 
     async def pose(self) -> Pose:
         """Where the tip is. Raises `ProtocolViolation`."""

@@ -28,6 +28,8 @@ class ArcsOptions:
     port: int = 30004
     tcp_offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Offset from flange to brush tip."""
+    tcp_rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Turn from the flange's axes to the brush's, as `to_wire` orders it: R = Rz(rz) Ry(ry) Rx(rx)."""
     position_tolerance_mm: float = 0.05
     rotation_tolerance_deg: float = 0.1
     poll_s: float = 0.02
@@ -113,7 +115,7 @@ async def read_back(controller: Controller) -> Settings:
 
 def configured(options: ArcsOptions) -> Settings:
     """The settings that `options` gives; the others stay as they are on the pendant."""
-    wanted: dict[str, Value] = {TOOL_OFFSET: (*options.tcp_offset_mm, 0.0, 0.0, 0.0)}
+    wanted: dict[str, Value] = {TOOL_OFFSET: (*options.tcp_offset_mm, *options.tcp_rotation_deg)}
     if options.payload_kg is not None:
         wanted[PAYLOAD] = (options.payload_kg, *options.payload_cog_mm)
     if options.collision_level is not None:
@@ -159,7 +161,7 @@ async def make_ready(controller: Controller, options: ArcsOptions, on_notice: Ca
     one that it accepted but did not apply.
     """
     _require_automatic((await read_back(controller))[OPERATIONAL_MODE], on_notice)
-    await controller.set_tcp_offset(options.tcp_offset_mm)
+    await controller.set_tcp_offset(options.tcp_offset_mm, options.tcp_rotation_deg)
     if options.payload_kg is not None:
         params = {
             "m": options.payload_kg,

@@ -10,6 +10,7 @@ from collect.errors import ConfigError
 from collect.planning.limit_check import check_protocol
 from collect.protocols.config import load_protocol
 from collect.rig.config import load_rig
+from collect.rig.config_devices import LimitsConfig, RobotConfig
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml
 
@@ -179,3 +180,12 @@ def test_a_speed_above_the_cap_is_refused(tmp_path: Path) -> None:
 def test_a_cell_larger_than_the_sheet_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"paper.cell_mm: .* does not fit"):
         plan(tmp_path, old="cell_mm = [40.0, 24.0]", new="cell_mm = [400.0, 24.0]")
+
+
+def test_a_turn_of_the_tool_is_recorded_only_where_there_is_one():
+    """A session that an earlier version began has no such field, and must not look changed."""
+    limits = {"x_mm": (0, 1), "y_mm": (0, 1), "z_mm": (0, 1)}
+    square = RobotConfig(kind="aubo-arcs", host="192.0.2.7", tcp_offset_mm=(0, 0, 180), limits=LimitsConfig(**limits))
+    turned = square.model_copy(update={"tcp_rotation_deg": (2.0, 0.0, 0.0)})
+    assert "tcp_rotation_deg" not in square.model_dump()
+    assert turned.model_dump()["tcp_rotation_deg"] == (2.0, 0.0, 0.0)

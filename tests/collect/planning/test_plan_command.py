@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import collect.cli
 from collect.errors import ConfigError
-from collect.planning.limit_check import all_poses, ask_reach
+from collect.planning.limit_check import _for_tool, all_poses, ask_reach
 from collect.planning.picture import draw_plan
 from collect.planning.summary import make_plan
 from collect.protocols.config import load_protocol
@@ -20,7 +20,9 @@ from collect.rig.config import RigConfig, load_rig
 from collect.rig.paper import PaperPlane
 from drivers.arcs.codes import RobotMode
 from drivers.errors import ConnectionLost
+from drivers.geometry import brush_pose, from_wire
 from drivers.sim.arcs.server import ArcsServer
+from drivers.sim.arm.kinematics import inverted, matrix_of
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml
 from drivers.sim.world import World
@@ -184,3 +186,14 @@ def test_the_command_line_says_what_is_missing(
     ran = brushloop(*arguments, cwd=tmp_path)
     assert ran.returncode == code
     assert words in ran.stderr
+
+
+def test_a_tip_is_where_either_tool_says_that_it_is():
+    """Two descriptions of the flange's place: theirs, and ours with a turn of its own, give the same flange."""
+    ours, theirs = [0.004, -0.007, 0.18, 0.03, -0.02, 0.5], [0.05, -0.1, 0.3, 0.1, 0.2, 1.0]
+    tip = brush_pose(400.0, 50.0, 130.0, heading_deg=70.0, tilt_deg=10.0)
+    flanges = [
+        matrix_of(at) @ inverted(matrix_of(from_wire(tool)))
+        for at, tool in ((tip, ours), (_for_tool(tip, ours, theirs), theirs))
+    ]
+    assert flanges[1] == pytest.approx(flanges[0], abs=1e-9)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import math
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
@@ -13,9 +14,10 @@ from drivers.arcs.codes import OutOfReach, QueueFull, RobotMode, SafetyMode, Wro
 from drivers.arcs.robot import ArcsOptions, AuboArcs
 from drivers.clock import HostClock
 from drivers.errors import MotionFailed, MotionRefused, RpcError
-from drivers.geometry import brush_pose
+from drivers.geometry import brush_pose, distance, from_wire, lean
 from drivers.limits import Limits
 from drivers.sim.arcs.server import ArcsServer
+from drivers.sim.arm.kinematics import forward, pose_of
 from drivers.sim.rig import HOST
 
 NEAR = brush_pose(260.0, -220.0, 250.0)
@@ -87,6 +89,16 @@ async def test_what_is_configured_is_set_in_the_wires_units(make_arm: MakeArm, c
     box = cabinet.cabinet
     assert box.payload == [0.4, [0.0, 0.001, 0.06], [0.0] * 3, [0.0] * 6]
     assert (box.collision_level, box.motion.fraction) == (8, 0.5)
+
+
+async def test_a_brush_that_is_not_square_to_the_flange_is_pressed_upright(make_arm: MakeArm, cabinet: ArcsServer):
+    turn = {"tcp_offset_mm": (4.0, -7.0, 180.0), "tcp_rotation_deg": (2.0, -1.5, 0.0)}
+    arm = await enabled(make_arm, **turn)
+    assert cabinet.tcp_offset == pytest.approx([0.004, -0.007, 0.18, math.radians(2.0), math.radians(-1.5), 0.0])
+    await arm.move(NEAR, **QUICK)
+    flange = from_wire(cabinet.cabinet.fk([*cabinet.cabinet.joints()])[0])
+    assert distance(flange, NEAR)[0] < 0.1
+    assert lean(pose_of(forward(cabinet.cabinet.joints())))[0] == pytest.approx(2.5, abs=0.05)
 
 
 @pytest.mark.parametrize("wrong", [{"payload_kg": 9.0}, {"collision_level": 12}, {"speed_fraction": 1.5}])
