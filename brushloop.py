@@ -18,6 +18,7 @@ import calibrate.loop.cli
 import calibrate.validate.cli
 import calibrate.writing.cli
 import collect.cli
+import collect.cli_rig
 import model.train.cli
 import sessions.cli
 from calibrate.path_or_command import PathOrCommand
@@ -55,6 +56,7 @@ app = typer.Typer(
 )
 app.add_typer(collect.cli.app, name="collect")
 app.command("doctor")(collect.cli.doctor)
+app.add_typer(collect.cli_rig.app, name="rig")
 app.add_typer(calibrate.cli.app, name="calibrate")
 app.add_typer(calibrate.board.cli.app, name="camera")
 app.add_typer(calibrate.validate.cli.app, name="validate")

@@ -119,7 +119,7 @@ def plan(
     from collect.rig.paper import PaperPlane
 
     if picture is not None:
-        from collect.planning.picture import check_picture
+        from collect.rig.drawing import check_picture
 
         check_picture(picture)
     rig, wanted = load_rig(config), load_protocol(protocol)

@@ -8,36 +8,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from collect.errors import ConfigError
 from collect.planning.summary import PlacedStroke, Plan
 from collect.planning.walk import sheet_of
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.plan import Drawn
 from collect.rig.config import RigConfig
+from collect.rig.drawing import BLUE, GREEN, GREY, ORANGE, PAPER, Axes, finish
 from collect.rig.paper import Sheet, to_paper
 from collect.touch.selfcheck import partners
 
-Axes = Any
-"""Axes of matplotlib, whose types are incomplete."""
-ENDINGS = (".png", ".svg", ".pdf", ".jpg")
 MOST_SHEETS = 11
 """Most sheets drawn: with the view of the whole table, twelve panels."""
-BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
-"""From the palette of Okabe and Ito, which colour-blind people can tell apart; the marks differ in shape too."""
-
-
-def check_picture(path: Path) -> None:
-    """Raise `ConfigError` if no picture can be written to this path. Called before the plan is computed."""
-    if path.suffix.lower() not in ENDINGS:
-        raise ConfigError("--picture", "", f"{path} must end in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
-    if not path.parent.is_dir():
-        raise ConfigError("--picture", "", f"{path}: there is no folder {path.parent}")
-    if path.is_dir():
-        raise ConfigError("--picture", "", f"{path} is a folder")
 
 
 def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Path) -> None:
-    """Write the picture, in the format of the file's ending. `check_picture` must have passed.
+    """Write the picture, in the format of the file's ending. `collect.rig.drawing.check_picture` must have passed.
 
     Raises OSError if it cannot be written.
     """
@@ -71,7 +56,7 @@ def _place(axes: Axes, config: RigConfig, plan: Plan, sheet: Sheet) -> None:
     board = config.board
     size = [n * board.square_mm for n in board.squares]
     axes.add_patch(Rectangle(board.origin_mm, *size, fill=False, edgecolor=GREY, linestyle="--", label="board"))
-    axes.add_patch(Rectangle((0.0, 0.0), *config.paper.size_mm, facecolor="#fbf7ea", edgecolor="black", label="sheet"))
+    axes.add_patch(Rectangle((0.0, 0.0), *config.paper.size_mm, facecolor=PAPER, edgecolor="black", label="sheet"))
     for index in range(sheet.capacity if plan.placed else 0):
         cell = sheet.cell(index)
         axes.add_patch(_outline(cell.rect_mm, GREY))
@@ -85,7 +70,7 @@ def _place(axes: Axes, config: RigConfig, plan: Plan, sheet: Sheet) -> None:
     shown = ((0.0, 0.0), config.paper.size_mm, config.ink.well_mm, park, board.origin_mm, far)
     for limit, along in zip((axes.set_xlim, axes.set_ylim), zip(*shown, strict=True), strict=True):
         limit(min(along) - 15.0, max(along) + 15.0)
-    _finish(axes, "the place from above, paper frame")
+    finish(axes, "the place from above, paper frame")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5, frameon=False)
 
 
@@ -137,7 +122,7 @@ def _sheet(
         if placed and placed[0].drawn
         else ": # order, H mm, a deg; darker is deeper; + where the tip meets the paper"
     )
-    _finish(axes, f"sheet {number}, {len(placed)} strokes{note}")
+    finish(axes, f"sheet {number}, {len(placed)} strokes{note}")
 
 
 def _figure(axes: Axes, rect_mm: tuple[float, float, float, float], figure: Drawn) -> None:
@@ -162,11 +147,3 @@ def _outline(rect_mm: tuple[float, float, float, float], edge: str, face: object
 
     x_mm, y_mm, width_mm, height_mm = rect_mm
     return Rectangle((x_mm, y_mm), width_mm, height_mm, edgecolor=edge, facecolor=face or "none", linewidth=0.8)
-
-
-def _finish(axes: Axes, title: str) -> None:
-    axes.set_aspect("equal")
-    axes.set_title(title, fontsize=10)
-    axes.set_xlabel("x mm", fontsize=8)
-    axes.set_ylabel("y mm", fontsize=8)
-    axes.tick_params(labelsize=8)
