@@ -32,7 +32,7 @@ from calibrate.validate.sources import URL, LoadedSession, one_source, open_sess
 
 FOLDER = "validation"
 WORK = "work"
-TABLE_3 = "table3.csv"
+SCORES, PARQUET, TABLE_3 = "scores.csv", "scores.parquet", "table3.csv"
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,11 +146,13 @@ def _write(
     curves: Sequence[Any],
     extras: Extras,
 ) -> tuple[Report, tuple[str, ...]]:
-    digest = write_csv(outcome, folder / "scores.csv")
+    digest = write_csv(outcome, folder / SCORES)
     notes: list[str] = []
+    beside = [SCORES]
     if request.parquet is not False:
         try:
-            write_parquet(outcome, folder / "scores.parquet")
+            write_parquet(outcome, folder / PARQUET)
+            beside.append(PARQUET)
         except CalibrationError as error:
             if request.parquet:
                 raise
@@ -163,7 +165,7 @@ def _write(
         (folder / TABLE_3).unlink(missing_ok=True)  # left by an earlier run with characters
     refused = [(r.session_id, r.stroke_id, r.why) for r in report.refused]
     files["failures.csv"] = csv_text(("session_id", "stroke_id", "why"), refused)
-    files["report.html"] = page_of(outcome, report, curves, extras.figures)
+    files["report.html"] = page_of(outcome, report, curves, [*beside, *files, "report.json"], extras.figures)
     files["report.json"] = report.to_json()
     write_files(folder, files)
     return report, tuple(notes)

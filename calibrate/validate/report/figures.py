@@ -24,7 +24,7 @@ ROWS = slice(32, 96)
 """Rows to show: the middle half of a field, as a press is at most half as thick as the field is high."""
 MAX_POINTS = 200
 MAX_SAMPLES, MAX_CELLS = 15, 5
-GRAY_MM = KEYS.index((Alignment.MM, Tone.GRAY))
+GRAY_MM, MM_BINARY = KEYS.index((Alignment.MM, Tone.GRAY)), KEYS.index((Alignment.MM, Tone.BINARY))
 MAX_CURVE_BYTES = 64 * 1024 * 1024
 BLUE, RED = "#0072B2", "#D55E00"
 
@@ -121,14 +121,15 @@ def curves(given: Sequence[Curve]) -> str:
 
 
 def samples(outcome: Outcome, shown: str) -> list[dict[str, Any]]:
-    """The first capture of each cell above one model's prediction: the paper's figures 7 and 8."""
+    """The first capture of each cell, one model's prediction and their difference: the paper's figures 7 and 8."""
     figures: list[dict[str, Any]] = []
     for k in _first_of_cells(outcome, MAX_SAMPLES):
         row = outcome.rows[k]
-        image, measured = predicted(outcome, k, shown), row.press.measured
+        measured = row.press.measured
         size = "" if measured is None else f"{measured.length_mm:.1f} × {measured.breadth_mm:.1f} mm"
-        drawn = "" if image is None else _ink(image)
-        figures.append({"row": row, "size": size, "captured": _ink(captured_image(outcome, k)), "predicted": drawn})
+        csim, ssim = 100.0 * outcome.values[k, outcome.names.index(shown), MM_BINARY] if shown else (np.nan, np.nan)
+        scores = f"CSIM {csim:.1f}, SSIM {ssim:.1f}" if np.isfinite(csim) else ""
+        figures.append({"row": row, "size": size, "scores": scores, "images": triple(outcome, k, shown)})
     return figures
 
 
@@ -176,8 +177,14 @@ def extreme(outcome: Outcome, session_id: str, stroke_id: str, model: str) -> di
         for k, row in enumerate(outcome.rows)
         if row.press.stroke_id == stroke_id and outcome.sessions[row.session].header.session_id == session_id
     )
+    return triple(outcome, k, model)
+
+
+def triple(outcome: Outcome, k: int, model: str) -> dict[str, str]:
+    """Captured, predicted and difference of one stroke; captured alone if the model does not predict it."""
     captured, image = captured_image(outcome, k), predicted(outcome, k, model)
-    assert image is not None, "a stroke that was scored was predicted"
+    if image is None:
+        return {"captured": _ink(captured)}
     a, b = (np.asarray(one[ROWS] / 255.0, np.float32) for one in (captured, image))
     return {"captured": ink_uri(a), "predicted": ink_uri(b), "difference": overlay_uri(a, b)}
 

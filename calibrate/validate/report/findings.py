@@ -56,6 +56,29 @@ def measured(report: Report) -> str:
     )
 
 
+def verdict(report: Report) -> Iterator[str]:
+    """The report in at most three sentences: how well the model shown predicts, beside what, and on what ink."""
+    shown, top, bezier, published = (
+        _avg(report, name) for name in (report.shown, CEILING, who.BEZIER_REFITTED, "ccd-bsm")
+    )
+    if shown is not None:
+        below = "" if top is None else f", {top.avg - shown.avg:.1f} points below the ceiling of {top.avg:.1f} %"
+        unseen = " from cells that it has not seen" if report.shown == who.FITTED_HELD_OUT else ""
+        label = _label(report, report.shown)
+        yield f"{label} predicts presses{unseen} with an average CSIM of {shown.avg:.1f} %{below}."
+    others = [f"a Bézier stroke fitted to the same captures reaches {bezier.avg:.1f} %"] if bezier is not None else []
+    if published is not None and report.shown != "ccd-bsm":
+        others.append(f"CCD-BSM as published reaches {published.avg:.1f} %")
+    if others:
+        words = " and ".join(others)
+        yield f"{words[0].upper()}{words[1:]}."
+    yield {
+        Source.LOOPBACK: "The brush and its ink are simulated, so this tests the method and says nothing about paper.",
+        Source.REAL: "The ink is real, pressed by the arm and photographed as the recording says.",
+        Source.IMPORT: "The photographs come from elsewhere; their scale and commands were not measured here.",
+    }[report.source]
+
+
 def findings(report: Report) -> Iterator[str]:
     """How well the models predict: the ceiling, the best model that had not seen the strokes, the published one."""
     top = _avg(report, CEILING)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 from calibrate.compare.field import Alignment, Tone
@@ -19,8 +20,13 @@ CELL_COLUMNS = ("ccd-bsmg", who.GENERATOR_HELD_OUT, "ccd-bsm", who.FITTED_HELD_O
 MAX_REFUSED = 200
 
 
-def page_of(outcome: Outcome, report: Report, curves: Sequence[Curve], figures_13: Sequence[str] = ()) -> str:
-    """The whole page. `figures_13` are pictures of written characters as data URIs, empty if missing."""
+def page_of(
+    outcome: Outcome, report: Report, curves: Sequence[Curve], beside: Sequence[str], figures_13: Sequence[str] = ()
+) -> str:
+    """The whole page. `beside` names the data files in its folder.
+
+    `figures_13` are pictures of written characters as data URIs, empty if missing.
+    """
     shown = tables.candidate(report, report.shown)
     normal, strict = (Alignment.SIZE_NORMALISED, Tone.BINARY), (Alignment.MM, Tone.BINARY)
     return render(
@@ -29,6 +35,8 @@ def page_of(outcome: Outcome, report: Report, curves: Sequence[Curve], figures_1
         name=", ".join(session.session_id for session in report.sessions[:4])
         + (f" and {len(report.sessions) - 4} more" if len(report.sessions) > 4 else ""),
         note=source_note(report.source),
+        beside=beside,
+        verdict=list(findings.verdict(report)),
         measured=findings.measured(report),
         findings=list(findings.findings(report)),
         trust=list(findings.trust(report)),
@@ -36,7 +44,8 @@ def page_of(outcome: Outcome, report: Report, curves: Sequence[Curve], figures_1
         tables={
             "one": tables.table_1(report, *normal),
             "two": tables.table_2(report, *normal),
-            "strict": tables.table_2(report, *strict),
+            # The paper has no such table, and its numbers could not be compared with these.
+            "strict": [replace(row, paper=None) for row in tables.table_2(report, *strict) if row.ours],
         },
         table_three=tables.table_3(report),
         figures_13=[(record.session, uri) for record, uri in zip(report.written, figures_13, strict=False) if uri],

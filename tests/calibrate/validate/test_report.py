@@ -21,6 +21,7 @@ from calibrate.validate.report.findings import trust
 from calibrate.validate.report.page import _of_session
 from sessions.reader import Recording
 from sessions.remarks import Remark, add_remark
+from tests.calibrate.validate.browser import BROWSER, content_widths_px
 
 pytestmark = pytest.mark.xdist_group("report")  # validated once
 
@@ -98,9 +99,12 @@ def test_tables_stand_beside_the_papers_numbers_and_carry_their_source(folder: P
 
 def test_the_page_is_one_file_that_fetches_nothing_and_escapes_what_others_wrote(folder: Path) -> None:
     page = (folder / "report.html").read_text()
-    sources = re.findall(r'(?:src|href)="([^"]*)"', page)
+    sources = re.findall(r'src="([^"]*)"', page)
     assert sources
-    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert all(re.match(r"data:image/(png|svg\+xml);base64,", source) for source in sources)
+    links = re.findall(r'href="([^"]*)"', page)
+    assert all(f'id="{link[1:]}"' in page or (folder / link).is_file() for link in links)
+    assert {"scores.csv", "scores.parquet", "summary.csv", "report.json", "#cell-1"} <= set(links)
     assert "<script" not in page
     assert "&lt;script&gt;" in page
     assert not re.search(r"url\(|@import|<link|<iframe", page)
@@ -227,3 +231,12 @@ def test_what_was_left_out_selected_or_pressed_on_other_paper_is_told_before_any
     assert "2 of 8 planned strokes were left out while it was collected: a, b." in said(left_out=("a", "b"))
     assert "1 of 8 takes did not count and were pressed again" in said(pressed_again=("a",))
     assert "found 2.00 mm apart (taught 1 mm, jog 3 mm)" in said(moved_mm=2.0, touches=("taught 1 mm", "jog 3 mm"))
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+def test_the_page_fits_a_telephone_and_a_wide_screen_and_the_browser_has_nothing_to_say(
+    folder: Path, tmp_path: Path
+) -> None:
+    sizes, errors = content_widths_px((folder / "report.html").read_text(), (390, 768, 1200, 1600), tmp_path)
+    assert errors == []
+    assert all(taken <= width for width, taken in sizes.items()), sizes
