@@ -50,10 +50,30 @@ class FrontDoor(TyperGroup):
 
 app = typer.Typer(
     cls=FrontDoor,
-    help="Press a Chinese brush with a robot arm, record it, and measure how well a stroke model predicts the ink.",
+    help="Press a Chinese brush with a robot arm, record it, and measure how well a stroke model predicts the ink.\n\n"
+    "Without a command, on a terminal, it opens the operator's screen: new sessions, resuming, review.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        say(f"brushloop {version('brushloop')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Take the options of brushloop itself."""
+
+
 app.add_typer(collect.cli.app, name="collect")
 app.command("doctor")(collect.cli.doctor)
 app.add_typer(collect.cli_rig.app, name="rig")
@@ -150,7 +170,7 @@ def main() -> None:
         if len(sys.argv) == 1 and sys.stdin.isatty() and sys.stdout.isatty():
             collect.cli.browse()
         else:
-            app()
+            app(prog_name="brushloop")
     except Exception as error:
         code, message = getattr(error, "exit_code", None), str(error)
         if code is None and isinstance(error, OSError) and error.filename:

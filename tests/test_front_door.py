@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,11 @@ def test_help_loads_nothing_heavy() -> None:
     assert "brushloop" in modules
     for heavy in HEAVY:
         assert not [m for m in modules if m == heavy or m.startswith(heavy + ".")], heavy
+
+
+def test_the_version_is_printed_and_the_module_runs_under_the_commands_name() -> None:
+    ran = subprocess.run([sys.executable, "-m", "brushloop", "--version"], capture_output=True, text=True, check=True)
+    assert ran.stdout.split() == ["brushloop", version("brushloop")]
 
 
 def test_a_rig_pc_collects_without_torch_and_a_validator_without_devices() -> None:
