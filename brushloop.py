@@ -109,6 +109,7 @@ def sim(
     seed: Annotated[int, typer.Option(min=0, help="Seed of brush, presses and noise.")] = 1,
     arcs_port: Annotated[int, typer.Option(min=0, max=65535, help="Controller port; 0: any.")] = 0,
     camera_port: Annotated[int, typer.Option(min=0, max=65535, help="Camera port; 0: any.")] = 0,
+    fps: Annotated[float, typer.Option(min=1, max=60, help="Camera's pictures per real second.")] = 8.0,
     idle_exit: Annotated[float, typer.Option(min=0, help="End after so many seconds without clients; 0: never.")] = 0.0,
     faults: Annotated[Path | None, typer.Option(help="A script of faults, faults.toml.")] = None,
     control: Annotated[Path | None, typer.Option(help="Make a control socket here, for `brushloop fault`.")] = None,
@@ -118,10 +119,11 @@ def sim(
     Ctrl-C ends it; SIGUSR1 puts a fresh sheet in.
     """
     from drivers.sim.brush.brush import BrushSpec
-    from drivers.sim.config import SimConfig
+    from drivers.sim.config import SimConfig, View
     from drivers.sim.serve import serve
 
-    config = SimConfig(seed=seed, rate=rate, arcs_port=arcs_port, camera_port=camera_port, brush=BrushSpec(seed=seed))
+    brush, view = BrushSpec(seed=seed), View(fps=fps)
+    config = SimConfig(seed=seed, rate=rate, arcs_port=arcs_port, camera_port=camera_port, brush=brush, view=view)
     serve(config, write_rig, idle_exit, say, faults=faults, control=control)
 
 

@@ -173,6 +173,9 @@ def loop(
     config: Rig,
     out: Annotated[Path | None, typer.Option(help="Folder for what the loop makes; <session>/loop by default.")] = None,
     fit: Annotated[Path | None, typer.Option(help="Brush fit; the one in use, or made, by default.")] = None,
+    presses: Annotated[
+        int | None, typer.Option(min=1, help="Only so many presses, spread evenly over the session.")
+    ] = None,
     repeats: Annotated[int, typer.Option(min=1, max=100, help="How often each is pressed again.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the order.")] = 1,
     sheet: NewSheet = None,
@@ -188,7 +191,7 @@ def loop(
     options += [] if sheet is None else ["--sheet", str(sheet)]
     folder = out if out is not None else Recording(session).path.parent / "loop"
     try:
-        run_loop(LoopRequest(session, config, folder, fit, repeats, seed, tuple(options)), say)
+        run_loop(LoopRequest(session, config, folder, fit, presses, repeats, seed, tuple(options)), say)
     except CommandFailed as error:
         raise typer.Exit(error.exit_code) from None  # the command has printed why
 

@@ -25,6 +25,9 @@ def invert(
     assume_tilt: Annotated[float, typer.Option(min=0, max=30, help="alpha where there is no anchor, deg.")] = 0.0,
     mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = MM_PER_PX,
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
+    presses: Annotated[
+        int | None, typer.Option(min=1, help="Only so many presses, spread evenly over the session.")
+    ] = None,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often the protocol presses each again.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of the order in which the protocol presses.")] = 1,
 ) -> None:
@@ -62,7 +65,7 @@ def invert(
             raise CalibrationError("--height-range", f"ends before the fitted brush marks, at {least:.2f} mm")
         within = Range((least, within.height_mm[1]), within.tilt_deg)
     settings = Settings(model, fitted, lam, within, anchor_sd, assume_tilt, Field(mm_per_px=mm_per_px))
-    made = invert_recording(session, settings, calibration)
+    made = invert_recording(session, settings, calibration, presses)
     protocol = write_inversion(made, out, repeats, seed)
     say(f"{made.header.session_id}: {len(made.rows)} presses recovered by {model} ({made.header.source})")
     for name, mean, sd, inside, n in off_command(made.rows):

@@ -7,10 +7,10 @@ describes the brush.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import TypeVar, cast
 
 import cv2
 import numpy as np
@@ -32,6 +32,7 @@ from sessions.errors import SessionDamaged
 from sessions.reader import Capture, Recording
 from sessions.recording.schemas import Header, Stroke
 
+_T = TypeVar("_T")
 BATCH = 64
 USELESS = frozenset({Flag.BLANK, Flag.DID_NOT_CONVERGE, Flag.CUT})
 """Flags that exclude a stroke: it is listed with the reason and not pressed again."""
@@ -91,8 +92,13 @@ class AlignedStroke:
     place_mm: tuple[float, float] | None
 
 
-def invert_recording(session: Path, settings: Settings, calibration_path: Path | None) -> Inversion:
-    """Recover every press of a session. Raises `CalibrationError` if it is not calibrated or holds no press."""
+def invert_recording(
+    session: Path, settings: Settings, calibration_path: Path | None, presses: int | None = None
+) -> Inversion:
+    """Recover every press of a session, or `presses` of them, spread evenly over the order in which they were made.
+
+    Raises `CalibrationError` if the session is not calibrated or holds no press.
+    """
     recording = Recording(session)
     digest = recording.sha256
     strokes = list(recording.stroke_records())
@@ -104,7 +110,10 @@ def invert_recording(session: Path, settings: Settings, calibration_path: Path |
     made = Inversion(recording.header, recording.path, digest, settings, [], [])
     anchored, loose = _inverters(recording.header, settings)
     waiting: dict[bool, list[AlignedStroke]] = {True: [], False: []}
+    chosen = {stroke.stroke_id for stroke in spread(strokes, presses)}
     for capture in recording.captures():
+        if capture.stroke.stroke_id not in chosen:
+            continue
         try:
             aligned = align(capture, calibration, settings.view)
         except (CaptureRefused, SessionDamaged) as error:
@@ -120,6 +129,13 @@ def invert_recording(session: Path, settings: Settings, calibration_path: Path |
     order = {stroke.stroke_id: number for number, stroke in enumerate(strokes)}
     made.rows.sort(key=lambda row: order[row.stroke_id])
     return made
+
+
+def spread(strokes: Sequence[_T], most: int | None) -> Sequence[_T]:
+    """At most `most` strokes at even distances; all of them if it is None."""
+    if most is None or most >= len(strokes):
+        return strokes
+    return [strokes[number * len(strokes) // most] for number in range(most)]
 
 
 def align(capture: Capture, calibration: Calibration | None, view: Field) -> AlignedStroke:

@@ -37,6 +37,8 @@ class LoopRequest:
     out: Path
     fit: Path | None = None
     """By default the current fit of the session; if there is none, it is fitted first."""
+    presses: int | None = None
+    """How many presses are recovered and made again, spread evenly over the session; None: all."""
     repeats: int = 1
     seed: int = 1
     collect_options: tuple[str, ...] = ()
@@ -56,6 +58,7 @@ def run_loop(request: LoopRequest, say: Say) -> Path:
         fit=fit.stem,
         height_range_mm=(LEAST_HEIGHT_MM, rig.brush.max_depth_mm),
         tilt_range_deg=(0.0, rig.robot.limits.tilt_deg),
+        presses=request.presses,
         repeats=request.repeats,
         seed=request.seed,
     )
@@ -96,6 +99,7 @@ def _recover(request: LoopRequest, folder: Path, fit: Path, settings: Settings, 
         options: list[str | Path] = ["--fit", fit, "--height-range", low, high]
         options += ["--tilt-range", *map(str, settings.tilt_range_deg)]
         options += ["--repeats", str(settings.repeats), "--seed", str(settings.seed)]
+        options += [] if settings.presses is None else ["--presses", str(settings.presses)]
         run_command(say, "invert", folder, "--out", request.out / RECOVERED, *options)
     check_recovered(request.out / RECOVERED)
     return protocol
@@ -122,6 +126,8 @@ class Settings(BaseModel):
     """Digest of the brush fit that recovers depth and tilt."""
     height_range_mm: tuple[float, float]
     tilt_range_deg: tuple[float, float]
+    presses: int | None = None
+    """None: all, as in loops begun before this could be chosen."""
     repeats: int
     seed: int
 

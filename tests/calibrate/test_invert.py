@@ -13,7 +13,7 @@ import pytest
 from calibrate.compare.field import Field
 from calibrate.errors import CalibrationError
 from calibrate.invert.files import PROTOCOL, write_inversion
-from calibrate.invert.invert import Row, Settings, align, invert_recording, off_command
+from calibrate.invert.invert import Row, Settings, align, invert_recording, off_command, spread
 from collect.protocols.config import load_protocol
 from collect.protocols.presses import ReplayConfig
 from model.ccdbsm import Brush, ccdbsm
@@ -68,6 +68,13 @@ def test_a_session_is_inverted_and_can_be_replayed(tmp_path: Path) -> None:
         first = next(csv.DictReader(file))
     assert first["commanded_height_mm"] == "12"
     assert first["source"] == "imported photographs"
+
+
+def test_some_presses_are_chosen_evenly_and_the_others_left_alone(tmp_path: Path) -> None:
+    made = invert_recording(session(tmp_path), Settings(anchor_sigma_mm=0.05), None, presses=2)
+    assert [row.stroke_id for row in made.rows] == ["p0", "p1"]
+    assert made.refused == []
+    assert [list(spread([*range(9)], most)) for most in (3, 9, 20, None)] == [[0, 3, 6], *[[*range(9)]] * 3]
 
 
 def test_without_an_anchor_alpha_is_what_was_commanded_and_flagged(tmp_path: Path) -> None:

@@ -89,6 +89,7 @@ def _glare(view: View, paper_to_image: NDArray[np.float64]) -> NDArray[np.float3
 TABLE_GRAY = 120
 PAPER_GRAY = 228
 INK_REFLECTANCE = 0.06
+TOOL_GRAY = 70
 TOOL_CLEAR_MM = 60.0
 """Radius of the disc that the arm hides when it is over the sheet."""
 NOISE_FIELDS = 4
@@ -118,6 +119,8 @@ class Scene:
         self._plane_to_image = self._raster_to_image()
         self._finished: dict[int, tuple[tuple[int, int] | None, NDArray[np.uint8]]] = {}
         """By noise field: the place of the tool's disc, and the frame. Valid for the sheet as it is lit now."""
+        self._without_tool: dict[int, NDArray[np.uint8]] = {}
+        """By noise field: the frame without the tool. Valid for the sheet as it is lit now."""
         self._lit: NDArray[np.float32] | None = None
         self._lit_version = -1
         self._count = 0
@@ -137,20 +140,32 @@ class Scene:
             self._lit_version = self._world.version
             self._lit = self._light_sheet()
             self._finished.clear()
+            self._without_tool.clear()
         field = self._count % NOISE_FIELDS
         self._count += 1
         disc_px = self._tool_disc(tool)
         at_px, frame = self._finished.get(field, (None, None))
         if frame is None or at_px != disc_px:
-            image = self._lit + self._noise[field]
+            frame = self._sheet_alone(field, self._lit)
             if disc_px is not None:
-                cv2.circle(image, disc_px, self._disc_radius_px, (70.0,), -1)
-            frame = np.clip(image, 0.0, 255.0).astype(np.uint8)
-            frame.flags.writeable = False
+                frame = frame.copy()
+                cv2.circle(frame, disc_px, self._disc_radius_px, (TOOL_GRAY,), -1)
+                frame.flags.writeable = False
             self._finished[field] = disc_px, frame
         if self._world.config.view.stamp_strip:
             frame = frame.copy()
             draw_strip(frame, host_ns)
+        return frame
+
+    def _sheet_alone(self, field: int, lit: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """The frame without the tool, made once for each sheet: a moving tool only hides part of it."""
+        frame = self._without_tool.get(field)
+        if frame is None:
+            image = lit + self._noise[field]
+            np.clip(image, 0.0, 255.0, out=image)
+            frame = image.astype(np.uint8)
+            frame.flags.writeable = False
+            self._without_tool[field] = frame
         return frame
 
     def _raster_to_image(self) -> NDArray[np.float64]:

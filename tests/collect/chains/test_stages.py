@@ -28,7 +28,7 @@ def test_a_loop_goes_on_with_what_it_was_begun_with_and_nothing_else(tmp_path: P
     keep_settings(SETTINGS, folder)
     keep_settings(SETTINGS, folder)
     assert begun_with(folder) == SETTINGS
-    for name, value in (("fit", "ef"), ("original_sha256", "xy"), ("height_range_mm", (2.0, 20.0))):
+    for name, value in (("fit", "ef"), ("original_sha256", "xy"), ("height_range_mm", (2.0, 20.0)), ("presses", 5)):
         with pytest.raises(ConfigError, match=f"{name}: this loop was begun with"):
             keep_settings(SETTINGS.model_copy(update={name: value}), folder)
     (folder / FILE).write_text("{}")

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.sim.camera.scene import PAPER_GRAY, Scene, board, homography, read_strip
+from drivers.geometry import brush_pose
+from drivers.sim.camera.scene import NOISE_FIELDS, PAPER_GRAY, TOOL_GRAY, Scene, board, homography, read_strip
 from drivers.sim.config import SimConfig, View
 from drivers.sim.world import World
 
@@ -97,6 +98,18 @@ def test_the_arm_hides_what_is_under_it():
     home = (table.origin_mm[0] - 74.0, table.origin_mm[1] + 82.0, 260.0)  # over (82, 74) of the sheet
     image = Scene(World(replace(CONFIG, home_mm=home))).render()
     assert gray_at(image, 82.0, 74.0) == pytest.approx(70.0, abs=3.0)
+
+
+def test_a_frame_after_the_arm_has_left_is_as_if_it_had_never_been_there():
+    over, away = brush_pose(380.0, 0.0, 180.0), brush_pose(*CONFIG.home_mm)
+    passed, alone = Scene(World(CONFIG)), Scene(World(CONFIG))
+    hidden = [passed.render(0, over) for _ in range(NOISE_FIELDS)]
+    for under_arm in hidden:
+        after, never = passed.render(0, away), alone.render(0, away)
+        assert np.array_equal(after, never)
+        # The arm hides a disc; every other pixel, its noise included, stays.
+        assert 0.13 < np.mean(under_arm != never) < 0.15
+        assert set(np.unique(under_arm[under_arm != never])) == {TOOL_GRAY}
 
 
 @pytest.mark.parametrize("host_ns", [0, 1, 2**63 - 1, 0x5555555555555555, 1_795_000_000_123_456_789])
