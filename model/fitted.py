@@ -73,12 +73,15 @@ def published() -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Sizes:
-    """The mark of one press, mm: offset of the widest place from the point of touch, the two sides, the half width."""
+    """The mark of one press, mm: offset of the widest place from the point of touch, the two sides, the half width.
 
-    widest: float
-    tip: float
-    heel: float
-    half: float
+    One number each, or one for each brush of a batch.
+    """
+
+    widest: Floats
+    tip: Floats
+    heel: Floats
+    half: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +89,7 @@ class FittedPress:
     """A calibrated brush: `values` (17,) in the order of `PARAMETERS`, `edges` (2, MODES, TERMS) mm.
 
     The edges are the residuals of the upper and the lower edge from the profile: sines along the mark, each with the
-    terms of `command_terms`.
+    terms of `command_terms`. With `values` (K, 17) it is a batch of K brushes, whose widths and edges come as (K, ...).
     """
 
     radius_mm: float
@@ -96,47 +99,48 @@ class FittedPress:
 
     def sizes(self, height_mm: float, tilt_deg: float) -> Sizes:
         """The mark's sizes. Raises ValueError outside the domain: h <= 0, or a tilt outside [0, 80) deg."""
-        p = dict(zip(NAMES, self.values.tolist(), strict=True))
+        p = dict(zip(NAMES, np.moveaxis(self.values, -1, 0), strict=True))
         h = height_mm + p["h0_mm"]
-        if not (h > 0.0 and height_mm > 0.0):
-            raise ValueError(f"height_mm = {height_mm:g}: the fitted brush starts to mark at {max(0.0, -p['h0_mm']):g}")
+        if not (np.all(h > 0.0) and height_mm > 0.0):
+            starts_mm = max(0.0, -float(np.min(p["h0_mm"])))
+            raise ValueError(f"height_mm = {height_mm:g}: the fitted brush starts to mark at {starts_mm:g}")
         if not 0.0 <= tilt_deg < 80.0:
             raise ValueError(f"tilt_deg = {tilt_deg:g} is outside [0, 80)")
         alpha, theta = math.radians(tilt_deg), math.atan(self.radius_mm / self.length_mm)
         o3a = h * (math.tan(alpha) - math.tan(alpha - theta))
-        o3c = h * self.radius_mm / (self.length_mm * math.cos(alpha))
+        o3c = h * (self.radius_mm / (self.length_mm * math.cos(alpha)))
         o4o3 = h / math.cos(alpha - theta) + o3a
         share = h / DEPTH_MM
-        long = share ** (p["length_power"] - 1.0) * max(0.05, 1.0 + p["length_tilt"] * tilt_deg)
-        wide = share ** (p["width_power"] - 1.0) * max(0.05, 1.0 + p["width_tilt"] * tilt_deg)
+        long = share ** (p["length_power"] - 1.0) * np.maximum(0.05, 1.0 + p["length_tilt"] * tilt_deg)
+        wide = share ** (p["width_power"] - 1.0) * np.maximum(0.05, 1.0 + p["width_tilt"] * tilt_deg)
         widest = p["lean"] * height_mm * math.tan(alpha) + p["origin_mm"] + p["origin_gain"] * h
-        heel = p["heel_gain"] * o3a * long * max(0.05, 1.0 + p["heel_tilt"] * tilt_deg)
+        heel = p["heel_gain"] * o3a * long * np.maximum(0.05, 1.0 + p["heel_tilt"] * tilt_deg)
         return Sizes(widest, p["tip_gain"] * o4o3 * long, heel, p["lam"] * o3c * wide)
 
     def half_width(self, height_mm: float, tilt_deg: float, x_mm: Floats) -> Floats:
-        """Half width of the profile at x from the point of touch, mm, any shape; beyond an end, minus the distance."""
+        """Half width of the profile at x (N,) from the point of touch, mm; beyond an end, minus the distance to it."""
         s = self.sizes(height_mm, tilt_deg)
-        heel_power, heel_round, tip_power, tip_round, core = self.values[6:11]
-        u = x_mm - s.widest
-        heel, tip = np.clip(u / s.heel, 0.0, 1.0), np.clip(-u / s.tip, 0.0, 1.0)
-        width = s.half * (1.0 - heel**heel_round) ** heel_power * (1.0 - tip**tip_round) ** tip_power
-        width += core * np.sqrt(1.0 - (heel + tip) ** 6)  # one of the two is 0
-        return width - np.maximum(u - s.heel, 0.0) - np.maximum(-u - s.tip, 0.0)
+        heel_power, heel_round, tip_power, tip_round, core = np.moveaxis(self.values[..., 6:11, None], -2, 0)
+        u = x_mm - s.widest[..., None]
+        at_heel = u > 0.0
+        long = np.where(at_heel, s.heel[..., None], s.tip[..., None])
+        share = np.minimum(np.abs(u) / long, 1.0)
+        fall = 1.0 - share ** np.where(at_heel, heel_round, tip_round)
+        width = s.half[..., None] * fall ** np.where(at_heel, heel_power, tip_power)
+        return width + core * np.sqrt(1.0 - (share * share) ** 3) - np.maximum(np.abs(u) - long, 0.0)
 
-    def edge_offsets(self, height_mm: float, tilt_deg: float, x_mm: Floats) -> tuple[Floats, Floats]:
-        """Offsets of the upper and the lower edge from the half width at x, mm; zero beyond the ends."""
+    def edges_at(self, height_mm: float, tilt_deg: float, x_mm: Floats) -> Floats:
+        """Distance of the upper and the lower edge from the axis at x (N,), (2, N) mm, as `half_width`."""
+        width = self.half_width(height_mm, tilt_deg, x_mm)[..., None, :]
+        if not self.edges.any():
+            return width.repeat(2, axis=-2)
         s = self.sizes(height_mm, tilt_deg)
-        waves = modes((x_mm - s.widest + s.tip) / (s.tip + s.heel))
-        upper, lower = self.edges @ command_terms(height_mm, tilt_deg)
-        return waves @ upper, waves @ lower
+        waves = modes((x_mm - (s.widest - s.tip)[..., None]) / (s.tip + s.heel)[..., None])
+        return width + np.moveaxis(waves @ (self.edges @ command_terms(height_mm, tilt_deg)).T, -1, -2)
 
     def chance(self, height_mm: float, tilt_deg: float, x_mm: Floats, y_mm: Floats, spread_mm: float) -> Floats:
         """The probability of ink (len(y_mm), len(x_mm)) if edges vary by `spread_mm`; y upward from the touch."""
-        width = self.half_width(height_mm, tilt_deg, x_mm)
-        upper, lower = self.edge_offsets(height_mm, tilt_deg, x_mm)
-        side = np.where(y_mm[:, None] > 0.0, upper[None], lower[None])
-        inside = np.clip((width[None] + side - np.abs(y_mm)[:, None]) / spread_mm, -30.0, 30.0)
-        return 1.0 / (1.0 + np.exp(-inside))
+        return chance_within(self.edges_at(height_mm, tilt_deg, x_mm), y_mm, spread_mm)
 
     def outline(self, height_mm: float, tilt_deg: float, points: int = 97) -> Floats:
         """The boundary as a counter-clockwise polygon (2 points, 2) mm, x from the point of touch, y upward."""
@@ -144,10 +148,15 @@ class FittedPress:
         # Points are denser at both ends, where the outline turns fastest.
         share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, points))
         x = s.widest - s.tip + share * (s.tip + s.heel)
-        width = np.maximum(self.half_width(height_mm, tilt_deg, x), 0.0)
-        upper, lower = self.edge_offsets(height_mm, tilt_deg, x)
-        top, bottom = np.maximum(width + upper, 0.0), -np.maximum(width + lower, 0.0)
-        return np.concatenate([np.column_stack([x, bottom]), np.column_stack([x, top])[::-1]])
+        top, bottom = np.maximum(self.edges_at(height_mm, tilt_deg, x), 0.0)
+        return np.concatenate([np.column_stack([x, -bottom]), np.column_stack([x, top])[::-1]])
+
+
+def chance_within(edges_mm: Floats, y_mm: Floats, spread_mm: float) -> Floats:
+    """The probability of ink (len(y_mm), N) between edges (2, N) that vary by `spread_mm`, the scale of a logistic."""
+    upper, lower = edges_mm
+    inside = np.where(y_mm[:, None] > 0.0, upper, lower) - np.abs(y_mm)[:, None]
+    return 1.0 / (1.0 + np.exp(-np.clip(inside / spread_mm, -30.0, 30.0)))
 
 
 def modes(share: Floats) -> Floats:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from model.fitted import MODES, NAMES, PARAMETERS, FittedPress, command_terms, modes
+from model.fitted import MODES, NAMES, PARAMETERS, FittedPress, chance_within, command_terms, modes
 
 Floats = NDArray[np.float64]
 
@@ -27,6 +27,8 @@ STAGES: tuple[tuple[str, tuple[str, ...]], ...] = (
 WORST_CONDITION = 300.0
 """Condition number of the Jacobian with unit columns above which noisy captures do not separate the parameters."""
 ROUNDS = 40
+STEP = 1e-4
+"""Step of a derivative, as a share of the parameter's spread."""
 EDGE_SPREAD_MM = (1.2, 0.4, 0.3, 0.15, 0.15)
 """Expected size of an edge's terms; for the k-th sine it falls as 1 / k."""
 EDGE_NOISE_MM = 0.25
@@ -164,20 +166,46 @@ def condition_number(square: Floats) -> float:
     return float(np.sqrt(values[-1] / values[0])) if values[0] > 1e-12 else float("inf")
 
 
-def jacobian(
-    press: FittedPress, free: Sequence[str], height_mm: float, tilt_deg: float, grid: Grid
-) -> tuple[Floats, Floats]:
-    """Probability of ink (pixels,), and its derivatives (pixels, P) by the free parameters over their spreads."""
-    base = press.chance(height_mm, tilt_deg, grid.x_mm, grid.y_mm, SPREAD_MM).ravel()
-    columns = np.empty((base.size, len(free)))
-    for k, name in enumerate(free):
-        at = NAMES.index(name)
-        step = 1e-4 * PARAMETERS[at].spread
-        values = press.values.copy()
-        values[at] += step
-        ahead = replace(press, values=values).chance(height_mm, tilt_deg, grid.x_mm, grid.y_mm, SPREAD_MM)
-        columns[:, k] = (ahead.ravel() - base) * 1e4
-    return base, columns
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """A press as a brush predicts it, with the derivatives by its free parameters over their spreads.
+
+    A parameter moves the two edges of the mark, and the ink of a pixel depends only on the edge on its side. So the
+    Jacobian J of the image is d ink / d edge, one image, times the derivatives of the edges, and J'J and J'r are sums
+    over columns. Matrices of that size are also too small for a matrix library to start threads for them.
+    """
+
+    ink: Floats
+    """Probability of ink (len(y_mm), len(x_mm))."""
+    by_edge: Floats
+    """Its derivative by the edge on the pixel's side, 1/mm."""
+    above: NDArray[np.bool_]
+    """Rows (len(y_mm),) on the upper side."""
+    edges: Floats
+    """Derivatives of the edges, (P, 2 len(x_mm)): the upper edge, then the lower, mm."""
+
+    def square(self) -> Floats:
+        """J'J, (P, P)."""
+        return (self.edges * self._by_side(self.by_edge**2)) @ self.edges.T
+
+    def pull(self, residual: Floats) -> Floats:
+        """J'r, (P,), of an image's residual r."""
+        return self.edges @ self._by_side(self.by_edge * residual)
+
+    def _by_side(self, image: Floats) -> Floats:
+        """Sums of an image over each side's rows, (2 len(x_mm),)."""
+        return np.concatenate([image[self.above].sum(axis=0), image[~self.above].sum(axis=0)])
+
+
+def draw(press: FittedPress, free: Sequence[str], height_mm: float, tilt_deg: float, grid: Grid) -> Drawn:
+    """Draw a press with its derivatives; the edges are moved by a small step of each free parameter."""
+    at = [NAMES.index(name) for name in free]
+    values = np.tile(press.values, (len(free) + 1, 1))
+    values[range(1, len(values)), at] += [STEP * PARAMETERS[k].spread for k in at]
+    edges = replace(press, values=values).edges_at(height_mm, tilt_deg, grid.x_mm)
+    ink = chance_within(edges[0], grid.y_mm, SPREAD_MM)
+    moved = (edges[1:] - edges[0]) / STEP
+    return Drawn(ink, ink * (1.0 - ink) / SPREAD_MM, grid.y_mm > 0.0, moved.reshape(len(free), -1))
 
 
 def fit_edges(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> Floats:
@@ -239,18 +267,18 @@ def _normal(
     press: FittedPress, free: Sequence[str], strokes: Sequence[Pressed], grid: Grid
 ) -> tuple[Floats, Floats, float]:
     """J'J and J'r of each stroke, and half the sum of squares. A cell is drawn once for all its strokes."""
-    drawn: dict[tuple[float, float], tuple[Floats, Floats, Floats]] = {}
+    drawn: dict[tuple[float, float], tuple[Drawn, Floats]] = {}
     squares: list[Floats] = []
     gradients: list[Floats] = []
     cost = 0.0
     for stroke in strokes:
         cell = (stroke.height_mm, stroke.tilt_deg)
         if cell not in drawn:
-            base, columns = jacobian(press, free, *cell, grid)
-            drawn[cell] = base, columns, columns.T @ columns
-        base, columns, square = drawn[cell]
-        miss = base - stroke.ink.ravel()
+            made = draw(press, free, *cell, grid)
+            drawn[cell] = made, made.square()
+        made, square = drawn[cell]
+        miss = made.ink - stroke.ink
         squares.append(square)
-        gradients.append(columns.T @ miss)
-        cost += 0.5 * float(miss @ miss)
+        gradients.append(made.pull(miss))
+        cost += 0.5 * float(np.vdot(miss, miss))
     return np.array(squares), np.array(gradients), cost

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.compare.field import SIZE_PX, Field
-from calibrate.fit.fit import EDGE_NOISE_MM, EDGE_SPREAD_MM, SPREAD_MM, Fit, Grid, Pressed, fit_presses, jacobian
+from calibrate.fit.fit import EDGE_NOISE_MM, EDGE_SPREAD_MM, SPREAD_MM, Fit, Grid, Pressed, draw, fit_presses
 from model.fitted import MODES, NAMES, FittedPress, command_terms
 
 Floats = NDArray[np.float64]
@@ -186,10 +186,10 @@ class _View:
 
 
 def _look(press: FittedPress, cell: Cell, grid: Grid) -> _View:
-    seen, slopes = jacobian(press, NAMES, *cell, grid)
-    sizes = press.sizes(*cell)
-    columns = (sizes.tip + sizes.heel) / grid.px_mm
-    return _View(slopes.T @ slopes / NOISE, max(float(seen @ seen), 1.0), columns, command_terms(*cell))
+    drawn, sizes = draw(press, NAMES, *cell, grid), press.sizes(*cell)
+    columns = float(sizes.tip + sizes.heel) / grid.px_mm
+    ink = max(float(np.vdot(drawn.ink, drawn.ink)), 1.0)
+    return _View(drawn.square() / NOISE, ink, columns, command_terms(*cell))
 
 
 def _terms_information(cells: Sequence[Cell], views: dict[Cell, _View], grid: Grid, *, prior: bool = True) -> Floats:
