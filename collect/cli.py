@@ -148,6 +148,9 @@ def plan(
 def doctor(
     config: Rig,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object per device.")] = False,
+    report: Annotated[
+        Path | None, typer.Option(help="Write an archive for a report of a defect, without secrets: FILE.zip.")
+    ] = None,
 ) -> None:
     """Ask every configured device for its identity and its faults. Powers nothing and moves nothing."""
     import asyncio
@@ -157,13 +160,23 @@ def doctor(
     from collect.rig.doctor import examine
     from drivers.clock import HostClock
 
-    findings = asyncio.run(examine(load_rig(config), HostClock()))
+    rig = load_rig(config)
+    if report is not None:
+        from collect.rig.report import check_report
+
+        check_report(report)
+    findings = asyncio.run(examine(rig, HostClock()))
     if as_json:
         say(*(json.dumps(finding.as_json()) for finding in findings))
     else:
         from collect.rig.doctor import doctor_table
 
         say(doctor_table(findings))
+    if report is not None:
+        from collect.rig.report import write_report
+
+        asyncio.run(write_report(report, rig, findings))
+        say(f"{report} holds what was asked and answered. Read it before you send it.", err=as_json)
     if not all(finding.well for finding in findings):
         raise typer.Exit(4)
 

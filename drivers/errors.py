@@ -79,6 +79,7 @@ class RpcError(DeviceError):
 
     def __init__(self, device: str, op: str, code: int, message: str) -> None:
         self.code = code
+        self.message = message
         super().__init__(device, op, f"controller answered error {code}: {message}")
 
 

@@ -110,6 +110,8 @@ class RtdeStream:
         self._reader: asyncio.StreamReader | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._segments: tuple[str, ...] = ()
+        self.offered: dict[str, int] = {}
+        """Names in the greeting that can be subscribed to, with their ids."""
         self.older: list[list[Any]] = []
         """Samples that had piled up before the newest one when it was read, oldest first."""
 
@@ -127,7 +129,8 @@ class RtdeStream:
             raise ProtocolViolation(DEVICE, "connect", "a greeting without an end") from None
         except (OSError, asyncio.IncompleteReadError) as error:
             raise ConnectionLost(DEVICE, "connect", f"{self.host}:{self.port}: {error}") from None
-        missing = set(segments) - set(outputs_of(greeting, DEVICE))
+        self.offered = outputs_of(greeting, DEVICE)
+        missing = set(segments) - set(self.offered)
         if missing:
             raise ProtocolViolation(DEVICE, "subscribe", f"the controller does not offer {sorted(missing)}")
         self._segments = tuple(segments)

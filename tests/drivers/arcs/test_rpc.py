@@ -3,85 +3,23 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import re
-from collections.abc import AsyncIterator, Awaitable, Callable
-from typing import Any
+from collections.abc import AsyncIterator
 
 import pytest
 
-from drivers.arcs.framing import FrameDecoder, encode
-from drivers.arcs.rpc import RpcConnection, encode_request
+from drivers.arcs.framing import encode
+from drivers.arcs.rpc import RpcConnection
 from drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, RpcError
+from tests.drivers.arcs.transcript import Answer, Controller, following, hang_up, nothing, reply, result, sends
 
 TIMEOUT_S = 0.5
-Answer = Callable[[str, asyncio.StreamWriter], Awaitable[None]]
-Line = tuple[str, dict[str, Any] | None, Answer]
-
-
-def reply(ident: object, **body: object) -> bytes:
-    return encode(json.dumps({"id": ident, "jsonrpc": "2.0", **body}).encode())
-
-
-def result(value: object) -> Answer:
-    return sends(lambda ident: reply(ident, result=value))
-
-
-def sends(make: Callable[[str], bytes], after_s: float = 0.0) -> Answer:
-    async def answer(ident: str, writer: asyncio.StreamWriter) -> None:
-        await asyncio.sleep(after_s)
-        writer.write(make(ident))
-
-    return answer
-
-
-async def nothing(_: str, __: asyncio.StreamWriter) -> None:
-    pass
-
-
-async def hang_up(_: str, writer: asyncio.StreamWriter) -> None:
-    writer.close()
-
-
-class Controller:
-    """Expects the lines of its script in order, and nothing else."""
-
-    def __init__(self) -> None:
-        self.script: list[Line] = []
-        self.surprises: list[str] = []
-        self.ids: list[str] = []
-        self.port = 0
-
-    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        decoder = FrameDecoder()
-        while data := await reader.read(4096):
-            for payload in decoder.feed(data):
-                await self._follow(payload, writer)
-        writer.close()
-
-    async def _follow(self, payload: bytes, writer: asyncio.StreamWriter) -> None:
-        request = json.loads(payload)
-        if not self.script:
-            self.surprises.append(f"nobody expected {request}")
-            return
-        method, params, answer = self.script.pop(0)
-        expected = encode_request(request["id"], method, params)
-        if payload != expected:
-            self.surprises.append(f"expected {expected!r}, got {payload!r}")
-        self.ids.append(request["id"])
-        await answer(request["id"], writer)
 
 
 @pytest.fixture
 async def controller() -> AsyncIterator[Controller]:
-    it = Controller()
-    server = await asyncio.start_server(it.serve, "127.0.0.1", 0)
-    it.port = server.sockets[0].getsockname()[1]
-    yield it
-    server.close()
-    await server.wait_closed()
-    assert not it.surprises
-    assert not it.script, f"never asked for: {it.script}"
+    async with following([]) as it:
+        yield it
 
 
 @pytest.fixture

@@ -1,0 +1,104 @@
+"""`doctor --report`: one archive for a report of a defect. It holds what devices answered, and nothing that is secret.
+
+| file | holds |
+|---|---|
+| `report.json` | versions, platform, the doctor's findings, numbers of `rig.toml`, the checks of `rig check` |
+| `arcs.jsonl` | the transcript of the controller: one question and its answer a line; tests replay it |
+| `rtde.json` | what RTDE offers and its newest sample, if `robot.rtde_port` is configured |
+| `README.txt` | what is in it and what was taken out |
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import zipfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from collect.errors import ConfigError
+from collect.rig.check import check_rig
+from collect.rig.config import RigConfig
+from collect.rig.doctor import Finding
+from collect.rig.scrub import Scrubber, numbers_only
+from drivers.arcs.survey import Exchange, rtde_answers, survey
+
+FORMAT = 1
+ENDING = ".zip"
+ABOUT = """\
+Made by `brushloop doctor --report`. Read it before you send it: it is meant to hold no secret.
+report.json  versions, platform, what each device answered, the numbers of rig.toml and what is doubtful in them
+arcs.jsonl   every question that was put to the arm's controller, and its answer
+rtde.json    what the controller's telemetry offers, if it is configured
+Taken out: names of hosts and users, addresses, paths, URLs, values of environment variables, every text of rig.toml.
+There are no photographs in it.
+"""
+
+
+def check_report(path: Path) -> None:
+    """Raise `ConfigError` if no archive can be written to this path. Called before any device is asked."""
+    if path.suffix.lower() != ENDING:
+        raise ConfigError("--report", "", f"{path} must end in {ENDING}")
+    if not path.parent.is_dir():
+        raise ConfigError("--report", "", f"{path}: there is no folder {path.parent}")
+    if path.exists():
+        raise ConfigError("--report", "", f"{path} exists, and nothing is overwritten: choose another name")
+
+
+async def write_report(path: Path, config: RigConfig, findings: list[Finding]) -> None:
+    """Ask the controller word by word and write the archive; `check_report` must have passed.
+
+    Raises OSError if it cannot be written.
+    """
+    robot, scrubber = config.robot, Scrubber(config)
+    exchanges = await survey(robot.host, robot.port, robot.framing)
+    files = {
+        "README.txt": ABOUT,
+        "report.json": json.dumps(_report(config, findings, scrubber), indent=2),
+        "arcs.jsonl": "".join(json.dumps(scrubber.value(_line(exchange))) + "\n" for exchange in exchanges),
+    }
+    if robot.rtde_port is not None:
+        answers = await rtde_answers(robot.host, robot.rtde_port)
+        files["rtde.json"] = json.dumps(scrubber.value(answers), indent=2)
+    with path.open("xb") as out, zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, text in files.items():
+            archive.writestr(name, text)
+
+
+def _line(exchange: Exchange) -> dict[str, Any]:
+    return asdict(exchange) | {"took_ms": round(exchange.took_ms, 3)}
+
+
+def _report(config: RigConfig, findings: list[Finding], scrubber: Scrubber) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "framing": config.robot.framing,
+        "versions": _versions(),
+        "platform": {
+            "system": platform.system(),
+            "release": platform.release(),
+            "machine": platform.machine(),
+            "python": platform.python_version(),
+            "cores": os.cpu_count(),
+        },
+        "findings": scrubber.value([finding.as_json() for finding in findings]),
+        "rig": numbers_only(config.model_dump(mode="json")),
+        "checks": scrubber.value([check.as_json() for check in check_rig(config)]),
+    }
+
+
+def _versions() -> dict[str, str]:
+    """Of brushloop and of every library that it names."""
+    named = ["brushloop", *(importlib.metadata.requires("brushloop") or ())]
+    found: dict[str, str] = {}
+    for requirement in named:
+        name = re.split(r"[^\w.-]", requirement, maxsplit=1)[0]
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue  # an extra that is not installed
+    return found

@@ -1,0 +1,108 @@
+"""`brushloop doctor --report`: what a lab sends with a report of a defect, and what stays in the lab."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from collect.rig.config import load_rig
+from collect.rig.doctor import Finding
+from collect.rig.report import write_report
+from collect.rig.scrub import Scrubber, numbers_only
+from drivers.sim.arcs.server import ArcsServer
+from drivers.sim.config import SimConfig
+from drivers.sim.rig_toml import Addresses, rig_toml
+from drivers.sim.world import World
+from tests.command import brushloop
+from tests.drivers.arcs.transcript import Archive
+
+if TYPE_CHECKING:
+    from conftest import Lab
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    path = tmp_path / "rig.toml"
+    path.write_text(rig_toml(SimConfig(), Addresses("127.0.0.1", 9, 9, 9, 9, "/dev/serial/by-id/usb-lab-7")))
+    return path
+
+
+def test_an_archive_holds_what_every_device_answered(lab: Lab) -> None:
+    report = lab.folder / "report.zip"
+    ran = brushloop("doctor", "--config", lab.folder / "rig.toml", "--report", report)
+    assert ran.returncode == 0
+    assert "Read it before you send it" in ran.stdout
+    with zipfile.ZipFile(report) as archive:
+        told = json.loads(archive.read("report.json"))
+        rtde = json.loads(archive.read("rtde.json"))
+    assert [finding["device"] for finding in told["findings"]] == ["camera", "force", "ink", "robot"]
+    assert told["versions"]["brushloop"]
+    assert told["versions"]["numpy"]
+    assert told["platform"]["python"]
+    assert told["rig"]["robot"]["tcp_offset_mm"] == [0.0, 0.0, 180.0]
+    assert len(rtde["sample"]) == 2
+    lines = Archive.read(report).lines
+    answered = {line["method"]: line["answer"] for line in lines}
+    assert answered["rob1.RobotState.getSafetyModeType"] == {"result": "Normal"}
+    assert answered["rob1.MotionControl.getSpeedFraction"]["result"] == 1.0
+    assert all(line["took_ms"] > 0.0 for line in lines)
+    assert lab.rig.arcs.mode == "PowerOff"
+    assert lab.rig.world.motion._next_id == 0
+
+
+async def test_a_controller_that_is_not_there_is_reported_as_such(rig: Path, tmp_path: Path) -> None:
+    finding = Finding("robot", "127.0.0.1:9", answers=False, problem="connect: 127.0.0.1:9: Connection refused")
+    await write_report(tmp_path / "report.zip", load_rig(rig), [finding])
+    archive = Archive.read(tmp_path / "report.zip")
+    assert [line["method"] for line in archive.lines] == ["connect"]
+    assert "refused" in archive.lines[0]["answer"]
+    assert "127.0.0.1" not in json.dumps([archive.robot, archive.lines])
+
+
+async def test_what_the_controller_refuses_is_kept_word_for_word(rig: Path, tmp_path: Path) -> None:
+    server = ArcsServer(World(SimConfig()))
+    await server.start("127.0.0.1", 0)
+    del server._methods["rob1.RobotConfig.getCollisionLevel"]
+    rig.write_text(rig.read_text().replace("port = 9\nrtde_port = 9", f"port = {server.port}"))
+    await write_report(tmp_path / "report.zip", load_rig(rig), [Finding("robot", "", answers=True)])
+    await server.stop()
+    [line] = [line for line in Archive.read(tmp_path / "report.zip").lines if "CollisionLevel" in line["method"]]
+    assert line["answer"]["error"]["code"] == -32601
+
+
+def test_names_addresses_paths_and_the_environment_stay_in_the_lab(rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("BRUSHLOOP_ROBOT__HOST", "arm7.lab.example")
+    monkeypatch.setenv("LOGNAME", "wanghui")
+    monkeypatch.setattr("socket.gethostname", lambda: "rigpc")
+    scrubber = Scrubber(load_rig(rig))
+    said = (
+        "robot: connect: arm7.lab.example:30004 as wanghui@rigpc from 192.0.2.7 (fe80::1:2:3, 00:1b:44:11:3a:b7); "
+        "see /home/wanghui/rig.toml and C:\\Users\\wanghui, http://wanghui:secret@cam.example/stream, "
+        "on rigpc; 200 rounds/s, 0.1600 mm/px"
+    )
+    told = scrubber.text(said)
+    for secret in ("arm7", "lab.example", "wanghui", "rigpc", "192.0.2.7", "fe80", "00:1b", "secret", "cam.example"):
+        assert secret not in told, told
+    assert told.startswith("robot: connect: <host>:30004 as ")
+    assert told.endswith("on <host>; 200 rounds/s, 0.1600 mm/px")
+
+
+def test_of_the_rig_only_numbers_and_fixed_words_are_sent(rig: Path) -> None:
+    sent = numbers_only(load_rig(rig).model_dump(mode="json"))
+    assert sent["robot"]["host"] == sent["brush"]["name"] == sent["camera"]["source"] == "<text>"
+    assert sent["robot"]["kind"] == "aubo-arcs"
+    assert sent["board"]["squares"] == [26, 20]
+    assert "usb-lab-7" not in json.dumps(sent)
+
+
+def test_nothing_is_overwritten(rig: Path, tmp_path: Path) -> None:
+    report = tmp_path / "report.zip"
+    report.write_bytes(b"mine")
+    ran = brushloop("doctor", "--config", rig, "--report", report)
+    assert ran.returncode == 2
+    assert "nothing is overwritten" in ran.stderr
+    assert report.read_bytes() == b"mine"

@@ -1,0 +1,150 @@
+"""A controller that follows a transcript: what the client must send, and what it is answered.
+
+A transcript is written in a test, or read from an archive of `brushloop doctor --report`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import zipfile
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drivers.arcs.framing import BareDecoder, FrameDecoder, encode
+from drivers.arcs.rpc import Framing, encode_bare_request, encode_request
+
+Answer = Callable[[str, asyncio.StreamWriter], Awaitable[None]]
+Line = tuple[str, dict[str, Any] | None, Answer]
+
+
+def reply(ident: object, **body: object) -> bytes:
+    return encode(json.dumps({"id": ident, "jsonrpc": "2.0", **body}).encode())
+
+
+def result(value: object) -> Answer:
+    return sends(lambda ident: reply(ident, result=value))
+
+
+def sends(make: Callable[[str], bytes], after_s: float = 0.0) -> Answer:
+    async def answer(ident: str, writer: asyncio.StreamWriter) -> None:
+        await asyncio.sleep(after_s)
+        writer.write(make(ident))
+
+    return answer
+
+
+async def nothing(_: str, __: asyncio.StreamWriter) -> None:
+    pass
+
+
+async def hang_up(_: str, writer: asyncio.StreamWriter) -> None:
+    writer.close()
+
+
+class Controller:
+    """Expects the lines of its script in order, and nothing else."""
+
+    def __init__(self, framing: Framing = "sof") -> None:
+        self.framing = framing
+        self.script: list[Line] = []
+        self.surprises: list[str] = []
+        self.ids: list[str] = []
+        self.port = 0
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        decoder = FrameDecoder() if self.framing == "sof" else BareDecoder()
+        while data := await reader.read(4096):
+            for payload in decoder.feed(data):
+                await self._follow(payload, writer)
+        writer.close()
+
+    async def _follow(self, payload: bytes, writer: asyncio.StreamWriter) -> None:
+        if payload.startswith(b"__login__"):
+            writer.write(encode(b"logged in"))
+            return
+        request = json.loads(payload)
+        if not self.script:
+            self.surprises.append(f"nobody expected {request}")
+            return
+        method, params, answer = self.script.pop(0)
+        expected = (encode_request if self.framing == "sof" else encode_bare_request)(request["id"], method, params)
+        if payload != expected:
+            self.surprises.append(f"expected {expected!r}, got {payload!r}")
+        self.ids.append(request["id"])
+        await answer(request["id"], writer)
+
+
+@asynccontextmanager
+async def following(script: list[Line], framing: Framing = "sof") -> AsyncIterator[Controller]:
+    """Serve the script on a port of 127.0.0.1; fail where anything else was sent, or anything was left unsent."""
+    it = Controller(framing)
+    it.script = script
+    async with serving(it):
+        yield it
+    assert not it.surprises
+    assert not it.script, f"never asked for: {it.script}"
+
+
+@asynccontextmanager
+async def serving(it: Controller) -> AsyncIterator[None]:
+    """Serve on a port of 127.0.0.1 until the block ends."""
+    server = await asyncio.start_server(it.serve, "127.0.0.1", 0)
+    it.port = server.sockets[0].getsockname()[1]
+    yield
+    server.close()
+    await server.wait_closed()
+
+
+@dataclass(frozen=True)
+class Archive:
+    """What `brushloop doctor --report` wrote."""
+
+    framing: Framing
+    robot: dict[str, Any]
+    """The doctor's finding about the arm."""
+    lines: list[dict[str, Any]]
+    """`arcs.jsonl`: each has method, params and answer."""
+
+    @classmethod
+    def read(cls, path: Path) -> Archive:
+        with zipfile.ZipFile(path) as archive:
+            report = json.loads(archive.read("report.json"))
+            lines = [json.loads(line) for line in archive.read("arcs.jsonl").splitlines()]
+        [robot] = [finding for finding in report["findings"] if finding["device"] == "robot"]
+        return cls(report["framing"], robot, lines)
+
+    def script(self) -> list[Line]:
+        """Its lines as a test writes them."""
+        return [(line["method"], line["params"], self._answer(line["answer"])) for line in self.lines]
+
+    def _answer(self, answer: dict[str, Any]) -> Answer:
+        if "silence" in answer:
+            return nothing
+        if "lost" in answer:
+            return hang_up
+        body = {key: value for key, value in answer.items() if key in ("result", "error")}  # of `refused`: neither
+        return sends(lambda ident: self._framed({"id": ident, "jsonrpc": "2.0", **body}))
+
+    def _framed(self, body: dict[str, Any]) -> bytes:
+        payload = json.dumps(body).encode()
+        return encode(payload) if self.framing == "sof" else payload
+
+
+class AnsweringByName(Controller):
+    """Answers each method as an archive has it, whenever and however often it is asked."""
+
+    def __init__(self, archive: Archive) -> None:
+        super().__init__(archive.framing)
+        self.answers = {method: answer for method, _, answer in archive.script()}
+        self.unknown = sends(lambda i: archive._framed({"id": i, "error": {"code": -32601, "message": "unknown"}}))
+
+    async def _follow(self, payload: bytes, writer: asyncio.StreamWriter) -> None:
+        if payload.startswith(b"__login__"):
+            await super()._follow(payload, writer)
+            return
+        request = json.loads(payload)
+        await self.answers.get(request["method"], self.unknown)(request["id"], writer)
