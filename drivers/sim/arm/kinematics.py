@@ -5,13 +5,14 @@ A real arm is calibrated and differs by most of a millimetre, so the driver alwa
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from drivers import rotation
 from drivers.samples import Pose
 
 Matrix = NDArray[np.float64]
@@ -31,23 +32,21 @@ ITERATIONS = 80
 DAMPING = 1e-3
 
 
-def _link(a_m: float, alpha_rad: float) -> Matrix:
-    c, s = math.cos(alpha_rad), math.sin(alpha_rad)
-    return np.array([[1.0, 0.0, 0.0, a_m], [0.0, c, -s, 0.0], [0.0, s, c, 0.0], [0.0, 0.0, 0.0, 1.0]])
+_OFFSETS_RAD = tuple(math.radians(theta) for theta in THETA_DEG)
+_TWISTS = tuple((math.cos(math.radians(alpha)), math.sin(math.radians(alpha))) for alpha in ALPHA_DEG)
 
 
-_LINKS = [_link(a, math.radians(alpha)) for a, alpha in zip(A_M, ALPHA_DEG, strict=True)]
-
-
-def _frames(q: Sequence[float]) -> list[Matrix]:
-    """The six joint frames in the base frame: T_i = Rx(alpha) Tx(a) Rz(q + theta) Tz(d)."""
-    frames: list[Matrix] = []
-    here: Matrix = np.eye(4)
-    for link, q_rad, theta_deg, d_m in zip(_LINKS, q, THETA_DEG, D_M, strict=True):
-        angle = q_rad + math.radians(theta_deg)
-        c, s = math.cos(angle), math.sin(angle)
-        here = here @ link @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, d_m], [0, 0, 0, 1]])
-        frames.append(here)
+def _frames(q: Sequence[float]) -> Matrix:
+    """(6, 4, 4) the joint frames in the base frame: T_i = Rx(alpha) Tx(a) Rz(q + theta) Tz(d)."""
+    links: list[list[list[float]]] = []
+    for (ca, sa), a_m, d_m, q_rad, offset_rad in zip(_TWISTS, A_M, D_M, q, _OFFSETS_RAD, strict=True):
+        c, s = math.cos(q_rad + offset_rad), math.sin(q_rad + offset_rad)
+        links.append(
+            [[c, -s, 0.0, a_m], [ca * s, ca * c, -sa, -sa * d_m], [sa * s, sa * c, ca, ca * d_m], [0.0, 0.0, 0.0, 1.0]]
+        )
+    frames = np.array(links)
+    for before, frame in itertools.pairwise(frames):
+        frame[:] = before @ frame
     return frames
 
 
@@ -77,12 +76,12 @@ def _descend(target: Matrix, q: Matrix) -> Matrix | None:
         frames = _frames(q.tolist())
         flange = frames[-1]
         shift = target[:3, 3] - flange[:3, 3]
-        turn = Rotation.from_matrix(target[:3, :3] @ flange[:3, :3].T).as_rotvec()
-        if np.linalg.norm(shift) < CLOSE_M and np.linalg.norm(turn) < CLOSE_RAD:
+        turn = rotation.vector(rotation.of_matrix((target[:3, :3] @ flange[:3, :3].T).tolist()))
+        if np.linalg.norm(shift) < CLOSE_M and math.hypot(*turn) < CLOSE_RAD:
             return q
-        axes = np.stack([f[:3, 2] for f in frames], axis=1)
-        arms = np.stack([flange[:3, 3] - f[:3, 3] for f in frames], axis=1)
-        jacobian = np.vstack([np.cross(axes, arms, axis=0), axes])
+        x, y, z = axes = frames[:, :3, 2].T
+        u, v, w = flange[:3, 3:] - frames[:, :3, 3].T
+        jacobian = np.vstack([y * w - z * v, z * u - x * w, x * v - y * u, axes])
         error = np.concatenate([shift, turn])
         damping = DAMPING * min(1.0, float(np.linalg.norm(error)))
         square = jacobian @ jacobian.T + (damping * damping + 1e-12) * np.eye(6)  # never singular
@@ -106,16 +105,15 @@ def _within(q: Matrix, near: Sequence[float]) -> Joints | None:
 def matrix_of(pose: Pose) -> Matrix:
     """A pose (mm) as a 4x4 matrix (m)."""
     matrix: Matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(pose.quaternion).as_matrix()
+    matrix[:3, :3] = np.transpose(rotation.columns(rotation.unit(pose.quaternion)))
     matrix[:3, 3] = np.array(pose.position_mm) / 1e3
     return matrix
 
 
 def pose_of(matrix: Matrix) -> Pose:
     """A 4x4 matrix (m) as a pose (mm)."""
-    qx, qy, qz, qw = (float(v) for v in Rotation.from_matrix(matrix[:3, :3]).as_quat())
     x, y, z = (float(v) * 1e3 for v in matrix[:3, 3])
-    return Pose(x, y, z, qx, qy, qz, qw)
+    return Pose(x, y, z, *rotation.of_matrix(matrix[:3, :3].tolist()))
 
 
 def inverted(matrix: Matrix) -> Matrix:

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from drivers import rotation
 from drivers.geometry import distance
 from drivers.samples import Pose
 from drivers.sim.arm.kinematics import Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
@@ -28,6 +28,8 @@ class ArmQueue(MotionQueue):
         super().__init__(home, on_path, capacity)
         self.tool: Matrix = np.eye(4) if tool is None else tool
         self._held: list[Move] | None = None
+        self._solved: tuple[Pose, Joints] | None = None
+        """The last pose whose joints were found, and the joints."""
 
     @property
     def size(self) -> int:
@@ -118,9 +120,9 @@ class ArmQueue(MotionQueue):
             return (0.0,) * 6
         front = self._queue[0]
         a, b = front.pose(now_s), front.pose(now_s + DT_S)
-        turn = Rotation.from_quat(b.quaternion) * Rotation.from_quat(a.quaternion).inv()
-        way = np.subtract(b.position_mm, a.position_mm)
-        return tuple(float(v) / DT_S for v in (*way, *turn.as_rotvec()))
+        turn = rotation.product(rotation.unit(b.quaternion), rotation.inverse(rotation.unit(a.quaternion)))
+        way = (q - p for p, q in zip(a.position_mm, b.position_mm, strict=True))
+        return tuple(v / DT_S for v in (*way, *rotation.vector(turn)))
 
     def joint_velocity(self, now_s: float) -> tuple[float, ...]:
         """Velocity of every joint in rad/s, over the next millisecond."""
@@ -134,7 +136,9 @@ class ArmQueue(MotionQueue):
 
     def near_joints(self, tip: Pose) -> Joints:
         """The joints for a tip pose, near the last known ones; the last known ones if no solution is found."""
-        self.near = inverse(matrix_of(tip) @ inverted(self.tool), self.near) or self.near
+        if self._solved != (tip, self.near):  # an arm at rest is asked again and again
+            self.near = inverse(matrix_of(tip) @ inverted(self.tool), self.near) or self.near
+            self._solved = (tip, self.near)
         return self.near
 
     def _last(self) -> Pose:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from drivers import rotation
 from drivers.force.rounds import Wrench
 from drivers.geometry import interpolate, lean
 from drivers.samples import Pose
@@ -62,7 +62,7 @@ class ContactWatch:
 def _sideways_mm(a: Pose, b: Pose) -> float:
     """Travel along the paper or across the brush's axis, whichever is shorter."""
     way = np.subtract(b.position_mm, a.position_mm)
-    axis = Rotation.from_quat(b.quaternion).as_matrix()[:, 2]
+    axis = np.array(rotation.columns(rotation.unit(b.quaternion))[2])
     return min(math.hypot(way[0], way[1]), float(np.linalg.norm(way - (way @ axis) * axis)))
 
 
@@ -107,8 +107,9 @@ class Reaction:
         `normal` is the unit vector out of the paper, in the base frame.
         """
         push_n = self.push_n(depth_mm, lean(leaning_with(tip, normal))[0])
-        force_n = np.multiply(normal, push_n) - np.array([0.0, 0.0, self._weight_n])
-        fx, fy, fz = (float(v) for v in Rotation.from_quat(tip.quaternion).inv().apply(force_n))
+        force_n = (normal[0] * push_n, normal[1] * push_n, normal[2] * push_n - self._weight_n)
+        axes = rotation.columns(rotation.unit(tip.quaternion))
+        fx, fy, fz = (x * force_n[0] + y * force_n[1] + z * force_n[2] for x, y, z in axes)
         return fx, fy, fz, -self._arm_m * fy, self._arm_m * fx, 0.0
 
 
@@ -116,10 +117,10 @@ def leaning_with(pose: Pose, normal: tuple[float, float, float]) -> Pose:
     """The pose in a frame whose z is the paper's normal, rotated from the base frame by the least angle."""
     if normal == LEVEL:
         return pose
-    axis = np.cross(normal, LEVEL)  # its length is the sine of the angle
-    level = Rotation.from_rotvec(axis / np.linalg.norm(axis) * math.acos(normal[2]))
-    qx, qy, qz, qw = (float(v) for v in (level * Rotation.from_quat(pose.quaternion)).as_quat())
-    return Pose(*pose.position_mm, qx, qy, qz, qw)
+    nx, ny, nz = normal
+    share = math.acos(nz) / math.hypot(nx, ny)  # of (ny, -nx, 0), the cross product of the normal and the level one
+    level = rotation.of_vector((share * ny, share * -nx, 0.0))
+    return Pose(*pose.position_mm, *rotation.product(level, rotation.unit(pose.quaternion)))
 
 
 @functools.lru_cache(maxsize=8)
