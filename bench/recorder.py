@@ -22,7 +22,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from bench.harness import BenchError, Result
 from sessions.recording.messages import encode_png, image_message, pose_message
 from sessions.recording.schemas import Event, Header, Source, Topic, Wrench
-from sessions.recording.writer import Outgoing, SegmentWriter
+from sessions.recording.writer import Outgoing, SegmentWriter, encoded
 
 POSE_HZ, FORCE_HZ, STILL_HZ = 100, 1000, 0.5
 LOAD_S = 10.0
@@ -45,7 +45,7 @@ def run(*, n: int | None = None, seed: int = 0) -> list[Result]:
     if rounds < 1:
         raise ValueError(f"n = {rounds}: at least one round is needed")
     load = list(_load(seed, LOAD_S))
-    megabytes = sum(len(_encoded(outgoing)) for outgoing in load) / 1e6
+    megabytes = sum(len(encoded(outgoing.message)) for outgoing in load) / 1e6
     paced = list(_load(seed, PACED_S))
     contestants = (_ours, _foxglove, _plain)
     rates: dict[str, list[float]] = {c.__name__: [] for c in contestants}
@@ -62,7 +62,7 @@ def run(*, n: int | None = None, seed: int = 0) -> list[Result]:
     ours, foxglove, plain = (median(rates[c.__name__]) for c in contestants)
     cpu, cpu_foxglove = (median(shares[c.__name__]) for c in (_ours, _foxglove))
     held, held_foxglove = (max(worst[c.__name__]) for c in (_ours, _foxglove))
-    still_mb = len(_encoded(paced[0])) / 1e6
+    still_mb = len(encoded(paced[0].message)) / 1e6
     conditions = (
         f"{POSE_HZ} Hz poses, {FORCE_HZ} Hz forces as JSON, a {still_mb:.1f} MB still "
         f"each {1 / STILL_HZ:g} s; fsync at the end; CPU includes the pacing; {os.cpu_count()} cores"
@@ -93,11 +93,6 @@ def _load(seed: int, seconds: float) -> Iterator[Outgoing]:
             yield Outgoing(Topic.TCP, t_ns, t_ns, tick, pose_message(t_ns, (x, y, z), (0.0, 0.0, 0.0, 1.0)))
         fx, fy, fz, mx, my, mz = random.normal(0, 1, 6)
         yield Outgoing(Topic.WRENCH, t_ns, t_ns, tick, Wrench(fx_n=fx, fy_n=fy, fz_n=fz, mx_nm=mx, my_nm=my, mz_nm=mz))
-
-
-def _encoded(outgoing: Outgoing) -> bytes:
-    message = outgoing.message
-    return message.model_dump_json().encode() if isinstance(message, Event) else message.SerializeToString()
 
 
 def _flat_out(contestant: Contestant, folder: Path, load: list[Outgoing]) -> float:
@@ -160,7 +155,7 @@ def _foxglove(folder: Path) -> Iterator[Write]:
         channel = channels.get(outgoing.topic)
         if channel is None:
             channel = channels[outgoing.topic] = _foxglove_channel(foxglove, outgoing, context)
-        channel.log(_encoded(outgoing), log_time=outgoing.log_ns)
+        channel.log(encoded(outgoing.message), log_time=outgoing.log_ns)
 
     path = folder / "foxglove.mcap"
     with foxglove.open_mcap(path, context=context):
@@ -183,7 +178,7 @@ def _plain(folder: Path) -> Iterator[Write]:
     with (folder / "plain.bin").open("xb") as file:
 
         def write(outgoing: Outgoing) -> None:
-            file.write(_encoded(outgoing))
+            file.write(encoded(outgoing.message))
 
         yield write
         file.flush()

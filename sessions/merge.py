@@ -16,7 +16,7 @@ from sessions.names import SESSION_ID, SNAPSHOT_NAMES
 from sessions.reader import Recording
 from sessions.recording import container
 from sessions.recording.container import Record
-from sessions.recording.mcap_file import HEADER_METADATA, count_messages, read_note, write_mcap
+from sessions.recording.mcap_file import HEADER_METADATA, count_messages, new_mcap, read_note
 from sessions.recording.schemas import Header, Quality, Stroke, Topic
 
 REPAIRS_NOTE = "brushloop.repairs"
@@ -56,9 +56,9 @@ def merge_session(folder: Path, state: Replay, header: Header, tag: str = "super
         notes = {REPAIRS_NOTE: {"repairs": list(state.repairs)}} if state.repairs else {}
         snapshots = [path for name in SNAPSHOT_NAMES if (path := folder / name).is_file()]
         attachments = {path.name: path.read_bytes() for path in snapshots}
-        steps = (folder / str(line["file"]) for line in state.segments)
-        records = (record for step in steps for record in container.messages(step))
-        write_mcap(part, header, notes, attachments, records)
+        with new_mcap(part, header, notes, attachments) as copy:
+            for line in state.segments:
+                copy.add_file(folder / str(line["file"]))
         counts = count_messages(part)
         if counts != expected:
             raise SessionDamaged(part, f"holds {counts}, but the journal says {expected}")
@@ -93,10 +93,12 @@ def merge_recordings(sources: list[Path], out: Path) -> Path:
     try:
         part.unlink(missing_ok=True)  # left by a killed merge: only a copy
         notes = {PARTS_NOTE: {"parts": [_provenance(one) for one in parts]}}
-        records = (record for one in parts for record in _renumbered(one))
-        written = write_mcap(part, header, notes, attachments, records)
-        if count_messages(part) != dict(written):
-            raise SessionDamaged(part, f"does not read back as {dict(written)}")
+        with new_mcap(part, header, notes, attachments) as copy:
+            for one in parts:
+                for record in _renumbered(one):
+                    copy.add(*record)
+        if count_messages(part) != dict(copy.counts):
+            raise SessionDamaged(part, f"does not read back as {dict(copy.counts)}")
         publish(part, out)
         fsync_folder(out.parent)
     except FileExistsError:

@@ -24,8 +24,8 @@ from sessions.recording.writer import ChannelTable, Outgoing
 
 if TYPE_CHECKING:
     from foxglove import Channel
-    from mcap.writer import Writer
 
+    from sessions.recording.mcap_writer import McapWriter
     from sessions.recording.messages import CompressedImage
 
 HOST = "127.0.0.1"
@@ -116,7 +116,7 @@ class LiveView:
 
     def _run(self, channels: _Channels) -> None:
         # The code that writes files registers topics and schemas here too, so that they are the same.
-        table = ChannelTable(cast("Writer", channels))
+        table = ChannelTable(cast("McapWriter", channels))
         while not self._closing.is_set():
             item = self._queue.get()
             if item is None:

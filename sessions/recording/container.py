@@ -17,15 +17,17 @@ from typing import TypeVar
 import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.reader import FOOTER_SIZE, SeekingReader
-from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from sessions.errors import InputError, SessionDamaged, in_one_line
+from sessions.recording.chunk import RECORD_START, Contents, unpacked
 
 MAX_RECORD_BYTES = 512 * 1024 * 1024
-"""Largest record that is read: a chunk is 256 KiB plus one message, the largest image allowed, with room to spare."""
+"""Largest record that is read: a chunk is 512 KiB plus one message, the largest image allowed, with room to spare."""
 UNREADABLE = (
     McapError,
     struct.error,
@@ -50,6 +52,12 @@ def messages(path: Path, topics: list[str] | None = None) -> Iterator[Record]:
     They are not sorted by log time: a stroke would precede its still if the host's clock was set back between the two.
     """
     return _guarded(path, lambda file: _messages(file, topics))
+
+
+def chunks(path: Path) -> Iterator[tuple[Contents, Summary]]:
+    """Chunks in the order in which they were written, every CRC checked, and the file's index. Raises
+    `SessionDamaged`."""
+    return _guarded(path, lambda file: _chunks(file, None))
 
 
 def metadata(path: Path) -> Iterator[Metadata]:
@@ -130,14 +138,44 @@ def _check_summary_crc(file: BoundedFile) -> None:
 
 
 def _messages(file: BoundedFile, topics: list[str] | None) -> Iterator[Record]:
-    reader, summary = indexed(file)
-    if not summary.chunk_indexes:
-        if summary.statistics is None or summary.statistics.message_count:
-            raise McapError("has messages outside chunks, which no CRC protects")
-        return
+    for contents, summary in _chunks(file, topics):
+        channels = {
+            number: channel
+            for number, channel in summary.channels.items()
+            if number in contents.index and (topics is None or channel.topic in topics)
+        }
+        schemas = {
+            number: summary.schemas[channel.schema_id] for number, channel in channels.items() if channel.schema_id
+        }
+        for message in contents.each(channels):
+            yield schemas.get(message.channel_id), channels[message.channel_id], message
+
+
+def _chunks(file: BoundedFile, topics: list[str] | None) -> Iterator[tuple[Contents, Summary]]:
+    """Chunks that may hold messages on `topics`."""
+    _reader, summary = indexed(file)
+    if not summary.chunk_indexes and (summary.statistics is None or summary.statistics.message_count):
+        raise McapError("has messages outside chunks, which no CRC protects")
+    wanted = {number for number, channel in summary.channels.items() if topics is None or channel.topic in topics}
     for index in summary.chunk_indexes:
-        check_chunk_at(file, index.chunk_start_offset)
-    yield from reader.iter_messages(topics, log_time_order=False)
+        if topics is None or not index.message_index_offsets or wanted & index.message_index_offsets.keys():
+            contents = chunk_at(file, index.chunk_start_offset)
+            if not contents.index.keys() <= summary.channels.keys():
+                raise McapError("a chunk has messages of a channel that the index does not list")
+            yield contents, summary
+
+
+def chunk_at(file: BoundedFile, offset: int) -> Contents:
+    """Read one chunk. Raises any of `UNREADABLE`."""
+    check_chunk_at(file, offset)
+    file.seek(offset)
+    opcode, length = RECORD_START.unpack(file.read(RECORD_START.size))
+    if opcode != Opcode.CHUNK or length > MAX_RECORD_BYTES:
+        raise ValueError("no chunk")
+    chunk = Chunk.read(ReadDataStream(io.BytesIO(file.read(length))))
+    if chunk.uncompressed_crc == 0:
+        raise ValueError("no CRC")
+    return unpacked(chunk)
 
 
 def check_chunk_at(file: BoundedFile, offset: int) -> None:

@@ -5,23 +5,23 @@ Metadata has no CRC in MCAP, so the header and each note include one.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Generator, Mapping
 from pathlib import Path, PurePath
 from typing import IO, Any, cast
 
 from mcap.records import Channel, Message, Schema
-from mcap.writer import CompressionType, Writer
 
 from sessions.disk import sync
 from sessions.errors import SessionDamaged, in_one_line
-from sessions.recording.container import Record, messages
+from sessions.recording import container
+from sessions.recording.mcap_writer import McapWriter
 from sessions.recording.schemas import Header, Topic
 
-CHUNK_BYTES = 256 * 1024
 HEADER_METADATA = "brushloop.header"
 BEGIN_NOTE, DONE_NOTE = "brushloop.begin", "brushloop.done"
 """Notes of a step's file: the journal's lines about it, so that a lost journal can be rebuilt."""
@@ -30,60 +30,76 @@ _MEDIA_TYPES = {".toml": "application/toml", ".json": "application/json"}
 
 def start_mcap(
     file: IO[bytes], header: Header, notes: Mapping[str, Mapping[str, Any]], attachments: Mapping[str, bytes]
-) -> Writer:
+) -> McapWriter:
     """Begin an MCAP file with everything that comes before its messages."""
-    writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-    writer.start(profile="", library=header.software)
+    writer = McapWriter(file, header.software)
     writer.add_metadata(HEADER_METADATA, header_metadata(header))
     for name, values in notes.items():
         writer.add_metadata(name, note(values))
     for name, data in attachments.items():
         media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream")
-        writer.add_attachment(0, 0, name, media_type, data)
+        writer.add_attachment(name, media_type, data)
     return writer
 
 
-def write_mcap(
-    path: Path,
-    header: Header,
-    notes: Mapping[str, Mapping[str, Any]],
-    attachments: Mapping[str, bytes],
-    records: Iterable[Record],
-) -> Counter[str]:
-    """Write a new file, durable on return, and return its number of messages by topic. Raises `OSError`."""
-    written: Counter[str] = Counter()
+class Copy:
+    """A new file that takes messages of other files as they are: times, sequence numbers and data stay."""
+
+    def __init__(self, writer: McapWriter) -> None:
+        self._writer = writer
+        self._numbers: dict[tuple[str, str], int] = {}
+
+    def add(self, schema: Schema | None, channel: Channel, message: Message) -> None:
+        """Add one message."""
+        self._writer.add_message(
+            channel_id=self._number(schema, channel),
+            log_time=message.log_time,
+            publish_time=message.publish_time,
+            sequence=message.sequence,
+            data=message.data,
+        )
+        if channel.topic == Topic.STROKE:
+            self._writer.flush()  # ends the chunk, so that a damaged chunk costs one stroke
+
+    def add_file(self, path: Path) -> None:
+        """Add all messages of a file, chunk by chunk, every CRC checked. Raises `SessionDamaged`."""
+        for contents, summary in container.chunks(path):
+            channels = {number: summary.channels[number] for number in contents.index}
+            numbers = {
+                number: self._number(summary.schemas[channel.schema_id] if channel.schema_id else None, channel)
+                for number, channel in channels.items()
+            }
+            self._writer.add_contents(contents, numbers)
+            if any(channel.topic == Topic.STROKE for channel in channels.values()):
+                self._writer.flush()  # as above
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Messages by topic; complete once the file is finished."""
+        return self._writer.counts
+
+    def _number(self, schema: Schema | None, channel: Channel) -> int:
+        ident = (channel.topic, schema.name if schema else "")
+        if ident not in self._numbers:
+            schema_id = 0
+            if schema:
+                schema_id = self._writer.register_schema(name=schema.name, encoding=schema.encoding, data=schema.data)
+            self._numbers[ident] = self._writer.register_channel(
+                topic=channel.topic, message_encoding=channel.message_encoding, schema_id=schema_id
+            )
+        return self._numbers[ident]
+
+
+@contextlib.contextmanager
+def new_mcap(
+    path: Path, header: Header, notes: Mapping[str, Mapping[str, Any]], attachments: Mapping[str, bytes]
+) -> Generator[Copy]:
+    """A new file to copy messages into; finished and durable after the block. Raises `OSError`."""
     with path.open("xb") as file:
         writer = start_mcap(file, header, notes, attachments)
-        channels: dict[tuple[str, str], int] = {}
-        for schema, channel, message in records:
-            ident = (channel.topic, schema.name if schema else "")
-            if ident not in channels:
-                channels[ident] = _register(writer, schema, channel)
-            _copy(writer, channels[ident], channel, message)
-            written[channel.topic] += 1
+        yield Copy(writer)
         writer.finish()
         sync(file)
-    return written
-
-
-def _register(writer: Writer, schema: Schema | None, channel: Channel) -> int:
-    schema_id = 0
-    if schema:
-        schema_id = writer.register_schema(name=schema.name, encoding=schema.encoding, data=schema.data)
-    return writer.register_channel(topic=channel.topic, message_encoding=channel.message_encoding, schema_id=schema_id)
-
-
-def _copy(writer: Writer, channel_id: int, channel: Channel, message: Message) -> None:
-    """Write one message, keeping its times and sequence number."""
-    writer.add_message(
-        channel_id=channel_id,
-        log_time=message.log_time,
-        publish_time=message.publish_time,
-        sequence=message.sequence,
-        data=message.data,
-    )
-    if channel.topic == Topic.STROKE:
-        writer.flush()  # ends the chunk, so that a damaged chunk costs one stroke
 
 
 def header_metadata(header: Header) -> dict[str, str]:
@@ -117,7 +133,11 @@ def read_note(metadata: dict[str, str]) -> dict[str, Any] | None:
 
 def count_messages(path: Path) -> dict[str, int]:
     """Number of messages by topic, with every chunk's CRC checked. Raises `SessionDamaged`."""
-    return dict(Counter(channel.topic for _schema, channel, _message in messages(path)))
+    counts: Counter[str] = Counter()
+    for contents, summary in container.chunks(path):
+        for number, index in contents.index.items():
+            counts[summary.channels[number].topic] += len(index) // 2
+    return dict(counts)
 
 
 def file_sha256(path: Path) -> str:

@@ -19,17 +19,24 @@ from typing import Any
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
-from mcap.stream_reader import breakup_chunk
+from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from sessions.errors import InputError, in_one_line
-from sessions.recording.container import MAX_RECORD_BYTES, UNREADABLE, BoundedFile, Record, check_chunk_at, indexed
+from sessions.recording.chunk import RECORD_START
+from sessions.recording.container import (
+    MAX_RECORD_BYTES,
+    UNREADABLE,
+    BoundedFile,
+    Record,
+    check_chunk_at,
+    chunk_at,
+    indexed,
+)
 from sessions.recording.mcap_file import HEADER_METADATA, header_crc, read_note
 
 _STROKE_NAME = re.compile(rb'"stroke_id":"([^"\\]{1,100})","kind"')
 """Beginning of a stroke's message."""
-_START = struct.Struct("<BQ")
 _PIECE_BYTES = 256
 _MESSAGE_INDEX = struct.Struct("<HI")
 
@@ -133,7 +140,7 @@ def glimpsed(found: Scan) -> list[str]:
             try:
                 check_chunk_at(file, part.offset)
                 file.seek(part.offset)
-                _opcode, length = _START.unpack(file.read(_START.size))
+                _opcode, length = RECORD_START.unpack(file.read(RECORD_START.size))
                 chunk = Chunk.read(ReadDataStream(io.BytesIO(file.read(length))))
                 data = _unpacked(chunk.data) if chunk.compression else chunk.data
             except UNREADABLE:
@@ -161,15 +168,15 @@ def _walk(file: BoundedFile, found: Scan) -> list[int]:
     at = len(MCAP0_MAGIC)
     while True:
         file.seek(at)
-        start = file.read(_START.size)
-        if len(start) < _START.size:
+        start = file.read(RECORD_START.size)
+        if len(start) < RECORD_START.size:
             found.damage.append(f"ends at byte {file.size} without an index")
             return offsets
-        opcode, length = _START.unpack(start)
+        opcode, length = RECORD_START.unpack(start)
         if not Opcode.HEADER <= opcode <= Opcode.DATA_END:
             found.damage.append(f"no record can be read at byte {at}")
             return offsets
-        if at + _START.size + length > file.size:
+        if at + RECORD_START.size + length > file.size:
             found.damage.append(f"is cut short in the record at byte {at}")
             return offsets
         if opcode == Opcode.CHUNK:
@@ -178,7 +185,7 @@ def _walk(file: BoundedFile, found: Scan) -> list[int]:
             _message_index(file, found, offsets[-1])
         else:
             _record(file, found, opcode, at, length)
-        at += _START.size + length
+        at += RECORD_START.size + length
         if opcode == Opcode.DATA_END:
             found.complete = True
             return offsets
@@ -195,9 +202,9 @@ def _message_index(file: BoundedFile, found: Scan, chunk: int) -> None:
 def _record_at(file: BoundedFile, found: Scan, offset: int) -> None:
     """Read a record that only the index lists."""
     file.seek(offset)
-    start = file.read(_START.size)
-    if len(start) == _START.size:
-        opcode, length = _START.unpack(start)
+    start = file.read(RECORD_START.size)
+    if len(start) == RECORD_START.size:
+        opcode, length = RECORD_START.unpack(start)
         _record(file, found, opcode, offset, length)
 
 
@@ -246,7 +253,7 @@ def _from_index(file: BoundedFile, found: Scan, known: set[int]) -> list[int]:
     for index in summary.chunk_indexes:
         if index.chunk_start_offset not in known:
             for offset in index.message_index_offsets.values():
-                file.seek(offset + _START.size)
+                file.seek(offset + RECORD_START.size)
                 _message_index(file, found, index.chunk_start_offset)
     missed = [index.chunk_start_offset for index in summary.chunk_indexes if index.chunk_start_offset not in known]
     for index in summary.metadata_indexes:
@@ -259,20 +266,8 @@ def _from_index(file: BoundedFile, found: Scan, known: set[int]) -> list[int]:
 
 def _chunk(file: BoundedFile, offset: int, found: Scan) -> Iterator[Record]:
     """Return all messages of one chunk, or raise one of `UNREADABLE`."""
-    check_chunk_at(file, offset)
-    file.seek(offset)
-    opcode, length = _START.unpack(file.read(_START.size))
-    if opcode != Opcode.CHUNK or length > MAX_RECORD_BYTES:
-        raise ValueError("no chunk")
-    chunk = Chunk.read(ReadDataStream(io.BytesIO(file.read(length))))
-    if chunk.uncompressed_crc == 0:
-        raise ValueError("no CRC")
-    records = breakup_chunk(chunk, validate_crc=True)
-    for record in records:
-        if isinstance(record, Schema):
-            found.schemas[record.id] = record
-        elif isinstance(record, Channel):
-            found.channels[record.id] = record
-    messages = [record for record in records if isinstance(record, Message)]
-    pairs = [(found.channels[message.channel_id], message) for message in messages]
+    contents = chunk_at(file, offset)
+    found.schemas.update({schema.id: schema for schema in contents.schemas})
+    found.channels.update({channel.id: channel for channel in contents.channels})
+    pairs = [(found.channels[message.channel_id], message) for message in contents.each()]
     return iter([(found.schemas[ch.schema_id] if ch.schema_id else None, ch, message) for ch, message in pairs])

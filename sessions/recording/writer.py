@@ -14,17 +14,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mcap.writer import Writer
-
 from sessions.disk import fsync_folder, sync
 from sessions.errors import SessionError, disk_error
 from sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE, file_sha256, note, start_mcap
+from sessions.recording.mcap_writer import McapWriter
 from sessions.recording.schemas import Event, Header, Recorded, Topic
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
 
 FLUSH_S = 0.25
+WAIT_S = 0.001
+"""Between two looks at a full queue."""
 QUEUE_LIMIT = 20_000
 """Queue size, about 200 s of poses: a full queue means that the disk does not keep up, which is an error."""
 
@@ -53,7 +54,8 @@ class SegmentWriter:
         self.final = final
         self._part = final.with_name(final.name + ".part")
         self._header = header
-        self._queue: queue.Queue[Outgoing | None] = queue.Queue(queue_limit)
+        self._queue: queue.SimpleQueue[Outgoing | None] = queue.SimpleQueue()
+        self._queue_limit = queue_limit
         self._begun = begun
         self._finished: dict[str, Any] | None = None
         self._error: Exception | None = None
@@ -74,10 +76,12 @@ class SegmentWriter:
     def write(self, outgoing: Outgoing, wait_s: float = 0.0) -> None:
         """Queue a message, waiting at most `wait_s`. Raises `SessionError` for a disk that failed or is too slow."""
         self._raise_error()
-        try:
-            self._queue.put(outgoing, block=wait_s > 0.0, timeout=wait_s or None)
-        except queue.Full:
-            raise SessionError(self._part, f"{self._queue.maxsize} messages wait: the disk does not keep up") from None
+        deadline = time.monotonic() + wait_s
+        while self._queue.qsize() >= self._queue_limit:
+            if time.monotonic() >= deadline:
+                raise SessionError(self._part, f"{self._queue_limit} messages wait: the disk does not keep up")
+            time.sleep(WAIT_S)
+        self._queue.put(outgoing)
 
     def finish(self, finished: dict[str, Any] | None = None) -> Recorded:
         """Drain, finish, fsync, rename, fsync the folder. Raises `SessionError`; the part file then stays.
@@ -136,34 +140,42 @@ class SegmentWriter:
                 self._ended = True
                 break
             channels.add(outgoing)
-            self.counts[str(outgoing.topic)] += 1
             if time.monotonic() - flushed > FLUSH_S:
                 writer.flush()
                 flushed = time.monotonic()
+        writer.flush()
+        self.counts = writer.counts
         if self._finished is not None:
             writer.add_metadata(DONE_NOTE, note({**self._finished, "counts": dict(self.counts)}))
         writer.finish()
 
 
+def encoded(message: Event | Message) -> bytes:
+    """The message as it is recorded: an event as JSON, anything else as protobuf."""
+    if isinstance(message, Event):
+        return message.__pydantic_serializer__.to_json(message)  # `model_dump_json` decodes it
+    return message.SerializeToString()
+
+
 class ChannelTable:
     """Registers a channel at the first message on a topic, and flushes so that its schema is on disk."""
 
-    def __init__(self, writer: Writer) -> None:
+    def __init__(self, writer: McapWriter) -> None:
         self._writer = writer
         self._channels: dict[str, int] = {}
 
     def add(self, outgoing: Outgoing) -> None:
         """Encode and write one message."""
-        new = outgoing.topic not in self._channels
-        if new:
-            self._channels[outgoing.topic] = self._register(outgoing)
-        message = outgoing.message
+        number = self._channels.get(outgoing.topic)
+        new = number is None
+        if number is None:
+            number = self._channels[outgoing.topic] = self._register(outgoing)
         self._writer.add_message(
-            channel_id=self._channels[outgoing.topic],
+            channel_id=number,
             log_time=outgoing.log_ns,
             publish_time=outgoing.publish_ns,
             sequence=outgoing.sequence,
-            data=message.model_dump_json().encode() if isinstance(message, Event) else message.SerializeToString(),
+            data=encoded(outgoing.message),
         )
         if new or outgoing.topic == Topic.STROKE:  # ends the chunk, so that a damaged chunk costs one stroke
             self._writer.flush()

@@ -16,7 +16,7 @@ from sessions.errors import SessionDamaged, disk_error
 from sessions.journal.codec import Line
 from sessions.reader import parse_header
 from sessions.recording.container import Record
-from sessions.recording.mcap_file import HEADER_METADATA, count_messages, header_crc, write_mcap
+from sessions.recording.mcap_file import HEADER_METADATA, count_messages, header_crc, new_mcap
 from sessions.recording.messages import decode_still
 from sessions.recording.salvage import Scan, glimpsed, salvaged, scan
 from sessions.recording.schemas import Header, Stroke, Topic
@@ -35,7 +35,9 @@ def replace_damaged(
     fresh = path.with_name(path.name + ".repair")
     try:
         fresh.unlink(missing_ok=True)  # left by a killed repair: only a copy
-        write_mcap(fresh, header, notes, attachments, messages)
+        with new_mcap(fresh, header, notes, attachments) as copy:
+            for record in messages:
+                copy.add(*record)
         counts = count_messages(fresh)
         kept = set_aside(path, "damaged").name if path.exists() else ""
         fresh.replace(path)

@@ -13,7 +13,7 @@ from sessions.journal.codec import encode_line
 from sessions.journal.journal import JOURNAL_NAME
 from sessions.journal.lines import read_lines
 from sessions.reader import Recording
-from sessions.recording import mcap_file
+from sessions.recording import mcap_writer
 from sessions.repair import rewrite
 from sessions.repair.repair import repair_session
 from sessions.repair.verify import verify_session
@@ -210,7 +210,7 @@ def test_a_closed_session_whose_steps_are_damaged_still_has_it_all(make, closed,
 
 
 def test_where_steps_and_merged_file_are_damaged_the_better_one_is_taken(make, store, repair, monkeypatch):
-    monkeypatch.setattr(mcap_file, "CHUNK_BYTES", 256)
+    monkeypatch.setattr(mcap_writer, "CHUNK_BYTES", 256)
     make.collect(store)
     final, closed = store.close(), store.folder
     store.release()
@@ -226,7 +226,7 @@ def test_where_steps_and_merged_file_are_damaged_the_better_one_is_taken(make, s
 
 
 def test_an_import_keeps_every_stroke_whose_photograph_is_whole(make, photos, out, run, repair, monkeypatch):
-    monkeypatch.setattr(mcap_file, "CHUNK_BYTES", 256)
+    monkeypatch.setattr(mcap_writer, "CHUNK_BYTES", 256)
     rows = [{"file": f"{n}.png", "px_per_mm": "10", "height_mm": "13", "tilt_deg": "5"} for n in range(5)]
     make.photographs(photos, *rows)
     final = run()

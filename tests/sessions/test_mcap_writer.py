@@ -1,0 +1,96 @@
+"""Our writer of MCAP files beside the mcap library's: the same records in the same order."""
+
+import io
+from dataclasses import asdict
+
+import pytest
+from mcap.reader import make_reader
+from mcap.records import Chunk, ChunkIndex
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.writer import CompressionType, Writer
+
+from sessions.recording.container import chunks, messages
+from sessions.recording.mcap_writer import CHUNK_BYTES, McapWriter
+
+PLACES = {"chunk_length", "chunk_start_offset", "compressed_size", "message_index_offsets"}
+"""What depends on how well a chunk was compressed; the library compresses at another level."""
+
+
+def theirs(file):
+    writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+    writer.start(profile="", library="test")
+    return writer, lambda name, media_type, data: writer.add_attachment(0, 0, name, media_type, data)
+
+
+def ours(file):
+    writer = McapWriter(file, "test")
+    return writer, writer.add_attachment
+
+
+def written(begin):
+    """A file with two topics, large and small messages, a clock that goes back, and whatever else a file may hold."""
+    file = io.BytesIO()
+    writer, attach = begin(file)
+    writer.add_metadata("note", {"a": "1"})
+    attach("rig.toml", "application/toml", b"x = 1")
+    json = writer.register_schema(name="Thing", encoding="jsonschema", data=b"{}")
+    things = writer.register_channel(topic="/things", message_encoding="json", schema_id=json)
+    bare = writer.register_channel(topic="/bare", message_encoding="", schema_id=0)
+    for number in range(500):
+        writer.add_message(channel_id=things, log_time=number, publish_time=number + 1, sequence=number, data=b"{}")
+    writer.flush()
+    writer.flush()  # nothing waits: no chunk is written
+    for number, size in enumerate((0, CHUNK_BYTES, 10)):
+        writer.add_message(channel_id=bare, log_time=100 - number, publish_time=0, sequence=2**32 - 1, data=bytes(size))
+    writer.add_metadata("done", {})
+    writer.finish()
+    file.seek(0)
+    return file
+
+
+def records(file):
+    for record in StreamReader(file, emit_chunks=True, validate_crcs=True).records:
+        values = asdict(record)
+        if isinstance(record, Chunk):
+            stream, size = get_chunk_data_stream(record, validate_crc=True)
+            values["data"] = stream.read(size)
+        if isinstance(record, ChunkIndex):
+            values = {name: value for name, value in values.items() if name not in PLACES}
+        if "offset" in values or "group_start" in values or "summary_start" in values:
+            continue  # places in the file again; the reader below finds everything by them
+        yield type(record).__name__, values
+
+
+def test_the_same_calls_write_the_same_records_as_the_mcap_library():
+    assert list(records(written(ours))) == list(records(written(theirs)))
+
+
+@pytest.mark.parametrize("topic", ["/things", "/bare"])
+def test_the_mcap_library_finds_by_our_index_what_it_finds_by_its_own(topic):
+    def found(file):
+        reader = make_reader(file, validate_crcs=True)
+        assert [(a.name, a.data) for a in reader.iter_attachments()] == [("rig.toml", b"x = 1")]
+        assert [m.name for m in reader.iter_metadata()] == ["note", "done"]
+        return [asdict(message) for _, _, message in reader.iter_messages([topic])]
+
+    assert found(written(ours)) == found(written(theirs))
+
+
+def test_chunks_of_another_file_are_copied_under_the_numbers_of_their_new_channels(tmp_path):
+    source, copy = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+    source.write_bytes(written(theirs).getvalue())
+    with copy.open("xb") as file:
+        writer = McapWriter(file, "test")
+        for topic in ("/other", "/bare", "/things"):
+            writer.register_channel(topic=topic, message_encoding="json", schema_id=0)
+        for contents, _summary in chunks(source):
+            writer.add_contents(contents, {1: 3, 2: 2})
+        writer.finish()
+
+    def told(path):
+        return [(c.topic, m.sequence, m.log_time, m.publish_time, m.data) for _, c, m in messages(path)]
+
+    assert told(copy) == told(source)
+    with copy.open("rb") as file:
+        by_index = [m.log_time for _, _, m in make_reader(file, validate_crcs=True).iter_messages(["/bare"])]
+    assert by_index == [98, 99, 100]
