@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
@@ -54,9 +55,10 @@ class Export:
     @classmethod
     def of(cls, recording: Recording) -> Export:
         """Prepare the export of a recording. Raises `SessionDamaged` where a stroke appears twice."""
-        waits = {one.stroke_id: one.dip_to_touch_s for one in recording.stroke_records()}
+        strokes = list(recording.stroke_records())
+        waits = {one.stroke_id: one.dip_to_touch_s for one in strokes}
         odd = frozenset(unlike({name: wait for name, wait in waits.items() if wait is not None}))
-        return cls(recording, _file_names(recording), odd)
+        return cls(recording, _file_names(recording.path, strokes), odd)
 
     def captures(self) -> Iterator[tuple[Row, Capture]]:
         """Strokes as rows of plain values, None where a value is not recorded, with their photographs."""
@@ -132,12 +134,12 @@ def _pair(stem: str, unit: str, values: tuple[float, float] | None) -> Row:
     return {f"{stem}_x{end}": first, f"{stem}_y{end}": second}
 
 
-def _file_names(recording: Recording) -> dict[str, str]:
+def _file_names(path: Path, strokes: list[Stroke]) -> dict[str, str]:
     """Readable, safe and distinct file names, whatever the strokes are called."""
     names: dict[str, str] = {}
-    for number, stroke in enumerate(recording.stroke_records()):
+    for number, stroke in enumerate(strokes):
         if stroke.stroke_id in names:
-            raise SessionDamaged(recording.path, f"holds stroke {stroke.stroke_id} twice")
+            raise SessionDamaged(path, f"holds stroke {stroke.stroke_id} twice")
         safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stroke.stroke_id)[:80]
         names[stroke.stroke_id] = f"{number:04d}-{safe}"
     return names
