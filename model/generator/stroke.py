@@ -48,7 +48,7 @@ class GeneratorModel:
         inputs = self._inputs(values)
         with torch.no_grad():
             drawn = self.network(inputs)
-        origin = self.target.origin_mm(inputs, self.target.shape(inputs))
+        origin = self.target.origin_mm(inputs)
         return traced(drawn, origin, self.target.px_mm)
 
     def of_press(self, height_mm: Number, tilt_deg: Number) -> Values:

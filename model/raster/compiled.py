@@ -7,6 +7,7 @@ numba caches the machine code next to the source or in its cache folder.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -36,7 +37,7 @@ def coverage_numpy(
 
     float32 unless `out` is given: a C-contiguous float32 or float64 array of that shape, which is filled and
     returned. `threads` defaults to the number of cores for large batches and 1 for small ones. The error stays below
-    1e-6. Raises ValueError for an invalid size, shape or `out`.
+    1e-6. Raises ValueError for an invalid size, shape or `out`, and for a shape that is not finite.
     """
     from model.raster.kernel import rasterise  # numba takes a fifth of a second to import
 
@@ -49,16 +50,20 @@ def coverage_numpy(
         out = np.empty(wanted, np.float32)
     if out.shape != wanted or out.dtype.char not in "fd" or not out.flags.c_contiguous:
         raise ValueError(f"out is {out.dtype} {out.shape}, expected C-contiguous float32 or float64 {wanted}")
-    count = min(threads or os.cpu_count() or 1, max(1, len(out) // _PER_THREAD))
-    if count == 1:
-        rasterise(points, weights, maps, out)
-        return out
-    parts = [slice(k * len(out) // count, (k + 1) * len(out) // count) for k in range(count)]
-    # The loops release the interpreter's lock, so plain threads run in parallel.
-    with ThreadPoolExecutor(count) as pool:
-        for done in [pool.submit(rasterise, points[at], weights[at], maps[at], out[at]) for at in parts]:
-            done.result()
+    in_parts(lambda at: rasterise(points[at], weights[at], maps[at], out[at]), len(out), threads)
     return out
+
+
+def in_parts(work: Callable[[slice], None], count: int, threads: int | None) -> None:
+    """Do the work on all of `count` images, an equal share on each thread where there are enough."""
+    parts = min(threads or os.cpu_count() or 1, max(1, count // _PER_THREAD))
+    if parts == 1:
+        work(slice(0, count))
+        return
+    # The loops release the interpreter's lock, so plain threads run in parallel.
+    with ThreadPoolExecutor(parts) as pool:
+        for done in [pool.submit(work, slice(k * count // parts, (k + 1) * count // parts)) for k in range(parts)]:
+            done.result()
 
 
 def _array(tensor: Tensor) -> NDArray[np.float64]:

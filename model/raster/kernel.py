@@ -37,14 +37,13 @@ def rasterise(points, weights, placed, out):
     # Steps of each row, from the cell left of the image on; crossings with row and column edges, the latter one later;
     # and the first and last cell that pieces pass in each row, on their way down and up.
     steps, crossings = np.zeros((size, size + 8)), np.empty((2, size + 3))
-    drawn = _rasterise(points, weights, placed, out, steps, crossings, np.empty((size, 4), np.int64))
-    if drawn < len(out):
-        raise ValueError(f"shape {drawn} is not finite, or lies more than {FURTHEST:g} pixels away")
+    if not _rasterise(points, weights, placed, out, steps, crossings, np.empty((size, 4), np.int64)):
+        raise ValueError(f"a shape is not finite, or lies more than {FURTHEST:g} pixels away")
 
 
 @numba.njit(**OPTIONS, cache=True)
 def _rasterise(points, weights, placed, out, steps, crossings, spans):
-    """Draw one image after another; return how many could be drawn."""
+    """Draw one image after another; false for a shape that cannot be drawn."""
     size = out.shape[1]
     for n in range(out.shape[0]):
         for i in range(size):
@@ -57,7 +56,7 @@ def _rasterise(points, weights, placed, out, steps, crossings, spans):
             x1, y1 = p[0] * q[1, 0] + p[1] * q[1, 1] + p[2], p[3] * q[1, 0] + p[4] * q[1, 1] + p[5]
             x2, y2 = p[0] * q[2, 0] + p[1] * q[2, 1] + p[2], p[3] * q[2, 0] + p[4] * q[2, 1] + p[5]
             if not abs(x0) + abs(y0) + abs(x1) + abs(y1) + abs(x2) + abs(y2) < FURTHEST:
-                return n
+                return False
             if w == 1.0:
                 _parabola(x0, y0, x1, y1, x2, y2, steps, crossings, spans)
             elif w >= 0.5:
@@ -73,7 +72,7 @@ def _rasterise(points, weights, placed, out, steps, crossings, spans):
                 _ellipse(x0, y0, xa, ya, xm, ym, half, steps, crossings, spans)
                 _ellipse(xm, ym, xb, yb, x2, y2, half, steps, crossings, spans)
         _fill(out, n, steps, spans)
-    return out.shape[0]
+    return True
 
 
 @compiled

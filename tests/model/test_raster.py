@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import quad
 
-from model.ccdbsm import Brush, CcdBsm, ccdbsm
+from model.ccdbsm import Brush, CcdBsm, DomainError, ccdbsm
 from model.coverage import centred_origin, coverage
 from model.outline import cross, loop
+from model.press_images import press_images
 from model.raster.compiled import coverage_numpy
 from model.raster.exact import coverage_at
 from model.registry import stroke_models
@@ -132,6 +133,47 @@ def test_arcs_of_any_span_and_shear_come_out_right(weight: float) -> None:
     assert abs(image - coverage_at(shape, (0.0, 25.6)).numpy()).max() < 1e-6
 
 
+@pytest.mark.parametrize(("size_px", "px_mm"), [(128, 0.2), (64, 0.05), (200, 0.1), (1, 30.0)])
+@pytest.mark.parametrize("grid", ["nowhere", "on corners", "beside corners"])
+def test_images_straight_from_presses_match_the_closed_form(size_px: int, px_mm: float, grid: str) -> None:
+    # Marks that end on pixel edges, lie on row edges and in the middle of rows, and reach beyond the image or miss it.
+    rng = np.random.default_rng(size_px)
+    tilt_deg = rng.uniform(0, 60, 150)
+    height_mm = np.minimum(rng.uniform(0.01, 40, 150), 47 * np.cos(np.radians(tilt_deg)))
+    mark = ccdbsm(Brush(), torch.from_numpy(height_mm), torch.from_numpy(tilt_deg))
+    side_mm = size_px * px_mm
+    origin = rng.uniform(-0.6 * side_mm - 10, 1.6 * side_mm + 10, (150, 2))
+    if grid != "nowhere":
+        origin = np.round(2 * origin / px_mm) / 2 * px_mm
+        origin[:, 0] = np.round(origin[:, 0] / px_mm) * px_mm - rng.choice([0.0, 1.0], 150) * mark.o3a_mm.numpy()
+    if grid == "beside corners":
+        origin += rng.choice([1e-6, -1e-7, 1e-12], (150, 2))
+    level = coverage(mark, torch.from_numpy(origin), size_px=size_px, px_mm=px_mm).numpy()
+    dirty = np.full(level.shape, 7, np.float32)
+    images = press_images(Brush(), height_mm, tilt_deg, origin_mm=origin, size_px=size_px, px_mm=px_mm, out=dirty)
+    assert abs(images - level).max() < 1e-6
+    assert images.min() >= 0
+    assert images.max() <= 1
+
+
+def test_presses_of_many_brushes_are_centred_and_checked() -> None:
+    radius_mm, lam = torch.tensor([5.0, 6.0, 7.0], **DOUBLE), np.array([1.0, 2.0, 3.0])
+    mark = ccdbsm(Brush(radius_mm, 44.0), 15.0, 7.0, torch.from_numpy(lam))
+    expected = coverage(mark, centred_origin(mark)).numpy()
+    np.testing.assert_allclose(press_images(Brush(radius_mm, 44.0), 15.0, 7.0, lam), expected, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(*(press_images(Brush(), np.full(130, 15.0), 7.0, threads=n) for n in (1, 2)))
+    with pytest.raises(DomainError, match=r"tilt_deg = -1 is outside \[0, 82.875\) deg"):
+        press_images(Brush(), np.array([15.0, 15.0]), np.array([7.0, -1.0]))
+    with pytest.raises(DomainError, match=r"height_mm = nan is outside \(0, 47.6"):
+        press_images(Brush(), math.nan, 7.0)
+    with pytest.raises(ValueError, match="a shape is not finite"):
+        press_images(Brush(), np.full(2, 15.0), 7.0, origin_mm=np.array([[1.0, 1.0], [math.nan, 1.0]]))
+    with pytest.raises(ValueError, match=r"origin_mm has shape \(2, 2\)"):
+        press_images(Brush(), 15.0, 7.0, origin_mm=np.ones((2, 2)))
+    with pytest.raises(ValueError, match="out is float64"):
+        press_images(Brush(), 15.0, 7.0, out=np.empty((1, 128, 128)))  # pyright: ignore[reportArgumentType]
+
+
 @given(presses, st.floats(-180, 180), st.sampled_from(sorted(MODELS)))
 @settings(deadline=None, max_examples=40)
 def test_the_ink_of_a_whole_mark_is_its_area(press: tuple[float, float], heading_deg: float, name: str) -> None:
@@ -228,5 +270,5 @@ def test_what_makes_no_image_is_refused() -> None:
     with pytest.raises(ValueError, match=r"out is int64 \(3, 128, 128\)"):
         coverage_numpy(mark, (1.0, 1.0), out=np.zeros((3, 128, 128), np.int64))
     for nowhere in (math.nan, math.inf, 1e30):
-        with pytest.raises(ValueError, match="shape 0 is not finite, or lies more than 1e"):
+        with pytest.raises(ValueError, match="a shape is not finite, or lies more than 1e"):
             coverage_numpy(mark, (nowhere, 1.0))
