@@ -1,4 +1,4 @@
-"""The commands of `brushloop rig`: look at a rig.toml and check it.
+"""The commands of `brushloop rig`: teach a rig, look at its rig.toml and check it.
 
 Imports wait until a command runs, so that `--help` loads nothing heavy.
 """
@@ -19,6 +19,48 @@ app = typer.Typer(
 )
 RigFile = Annotated[Path, typer.Argument(help="The rig: addresses, frames, limits.")]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object instead of text.")]
+
+
+Plain = Annotated[bool, typer.Option("--plain", help="Questions in the terminal line by line, no screen.")]
+Arm = Annotated[bool, typer.Option("--arm", help="Let the arm move where a step needs it; each time a key asks again.")]
+
+
+@app.command()
+def new(
+    rig: Annotated[Path, typer.Argument(help="The rig.toml to make; what is taught is kept beside it.")] = Path(
+        "rig.toml"
+    ),
+    plain: Plain = False,
+    arm: Arm = False,
+) -> None:
+    """Lead through the first day: from an unboxed arm to a rig.toml. Run it again to go on where it was left."""
+    _teach(rig, None, plain=plain, arm=arm)
+
+
+@app.command()
+def teach(
+    step: Annotated[str, typer.Argument(help="arm, camera, tip, sheet, places, brush, force, limits or proof.")],
+    rig: Annotated[Path, typer.Option(help="The rig.toml that was made; what was taught lies beside it.")] = Path(
+        "rig.toml"
+    ),
+    plain: Plain = False,
+    arm: Arm = False,
+) -> None:
+    """Teach one step again. Only its own values change, and what rests on them, which is listed."""
+    _teach(rig, step, plain=plain, arm=arm)
+
+
+def _teach(rig: Path, step: str | None, *, plain: bool, arm: bool) -> None:
+    import asyncio
+
+    from collect.teach.day import Day
+    from collect.teach.plain import PlainGuide
+    from collect.teach.wizard import Wizard
+    from drivers.clock import HostClock
+
+    day = Day(PlainGuide(rig.with_name(f"{rig.stem}.pictures")), rig, HostClock(), armed=arm)
+    wizard = Wizard(day)
+    asyncio.run(wizard.run() if step is None else wizard.again(step))
 
 
 @app.command()

@@ -27,6 +27,8 @@ TRIALS = 500
 OUTLIER_MEDIANS = 5.0
 LEAST_OUTLIER_MM = 0.3
 """Marks that lie closer than this to the predicted place are never outliers."""
+MIXED_UP_MM, EXPLAINED = 3.0, 0.2
+"""A misfit is taken for mixed names only above this, and if they explain all but this share of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +96,8 @@ def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats, model: Mod
         raise CalibrationError(where, f"at least {least} are needed")
     if np.ptp(robot_mm, axis=0).max() < 1.0:
         raise CalibrationError(where, "lie within 1 mm: touch the paper at places far apart")
+    if model == "rigid" and (problem := mixed_up(names, robot_mm, seen_mm)):
+        raise CalibrationError(where, problem)
     kept = _agreeing(robot_mm, seen_mm, model)
     if kept.sum() < max(least, (len(names) + 1) // 2):
         raise CalibrationError(where, f"only {kept.sum()} agree: are their names mixed up?")
@@ -116,6 +120,38 @@ def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats, model: Mod
         _rms(residuals[kept]),
         left_out,
     )
+
+
+def mixed_up(names: Sequence[str], robot_mm: Floats, seen_mm: Floats) -> str:
+    """What explains that points do not fit: a mirror, or two names that were exchanged; empty if they fit, or nothing
+    explains it.
+
+    `robot_mm` and `seen_mm` are (n, 2). An explanation counts if it leaves a fifth of the largest misfit or less.
+    """
+    as_named = _worst(robot_mm, seen_mm)
+    if as_named <= MIXED_UP_MM:
+        return ""
+    enough_mm = max(LEAST_OUTLIER_MM, EXPLAINED * as_named)
+    if _worst(robot_mm * [1.0, -1.0], seen_mm) <= enough_mm:
+        return (
+            f"fit only as in a mirror (off by {as_named:.1f} mm otherwise): were they named from the other side, or is "
+            "the photograph mirrored?"
+        )
+    found = list[tuple[float, str]]()
+    for a, b in itertools.combinations(range(len(names)), 2):
+        exchanged = robot_mm.copy()
+        exchanged[[a, b]] = robot_mm[[b, a]]
+        found.append((_worst(exchanged, seen_mm), f"{names[a]} and {names[b]}"))
+    off_mm, pair = min(found)
+    if off_mm > enough_mm:
+        return ""
+    return f"fit only if {pair} are swapped (off by {as_named:.1f} mm otherwise): one was touched in the other's place"
+
+
+def _worst(robot_mm: Floats, seen_mm: Floats) -> float:
+    """Largest distance that a rigid fit leaves."""
+    off = seen_mm - _apply(_fit(robot_mm, seen_mm, "rigid"), robot_mm)
+    return float(np.linalg.norm(off, axis=1).max())
 
 
 def _agreeing(robot_mm: Floats, seen_mm: Floats, model: Model) -> NDArray[np.bool_]:

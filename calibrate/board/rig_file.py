@@ -77,7 +77,7 @@ class RigFile:
     def write(self, lines: PaperLines) -> Path:
         """Write these two values; returns the path of the old file. Raises `CalibrationError` and OSError."""
         made = self.with_paper(lines)
-        kept = _free(self.path)
+        kept = free_name(self.path)
         with kept.open("xb") as file:
             file.write(self.text.encode())
         write_whole(self.path.resolve(), made)
@@ -118,7 +118,7 @@ def _changed(tables: dict[str, Any], lines: PaperLines) -> dict[str, Any]:
     return tables | {"paper": cast("dict[str, Any]", tables["paper"]) | tomllib.loads(lines.toml)}
 
 
-def _free(path: Path) -> Path:
+def free_name(path: Path) -> Path:
     """An unused name beside the file."""
     number, kept = 1, path.with_name(f"{path.name}.bak")
     while kept.exists() or kept.is_symlink():

@@ -1,0 +1,130 @@
+"""What every step works with: the person, the notebook, and what it may do."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import AsyncGenerator, Generator
+from pathlib import Path
+from typing import Protocol
+
+from collect.errors import StepError
+from collect.operator import Choice
+from collect.teach.arm_reader import Address, ArmReader, reading
+from collect.teach.errors import CannotTeach
+from collect.teach.guide import Brought, Guide, Picture, Shown, Target, Tone, WentBack
+from collect.teach.store import Notebook, StepName, Taught, TaughtFile, Value, now_utc, touch_of
+from drivers.clock import Clock
+from drivers.samples import Pose
+
+ARM = Choice("a", "let it move: I look at the cell, my hand is at the emergency stop")
+STAY = Choice("x", "leave it where it is")
+YES, NO = Choice("y", "yes"), Choice("n", "no")
+
+
+class Day:
+    """One session with a person at one rig. Everything that is kept is on disk when the method returns."""
+
+    def __init__(self, guide: Guide, rig_path: Path, clock: Clock, *, armed: bool) -> None:
+        """`armed`: the command line allows motion; the person is asked again each time. Raises `ConfigError`."""
+        self.guide = guide
+        self.rig_path = rig_path
+        self.clock = clock
+        self.armed = armed
+        self._file = TaughtFile(rig_path)
+        self.notebook: Notebook = self._file.load()
+
+    def save(self, notebook: Notebook) -> None:
+        """Take this as what is known."""
+        self._file.save(notebook)
+        self.notebook = notebook
+
+    def keep(
+        self,
+        step: StepName,
+        field: str,
+        value: Value,
+        how: str,
+        *,
+        unit: str = "",
+        sigma: float | None = None,
+        known: str = "",
+    ) -> None:
+        """Note one value."""
+        taught = Taught(value=value, unit=unit, how=how, sigma=sigma, known=known, at=now_utc(), step=step)
+        self.save(self.notebook.with_values({field: taught}))
+
+    async def say(self, *lines: str, tone: Tone = "finding", picture: Picture | None = None) -> None:
+        """Show lines to the person."""
+        await self.guide.show(Shown(lines, picture, tone))
+
+    async def yes(self, question: str, *, default: bool) -> bool:
+        """Ask for yes or no."""
+        return await self.guide.choose(question, (YES, NO), "y" if default else "n") == "y"
+
+    async def may_move(self, what: str) -> None:
+        """Ask for the key that lets the arm move. Raises `CannotTeach` unless both it and `--arm` are given."""
+        if not self.armed:
+            raise CannotTeach(f"{what}: this moves the arm.", "Start the same command again with --arm.")
+        question = f"{what}. The arm moves by itself, slower than 50 mm/s. Is nobody within its reach?"
+        if await self.guide.choose(question, (ARM, STAY), STAY.key) != ARM.key:
+            raise WentBack
+
+    @contextlib.asynccontextmanager
+    async def arm(self) -> AsyncGenerator[ArmReader]:
+        """The arm that was found, to be read only."""
+        address = Address(str(self.notebook.get("robot.host")), int(self.notebook.number("robot.port")))
+        framing = "bare" if self.notebook.get("robot.framing") == "bare" else "sof"
+        async with reading(address, framing) as reader:
+            yield reader
+
+    @contextlib.contextmanager
+    def touched_again_if_refused(self, *kinds: str) -> Generator[None]:
+        """Forget what was touched of these kinds where it turns out to contradict itself: it is asked for again."""
+        try:
+            yield
+        except (CannotTeach, StepError):
+            self.save(self.notebook.without_touches(*kinds))
+            raise
+
+    async def touch(self, reader: ArmReader, target: Target, how: str, name: str) -> Pose | None:
+        """Have the tip brought to a thing, and note where the flange is then; None if the person skips it.
+
+        A thing that was touched before is not asked for again. Raises `WentBack`.
+        """
+        if name in self.notebook.touches:
+            return self.notebook.touches[name].pose()
+        match await self.guide.bring(target, how):
+            case Brought.BACK:
+                raise WentBack
+            case Brought.SKIP:
+                return None
+            case Brought.DONE:
+                flange = await reader.flange()
+                self.save(self.notebook.with_touch(name, touch_of(flange)))
+                return flange
+
+
+class Step(Protocol):
+    """One step of the first day."""
+
+    name: StepName
+    title: str
+    minutes: int
+    needs: tuple[StepName, ...]
+    """Steps whose values this one rests on."""
+
+    async def teach(self, day: Day) -> None:
+        """Ask, measure and keep. Raises `WentBack`, `LeftOff`, `CannotTeach` and what the devices raise."""
+        ...
+
+    def derived(self, notebook: Notebook) -> dict[str, Taught]:
+        """What follows from the notebook alone: computed again whenever something that it rests on has changed."""
+        ...
+
+    def forget(self, notebook: Notebook) -> Notebook:
+        """The notebook without what this step observed, for teaching it anew."""
+        ...
+
+    def summary(self, notebook: Notebook) -> str:
+        """What was taught, in a few words."""
+        ...

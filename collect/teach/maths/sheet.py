@@ -1,0 +1,193 @@
+"""Where the sheet and the board lie, from their touched corners; and which corners were taken for one another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from calibrate.board.register import mixed_up
+from calibrate.board.spec import BoardSpec, size_mm
+from collect.rig.paper import PlaneFit, fit_plane
+from collect.teach.errors import CannotTeach
+
+Floats = NDArray[np.float64]
+Point = tuple[float, float, float]
+CORNERS = ("lower left", "lower right", "upper right", "upper left")
+HAND_MM = 0.15
+"""No hand touches better, in one axis."""
+WORST_CORNER_MM = 3.0
+"""A corner that lies farther off than this was not just touched badly."""
+WORST_SCALE = 0.004
+"""Relative error of the board's size from which the print is doubted: 1 mm over a page."""
+ASKEW_DEG = 0.5
+"""A sheet turned by more against its board is to be laid straight: `rig.toml` knows one turn for both."""
+
+
+@dataclass(frozen=True, slots=True)
+class SheetFit:
+    """The sheet in the base frame, and the board on which it lies in the sheet's frame."""
+
+    origin_mm: tuple[float, float]
+    yaw_deg: float
+    size_mm: tuple[float, float]
+    board_origin_mm: tuple[float, float]
+    plane: PlaneFit
+    """Through all touched corners."""
+    residuals_mm: dict[str, float]
+    """Of each touch, along the sheet."""
+    origin_sigma_mm: float
+    """Standard error of the origin in each axis, at worst."""
+    yaw_sigma_deg: float
+    height_sigma_mm: float
+    """Standard error of the plane's height in the middle of the sheet."""
+    scale: float
+    """Touched over printed size of the board."""
+
+
+def corners_of(width_mm: float, height_mm: float) -> Floats:
+    """(4, 2) corners of a rectangle in the order of `CORNERS`, from its lower left one."""
+    return np.array([[0.0, 0.0], [width_mm, 0.0], [width_mm, height_mm], [0.0, height_mm]])
+
+
+def check_board(board: Mapping[str, Sequence[Point]], spec: BoardSpec) -> None:
+    """Raise `CannotTeach` where the touched corners of the board do not form the printed one, and say why.
+
+    Names swapped or given as in a mirror, a print of another size, or one corner that was touched badly.
+    """
+    printed = corners_of(*size_mm(spec))
+    touched = np.array([np.mean(board[name], axis=0)[:2] for name in CORNERS])
+    if problem := mixed_up(CORNERS, touched, printed):
+        raise CannotTeach(
+            f"the corners of the board {problem}.",
+            "The print's name stands along its lower edge; seen from above the corners follow counter-clockwise.",
+        )
+    scale = _scale(printed, touched)
+    distances = _distances(printed * scale, touched)
+    if max(distances) > WORST_CORNER_MM:
+        listed = ", ".join(f"{name} {off:.1f}" for name, off in zip(CORNERS, distances, strict=True))
+        width_mm, height_mm = size_mm(spec)
+        raise CannotTeach(
+            f"the corners of the board do not form its rectangle of {width_mm:g} x {height_mm:g} mm (off by, in mm: "
+            f"{listed}).",
+            "Touch the corner that is off again, or correct what was said of the print in the camera's step.",
+        )
+    if abs(scale - 1.0) > WORST_SCALE:
+        raise CannotTeach(
+            f"the board is {100.0 * scale:.1f} % of the size that its print gives: its squares measure "
+            f"{scale * spec.square_mm:.2f} mm, not {spec.square_mm:g} mm.",
+            "Print it again at 100 %, without `fit to page`, or measure ten squares with calipers and teach the camera "
+            "again with that size.",
+        )
+
+
+def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence[Point]], spec: BoardSpec) -> SheetFit:
+    """Least squares over all touches of four board corners and four sheet corners, by name; base frame, in mm.
+
+    The board gives most of the turn, the sheet's own corners its origin and its size. Raises `CannotTeach` for a sheet
+    that lies askew on its board or whose corners were named otherwise, and `StepError` where it leans too much.
+    """
+    printed = corners_of(*size_mm(spec))
+    on_board = [(CORNERS.index(name), point) for name, points in board.items() for point in points]
+    on_sheet = [(CORNERS.index(name), point) for name, points in sheet.items() for point in points]
+    b, bk = np.array([p[:2] for _, p in on_board]), [k for k, _ in on_board]
+    s, sk = np.array([p[:2] for _, p in on_sheet]), [k for k, _ in on_sheet]
+    _check_askew(b, bk, s, sk, printed)
+
+    def off(values: Floats) -> Floats:
+        yaw, bx, by, sx, sy, width, height = values
+        turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+        board_at = printed[bk] @ turn.T + [bx, by]
+        sheet_at = (corners_of(width, height)[sk] + [sx, sy]) @ turn.T + [bx, by]
+        return np.concatenate([(b - board_at).ravel(), (s - sheet_at).ravel()])
+
+    yaw0 = _turn(printed[bk], b)
+    turn0 = np.array([[math.cos(yaw0), -math.sin(yaw0)], [math.sin(yaw0), math.cos(yaw0)]])
+    at0 = b.mean(axis=0) - turn0 @ printed[bk].mean(axis=0)
+    local = (s - at0) @ turn0
+    left, low = local.min(axis=0)
+    right, high = local.max(axis=0)
+    solved = least_squares(off, np.array([yaw0, *at0, left, low, right - left, high - low]))
+    yaw, bx, by, sx, sy, width, height = (float(v) for v in solved.x)
+    residuals = np.asarray(solved.fun, np.float64).reshape(-1, 2)
+    freedom = max(residuals.size - 7, 1)
+    noise_mm = max(math.sqrt(float((residuals**2).sum()) / freedom), HAND_MM)
+    slopes = np.asarray(solved.jac, np.float64)
+    spread = noise_mm**2 * np.asarray(np.linalg.inv(slopes.T @ slopes), np.float64)
+    turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+    origin = turn @ np.array([sx, sy]) + [bx, by]
+    by_values = _origin_slopes(yaw, sx, sy)
+    origin_spread = by_values @ spread @ by_values.T
+    points = [p for _, p in (*on_board, *on_sheet)]
+    level = [(*((np.array(p[:2]) - origin) @ turn).tolist(), p[2]) for p in points]
+    plane = fit_plane([(float(x), float(y), float(z)) for x, y, z in level])
+    names = [f"board {CORNERS[k]}" for k in bk] + [f"sheet {CORNERS[k]}" for k in sk]
+    lengths = [float(v) for v in np.linalg.norm(residuals, axis=1)]
+    height_mm = max(math.sqrt(sum(r * r for r in plane.residuals_mm) / max(len(points) - 3, 1)), HAND_MM)
+    return SheetFit(
+        (float(origin[0]), float(origin[1])),
+        math.degrees(math.remainder(yaw, math.tau)),
+        (width, height),
+        (-sx, -sy),
+        plane,
+        {f"{name} {number}": length for number, (name, length) in enumerate(zip(names, lengths, strict=True), 1)},
+        math.sqrt(float(np.diag(origin_spread).max())),
+        math.degrees(math.sqrt(float(spread[0, 0]))),
+        height_mm / math.sqrt(len(points)),
+        _scale(printed[bk], b),
+    )
+
+
+def _origin_slopes(yaw: float, sx: float, sy: float) -> Floats:
+    """(2, 7) change of the sheet's origin with yaw, bx, by, sx, sy, width, height."""
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    return np.array(
+        [
+            [-sin * sx - cos * sy, 1.0, 0.0, cos, -sin, 0.0, 0.0],
+            [cos * sx - sin * sy, 0.0, 1.0, sin, cos, 0.0, 0.0],
+        ]
+    )
+
+
+def _check_askew(b: Floats, bk: list[int], s: Floats, sk: list[int], printed: Floats) -> None:
+    mean = [s[[k for k, one in enumerate(sk) if one == corner]].mean(axis=0) for corner in range(4)]
+    along = (mean[1] - mean[0]) + (mean[2] - mean[3])
+    up = (mean[3] - mean[0]) + (mean[2] - mean[1])
+    if along[0] * up[1] - along[1] * up[0] <= 0.0:
+        raise CannotTeach(
+            "the corners of the sheet were named as in a mirror.", "Seen from above they follow counter-clockwise."
+        )
+    own = math.atan2(along[1] - up[0], along[0] + up[1])
+    askew = math.degrees(math.remainder(own - _turn(printed[bk], b), math.tau))
+    if abs(abs(askew) - 180.0) < 30.0 or abs(abs(askew) - 90.0) < 30.0:
+        raise CannotTeach(
+            f"the corners of the sheet were named turned by {askew:.0f} deg against those of the board.",
+            "The lower left corner of both is the one beside the print's name.",
+        )
+    if abs(askew) > ASKEW_DEG:
+        raise CannotTeach(
+            f"the sheet lies turned by {askew:+.1f} deg on its board.", "Lay its edges along the squares; touch again."
+        )
+
+
+def _turn(printed: Floats, touched: Floats) -> float:
+    """Angle of the rigid fit, in rad."""
+    a, b = printed - printed.mean(axis=0), touched - touched.mean(axis=0)
+    return math.atan2(float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()), float((a * b).sum()))
+
+
+def _scale(printed: Floats, touched: Floats) -> float:
+    a, b = printed - printed.mean(axis=0), touched - touched.mean(axis=0)
+    dot, cross = float((a * b).sum()), float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
+    return math.hypot(dot, cross) / float((a**2).sum())
+
+
+def _distances(printed: Floats, touched: Floats) -> list[float]:
+    angle = _turn(printed, touched)
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    off = touched - touched.mean(axis=0) - (printed - printed.mean(axis=0)) @ turn.T
+    return [float(v) for v in np.linalg.norm(off, axis=1)]

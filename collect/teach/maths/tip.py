@@ -1,0 +1,132 @@
+"""The tip of the brush in the flange's frame, from flange poses at which it touched one and the same point."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.special import stdtrit
+
+from collect.teach.errors import CannotTeach
+from drivers.samples import Pose
+
+Floats = NDArray[np.float64]
+LEAST_TOUCHES = 4
+WORST_CONDITION = 60.0
+"""Above this the directions are so alike that errors of the touches appear many times larger in the length. A wrist
+that turns along with the lean makes all of them one: the same side of the flange is always up."""
+OUTLIER_SHARE = 4.0
+"""A touch whose residual exceeds the others' standard deviation by this factor is named as a slip."""
+LEAST_OUTLIER_MM = 1.0
+HAND_MM = 0.15
+"""No hand touches better, in one axis: a few touches that agree by chance do not prove otherwise."""
+
+
+@dataclass(frozen=True, slots=True)
+class TipFit:
+    """Where the tip is, and how well that is known."""
+
+    offset_mm: tuple[float, float, float]
+    """Flange to tip, along the flange's axes."""
+    pin_mm: tuple[float, float, float]
+    """The point that was touched, in the base frame."""
+    residuals_mm: tuple[float, ...]
+    """Distance of the tip from the point in each touch."""
+    sigma_mm: tuple[float, float, float]
+    """Standard error of each component of the offset."""
+    freedom: int
+    """Degrees of freedom of the noise's estimate."""
+    condition: float
+    """Ratio of the largest to the smallest singular value of the equations."""
+
+    @property
+    def error_mm(self) -> float:
+        """Root mean square of the distance by which the offset may be wrong."""
+        return math.hypot(*self.sigma_mm)
+
+    @property
+    def reach_mm(self) -> float:
+        """Half width of the 95 % interval of the worst component, by Student's t."""
+        return float(stdtrit(self.freedom, 0.975)) * max(self.sigma_mm)
+
+    def slip(self) -> int | None:
+        """Number of the touch that does not fit the others; None if all do."""
+        worst = int(np.argmax(self.residuals_mm))
+        others = [r for k, r in enumerate(self.residuals_mm) if k != worst]
+        typical_mm = math.sqrt(sum(r * r for r in others) / len(others))
+        limit_mm = max(LEAST_OUTLIER_MM, OUTLIER_SHARE * typical_mm)
+        return worst if self.residuals_mm[worst] > limit_mm and len(others) >= LEAST_TOUCHES else None
+
+
+def find_tip(flanges: Sequence[Pose]) -> TipFit:
+    """Solve R_i t + p_i = c for the offset t and the point c by least squares (pivot calibration, e.g. Yaniv 2015).
+
+    R_i and p_i are the poses of the flange. Raises `CannotTeach` for fewer than four touches, and for directions that
+    are too alike.
+    """
+    if len(flanges) < LEAST_TOUCHES:
+        raise CannotTeach(f"{len(flanges)} touches of the pin", f"do not give the tip: {LEAST_TOUCHES} are needed.")
+    turns = np.array([Rotation.from_quat(pose.quaternion).as_matrix() for pose in flanges])
+    places = np.array([pose.position_mm for pose in flanges])
+    equations = np.concatenate([np.concatenate([turn, -np.eye(3)], axis=1) for turn in turns])
+    _, sizes, _ = np.linalg.svd(equations, full_matrices=False)
+    condition = float(sizes[0] / max(sizes[-1], 1e-12))
+    if condition > WORST_CONDITION:
+        raise CannotTeach(
+            f"the touches of the pin are too alike (condition {condition:.0f}, limit {WORST_CONDITION:g}):",
+            "lean the brush by 30 deg or more to all four sides, and do not turn the wrist along with it.",
+        )
+    found = np.asarray(np.linalg.lstsq(equations, -places.ravel(), rcond=None)[0], np.float64)
+    off = (equations @ found + places.ravel()).reshape(-1, 3)
+    freedom = 3 * len(flanges) - 6
+    noise_mm = max(math.sqrt(float((off**2).sum()) / freedom), HAND_MM)
+    spread = noise_mm * np.sqrt(np.diag(np.linalg.inv(equations.T @ equations)))
+    return TipFit(
+        _triple(found[:3]),
+        _triple(found[3:]),
+        tuple(float(r) for r in np.linalg.norm(off, axis=1)),
+        _triple(spread[:3]),
+        freedom,
+        condition,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class AxisFit:
+    """How the brush leans against the flange, from poses in which a person held it upright."""
+
+    rotation_deg: tuple[float, float, float]
+    """As `robot.tcp_rotation_deg`: about x, then y, then z of the flange."""
+    lean_deg: float
+    sigma_deg: float
+    """Standard error of the lean in each direction."""
+
+
+def find_axis(flanges: Sequence[Pose]) -> AxisFit:
+    """The brush's direction in the flange's frame: the mean of where "down" was. At least three poses.
+
+    A person who holds a brush upright by eye errs by a degree to any side, which the mean takes out.
+    """
+    down = np.array([Rotation.from_quat(p.quaternion).inv().apply([0.0, 0.0, -1.0]) for p in flanges])
+    mean = np.asarray(down.mean(axis=0) / np.linalg.norm(down.mean(axis=0)), np.float64)
+    scatter = down - mean * (down @ mean)[:, None]
+    sigma = math.sqrt(float((scatter**2).sum()) / (2.0 * (len(down) - 1)) / len(down))
+    across = np.cross([0.0, 0.0, 1.0], mean)
+    lean = math.atan2(float(np.linalg.norm(across)), float(mean[2]))
+    axis = across / max(float(np.linalg.norm(across)), 1e-12)
+    rz, ry, rx = Rotation.from_rotvec(lean * axis).as_euler("ZYX", degrees=True)
+    return AxisFit((float(rx), float(ry), float(rz)), math.degrees(lean), math.degrees(sigma))
+
+
+def tip_of(flange: Pose, offset_mm: Sequence[float]) -> tuple[float, float, float]:
+    """Where the tip is while the flange is there, in the base frame."""
+    return _triple(np.array(flange.position_mm) + Rotation.from_quat(flange.quaternion).apply(offset_mm))
+
+
+def _triple(values: Floats) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in values)
+    return x, y, z

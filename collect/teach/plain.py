@@ -1,0 +1,142 @@
+"""The first day in a terminal, line by line: questions on the standard output, answers from the standard input."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from collect.operator import Choice
+from collect.teach.guide import Brought, JogStep, JogView, LeftOff, Shown, StepState, Target, WentBack
+from sessions.terminal import say
+
+BACK, SKIP, QUIT = "back", "skip", "quit"
+MARKS = {"open": "  ", "current": "->", "taught": "ok"}
+AXES = {"x", "y", "z"}
+
+
+def _read() -> str | None:
+    """One line from the standard input; None at its end."""
+    line = sys.stdin.readline()
+    return line.rstrip("\r\n") if line else None
+
+
+class PlainGuide:
+    """A person at a terminal. `back` leaves a step, `quit` or the end of the input leaves off."""
+
+    def __init__(self, pictures: Path, read: Callable[[], str | None] = _read) -> None:
+        """Pictures are written into the folder `pictures`, and named."""
+        self._pictures = pictures
+        self._read = read
+        self._shown = 0
+
+    async def overview(self, steps: tuple[StepState, ...]) -> None:
+        """Print one line per step."""
+        say("")
+        for number, step in enumerate(steps, start=1):
+            after = f": {step.summary}" if step.summary else f" (about {step.minutes} min)"
+            say(f"{MARKS[step.state]} {number}. {step.title}{after}")
+
+    async def show(self, what: Shown) -> None:
+        """Print the lines; write a picture into the folder and print its path."""
+        head = {"finding": "", "warning": "warning: ", "trouble": "TROUBLE: "}[what.tone]
+        for number, line in enumerate(what.lines):
+            say(f"  {head if number == 0 else ''}{line}")
+        if what.picture is not None:
+            say(f"  picture: {await asyncio.to_thread(self._save, what)}")
+
+    async def choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
+        """Print the choices and read a key."""
+        keys = {choice.key: choice for choice in choices}
+        say(question, *(f"  {c.key}: {c.label}{' (Enter)' if c.key == default else ''}" for c in choices))
+        while True:
+            answer = await self._line() or default
+            if answer in keys:
+                return answer
+            say(f"  {answer!r} is none of {', '.join(keys)}")
+
+    async def number(self, question: str, unit: str, low: float, high: float, default: float | None) -> float:
+        """Read a number in the range."""
+        ending = "" if default is None else f"; Enter: {default:g}"
+        say(f"{question} [{unit}, {low:g} to {high:g}{ending}]")
+        while True:
+            answer = await self._line()
+            if not answer and default is not None:
+                return default
+            try:
+                value = float(answer.replace(",", "."))
+            except ValueError:
+                say(f"  {answer!r} is not a number")
+                continue
+            if low <= value <= high:
+                return value
+            say(f"  {value:g} {unit} is outside {low:g} to {high:g} {unit}")
+
+    async def text(self, question: str, default: str) -> str:
+        """Read a line."""
+        say(f"{question}{f' [Enter: {default}]' if default else ''}")
+        return await self._line() or default
+
+    async def bring(self, target: Target, how: str) -> Brought:
+        """Print the request and wait for Enter."""
+        say(how, f"  Enter: it is there; {SKIP}; {BACK}")
+        while True:
+            match (await self._raw()).strip().lower():
+                case "":
+                    return Brought.DONE
+                case "skip":
+                    return Brought.SKIP
+                case "back":
+                    return Brought.BACK
+                case other:
+                    say(f"  {other!r} is none of Enter, {SKIP}, {BACK}")
+
+    async def jog(self, view: JogView) -> JogStep | Brought:
+        """Read a step such as `z -0.1`."""
+        moved = ", ".join(f"{v:+.2f}" for v in view.moved_mm)
+        if view.refused:
+            say(f"  {view.refused}")
+        steps = ", ".join(f"{s:g}" for s in view.steps_mm)
+        say(f"{view.question} Moved by ({moved}) mm.", f"  `z -0.1` (steps {steps} mm); Enter: it is there; {BACK}")
+        while True:
+            words = (await self._raw()).strip().lower().split()
+            match words:
+                case []:
+                    return Brought.DONE
+                case ["back"]:
+                    return Brought.BACK
+                case ["x" | "y" | "z" as axis, mm] if _is_step(mm, view.steps_mm):
+                    return JogStep(axis, float(mm))
+                case _:
+                    say(f"  {' '.join(words)!r} is no step such as `z -0.1`")
+
+    async def _line(self) -> str:
+        answer = (await self._raw()).strip()
+        if answer.lower() == BACK:
+            raise WentBack
+        return answer
+
+    async def _raw(self) -> str:
+        line = await asyncio.to_thread(self._read)
+        if line is None or line.strip().lower() == QUIT:
+            raise LeftOff
+        return line
+
+    def _save(self, what: Shown) -> Path:
+        import cv2
+
+        assert what.picture is not None
+        self._pictures.mkdir(parents=True, exist_ok=True)
+        self._shown += 1
+        path = self._pictures / f"{self._shown:02d}.png"
+        cv2.imwrite(str(path), what.picture)
+        return path
+
+
+def _is_step(text: str, steps_mm: tuple[float, ...]) -> bool:
+    try:
+        value = abs(float(text))
+    except ValueError:
+        return False
+    return any(abs(value - step) < 1e-9 for step in steps_mm)

@@ -1,0 +1,239 @@
+"""Step 2: the camera, the print of the board, and the lens by photographs of the board held in hand."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import itertools
+from collections.abc import Awaitable, Callable
+from importlib.metadata import version
+from pathlib import Path
+
+import cv2
+
+from calibrate.board.artefact import lens_file
+from calibrate.board.detect import BoardView, find_board
+from calibrate.board.intrinsics import GOOD_VIEWS, RMS_LIMIT_PX, Fitted, fit_lens
+from calibrate.board.spec import BoardSpec, describe
+from calibrate.errors import CalibrationError
+from calibrate.files import read_gray
+from collect.teach.cameras import Gray, devices, frame_rate_hz, locked_settings, opened, still, taught_camera
+from collect.teach.day import Day
+from collect.teach.errors import CannotTeach
+from collect.teach.guide import Brought, Target, WentBack
+from collect.teach.maths.coverage import coverage_picture, still_missing
+from collect.teach.steps.sheet import board_of
+from collect.teach.store import Notebook, StepName, Taught
+from drivers.errors import DeviceError
+
+Take = Callable[[], Awaitable[Gray]]
+ASIDE = ("aside.frame_rate_hz", "aside.lens_folder")
+MOST_VIEWS = 20
+HOLD = (
+    "flat in the middle of the picture",
+    "slanted to the left",
+    "slanted to the right",
+    "slanted away from the camera",
+    "slanted toward the camera",
+    "in the upper left of the picture",
+    "in the upper right of the picture",
+    "in the lower right of the picture",
+    "in the lower left of the picture",
+    "turned by a quarter and slanted",
+)
+MIRRORED = (
+    "Switch mirroring (`flip`) off in the camera's own set-up, or take the mirror out of its way; then try again."
+)
+OTHER_PRINT = (
+    "Count the squares of the print again, the outermost ones too, and measure one; then teach the camera again."
+)
+
+
+class CameraStep:
+    """Source, settings, frame rate, print of the board, lens."""
+
+    name: StepName = "camera"
+    title = "Find the camera, its settings and its lens"
+    minutes = 12
+    needs: tuple[StepName, ...] = ("arm",)
+
+    async def teach(self, day: Day) -> None:
+        """Ask for source and print, measure the rest. Raises `CannotTeach`, `DeviceError`, `CalibrationError`."""
+        if "camera.source" not in day.notebook.values:
+            await self._source(day)
+        if "board.dictionary" not in day.notebook.values:
+            await self._print(day)
+        async with taught_camera(day.notebook, day.clock) as camera:
+            if "aside.frame_rate_hz" not in day.notebook.values:
+                rate_hz = await frame_rate_hz(camera)
+                day.keep("camera", "aside.frame_rate_hz", rate_hz, "frames counted", unit="Hz")
+                await day.say(f"{rate_hz:.1f} frames per second; the delay is measured in the last step, by the arm.")
+            picture = await still(camera, day.clock)
+            await self._first_look(day, picture)
+            folder = self._folder(day)
+            fitted = await self._lens(day, folder, lambda: still(camera, day.clock))
+        if fitted is not None:
+            await self._keep_lens(day, folder, fitted)
+
+    def _folder(self, day: Day) -> Path:
+        """Where the photographs of the lens are, so that a session that was cut does not take them again."""
+        if "aside.lens_folder" not in day.notebook.values:
+            names = (f"{day.rig_path.stem}.lens-{number}" for number in itertools.count(1))
+            name = next(name for name in names if not (day.rig_path.parent / name).exists())
+            day.keep("camera", "aside.lens_folder", name, "photographs of the board held in hand")
+        folder = day.rig_path.parent / str(day.notebook.get("aside.lens_folder"))
+        folder.mkdir(exist_ok=True)
+        return folder
+
+    async def _source(self, day: Day) -> None:
+        found = devices()
+        question = "Address of the camera's stream, as http://192.0.2.8/stream.mjpg" + (
+            f", or a device of this computer: {', '.join(found)}" if found else ""
+        )
+        for source in found:
+            await self._picture(day, source)
+        source = await day.guide.text(question, found[0] if found else "")
+        if source not in found:
+            await self._picture(day, source)
+        settings = await locked_settings(source)
+        day.keep("camera", "camera.kind", "opencv", "the only kind")
+        for name, value in settings.items():
+            field = f"camera.locked.{name}"
+            whole = name in ("width", "height")
+            day.keep("camera", field, int(value) if whole else value, "chosen by the camera itself, locked, read back")
+        if not settings:
+            await day.say(
+                "The settings of a stream cannot be set from here: switch automatic exposure, white balance and focus "
+                "off in the camera's own set-up.",
+                tone="warning",
+            )
+        # Last, so that a session that is cut before begins again with the source.
+        day.keep("camera", "camera.source", source, "typed, and its picture was seen")
+
+    async def _picture(self, day: Day, source: str) -> None:
+        try:
+            async with opened(source, day.clock) as camera:
+                picture = await still(camera, day.clock)
+        except DeviceError as error:
+            if source in devices():
+                await day.say(f"device {source}: {error.what}", tone="warning")
+                return
+            raise
+        height, width = picture.shape
+        await day.say(f"{source}: {width} x {height} px", picture=picture)
+
+    async def _print(self, day: Day) -> None:
+        await day.say("The board: a print of `brushloop camera board`. Its name stands along its lower edge.")
+        across = await day.guide.number("Squares along its longer side, as printed", "squares", 3, 50, None)
+        along = await day.guide.number("Squares along its shorter side, as printed", "squares", 3, 50, None)
+        square_mm = await day.guide.number("Side of a square (ten of them by calipers)", "mm", 2.0, 100.0, None)
+        marker_mm = await day.guide.number("Side of a marker", "mm", 1.0, 100.0, 0.75 * square_mm)
+        dictionary = await day.guide.text("Markers of the print", "DICT_5X5_1000")
+        how = "typed from the board's print"
+        try:
+            BoardSpec(
+                squares=(int(across), int(along)),
+                square_mm=square_mm,
+                marker_mm=marker_mm,
+                dictionary=dictionary,
+                origin_mm=(0.0, 0.0),
+            )
+        except ValueError as error:
+            raise CannotTeach(f"no such board: {error}".splitlines()[0] + ".", "Read the print again.") from None
+        day.keep("camera", "board.squares", [int(across), int(along)], how)
+        day.keep("camera", "board.square_mm", square_mm, how, unit="mm")
+        day.keep("camera", "board.marker_mm", marker_mm, how, unit="mm")
+        day.keep("camera", "board.dictionary", dictionary, how)
+
+    async def _first_look(self, day: Day, picture: Gray) -> None:
+        """The board where it lies: a mirrored camera and a wrong print show at once."""
+        spec = board_of(day.notebook)
+        try:
+            await asyncio.to_thread(find_board, picture, spec, "camera")
+        except CalibrationError as error:
+            if "mirrored" in error.what:
+                raise CannotTeach(f"{error.what}.", MIRRORED) from None
+            if "another board" in error.what or "arranged" in error.what:
+                self._forget_print(day)
+                raise CannotTeach(f"{error.what}.", OTHER_PRINT) from None
+            await day.say(f"The board is not seen yet: {error.what}", picture=picture, tone="warning")
+
+    def _forget_print(self, day: Day) -> None:
+        kept = {field: taught for field, taught in day.notebook.values.items() if not field.startswith("board.")}
+        day.save(day.notebook.model_copy(update={"values": kept}))
+
+    async def _lens(self, day: Day, folder: Path, take: Take) -> Fitted | None:
+        """Have the board held before the camera until the lens is known and its picture covered.
+
+        None if the person skips it from the start: a lens that bends nothing needs no file.
+        """
+        spec, views = board_of(day.notebook), list[BoardView]()
+        for path in sorted(folder.glob("*.png")):
+            views.append(await asyncio.to_thread(find_board, read_gray(path), spec, path.name))
+        for index in range(MOST_VIEWS):
+            name = f"{index:02d}.png"
+            if (folder / name).exists():
+                continue
+            if len(views) >= GOOD_VIEWS and not still_missing(views):
+                break
+            where = HOLD[index] if index < len(HOLD) else "where it is still missing"
+            if not await self._held(day, folder / name, where, take, views) and not views:
+                await day.say("Without the lens: straight lines must look straight in the picture.", tone="warning")
+                return None
+            if views and (todo := still_missing(views)):
+                await day.say(*todo, picture=coverage_picture(views))
+        fitted = await asyncio.to_thread(fit_lens, views)
+        for warning in (*fitted.warnings, *fitted.guidance):
+            await day.say(warning, tone="warning")
+        return fitted
+
+    async def _held(self, day: Day, path: Path, where: str, take: Take, views: list[BoardView]) -> bool:
+        """Take one photograph of the held board; False where the person skips it."""
+        target = Target("hold-board", int(path.stem))
+        how = f"Cover the sheet, and hold the board before the camera, {where}, all of it sharp; keep still."
+        match await day.guide.bring(target, how):
+            case Brought.BACK:
+                raise WentBack
+            case Brought.SKIP:
+                return False
+            case Brought.DONE:
+                picture = await take()
+        try:
+            view = await asyncio.to_thread(find_board, picture, board_of(day.notebook), path.name)
+        except CalibrationError as error:
+            if "mirrored" in error.what:
+                raise CannotTeach(f"{error.what}.", MIRRORED) from None
+            await day.say(f"not used: {error.what}", picture=picture, tone="warning")
+            return True
+        await asyncio.to_thread(cv2.imwrite, str(path), picture)
+        views.append(view)
+        return True
+
+    async def _keep_lens(self, day: Day, folder: Path, fitted: Fitted) -> None:
+        digests = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.glob("*.png"))}
+        software = f"brushloop {version('brushloop')}"
+        file = lens_file(fitted, describe(board_of(day.notebook)), digests, RMS_LIMIT_PX, software)
+        path = file.save(day.rig_path.parent)
+        reach = fitted.focal_reach_px
+        day.keep(
+            "camera",
+            "camera.lens_file",
+            str(path.relative_to(day.rig_path.parent)),
+            f"fitted to {len(fitted.residuals_px)} photographs of the board held in {fitted.ways} ways",
+            known=f"residual {fitted.rms_px:.2f} px"
+            + ("" if reach is None else f", focal length to +-{max(reach):.1f} px (95 %)"),
+        )
+
+    def derived(self, notebook: Notebook) -> dict[str, Taught]:
+        """Nothing: all of it was measured."""
+        return {}
+
+    def forget(self, notebook: Notebook) -> Notebook:
+        """Without source, settings, print and lens; the photographs of the lens are taken again."""
+        gone = ("camera.", "board.squares", "board.square_mm", "board.marker_mm", "board.dictionary", *ASIDE)
+        kept = {field: taught for field, taught in notebook.values.items() if not field.startswith(gone)}
+        return notebook.model_copy(update={"values": kept})
+
+    def summary(self, notebook: Notebook) -> str:
+        """Source and rate."""
+        return f"{notebook.get('camera.source')}, {notebook.number('aside.frame_rate_hz'):.0f} frames/s"

@@ -1,0 +1,186 @@
+"""Step 7: the force sensor: found, its sign and scale checked by a push, its bias and noise measured."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import statistics
+
+import numpy as np
+from numpy.typing import NDArray
+
+from collect.rig.config_devices import ForceConfig
+from collect.rig.devices import make_force
+from collect.teach.day import Day
+from collect.teach.errors import CannotTeach
+from collect.teach.guide import Brought, Target, WentBack
+from collect.teach.maths.sheet import corners_of
+from collect.teach.store import Notebook, StepName, Taught, now_utc
+from drivers.force.rounds import LOOPBACK_CHANNEL
+from drivers.samples import ForceSample
+
+REST_S = 1.0
+"""How long the sensor is listened to with nothing touching."""
+WAIT_S = 3.0
+"""How long a push is waited for after the person has said that it was done."""
+LEAST_PUSH_N, MOST_PUSH_N = 0.3, 60.0
+"""A finger pushes with more than the first and less than the second: otherwise the scale is wrong."""
+MOST_NOISE_N = 0.05
+STRAIGHT = 0.8
+"""Least share of the push along the sensor's z."""
+INSET_MM = 6.0
+"""Distance of the touch points from the sheet's edges: in its margin, where they cost no cell."""
+
+
+class ForceStep:
+    """Where the sensor is, which way it points, and how zero touch is done."""
+
+    name: StepName = "force"
+    title = "Force sensor"
+    minutes = 3
+    needs: tuple[StepName, ...] = ("sheet",)
+
+    async def teach(self, day: Day) -> None:
+        """Find the sensor and have it pushed. Raises `CannotTeach`, `DeviceError`."""
+        question = "CAN bus of the force sensor: an interface such as can0, or HOST:PORT of a gateway; Enter: no sensor"
+        if "aside.bus" not in day.notebook.values:
+            bus = (await day.guide.text(question, "")).strip()
+            for field, value in _addressed(bus).items():
+                day.keep("force", f"force.{field}", value, "typed")
+            day.keep("force", "aside.bus", bus, "typed")
+        if not day.notebook.get("aside.bus"):
+            await day.say(
+                "Without a force sensor the height of the paper is found by jogging with keys, when a session starts."
+            )
+            return
+        await self._pushed(day)
+
+    async def _pushed(self, day: Day) -> None:
+        samples = list[ForceSample]()
+        sensor = make_force(config_of(day.notebook), day.clock)
+        try:
+            identity = await sensor.connect()
+            await sensor.bias(REST_S)
+            sensor.listen(samples.append)
+            await asyncio.sleep(REST_S)
+            noise_n = _noise(samples)
+            await day.say(f"{identity.model}: {sensor.health().rate_hz:.0f} rounds/s, noise {noise_n:.4f} N")
+            samples.clear()
+            how = (
+                "Push the tip of the brush gently up with a finger for a second, along the brush toward the flange, "
+                "then take the finger away."
+            )
+            if await day.guide.bring(Target("push-sensor"), how) is not Brought.DONE:
+                raise WentBack
+            force_n = await self._push(samples)
+        finally:
+            sensor.listen(None)
+            await sensor.close()
+        axis = judged_push(force_n, noise_n)
+        how = f"a finger pushed the tip with {float(np.linalg.norm(force_n)):.1f} N"
+        if axis[2] > 0.0:
+            await day.say(
+                "The sensor counts a push toward the flange as positive: it is mounted, or wired, the other way round "
+                "than usual. push_axis takes this into account; nothing has to be changed."
+            )
+        day.keep("force", "touch.force.push_axis", axis, how, known="direction within 35 deg, sign certain")
+        day.keep("force", "aside.force_noise_n", noise_n, f"{REST_S:g} s with nothing touching", unit="N")
+
+    async def _push(self, samples: list[ForceSample]) -> NDArray[np.float64]:
+        """Mean force of the strongest tenth of a second, once the push is over or has been waited for."""
+        for _ in range(int(WAIT_S / 0.1)):
+            pushed = strongest(samples)
+            if np.linalg.norm(pushed) > LEAST_PUSH_N and samples and math.hypot(*samples[-1].force_n) < LEAST_PUSH_N:
+                return pushed
+            await asyncio.sleep(0.1)
+        return strongest(samples)
+
+    def derived(self, notebook: Notebook) -> dict[str, Taught]:
+        """How zero touch is done: by force, or by jogging, at four points."""
+        width_mm, height_mm = notebook.numbers("paper.size_mm")
+        sensor = bool(notebook.get("aside.bus"))
+        middle = np.array([width_mm, height_mm]) / 2.0
+        points = middle + (corners_of(width_mm, height_mm) - middle) * (1.0 - INSET_MM / middle)
+
+        def taught(value: str | list[list[float]], how: str) -> Taught:
+            return Taught(value=value, how=how, at=now_utc(), step="force")
+
+        found = {"touch.method": taught("force" if sensor else "jog", "a sensor was found" if sensor else "no sensor")}
+        return found | {"touch.points_mm": taught(points.tolist(), f"{INSET_MM:g} mm inside the sheet's corners")}
+
+    def forget(self, notebook: Notebook) -> Notebook:
+        """Without bus and push."""
+        gone = ("force.", "touch.", "aside.bus", "aside.force_noise_n")
+        kept = {field: taught for field, taught in notebook.values.items() if not field.startswith(gone)}
+        return notebook.model_copy(update={"values": kept})
+
+    def summary(self, notebook: Notebook) -> str:
+        """The bus and the axis."""
+        if not notebook.get("aside.bus"):
+            return "none"
+        sign = "+" if notebook.numbers("touch.force.push_axis")[2] > 0.0 else "-"
+        return f"{notebook.get('aside.bus')}, a push is along {sign}z"
+
+
+def _addressed(bus: str) -> dict[str, str | int]:
+    """The fields of `[force]` for what was typed. Raises `CannotTeach`."""
+    if not bus:
+        return {}
+    host, colon, rest = bus.partition(":")
+    if not colon:
+        return {"kind": "sri-m8123", "interface": "socketcan", "channel": bus}
+    port, _, channel = rest.partition("/")
+    if not port.isdecimal() or not 0 < int(port) < 65536:
+        raise CannotTeach(f"{bus!r} is no bus.", "Type can0, or HOST:PORT or HOST:PORT/CHANNEL of a gateway.")
+    at = {"kind": "sri-m8123", "interface": "socketcand", "channel": channel or LOOPBACK_CHANNEL}
+    return {**at, "host": host, "port": int(port)}
+
+
+def config_of(notebook: Notebook) -> ForceConfig:
+    """The sensor as it was addressed."""
+    fields = {
+        field.removeprefix("force."): t.value for field, t in notebook.values.items() if field.startswith("force.")
+    }
+    return ForceConfig.model_validate(fields)
+
+
+def strongest(samples: list[ForceSample], over: int = 20) -> NDArray[np.float64]:
+    """(3,) mean of the `over` consecutive samples with the largest force; zeros where there are fewer."""
+    forces = np.array([sample.force_n for sample in samples], np.float64).reshape(-1, 3)
+    if len(forces) < over:
+        return np.zeros(3)
+    sums = np.cumsum(np.vstack([np.zeros(3), forces]), axis=0)
+    means = (sums[over:] - sums[:-over]) / over
+    return np.asarray(means[int(np.argmax(np.linalg.norm(means, axis=1)))], np.float64)
+
+
+def judged_push(force_n: NDArray[np.float64], noise_n: float) -> list[float]:
+    """The sensor's axis along which the paper pushes, with its sign. Raises `CannotTeach` for an unlikely push."""
+    size_n = float(np.linalg.norm(force_n))
+    if noise_n > MOST_NOISE_N:
+        raise CannotTeach(
+            f"the sensor's noise is {noise_n:.3f} N, limit {MOST_NOISE_N:g} N.",
+            "Let nothing touch the brush; check shielding and termination.",
+        )
+    if size_n < LEAST_PUSH_N:
+        raise CannotTeach(
+            f"no push was felt (at most {size_n:.3f} N).",
+            "Push harder and longer; check that this is the sensor's bus.",
+        )
+    if size_n > MOST_PUSH_N:
+        raise CannotTeach(
+            f"the push reads {size_n:.0f} N, more than a finger gives.",
+            "The sensor's scale or unit is wrong: see its sheet.",
+        )
+    if abs(float(force_n[2])) < STRAIGHT * size_n:
+        listed = ", ".join(f"{v:+.2f}" for v in force_n.tolist())
+        raise CannotTeach(
+            f"the push reads ({listed}) N, not along the sensor's z.",
+            "Push along the brush; the sensor's z must lie along the tool.",
+        )
+    return [0.0, 0.0, math.copysign(1.0, float(force_n[2]))]
+
+
+def _noise(samples: list[ForceSample]) -> float:
+    axes = list(zip(*(sample.force_n for sample in samples), strict=True))
+    return max((statistics.stdev(axis) for axis in axes if len(axis) > 1), default=0.0)

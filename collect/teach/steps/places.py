@@ -1,0 +1,174 @@
+"""Step 5: well, pot of water and park position, taught by going there."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumbnail
+from collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig
+from collect.rig.paper import to_base, to_paper
+from collect.teach.cameras import still, taught_camera
+from collect.teach.day import Day
+from collect.teach.errors import CannotTeach
+from collect.teach.guide import Target
+from collect.teach.maths.box import Point, rim
+from collect.teach.maths.sheet import corners_of
+from collect.teach.maths.tip import tip_of
+from collect.teach.store import Notebook, StepName, Taught, Value, now_utc
+
+TRAVEL_MM = 60.0
+"""Travel height above the highest corner of the sheet: room for a dry run 30 mm above it."""
+RIM_CLEAR_MM = TRAVEL_CLEARANCE_MM + 5.0
+"""Travel height above the rim of any pot: a drop hangs from the tip."""
+RIMS = ("on the side of the sheet", "a third of the way round", "two thirds of the way round")
+
+
+class PlacesStep:
+    """Where ink, water and rest are, and how high the arm travels between them."""
+
+    name: StepName = "places"
+    title = "Well, wash and park"
+    minutes = 5
+    needs: tuple[StepName, ...] = ("camera", "tip", "sheet")
+
+    async def teach(self, day: Day) -> None:
+        """Have the tip brought to each place; look whether the parked arm is out of the picture."""
+        async with day.arm() as reader:
+            for index, where in enumerate(RIMS):
+                how = f"Bring the tip to the rim of the ink well, {where}."
+                await day.touch(reader, Target("well-rim", index), how, f"well-rim {index}")
+            how = "Bring the tip into the middle of the well, as deep as a dip shall go: a few mm above its bottom."
+            await day.touch(reader, Target("well"), how, "well 0")
+            with day.touched_again_if_refused("well-rim", "well"):
+                found = _check_well(day.notebook)
+            await day.say(found)
+            if "wash-pot 0" not in day.notebook.touches and "aside.wash" not in day.notebook.values:
+                wash = await day.yes("Is there a pot of water to wash the brush in?", default=False)
+                if wash:
+                    how = "Bring the tip into the middle of the pot of water, as deep as a wash shall go."
+                    await day.touch(reader, Target("wash-pot"), how, "wash-pot 0")
+                day.keep("places", "aside.wash", wash, "answered")
+            if not (clear := _clear_view(day.rig_path)).exists() or "clear-view 0" not in day.notebook.touches:
+                how = "Guide the arm so far away that neither it nor its shadow is in the camera's picture."
+                await day.touch(reader, Target("clear-view"), how, "clear-view 0")
+                cv2.imwrite(str(clear), (await self._seen(day)).astype(np.uint8))
+            how = "Bring the arm to where it shall wait: brush upright, above everything, out of the camera's picture."
+            await day.touch(reader, Target("park"), how, "park 0")
+            await self._look(day, clear)
+
+    async def _seen(self, day: Day) -> Thumbnail:
+        async with taught_camera(day.notebook, day.clock) as camera:
+            return thumbnail(await still(camera, day.clock))
+
+    async def _look(self, day: Day, clear: Path) -> None:
+        """Compare the picture with the one without the arm. Raises `CannotTeach` where the parked arm is seen."""
+        without = np.asarray(cv2.imread(str(clear), cv2.IMREAD_GRAYSCALE), np.float32)
+        now = await self._seen(day)
+        share = changed_share(now, without)
+        if share >= ARM_SHARE:
+            await day.say("The picture now:", picture=now.astype(np.uint8))
+            with day.touched_again_if_refused("park"):
+                raise CannotTeach(
+                    f"the parked arm, or its shadow, is in the picture: {100 * share:.0f} % of it changed.",
+                    "Park it farther from the sheet, or higher; only the park position is asked again.",
+                )
+        await day.say(f"At the park position {100 * share:.1f} % of the picture changed: the arm is out of it.")
+
+    def derived(self, notebook: Notebook) -> dict[str, Taught]:
+        """Places in the sheet's frame, and the travel height."""
+        paper, places = paper_of(notebook), tips(notebook)
+        centre_mm, radius_mm, rim_z_mm = _well(notebook)
+        safe_mm = max(max(sheet_heights(notebook)) + TRAVEL_MM, rim_z_mm + RIM_CLEAR_MM)
+        by_hand = "the tip was brought there by hand"
+
+        def taught(value: Value, how: str = by_hand, known: str = "one touch by hand, within a mm") -> Taught:
+            return Taught(value=value, unit="mm", how=how, known=known, at=now_utc(), step="places")
+
+        x, y, z = places["park 0"]
+        found = {
+            "ink.well_mm": taught(
+                list(to_paper(paper, *centre_mm)), f"the circle through {len(RIMS)} points of its rim touched by hand"
+            ),
+            "ink.dip_z_mm": taught(places["well 0"][2]),
+            "aside.well_radius_mm": taught(radius_mm),
+            "aside.rim_z_mm": taught(rim_z_mm),
+            "motion.safe_z_mm": taught(
+                safe_mm,
+                f"the higher of sheet + {TRAVEL_MM:g} mm and rim of the well + {RIM_CLEAR_MM:g} mm",
+                "a stated clearance",
+            ),
+            "motion.park_mm": taught(
+                [x, y, max(z, safe_mm)], by_hand + ("" if z >= safe_mm else ", and lifted to travel height")
+            ),
+        }
+        if "wash-pot 0" in places:
+            wash_x, wash_y, wash_z = places["wash-pot 0"]
+            found["ink.wash.pot_mm"] = taught(list(to_paper(paper, wash_x, wash_y)))
+            found["ink.wash.dip_z_mm"] = taught(wash_z)
+        return found
+
+    def forget(self, notebook: Notebook) -> Notebook:
+        """Without what was touched here."""
+        gone = {"aside.wash", "ink.wash.pot_mm", "ink.wash.dip_z_mm"}
+        kept = {field: taught for field, taught in notebook.values.items() if field not in gone}
+        cleared = notebook.without_touches("well-rim", "well", "wash-pot", "park", "clear-view")
+        return cleared.model_copy(update={"values": kept})
+
+    def summary(self, notebook: Notebook) -> str:
+        """Well and park."""
+        x, y = notebook.numbers("ink.well_mm")
+        px, py, pz = notebook.numbers("motion.park_mm")
+        return f"well ({x:.0f}, {y:.0f}) mm on the sheet's axes, park ({px:.0f}, {py:.0f}, {pz:.0f}) mm"
+
+
+def tips(notebook: Notebook) -> dict[str, Point]:
+    """The tip at everything that was touched, by name, in the base frame."""
+    offset_mm = notebook.numbers("robot.tcp_offset_mm")
+    return {name: tip_of(touch.pose(), offset_mm) for name, touch in notebook.touches.items()}
+
+
+def paper_of(notebook: Notebook) -> PaperConfig:
+    """The sheet as it was taught."""
+    names = ("origin_mm", "yaw_deg", "touch_z_mm", "size_mm", "touch_point_mm")
+    return PaperConfig.model_validate({"name": "sheet"} | {name: notebook.get(f"paper.{name}") for name in names})
+
+
+def sheet_heights(notebook: Notebook) -> list[float]:
+    """Touch height at the four corners of the sheet, in the base frame."""
+    z0_mm, slope_x, slope_y = notebook.numbers("aside.plane")
+    width_mm, height_mm = notebook.numbers("paper.size_mm")
+    return [z0_mm + slope_x * x + slope_y * y for x, y in corners_of(width_mm, height_mm).tolist()]
+
+
+def sheet_corners(notebook: Notebook) -> list[Point]:
+    """The corners of the sheet in the base frame."""
+    paper, heights = paper_of(notebook), sheet_heights(notebook)
+    return [(*to_base(paper, x, y), z) for (x, y), z in zip(corners_of(*paper.size_mm).tolist(), heights, strict=True)]
+
+
+def _well(notebook: Notebook) -> tuple[tuple[float, float], float, float]:
+    return rim([point for name, point in tips(notebook).items() if name.startswith("well-rim ")])
+
+
+def _check_well(notebook: Notebook) -> str:
+    """What was found of the well. Raises `CannotTeach` where rim and dip contradict each other."""
+    (x, y), radius_mm, rim_z_mm = _well(notebook)
+    dip_x, dip_y, dip_z = tips(notebook)["well 0"]
+    off_mm = math.dist((x, y), (dip_x, dip_y))
+    if off_mm > 0.6 * radius_mm:
+        raise CannotTeach(
+            f"the dip is {off_mm:.0f} mm from the middle of the well's rim, whose radius is {radius_mm:.0f} mm.",
+            "Teach the well again: three points on the rim, then the middle.",
+        )
+    if dip_z >= rim_z_mm:
+        raise CannotTeach("the dip is no deeper than the rim of the well.", "Bring the tip into the ink.")
+    return f"well of radius {radius_mm:.1f} mm, its rim {rim_z_mm - dip_z:.1f} mm above the bottom of a dip"
+
+
+def _clear_view(rig_path: Path) -> Path:
+    """A small picture without the arm, kept beside the notebook."""
+    return rig_path.with_name(f"{rig_path.stem}.clear-view.png")

@@ -1,0 +1,212 @@
+"""Step 9: the proof. Every device answers, a dry run 30 mm above, a touch, the self-check, and one judged press."""
+
+from __future__ import annotations
+
+import asyncio
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from collect.engine.dry_run import DryRunEngine
+from collect.engine.engine import Engine
+from collect.engine.open_or_resume import Opening, open_store
+from collect.rig.config import RigConfig
+from collect.rig.doctor import examine
+from collect.rig.paper import PaperPlane
+from collect.teach.day import Day
+from collect.teach.errors import CannotTeach
+from collect.teach.rig_text import rig_of, rig_text
+from collect.teach.store import Notebook, StepName, Taught
+from sessions.journal.journal import JOURNAL_NAME, replay
+
+ABOVE_MM = 30.0
+SLOW_MM_S = 45.0
+PRESS_SHARE = 0.6
+"""Depth of the judged press as a share of the deepest."""
+DEEPEST_DRY_MM = 24.0
+SLOW_CAMERA_MS = 600.0
+"""A camera that is later than this makes every photograph slow, and says that something buffers its pictures."""
+POLL_S = 0.1
+
+
+class ProofStep:
+    """Only what has passed this is ready."""
+
+    name: StepName = "proof"
+    title = "Proof"
+    minutes = 6
+    needs: tuple[StepName, ...] = ("arm", "camera", "tip", "sheet", "places", "brush", "force", "limits")
+
+    async def teach(self, day: Day) -> None:
+        """Prove what was taught, and measure height and delay by it. Raises `CannotTeach` and what the run raises."""
+        rig = rig_of(day.notebook, day.rig_path)
+        await self._doctor(day, rig)
+        depth_mm = min(PRESS_SHARE * rig.brush.max_depth_mm, DEEPEST_DRY_MM)
+        protocol = f'kind = "grid"\nheights_mm = [{depth_mm:g}]\ntilts_deg = [0.0]\nrepeats = 1\n'
+        await day.may_move(f"Dry run, {ABOVE_MM:g} mm above the sheet")
+        with tempfile.TemporaryDirectory(prefix="brushloop-proof-") as folder:
+            await self._run(day, Path(folder), protocol, dry=True)
+        await day.say("The dry run made every move of a press, and nothing was met.")
+        await day.may_move(
+            "Touch the sheet, press three marks and one stroke: the well must hold ink, the sheet be blank"
+        )
+        with tempfile.TemporaryDirectory(prefix="brushloop-proof-") as folder:
+            session = await self._run(day, Path(folder), protocol, dry=False)
+            proven = read_proof(session)
+        await self._keep(day, proven)
+
+    async def _doctor(self, day: Day, rig: RigConfig) -> None:
+        findings = await examine(rig, day.clock)
+        for finding in findings:
+            await day.say(f"{finding.device}: {finding.identity or finding.address}; {finding.notes}")
+        ill = [finding for finding in findings if not finding.well]
+        if ill:
+            raise CannotTeach(f"{ill[0].device}: {ill[0].problem}.", ill[0].remedy or "Check power, cable and address.")
+
+    async def _run(self, day: Day, folder: Path, protocol: str, *, dry: bool) -> Path:
+        """Run the protocol slowly on what was taught; returns the session's folder."""
+        rig_path, protocol_path = folder / "rig.toml", folder / "protocol.toml"
+        rig_path.write_text(_with_lens_at(day), encoding="utf-8")
+        protocol_path.write_text(protocol, encoding="utf-8")
+        opening = Opening.load(
+            folder / "sessions", rig_path, protocol_path, armed=True, dry_run_mm=ABOVE_MM if dry else None
+        )
+        opening = replace(opening, rig=slowly(opening.rig))
+        make = DryRunEngine if dry else Engine
+        engine = make(
+            opening.rig,
+            opening.protocol,
+            lambda rig: open_store(opening, None, rig, day.clock),
+            day.clock,
+            watched=True,
+            armed=True,
+        )
+        engine.start()
+        try:
+            await self._followed(day, engine)
+        finally:
+            if not engine.finished:
+                engine.stop()
+            await asyncio.shield(asyncio.to_thread(engine.join))
+        return Path(engine.snapshot().folder)
+
+    async def _followed(self, day: Day, engine: Engine) -> None:
+        """Show what the run reports, and pass its questions on to the person."""
+        shown = 0
+        while True:
+            over, now = engine.finished, engine.snapshot()
+            if lines := now.messages[max(shown - now.messages_before, 0) :]:
+                await day.say(*lines)
+            shown = now.messages_before + len(now.messages)
+            if over:
+                return
+            if (asked := now.prompt) is not None:
+                engine.answer(asked.number, await day.guide.choose(asked.question, asked.choices, asked.default))
+            await asyncio.sleep(POLL_S)
+
+    async def _keep(self, day: Day, proven: Proven) -> None:
+        plane, touch_point = proven.plane, day.notebook.numbers("paper.touch_point_mm")
+        z_mm = plane.touch_z_mm(touch_point[0], touch_point[1])
+        by_hand_mm = day.notebook.number("paper.touch_z_mm")
+        known = f"residuals up to {proven.worst_mm:.3f} mm; by hand it was {by_hand_mm:.2f} mm"
+        sigma = max(proven.sigma_mm, 0.01)
+        how = f"touched by {proven.method}, leaning by {plane.slope_deg:.2f} deg"
+        day.keep("proof", "paper.touch_z_mm", z_mm, how, unit="mm", sigma=sigma, known=known)
+        day.keep("proof", "aside.plane", [plane.z0_mm, plane.slope_x, plane.slope_y], how, unit="mm", sigma=sigma)
+        delay_ms = proven.delay_ms
+        how = "the arm was seen to leave the picture later than it did"
+        day.keep("proof", "camera.latency_ms", delay_ms, how, unit="ms", known=f"varying by {proven.jitter_ms:.0f} ms")
+        await day.say(
+            f"touch height {z_mm:.3f} mm ({z_mm - by_hand_mm:+.2f} mm from the touch by hand), {known}",
+            f"self-check: marks {proven.offset_mm[0]:+.1f}, {proven.offset_mm[1]:+.1f} mm from where they were "
+            f"commanded, turned by {proven.turn_deg:+.2f} deg",
+            f"one press was judged sound; camera delay {delay_ms:.0f} ms",
+        )
+        if delay_ms > SLOW_CAMERA_MS:
+            await day.say(
+                f"The camera is slow: {delay_ms / 1e3:.1f} s. Each photograph waits for it.",
+                "Use a cable instead of Wi-Fi, MJPEG instead of H.264, fewer pixels, or no buffer in between.",
+                tone="warning",
+            )
+        await day.say("READY")
+
+    def derived(self, notebook: Notebook) -> dict[str, Taught]:
+        """Nothing: all of it was measured."""
+        return {}
+
+    def forget(self, notebook: Notebook) -> Notebook:
+        """Measured values stay until they are measured again."""
+        return notebook
+
+    def summary(self, notebook: Notebook) -> str:
+        """Height and delay."""
+        return (
+            f"touch height {notebook.number('paper.touch_z_mm'):.2f} mm, camera delay "
+            f"{notebook.number('camera.latency_ms'):.0f} ms"
+        )
+
+
+def slowly(rig: RigConfig) -> RigConfig:
+    """The same rig, with no move faster than 50 mm/s."""
+    motion, limits = rig.motion, rig.robot.limits
+    slow = motion.model_copy(
+        update={
+            "travel_speed_mm_s": min(motion.travel_speed_mm_s, SLOW_MM_S),
+            "press_speed_mm_s": min(motion.press_speed_mm_s, SLOW_MM_S),
+        }
+    )
+    capped = limits.model_copy(update={"speed_mm_s": min(limits.speed_mm_s, 50.0)})
+    return rig.model_copy(update={"motion": slow, "robot": rig.robot.model_copy(update={"limits": capped})})
+
+
+@dataclass(frozen=True, slots=True)
+class Proven:
+    """What the run of the proof measured."""
+
+    plane: PaperPlane
+    method: str
+    worst_mm: float
+    sigma_mm: float
+    delay_ms: float
+    jitter_ms: float
+    offset_mm: tuple[float, float]
+    turn_deg: float
+
+
+def read_proof(session: Path) -> Proven:
+    """From the journal of the session. Raises `CannotTeach` where the press was not judged sound."""
+    results: list[dict[str, Any]] = [line["result"] for line in replay(session / JOURNAL_NAME).done.values()]
+
+    def having(name: str) -> dict[str, Any]:
+        none: dict[str, Any] = {}
+        return next((result for result in results if name in result), none)
+
+    touch, check, capture = having("slope_deg"), having("turn_deg"), having("kept")
+    if not capture.get("kept") or capture.get("verdict"):
+        raise CannotTeach(
+            f"the press was not judged sound ({capture.get('verdict') or 'it was left out'}).",
+            "Look at its picture above: ink, light, sheet; then prove again.",
+        )
+    if not touch or not check:
+        raise CannotTeach("the run had no touch or no self-check.", "Report this as a defect.")
+    sigmas = [sigma for point in touch["points"] for sigma in point["sigma_mm"] if sigma is not None]
+    return Proven(
+        PaperPlane(float(touch["touch_z_mm"]), float(touch["slope_x"]), float(touch["slope_y"])),
+        str(touch["method"]),
+        max((abs(float(r)) for r in touch["residuals_mm"]), default=0.0),
+        float(max(sigmas, default=0.0)),
+        float(capture["camera_delay_ms"]),
+        float(capture["camera_jitter_ms"]),
+        (float(check["offset_mm"][0]), float(check["offset_mm"][1])),
+        float(check["turn_deg"]),
+    )
+
+
+def _with_lens_at(day: Day) -> str:
+    """`rig.toml` for another folder: it names the lens file by its whole path."""
+    field = "camera.lens_file"
+    if (taught := day.notebook.values.get(field)) is None:
+        return rig_text(day.notebook, day.rig_path)
+    path = str((day.rig_path.parent / str(taught.value)).absolute())
+    return rig_text(day.notebook.with_values({field: taught.model_copy(update={"value": path})}), day.rig_path)

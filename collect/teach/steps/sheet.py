@@ -1,0 +1,168 @@
+"""Step 4: the sheet and the board under it, by their touched corners."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+from calibrate.board.spec import BoardSpec
+from collect.teach.day import Day
+from collect.teach.errors import CannotTeach
+from collect.teach.guide import Target, TargetKind
+from collect.teach.maths.sheet import CORNERS, Point, SheetFit, check_board, fit_sheet
+from collect.teach.maths.tip import find_axis, tip_of
+from collect.teach.store import Notebook, StepName, Taught, now_utc
+from drivers.samples import Pose
+
+BOARD: TargetKind = "board-corner"
+SHEET: TargetKind = "sheet-corner"
+THINGS: tuple[tuple[TargetKind, str], ...] = ((BOARD, "the board's outermost square"), (SHEET, "the sheet"))
+GOOD_MM = 0.13
+"""Standard error of the sheet's origin, in each axis, at which touching ends."""
+MOST_ROUNDS = 5
+WORST_MM = 0.25
+LEAST_LEAN = 3.0
+"""A lean of the brush against the flange counts from this many standard errors."""
+INSET_MM = 2.0
+"""Where zero touch is done: this far inside the sheet's lower left corner, beside every cell."""
+
+
+class SheetStep:
+    """Origin, turn, size, plane of the sheet; the board's place; and how the brush leans against the flange."""
+
+    name: StepName = "sheet"
+    title = "Sheet and board"
+    minutes = 8
+    needs: tuple[StepName, ...] = ("camera", "tip")
+
+    async def teach(self, day: Day) -> None:
+        """Have the corners touched until the origin is known well enough. Raises `CannotTeach`, `StepError`."""
+        await day.say(
+            "Lay the board where the sheet will lie, in the middle of the picture, and the sheet on it, its edges "
+            "along the squares.",
+            "Touch each corner with the brush upright (hold a set square beside it), and hold still.",
+        )
+        async with day.arm() as reader:
+            for number in range(MOST_ROUNDS):
+                for kind, thing in THINGS:
+                    if number and kind == BOARD and number % 2:
+                        continue  # the sheet's own corners give its origin, and need more touches
+                    for corner in CORNERS:
+                        how = f"Bring the tip to the {corner} corner of {thing}" + (" once more." if number else ".")
+                        await day.touch(reader, Target(kind, number, corner), how, f"{kind} {number} {corner}")
+                    if kind == BOARD:
+                        with day.touched_again_if_refused(BOARD):
+                            check_board(corners(day.notebook, BOARD), board_of(day.notebook))
+                with day.touched_again_if_refused(SHEET):
+                    fit = fitted(day.notebook)
+                await day.say(*in_words(fit))
+                if fit.origin_sigma_mm <= GOOD_MM:
+                    return
+        with day.touched_again_if_refused(BOARD, SHEET):
+            check_known(fitted(day.notebook))
+
+    def derived(self, notebook: Notebook) -> dict[str, Taught]:
+        """Everything that follows from the touched corners and the tip."""
+        fit, upright = fitted(notebook), find_axis(upright_poses(notebook))
+        touches = len(notebook.touched(BOARD)) + len(notebook.touched(SHEET))
+        worst_mm = max(fit.residuals_mm.values())
+        by_hand = f"{touches} corners of board and sheet touched by hand"
+        known = f"residuals up to {worst_mm:.2f} mm"
+        point = (INSET_MM, INSET_MM)
+
+        def taught(
+            value: list[float] | float, unit: str, sigma: float | None, how: str = by_hand, more: str = known
+        ) -> Taught:
+            return Taught(value=value, unit=unit, how=how, sigma=sigma, known=more, at=now_utc(), step="sheet")
+
+        leans = upright.lean_deg > LEAST_LEAN * upright.sigma_deg
+        rotation = list(upright.rotation_deg) if leans else [0.0, 0.0, 0.0]
+        return {
+            "paper.origin_mm": taught(list(fit.origin_mm), "mm", fit.origin_sigma_mm),
+            "paper.yaw_deg": taught(fit.yaw_deg, "deg", fit.yaw_sigma_deg),
+            "paper.size_mm": taught(list(fit.size_mm), "mm", fit.origin_sigma_mm),
+            "paper.touch_point_mm": taught(list(point), "mm", None, "beside every cell", ""),
+            "paper.touch_z_mm": taught(
+                fit.plane.plane.touch_z_mm(*point),
+                "mm",
+                fit.height_sigma_mm,
+                more=f"the sheet leans by {fit.plane.plane.slope_deg:.2f} deg; not yet measured by touch",
+            ),
+            "board.origin_mm": taught(list(fit.board_origin_mm), "mm", fit.origin_sigma_mm),
+            "aside.plane": taught(
+                [fit.plane.plane.z0_mm, fit.plane.plane.slope_x, fit.plane.plane.slope_y], "mm", fit.height_sigma_mm
+            ),
+            "robot.tcp_rotation_deg": taught(
+                rotation,
+                "deg",
+                upright.sigma_deg,
+                f"the mean of {len(upright_poses(notebook))} poses in which the brush was held upright by hand",
+                f"leans by {upright.lean_deg:.2f} deg against the flange"
+                + ("" if leans else ", no more than the hand's error: taken as square"),
+            ),
+        }
+
+    def forget(self, notebook: Notebook) -> Notebook:
+        """Without the touches of both."""
+        return notebook.without_touches(BOARD, SHEET)
+
+    def summary(self, notebook: Notebook) -> str:
+        """Origin and turn."""
+        x, y = notebook.numbers("paper.origin_mm")
+        return f"origin ({x:.1f}, {y:.1f}) mm, turned by {notebook.number('paper.yaw_deg'):.2f} deg"
+
+
+def board_of(notebook: Notebook) -> BoardSpec:
+    """The print as it was described, its lower left corner at the origin."""
+    across, along = notebook.numbers("board.squares")
+    return BoardSpec(
+        squares=(int(across), int(along)),
+        square_mm=notebook.number("board.square_mm"),
+        marker_mm=notebook.number("board.marker_mm"),
+        dictionary=str(notebook.get("board.dictionary")),
+        origin_mm=(0.0, 0.0),
+    )
+
+
+def corners(notebook: Notebook, kind: str) -> dict[str, list[Point]]:
+    """The tip at every touch of each corner, in the base frame."""
+    offset_mm, found = notebook.numbers("robot.tcp_offset_mm"), defaultdict[str, list[Point]](list)
+    for name, flange in notebook.touched(kind).items():
+        found[name.split(" ", 1)[1]].append(tip_of(flange, offset_mm))
+    return dict(found)
+
+
+def upright_poses(notebook: Notebook) -> list[Pose]:
+    """The flange wherever the brush was held upright."""
+    return [*notebook.touched(BOARD).values(), *notebook.touched(SHEET).values()]
+
+
+def fitted(notebook: Notebook) -> SheetFit:
+    """The sheet from everything touched so far. Raises `CannotTeach` where a corner was skipped."""
+    board, sheet = corners(notebook, BOARD), corners(notebook, SHEET)
+    missing = [
+        f"{thing} {name}" for thing, of in (("board", board), ("sheet", sheet)) for name in CORNERS if name not in of
+    ]
+    if missing:
+        raise CannotTeach(f"not touched: {', '.join(missing)}.", "All four corners of both are needed.")
+    return fit_sheet(board, sheet, board_of(notebook))
+
+
+def check_known(fit: SheetFit) -> None:
+    """Raise `CannotTeach` unless the origin is known well enough."""
+    if fit.origin_sigma_mm > WORST_MM:
+        raise CannotTeach(
+            f"the corner of the sheet is known to {fit.origin_sigma_mm:.2f} mm only.",
+            "Fix the sheet, hold still while you press Enter, and touch the corners again.",
+        )
+
+
+def in_words(fit: SheetFit) -> tuple[str, ...]:
+    """What was found, for the person."""
+    (x, y), (width, height) = fit.origin_mm, fit.size_mm
+    worst = max(fit.residuals_mm, key=lambda name: fit.residuals_mm[name])
+    return (
+        f"sheet of {width:.1f} x {height:.1f} mm, origin ({x:.2f}, {y:.2f}) mm, known to {fit.origin_sigma_mm:.2f} mm "
+        f"(goal {GOOD_MM:g}), turned by {fit.yaw_deg:.2f} +- {fit.yaw_sigma_deg:.2f} deg, leaning by "
+        f"{fit.plane.plane.slope_deg:.2f} deg",
+        f"largest residual: {worst}, {fit.residuals_mm[worst]:.2f} mm; board {100 * fit.scale:.2f} % of its print",
+    )

@@ -1,0 +1,160 @@
+"""The first day as a whole: one step after the other, each kept as it is taught, and a `rig.toml` at the end."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from calibrate.errors import CalibrationError
+from collect.errors import CollectAborted, ConfigError, StepError
+from collect.operator import Choice
+from collect.teach.day import Day, Step
+from collect.teach.errors import CannotTeach
+from collect.teach.guide import LeftOff, StepState, WentBack
+from collect.teach.rig_text import write_rig
+from collect.teach.steps import all_steps
+from collect.teach.store import Notebook, StepName, Value
+from drivers.errors import DeviceError
+
+AGAIN, LEAVE = Choice("a", "try this step again"), Choice("q", "leave off; what was taught is kept")
+SAME = 1e-6
+Refused = CannotTeach | DeviceError | CalibrationError | StepError | ConfigError
+
+
+class Wizard:
+    """Leads a person through the steps."""
+
+    def __init__(self, day: Day, steps: Sequence[Step] | None = None) -> None:
+        self._day = day
+        self._steps = tuple(all_steps() if steps is None else steps)
+
+    async def run(self) -> Path:
+        """Teach every step that is not done, then write `rig.toml`; returns its path.
+
+        Raises `CollectAborted` where the person leaves off: the same command goes on from there.
+        """
+        for step in self._steps:
+            if step.name not in self._day.notebook.done:
+                await self._taught(step)
+        await self._overview(None)
+        return await self._written()
+
+    async def again(self, name: str) -> Path | None:
+        """Teach one step anew; returns the path of `rig.toml` if it could be written.
+
+        Raises `ConfigError` for a name that is none, otherwise as `run` does.
+        """
+        step = next((one for one in self._steps if one.name == name), None)
+        if step is None:
+            raise ConfigError("STEP", "", f"{name!r} is none of {', '.join(one.name for one in self._steps)}")
+        missing = [need for need in step.needs if need not in self._day.notebook.done]
+        if missing:
+            raise CollectAborted(
+                f"`{name}` rests on {', '.join(missing)}, not taught yet: `brushloop rig new` goes on from there"
+            )
+        if name in self._day.notebook.done:
+            self._day.save(step.forget(self._day.notebook))
+        await self._taught(step)
+        rest = [one.name for one in self._steps if one.name not in self._day.notebook.done]
+        if rest and rest != ["proof"]:
+            return None
+        return await self._written()
+
+    async def _taught(self, step: Step) -> None:
+        while True:
+            await self._overview(step.name)
+            before = self._day.notebook
+            try:
+                await step.teach(self._day)
+                await self._derive(step, before)
+                return
+            except LeftOff:
+                raise CollectAborted("left off; the same command goes on from there") from None
+            except WentBack:
+                await self._day.say("This step was left; it begins again where it was.")
+            except (CannotTeach, DeviceError, CalibrationError, StepError, ConfigError) as error:
+                await self._day.say(*_in_lines(error), tone="trouble")
+            await self._ask_again()
+
+    async def _ask_again(self) -> None:
+        try:
+            answer = await self._day.guide.choose("How to go on?", (AGAIN, LEAVE), AGAIN.key)
+        except (LeftOff, WentBack):
+            answer = LEAVE.key
+        if answer == LEAVE.key:
+            raise CollectAborted("left off; the same command goes on from there")
+
+    async def _derive(self, step: Step, before: Notebook) -> None:
+        """Finish a step: compute what rests on it again, and list what that changed. Proofs of the past are void."""
+        notebook = self._day.notebook
+        dependent = self._resting_on(step.name)
+        for one in self._steps:
+            if one.name == step.name or (one.name in dependent and one.name in notebook.done):
+                notebook = notebook.with_values(one.derived(notebook))
+        reopened: tuple[StepName, ...] = ("proof",) if step.name != "proof" else ()
+        self._day.save(notebook.finished(step.name, reopens=reopened))
+        changed = [
+            f"{field}: {_shown(old.value)} -> {_shown(new.value)}"
+            for field, new in notebook.values.items()
+            if new.step != step.name
+            and (old := before.values.get(field)) is not None
+            and not _same(old.value, new.value)
+        ]
+        if changed:
+            await self._day.say("Changed with it, because it rests on this step:", *changed)
+        await self._day.say(f"{step.title}: {step.summary(notebook)}")
+
+    def _resting_on(self, name: StepName) -> set[StepName]:
+        found: set[StepName] = {name}
+        for step in self._steps:
+            if found & set(step.needs):
+                found.add(step.name)
+        return found - {name}
+
+    async def _written(self) -> Path:
+        path, kept = write_rig(self._day.rig_path, self._day.notebook)
+        await self._day.say(
+            f"{path}: written, with how each value was obtained"
+            + (f"; as it was before: {kept}" if kept is not None else "")
+        )
+        return path
+
+    async def _overview(self, current: StepName | None) -> None:
+        done = self._day.notebook.done
+        await self._day.guide.overview(
+            tuple(
+                StepState(
+                    step.name,
+                    step.title,
+                    step.minutes,
+                    "current" if step.name == current else "taught" if step.name in done else "open",
+                    step.summary(self._day.notebook) if step.name in done else "",
+                )
+                for step in self._steps
+            )
+        )
+
+
+def _in_lines(error: Refused) -> tuple[str, ...]:
+    match error:
+        case CannotTeach():
+            return error.what, error.way_out
+        case DeviceError():
+            return f"{error.device}: {error.op}: {error.what}", error.remedy or "Check power, cable and address."
+        case _:
+            return (str(error),)
+
+
+def _same(old: Value, new: Value) -> bool:
+    if isinstance(old, list) and isinstance(new, list):
+        return len(old) == len(new) and all(_same(a, b) for a, b in zip(old, new, strict=True))
+    if isinstance(old, int | float) and isinstance(new, int | float):
+        return math.isclose(old, new, abs_tol=SAME)
+    return old == new
+
+
+def _shown(value: Value) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(_shown(v) for v in value)}]"
+    return f"{value:.3f}" if isinstance(value, float) else str(value)

@@ -1,0 +1,197 @@
+"""The computations of the first day against references, and against what a hand's errors do to them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from calibrate.board.register import mixed_up, register
+from calibrate.board.spec import BoardSpec
+from calibrate.errors import CalibrationError
+from collect.teach.errors import CannotTeach
+from collect.teach.maths.box import hull, rim
+from collect.teach.maths.sheet import CORNERS, Point, check_board, corners_of, fit_sheet
+from collect.teach.maths.tip import find_axis, find_tip, tip_of
+from drivers.samples import Pose
+
+BOARD = BoardSpec(squares=(26, 20), square_mm=12.0, marker_mm=9.0, origin_mm=(0.0, 0.0))
+PIN_MM = np.array([320.0, 150.0, 90.0])
+
+
+def flange_at(tip_mm: np.ndarray, turn: Rotation, offset_mm: np.ndarray) -> Pose:
+    x, y, z = tip_mm - turn.apply(offset_mm)
+    return Pose(float(x), float(y), float(z), *(float(v) for v in turn.as_quat()))
+
+
+def leaning(toward_deg: float, tilt_deg: float) -> Rotation:
+    """The flange down, then leaning, the wrist as it was."""
+    return Rotation.from_euler("ZYZ", [toward_deg, tilt_deg, -toward_deg], degrees=True) * Rotation.from_rotvec(
+        [math.pi, 0.0, 0.0]
+    )
+
+
+def around(count: int, tilt_deg: float = 30.0) -> list[Rotation]:
+    return [leaning(90.0 * k + 20.0 * (k // 4), tilt_deg) for k in range(count)]
+
+
+offsets = st.tuples(st.floats(-40.0, 40.0), st.floats(-40.0, 40.0), st.floats(50.0, 400.0))
+
+
+@given(offsets, st.floats(15.0, 45.0))
+def test_a_tip_is_found_exactly_from_exact_touches(offset: tuple[float, float, float], tilt_deg: float) -> None:
+    fit = find_tip([flange_at(PIN_MM, turn, np.array(offset)) for turn in around(4, tilt_deg)])
+    assert np.allclose(fit.offset_mm, offset, atol=1e-6)
+    assert np.allclose(fit.pin_mm, PIN_MM, atol=1e-6)
+
+
+def test_the_error_that_is_stated_is_the_error_that_is_made() -> None:
+    rng, offset = np.random.default_rng(3), np.array([4.0, -3.0, 180.0])
+    made, stated = [], []
+    for _ in range(200):
+        touches = [flange_at(PIN_MM + rng.normal(0.0, 0.3, 3), turn, offset) for turn in around(12)]
+        fit = find_tip(touches)
+        made.append(math.dist(fit.offset_mm, offset))
+        stated.append(fit.error_mm)
+    assert math.sqrt(np.mean(np.square(made))) == pytest.approx(np.mean(stated), rel=0.15)
+
+
+def test_touches_with_the_wrist_turned_along_cannot_give_the_length() -> None:
+    turns = [Rotation.from_euler("Z", 90.0 * k, degrees=True) * leaning(0.0, 30.0) for k in range(6)]
+    with pytest.raises(CannotTeach, match=r"too alike.*do not turn the wrist"):
+        find_tip([flange_at(PIN_MM, turn, np.array([0.0, 0.0, 180.0])) for turn in turns])
+
+
+def test_a_touch_that_slipped_is_named() -> None:
+    rng, offset = np.random.default_rng(5), np.array([0.0, 0.0, 180.0])
+    places = [PIN_MM + rng.normal(0.0, 0.1, 3) for _ in range(9)]
+    places[6] = places[6] + [0.0, 4.0, 0.0]
+    fit = find_tip([flange_at(p, turn, offset) for p, turn in zip(places, around(9), strict=True)])
+    assert fit.slip() == 6
+
+
+def test_how_the_brush_leans_is_the_mean_of_upright_poses() -> None:
+    rng, true = np.random.default_rng(2), Rotation.from_euler("ZYX", [0.0, 1.5, -2.0], degrees=True)
+    down = Rotation.from_rotvec([math.pi, 0.0, 0.0])
+    poses = []
+    for heading_deg in rng.uniform(0.0, 360.0, 40):
+        held = Rotation.from_rotvec(np.radians([*rng.normal(0.0, 0.5, 2), 0.0]))
+        turn = held * Rotation.from_euler("Z", heading_deg, degrees=True) * down * true.inv()
+        poses.append(flange_at(PIN_MM, turn, np.zeros(3)))
+    fit = find_axis(poses)
+    axis = Rotation.from_euler("ZYX", fit.rotation_deg[::-1], degrees=True).apply([0.0, 0.0, 1.0])
+    assert math.degrees(math.acos(float(axis @ true.apply([0.0, 0.0, 1.0])))) < 4.0 * fit.sigma_deg < 1.0
+
+
+@given(offsets, st.floats(0.0, 359.0), st.floats(10.0, 60.0))
+def test_the_tip_of_a_flange_undoes_the_flange_of_a_tip(
+    offset: tuple[float, float, float], toward_deg: float, tilt_deg: float
+) -> None:
+    flange = flange_at(PIN_MM, leaning(toward_deg, tilt_deg), np.array(offset))
+    assert np.allclose(tip_of(flange, offset), PIN_MM, atol=1e-9)
+
+
+# The sheet on its board
+
+
+def laid(
+    yaw_deg: float, at_mm: tuple[float, float], slope: tuple[float, float] = (0.0, 0.0), *, noise_mm: float = 0.0
+) -> tuple[dict[str, list[Point]], dict[str, list[Point]]]:
+    """Touched corners of the board, and of a sheet of 240 x 170 mm that lies 34 mm inside it."""
+    rng = np.random.default_rng(7)
+    turn = Rotation.from_euler("z", yaw_deg, degrees=True)
+
+    def touched(corners: np.ndarray) -> dict[str, list[Point]]:
+        found: dict[str, list[Point]] = {}
+        for name, (x, y) in zip(CORNERS, corners, strict=True):
+            z = 120.0 + slope[0] * x + slope[1] * y
+            place = turn.apply([x, y, z]) + np.array([*at_mm, 0.0]) + rng.normal(0.0, noise_mm, 3)
+            found[name] = [(float(place[0]), float(place[1]), float(place[2]))]
+        return found
+
+    return touched(corners_of(312.0, 240.0)), touched(corners_of(240.0, 170.0) + 34.0)
+
+
+@given(st.floats(-179.0, 179.0), st.floats(-500.0, 500.0), st.floats(-500.0, 500.0), st.floats(-0.02, 0.02))
+@settings(max_examples=40)
+def test_a_sheet_is_found_exactly_from_exact_touches(yaw_deg: float, x_mm: float, y_mm: float, slope: float) -> None:
+    board, sheet = laid(yaw_deg, (x_mm, y_mm), (slope, -slope))
+    check_board(board, BOARD)
+    fit = fit_sheet(board, sheet, BOARD)
+    at = Rotation.from_euler("z", yaw_deg, degrees=True).apply([34.0, 34.0, 0.0])
+    assert math.dist(fit.origin_mm, (x_mm + at[0], y_mm + at[1])) < 1e-4
+    assert abs(math.remainder(fit.yaw_deg - yaw_deg, 360.0)) < 1e-5
+    assert np.allclose(fit.size_mm, (240.0, 170.0), atol=1e-4)
+    assert np.allclose(fit.board_origin_mm, (-34.0, -34.0), atol=1e-4)
+    assert fit.plane.plane.slope_x == pytest.approx(slope, abs=1e-6)
+
+
+@pytest.mark.parametrize("pair", list(itertools.combinations(CORNERS, 2)))
+def test_corners_that_were_swapped_are_named(pair: tuple[str, str]) -> None:
+    board, _ = laid(30.0, (400.0, -100.0), noise_mm=0.3)
+    one, other = pair
+    board[one], board[other] = board[other], board[one]
+    with pytest.raises(CannotTeach) as refused:
+        check_board(board, BOARD)
+    said = refused.value.what
+    assert "swapped" in said or "mirror" in said
+    assert "swapped" not in said or (one in said and other in said)
+
+
+def test_corners_named_as_in_a_mirror_are_recognised() -> None:
+    board, _ = laid(30.0, (400.0, -100.0), noise_mm=0.3)
+    mirrored = {
+        name: board[name.replace("left", "?").replace("right", "left").replace("?", "right")] for name in CORNERS
+    }
+    with pytest.raises(CannotTeach, match="mirror"):
+        check_board(mirrored, BOARD)
+
+
+def test_a_print_of_another_size_is_named_with_its_squares() -> None:
+    board, _ = laid(30.0, (400.0, -100.0), noise_mm=0.3)
+    claimed = BOARD.model_copy(update={"square_mm": 12.4, "marker_mm": 9.3})
+    with pytest.raises(CannotTeach, match=r"its squares measure 12\.0\d mm, not 12\.4 mm"):
+        check_board(board, claimed)
+
+
+def test_a_sheet_that_lies_askew_is_refused() -> None:
+    board, _ = laid(30.0, (400.0, -100.0))
+    _, askew = laid(32.0, (405.0, -104.0))
+    with pytest.raises(CannotTeach, match=r"turned by \+2\.0 deg on its board"):
+        fit_sheet(board, askew, BOARD)
+
+
+def test_points_of_a_registration_that_were_swapped_are_named() -> None:
+    robot = np.array([[0.0, 0.0], [100.0, 0.0], [100.0, 60.0], [0.0, 60.0], [50.0, 20.0]])
+    seen = robot + 5.0
+    names = ("a", "b", "c", "d", "e")
+    with pytest.raises(CalibrationError, match="fit only if b and e are swapped"):
+        register(names, robot[[0, 4, 2, 3, 1]], seen)
+    with pytest.raises(CalibrationError, match="fit only as in a mirror"):
+        register(names, robot * [1.0, -1.0], seen)
+    assert mixed_up(names, robot, seen) == ""
+
+
+# Places
+
+
+@given(st.floats(5.0, 60.0), st.floats(-600.0, 600.0), st.floats(-600.0, 600.0))
+def test_a_rim_is_the_circle_through_its_points(radius_mm: float, x_mm: float, y_mm: float) -> None:
+    points = [(x_mm + radius_mm * math.cos(a), y_mm + radius_mm * math.sin(a), 130.0) for a in (0.3, 2.2, 4.4)]
+    centre, radius, height = rim(points)
+    assert math.dist(centre, (x_mm, y_mm)) < 1e-6
+    assert (radius, height) == (pytest.approx(radius_mm), 130.0)
+
+
+def test_points_on_a_line_are_no_rim() -> None:
+    with pytest.raises(CannotTeach, match="rim"):
+        rim([(0.0, 0.0, 1.0), (10.0, 0.0, 1.0), (20.0, 0.01, 1.0)])
+
+
+def test_the_box_holds_every_point_and_its_floor_is_not_lowered() -> None:
+    assert hull([(1.2, 2.0, 100.0), (11.0, -5.5, 150.0)], 25.0) == ((-24, 36), (-31, 27), (100.0, 175))
