@@ -14,6 +14,7 @@ from collect.tui.finish_screen import FinishScreen
 from sessions.repair.verify import Verdict
 from tests.collect.tui.fake import DONE, FAILED, JOGGED, PAUSED, SET_UP, SPLIT, TOUCHED, FakeEngine, full_picture
 from tests.collect.tui.fake_browser import FakeBrowser, a_review
+from tests.collect.tui.teach_fake import Asking, app_of
 
 SIZES = {"80x24": (80, 24), "120x40": (120, 40), "200x60": (200, 60)}
 NOW = {
@@ -110,6 +111,23 @@ def test_the_end_of_a_session(snap_compare: Callable[..., bool], monkeypatch: py
 def test_over_a_larger_run(snap_compare: Callable[..., bool], name: str, keys: list[str], size: str) -> None:
     app = OperatorApp(FakeEngine(full_picture()))
     assert snap_compare(app, terminal_size=SIZES[size], run_before=pressing(*keys))
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"),
+    [("bring", "80x24"), ("bring", "120x40"), ("jog", "80x24"), ("choose", "120x40"), ("number", "80x24")],
+)
+def test_first_day(snap_compare: Callable[..., bool], kind: str, size: str) -> None:
+    app = app_of(Asking(kind))
+
+    async def asked(pilot: Pilot[None]) -> None:
+        while not app._screen.asking:
+            await pilot.pause(0.02)
+        await pilot.pause()
+
+    assert snap_compare(app, terminal_size=SIZES[size], run_before=asked)
+    app.teaching.stop()
+    app.teaching._thread.join()
 
 
 def test_light(snap_compare: Callable[..., bool]) -> None:

@@ -1,0 +1,171 @@
+"""The app of the first day: polls what the steps show, and stops the arm by key from every state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine
+from typing import Any, ClassVar
+
+from textual import events
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import VerticalScroll
+from textual.screen import ModalScreen
+from textual.widgets import Static
+
+from collect.errors import CollectAborted, describe
+from collect.headless import REFRESH_S, stop_signals
+from collect.tui.pictures import Pictures
+from collect.tui.question_screens import Confirm
+from collect.tui.teach_guide import ScreenGuide, Teaching
+from collect.tui.teach_screen import TeachScreen
+from collect.tui.terminal import PlainApp, TerminalDriver
+from collect.tui.text import SOFTWARE_STOP
+
+Work = Callable[[ScreenGuide], Coroutine[Any, Any, object]]
+AT_WORK = ("Something is at work: stop it and leave?", "y  stop and leave      n  go on      s  stop now")
+STOPPED = "Stopped. Look at the arm before you go on.\ng  go on from the last question   q  leave, all is kept"
+DONE = "This is done.   q  leave"
+HELP = f"""\
+enter     take the answer that is offered, or: the tip is there
+esc       leave this step; it begins again where it was
+k         skip this thing, where the step can do without it
+q         leave; everything taught is kept, the same command goes on
+ctrl-q    the same while you type
+s, ctrl-c stop the arm at once (ctrl-c while you type)
+tab       picture, on a narrow screen
+
+Jog: arrows move along base x and y, page up and down along z, 1 to 9
+choose the size of a step. Every step is checked against the box that is
+known so far, and is slower than 50 mm/s.
+
+{SOFTWARE_STOP}"""
+
+
+class TeachHelp(ModalScreen[None]):
+    """Every key on one page; any of its own keys closes it."""
+
+    DEFAULT_CSS = """
+    TeachHelp { align: center middle; }
+    TeachHelp VerticalScroll {
+        width: 78; max-width: 100%; height: auto; max-height: 100%; padding: 0 1;
+        border: heavy $accent; background: $surface;
+    }
+    """
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,q,question_mark,enter", "dismiss(None)", "Close")]
+
+    def compose(self) -> ComposeResult:
+        """Lay out the page."""
+        with VerticalScroll() as page:
+            page.border_title = "Help, escape closes"
+            yield Static(HELP, markup=False)
+
+
+class TeachApp(PlainApp):
+    """Runs the steps, shows them, and carries the keys to them."""
+
+    TITLE = "brushloop"
+    ALLOW_SELECT = False
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("q", "leave", "Leave"),
+        Binding("ctrl+q", "leave", "Leave", show=False, priority=True),
+        Binding("question_mark", "help", "Help"),
+        Binding("g", "go_on", "Go on", show=False),
+    ]
+
+    def __init__(self, work: Work, name: str, pictures: Pictures | None = None) -> None:
+        super().__init__(driver_class=TerminalDriver)
+        self._work = work
+        self._name = name
+        self._pictures = pictures or Pictures()
+        self.teaching = Teaching(work)
+        self._screen = TeachScreen(self.teaching.guide, name, self._pictures)
+        self._ending = False
+        self._signalled = False
+
+    def on_mount(self) -> None:
+        """Start the steps; then look ten times a second."""
+        self.push_screen(self._screen)
+        self.teaching.start()
+        self.set_interval(REFRESH_S, self._poll)
+
+    async def on_event(self, event: events.Event) -> None:
+        """Stop keys come first, on every screen; `s` is a letter only while a line is typed."""
+        if isinstance(event, events.Key) and not self.teaching.finished:
+            letter = event.key == "s" and self._screen.typing and self.screen is self._screen
+            if event.key in ("s", "ctrl+c") and not letter:
+                self.action_stop()
+                return
+        await super().on_event(event)
+
+    def action_stop(self) -> None:
+        """Stop whatever is under way, and say so at once."""
+        self.teaching.stop()
+        if self._screen.is_mounted:
+            self._screen.stop_sent()
+
+    def action_leave(self) -> None:
+        """Leave; where something is at work, ask first."""
+        if isinstance(self.screen, Confirm):
+            return
+        if self.teaching.finished:
+            self.exit()
+        elif self._screen.asking:
+            self._ending = True
+            self.teaching.guide.leave()
+        else:
+            self.push_screen(Confirm(*AT_WORK), self._stop_and_leave)
+
+    def _stop_and_leave(self, yes: bool | None) -> None:
+        if yes:
+            self._ending = True
+            self.action_stop()
+
+    def action_go_on(self) -> None:
+        """After a stop, begin again where the notebook is."""
+        if self.teaching.finished and self.teaching.stopped and self.teaching.error is None:
+            self.teaching = Teaching(self._work)
+            self._screen.follow(self.teaching.guide)
+            self.teaching.start()
+
+    def action_help(self) -> None:
+        """Show every key."""
+        if not isinstance(self.screen, TeachHelp):
+            self.push_screen(TeachHelp())
+
+    def leave_soon(self) -> None:
+        """End the app, from any thread: a signal came."""
+        self._signalled = True
+
+    def _poll(self) -> None:
+        if not self.is_running or not self._screen.is_mounted:
+            return
+        over = ""
+        if self.teaching.finished:
+            error = self.teaching.error
+            if self._signalled or isinstance(error, CollectAborted) or (self._ending and error is None):
+                self.exit()
+                return
+            over = describe(error) + "\nq  leave" if error is not None else STOPPED if self.teaching.stopped else DONE
+        self._screen.show(self.teaching.guide.view, over)
+
+
+def run_teaching(work: Work, name: str, pictures: Pictures | None = None) -> None:
+    """Show the screen until the person leaves; raises what ended the steps.
+
+    However the screen ends, nobody watches the arm any more: whatever moves it is stopped.
+    """
+    app = TeachApp(work, name, pictures)
+
+    def on_signal(_: int) -> None:
+        app.teaching.stop()
+        app.leave_soon()
+
+    with stop_signals(on_signal):
+        try:
+            app.run()
+        finally:
+            if not app.teaching.finished:
+                app.teaching.stop()
+    app.teaching.join()
+    if app.teaching.stopped:
+        raise CollectAborted("stopped; the same command goes on from there")

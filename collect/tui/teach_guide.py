@@ -1,0 +1,241 @@
+"""The guided first day between two threads: the steps ask in theirs, the screen answers from its own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from collect.operator import Choice
+from collect.teach.guide import (
+    Brought,
+    JogStep,
+    JogView,
+    LeftOff,
+    Picture,
+    Shown,
+    StepState,
+    Target,
+    WentBack,
+)
+from drivers.samples import Pose
+
+Kind = Literal["choose", "number", "text", "bring", "jog"]
+Answer = str | float | Brought | JogStep
+AGAIN_S = 5.0
+"""A stop that is not over after this long is sent again."""
+MOST_FINDINGS = 200
+"""Findings that can be scrolled back to."""
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What the steps wait for."""
+
+    number: int
+    """From 1; an answer to an older question is dropped."""
+    kind: Kind
+    text: str
+    choices: tuple[Choice, ...] = ()
+    default: str = ""
+    """Key of a choice, or what an empty line stands for; empty if an empty line is no answer."""
+    unit: str = ""
+    low: float = 0.0
+    high: float = 0.0
+    jog: JogView | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TeachView:
+    """Everything that the screen shows; replaced whole, so that any thread may read it."""
+
+    steps: tuple[StepState, ...] = ()
+    findings: tuple[Shown, ...] = ()
+    question: Question | None = None
+    picture: Picture | None = None
+    """The newest picture of a finding."""
+    tip: Pose | None = None
+    """Where the tip is now, or the flange before the tip is taught."""
+    tip_known: bool = False
+    live: Picture | None = None
+    """What the camera sees now, where that is known."""
+
+
+class ScreenGuide:
+    """`Guide` for a screen. The methods that a step awaits run in the steps' event loop, all others in any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._view = TeachView()
+        self._count = 0
+        self._open: tuple[asyncio.AbstractEventLoop, asyncio.Future[Answer]] | None = None
+        self._leaving = False
+
+    @property
+    def view(self) -> TeachView:
+        """What there is to show now."""
+        with self._lock:
+            return self._view
+
+    # Of the steps
+
+    async def overview(self, steps: tuple[StepState, ...]) -> None:
+        """Show the steps and their states."""
+        self._change(steps=steps)
+
+    async def show(self, what: Shown) -> None:
+        """Add a finding, and show its picture if it has one."""
+        findings = (*self.view.findings, what)[-MOST_FINDINGS:]
+        self._change(findings=findings, picture=self.view.picture if what.picture is None else what.picture)
+
+    async def choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
+        """The key of one of the choices."""
+        return str(await self._ask("choose", question, choices=choices, default=default))
+
+    async def number(self, question: str, unit: str, low: float, high: float, default: float | None) -> float:
+        """A number in [low, high]; the screen checks it."""
+        empty = "" if default is None else f"{default:g}"
+        answer = await self._ask("number", question, unit=unit, low=low, high=high, default=empty)
+        assert isinstance(answer, float)
+        return answer
+
+    async def text(self, question: str, default: str) -> str:
+        """A line of text."""
+        return str(await self._ask("text", question, default=default))
+
+    async def bring(self, target: Target, how: str) -> Brought:
+        """Wait until the person says that the tip is there."""
+        answer = await self._ask("bring", how)
+        assert isinstance(answer, Brought)
+        return answer
+
+    async def jog(self, view: JogView) -> JogStep | Brought:
+        """The next step by key."""
+        answer = await self._ask("jog", view.question, jog=view)
+        assert isinstance(answer, JogStep | Brought)
+        return answer
+
+    def see(self, tip: Pose | None, tip_known: bool, picture: Picture | None) -> None:
+        """Show where the arm is and what the camera sees."""
+        self._change(tip=tip, tip_known=tip_known, live=picture)
+
+    # Of the screen
+
+    def answer(self, number: int, answer: Answer) -> None:
+        """Answer the question of that number; nothing happens if it is answered already."""
+        self._settle(number, lambda future: future.set_result(answer))
+
+    def back(self, number: int) -> None:
+        """Leave the step from its question."""
+        self._settle(number, lambda future: future.set_exception(WentBack()))
+
+    def leave(self) -> None:
+        """End at the open question, or at the next one."""
+        with self._lock:
+            self._leaving, question = True, self._view.question
+        if question is not None:
+            self._settle(question.number, lambda future: future.set_exception(LeftOff()))
+
+    def _settle(self, number: int, settle: Callable[[asyncio.Future[Answer]], None]) -> None:
+        with self._lock:
+            if self._open is None or self._view.question is None or self._view.question.number != number:
+                return
+            loop, future = self._open
+            self._open = None
+        loop.call_soon_threadsafe(lambda: None if future.done() else settle(future))
+
+    async def _ask(self, kind: Kind, text: str, **more: Any) -> Answer:
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[Answer] = loop.create_future()
+        with self._lock:
+            if self._leaving:
+                raise LeftOff
+            self._count += 1
+            self._open = (loop, future)
+            self._view = replace(self._view, question=Question(self._count, kind, text, **more))
+        try:
+            return await future
+        finally:
+            with self._lock:
+                self._open = None
+                self._view = replace(self._view, question=None)
+
+    def _change(self, **fields: Any) -> None:
+        with self._lock:
+            self._view = replace(self._view, **fields)
+
+
+class Teaching:
+    """The steps in a thread of their own, so that nothing they compute keeps a stop waiting on the screen."""
+
+    def __init__(self, work: Callable[[ScreenGuide], Coroutine[Any, Any, object]]) -> None:
+        self.guide = ScreenGuide()
+        self.error: BaseException | None = None
+        """What ended it, other than a stop."""
+        self.stopped = False
+        """Whether a stop ended it."""
+        self._work = work
+        self._cancelled_s = -math.inf
+        self._started = threading.Event()
+        self._task: asyncio.Task[object] | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._thread = threading.Thread(target=self._run, name="first day", daemon=True)
+
+    def start(self) -> None:
+        """Begin; returns once a stop can be carried out."""
+        self._thread.start()
+        self._started.wait()
+
+    @property
+    def finished(self) -> bool:
+        """Whether it is over."""
+        return self._started.is_set() and not self._thread.is_alive()
+
+    def stop(self) -> None:
+        """Cancel what is under way: a driver stops its arm before it lets a cancelled move end. From any thread.
+
+        Again only after `AGAIN_S`: a second cancellation would cut the stop short that the first one has begun.
+        """
+        now_s = time.monotonic()
+        if self._loop is not None and self._task is not None and now_s - self._cancelled_s > AGAIN_S:
+            self._cancelled_s = now_s
+            with contextlib.suppress(RuntimeError):  # the loop has just ended
+                self._loop.call_soon_threadsafe(self._task.cancel)
+
+    def join(self) -> None:
+        """Wait for the end, and raise what ended it."""
+        self._thread.join()
+        if self.error is not None:
+            raise self.error
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._main())
+        except asyncio.CancelledError as stopped:
+            self.stopped = True
+            # The notes say whether the arm was seen at rest.
+            if notes := getattr(stopped, "__notes__", []):
+                self.error = StopUnsure(" ".join(notes))
+        except BaseException as error:
+            self.error = error
+        finally:
+            self._started.set()
+
+    async def _main(self) -> None:
+        self._loop, self._task = asyncio.get_running_loop(), asyncio.ensure_future(self._work(self.guide))
+        self._started.set()
+        await self._task
+
+
+class StopUnsure(Exception):
+    """The arm was told to stop and was not seen at rest."""
+
+    exit_code = 4
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"{what} Use the emergency stop, the red button, if it moves.")

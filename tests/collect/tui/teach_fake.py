@@ -1,0 +1,85 @@
+"""A first day that asks one question of each kind, for tests of its screen."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import cv2
+import numpy as np
+
+from collect.operator import Choice
+from collect.teach.guide import Brought, JogStep, JogView, Shown, StepState, Target
+from collect.tui.teach_app import TeachApp
+from collect.tui.teach_guide import ScreenGuide
+from drivers.geometry import brush_pose
+
+STEPS = (
+    StepState("arm", "Find the arm", 3, "taught", "192.0.2.7:30004"),
+    StepState("camera", "Find the camera, its settings and its lens", 12, "taught", "2048 x 1536, 8 Hz"),
+    StepState("tip", "Tip of the brush", 8, "current"),
+    *(StepState(name, name.capitalize(), 5, "open") for name in ("sheet", "places", "brush", "force", "limits")),
+    StepState("proof", "Proof", 6, "open"),
+)
+FOUND = Shown(("five directions: the tip is known to 0.11 mm", "residuals 0.10, 0.24, 0.08, 0.17, 0.21 mm"))
+WARNED = Shown(("direction 2 is like direction 1: lean the brush farther",), tone="warning")
+YES, NO = Choice("y", "yes, take it"), Choice("n", "no, touch it again")
+JOG = JogView("Lower the tip onto the paper.", (0.0, 0.1, -1.3), (0.02, 0.1, 1.0), "z = 97.900 mm is outside the box")
+
+
+def board() -> np.ndarray:
+    squares = cv2.aruco.CharucoBoard((7, 5), 20.0, 15.0, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100))
+    return squares.generateImage((560, 400), marginSize=20)
+
+
+class Asking:
+    """Asks what it is told to, and notes the answers."""
+
+    def __init__(self, *kinds: str) -> None:
+        self.kinds = kinds
+        self.answers: list[object] = []
+        self.moving = asyncio.Event
+        self.stopped_arm = False
+
+    async def __call__(self, guide: ScreenGuide) -> object:
+        await guide.overview(STEPS)
+        await guide.show(FOUND)
+        await guide.show(WARNED)
+        guide.see(brush_pose(412.25, -31.5, 121.75), True, None)
+        for kind in self.kinds:
+            self.answers.append(await self._ask(guide, kind))
+        return None
+
+    async def _ask(self, guide: ScreenGuide, kind: str) -> Any:
+        match kind:
+            case "choose":
+                return await guide.choose("Take this tip?", (YES, NO), "y")
+            case "number":
+                return await guide.number("Squares along its longer side", "squares", 3, 50, None)
+            case "text":
+                return await guide.text("Address of the cabinet", "192.0.2.7")
+            case "bring":
+                await guide.show(Shown(("the board as the camera sees it",), board()))
+                how = "Guide the tip to the pin by hand, the brush leaning toward the window, then press Enter."
+                return await guide.bring(Target("pin", 2), how)
+            case "jog":
+                while not isinstance(answer := await guide.jog(JOG), Brought):
+                    self.answers.append(answer)
+                return answer
+            case _:
+                return await self._move()
+
+    async def _move(self) -> None:
+        """A move that a driver stops when it is cancelled."""
+        try:
+            await asyncio.sleep(60.0)
+        except asyncio.CancelledError:
+            self.stopped_arm = True
+            raise
+
+
+def app_of(asking: Asking) -> TeachApp:
+    return TeachApp(asking, "rig.toml")
+
+
+__all__ = ["JOG", "Asking", "JogStep", "app_of"]

@@ -1,0 +1,129 @@
+"""The screen of the first day: every question is answered by key, and a stop key stops whatever is at work."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import pytest
+from textual.pilot import Pilot
+
+from collect.errors import CollectAborted
+from collect.teach.guide import Brought, JogStep, LeftOff, WentBack
+from collect.tui.question_screens import Confirm
+from collect.tui.teach_app import TeachApp
+from tests.collect.tui.screen_text import shown
+from tests.collect.tui.teach_fake import Asking, app_of
+
+SIZE = (80, 24)
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(20.0):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
+@asynccontextmanager
+async def running(asking: Asking) -> AsyncIterator[tuple[TeachApp, Pilot[None]]]:
+    app = app_of(asking)
+    async with app.run_test(size=SIZE) as pilot:
+        await until(lambda: app._screen._drawn is not None and (app._screen.asking or not asking.kinds))
+        await pilot.pause()
+        try:
+            yield app, pilot
+        finally:
+            app.teaching.stop()
+            app.teaching._thread.join()
+
+
+async def seen(app: TeachApp, pilot: Pilot[None], condition: Callable[[], bool]) -> None:
+    await until(condition)
+    await pilot.pause()
+
+
+@pytest.mark.parametrize(
+    ("kind", "keys", "answer"),
+    [
+        ("choose", ["n"], "n"),
+        ("choose", ["enter"], "y"),
+        ("number", ["2", "6", "enter"], 26.0),
+        ("text", ["enter"], "192.0.2.7"),
+        ("text", ["s", "q", "1", "enter"], "sq1"),
+        ("bring", ["enter"], Brought.DONE),
+        ("bring", ["k"], Brought.SKIP),
+        ("jog", ["enter"], Brought.DONE),
+    ],
+)
+async def test_a_question_is_answered_by_its_keys(kind: str, keys: list[str], answer: object) -> None:
+    asking = Asking(kind)
+    async with running(asking) as (app, pilot):
+        await pilot.press(*keys)
+        await seen(app, pilot, lambda: bool(asking.answers))
+    assert asking.answers == [answer]
+
+
+async def test_arrows_jog_by_the_chosen_step() -> None:
+    asking = Asking("jog")
+    async with running(asking) as (app, pilot):
+        await pilot.press("3", "left")
+        await seen(app, pilot, lambda: len(asking.answers) == 1 and app._screen.asking)
+        await pilot.press("1", "pageup")
+        await seen(app, pilot, lambda: len(asking.answers) == 2 and app._screen.asking)
+    assert asking.answers == [JogStep("x", -1.0), JogStep("z", 0.02)]
+
+
+async def test_a_number_out_of_range_is_refused_with_the_range() -> None:
+    asking = Asking("number")
+    async with running(asking) as (app, pilot):
+        await pilot.press("9", "9", "enter")
+        await pilot.pause()
+        assert "99 is outside 3 to 50 squares" in shown(app)
+        assert app._screen.asking
+    assert asking.answers == []
+
+
+@pytest.mark.parametrize(("keys", "raised"), [(["escape"], WentBack), (["q"], LeftOff)])
+async def test_escape_leaves_the_step_and_q_the_day(keys: list[str], raised: type[Exception]) -> None:
+    async with running(Asking("bring")) as (app, pilot):
+        await pilot.press(*keys)
+        await seen(app, pilot, lambda: app.teaching.finished)
+    assert isinstance(app.teaching.error, raised)
+
+
+@pytest.mark.parametrize("key", ["s", "ctrl+c"])
+async def test_a_stop_key_stops_what_is_at_work_and_g_goes_on(key: str) -> None:
+    asking = Asking("choose", "move")
+    async with running(asking) as (app, pilot):
+        await pilot.press("y")
+        await seen(app, pilot, lambda: not app._screen.asking)
+        assert "at work; s: software stop" in shown(app)
+        await pilot.press(key)
+        await seen(app, pilot, lambda: asking.stopped_arm and "Stopped." in shown(app))
+        await pilot.press("g")
+        await seen(app, pilot, lambda: app._screen.asking)
+        assert not app.teaching.finished
+
+
+async def test_leaving_while_something_is_at_work_asks_and_the_stop_key_works_over_it() -> None:
+    asking = Asking("choose", "move")
+    async with running(asking) as (app, pilot):
+        await pilot.press("y")
+        await seen(app, pilot, lambda: not app._screen.asking)
+        await pilot.press("q")
+        await pilot.pause()
+        assert isinstance(app.screen, Confirm)
+        await pilot.press("s")
+        await seen(app, pilot, lambda: asking.stopped_arm)
+
+
+async def test_what_ends_the_steps_ends_the_app() -> None:
+    async def broken(_: object) -> None:
+        raise CollectAborted("left off")
+
+    app = TeachApp(broken, "rig.toml")
+    async with app.run_test(size=SIZE):
+        await until(lambda: not app.is_running)
+    with pytest.raises(CollectAborted, match="left off"):
+        app.teaching.join()
