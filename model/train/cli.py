@@ -21,6 +21,7 @@ def train(
     steps: Annotated[int | None, typer.Option(help="G, the most steps.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of weights and images.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads of each process.")] = None,
+    workers: Annotated[int | None, typer.Option(help="Threads of each process that draw images ahead.")] = None,
     device: Annotated[str | None, typer.Option(help="cpu or cuda.")] = None,
     tensorboard: Annotated[bool, typer.Option(help="Write TensorBoard's event files too.")] = False,
 ) -> None:
@@ -30,7 +31,7 @@ def train(
     from model.train import config as configs
     from model.train.run import train_with_bar
 
-    changes = {"steps": steps, "seed": seed, "threads": threads, "device": device}
+    changes = {"steps": steps, "seed": seed, "threads": threads, "workers": workers, "device": device}
     changes = {name: value for name, value in changes.items() if value is not None}
     if config is None:
         chosen = configs.preset(target, **changes)

@@ -94,6 +94,8 @@ class TrainConfig(_Frozen):
     """Origin of weights and images when training on captures."""
     threads: Annotated[int, Field(ge=1, le=256)] = 1
     """Threads of torch in each process; a different number changes the last bits of the weights."""
+    workers: Annotated[int, Field(ge=0, le=64)] = 1
+    """Threads of each process that draw batches ahead; 0 draws each when its step comes. Changes no image."""
     device: Literal["cpu", "cuda"] = "cpu"
 
     @model_validator(mode="after")
@@ -180,7 +182,7 @@ def checked(where: Path | str, fields: Any) -> TrainConfig:
 
 
 def differences(old: TrainConfig, new: TrainConfig) -> list[str]:
-    """List differences between two configurations as `field: old -> new`."""
+    """List differences between two configurations as `field: old -> new`, except in `workers`, which change nothing."""
     found: list[str] = []
 
     def walk(a: Any, b: Any, path: str) -> None:
@@ -190,5 +192,6 @@ def differences(old: TrainConfig, new: TrainConfig) -> list[str]:
         elif a != b:
             found.append(f"{path}: {a} -> {b}")
 
-    walk(old.model_dump(mode="json"), new.model_dump(mode="json"), "")
+    before, after = (config.model_dump(mode="json", exclude={"workers"}) for config in (old, new))
+    walk(before, after, "")
     return found

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -11,9 +12,10 @@ import torch
 from torch import Tensor
 
 from model.generator.network import Generator, squared_error
+from model.train.batches import Batch, batches
 from model.train.checkpoint import State, put_weights
 from model.train.config import TrainConfig
-from model.train.data import Images, batch_numbers
+from model.train.data import Images
 from model.train.distributed import Group
 from model.train.errors import BlankOutput, Diverged, TrainingStopped
 
@@ -88,9 +90,15 @@ def train(
     optimiser = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
     _put_moments(optimiser, network, state)
     run = _Run(config, network, optimiser, sets, watcher, group, state.losses.tolist(), state.validations.tolist())
-    step, saved = state.step, state.step
+    with closing(batches(config, sets[0], group, state.step)) as drawn:
+        return _steps(run, drawn, state.step, stopping)
+
+
+def _steps(run: _Run, drawn: Iterator[Batch], step: int, stopping: Callable[[], bool]) -> State:
+    """Make the steps that are left, and what falls due between them."""
+    config, group, watcher, saved = run.config, run.group, run.watcher, step
     while step < config.steps and not converged(config, run.validations):
-        loss, stop = run.step(step, stopping())
+        loss, stop = run.step(step, next(drawn), stopping())
         step += 1
         if not math.isfinite(loss):
             raise Diverged(step)
@@ -161,14 +169,13 @@ class _Run:
     validations: list[list[float]]
     blanks: int = 0
 
-    def step(self, step: int, stopping: bool) -> tuple[float, bool]:
+    def step(self, step: int, batch: Batch, stopping: bool) -> tuple[float, bool]:
         """Make one update; return Eq. 6 over the global batch and whether any process was asked to stop."""
-        config, training = self.config, self.sets[0]
-        numbers = batch_numbers(len(training), config.batch, config.seed, step)
-        inputs, target = (part.to(self.group.device) for part in training.pick(self.group.share(numbers)))
+        config = self.config
+        inputs, target = (part.to(self.group.device) for part in (batch.inputs, batch.target))
         for options in self.optimiser.param_groups:
             options["lr"] = learning_rate(config, step)
-        pixels = len(numbers) * config.target.size_px**2
+        pixels = batch.count * config.target.size_px**2
         loss = squared_error(self.network.field(inputs), target, config.ink_weight) / pixels
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()

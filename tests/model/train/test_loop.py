@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import threading
+from contextlib import closing
+
 import pytest
 import torch
+from torch import Tensor
 
+from model.train.batches import batches
 from model.train.checkpoint import State
-from model.train.config import TrainConfig
-from model.train.data import batch_numbers, exact_sets
+from model.train.config import TrainConfig, differences
+from model.train.data import Exact, batch_numbers, exact_sets
+from model.train.distributed import Group
 from model.train.errors import BlankOutput, Diverged, TrainingStopped
 from model.train.loop import converged, learning_rate, new_state, train
 
@@ -48,6 +54,30 @@ def test_batches_follow_from_seed_and_step(tiny: TrainConfig) -> None:
     first, second = exact_sets(tiny), exact_sets(tiny)
     assert torch.equal(first[0].inputs, second[0].inputs)
     assert not torch.isin(first[1].inputs[:, 0], first[0].inputs[:, 0]).any()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_batches_drawn_ahead_are_those_drawn_in_time(tiny: TrainConfig, notes, workers: int) -> None:
+    in_time, ahead = (tiny.model_copy(update={"workers": n, "steps": 8}) for n in (0, workers))
+    pairs = zip(*(batches(config, exact_sets(config)[0], Group(), 3) for config in (in_time, ahead)), strict=True)
+    for one, other in pairs:
+        assert torch.equal(one.inputs, other.inputs)
+        assert torch.equal(one.target, other.target)
+    assert same(*(train(config, new_state(config), exact_sets(config), notes) for config in (in_time, ahead)))
+    assert differences(in_time, ahead) == []  # so either goes on where the other stopped
+
+
+def test_batches_are_drawn_while_earlier_ones_are_in_use(tiny: TrainConfig) -> None:
+    class Noted(Exact):
+        def pick(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
+            drawn.release()
+            return super().pick(numbers)
+
+    drawn = threading.Semaphore(0)
+    training = exact_sets(tiny)[0]
+    with closing(batches(tiny, Noted(training.target, training.inputs), Group(), 0)) as ahead:
+        next(ahead)
+        assert all(drawn.acquire(timeout=10) for _ in range(3))  # the first and two more
 
 
 def test_asked_to_stop_it_keeps_the_last_step(tiny: TrainConfig, notes) -> None:
