@@ -16,6 +16,7 @@ Picture = NDArray[np.uint8]
 
 TargetKind = Literal[
     "pin",
+    "upright",
     "board-corner",
     "sheet-corner",
     "well",
@@ -34,7 +35,7 @@ class Target:
 
     kind: TargetKind
     index: int = 0
-    """Which one, from 0: the direction of the pin, the pose of a held board."""
+    """Which one, from 0: direction of the pin, turn of the wrist of an upright brush, pose of a held board."""
     corner: str = ""
     """Which corner: `lower left`, `lower right`, `upper right` or `upper left`, as the print names it."""
 

@@ -17,6 +17,7 @@ from calibrate.board.intrinsics import GOOD_VIEWS, RMS_LIMIT_PX, Fitted, fit_len
 from calibrate.board.spec import BoardSpec, describe
 from calibrate.errors import CalibrationError
 from calibrate.files import read_gray
+from collect.operator import Choice
 from collect.teach.cameras import Gray, devices, frame_rate_hz, locked_settings, opened, still, taught_camera
 from collect.teach.day import Day
 from collect.teach.errors import CannotTeach
@@ -59,10 +60,10 @@ class CameraStep:
 
     async def teach(self, day: Day) -> None:
         """Ask for source and print, measure the rest. Raises `CannotTeach`, `DeviceError`, `CalibrationError`."""
-        if "camera.source" not in day.notebook.values:
-            await self._source(day)
         if "board.dictionary" not in day.notebook.values:
             await self._print(day)
+        if "camera.source" not in day.notebook.values:
+            await self._source(day)
         async with taught_camera(day.notebook, day.clock) as camera:
             if "aside.frame_rate_hz" not in day.notebook.values:
                 rate_hz = await frame_rate_hz(camera)
@@ -87,14 +88,20 @@ class CameraStep:
 
     async def _source(self, day: Day) -> None:
         found = devices()
-        question = "Address of the camera's stream, as http://192.0.2.8/stream.mjpg" + (
-            f", or a device of this computer: {', '.join(found)}" if found else ""
-        )
-        for source in found:
-            await self._picture(day, source)
-        source = await day.guide.text(question, found[0] if found else "")
-        if source not in found:
-            await self._picture(day, source)
+        if found:
+            await day.say(f"Video devices of this computer: {', '.join(found)}")
+        question = "Address of the camera's stream, as http://192.0.2.8/stream.mjpg (several: with spaces between them)"
+        typed = (await day.guide.text(question, "")).split()
+        seen = {source: await self._looked_at(day, source) for source in dict.fromkeys([*typed, *found])}
+        usable = {source: corners for source, corners in seen.items() if corners is not None}
+        if not usable:
+            raise CannotTeach("no camera gives a picture.", "Check power, cable and address; then try again.")
+        source = max(usable, key=lambda one: usable[one] or 0)
+        if len(usable) > 1:
+            keys = {str(number): one for number, one in enumerate(usable, 1)}
+            choices = tuple(Choice(key, one) for key, one in keys.items())
+            best = next(key for key, one in keys.items() if one == source)
+            source = keys[await day.guide.choose("Which of them looks at the sheet?", choices, best)]
         settings = await locked_settings(source)
         day.keep("camera", "camera.kind", "opencv", "the only kind")
         for name, value in settings.items():
@@ -108,19 +115,24 @@ class CameraStep:
                 tone="warning",
             )
         # Last, so that a session that is cut before begins again with the source.
-        day.keep("camera", "camera.source", source, "typed, and its picture was seen")
+        day.keep("camera", "camera.source", source, "typed or found, and its picture was seen")
 
-    async def _picture(self, day: Day, source: str) -> None:
+    async def _looked_at(self, day: Day, source: str) -> int | None:
+        """Show a picture of a camera; return how many corners of the board it shows, None where it gives none."""
         try:
             async with opened(source, day.clock) as camera:
                 picture = await still(camera, day.clock)
         except DeviceError as error:
-            if source in devices():
-                await day.say(f"device {source}: {error.what}", tone="warning")
-                return
-            raise
+            await day.say(f"{source}: {error.what}", tone="warning")
+            return None
         height, width = picture.shape
-        await day.say(f"{source}: {width} x {height} px", picture=picture)
+        try:
+            corners = len((await asyncio.to_thread(find_board, picture, board_of(day.notebook), source)).ids)
+            what = f"{corners} corners of the board are seen"
+        except CalibrationError as error:
+            corners, what = 0, error.what
+        await day.say(f"{source}: {width} x {height} px; {what}", picture=picture)
+        return corners
 
     async def _print(self, day: Day) -> None:
         await day.say("The board: a print of `brushloop camera board`. Its name stands along its lower edge.")

@@ -28,6 +28,8 @@ LEAST_PUSH_N, MOST_PUSH_N = 0.3, 60.0
 MOST_NOISE_N = 0.05
 STRAIGHT = 0.8
 """Least share of the push along the sensor's z."""
+LEAN_ROOM_DEG = 0.3
+"""Room for another sheet on the same table."""
 INSET_MM = 6.0
 """Distance of the touch points from the sheet's edges: in its margin, where they cost no cell."""
 
@@ -102,11 +104,19 @@ class ForceStep:
         middle = np.array([width_mm, height_mm]) / 2.0
         points = middle + (corners_of(width_mm, height_mm) - middle) * (1.0 - INSET_MM / middle)
 
-        def taught(value: str | list[list[float]], how: str) -> Taught:
+        def taught(value: str | float | list[list[float]], how: str) -> Taught:
             return Taught(value=value, how=how, at=now_utc(), step="force")
 
         found = {"touch.method": taught("force" if sensor else "jog", "a sensor was found" if sensor else "no sensor")}
-        return found | {"touch.points_mm": taught(points.tolist(), f"{INSET_MM:g} mm inside the sheet's corners")}
+        _, slope_x, slope_y = notebook.numbers("aside.plane")
+        lean_deg = math.degrees(math.atan(math.hypot(slope_x, slope_y)))
+        widest_deg = min(max(math.ceil(10.0 * (lean_deg + LEAN_ROOM_DEG)) / 10.0, 1.0), 3.0)
+        return found | {
+            "touch.points_mm": taught(points.tolist(), f"{INSET_MM:g} mm inside the sheet's corners"),
+            "touch.lean_deg": taught(
+                widest_deg, f"the sheet leans by {lean_deg:.2f} deg, and {LEAN_ROOM_DEG:g} deg more"
+            ),
+        }
 
     def forget(self, notebook: Notebook) -> Notebook:
         """Without bus and push."""

@@ -15,8 +15,7 @@ from collect.teach.cameras import still, taught_camera
 from collect.teach.day import Day
 from collect.teach.errors import CannotTeach
 from collect.teach.guide import Target
-from collect.teach.maths.box import Point, rim
-from collect.teach.maths.sheet import corners_of
+from collect.teach.maths.sheet import Point, corners_of
 from collect.teach.maths.tip import tip_of
 from collect.teach.store import Notebook, StepName, Taught, Value, now_utc
 
@@ -24,7 +23,8 @@ TRAVEL_MM = 60.0
 """Travel height above the highest corner of the sheet: room for a dry run 30 mm above it."""
 RIM_CLEAR_MM = TRAVEL_CLEARANCE_MM + 5.0
 """Travel height above the rim of any pot: a drop hangs from the tip."""
-RIMS = ("on the side of the sheet", "a third of the way round", "two thirds of the way round")
+LEAST_RADIUS_MM, MOST_RADIUS_MM = 5.0, 100.0
+"""From the rim of a well to its middle."""
 
 
 class PlacesStep:
@@ -38,9 +38,7 @@ class PlacesStep:
     async def teach(self, day: Day) -> None:
         """Have the tip brought to each place; look whether the parked arm is out of the picture."""
         async with day.arm() as reader:
-            for index, where in enumerate(RIMS):
-                how = f"Bring the tip to the rim of the ink well, {where}."
-                await day.touch(reader, Target("well-rim", index), how, f"well-rim {index}")
+            await day.touch(reader, Target("well-rim"), "Bring the tip to the rim of the ink well.", "well-rim 0")
             how = "Bring the tip into the middle of the well, as deep as a dip shall go: a few mm above its bottom."
             await day.touch(reader, Target("well"), how, "well 0")
             with day.touched_again_if_refused("well-rim", "well"):
@@ -81,20 +79,19 @@ class PlacesStep:
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """Places in the sheet's frame, and the travel height."""
         paper, places = paper_of(notebook), tips(notebook)
-        centre_mm, radius_mm, rim_z_mm = _well(notebook)
+        x, y, dip_z_mm = places["well 0"]
+        rim_x, rim_y, rim_z_mm = places["well-rim 0"]
         safe_mm = max(max(sheet_heights(notebook)) + TRAVEL_MM, rim_z_mm + RIM_CLEAR_MM)
         by_hand = "the tip was brought there by hand"
 
         def taught(value: Value, how: str = by_hand, known: str = "one touch by hand, within a mm") -> Taught:
             return Taught(value=value, unit="mm", how=how, known=known, at=now_utc(), step="places")
 
-        x, y, z = places["park 0"]
+        park_x, park_y, park_z = places["park 0"]
         found = {
-            "ink.well_mm": taught(
-                list(to_paper(paper, *centre_mm)), f"the circle through {len(RIMS)} points of its rim touched by hand"
-            ),
-            "ink.dip_z_mm": taught(places["well 0"][2]),
-            "aside.well_radius_mm": taught(radius_mm),
+            "ink.well_mm": taught(list(to_paper(paper, x, y))),
+            "ink.dip_z_mm": taught(dip_z_mm),
+            "aside.well_radius_mm": taught(math.dist((x, y), (rim_x, rim_y))),
             "aside.rim_z_mm": taught(rim_z_mm),
             "motion.safe_z_mm": taught(
                 safe_mm,
@@ -102,7 +99,8 @@ class PlacesStep:
                 "a stated clearance",
             ),
             "motion.park_mm": taught(
-                [x, y, max(z, safe_mm)], by_hand + ("" if z >= safe_mm else ", and lifted to travel height")
+                [park_x, park_y, max(park_z, safe_mm)],
+                by_hand + ("" if park_z >= safe_mm else ", and lifted to travel height"),
             ),
         }
         if "wash-pot 0" in places:
@@ -150,23 +148,18 @@ def sheet_corners(notebook: Notebook) -> list[Point]:
     return [(*to_base(paper, x, y), z) for (x, y), z in zip(corners_of(*paper.size_mm).tolist(), heights, strict=True)]
 
 
-def _well(notebook: Notebook) -> tuple[tuple[float, float], float, float]:
-    return rim([point for name, point in tips(notebook).items() if name.startswith("well-rim ")])
-
-
 def _check_well(notebook: Notebook) -> str:
     """What was found of the well. Raises `CannotTeach` where rim and dip contradict each other."""
-    (x, y), radius_mm, rim_z_mm = _well(notebook)
-    dip_x, dip_y, dip_z = tips(notebook)["well 0"]
-    off_mm = math.dist((x, y), (dip_x, dip_y))
-    if off_mm > 0.6 * radius_mm:
+    (rim_x, rim_y, rim_z), (x, y, z) = tips(notebook)["well-rim 0"], tips(notebook)["well 0"]
+    radius_mm = math.dist((rim_x, rim_y), (x, y))
+    if not LEAST_RADIUS_MM <= radius_mm <= MOST_RADIUS_MM:
         raise CannotTeach(
-            f"the dip is {off_mm:.0f} mm from the middle of the well's rim, whose radius is {radius_mm:.0f} mm.",
-            "Teach the well again: three points on the rim, then the middle.",
+            f"the dip is {radius_mm:.0f} mm from the rim, seen from above, which no well is.",
+            "Teach the well again: its rim, then its middle.",
         )
-    if dip_z >= rim_z_mm:
+    if z >= rim_z:
         raise CannotTeach("the dip is no deeper than the rim of the well.", "Bring the tip into the ink.")
-    return f"well of radius {radius_mm:.1f} mm, its rim {rim_z_mm - dip_z:.1f} mm above the bottom of a dip"
+    return f"well of radius {radius_mm:.0f} mm, its rim {rim_z - z:.1f} mm above the bottom of a dip"
 
 
 def _clear_view(rig_path: Path) -> Path:

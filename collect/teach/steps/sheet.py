@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections import defaultdict
 
+import numpy as np
+
 from calibrate.board.spec import BoardSpec
 from collect.teach.day import Day
 from collect.teach.errors import CannotTeach
 from collect.teach.guide import Target, TargetKind
-from collect.teach.maths.sheet import CORNERS, Point, SheetFit, check_board, fit_sheet
-from collect.teach.maths.tip import find_axis, tip_of
+from collect.teach.maths.sheet import CORNERS, Point, SheetFit, check_board, corners_of, fit_sheet
+from collect.teach.maths.tip import tip_of
 from collect.teach.store import Notebook, StepName, Taught, now_utc
-from drivers.samples import Pose
 
 BOARD: TargetKind = "board-corner"
 SHEET: TargetKind = "sheet-corner"
@@ -20,14 +21,12 @@ GOOD_MM = 0.13
 """Standard error of the sheet's origin, in each axis, at which touching ends."""
 MOST_ROUNDS = 5
 WORST_MM = 0.25
-LEAST_LEAN = 3.0
-"""A lean of the brush against the flange counts from this many standard errors."""
 INSET_MM = 2.0
-"""Where zero touch is done: this far inside the sheet's lower left corner, beside every cell."""
+"""Distance of the touch point from the sheet's edges: beside every cell."""
 
 
 class SheetStep:
-    """Origin, turn, size, plane of the sheet; the board's place; and how the brush leans against the flange."""
+    """Origin, turn, size and plane of the sheet, and the board's place on it."""
 
     name: StepName = "sheet"
     title = "Sheet and board"
@@ -62,20 +61,18 @@ class SheetStep:
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """Everything that follows from the touched corners and the tip."""
-        fit, upright = fitted(notebook), find_axis(upright_poses(notebook))
+        fit = fitted(notebook)
         touches = len(notebook.touched(BOARD)) + len(notebook.touched(SHEET))
         worst_mm = max(fit.residuals_mm.values())
         by_hand = f"{touches} corners of board and sheet touched by hand"
         known = f"residuals up to {worst_mm:.2f} mm"
-        point = (INSET_MM, INSET_MM)
+        point = touch_point(fit)
 
         def taught(
             value: list[float] | float, unit: str, sigma: float | None, how: str = by_hand, more: str = known
         ) -> Taught:
             return Taught(value=value, unit=unit, how=how, sigma=sigma, known=more, at=now_utc(), step="sheet")
 
-        leans = upright.lean_deg > LEAST_LEAN * upright.sigma_deg
-        rotation = list(upright.rotation_deg) if leans else [0.0, 0.0, 0.0]
         return {
             "paper.origin_mm": taught(list(fit.origin_mm), "mm", fit.origin_sigma_mm),
             "paper.yaw_deg": taught(fit.yaw_deg, "deg", fit.yaw_sigma_deg),
@@ -91,14 +88,6 @@ class SheetStep:
             "aside.plane": taught(
                 [fit.plane.plane.z0_mm, fit.plane.plane.slope_x, fit.plane.plane.slope_y], "mm", fit.height_sigma_mm
             ),
-            "robot.tcp_rotation_deg": taught(
-                rotation,
-                "deg",
-                upright.sigma_deg,
-                f"the mean of {len(upright_poses(notebook))} poses in which the brush was held upright by hand",
-                f"leans by {upright.lean_deg:.2f} deg against the flange"
-                + ("" if leans else ", no more than the hand's error: taken as square"),
-            ),
         }
 
     def forget(self, notebook: Notebook) -> Notebook:
@@ -109,6 +98,15 @@ class SheetStep:
         """Origin and turn."""
         x, y = notebook.numbers("paper.origin_mm")
         return f"origin ({x:.1f}, {y:.1f}) mm, turned by {notebook.number('paper.yaw_deg'):.2f} deg"
+
+
+def touch_point(fit: SheetFit) -> tuple[float, float]:
+    """Inside the lowest corner of the sheet: the floor of every press is counted from there."""
+    points = np.array(fit.size_mm) / 2.0 + (corners_of(*fit.size_mm) - np.array(fit.size_mm) / 2.0) * (
+        1.0 - 2.0 * INSET_MM / np.array(fit.size_mm)
+    )
+    x, y = min(points.tolist(), key=lambda at: fit.plane.plane.touch_z_mm(at[0], at[1]))
+    return round(x, 3), round(y, 3)
 
 
 def board_of(notebook: Notebook) -> BoardSpec:
@@ -131,11 +129,6 @@ def corners(notebook: Notebook, kind: str) -> dict[str, list[Point]]:
     return dict(found)
 
 
-def upright_poses(notebook: Notebook) -> list[Pose]:
-    """The flange wherever the brush was held upright."""
-    return [*notebook.touched(BOARD).values(), *notebook.touched(SHEET).values()]
-
-
 def fitted(notebook: Notebook) -> SheetFit:
     """The sheet from everything touched so far. Raises `CannotTeach` where a corner was skipped."""
     board, sheet = corners(notebook, BOARD), corners(notebook, SHEET)
@@ -143,7 +136,11 @@ def fitted(notebook: Notebook) -> SheetFit:
         f"{thing} {name}" for thing, of in (("board", board), ("sheet", sheet)) for name in CORNERS if name not in of
     ]
     if missing:
-        raise CannotTeach(f"not touched: {', '.join(missing)}.", "All four corners of both are needed.")
+        raise CannotTeach(
+            f"not touched: {', '.join(missing)}.",
+            "All four corners of both are needed. What the arm does not reach by hand is out of its reach: move the "
+            "board with the sheet nearer to it, and touch all corners again.",
+        )
     return fit_sheet(board, sheet, board_of(notebook))
 
 

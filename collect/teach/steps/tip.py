@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collect.teach.arm_reader import ArmReader
 from collect.teach.day import Day
 from collect.teach.errors import CannotTeach
 from collect.teach.guide import Target
-from collect.teach.maths.tip import LEAST_TOUCHES, find_tip
+from collect.teach.maths.tip import LEAST_TOUCHES, find_axis, find_tip
 from collect.teach.store import Notebook, StepName, Taught, now_utc
 
 MOST_TOUCHES = 24
-GOOD_MM = 0.17
+GOOD_MM = 0.18
 """Root mean square error of the tip at which touching ends."""
 WORST_MM = 0.35
 """Above this after the last touch, the tip is not accepted."""
+LEAST_UPRIGHTS, UPRIGHTS = 3, 5
+"""Times that the brush is held against a set square, each with another turn of the wrist."""
+LEAST_LEAN = 3.0
+"""A lean of the brush against the flange counts from this many standard errors."""
 SIDES = ("away from you", "to the right", "toward you", "to the left")
 
 
@@ -31,18 +36,28 @@ class TipStep:
             "Touch its point with the tip of the dry brush, each time leaning to another side, and hold still.",
         )
         async with day.arm() as reader:
+            await self._pin(day, reader)
+            await day.say("Now the direction of the brush: hold it upright, a set square on the table beside it.")
+            for index in range(UPRIGHTS):
+                how = (
+                    f"Upright {index + 1} of {UPRIGHTS}: the brush upright along the set square"
+                    f"{', the wrist turned otherwise than before' if index else ''}, anywhere over the table."
+                )
+                await day.touch(reader, Target("upright", index), how, f"upright {index}")
+
+    async def _pin(self, day: Day, reader: ArmReader) -> None:
+        if await self._known(day):
+            return
+        for index in range(MOST_TOUCHES):
+            if f"pin {index}" in day.notebook.touches:
+                continue
+            how = (
+                f"Touch {index + 1}: bring the tip to the pin, the brush leaning by 30 deg or more "
+                f"{SIDES[index % 4]}; lean it without turning the wrist along."
+            )
+            await day.touch(reader, Target("pin", index), how, f"pin {index}")
             if await self._known(day):
                 return
-            for index in range(MOST_TOUCHES):
-                if f"pin {index}" in day.notebook.touches:
-                    continue
-                how = (
-                    f"Touch {index + 1}: bring the tip to the pin, the brush leaning by 30 deg or more "
-                    f"{SIDES[index % 4]}; lean it without turning the wrist along."
-                )
-                await day.touch(reader, Target("pin", index), how, f"pin {index}")
-                if await self._known(day):
-                    return
         with day.touched_again_if_refused("pin"):
             fit = find_tip(list(day.notebook.touched("pin").values()))
             if fit.error_mm > WORST_MM:
@@ -77,29 +92,49 @@ class TipStep:
         return fit.error_mm <= GOOD_MM
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
-        """The offset."""
+        """The offset, and how the brush leans against the flange."""
         touches = list(notebook.touched("pin").values())
-        fit = find_tip(touches)
-        known = (
-            f"95 % interval of the worst component +-{fit.reach_mm:.2f} mm, condition {fit.condition:.0f}, residuals "
-            f"up to {max(fit.residuals_mm):.2f} mm"
+        fit, now = find_tip(touches), now_utc()
+        offset = Taught(
+            value=list(fit.offset_mm),
+            unit="mm",
+            how=f"the same pin touched from {len(touches)} sides by hand",
+            sigma=fit.error_mm,
+            known=f"95 % interval of the worst component +-{fit.reach_mm:.2f} mm, condition {fit.condition:.0f}, "
+            f"residuals up to {max(fit.residuals_mm):.2f} mm",
+            at=now,
+            step="tip",
         )
-        how = f"the same pin touched from {len(touches)} sides by hand"
-        return {
-            "robot.tcp_offset_mm": Taught(
-                value=list(fit.offset_mm),
-                unit="mm",
-                how=how,
-                sigma=fit.error_mm,
-                known=known,
-                at=now_utc(),
+        uprights = list(notebook.touched("upright").values())
+        if len(uprights) < LEAST_UPRIGHTS:
+            square = Taught(
+                value=[0.0, 0.0, 0.0],
+                unit="deg",
+                how="taken as square to the flange",
+                known="not measured",
+                at=now,
                 step="tip",
             )
+            return {"robot.tcp_offset_mm": offset, "robot.tcp_rotation_deg": square}
+        axis = find_axis(uprights)
+        leans = axis.lean_deg > LEAST_LEAN * axis.sigma_deg
+        return {
+            "robot.tcp_offset_mm": offset,
+            "robot.tcp_rotation_deg": Taught(
+                value=list(axis.rotation_deg) if leans else [0.0, 0.0, 0.0],
+                unit="deg",
+                how=f"held upright along a set square {len(uprights)} times",
+                sigma=axis.sigma_deg,
+                known=f"leans by {axis.lean_deg:.2f} deg against the flange"
+                + ("" if leans else ", no more than the hand's error: taken as square"),
+                at=now,
+                step="tip",
+            ),
         }
 
     def forget(self, notebook: Notebook) -> Notebook:
         """Without the touches."""
-        return notebook.without_touches("pin")
+        return notebook.without_touches("pin", "upright")
 
     def summary(self, notebook: Notebook) -> str:
         """The length."""

@@ -15,7 +15,7 @@ from calibrate.board.register import mixed_up, register
 from calibrate.board.spec import BoardSpec
 from calibrate.errors import CalibrationError
 from collect.teach.errors import CannotTeach
-from collect.teach.maths.box import hull, rim
+from collect.teach.maths.box import hull
 from collect.teach.maths.sheet import CORNERS, Point, check_board, corners_of, fit_sheet
 from collect.teach.maths.tip import find_axis, find_tip, tip_of
 from drivers.samples import Pose
@@ -177,20 +177,7 @@ def test_points_of_a_registration_that_were_swapped_are_named() -> None:
     assert mixed_up(names, robot, seen) == ""
 
 
-# Places
-
-
-@given(st.floats(5.0, 60.0), st.floats(-600.0, 600.0), st.floats(-600.0, 600.0))
-def test_a_rim_is_the_circle_through_its_points(radius_mm: float, x_mm: float, y_mm: float) -> None:
-    points = [(x_mm + radius_mm * math.cos(a), y_mm + radius_mm * math.sin(a), 130.0) for a in (0.3, 2.2, 4.4)]
-    centre, radius, height = rim(points)
-    assert math.dist(centre, (x_mm, y_mm)) < 1e-6
-    assert (radius, height) == (pytest.approx(radius_mm), 130.0)
-
-
-def test_points_on_a_line_are_no_rim() -> None:
-    with pytest.raises(CannotTeach, match="rim"):
-        rim([(0.0, 0.0, 1.0), (10.0, 0.0, 1.0), (20.0, 0.01, 1.0)])
+# Limits
 
 
 def test_the_box_holds_every_point_and_its_floor_is_not_lowered() -> None:
