@@ -112,16 +112,29 @@ def sim(
     fps: Annotated[float, typer.Option(min=1, max=60, help="Camera's pictures per real second.")] = 8.0,
     idle_exit: Annotated[float, typer.Option(min=0, help="End after so many seconds without clients; 0: never.")] = 0.0,
     faults: Annotated[Path | None, typer.Option(help="A script of faults, faults.toml.")] = None,
-    control: Annotated[Path | None, typer.Option(help="Make a control socket here, for `brushloop fault`.")] = None,
+    control: Annotated[Path | None, typer.Option(help="Make a control socket here, for `fault` and `hand`.")] = None,
+    unknown: Annotated[
+        int | None, typer.Option(min=0, help="Serve a lab that nobody has measured, drawn from this seed.")
+    ] = None,
+    trap: Annotated[str | None, typer.Option(help="What is wrong in the unknown lab, such as swapped-corner.")] = None,
+    truth: Annotated[Path | None, typer.Option(help="File for the unknown lab's true values, for tests.")] = None,
 ) -> None:
     """Serve the loopback rig: an ARCS controller and an MJPEG camera over one simulated world, on 127.0.0.1 only.
 
-    Ctrl-C ends it; SIGUSR1 puts a fresh sheet in.
+    Ctrl-C ends it; SIGUSR1 puts a fresh sheet in. An unknown lab has a loopback address of its own, and no rig.toml:
+    that is what `brushloop rig new` finds out there.
     """
     from drivers.sim.brush.brush import BrushSpec
     from drivers.sim.config import SimConfig, View
-    from drivers.sim.serve import serve
+    from drivers.sim.serve import LabRefused, serve, serve_unknown
 
+    if unknown is not None:
+        if write_rig is not None or faults is not None or arcs_port or camera_port:
+            raise LabRefused("--unknown: goes with --trap, --truth, --control, --rate and --idle-exit alone")
+        serve_unknown(unknown, trap, rate, idle_exit, say, truth=truth, control=control)
+        return
+    if trap is not None or truth is not None:
+        raise LabRefused("--trap and --truth: go with --unknown SEED")
     brush, view = BrushSpec(seed=seed), View(fps=fps)
     config = SimConfig(seed=seed, rate=rate, arcs_port=arcs_port, camera_port=camera_port, brush=brush, view=view)
     serve(config, write_rig, idle_exit, say, faults=faults, control=control)
@@ -150,6 +163,21 @@ def fault(
     options = {"after_s": after_s, "on": on, "nth": nth, "phase": phase, "press": press, "count": count}
     request = request_of(what, kind, options | {"for_s": for_s, "late_s": late_s, "id": ident})
     say(*dumps(ask(control, request), indent=2).split("\n"))
+
+
+@app.command()
+def hand(
+    control: Annotated[Path, typer.Argument(help="Control socket of a lab: `brushloop sim --unknown`.")],
+    act: Annotated[str, typer.Argument(help="bring, measure, mend or plug.")],
+    to: Annotated[str | None, typer.Argument(help="What: pin, board-corner, well, park, hold-board, ...")] = None,
+    index: Annotated[int, typer.Option(min=0, max=999, help="Which one, from 0: the direction at the pin, ...")] = 0,
+    corner: Annotated[str | None, typer.Option(help="Such as 'lower left' or 'upper right'.")] = None,
+) -> None:
+    """Be the person in an unknown lab: guide the arm by hand, hold the printed board, mend what is wrong."""
+    from drivers.sim.fault_client import ask
+
+    wanted = {"act": act, "to": to, "index": index or None, "corner": corner}
+    say(ask(control, {"do": "hand", **{name: value for name, value in wanted.items() if value is not None}})["says"])
 
 
 @app.command()

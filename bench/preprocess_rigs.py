@@ -19,7 +19,8 @@ from calibrate.board.spec import BoardSpec
 from drivers.geometry import brush_pose
 from drivers.sim.brush.brush import BrushSpec
 from drivers.sim.brush.paper import PX_PER_MM as SHEET_PX_PER_MM
-from drivers.sim.camera.scene import Optics, Scene
+from drivers.sim.camera.optics import Optics
+from drivers.sim.camera.scene import Scene
 from drivers.sim.config import SimConfig, Table, View
 from drivers.sim.world import World
 

@@ -66,6 +66,13 @@ class View:
     turn_deg: float = 0.6
     centre_mm: tuple[float, float] = (122.0, 86.0)
     """The point of the paper plane in the middle of the image, in the paper frame."""
+    lens_mm: tuple[float, float, float] | None = None
+    """Place of a pinhole over the sheet, in the paper frame; `px_per_mm` and `keystone` then shape nothing. Without
+    it they describe the perspective."""
+    focal: float = 1.0
+    """Focal length, in image widths."""
+    mirrored: bool = False
+    """The picture is mirrored left to right, as some cameras' drivers do by default."""
     noise: float = 2.0
     """Standard deviation of the noise, in gray levels."""
     shade: float = 0.18
@@ -79,7 +86,7 @@ class View:
     glare_sigma_mm: float = 6.0
     """Standard deviation of the reflection's Gaussian profile."""
     k1: float = 0.0
-    """Radial distortion in OpenCV's model with a focal length of one image width; 0 until calibration corrects it."""
+    """Radial distortion in OpenCV's model; 0 until calibration corrects it."""
     blur_px: float = 0.7
     fps: float = 8.0
     jpeg_quality: int = 95
@@ -123,6 +130,14 @@ class SimConfig:
     """Mass of holder and brush below the sensor."""
     tool_mm: float = 180.0
     """True length from the flange to the tip, along the flange's z; an operator measures and configures it."""
+    tool_sideways_mm: tuple[float, float] = (0.0, 0.0)
+    """True place of the tip along the flange's x and y."""
+    tool_lean_deg: tuple[float, float] = (0.0, 0.0)
+    """True turn of the brush about the flange's x, then its y: a holder that is not square to the flange."""
+    sensor_turn_deg: float = 0.0
+    """How the force sensor is mounted: its turn about the flange's z."""
+    sensor_sign: Literal[1, -1] = 1
+    """-1 for a sensor that reports the push of the tool on the paper instead of the paper's on the tool."""
     brush: BrushSpec = field(default_factory=BrushSpec)
     table: Table = field(default_factory=Table)
     view: View = field(default_factory=View)

@@ -1,4 +1,4 @@
-"""`brushloop fault`: sends one request to the control socket of a rig and prints the answer."""
+"""`brushloop fault` and `brushloop hand`: send one request to the control socket of a rig and print the answer."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 TIMEOUT_S = 5.0
+GUIDING_S = 120.0
+"""Longest time for which a person is busy with one thing."""
 MAX_ANSWER_BYTES = 4 * 1024 * 1024
 PLAIN = ("list", "clear", "state", "release", "fresh-sheet")
 
@@ -36,7 +38,7 @@ def ask(path: Path, request: Mapping[str, object]) -> dict[str, Any]:
     """Send a request; return the rig's answer. Raises `FaultRefused`, with one line, if it is missing or a refusal."""
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
-            client.settimeout(TIMEOUT_S)
+            client.settimeout(GUIDING_S if request["do"] == "hand" else TIMEOUT_S)
             client.connect(str(path))
             client.sendall(json.dumps(request).encode() + b"\n")
             line = _read_line(client)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import asyncio
 from typing import Any, Literal, Protocol
 
+from scipy.spatial.transform import Rotation
+
 from drivers.arcs.codes import SafetyMode
+from drivers.force.rounds import Wrench
 from drivers.sim.arcs.power import EMERGENCY_STOPS
 from drivers.sim.arcs.rtde_server import RtdeServer
 from drivers.sim.arcs.server import ArcsServer
@@ -132,13 +135,17 @@ class Faults:
 class LoopbackRig:
     """`async with LoopbackRig(config) as rig:` serves until the block ends."""
 
-    def __init__(self, config: SimConfig) -> None:
+    def __init__(self, config: SimConfig, host: str = HOST) -> None:
+        """`host` is another loopback address, where one lab is to have the ports of a real one for itself."""
         self.config = config
+        self._host = host
         self.world = World(config)
         self.arcs = ArcsServer(self.world)
         self.rtde = RtdeServer(self.arcs.cabinet)
         view = config.view
-        self.camera = MjpegServer(Scene(self.world), fps=view.fps, jpeg_quality=view.jpeg_quality, view=view)
+        self.scene = Scene(self.world)
+        """What the camera looks at."""
+        self.camera = MjpegServer(self.scene, fps=view.fps, jpeg_quality=view.jpeg_quality, view=view)
         self.force = _force(self.world) if config.force_sensor else None
         self.ink = None if config.ink_device == "none" else PtyLine(_ink(self.world, config.ink_device))
         board = None if self.force is None else self.force.board
@@ -146,12 +153,12 @@ class LoopbackRig:
 
     async def __aenter__(self) -> LoopbackRig:
         try:
-            await self.arcs.start(HOST, self.config.arcs_port)
-            await self.rtde.start(HOST, self.config.rtde_port)
-            await self.camera.start(HOST, self.config.camera_port)
+            await self.arcs.start(self._host, self.config.arcs_port)
+            await self.rtde.start(self._host, self.config.rtde_port)
+            await self.camera.start(self._host, self.config.camera_port)
             if self.force is not None:
                 await asyncio.to_thread(self.world.reaction.prepare)  # takes some tenths of a second
-                await self.force.start(HOST, self.config.force_port)
+                await self.force.start(self._host, self.config.force_port)
             if self.ink is not None:
                 self.ink.__enter__()
             self.faults.start()
@@ -176,17 +183,23 @@ class LoopbackRig:
         ink_path = None if self.ink is None else self.ink.path
         return rig_toml(
             self.config,
-            Addresses(HOST, self.arcs.port, self.rtde.port, self.camera.port, force_port, ink_path),
+            Addresses(self._host, self.arcs.port, self.rtde.port, self.camera.port, force_port, ink_path),
         )
 
     def where(self) -> str:
         """One line for people: which device listens where."""
-        places = [f"controller on {HOST}:{self.arcs.port} and {self.rtde.port}", f"camera on {self.camera.port}"]
+        places = [f"controller on {self._host}:{self.arcs.port} and {self.rtde.port}", f"camera on {self.camera.port}"]
         if self.force is not None:
             places.append(f"force on {self.force.port}")
         if self.ink is not None:
             places.append(f"ink on {self.ink.path}")
         return ", ".join(places)
+
+    def reconfigure(self, config: SimConfig) -> None:
+        """Change table, view or sensor while serving, as a person in the lab would; tool and brush stay."""
+        self.config = self.world.config = config
+        self.scene = Scene(self.world)
+        self.camera.show(self.scene, config.view)
 
     async def idle(self, seconds: float) -> None:
         """Return once no client has been connected for `seconds`."""
@@ -201,9 +214,23 @@ class LoopbackRig:
 def _force(world: World) -> SocketcandServer:
     config = world.config
     board = ForceBoard(
-        lambda _t_s: world.wrench(), noise_n=config.force_noise_n, noise_nm=config.force_noise_nm, seed=config.seed
+        lambda _t_s: _at_sensor(world.config, world.wrench()),
+        noise_n=config.force_noise_n,
+        noise_nm=config.force_noise_nm,
+        seed=config.seed,
     )
     return SocketcandServer(board, world.clock.now_s, rate_hz=config.force_hz)
+
+
+def _at_sensor(config: SimConfig, wrench: Wrench) -> Wrench:
+    """The wrench as the sensor reports it, whose axes and sign depend on how it is mounted."""
+    if (config.tool_lean_deg, config.sensor_turn_deg, config.sensor_sign) == ((0.0, 0.0), 0.0, 1):
+        return wrench
+    brush = Rotation.from_euler("xy", config.tool_lean_deg, degrees=True)
+    at_sensor = Rotation.from_euler("z", config.sensor_turn_deg, degrees=True).inv() * brush
+    force, torque = (config.sensor_sign * at_sensor.apply(part) for part in (wrench[:3], wrench[3:]))
+    fx, fy, fz, mx, my, mz = (float(v) for v in (*force, *torque))
+    return fx, fy, fz, mx, my, mz
 
 
 def _ink(world: World, device: Literal["station", "pump"]) -> Instrument:

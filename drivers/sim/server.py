@@ -45,11 +45,12 @@ class LoopbackServer(abc.ABC):
 
     async def stop(self) -> None:
         """Close the listener and every client."""
-        if self._server is not None:
-            self._server.close()
+        server, self._server = self._server, None
+        if server is not None:
+            server.close()
             self.drop_clients()
             await asyncio.gather(*self._clients, return_exceptions=True)
-            await self._server.wait_closed()
+            await server.wait_closed()
 
     def drop_clients(self) -> None:
         """Close every connection from the server's side."""

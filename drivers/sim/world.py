@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drivers.force.rounds import Wrench
-from drivers.geometry import brush_pose, lean
+from drivers.geometry import brush_pose, from_wire, lean
 from drivers.samples import Pose
+from drivers.sim.arm.kinematics import Matrix, matrix_of
 from drivers.sim.arm.queue import ArmQueue
 from drivers.sim.brush.brush import MAX_TILT_DEG, Brush
 from drivers.sim.brush.contact import Contact, ContactWatch, Reaction, leaning_with
@@ -133,9 +134,11 @@ class World:
         self.version = 0
         """Number of visible changes to the sheet so far."""
         self._watch = ContactWatch(self._above_mm)
-        tool = np.eye(4)
-        tool[2, 3] = config.tool_mm / 1e3
-        self.motion = ArmQueue(brush_pose(*config.home_mm), self._travelled, tool)
+        self.hand_guided = False
+        """While a person guides the arm, the brush is dry and held lightly: contacts leave nothing."""
+        self.push_n = (0.0, 0.0, 0.0)
+        """Force of a person's finger on the tip, in the base frame."""
+        self.motion = ArmQueue(brush_pose(*config.home_mm), self._travelled, tool_of(config))
 
     def flaw_next(self, flaw: Flaw, severity: float = 1.0) -> None:
         """Give a flaw to the next press that lifts off; raises ValueError unless severity is in 0 .. 1."""
@@ -156,7 +159,7 @@ class World:
         """Current wrench on the force sensor, in the tool's frame."""
         tip = self.tool()
         x_mm, y_mm, depth_mm = self._on_sheet(tip)
-        return self.reaction.wrench(tip, 0.0 if self._in_well(x_mm, y_mm) else depth_mm, self._normal)
+        return self.reaction.wrench(tip, 0.0 if self._in_well(x_mm, y_mm) else depth_mm, self._normal, self.push_n)
 
     def to_paper(self, x_mm: float, y_mm: float) -> tuple[float, float]:
         """Convert x and y from the base frame to the paper frame."""
@@ -166,6 +169,8 @@ class World:
         return math.cos(yaw) * dx + math.sin(yaw) * dy, -math.sin(yaw) * dx + math.cos(yaw) * dy
 
     def _travelled(self, start: Pose, end: Pose) -> None:
+        if self.hand_guided:
+            return
         # Along a straight line the tip's height is linear, so the lowest point is one of the ends.
         for pose in (start, end):
             self._dip(pose)
@@ -268,3 +273,9 @@ class World:
         """(tilt_deg, heading_deg) in the paper frame; tilt from the sheet's normal."""
         tilt_deg, base_heading_deg = lean(leaning_with(pose, self._normal))
         return tilt_deg, base_heading_deg - self.config.table.yaw_deg
+
+
+def tool_of(config: SimConfig) -> Matrix:
+    """The true brush in the flange's frame, in m: z along the brush."""
+    about_x, about_y = (math.radians(v) for v in config.tool_lean_deg)
+    return matrix_of(from_wire([*(v / 1e3 for v in (*config.tool_sideways_mm, config.tool_mm)), about_x, about_y, 0.0]))

@@ -101,13 +101,20 @@ class Reaction:
         at_tilts = np.array([np.interp(depth_mm, steps_mm, rows[k]) for k in range(len(TILTS_DEG))], np.float64)
         return float(np.interp(tilt_deg, np.array(TILTS_DEG), at_tilts))
 
-    def wrench(self, tip: Pose, depth_mm: float, normal: tuple[float, float, float] = LEVEL) -> Wrench:
+    def wrench(
+        self,
+        tip: Pose,
+        depth_mm: float,
+        normal: tuple[float, float, float] = LEVEL,
+        finger_n: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> Wrench:
         """Force in N and torque in Nm on the sensor, in the tool's frame: z along the tool, towards the tip.
 
-        `normal` is the unit vector out of the paper, in the base frame.
+        `normal` is the unit vector out of the paper, `finger_n` a person's push on the tip, both in the base frame.
         """
         push_n = self.push_n(depth_mm, lean(leaning_with(tip, normal))[0])
-        force_n = (normal[0] * push_n, normal[1] * push_n, normal[2] * push_n - self._weight_n)
+        push, weight_n = (push_n * part for part in normal), (0.0, 0.0, self._weight_n)
+        force_n = [a - b + c for a, b, c in zip(push, weight_n, finger_n, strict=True)]
         axes = rotation.columns(rotation.unit(tip.quaternion))
         fx, fy, fz = (x * force_n[0] + y * force_n[1] + z * force_n[2] for x, y, z in axes)
         return fx, fy, fz, -self._arm_m * fy, self._arm_m * fx, 0.0

@@ -7,6 +7,7 @@ import random
 import time
 from collections import deque
 from collections.abc import Callable
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.camera.source import LOOPBACK_SERVER
 from drivers.samples import Pose
-from drivers.sim.camera.scene import NOISE_FIELDS, Scene
+from drivers.sim.camera.scene import NOISE_FIELDS
 from drivers.sim.config import View
 from drivers.sim.faults.board import FaultBoard
 from drivers.sim.faults.kinds import KINDS, Device
@@ -76,10 +77,22 @@ class _Line:
             self._writer.write(data)
 
 
+class Picture(Protocol):
+    """What a camera looks at: `Scene`, `RoomScene`."""
+
+    def tool(self) -> Pose:
+        """Pose of the tool now; called in the thread that owns the world."""
+        ...
+
+    def render(self, host_ns: int = 0, tool: Pose | None = None) -> NDArray[np.uint8]:
+        """A picture with the tool there; may run in another thread."""
+        ...
+
+
 class MjpegServer(LoopbackServer):
     """Serves `/stream.mjpg`. A client that reads too slowly is sent the newest image next, never a backlog."""
 
-    def __init__(self, scene: Scene, *, fps: float, jpeg_quality: int, view: View | None = None) -> None:
+    def __init__(self, scene: Picture, *, fps: float, jpeg_quality: int, view: View | None = None) -> None:
         """`view` gives the delay of pictures; without it they are sent at once."""
         super().__init__()
         self._scene = scene
@@ -91,6 +104,12 @@ class MjpegServer(LoopbackServer):
         """The newest images of the scene and their JPEGs, reused while nothing changes."""
         self.faults: FaultBoard | None = None
         """Faults of this server; a rig shares one board among all its servers."""
+
+    def show(self, scene: Picture, view: View) -> None:
+        """Look at something else, with other settings. Every stream begins anew, as when a camera is set up again."""
+        self._scene, self._view = scene, view
+        self._coded.clear()
+        self.drop_clients()
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer any request with the stream."""

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
-from typing import cast
 
 import cv2
 import numpy as np
@@ -12,79 +10,10 @@ from numpy.typing import NDArray
 
 from drivers.samples import Pose
 from drivers.sim.brush.paper import PX_PER_MM
-from drivers.sim.config import Table, View
+from drivers.sim.camera.held import Held, held_picture
+from drivers.sim.camera.optics import Optics
+from drivers.sim.config import Table
 from drivers.sim.world import World
-
-Floats = NDArray[np.float64]
-SHADOW_SOFTNESS = 0.02
-"""Width of the shadow's edge, as a share of the image."""
-
-
-class Optics:
-    """Projection of the paper plane to pixels, and the uneven light on the sheet."""
-
-    def __init__(self, view: View, seed: int) -> None:
-        self.homography = homography(view)
-        self.light = _light(view, np.random.default_rng([seed, 11]))
-        self.glare = _glare(view, self.homography) if view.glare else None
-        f, cx, cy = float(view.width_px), (view.width_px - 1) / 2, (view.height_px - 1) / 2
-        self.camera_matrix: Floats = np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
-        self.distortion: Floats = np.array([view.k1, 0.0, 0.0, 0.0])
-        self._map = self._undistorted_places(view) if view.k1 else None
-
-    def image_of(self, paper_mm: Floats) -> Floats:
-        """(n, 2) pixels (centres on integers) of (n, 2) points of the paper plane, distortion included."""
-        mapped = np.column_stack([paper_mm, np.ones(len(paper_mm))]) @ self.homography.T
-        undistorted = mapped[:, :2] / mapped[:, 2:]
-        rays = np.column_stack([undistorted, np.ones(len(undistorted))]) @ np.linalg.inv(self.camera_matrix).T
-        none = np.zeros(3)
-        distorted, _ = cv2.projectPoints(rays[:, None], none, none, self.camera_matrix, self.distortion)
-        return np.asarray(distorted, np.float64).reshape(-1, 2)
-
-    def distort(self, undistorted: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """An image as this lens would have taken it; the same if the lens is perfect."""
-        if self._map is None:
-            return undistorted
-        distorted = cv2.remap(undistorted, self._map, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return cast("NDArray[np.uint8]", distorted)
-
-    def _undistorted_places(self, view: View) -> NDArray[np.float32]:
-        """(h, w, 2): for every pixel of the distorted image, its place in the undistorted one."""
-        columns, rows = np.meshgrid(np.arange(view.width_px), np.arange(view.height_px))
-        pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(np.float64)
-        places = cv2.undistortPoints(pixels, self.camera_matrix, self.distortion, P=self.camera_matrix)
-        return places.reshape(view.height_px, view.width_px, 2).astype(np.float32)
-
-
-def homography(view: View) -> NDArray[np.float64]:
-    """(3, 3) from the paper plane in mm to image pixels, pixel centres on integers; rows run against y."""
-    turn = math.radians(view.turn_deg)
-    cos, sin, s = math.cos(turn), math.sin(turn), view.px_per_mm
-    x, y = view.centre_mm
-    to_centre = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, 1.0]])
-    flat = np.array([[s * cos, -s * sin, 0.0], [-s * sin, -s * cos, 0.0], [0.0, 0.0, 1.0]])
-    tilt = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, view.keystone / view.height_px, 1.0]])
-    to_image = np.array([[1.0, 0.0, view.width_px / 2], [0.0, 1.0, view.height_px / 2], [0.0, 0.0, 1.0]])
-    return to_image @ tilt @ flat @ to_centre
-
-
-def _light(view: View, rng: np.random.Generator) -> NDArray[np.float32]:
-    x = np.linspace(0.0, 1.0, view.width_px, dtype=np.float32)
-    y = np.linspace(0.0, 1.0, view.height_px, dtype=np.float32)[:, None]
-    slope = 1.0 - view.shade * (0.6 * x + 0.4 * y) ** 2
-    across = math.cos(angle := rng.uniform(0.0, 2.0 * math.pi)) * (x - 0.5) + math.sin(angle) * (y - 0.5)
-    edge = rng.uniform(-0.1, 0.1)
-    in_shadow = 1.0 / (1.0 + np.exp(-(across - edge) / SHADOW_SOFTNESS))
-    return (slope * (1.0 - view.shadow * in_shadow)).astype(np.float32)
-
-
-def _glare(view: View, paper_to_image: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Gray levels (h, w) that a lamp's reflection adds; the lens's distortion of it is left out."""
-    u, v, scale = paper_to_image @ np.array([*view.glare_mm, 1.0])
-    x, y = np.arange(view.width_px) - u / scale, np.arange(view.height_px)[:, None] - v / scale
-    sigma_px = view.glare_sigma_mm * view.px_per_mm
-    return (view.glare * np.exp(-0.5 * (x**2 + y**2) / sigma_px**2)).astype(np.float32)
-
 
 TABLE_GRAY = 120
 PAPER_GRAY = 228
@@ -92,6 +21,7 @@ INK_REFLECTANCE = 0.06
 TOOL_GRAY = 70
 TOOL_CLEAR_MM = 60.0
 """Radius of the disc that the arm hides when it is over the sheet."""
+FAR_WIDTHS = 2.5
 NOISE_FIELDS = 4
 MARGIN_MM = 15.0
 """Width of the strip of table drawn around the board."""
@@ -122,8 +52,10 @@ class Scene:
         self._without_tool: dict[int, NDArray[np.uint8]] = {}
         """By noise field: the frame without the tool. Valid for the sheet as it is lit now."""
         self._lit: NDArray[np.float32] | None = None
-        self._lit_version = -1
+        self._lit_version: tuple[int, Held | None] = (-1, None)
         self._count = 0
+        self.held: Held | None = None
+        """The board that a person holds before the camera; it hides everything else."""
 
     def tool(self) -> Pose:
         """Pose of the tool now. Advances the world, so only the thread that owns the world may call it."""
@@ -136,14 +68,18 @@ class Scene:
         returned again while the picture does not change.
         """
         tool = tool or self.tool()
-        if self._lit is None or self._lit_version != self._world.version:
-            self._lit_version = self._world.version
-            self._lit = self._light_sheet()
+        config, held = self._world.config, self.held
+        if self._lit is None or self._lit_version != (self._world.version, held):
+            self._lit_version = self._world.version, held
+            if held is None:
+                self._lit = self._light_sheet()
+            else:
+                self._lit = held_picture(board(config.table), config.table, config.view, self.optics, held)
             self._finished.clear()
             self._without_tool.clear()
         field = self._count % NOISE_FIELDS
         self._count += 1
-        disc_px = self._tool_disc(tool)
+        disc_px = None if held else self._tool_disc(tool)
         at_px, frame = self._finished.get(field, (None, None))
         if frame is None or at_px != disc_px:
             frame = self._sheet_alone(field, self._lit)
@@ -151,8 +87,10 @@ class Scene:
                 frame = frame.copy()
                 cv2.circle(frame, disc_px, self._disc_radius_px, (TOOL_GRAY,), -1)
                 frame.flags.writeable = False
+            if config.view.mirrored:
+                frame = np.ascontiguousarray(frame[:, ::-1])
             self._finished[field] = disc_px, frame
-        if self._world.config.view.stamp_strip:
+        if config.view.stamp_strip:
             frame = frame.copy()
             draw_strip(frame, host_ns)
         return frame
@@ -200,7 +138,10 @@ class Scene:
         """Pixel at the centre of the disc that the arm hides; None if all of it lies outside the image."""
         view, radius_px = self._world.config.view, self._disc_radius_px
         x_mm, y_mm = self._world.to_paper(tool.x_mm, tool.y_mm)
-        [[u, v]] = self.optics.image_of(np.array([[x_mm, y_mm]]))
+        at_mm = np.array([[x_mm, y_mm]])
+        if np.abs(self.optics.straight(at_mm)).max() > FAR_WIDTHS * view.width_px:
+            return None  # so far outside, the formula of the distortion leads back into the image
+        [[u, v]] = self.optics.image_of(at_mm)
         u_px, v_px = round(float(u)), round(float(v))
         beside = max(-u_px, u_px - view.width_px, -v_px, v_px - view.height_px) > radius_px + 1
         return None if beside else (u_px, v_px)

@@ -10,7 +10,7 @@ from calibrate.board.detect import find_board
 from calibrate.board.intrinsics import fit_lens
 from calibrate.board.lens import Lens
 from calibrate.board.view import see_board_and_lens
-from drivers.sim.camera.scene import Optics
+from drivers.sim.camera.optics import Optics
 from drivers.sim.config import Table
 
 WORST = 2e-4

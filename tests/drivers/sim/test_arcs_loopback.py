@@ -10,8 +10,9 @@ from drivers.sim.arcs.rtde_server import RtdeServer
 from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.camera.mjpeg_server import MjpegServer
 from drivers.sim.config import SimConfig
+from drivers.sim.control import ControlServer
 from drivers.sim.instruments.force_board import SocketcandServer
-from drivers.sim.serve import ControlServer
+from drivers.sim.lab.lab import OlderSoftware
 from drivers.sim.server import LoopbackServer, NotLoopback
 from drivers.sim.world import World
 
@@ -29,7 +30,7 @@ def test_these_are_all_the_servers_there_are():
         return {kind, *(b for k in kind.__subclasses__() for b in below(k))}
 
     ours = {k for k in below(LoopbackServer) if k.__module__.startswith("drivers.")} - {LoopbackServer}
-    assert ours == {ArcsServer, RtdeServer, MjpegServer, ControlServer, SocketcandServer}
+    assert ours == {ArcsServer, RtdeServer, MjpegServer, ControlServer, SocketcandServer, OlderSoftware}
     assert all(k.start is LoopbackServer.start for k in ours), "a server that listens in its own way must refuse too"
 
 

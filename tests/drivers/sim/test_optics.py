@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.sim.camera.scene import Optics, Scene, board
+from drivers.sim.camera.optics import Optics
+from drivers.sim.camera.scene import Scene, board
 from drivers.sim.config import SimConfig, View
 from drivers.sim.world import World
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from drivers.geometry import brush_pose
-from drivers.sim.camera.scene import NOISE_FIELDS, PAPER_GRAY, TOOL_GRAY, Scene, board, homography, read_strip
+from drivers.sim.camera.optics import homography
+from drivers.sim.camera.scene import NOISE_FIELDS, PAPER_GRAY, TOOL_GRAY, Scene, board, read_strip
 from drivers.sim.config import SimConfig, View
 from drivers.sim.world import World
 

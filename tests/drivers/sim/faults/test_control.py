@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from drivers.arcs.codes import SafetyMode
 from drivers.sim.config import SimConfig
+from drivers.sim.control import MAX_LINE_BYTES, ControlPathError, ControlServer, live_control
 from drivers.sim.rig import LoopbackRig
-from drivers.sim.serve import MAX_LINE_BYTES, ControlPathError, ControlServer, live_control
 
 Ask = Callable[[object], Awaitable[dict[str, Any]]]
 
@@ -148,7 +148,7 @@ def idle_control() -> ControlServer:
 @settings(deadline=None)
 @given(line=st.binary(max_size=80) | json_values.map(lambda value: json.dumps(value).encode()))
 def test_whatever_a_client_says_has_an_answer_of_one_line(idle_control: ControlServer, line: bytes):
-    answer = idle_control.answer(line)
+    answer = asyncio.run(idle_control.answer(line))
     assert isinstance(answer["ok"], bool)
     assert answer["ok"] or answer["error"].isprintable()
 

@@ -1,0 +1,133 @@
+"""What a person aims at when asked for a thing: the pose of the brush, with the errors that a hand makes."""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from drivers.samples import Pose
+from drivers.sim.camera.held import Held
+from drivers.sim.camera.optics import Floats
+from drivers.sim.lab.facts import PIN_TILTS_DEG, Facts
+from drivers.sim.lab.places import Place, azimuth_deg, board_size_mm, corner, held, in_base, over_sheet
+
+TOUCHED = ("pin", "board-corner", "sheet-corner", "well-rim")
+"""Things that the tip touches; to the others it is brought as near as the eye can tell."""
+BY_EYE_MM = 1.0
+SEEN_SIGMAS = 2.5
+UPRIGHT_DEG = 1.0
+"""Standard deviation of a brush that is held upright by eye, about either axis."""
+SQUARE_DEG = 0.15
+"""The same against a set square."""
+DIP_ABOVE_BOTTOM_MM = 2.5
+UPRIGHT_ABOVE_MM = 70.0
+PICTURE_HEIGHTS = (
+    (0.0, 0.0),
+    (-0.3, -0.3),
+    (0.3, -0.3),
+    (0.3, 0.3),
+    (-0.3, 0.3),
+    (0.0, -0.35),
+    (0.0, 0.35),
+    (-0.35, 0.0),
+    (0.35, 0.0),
+)
+"""Where in the picture the held board's middle is, in shares of its width and height from the centre."""
+
+
+class Aims:
+    """The person's aims in one lab. An error depends on the seed, the thing, and how often it was asked for."""
+
+    def __init__(self, facts: Callable[[], Facts]) -> None:
+        self._facts = facts
+        self._asked: Counter[str] = Counter()
+
+    def tip(self, to: str, index: int, name: str) -> Pose:
+        """Pose of the tip for a thing. Raises ValueError for one that the lab does not have."""
+        facts, rng = self._facts(), self._drawn(to, index, name)
+        place = self._place(facts, to, name)
+        wrist_deg = azimuth_deg(place) + float(rng.normal(0.0, 5.0))
+        tilt_deg, toward_deg = 0.0, 0.0
+        if to == "pin":
+            tilt_deg, toward_deg, wrist_deg = self._pin(index, wrist_deg, rng)
+        elif to == "upright":
+            wrist_deg += (0.0, 100.0, -100.0, 50.0, -50.0)[index % 5]
+        spread_mm = facts.hand_mm if to in TOUCHED else BY_EYE_MM
+        x, y, z = (float(v) for v in np.array(place) + _error_mm(rng, spread_mm))
+        aimed = held((x, y, z), wrist_deg=wrist_deg, tilt_deg=tilt_deg, toward_deg=toward_deg)
+        return _unsteady(aimed, SQUARE_DEG if to == "upright" else UPRIGHT_DEG, rng)
+
+    def board(self, index: int) -> Held:
+        """How the board is held before the camera: each time slanted another way, in another part of the picture."""
+        facts, rng = self._facts(), self._drawn("hold-board", index, "")
+        view, table = facts.config.view, facts.config.table
+        width_mm, _ = board_size_mm(table)
+        far_mm = view.focal * width_mm / float(rng.uniform(0.85, 1.05))
+        across, down = PICTURE_HEIGHTS[index % len(PICTURE_HEIGHTS)]
+        slant_deg, toward = float(rng.uniform(18, 32)), float(np.radians(140.0 * index + rng.uniform(-15, 15)))
+        slant = Rotation.from_rotvec(np.radians(slant_deg) * np.array([np.cos(toward), np.sin(toward), 0.0]))
+        turn = slant * Rotation.from_euler("z", float(rng.normal(0.0, 6.0)), degrees=True)
+        rx, ry, rz = (float(v) for v in turn.as_rotvec(degrees=True))
+        share = far_mm / view.focal
+        high = view.height_px / view.width_px
+        return Held((rx, ry, rz), (0.5 * across * share, 0.5 * down * share * high, far_mm))
+
+    def _pin(self, index: int, wrist_deg: float, rng: np.random.Generator) -> tuple[float, float, float]:
+        """Upright and leaning by turns, each from another direction and with another turn of the wrist."""
+        tilt_deg = PIN_TILTS_DEG[0] if index == 0 else PIN_TILTS_DEG[1] + float(rng.uniform(-5, 0))
+        turned_deg = (0.0, 70.0, -70.0, 30.0, -30.0, 110.0)[index % 6]
+        return tilt_deg, 120.0 * index + 30.0 * (index // 3) + float(rng.uniform(-10, 10)), wrist_deg + turned_deg
+
+    def _place(self, facts: Facts, to: str, name: str) -> Place:
+        table = facts.config.table
+        match to:
+            case "pin":
+                return facts.pin_mm
+            case "board-corner" | "sheet-corner":
+                return corner(table, to.removesuffix("-corner"), self._meant(facts, name))
+            case "well":
+                return in_base(table, *table.well_mm, DIP_ABOVE_BOTTOM_MM)
+            case "well-rim":
+                x, y = table.well_mm
+                return in_base(table, x, y + table.well_radius_mm, table.well_depth_mm)
+            case "wash-pot":
+                return in_base(table, *facts.wash_mm, DIP_ABOVE_BOTTOM_MM)
+            case "park" if facts.parks_in_picture:
+                return over_sheet(table, facts.park_mm[2] - table.paper_z_mm)
+            case "park" | "clear-view":
+                return facts.park_mm
+            case "upright":
+                return over_sheet(table, UPRIGHT_ABOVE_MM)
+            case _:
+                raise ValueError(f"to = {to!r}: there is no such thing in this lab")
+
+    def _meant(self, facts: Facts, name: str) -> str:
+        """The corner that the person takes for the one that was asked for."""
+        words = " ".join(name.replace("-", " ").replace("_", " ").split())
+        if facts.swapped is not None and words in facts.swapped:
+            return facts.swapped[1 - facts.swapped.index(words)]
+        return words
+
+    def _drawn(self, to: str, index: int, name: str) -> np.random.Generator:
+        key = f"{to} {index} {name}"
+        self._asked[key] += 1
+        return np.random.default_rng([self._facts().seed, 31, zlib.crc32(key.encode()), self._asked[key]])
+
+
+def _error_mm(rng: np.random.Generator, spread_mm: float) -> Floats:
+    """(3,) normal along each axis; a person sees what is farther off than that, and tries again."""
+    while True:
+        error = rng.normal(0.0, spread_mm, 3)
+        if np.abs(error).max() <= SEEN_SIGMAS * spread_mm:
+            return error
+
+
+def _unsteady(pose: Pose, spread_deg: float, rng: np.random.Generator) -> Pose:
+    """The pose with the brush leaning a little otherwise; the tip stays."""
+    lean = Rotation.from_rotvec([*rng.normal(0.0, spread_deg, 2), 0.0], degrees=True)
+    qx, qy, qz, qw = (float(v) for v in (lean * Rotation.from_quat(pose.quaternion)).as_quat())
+    return Pose(*pose.position_mm, qx, qy, qz, qw)

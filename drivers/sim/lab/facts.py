@@ -1,0 +1,280 @@
+"""The facts of an unknown lab: what is true there, what a person can read there, and how a seed draws them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from drivers.geometry import brush_pose
+from drivers.samples import Pose
+from drivers.sim.arm.kinematics import HOME, Joints, Matrix, inverse, inverted, matrix_of
+from drivers.sim.brush.brush import BrushSpec
+from drivers.sim.camera.optics import homography
+from drivers.sim.config import SimConfig, Table, View
+from drivers.sim.lab.places import (
+    CORNERS,
+    Place,
+    azimuth_deg,
+    board_size_mm,
+    corner,
+    held,
+    in_base,
+    over_sheet,
+    shifted,
+)
+from drivers.sim.world import tool_of
+
+PICTURE_PX = (1600, 1200)
+PRINTS = ((26, 20, 12.0, 9.0), (24, 19, 12.0, 9.0), (22, 17, 14.0, 10.5), (27, 20, 12.0, 9.0))
+"""Boards that fit on A3: columns, rows, square and marker in mm."""
+BRUSHES = ((5.5, 46.0), (6.0, 48.0), (6.5, 50.0))
+LIFT_MM = 60.0
+"""How far a person lifts the brush before going elsewhere."""
+PIN_TILTS_DEG = (0.0, 35.0)
+CLEAR_OF_PICTURE_MM = 75.0
+"""More than the arm hides around the tip."""
+
+
+BASE_CLEAR_MM = 230.0
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """One lab. Numbers are true ones; only tests may compare them with what was found."""
+
+    seed: int
+    config: SimConfig
+    pin_mm: Place
+    """Upper end of a pin that stands on the table."""
+    wash_mm: tuple[float, float]
+    """Centre of a pot of water like the well, in the paper frame."""
+    park_mm: Place
+    """A place for the tip outside the picture."""
+    cabinet_tcp: tuple[float, ...] = (0.0,) * 6
+    """What somebody once typed at the pendant: m and rad."""
+    payload_kg: float = 0.0
+    sheet_camera: int = 0
+    """Which of the two streams shows the sheet."""
+    printed_square_mm: float = 12.0
+    printed_marker_mm: float = 9.0
+    """As the line below the print says."""
+    hand_mm: float = 0.3
+    """Standard deviation of a hand along each axis, where the tip is brought to a thing."""
+    swapped: tuple[str, str] | None = None
+    """Corners that the person takes for each other."""
+    parks_in_picture: bool = False
+    arcs_answers: bool = True
+    """False for a cabinet with the older software."""
+    cable_after: int | None = None
+    """Number of touched things after which somebody trips over the controller's cable."""
+    ruler_unit: str = field(default="mm")
+    """Unit in which the person writes down a length."""
+
+
+def draw(seed: int, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX) -> Facts:
+    """The lab of this seed: drawn again until the arm reaches everything and the camera sees the board."""
+    for attempt in itertools.count():
+        facts = _guess(np.random.default_rng([seed, 16, attempt]), seed, rate, picture_px)
+        if facts is not None and _board_in_picture(facts.config) and reaches(facts.config, poses(facts)):
+            return facts
+    raise AssertionError("unreachable")
+
+
+def _guess(rng: np.random.Generator, seed: int, rate: float, picture_px: tuple[int, int]) -> Facts | None:
+    table = _table(rng)
+    view = _view(rng, table, picture_px)
+    sideways_mm, at, lean_deg, toward = (
+        rng.uniform(0, 15),
+        rng.uniform(0, math.tau),
+        rng.uniform(0, 3),
+        rng.uniform(0, math.tau),
+    )
+    radius_mm, length_mm = BRUSHES[rng.integers(len(BRUSHES))]
+    pin = _beside(rng, table, 50.0)
+    wash = _beside(rng, table, 35.0)
+    config = SimConfig(
+        seed=seed,
+        rate=rate,
+        ink_device=("station", "pump", "none")[rng.integers(3)],
+        tool_mm=float(rng.uniform(120, 260)),
+        tool_sideways_mm=(float(sideways_mm * math.cos(at)), float(sideways_mm * math.sin(at))),
+        tool_lean_deg=(float(lean_deg * math.cos(toward)), float(lean_deg * math.sin(toward))),
+        sensor_turn_deg=float(rng.choice([0, 90, 180, 270]) + rng.normal(0.0, 2.0)),
+        sensor_sign=1 if rng.random() < 0.75 else -1,
+        brush=BrushSpec(seed=seed, radius_mm=radius_mm, length_mm=length_mm),
+        table=table,
+        view=view,
+    )
+    config = replace(config, sensor_to_tip_mm=config.tool_mm)
+    typed = _typed_tcp(rng, config)
+    payload_kg, sheet_camera = float(rng.choice([0.0, 0.5])), int(rng.integers(2))
+    park = _park(rng, config)
+    if park is None or min(_apart_mm(pin, wash), _apart_mm(pin, table.well_mm), _apart_mm(wash, table.well_mm)) < 60.0:
+        return None
+    return Facts(
+        seed,
+        replace(config, home_mm=park),
+        in_base(table, *pin, float(rng.uniform(20, 60))),
+        wash,
+        park,
+        typed,
+        payload_kg,
+        sheet_camera,
+        table.board_square_mm,
+        table.board_marker_mm,
+    )
+
+
+def _table(rng: np.random.Generator) -> Table:
+    columns, rows, square_mm, marker_mm = PRINTS[rng.integers(len(PRINTS))]
+    left, bottom, right, top = (float(v) for v in rng.integers(26, 41, 4))
+    width, height = columns * square_mm - left - right, rows * square_mm - bottom - top
+    reach_mm, bearing, yaw_deg = rng.uniform(400, 520), math.radians(rng.uniform(-110, 110)), float(rng.uniform(0, 360))
+    yaw = math.radians(yaw_deg)
+    table = Table(
+        origin_mm=(
+            float(reach_mm * math.cos(bearing) - math.cos(yaw) * width / 2 + math.sin(yaw) * height / 2),
+            float(reach_mm * math.sin(bearing) - math.sin(yaw) * width / 2 - math.cos(yaw) * height / 2),
+        ),
+        yaw_deg=yaw_deg,
+        paper_z_mm=float(rng.uniform(0, 160)),
+        slope_deg=(float(rng.uniform(-1, 1)), float(rng.uniform(-1, 1))),
+        sheet_mm=(width, height),
+        board_origin_mm=(-left, -bottom),
+        board_squares=(columns, rows),
+        board_square_mm=square_mm,
+        board_marker_mm=marker_mm,
+        well_radius_mm=float(rng.uniform(12, 18)),
+    )
+    return replace(table, well_mm=_beside(rng, table, table.well_radius_mm + 12.0))
+
+
+def _view(rng: np.random.Generator, table: Table, picture_px: tuple[int, int]) -> View:
+    (width, height), (width_px, height_px) = board_size_mm(table), picture_px
+    focal = float(rng.uniform(0.95, 1.25))
+    across_mm = max(width + rng.uniform(30, 60), (height + rng.uniform(30, 60)) * width_px / height_px)
+    left, bottom = table.board_origin_mm
+    centre = (left + width / 2 + float(rng.uniform(-8, 8)), bottom + height / 2 + float(rng.uniform(-8, 8)))
+    above_mm, aside, toward = focal * across_mm, rng.uniform(0, 0.1), rng.uniform(0, math.tau)
+    return View(
+        width_px=width_px,
+        height_px=height_px,
+        px_per_mm=width_px / float(across_mm),
+        turn_deg=float(rng.uniform(-6, 6) + (180.0 if rng.random() < 0.3 else 0.0)),
+        centre_mm=centre,
+        lens_mm=(
+            centre[0] + float(above_mm * aside * math.cos(toward)),
+            centre[1] + float(above_mm * aside * math.sin(toward)),
+            float(above_mm),
+        ),
+        focal=focal,
+        noise=float(rng.uniform(1.5, 2.5)),
+        shade=float(rng.uniform(0.05, 0.2)),
+        k1=float(rng.uniform(-0.08, 0.04)),
+        fps=float(rng.choice([10, 12, 15])),
+        delay_s=float(rng.uniform(0.08, 0.6)),
+        delay_jitter_s=float(rng.uniform(0.0, 0.03)),
+    )
+
+
+def _beside(rng: np.random.Generator, table: Table, clear_mm: float) -> tuple[float, float]:
+    """A point beside the board, in the paper frame."""
+    (width, height), (left, bottom) = board_size_mm(table), table.board_origin_mm
+    along, beyond = float(rng.uniform(0.15, 0.85)), clear_mm + float(rng.uniform(0, 15))
+    return (
+        (left + along * width, bottom - beyond),
+        (left + along * width, bottom + height + beyond),
+        (left - beyond, bottom + along * height),
+        (left + width + beyond, bottom + along * height),
+    )[rng.integers(4)]
+
+
+def _typed_tcp(rng: np.random.Generator, config: SimConfig) -> tuple[float, ...]:
+    """Nothing, another tool's, or this one's by a ruler."""
+    ruler_m = (config.tool_mm + float(rng.normal(0.0, 2.0))) / 1e3
+    other_m = float(rng.uniform(0.05, 0.2))
+    return ((0.0,) * 6, (0.0, 0.03, other_m, 0.0, 0.0, 0.5), (0.0, 0.0, ruler_m, 0.0, 0.0, 0.0))[rng.integers(3)]
+
+
+def _park(rng: np.random.Generator, config: SimConfig) -> Place | None:
+    """A place that the arm reaches and the camera does not see, and a straight way from the sheet past the base."""
+    table = config.table
+    middle = over_sheet(table)
+    for _ in range(40):
+        reach_mm = rng.uniform(300, 600)
+        bearing = math.radians(azimuth_deg(middle) + rng.uniform(-80, 80))
+        z_mm = config.table.paper_z_mm + float(rng.uniform(110, 180))
+        place = (float(reach_mm * math.cos(bearing)), float(reach_mm * math.sin(bearing)), z_mm)
+        if in_picture(config, place) or _nearest_mm(middle, place) < BASE_CLEAR_MM:
+            continue
+        if abs(math.degrees(bearing)) < 150.0 and reaches(config, [brush_pose(*place)]):
+            return place
+    return None
+
+
+def _nearest_mm(start: Place, end: Place) -> float:
+    """Least distance of a straight way from the axis of the base."""
+    a, b = np.array(start[:2]), np.array(end[:2])
+    along = float(np.clip(-a @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0))
+    return float(np.linalg.norm(a + along * (b - a)))
+
+
+def in_picture(config: SimConfig, place: Place) -> bool:
+    """Whether the arm with its tip there hides a part of the picture, lens distortion aside."""
+    table, view = config.table, config.view
+    yaw = math.radians(table.yaw_deg)
+    dx, dy = place[0] - table.origin_mm[0], place[1] - table.origin_mm[1]
+    x, y = math.cos(yaw) * dx + math.sin(yaw) * dy, -math.sin(yaw) * dx + math.cos(yaw) * dy
+    u, v, w = homography(view) @ np.array([x, y, 1.0])
+    edge_px = CLEAR_OF_PICTURE_MM * view.px_per_mm
+    return bool(-edge_px <= u / w <= view.width_px + edge_px and -edge_px <= v / w <= view.height_px + edge_px)
+
+
+def _board_in_picture(config: SimConfig) -> bool:
+    """Whether all of the board is seen, with a margin for the lens's distortion."""
+    table, view = config.table, config.view
+    (left, bottom), (width, height) = table.board_origin_mm, board_size_mm(table)
+    ends = np.array([[left + i * width, bottom + j * height, 1.0] for i in (0, 1) for j in (0, 1)])
+    mapped = ends @ homography(view).T
+    inside = mapped[:, :2] / mapped[:, 2:]
+    return bool(np.all((inside > 12.0) & (inside < np.array([view.width_px, view.height_px]) - 12.0)))
+
+
+def poses(facts: Facts) -> Iterator[Pose]:
+    """Poses of the tip that the lab must allow: by hand, and those of a later session, with room above."""
+    table = facts.config.table
+    touched = [corner(table, of, name) for of in ("board", "sheet") for name in CORNERS]
+    touched += [in_base(table, *facts.wash_mm), in_base(table, *table.well_mm)]
+    for place in touched:
+        upright = held(place, wrist_deg=azimuth_deg(place))
+        yield from (upright, shifted(upright, (0.0, 0.0, LIFT_MM + 20.0)))
+    for place in touched[4:8]:
+        for turn_deg in (0.0, 90.0, 180.0, 270.0):
+            x, y, z = place
+            yield brush_pose(x, y, z - 15.0, heading_deg=table.yaw_deg + turn_deg, tilt_deg=15.0)
+    for toward_deg in range(0, 360, 60):
+        yield held(facts.pin_mm, wrist_deg=azimuth_deg(facts.pin_mm), tilt_deg=PIN_TILTS_DEG[1], toward_deg=toward_deg)
+
+
+def reaches(config: SimConfig, wanted: Iterator[Pose] | list[Pose]) -> bool:
+    """Whether the arm reaches every pose of the tip with this tool."""
+    tool, near = inverted(tool_of(config)), HOME
+    for pose in wanted:
+        found = joints_for(tool, pose, near)
+        if found is None:
+            return False
+        near = found
+    return True
+
+
+def joints_for(flange_in_tool: Matrix, pose: Pose, near: Joints) -> Joints | None:
+    """Joints for a pose of the tip; None out of reach."""
+    return inverse(matrix_of(pose) @ flange_in_tool, near)
+
+
+def _apart_mm(a: tuple[float, float], b: tuple[float, float]) -> float:
+    return math.dist(a, b)

@@ -1,0 +1,156 @@
+"""The unknown lab as a whole: the loopback rig on an address and on the ports of a real one, and a person in it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import socket
+from collections.abc import Iterator
+from dataclasses import replace
+
+from drivers.arcs.robot import AUBOPE_PORT
+from drivers.force.rounds import LOOPBACK_CHANNEL
+from drivers.sim.arcs.cabinet import Cabinet
+from drivers.sim.camera.held import Held
+from drivers.sim.camera.mjpeg_server import MjpegServer
+from drivers.sim.camera.room import RoomScene
+from drivers.sim.config import View
+from drivers.sim.faults.kinds import ALWAYS, Device, Fault
+from drivers.sim.lab.facts import PICTURE_PX, draw
+from drivers.sim.lab.hand import Hand
+from drivers.sim.lab.seen import Seen, printed
+from drivers.sim.lab.traps import Trap, mended, spring
+from drivers.sim.rig import LoopbackRig
+from drivers.sim.server import LoopbackServer
+from drivers.sim.world import World
+
+ARCS_PORT, RTDE_PORT, CAN_PORT = 30004, 30010, 29536
+CAMERA_PORTS = (8080, 8081)
+ROOM_FPS = 5.0
+ADDRESSES = 200
+"""How many labs of one seed can be open at once on a machine."""
+
+
+class OlderSoftware(LoopbackServer):
+    """The port of the software before ARCS: it takes connections, and answers nothing that ARCS would."""
+
+    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Read until the client disconnects."""
+        while await reader.read(4096):
+            pass
+
+
+class UnknownLab:
+    """`async with UnknownLab(seed) as lab:` serves until the block ends; `lab.hand` is the person."""
+
+    def __init__(
+        self, seed: int, trap: Trap | None = None, *, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX
+    ) -> None:
+        self.trap = trap
+        """The trap that is still set."""
+        self._clean = draw(seed, rate, picture_px)
+        self.facts = self._clean if trap is None else spring(self._clean, trap)
+        self.host = _free_address(seed)
+        ports = {"arcs_port": ARCS_PORT, "rtde_port": RTDE_PORT, "force_port": CAN_PORT}
+        config = replace(self.facts.config, camera_port=CAMERA_PORTS[self.facts.sheet_camera], **ports)
+        self.rig = LoopbackRig(config, self.host)
+        self.world: World = self.rig.world
+        self.cabinet: Cabinet = self.rig.arcs.cabinet
+        self.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
+        self.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
+        towards_sheet = math.atan2(self.facts.pin_mm[1], self.facts.pin_mm[0])
+        self._room = MjpegServer(RoomScene(self.world, towards_sheet), fps=ROOM_FPS, jpeg_quality=80, view=View())
+        self._older = OlderSoftware()
+        self._touches = 0
+        self._pulled: list[int] = []
+        self.hand = Hand(self)
+
+    async def __aenter__(self) -> UnknownLab:
+        await self.rig.__aenter__()
+        try:
+            await self._room.start(self.host, CAMERA_PORTS[1 - self.facts.sheet_camera])
+            if not self.facts.arcs_answers:
+                await self.rig.arcs.stop()
+                await self.rig.rtde.stop()
+                await self._older.start(self.host, AUBOPE_PORT)
+        except BaseException:
+            await self.__aexit__()
+            raise
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._older.stop()
+        await self._room.stop()
+        await self.rig.__aexit__()
+
+    def seen(self) -> Seen:
+        """What a person can read in the lab now."""
+        ink = self.rig.ink
+        kind = "modbus-pump" if self.facts.config.ink_device == "pump" else "ink-station"
+        return Seen(
+            self.host,
+            tuple(f"http://{self.host}:{port}/stream.mjpg" for port in CAMERA_PORTS),
+            (self.host, CAN_PORT, LOOPBACK_CHANNEL),
+            None if ink is None else (kind, ink.path),
+            **printed(self.facts),
+        )
+
+    def hold(self, board: Held | None) -> None:
+        """Hold the print before the camera, or put it away."""
+        self.rig.scene.held = board
+
+    def touched(self) -> None:
+        """Another thing was touched; in one lab, somebody then trips over the cable."""
+        self._touches += 1
+        if self._touches == self.facts.cable_after:
+            board = self.rig.faults.board
+            self._pulled = [
+                board.hang(Fault(device=Device.ROBOT, kind="deaf", count=ALWAYS)),
+                board.hang(Fault(device=Device.TELEMETRY, kind="mute", count=ALWAYS)),
+            ]
+
+    def plug(self) -> str:
+        """Put the cable back."""
+        pulled, self._pulled = self._pulled, []
+        for ident in pulled:
+            self.rig.faults.board.take(ident)
+        return "The cable was out; it is in again." if pulled else "Every cable is in."
+
+    async def mend(self) -> str:
+        """See to the trap: the lab is from now on as the trap's description says."""
+        trap, self.trap = self.trap, None
+        if trap is None:
+            return "Nothing is wrong that I know of."
+        if trap is Trap.CABLE_PULLED:
+            return self.plug()
+        was, self.facts = self.facts, mended(self.facts, self._clean, trap)
+        if self.facts.config != was.config:
+            self.rig.reconfigure(self.facts.config)
+        if self.facts.cabinet_tcp != was.cabinet_tcp:
+            self.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
+        if self.facts.arcs_answers and not was.arcs_answers:
+            await self._older.stop()
+            await self.rig.arcs.start(self.host, ARCS_PORT)
+            await self.rig.rtde.start(self.host, RTDE_PORT)
+        return f"I have seen to it: {trap.value}."
+
+
+def _free_address(seed: int) -> str:
+    """A loopback address on which nobody uses a port of ours. Raises OSError where there is none."""
+    for last in range(10, 10 + ADDRESSES):
+        host = f"127.16.{seed % 250 + 1}.{last}"
+        with contextlib.ExitStack() as probes:
+            try:
+                for port in _ports():
+                    probe = probes.enter_context(socket.socket())
+                    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                    probe.bind((host, port))
+            except OSError:
+                continue
+            return host
+    raise OSError(f"no loopback address for the lab of seed {seed}: ports {', '.join(map(str, _ports()))} are in use")
+
+
+def _ports() -> Iterator[int]:
+    yield from (ARCS_PORT, RTDE_PORT, CAN_PORT, *CAMERA_PORTS, AUBOPE_PORT)
