@@ -78,4 +78,4 @@ def test_several_looks_are_told_with_their_spread():
     assert delay.delay_s == pytest.approx(0.23)
     assert delay.spread_s == pytest.approx(0.06)
     assert delay.bound_s == pytest.approx(0.30)
-    assert str(delay) == "230 ms (to 21), varying by 60 ms over 2 looks"
+    assert str(delay) == "230 ± 21 ms, varying by 60 ms over 2 trips"
