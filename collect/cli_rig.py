@@ -6,11 +6,15 @@ Imports wait until a command runs, so that `--help` loads nothing heavy.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from sessions.terminal import say
+
+if TYPE_CHECKING:
+    from collect.teach.day import Day
+    from collect.tui.teach_guide import ScreenGuide
 
 app = typer.Typer(
     help="Teach a rig on its first day, look at its rig.toml, check it.",
@@ -52,15 +56,35 @@ def teach(
 
 def _teach(rig: Path, step: str | None, *, plain: bool, arm: bool) -> None:
     import asyncio
+    import sys
 
     from collect.teach.day import Day
-    from collect.teach.plain import PlainGuide
-    from collect.teach.wizard import Wizard
     from drivers.clock import HostClock
 
-    day = Day(PlainGuide(rig.with_name(f"{rig.stem}.pictures")), rig, HostClock(), armed=arm)
+    if plain or not (sys.stdin.isatty() and sys.stdout.isatty()):
+        from collect.teach.plain import PlainGuide
+
+        day = Day(PlainGuide(rig.with_name(f"{rig.stem}.pictures")), rig, HostClock(), armed=arm)
+        asyncio.run(_taught(day, step))
+        return
+    from collect.tui.teach_app import run_teaching
+
+    async def watched_day(guide: ScreenGuide) -> Path | None:
+        from collect.teach.watch import watched
+
+        day = Day(guide, rig, HostClock(), armed=arm)
+        async with watched(day, guide.see_pose, guide.see_picture, lambda: guide.looking):
+            return await _taught(day, step)
+
+    if (written := run_teaching(watched_day, str(rig))) is not None:
+        say(f"{written} is written, with how each value was obtained. Next: brushloop rig check {written}")
+
+
+async def _taught(day: Day, step: str | None) -> Path | None:
+    from collect.teach.wizard import Wizard
+
     wizard = Wizard(day)
-    asyncio.run(wizard.run() if step is None else wizard.again(step))
+    return await (wizard.run() if step is None else wizard.again(step))
 
 
 @app.command()

@@ -117,12 +117,12 @@ class ArmReader:
         From the cabinet's tool pose, with its tool taken off again: whatever is set there does not matter. Raises
         `DeviceTimeout` if the arm keeps moving.
         """
-        before = await self._flange()
+        before = await self.flange_now()
         try:
             async with asyncio.timeout(PATIENCE_S):
                 while True:
                     await asyncio.sleep(STILL_S)
-                    here = await self._flange()
+                    here = await self.flange_now()
                     moved_mm, turned_deg = distance(before, here)
                     if moved_mm < STILL_MM and turned_deg < STILL_DEG:
                         return here
@@ -132,7 +132,8 @@ class ArmReader:
                 DEVICE, "getTcpPose", f"the arm did not rest for {PATIENCE_S:g} s", remedy="Hold it still."
             ) from None
 
-    async def _flange(self) -> Pose:
+    async def flange_now(self) -> Pose:
+        """Where the flange is, whether or not the arm rests. Raises `DeviceError`."""
         tool = await self.tool()
         at = from_wire(_six("getTcpPose", await self.ask("RobotState.getTcpPose")))
         turn = Rotation.from_quat(at.quaternion) * Rotation.from_euler("ZYX", tool[5:2:-1]).inv()

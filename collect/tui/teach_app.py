@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine
+from pathlib import Path
 from typing import Any, ClassVar
 
 from textual import events
@@ -21,7 +22,7 @@ from collect.tui.teach_screen import TeachScreen
 from collect.tui.terminal import PlainApp, TerminalDriver
 from collect.tui.text import SOFTWARE_STOP
 
-Work = Callable[[ScreenGuide], Coroutine[Any, Any, object]]
+Work = Callable[[ScreenGuide], Coroutine[Any, Any, Path | None]]
 AT_WORK = ("Something is at work: stop it and leave?", "y  stop and leave      n  go on      s  stop now")
 STOPPED = "Stopped. Look at the arm before you go on.\ng  go on from the last question   q  leave, all is kept"
 DONE = "This is done.   q  leave"
@@ -149,8 +150,8 @@ class TeachApp(PlainApp):
         self._screen.show(self.teaching.guide.view, over)
 
 
-def run_teaching(work: Work, name: str, pictures: Pictures | None = None) -> None:
-    """Show the screen until the person leaves; raises what ended the steps.
+def run_teaching(work: Work, name: str, pictures: Pictures | None = None) -> Path | None:
+    """Show the screen until the person leaves; returns the `rig.toml` that was written, raises what ended the steps.
 
     However the screen ends, nobody watches the arm any more: whatever moves it is stopped.
     """
@@ -169,3 +170,4 @@ def run_teaching(work: Work, name: str, pictures: Pictures | None = None) -> Non
     app.teaching.join()
     if app.teaching.stopped:
         raise CollectAborted("stopped; the same command goes on from there")
+    return app.teaching.written

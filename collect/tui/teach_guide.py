@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 from collect.operator import Choice
@@ -120,9 +121,19 @@ class ScreenGuide:
         assert isinstance(answer, JogStep | Brought)
         return answer
 
-    def see(self, tip: Pose | None, tip_known: bool, picture: Picture | None) -> None:
-        """Show where the arm is and what the camera sees."""
-        self._change(tip=tip, tip_known=tip_known, live=picture)
+    def see_pose(self, tip: Pose | None, tip_known: bool) -> None:
+        """Show where the arm is."""
+        self._change(tip=tip, tip_known=tip_known)
+
+    def see_picture(self, picture: Picture | None) -> None:
+        """Show what the camera sees."""
+        self._change(live=picture)
+
+    @property
+    def looking(self) -> bool:
+        """Whether the person guides something by hand, and wants to see it."""
+        question = self.view.question
+        return question is not None and question.kind in ("bring", "jog")
 
     # Of the screen
 
@@ -173,16 +184,18 @@ class ScreenGuide:
 class Teaching:
     """The steps in a thread of their own, so that nothing they compute keeps a stop waiting on the screen."""
 
-    def __init__(self, work: Callable[[ScreenGuide], Coroutine[Any, Any, object]]) -> None:
+    def __init__(self, work: Callable[[ScreenGuide], Coroutine[Any, Any, Path | None]]) -> None:
         self.guide = ScreenGuide()
         self.error: BaseException | None = None
         """What ended it, other than a stop."""
+        self.written: Path | None = None
+        """What the steps returned: the `rig.toml` that they wrote, if they did."""
         self.stopped = False
         """Whether a stop ended it."""
         self._work = work
         self._cancelled_s = -math.inf
         self._started = threading.Event()
-        self._task: asyncio.Task[object] | None = None
+        self._task: asyncio.Task[Path | None] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread = threading.Thread(target=self._run, name="first day", daemon=True)
 
@@ -229,7 +242,7 @@ class Teaching:
     async def _main(self) -> None:
         self._loop, self._task = asyncio.get_running_loop(), asyncio.ensure_future(self._work(self.guide))
         self._started.set()
-        await self._task
+        self.written = await self._task
 
 
 class StopUnsure(Exception):

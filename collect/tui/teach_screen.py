@@ -140,8 +140,7 @@ class TeachScreen(Screen[None]):
         self._title.show(f"First day   {one_line(self._name)}{_where(now.steps)}")
         self._steps.show(_steps_content(now.steps, summaries=self.size.height >= HIGH_ROWS))
         self._live.show(_live_text(now))
-        looking = now.question is not None and now.question.kind in ("bring", "jog") and now.live is not None
-        self._picture.show(_gray(now.live if looking else now.picture))
+        self._picture.show(_gray(now.live if self._guide.looking and now.live is not None else now.picture))
         if before is None or before.findings != now.findings:
             self._found.show(Content("\n").join(_finding(shown) for shown in now.findings))
             self.query_one("#teach-found", VerticalScroll).scroll_end(animate=False)

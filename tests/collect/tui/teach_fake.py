@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from collect.operator import Choice
-from collect.teach.guide import Brought, JogStep, JogView, Shown, StepState, Target
+from collect.teach.guide import Brought, JogView, Shown, StepState, Target
 from collect.tui.teach_app import TeachApp
 from collect.tui.teach_guide import ScreenGuide
 from drivers.geometry import brush_pose
@@ -38,14 +38,13 @@ class Asking:
     def __init__(self, *kinds: str) -> None:
         self.kinds = kinds
         self.answers: list[object] = []
-        self.moving = asyncio.Event
         self.stopped_arm = False
 
-    async def __call__(self, guide: ScreenGuide) -> object:
+    async def __call__(self, guide: ScreenGuide) -> None:
         await guide.overview(STEPS)
         await guide.show(FOUND)
         await guide.show(WARNED)
-        guide.see(brush_pose(412.25, -31.5, 121.75), True, None)
+        guide.see_pose(brush_pose(412.25, -31.5, 121.75), True)
         for kind in self.kinds:
             self.answers.append(await self._ask(guide, kind))
         return None
@@ -80,6 +79,3 @@ class Asking:
 
 def app_of(asking: Asking) -> TeachApp:
     return TeachApp(asking, "rig.toml")
-
-
-__all__ = ["JOG", "Asking", "JogStep", "app_of"]
