@@ -38,7 +38,7 @@ class Run:
     """A person accepts what each set-up step measured before it counts."""
 
     async def protocol(self, protocol: Protocol) -> None:
-        """Power on, retreat, do every step that is not in the journal yet, then repeat strokes that were marked bad."""
+        """Power on, retreat, do every step that is not in the journal yet, repeat what was marked bad, park."""
         self.context.progress.doing("power on")
         await self._once_arm_is_free(self.context.rig.robot.enable)
         await self._once_arm_is_free(self._recover)
@@ -49,6 +49,7 @@ class Run:
                 break
             for stroke_id, _ in (await self._result(step))["again"]:
                 await self._walk(takes(self.context.progress.made_again(str(stroke_id))))
+        await self._once_arm_is_free(self._recover)  # the last capture has set out for a dip that does not come
 
     async def _walk(self, protocol: Protocol) -> None:
         step = next(protocol)

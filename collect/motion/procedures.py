@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 
 from collect.errors import StepVoid
@@ -29,6 +30,8 @@ DEPTH_TOLERANCE_MM = 0.1
 """How far the depth at the end of the dwell may be from the requested one."""
 TOUCH_TOLERANCE_MM = 0.1
 """How far the arm may rest from the taught height at zero touch."""
+THERE_MM = 0.1
+"""How far from the beginning of a dip the arm counts as being there."""
 
 
 class Procedures:
@@ -50,7 +53,7 @@ class Procedures:
                 over_mm=over.target.position_mm,
                 park_mm=rig.config.motion.park_mm,
                 over=lambda: self.go(over),
-                park=self._park,
+                park=self.park,
                 over_sheet=self._over_sheet,
             ),
         )
@@ -77,9 +80,16 @@ class Procedures:
         await self.go(up)
         return rests_mm
 
+    async def set_out(self) -> None:
+        """Go where the next dip or wash begins, at travel height."""
+        await self.go(inking_moves(self._config, self._dips)[0])
+
     async def dip(self) -> None:
-        """Dip into the well and wipe; wash first if a wash is due."""
-        for move in inking_moves(self._config, self._dips):
+        """Dip into the well and wipe; wash first if a wash is due. An arm that has set out does not do so again."""
+        first, *moves = inking_moves(self._config, self._dips)
+        if math.dist((await self._rig.robot.where()).position_mm, first.target.position_mm) > THERE_MM:
+            moves.insert(0, first)
+        for move in moves:
             await self.go(move)
         self._dips += 1
 
@@ -100,7 +110,8 @@ class Procedures:
         """Park, and return the first frame exposed after the camera has shown the arm gone."""
         return await self.photographer.photograph()
 
-    async def _park(self) -> None:
+    async def park(self) -> None:
+        """Go out of the camera's view."""
         for move in park_moves(self._config):
             await self.go(move)
 

@@ -60,8 +60,10 @@ def moves_of(
             return StepMoves([*inking_moves(config, dips)], dips=1)
         case StepKind.CHOOSE | StepKind.REVIEW:
             return StepMoves()
-        case StepKind.BOARD | StepKind.CAPTURE:
+        case StepKind.BOARD:
             return StepMoves([*photograph_moves(config)], captures=1)
+        case StepKind.CAPTURE:
+            return StepMoves([*photograph_moves(config), inking_moves(config, dips)[0]], captures=1)
         case StepKind.PRESS:
             assert cell is not None
             down, up = press_moves(config, plane, cell, _number(step, "height_mm"), _number(step, "tilt_deg"))

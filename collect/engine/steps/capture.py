@@ -10,7 +10,7 @@ from calibrate.errors import CalibrationError
 from calibrate.stroke.params import Gray
 from collect.engine.last_capture import LastCapture, pictures_of, published_mark
 from collect.engine.steps.choose import measured
-from collect.engine.steps.context import RunContext, StepContext, uninterrupted
+from collect.engine.steps.context import RunContext, StepContext, meanwhile, uninterrupted
 from collect.engine.steps.retake import decide
 from collect.errors import BadPicture, NeedsOperator, StepError
 from collect.protocols.steps import Result
@@ -18,6 +18,7 @@ from collect.quality.checks import cell_is_blank, check_capture, check_drawing, 
 from collect.quality.verdict import Check, Family, Verdict
 from collect.rig.optics import undistorted
 from collect.rig.paper import Cell
+from drivers.samples import Frame
 from sessions.history import limit_s, unlike, waits_of
 from sessions.recording import schemas
 
@@ -84,6 +85,10 @@ def _inked_cells(run: RunContext, image: Gray, begun: int | None) -> list[str]:
 
 async def photograph(context: StepContext) -> Gray:
     """Park, take a fresh frame, record it as the still of this attempt, and return it in gray, undistorted."""
+    return await _recorded(context, await _fresh_frame(context))
+
+
+async def _fresh_frame(context: StepContext) -> Frame:
     run, photographer = context.run, context.run.procedures.photographer
     known = photographer.delay
     with context.recorder.sections.timed("wait for a fresh frame"):
@@ -91,9 +96,13 @@ async def photograph(context: StepContext) -> Gray:
     if photographer.delay is not known:
         context.recorder.log(f"camera delay: {photographer.delay}")
         run.progress.log(f"camera delay: {photographer.delay}")
+    return frame
+
+
+async def _recorded(context: StepContext, frame: Frame) -> Gray:
     with context.recorder.sections.timed("encode still"):
         await uninterrupted(context.recorder.still, frame, context.attempt.serial)
-    return await uninterrupted(undistorted, run.rig.config.camera, frame.image)
+    return await uninterrupted(undistorted, context.run.rig.config.camera, frame.image)
 
 
 def _camera_delay(context: StepContext) -> Result:
@@ -106,18 +115,18 @@ def _camera_delay(context: StepContext) -> Result:
 async def capture(context: StepContext) -> Result:
     """The CAPTURE step: `kept` if the stroke counts, `retake` if it must be pressed again on another cell.
 
-    Raises `BadPicture` if the photograph, not the stroke, is at fault.
+    Once the frame is there, the arm goes where the next dip begins while the frame is recorded and judged. The brush is
+    empty and stays so until the decision is in the journal: only the next step may dip it. Raises `BadPicture` if the
+    photograph, not the stroke, is at fault.
     """
     run, stroke_id = context.run, str(context.step.params["stroke_id"])
     if int(context.number("sheet")) != run.store.state.sheet:
         raise StepError(f"{stroke_id} is not on the sheet that is in")
     cell = run.sheet.cell(int(context.number("cell")))
-    image = await photograph(context)
+    frame = await _fresh_frame(context)
     waited = _wait_check(context)
-    verdict = await _judged(context, image, cell, waited)
-    run.memory.sound_frame = image
-    if run.asker.watched:
-        await uninterrupted(_show, context, verdict, image, cell)
+    moving = context.guard.guarded(run.procedures.set_out())
+    image, verdict = await meanwhile(moving, _looked_at(context, frame, cell, waited))
     kept, retake = await decide(context, verdict, image, cell)
     if not kept:
         run.progress.looked_at(kept=False)
@@ -134,6 +143,18 @@ async def capture(context: StepContext) -> Result:
         "verdict": "" if verdict is None or verdict.cause is None else str(verdict.cause.name),
         **(await measured(context, image, cell) if context.step.params.get("measured") else {}),
     }
+
+
+async def _looked_at(
+    context: StepContext, frame: Frame, cell: Cell, waited: schemas.Check | None
+) -> tuple[Gray, Verdict | None]:
+    """Record the frame, judge the stroke in it, and show both; nothing moves here."""
+    image = await _recorded(context, frame)
+    verdict = await _judged(context, image, cell, waited)
+    context.run.memory.sound_frame = image
+    if context.run.asker.watched:
+        await uninterrupted(_show, context, verdict, image, cell)
+    return image, verdict
 
 
 def _wait_check(context: StepContext) -> schemas.Check | None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from calibrate.board.pix2len import Plane
 from calibrate.board.view import see_board
@@ -112,6 +112,19 @@ class StepContext:
         value = self.step.params[name]
         assert isinstance(value, float | int)
         return float(value)
+
+
+async def meanwhile(moving: Coroutine[Any, Any, None], work: Coroutine[Any, Any, _R]) -> _R:
+    """Do `work` while the arm moves; return its result once both have ended, on failure and cancellation too.
+
+    Raises the error of the motion before that of the work. Work that fails does not stop the arm, which is under way to
+    where it may wait.
+    """
+    moved, done = await asyncio.gather(moving, work, return_exceptions=True)
+    for ended in (moved, done):
+        if isinstance(ended, BaseException):
+            raise ended
+    return cast("_R", done)
 
 
 async def uninterrupted(function: Callable[..., _R], *args: object) -> _R:

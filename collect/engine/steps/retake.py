@@ -39,6 +39,8 @@ async def _after_failure(context: StepContext, verdict: Verdict, image: Gray, ce
     stroke_id = str(context.step.params["stroke_id"])
     text = f"{stroke_id}, take {take}: {verdict.reason}"
     prompt = Prompt(text, (KEEP, AGAIN, SKIP), SKIP.key, image=_cut_out(run, image, cell))
+    if run.asker.watched:
+        await run.procedures.park()  # a person may reach under the arm
     try:
         with run.progress.meanwhile("wait for an answer"):
             answer = await run.asker.ask(prompt)
