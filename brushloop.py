@@ -183,14 +183,17 @@ def hand(
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for everything that the demo makes.")] = Path("demo-run"),
+    full: Annotated[
+        bool, typer.Option("--full", help="More presses, and a written character: all three tables.")
+    ] = False,
     repeats: Annotated[int, typer.Option(min=1, max=2, help="Presses per (H, alpha); one sheet holds two.")] = 2,
-    rate: Annotated[float, typer.Option(min=0.01, max=1000, help="Simulated seconds per real second.")] = 20.0,
+    rate: Annotated[float, typer.Option(min=0.01, max=1000, help="Simulated seconds per real second.")] = 60.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the rig and of the order of presses.")] = 1,
 ) -> None:
-    """Collect, calibrate and validate a short session on the loopback rig. Run again, it goes on where it stopped."""
-    from collect.chains.demo import run_demo
+    """Press, calibrate, press again and validate on the loopback rig. Run again, it goes on where it stopped."""
+    from collect.chains.demo import FULL, QUICK, Demo
 
-    if code := run_demo(out, repeats, rate, seed):
+    if code := Demo(out, FULL if full else QUICK, repeats, rate, seed).run():
         raise typer.Exit(code)
 
 

@@ -1,116 +1,204 @@
 """`brushloop demo`: the real commands, in order, against a loopback rig in a process of its own.
 
-All files go under one folder. A demo that is killed and started again continues where it stopped: the rig's process,
-which holds the simulated sheet, outlives the demo by a minute.
+All files go under one folder. A demo that is killed and started again continues where it stopped: what a step has
+finished is on disk, and the rig's process, which holds the simulated sheet, outlives the demo by some minutes.
 """
 
 from __future__ import annotations
 
-import socket
-import subprocess
-import sys
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
+from calibrate.artefact import artefacts
 from collect.chains.commands import GIVEN_UP, finished_session, run_command
-from collect.errors import CollectAborted
-from collect.rig.config import RigConfig, load_rig
+from collect.chains.demo_rig import DemoRig
+from collect.chains.loop import FITS, LoopRequest, run_loop
+from collect.chains.loop import PAGE as LOOP_PAGE
+from collect.chains.loop import PROTOCOL as REPLAY
+from collect.chains.writing import PAGE as WRITTEN_PAGE
+from collect.chains.writing import PROTOCOL as WRITE
+from collect.chains.writing import Writing, WritingRequest
+from collect.errors import ConfigError
+from model.train import SHIPPED_GENERATOR
 from sessions.folders import open_sessions
 from sessions.terminal import say
 
-HEIGHTS_MM = [11.0, 13.0, 15.0, 17.0, 20.0]
-TILTS_DEG = [0.0, 5.0, 10.0]
-START_S = 60.0
-IDLE_EXIT_S = 60.0
+CHARACTER = "字"
 
 
-def run_demo(out: Path, repeats: int, rate: float, seed: int) -> int:
-    """Collect, calibrate, fit and validate under `out`; at the end print the paths of the report and of the MCAP.
+@dataclass(frozen=True, slots=True)
+class Size:
+    """How much a demo does."""
 
-    Returns the exit code, 3 if the collection left strokes out. A session without a report is continued; a new one is
-    started only when the last one has its report.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    rig_toml, protocol_toml, sessions = out / "rig.toml", out / "protocol.toml", out / "sessions"
-    protocol = (
-        f'kind = "grid"\nheights_mm = {HEIGHTS_MM}\ntilts_deg = {TILTS_DEG}\nrepeats = {repeats}\nseed = {seed}\n'
-    )
-    if not protocol_toml.exists() or protocol_toml.read_text(encoding="utf-8") != protocol:
-        protocol_toml.write_text(protocol, encoding="utf-8")
-    if (session := finished_session(sessions, protocol_toml)) is not None and not _report(session).is_file():
-        say(f"continuing with {session}: its collection is finished")
-        _evaluate(session)
-        return 0
-    finished = sessions.is_dir() and any(sessions.iterdir()) and not open_sessions(sessions)
-    rig = _serving(rig_toml, rate, seed, fresh=finished)
-    try:
-        sheet = ("--sheet", "1") if finished else ()
-        files = ("--config", rig_toml, "--protocol", protocol_toml, "--out", sessions)
-        code = run_command(say, "collect", *files, "--no-tui", *sheet, accepts=(0, GIVEN_UP))
-    finally:
-        if rig is not None and rig.poll() is not None:
-            say(f"the loopback rig ended with {rig.returncode}; see {out / 'rig.log'}", err=True)
-    session = max(sessions.iterdir(), key=lambda path: path.stat().st_mtime_ns)
-    _evaluate(session)
-    if rig is not None:
-        rig.terminate()
-        rig.wait()
-    return code
+    heights_mm: tuple[float, ...]
+    tilts_deg: tuple[float, ...]
+    again: int
+    """Presses that are recovered from their images and made again."""
+    writings: int
+    """How often the character is written; 0 leaves Table 3 empty."""
+
+    @property
+    def cells(self) -> int:
+        """Number of combinations of H and alpha."""
+        return len(self.heights_mm) * len(self.tilts_deg)
 
 
-def _evaluate(session: Path) -> None:
-    for command in ("calibrate", "fit", "validate"):
-        run_command(say, command, session)
-    say("", f"Report: {_report(session)}", f"MCAP:   {session / f'{session.name}.mcap'}")
+QUICK = Size((11.0, 15.0, 20.0), (0.0, 5.0, 10.0), again=6, writings=0)
+FULL = Size((11.0, 13.0, 15.0, 17.0, 20.0), (0.0, 5.0, 10.0), again=15, writings=4)
+
+# What the steps take on two quiet cores, in seconds, for the announcements.
+SESSION_S = 8.0
+"""A collection without its strokes: start, camera delay, board, merge."""
+STROKE_S, MOTION_S, WRITING_MOTION_S = 0.6, 20.0, 150.0
+"""A stroke without its motion; the motion of a press and of a written character, in simulated seconds."""
+COMMAND_S, FIT_CELL_S, VALIDATE_CELL_S = 2.0, 0.6, 0.6
+"""A command that only computes; fit and validation of one cell of the grid."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step of the demo; `run` does what of it is not done yet."""
+
+    title: str
+    about_s: float
+    run: Callable[[], None]
+
+
+class Demo:
+    """Collect, calibrate, press again, write if asked, and validate, all under `out`."""
+
+    def __init__(self, out: Path, size: Size, repeats: int, rate: float, seed: int) -> None:
+        self._out = out
+        self._size = size
+        self._repeats = repeats
+        self._rate = rate
+        self._seed = seed
+        self._protocol, self._sessions = out / "protocol.toml", out / "sessions"
+        self._rig = DemoRig(out, rate=rate, seed=seed)
+        self._session: Path | None = None
+        self._collect_code = 0
+
+    def run(self) -> int:
+        """Run every step, and print the paths of the report and of the recording.
+
+        Returns the exit code, 3 if the collection left strokes out. A session without a report is continued; a new one
+        is started only when the last one has its report. Raises `ConfigError`, `SessionError`, `CommandFailed`.
+        """
+        self._out.mkdir(parents=True, exist_ok=True)
+        self._write_protocol()
+        steps = self._steps()
+        total_s = sum(step.about_s for step in steps)
+        say(f"Demo on the loopback rig, all simulated: {len(steps)} steps, about {total_s:.0f} s on two quiet cores.")
+        began_s = time.monotonic()
+        for number, step in enumerate(steps, 1):
+            say("", f"[{number}/{len(steps)}] {step.title}: about {step.about_s:.0f} s")
+            step_began_s = time.monotonic()
+            step.run()
+            say(f"[{number}/{len(steps)}] done in {time.monotonic() - step_began_s:.0f} s")
+        self._rig.end()
+        session = self._finished()
+        say("", f"Done in {time.monotonic() - began_s:.0f} s, simulated: nothing here is a result on paper.")
+        say(f"Report: {_report(session)}", f"MCAP:   {session / f'{session.name}.mcap'}")
+        return self._collect_code
+
+    def _steps(self) -> list[Step]:
+        size, presses = self._size, self._size.cells * self._repeats
+        press_s = STROKE_S + MOTION_S / self._rate
+        steps = [
+            Step(f"press {presses} times, photograph, record", SESSION_S + presses * press_s, self._collect),
+            Step("calibrate the camera, fit the brush", COMMAND_S + size.cells * FIT_CELL_S, self._fit),
+            Step(
+                f"recover {size.again} presses from their images and make them again",
+                SESSION_S + 3 * COMMAND_S + size.again * press_s,
+                self._press_again,
+            ),
+        ]
+        if size.writings:
+            writing_s = SESSION_S + 3 * COMMAND_S + size.writings * (STROKE_S + WRITING_MOTION_S / self._rate)
+            steps.append(Step(f"write {CHARACTER} {size.writings} times", writing_s, self._write))
+        steps.append(
+            Step("compare every model with every stroke", COMMAND_S + size.cells * VALIDATE_CELL_S, self._validate)
+        )
+        return steps
+
+    def _write_protocol(self) -> None:
+        size = self._size
+        protocol = (
+            f'kind = "grid"\nheights_mm = {list(size.heights_mm)}\ntilts_deg = {list(size.tilts_deg)}\n'
+            f"repeats = {self._repeats}\nseed = {self._seed}\n"
+        )
+        if not self._protocol.exists() or self._protocol.read_text(encoding="utf-8") != protocol:
+            self._protocol.write_text(protocol, encoding="utf-8")
+
+    def _collect(self) -> None:
+        session = finished_session(self._sessions, self._protocol)
+        if session is not None and not _report(session).is_file():
+            say(f"continuing with {session}: its collection is finished")
+            self._session = session
+            return
+        earlier = self._sessions.is_dir() and any(self._sessions.iterdir()) and not open_sessions(self._sessions)
+        if earlier:
+            self._rig.start()
+        else:
+            self._rig.ready()
+        sheet = ("--sheet", "1") if earlier else ()
+        files = ("--config", self._rig.config, "--protocol", self._protocol, "--out", self._sessions)
+        self._collect_code = run_command(say, "collect", *files, "--no-tui", *sheet, accepts=(0, GIVEN_UP))
+        self._session = finished_session(self._sessions, self._protocol)
+
+    def _fit(self) -> None:
+        session = self._finished()
+        if not artefacts(session):
+            run_command(say, "calibrate", session)
+        if not artefacts(session, FITS):
+            run_command(say, "fit", session)
+
+    def _press_again(self) -> None:
+        session = self._finished()
+        folder = session / "loop"
+        if (folder / LOOP_PAGE).is_file():
+            return
+        self._blank_sheet(folder / REPLAY)
+        options = ("--no-tui", "--sheet", "1")
+        request = LoopRequest(
+            session, self._rig.config, folder, presses=self._size.again, seed=self._seed, collect_options=options
+        )
+        run_loop(request, say)
+
+    def _write(self) -> None:
+        folder = self._finished() / "written"
+        if (folder / WRITTEN_PAGE).is_file():
+            return
+        self._blank_sheet(folder / "plan" / WRITE)
+        request = WritingRequest(
+            what=CHARACTER,
+            config=self._rig.config,
+            out=folder,
+            sessions=self._sessions,
+            count=self._size.writings,
+            sheet=1,
+            collect_options=("--no-tui",),
+        )
+        Writing(request, say).run()
+
+    def _validate(self) -> None:
+        run_command(say, "validate", self._finished(), "--generator", SHIPPED_GENERATOR)
+
+    def _blank_sheet(self, protocol: Path) -> None:
+        """Have the rig ready for the session of this protocol, with a blank sheet unless that has begun."""
+        if protocol.exists() and finished_session(self._sessions, protocol) is not None:
+            return
+        self._rig.ready()
+        if not open_sessions(self._sessions):
+            self._rig.fresh_sheet(say)
+
+    def _finished(self) -> Path:
+        if self._session is None:
+            raise ConfigError(self._sessions, "", f"holds no finished session of {self._protocol}")
+        return self._session
 
 
 def _report(session: Path) -> Path:
     return session / "validation" / "report.html"
-
-
-def _serving(rig_toml: Path, rate: float, seed: int, *, fresh: bool) -> subprocess.Popen[bytes] | None:
-    """Start a rig; return None if the rig of an earlier demo still runs and has a session to finish."""
-    arcs_port, camera_port = _free_port(), _free_port()
-    if rig_toml.exists() and not fresh:
-        known = load_rig(rig_toml)
-        arcs_port, camera_port = known.robot.port, _camera_port(known)
-        if _listens(arcs_port) and _listens(camera_port):
-            return None
-    log = (rig_toml.parent / "rig.log").open("ab")
-    command = [sys.executable, "-m", "brushloop", "sim", "--write-rig", str(rig_toml), "--rate", str(rate)]
-    command += ["--seed", str(seed), "--arcs-port", str(arcs_port), "--camera-port", str(camera_port)]
-    # In a process session of its own: Ctrl-C at the demo must not end the rig under the arm.
-    with log:
-        process = subprocess.Popen(
-            [*command, "--idle-exit", str(IDLE_EXIT_S)],
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-        )
-    deadline = time.monotonic() + START_S
-    while not (_listens(arcs_port) and _listens(camera_port) and _names(rig_toml, arcs_port)):
-        if process.poll() is not None or time.monotonic() > deadline:
-            raise CollectAborted(f"the loopback rig did not start; see {rig_toml.parent / 'rig.log'}")
-        time.sleep(0.1)
-    return process
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def _listens(port: int) -> bool:
-    with socket.socket() as probe:
-        probe.settimeout(1.0)
-        return probe.connect_ex(("127.0.0.1", port)) == 0
-
-
-def _names(rig_toml: Path, arcs_port: int) -> bool:
-    return rig_toml.exists() and f"port = {arcs_port}\n" in rig_toml.read_text(encoding="utf-8")
-
-
-def _camera_port(rig: RigConfig) -> int:
-    return int(rig.camera.source.split(":")[2].split("/")[0])

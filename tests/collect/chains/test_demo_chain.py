@@ -1,20 +1,27 @@
-"""What the demo does after a collection that left strokes out, and after one whose report was never written."""
+"""What the demo does in which order, after a collection that left strokes out, and after a kill; no rig."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+import brushloop
 from collect.chains import demo
 from collect.chains.commands import GIVEN_UP, CommandFailed
+from collect.chains.demo import FULL, QUICK, Demo, Size
+from collect.chains.demo_rig import DemoRig
+from collect.chains.loop import LoopRequest
+from collect.chains.writing import WritingRequest
+from collect.errors import ConfigError
 from collect.protocols.config import load_protocol
 from sessions.store import SessionStore
 from tests.sessions.conftest import Make
 
 
 class Chain:
-    """Stands for the commands: notes them; `collect` makes a finished session, `validate` its report."""
+    """Stands for rig and commands: notes them; `collect` makes a finished session, the others their reports."""
 
     def __init__(self) -> None:
         self.ran: list[str] = []
@@ -45,22 +52,60 @@ class Chain:
             report.write_text("report")
         return 0
 
+    def loop(self, request: LoopRequest, _say: object) -> None:
+        self.ran.append(f"loop {request.presses}")
+        request.out.mkdir()
+        (request.out / "loop.html").touch()
+
+    def rig(self, what: str) -> None:
+        self.ran.append(what)
+
+
+class FakeRig:
+    """Stands for the rig's process."""
+
+    def __init__(self, chain: Chain, folder: Path) -> None:
+        self.config = folder / "rig.toml"
+        self.start = lambda: chain.rig("rig starts")
+        self.ready = lambda: chain.rig("rig")
+        self.fresh_sheet = lambda _say: chain.rig("fresh sheet")
+        self.end = lambda: None
+
+
+class FakeWriting:
+    """Stands for `brushloop write`."""
+
+    def __init__(self, chain: Chain, request: WritingRequest) -> None:
+        self._chain = chain
+        self._request = request
+
+    def run(self) -> None:
+        self._chain.ran.append(f"write {self._request.what} {self._request.count}")
+        self._request.out.mkdir()
+        (self._request.out / "written.html").touch()
+
 
 @pytest.fixture
 def chain(monkeypatch: pytest.MonkeyPatch) -> Chain:
     made = Chain()
     monkeypatch.setattr(demo, "run_command", made)
-    monkeypatch.setattr(demo, "_serving", lambda *_, **__: None)
+    monkeypatch.setattr(demo, "run_loop", made.loop)
+    monkeypatch.setattr(demo, "DemoRig", lambda folder, **_: FakeRig(made, folder))
+    monkeypatch.setattr(demo, "Writing", lambda request, _say: FakeWriting(made, request))
     return made
 
 
-ALL = ["collect", "calibrate", "fit", "validate"]
+EVALUATED = ["calibrate", "fit", "rig", "fresh sheet", "loop 6", "validate"]
+
+
+def run(folder: Path, size: Size = QUICK) -> int:
+    return Demo(folder, size, 1, 20.0, 1).run()
 
 
 def test_strokes_that_were_left_out_end_in_a_report_and_exit_code_3(chain: Chain, tmp_path: Path) -> None:
     chain.collect_code = GIVEN_UP
-    assert demo.run_demo(tmp_path, 1, 20.0, 1) == 3
-    assert chain.ran == ALL
+    assert run(tmp_path) == 3
+    assert chain.ran == ["rig", "collect", *EVALUATED]
     assert (tmp_path / "sessions" / "grid-1" / "validation" / "report.html").is_file()
 
 
@@ -69,10 +114,64 @@ def test_a_demo_that_ended_after_its_collection_goes_on_there_and_begins_no_new_
 ) -> None:
     chain.validate_fails = True
     with pytest.raises(CommandFailed, match="goes on from there"):
-        demo.run_demo(tmp_path, 1, 20.0, 1)
+        run(tmp_path)
     chain.validate_fails = False
     chain.ran.clear()
-    assert demo.run_demo(tmp_path, 1, 20.0, 1) == 0
-    assert chain.ran == ALL[1:]
-    assert demo.run_demo(tmp_path, 1, 20.0, 1) == 0
+    assert run(tmp_path) == 0
+    # The presses that were made again are there: no rig, and no sheet, is needed.
+    assert chain.ran == ["calibrate", "fit", "validate"]
+    chain.ran.clear()
+    assert run(tmp_path) == 0
+    assert chain.ran == ["rig starts", "collect", *EVALUATED]
     assert sorted(path.name for path in (tmp_path / "sessions").iterdir()) == ["grid-1", "grid-2"]
+
+
+def test_the_full_demo_also_writes_and_says_beforehand_what_it_does_and_how_long_it_takes(
+    chain: Chain, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(tmp_path, FULL) == 0
+    again = ["calibrate", "fit", "rig", "fresh sheet", "loop 15"]
+    assert chain.ran == ["rig", "collect", *again, "rig", "fresh sheet", "write 字 4", "validate"]
+    said = capsys.readouterr().out
+    assert "all simulated: 5 steps, about " in said
+    for step in ("press 15 times", "fit the brush", "recover 15 presses", "write 字 4 times", "every stroke"):
+        assert step in said
+    assert said.count(" s\n[") == said.count("done in") == 5
+
+
+def test_the_command_passes_on_what_was_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: list[tuple[object, ...]] = []
+
+    class Noted:
+        def __init__(self, *given: object) -> None:
+            asked.append(given)
+
+        def run(self) -> int:
+            return GIVEN_UP
+
+    monkeypatch.setattr(demo, "Demo", Noted)
+    words = ["demo", "--out", str(tmp_path)]
+    assert CliRunner().invoke(brushloop.app, words).exit_code == GIVEN_UP
+    assert CliRunner().invoke(brushloop.app, [*words, "--full", "--repeats", "1", "--seed", "5"]).exit_code == GIVEN_UP
+    assert asked == [(tmp_path, QUICK, 2, 60.0, 1), (tmp_path, FULL, 1, 60.0, 5)]
+
+
+def test_the_sheet_is_not_changed_under_a_session_that_has_begun(chain: Chain, tmp_path: Path) -> None:
+    def killed(request: LoopRequest, _say: object) -> None:
+        chain.ran.append("loop is killed")
+        header = Make.header.model_copy(update={"session_id": "replay-1"})
+        SessionStore.create(tmp_path / "sessions" / "replay-1", header, Make.snapshots, Make().clock()).release()
+        raise CommandFailed(["collect"], 4)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(demo, "run_loop", killed)
+        with pytest.raises(CommandFailed):
+            run(tmp_path)
+    chain.ran.clear()
+    assert run(tmp_path) == 0
+    assert chain.ran == ["calibrate", "fit", "rig", "loop 6", "validate"]
+
+
+def test_a_folder_whose_path_is_too_long_for_a_socket_is_refused_before_anything_starts(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="at most 100 bytes: use another --out"):
+        DemoRig(tmp_path / ("long" * 30), rate=20.0, seed=1).start()

@@ -1,0 +1,109 @@
+"""The loopback rig of `brushloop demo`, in a process of its own that outlives the demo by some minutes.
+
+It holds the simulated sheet: a demo that is killed and started again finds its strokes where they were.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from collect.chains.commands import Say, run_command
+from collect.errors import CollectAborted, ConfigError
+from collect.rig.config import RigConfig, load_rig
+
+START_S = 60.0
+IDLE_EXIT_S = 180.0
+"""Longer than the evaluation between two collections takes on a busy computer."""
+FPS = 16
+"""Pictures per second: a photograph waits for several. Drawing and decoding more would cost what they save."""
+MAX_CONTROL_BYTES = 100
+
+
+class DemoRig:
+    """Starts the rig, or finds the one of an earlier demo in the same folder."""
+
+    def __init__(self, folder: Path, *, rate: float, seed: int) -> None:
+        self.config = folder / "rig.toml"
+        self._folder = folder
+        self._rate = rate
+        self._seed = seed
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Start a rig with a blank sheet, on new ports. Raises `CollectAborted`, `ConfigError`."""
+        self._serve(_free_port(), _free_port())
+
+    def ready(self) -> None:
+        """Go on with the rig that `rig.toml` names; start it on the same ports, with a blank sheet, if it has ended.
+
+        Raises `CollectAborted` and `ConfigError`.
+        """
+        if not self.config.exists():
+            self.start()
+            return
+        known = load_rig(self.config)
+        ports = known.robot.port, _camera_port(known)
+        if not all(map(_listens, ports)):
+            self._serve(*ports)
+
+    def fresh_sheet(self, say: Say) -> None:
+        """Put a blank sheet in. Raises `CommandFailed`."""
+        run_command(say, "fault", self._control(load_rig(self.config).robot.port), "fresh-sheet")
+
+    def end(self) -> None:
+        """End the rig if this process started it; one that an earlier demo started ends by itself when idle."""
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait()
+
+    def _serve(self, arcs_port: int, camera_port: int) -> None:
+        log = self._folder / "rig.log"
+        command: list[str | Path] = [sys.executable, "-m", "brushloop", "sim", "--write-rig", self.config]
+        command += ["--rate", str(self._rate), "--fps", str(FPS), "--seed", str(self._seed)]
+        command += ["--arcs-port", str(arcs_port), "--camera-port", str(camera_port)]
+        command += ["--control", self._control(arcs_port), "--idle-exit", str(IDLE_EXIT_S)]
+        # In a process session of its own: Ctrl-C at the demo must not end the rig under the arm.
+        with log.open("ab") as file:
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True
+            )
+        deadline = time.monotonic() + START_S
+        while not (_listens(arcs_port) and _listens(camera_port) and _names(self.config, arcs_port)):
+            if self._process.poll() is not None or time.monotonic() > deadline:
+                raise CollectAborted(f"the loopback rig did not start; see {log}")
+            time.sleep(0.1)
+
+    def _control(self, arcs_port: int) -> Path:
+        """The control socket of the rig on that port. Raises `ConfigError` where its path would be too long."""
+        path = self._folder / f"rig-{arcs_port}.sock"
+        path = min(path, Path(os.path.relpath(path)), key=lambda one: len(os.fsencode(one)))
+        if len(os.fsencode(path)) > MAX_CONTROL_BYTES:
+            raise ConfigError(
+                path, "", f"is too long for a socket, at most {MAX_CONTROL_BYTES} bytes: use another --out"
+            )
+        return path
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.settimeout(1.0)
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def _names(rig_toml: Path, arcs_port: int) -> bool:
+    return rig_toml.exists() and f"port = {arcs_port}\n" in rig_toml.read_text(encoding="utf-8")
+
+
+def _camera_port(rig: RigConfig) -> int:
+    return int(rig.camera.source.split(":")[2].split("/")[0])
