@@ -143,7 +143,9 @@ class TeachScreen(Screen[None]):
         self._picture.show(_gray(now.live if self._guide.looking and now.live is not None else now.picture))
         if before is None or before.findings != now.findings:
             self._found.show(Content("\n").join(_finding(shown) for shown in now.findings))
-            self.query_one("#teach-found", VerticalScroll).scroll_end(animate=False)
+            # Only after the layout is it known where the end is.
+            found = self.query_one("#teach-found", VerticalScroll)
+            self.call_after_refresh(found.scroll_end, animate=False)
         if before is None or before.question != now.question or over != self._over:
             self._over = over
             self._ask(now.question, over)

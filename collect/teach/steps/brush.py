@@ -14,7 +14,7 @@ from drivers.clock import Clock
 DEEPEST_SHARE = 0.45
 """A bundle that is pressed deeper than this share of its length comes near to its ferrule."""
 PRIME_ML = 0.5
-NONE, STATION, PUMP = Choice("n", "nothing: by hand"), Choice("s", "an ink station"), Choice("p", "a Modbus pump")
+NONE, STATION, PUMP = Choice("n", "nothing: by hand"), Choice("i", "an ink station"), Choice("p", "a Modbus pump")
 
 
 class BrushStep:

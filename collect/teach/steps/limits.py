@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
+
+from calibrate.files import read_gray
 from collect.errors import ConfigError
 from collect.planning.limit_check import ask_reach
 from collect.rig.config import RigConfig
+from collect.rig.picture import draw_rig
 from collect.teach.day import Day
 from collect.teach.errors import CannotTeach
 from collect.teach.maths.box import Point, hull
@@ -39,6 +43,13 @@ class LimitsStep:
     async def teach(self, day: Day) -> None:
         """Show the box, have each limit confirmed, and ask the controller whether the arm reaches every corner."""
         found = self.derived(day.notebook)
+        rig = rig_of(day.notebook.with_values(found), day.rig_path)
+        picture = day.rig_path.with_name(f"{day.rig_path.stem}.limits.png")
+        await asyncio.to_thread(draw_rig, rig, picture)
+        await day.say(
+            f"{picture} shows reach, box, sheet, board, well and park, from above and from the side.",
+            picture=await asyncio.to_thread(read_gray, picture),
+        )
         for field, taught in found.items():
             if field in day.notebook.values and field not in _box_fields():
                 continue
@@ -47,7 +58,6 @@ class LimitsStep:
                     f"{field} was not agreed.",
                     "Teach the place again that makes the box too large: `brushloop rig teach`.",
                 )
-        rig = rig_of(day.notebook.with_values(found), day.rig_path)
         try:
             count = await ask_reach(day.rig_path, rig, _to_reach(rig, day.notebook))
         except ConfigError as error:
