@@ -28,8 +28,9 @@ demo: $(STAMP)  ## collect, calibrate and validate a short session on the loopba
 test: $(STAMP)-dev  ## lint, layers, types, and the tests; types are checked beside the tests
 	@$(MAKE) --no-print-directory --jobs 2 lint types suite
 
+# Bytecode is kept, whatever the shell says: workers and the processes that tests start compile each module once.
 suite: $(STAMP)-dev
-	$(BIN)/python -m pytest -n 3 --dist loadgroup
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 3 --dist loadgroup
 
 lint: $(STAMP)-dev
 	$(BIN)/ruff check .

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import os
 import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 
 import pytest
+import typer.main
+import typer.testing
 from hypothesis import settings
 
 for _library in ("OPENBLAS", "OMP", "MKL"):
@@ -18,9 +21,12 @@ os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")
 
 # The same examples every time, so that a failure is that of the change; `make soak` looks for new ones.
 # No deadline: how long an example takes is up to whatever else the machine does.
-settings.register_profile("same", derandomize=True, deadline=None)
-settings.register_profile("search", derandomize=False, deadline=None)
+settings.register_profile("same", max_examples=40, derandomize=True, deadline=None)
+settings.register_profile("search", max_examples=200, derandomize=False, deadline=None)
 settings.load_profile("same")
+
+# Our command line does not change between tests: its tree of commands is built once instead of at every command.
+typer.main.get_command = typer.testing._get_command = functools.cache(typer.main.get_command)
 
 TOLERATED = ("asyncio_", "pytest_timeout", "ThreadPoolExecutor", "tqdm", "fsspecIO")
 """Pools that live as long as their loop or process; nothing of ours is called that."""
