@@ -36,6 +36,13 @@ LONGEST = (
     "tests/collect/tui/test_session.py",
     "tests/collect/quality",
     "tests/calibrate/validate",
+    "tests/collect/durability",
+    "tests/collect/faults",
+    "tests/collect/test_soak.py",
+    "tests/model/train",
+    "tests/sessions/test_kill.py",
+    "tests/sessions/test_repair_everywhere.py",
+    "tests/test_bench.py",
 )
 """They come first, so that no worker is left alone with one of them at the end."""
 

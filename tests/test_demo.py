@@ -44,7 +44,7 @@ def again_steps_done(out: Path) -> int:
     return journals[0].read_bytes().count(b'"event":"done","key"') if journals else 0
 
 
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(600)
 def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactly_once(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     command = [sys.executable, "-c", SMALL, str(out)]

@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import json
 import secrets
-import string
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -73,12 +72,11 @@ Framing = Literal["sof", "bare"]
 SDK_INTERFACE_VERSION = "0.24.0"
 # What the vendor's client 0.24.1 sends for the factory account; its obfuscation of other passwords is not known.
 FACTORY_LOGIN_TOKEN = "3353545435353664345433434443435463466335333566235443434253142434333426365553"
-_ID_ALPHABET = string.ascii_letters + string.digits
 
 
 def request_id() -> str:
     """An id of the vendor client's shape: 8-4-4 characters."""
-    raw = "".join(secrets.choice(_ID_ALPHABET) for _ in range(16))
+    raw = secrets.token_hex(8)
     return f"{raw[:8]}-{raw[8:12]}-{raw[12:]}"
 
 

@@ -75,9 +75,6 @@ class Brush:
         self.spec = spec
         self._bundle = _bundle(spec)
         self._bristles = grow_bristles(spec.bristles, np.random.default_rng(spec.seed))
-        # spines depend on (depth, tilt) only, and a protocol repeats its cells
-        self._spine = lru_cache(maxsize=REMEMBERED_SPINES)(self._solve)
-        self._stances = lru_cache(maxsize=REMEMBERED_STANCES)(self._solve_stances)
 
     def press(
         self,
@@ -107,7 +104,7 @@ class Brush:
         if flaw is not None and severity > 0.0:
             rng = np.random.default_rng([self.spec.seed, press_seed, 2])
             trouble = draw_trouble(flaw, severity, self.spec.bristles, self.spec.length_mm, rng)
-        spine = self._spine(float(depth_mm), float(tilt_deg))
+        spine = _spine(self.spec, float(depth_mm), float(tilt_deg))
         return print_footprint(spine, self._tuft(press_seed, trouble), ink_load, px_per_mm, self._paper(press_seed))
 
     def deepest_mm(self, tilt_deg: float) -> float:
@@ -116,7 +113,7 @@ class Brush:
 
     def push_n(self, depth_mm: float, tilt_deg: float) -> Vector:
         """Normal force in N at equally spaced depths from 0 to `depth_mm`, on the way down."""
-        path = press_spine(self._bundle, depth_mm, math.radians(tilt_deg))
+        path = _spine(self.spec, depth_mm, tilt_deg)
         return np.array([0.0, *(float(shape.normal_n.sum()) for shape in path)])
 
     def drag(
@@ -143,7 +140,7 @@ class Brush:
             return blank_footprint(px_per_mm)
         return draw_drag(
             path,
-            self._stances(math.ceil(deepest), float(tilt_deg)),
+            _stances(self.spec, math.ceil(deepest), float(tilt_deg)),
             math.radians(heading_deg),
             self._tuft(press_seed, None),
             ink_load,
@@ -166,16 +163,21 @@ class Brush:
     def _paper(self, press_seed: int) -> np.random.Generator:
         return np.random.default_rng([self.spec.seed, press_seed, 1])
 
-    def _solve(self, depth_mm: float, tilt_deg: float) -> tuple[SpineShape, ...]:
-        return press_spine(self._bundle, depth_mm, math.radians(tilt_deg))
 
-    def _solve_stances(self, depth_mm: int, tilt_deg: float) -> Stances:
-        tilt_rad = math.radians(tilt_deg)
-        return Stances(
-            (rest_spine(self._bundle, tilt_rad), *press_spine(self._bundle, depth_mm, tilt_rad)),
-            (rest_spine(self._bundle, tilt_rad), *pull_spine(self._bundle, depth_mm, tilt_rad)),
-            float(depth_mm),
-        )
+@lru_cache(maxsize=REMEMBERED_SPINES)
+def _spine(spec: BrushSpec, depth_mm: float, tilt_deg: float) -> tuple[SpineShape, ...]:
+    """The way down; it depends on brush, depth and tilt only, and a protocol repeats its cells."""
+    return press_spine(_bundle(spec), depth_mm, math.radians(tilt_deg))
+
+
+@lru_cache(maxsize=REMEMBERED_STANCES)
+def _stances(spec: BrushSpec, depth_mm: int, tilt_deg: float) -> Stances:
+    bundle, tilt_rad = _bundle(spec), math.radians(tilt_deg)
+    return Stances(
+        (rest_spine(bundle, tilt_rad), *press_spine(bundle, depth_mm, tilt_rad)),
+        (rest_spine(bundle, tilt_rad), *pull_spine(bundle, depth_mm, tilt_rad)),
+        float(depth_mm),
+    )
 
 
 def _bundle(spec: BrushSpec) -> Bundle:
