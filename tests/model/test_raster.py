@@ -187,19 +187,21 @@ def test_the_ink_of_a_whole_mark_is_its_area(press: tuple[float, float], heading
 @pytest.mark.parametrize("heading_deg", [30.0, -100.0])
 def test_supersampling_agrees_at_a_heading(heading_deg: float) -> None:
     # A point is counted whole, so single pixels differ by up to half a line of 32 points; see test_coverage.py.
+    # The pixels are twice as large as usual, which leaves a quarter of the points.
+    raster = {"size_px": 64, "px_mm": 0.4}
     mark = ccdbsm(Brush(), 15.0, 7.0)
-    fine = (np.arange(32 * 128) + 0.5) * 0.2 / 32
+    fine = (np.arange(32 * 64) + 0.5) * 0.4 / 32
     right, up, psi = fine - ORIGIN[0], ORIGIN[1] - fine, math.radians(heading_deg)
     x = right[None, :] * math.cos(psi) + up[:, None] * math.sin(psi)
     y = up[:, None] * math.cos(psi) - right[None, :] * math.sin(psi)
     a, w, t = mark.o3a_mm.item(), mark.half_width_mm.item(), mark.o4o3_mm.item()
     inside = abs(y) <= np.where(x < 0, w * (1 - (x / t) ** 2), w * np.sqrt(np.maximum(0, 1 - (x / a) ** 2)))
     inside &= (x > -t) & (x < a)
-    sampled = inside.reshape(128, 32, 128, 32).mean((1, 3))
+    sampled = inside.reshape(64, 32, 64, 32).mean((1, 3))
     for image in (
-        coverage_at(mark, ORIGIN, heading_deg)[0].numpy(),
-        coverage_at(ccdbsm(Brush(), 15.0, 7.0, dtype=torch.float32), ORIGIN, heading_deg)[0].numpy(),
-        coverage_numpy(mark, ORIGIN, heading_deg)[0],
+        coverage_at(mark, ORIGIN, heading_deg, **raster)[0].numpy(),
+        coverage_at(ccdbsm(Brush(), 15.0, 7.0, dtype=torch.float32), ORIGIN, heading_deg, **raster)[0].numpy(),
+        coverage_numpy(mark, ORIGIN, heading_deg, **raster)[0],
     ):
         boundary = (image > 0) & (image < 1)
         assert abs(image - sampled)[boundary].mean() < 1e-3

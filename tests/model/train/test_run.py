@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
+import multiprocessing
 import random
-import signal
 import socket
-import subprocess
-import sys
+from collections.abc import Callable
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
 import pytest
@@ -20,8 +19,7 @@ from model.train.distributed import Group, joined
 from model.train.errors import TrainError
 from model.train.run import run_training
 
-CHILD = """
-import sys
+TELLING = """
 from pathlib import Path
 from model.train.config import load_config
 from model.train.distributed import Group
@@ -29,12 +27,39 @@ from model.train.run import run_training
 
 class Told:
     def stepped(self, step, loss):
-        print(step, flush=True)
+        told.send(step)
     def validated(self, validation):
         pass
 
-run_training(load_config(Path(sys.argv[1])), Path(sys.argv[2]), Group(), Told(), lambda: False)
+run_training(load_config(Path(toml)), Path(out), Group(), Told(), lambda: False)
 """
+SHARING = """
+import os, sys
+from model.train.cli import app
+
+os.environ |= environment
+sys.stdout = open(said, "w")
+app(["--config", toml, "--out", out], standalone_mode=False)
+"""
+
+
+@pytest.fixture(scope="module")
+def processes() -> ForkServerContext:
+    """Makes processes that begin with everything imported: imports would be most of what they do."""
+    context = multiprocessing.get_context("forkserver")
+    needed = (
+        "pytest torch._dynamo torch.distributed matplotlib.figure skimage.metrics numba model.train.run model.train.cli"
+    )
+    context.set_forkserver_preload(needed.split())
+    return context
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory, write_tiny: Callable[[Path], Path]) -> Path:
+    """The folder of a training that nobody disturbed; tests only read it."""
+    folder = tmp_path_factory.mktemp("finished")
+    finish(load_config(write_tiny(folder)), folder / "g")
+    return folder / "g"
 
 
 class Silent:
@@ -48,28 +73,28 @@ def finish(config: TrainConfig, folder: Path) -> dict[str, torch.Tensor]:
     return load_file(folder / "checkpoint.safetensors")
 
 
-def test_killed_at_random_and_resumed_it_gives_the_same_bits(tmp_path: Path, toml: Path) -> None:
+def test_killed_at_random_and_resumed_it_gives_the_same_bits(
+    tmp_path: Path, finished: Path, toml: Path, processes: ForkServerContext
+) -> None:
     toml.write_text("checkpoint_every = 3\n" + toml.read_text().replace("checkpoint_every = 10\n", ""))
-    config = load_config(toml)
-    unbroken = finish(config, tmp_path / "unbroken")
     last = random.randint(1, 28)
-    command = [sys.executable, "-c", CHILD, str(toml), str(tmp_path / "killed")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
-        assert child.stdout is not None
-        for line in child.stdout:
-            if int(line) == last:
-                break
-        child.send_signal(signal.SIGKILL)
-    assert not (tmp_path / "killed" / "generator.safetensors").exists()
-    resumed = finish(config, tmp_path / "killed")
+    told, tell = processes.Pipe(duplex=False)
+    names = {"toml": str(toml), "out": str(tmp_path), "told": tell}
+    child = processes.Process(target=exec, args=(TELLING, names))
+    child.start()
+    while told.recv() != last:
+        pass
+    child.kill()
+    child.join()
+    assert not (tmp_path / "generator.safetensors").exists()
+    resumed, unbroken = finish(load_config(toml), tmp_path), load_file(finished / "checkpoint.safetensors")
     assert unbroken.keys() == resumed.keys()
     for name, tensor in unbroken.items():
         assert torch.equal(tensor, resumed[name]), f"{name} differs after a kill at step {last}"
 
 
-def test_the_folder_holds_all_that_the_algorithm_puts_out(tmp_path: Path, tiny: TrainConfig) -> None:
-    finish(tiny, tmp_path)
-    left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()} - {".lock"}
+def test_the_folder_holds_all_that_the_algorithm_puts_out(finished: Path) -> None:
+    left = {str(path.relative_to(finished)) for path in finished.rglob("*") if path.is_file()} - {".lock"}
     pictures = {f"pictures/step-{step:07d}.png" for step in (15, 30)}
     files = {
         "checkpoint.safetensors",
@@ -80,24 +105,22 @@ def test_the_folder_holds_all_that_the_algorithm_puts_out(tmp_path: Path, tiny: 
         "validation.csv",
     }
     assert left == files | pictures
-    assert len((tmp_path / "loss.csv").read_text().splitlines()) == 31
-    card = (tmp_path / "generator.md").read_text()
+    assert len((finished / "loss.csv").read_text().splitlines()) == 31
+    card = (finished / "generator.md").read_text()
     assert "| `height_mm` | mm | 11 | 20 |" in card
     assert "It has seen no real ink" in card
     assert "30 steps of 16, seed 0, all steps done" in card
 
 
-def test_a_finished_training_is_not_done_again(tmp_path: Path, tiny: TrainConfig) -> None:
-    finish(tiny, tmp_path)
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*.*") if path.name != ".lock"}
-    finish(tiny, tmp_path)
+def test_a_finished_training_is_not_done_again(finished: Path, tiny: TrainConfig) -> None:
+    before = {path: path.stat().st_mtime_ns for path in finished.glob("*.*") if path.name != ".lock"}
+    finish(tiny, finished)
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
-def test_another_training_in_the_folder_is_refused_with_the_difference(tmp_path: Path, tiny: TrainConfig) -> None:
-    finish(tiny, tmp_path)
+def test_another_training_in_the_folder_is_refused_with_the_difference(finished: Path, tiny: TrainConfig) -> None:
     with pytest.raises(TrainError, match="another configuration: steps: 30 -> 40; use a new folder"):
-        finish(tiny.model_copy(update={"steps": 40}), tmp_path)
+        finish(tiny.model_copy(update={"steps": 40}), finished)
 
 
 def test_a_folder_in_use_is_refused(tmp_path: Path, tiny: TrainConfig) -> None:
@@ -105,23 +128,38 @@ def test_a_folder_in_use_is_refused(tmp_path: Path, tiny: TrainConfig) -> None:
         finish(tiny, tmp_path)
 
 
-def test_two_processes_share_each_batch_and_reach_the_same_weights(tmp_path: Path, toml: Path) -> None:
-    alone = finish(load_config(toml), tmp_path / "alone")
+def test_two_processes_share_each_batch_and_reach_the_same_weights(
+    tmp_path: Path, finished: Path, toml: Path, processes: ForkServerContext
+) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2"}
-    command = [sys.executable, "-m", "brushloop", "train", "--config", str(toml), "--out", str(tmp_path / "pair")]
+    said = [tmp_path / "first.txt", tmp_path / "second.txt"]
     pair = [
-        subprocess.Popen(command, env=os.environ | shared | {"RANK": rank, "LOCAL_RANK": rank}, stdout=subprocess.PIPE)
-        for rank in ("0", "1")
+        processes.Process(
+            target=exec,
+            args=(
+                SHARING,
+                {
+                    "toml": str(toml),
+                    "out": str(tmp_path / "pair"),
+                    "said": str(said[rank]),
+                    "environment": shared | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
+                },
+            ),
+        )
+        for rank in (0, 1)
     ]
-    said = [process.communicate()[0] for process in pair]
-    assert [process.returncode for process in pair] == [0, 0]
-    assert b"Generator:" in said[0]
-    assert said[1] == b""
+    for process in pair:
+        process.start()
+    for process in pair:
+        process.join()
+    assert [process.exitcode for process in pair] == [0, 0]
+    assert "Generator:" in said[0].read_text()
+    assert said[1].read_text() == ""
     together = load_file(tmp_path / "pair" / "checkpoint.safetensors")
-    for name, tensor in alone.items():
+    for name, tensor in load_file(finished / "checkpoint.safetensors").items():
         torch.testing.assert_close(together[name], tensor, rtol=1e-3, atol=1e-5, msg=lambda m, n=name: f"{n}: {m}")
 
 
