@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from drivers.sim.config import SimConfig
 from drivers.sim.control import live_control
@@ -86,10 +86,17 @@ async def _serve_unknown(
     truth: Path | None,
     control: Path | None,
 ) -> None:
-    over = _signalled()
-    async with UnknownLab(seed, trap, rate=rate) as lab, live_control(lab.rig.faults, control, lab.hand.obey):
+    over, lab = _signalled(), UnknownLab(seed, trap, rate=rate)
+
+    async def obey(request: Mapping[str, object]) -> dict[str, Any]:
+        answer = await lab.hand.obey(request)
         if truth is not None:
-            _write_whole(truth, truth_text(lab.facts, trap))
+            _write_whole(truth, truth_text(lab.facts, lab.trap))  # what was mended is no longer as it was
+        return answer
+
+    async with lab, live_control(lab.rig.faults, control, obey):
+        if truth is not None:
+            _write_whole(truth, truth_text(lab.facts, lab.trap))
         how = [] if control is None else [f"hand      brushloop hand {control} bring pin"]
         tell(*lab.seen().lines(), *how, "Ctrl-C ends")
         await _until_over(lab.rig, over, idle_exit_s)

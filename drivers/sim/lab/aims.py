@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from drivers.samples import Pose
 from drivers.sim.camera.held import Held
 from drivers.sim.camera.optics import Floats
-from drivers.sim.lab.facts import PIN_TILTS_DEG, Facts
+from drivers.sim.lab.facts import PIN_TILT_DEG, Facts
 from drivers.sim.lab.places import Place, azimuth_deg, board_size_mm, corner, held, in_base, over_sheet
 
 TOUCHED = ("pin", "board-corner", "sheet-corner", "well-rim")
@@ -25,18 +27,34 @@ SQUARE_DEG = 0.15
 """The same against a set square."""
 DIP_ABOVE_BOTTOM_MM = 2.5
 UPRIGHT_ABOVE_MM = 70.0
-PICTURE_HEIGHTS = (
-    (0.0, 0.0),
-    (-0.3, -0.3),
-    (0.3, -0.3),
-    (0.3, 0.3),
-    (-0.3, 0.3),
-    (0.0, -0.35),
-    (0.0, 0.35),
-    (-0.35, 0.0),
-    (0.35, 0.0),
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """A way to hold the board: slanted toward a side of the picture, turned in it, away from its middle."""
+
+    slant_deg: float = 0.0
+    toward_deg: float = 0.0
+    turn_deg: float = 0.0
+    aside: tuple[float, float] = (0.0, 0.0)
+    """Right and down, in shares of the picture's width and height."""
+
+
+HELD = (
+    Way(3.0),
+    *(Way(28.0, toward) for toward in (270.0, 90.0, 0.0, 180.0)),
+    Way(22.0, 45.0, 0.0, (-0.17, -0.17)),
+    Way(22.0, 135.0, 0.0, (0.17, -0.17)),
+    Way(22.0, 225.0, 0.0, (0.17, 0.17)),
+    Way(22.0, 315.0, 0.0, (-0.17, 0.17)),
+    Way(25.0, 60.0, 90.0),
 )
-"""Where in the picture the held board's middle is, in shares of its width and height from the centre."""
+"""As a person is asked to: flat, to the left and right, away and toward, in the four corners, turned by a quarter."""
+
+
+def _any_way(rng: np.random.Generator) -> Way:
+    x, y, toward = rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2), rng.uniform(0, 360)
+    return Way(float(rng.uniform(18, 30)), float(toward), 0.0, (float(x), float(y)))
 
 
 class Aims:
@@ -65,22 +83,25 @@ class Aims:
         """How the board is held before the camera: each time slanted another way, in another part of the picture."""
         facts, rng = self._facts(), self._drawn("hold-board", index, "")
         view, table = facts.config.view, facts.config.table
-        width_mm, _ = board_size_mm(table)
-        far_mm = view.focal * width_mm / float(rng.uniform(0.85, 1.05))
-        across, down = PICTURE_HEIGHTS[index % len(PICTURE_HEIGHTS)]
-        slant_deg, toward = float(rng.uniform(18, 32)), float(np.radians(140.0 * index + rng.uniform(-15, 15)))
-        slant = Rotation.from_rotvec(np.radians(slant_deg) * np.array([np.cos(toward), np.sin(toward), 0.0]))
-        turn = slant * Rotation.from_euler("z", float(rng.normal(0.0, 6.0)), degrees=True)
-        rx, ry, rz = (float(v) for v in turn.as_rotvec(degrees=True))
-        share = far_mm / view.focal
+        pose = HELD[index] if index < len(HELD) else _any_way(rng)
+        width_mm, height_mm = board_size_mm(table)
         high = view.height_px / view.width_px
-        return Held((rx, ry, rz), (0.5 * across * share, 0.5 * down * share * high, far_mm))
+        longest = max(width_mm, height_mm / high) if abs(pose.turn_deg) < 45.0 else max(height_mm, width_mm / high)
+        across_mm = longest / float(rng.uniform(0.85, 0.95))
+        toward = math.radians(pose.toward_deg + float(rng.uniform(-15, 15)))
+        slant_deg = pose.slant_deg + float(rng.uniform(-3, 3))
+        in_picture = Rotation.from_euler("z", pose.turn_deg + float(rng.normal(0.0, 4.0)), degrees=True)
+        axis = slant_deg * np.array([math.cos(toward), math.sin(toward), 0.0])
+        turn = Rotation.from_rotvec(axis, degrees=True) * in_picture
+        rx, ry, rz = (float(v) for v in turn.as_rotvec(degrees=True))
+        x, y = pose.aside
+        return Held((rx, ry, rz), (x * across_mm, y * across_mm * high, view.focal * across_mm))
 
     def _pin(self, index: int, wrist_deg: float, rng: np.random.Generator) -> tuple[float, float, float]:
-        """Upright and leaning by turns, each from another direction and with another turn of the wrist."""
-        tilt_deg = PIN_TILTS_DEG[0] if index == 0 else PIN_TILTS_DEG[1] + float(rng.uniform(-5, 0))
-        turned_deg = (0.0, 70.0, -70.0, 30.0, -30.0, 110.0)[index % 6]
-        return tilt_deg, 120.0 * index + 30.0 * (index // 3) + float(rng.uniform(-10, 10)), wrist_deg + turned_deg
+        """Leaning to each side in turn; after a round the wrist is turned, and the sides lie between the first ones."""
+        tilt_deg = PIN_TILT_DEG + float(rng.uniform(-4, 0))
+        toward_deg = 90.0 * index + 45.0 * (index // 4 % 2) + float(rng.uniform(-8, 8))
+        return tilt_deg, toward_deg, wrist_deg + (0.0, 70.0, -70.0)[index // 4 % 3]
 
     def _place(self, facts: Facts, to: str, name: str) -> Place:
         table = facts.config.table

@@ -28,13 +28,13 @@ from drivers.sim.lab.places import (
 )
 from drivers.sim.world import tool_of
 
-PICTURE_PX = (1600, 1200)
+PICTURE_PX = (1280, 960)
 PRINTS = ((26, 20, 12.0, 9.0), (24, 19, 12.0, 9.0), (22, 17, 14.0, 10.5), (27, 20, 12.0, 9.0))
 """Boards that fit on A3: columns, rows, square and marker in mm."""
 BRUSHES = ((5.5, 46.0), (6.0, 48.0), (6.5, 50.0))
 LIFT_MM = 60.0
 """How far a person lifts the brush before going elsewhere."""
-PIN_TILTS_DEG = (0.0, 35.0)
+PIN_TILT_DEG = 38.0
 CLEAR_OF_PICTURE_MM = 75.0
 """More than the arm hides around the tip."""
 
@@ -256,8 +256,8 @@ def poses(facts: Facts) -> Iterator[Pose]:
         for turn_deg in (0.0, 90.0, 180.0, 270.0):
             x, y, z = place
             yield brush_pose(x, y, z - 15.0, heading_deg=table.yaw_deg + turn_deg, tilt_deg=15.0)
-    for toward_deg in range(0, 360, 60):
-        yield held(facts.pin_mm, wrist_deg=azimuth_deg(facts.pin_mm), tilt_deg=PIN_TILTS_DEG[1], toward_deg=toward_deg)
+    for toward_deg in range(0, 360, 45):
+        yield held(facts.pin_mm, wrist_deg=azimuth_deg(facts.pin_mm), tilt_deg=PIN_TILT_DEG, toward_deg=toward_deg)
 
 
 def reaches(config: SimConfig, wanted: Iterator[Pose] | list[Pose]) -> bool:

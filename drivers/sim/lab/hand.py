@@ -5,7 +5,7 @@
 | `{"act": "bring", "to": "pin", "index": 2}` | guides the tip to a thing, of `THINGS`, and lets go |
 | `{"act": "bring", "to": "board-corner", "corner": "lower left"}` | the same, for a corner of the board or sheet |
 | `{"act": "bring", "to": "hold-board", "index": 0}` | holds the print before the camera until the next act |
-| `{"act": "bring", "to": "push-sensor", "index": 0}` | pushes the tip: 0 up, 1 along base x, 2 along y |
+| `{"act": "bring", "to": "push-sensor", "index": 0}` | pushes the tip: 0 toward the flange, 1 and 2 aside |
 | `{"act": "measure", "to": "square"}` | measures with calipers or a ruler: `square`, `marker`, `tool` |
 | `{"act": "mend"}` | sees to what is wrong, having been told: the trap's mistake ends |
 | `{"act": "plug"}` | puts a cable back |
@@ -19,6 +19,8 @@ import asyncio
 import math
 from collections.abc import Mapping
 from typing import Any, Protocol
+
+from scipy.spatial.transform import Rotation
 
 from drivers.arcs.codes import MOVING_ALLOWED, RobotMode
 from drivers.geometry import interpolate
@@ -38,7 +40,8 @@ THINGS = (
 SPEED_RAD_S, ACC_RAD_S2 = 0.35, 1.0
 LOOK_S = 0.005
 PUSH_N, PUSH_S = 2.0, 1.0
-PUSHES: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, PUSH_N), (PUSH_N, 0.0, 0.0), (0.0, PUSH_N, 0.0))
+PUSHES = ((0.0, 0.0, -PUSH_N), (PUSH_N, 0.0, 0.0), (0.0, PUSH_N, 0.0))
+"""In the brush's frame: along the brush toward the flange, and sideways."""
 HALVINGS = 5
 """Of the way to a thing out of reach, to find how near the arm comes."""
 
@@ -113,7 +116,7 @@ class Hand:
         if to == "hold-board":
             return {"reached": True, "says": "I hold the print before the camera."}
         if to == "push-sensor":
-            return await self._push(PUSHES[index % len(PUSHES)])
+            return await self._push(index)
         aim = self._aims.tip(to, index, corner)
         if (trouble := await self._take_hold()) is not None:
             return {"reached": False, "says": trouble}
@@ -136,8 +139,10 @@ class Hand:
             raise ValueError(f"to = {what!r} is not one of {', '.join(lengths_mm)}")
         return f"{lengths_mm[what] / 1e3:g}" if facts.ruler_unit == "m" and what == "tool" else f"{lengths_mm[what]:g}"
 
-    async def _push(self, force_n: tuple[float, float, float]) -> dict[str, Any]:
-        self._lab.world.push_n = force_n
+    async def _push(self, index: int) -> dict[str, Any]:
+        brush = Rotation.from_quat(self._lab.world.tool().quaternion)
+        x, y, z = (float(v) for v in brush.apply(PUSHES[index % len(PUSHES)]))
+        self._lab.world.push_n = (x, y, z)
         try:
             await asyncio.sleep(PUSH_S)
         finally:
