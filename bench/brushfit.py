@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from bench.brushfit_brushes import DEVELOPMENT, FROZEN
 from bench.harness import Result, machine
 from calibrate.fit.fit import Grid, Pressed, fit_presses
-from calibrate.fit.heldout import RefittedBezier, predictor, refit_bezier
+from calibrate.fit.heldout import RefittedBezier, image_of, predictor, refit_bezier
 from calibrate.fit.stepwise import next_press
 from drivers.sim.brush.brush import Brush, BrushSpec
 from drivers.sim.brush.paper import Footprint
@@ -176,7 +176,7 @@ def _csim(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
 
 
 def _image_of(bezier: RefittedBezier) -> Callable[[float, float], NDArray[np.floating]]:
-    return lambda height, tilt: bezier.image(height, tilt, grid())
+    return lambda height, tilt: image_of(bezier.outline(height, tilt), grid())
 
 
 def _pressed(ink: Images, chosen: Sequence[tuple[int, int]]) -> list[Pressed]:

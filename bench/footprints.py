@@ -15,7 +15,7 @@ import torch
 
 from drivers.sim.brush.brush import Brush, BrushSpec
 from drivers.sim.brush.paper import Footprint
-from model.ccdbsm import Brush as ModelBrush
+from model.brush import Brush as ModelBrush
 from model.ccdbsm import ccdbsm
 
 OUT = Path(__file__).resolve().parent.parent / "docs" / "loopback-brush.png"

@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from bench.harness import Result, machine
-from model.ccdbsm import Brush, ccdbsm
+from model.brush import Brush
+from model.ccdbsm import ccdbsm
 from model.inversion.noise import Noise
 from model.inversion.press import Flag, Inverter, Known, Range, Recovered, invert_rendered
 from model.protocol import Basis

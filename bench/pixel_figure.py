@@ -16,7 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from model.ccdbsm import Brush, ccdbsm
+from model.brush import Brush
+from model.ccdbsm import ccdbsm
 from model.raster.exact import coverage_at
 from model.raster.frame import to_pixels
 

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bench.harness import Result, machine
-from model.ccdbsm import Brush, CcdBsm, ccdbsm
+from model.brush import Brush
+from model.ccdbsm import CcdBsm, ccdbsm
 from model.coverage import PX_MM, SIZE_PX, centred_origin, coverage
 from model.press_images import press_images
 from model.raster.compiled import coverage_numpy

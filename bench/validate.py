@@ -33,7 +33,7 @@ from calibrate.compare.similarity import csim, ssim
 from calibrate.validate.jobs import ABSENT, PrepareJob, Press, ScoreJob, prepare_job, score_job
 from calibrate.validate.pool import Dask, Threads
 from drivers.sim.brush.brush import Brush, BrushSpec
-from model.ccdbsm import Brush as Bundle
+from model.brush import Brush as Bundle
 from model.registry import stroke_models
 from sessions.imports.photographs import ImportOptions, import_photographs
 from sessions.reader import Recording

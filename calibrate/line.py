@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +21,8 @@ class Line:
     @property
     def interval(self) -> tuple[float, float]:
         """95 % interval of the slope (Student's t with n - 2 degrees of freedom)."""
+        from scipy.special import stdtrit  # slow to import
+
         reach = float(stdtrit(self.n - 2, 0.975)) * self.slope_se
         return self.slope - reach, self.slope + reach
 

@@ -22,36 +22,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from model.brush import Brush, DomainError, require_positive
 from model.outline import Outline, column, disc_integral, loop, safe_sqrt
-
-
-class DomainError(ValueError):
-    """A parameter outside the domain; carries its `name`, the first bad `value` and the `allowed` range."""
-
-    def __init__(self, name: str, value: float, allowed: str, hint: str = "") -> None:
-        super().__init__(f"{name} = {value:g} is outside {allowed}" + (f"; {hint}" if hint else ""))
-        self.name = name
-        self.value = value
-        self.allowed = allowed
-
 
 DILATIONS = {"1": 1.0, "pi/2": 0.5 * math.pi, "pi": math.pi}
 """The values of lambda in the paper's figure 3; a fitted lambda may be any positive number."""
-
-
-@dataclass(frozen=True, slots=True)
-class Brush:
-    """The hair bundle as a cone: largest radius R and length L, mm; both must be positive, else DomainError.
-
-    R and L are floats, or (B,) tensors for gradients with respect to the brush.
-    """
-
-    radius_mm: float | Tensor = 6.0
-    length_mm: float | Tensor = 48.0
-
-    def __post_init__(self) -> None:
-        for name, value in (("radius_mm", self.radius_mm), ("length_mm", self.length_mm)):
-            _require_positive(name, value)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,7 +122,7 @@ def ccdbsm(
     area of each cross-section. Raises DomainError unless alpha >= 0, alpha + theta < 90 deg, 0 < H <= L cos
     alpha, lambda > 0.
     """
-    _require_positive("lam", lam)
+    require_positive("lam", lam)
     height, tilt, radius, length, dilation = as_batch(
         height_mm, tilt_deg, brush.radius_mm, brush.length_mm, lam, dtype=dtype
     )
@@ -194,11 +169,3 @@ def _check_domain(height: Tensor, tilt: Tensor, theta: Tensor, length: Tensor) -
         index = int(bad.nonzero()[0])
         allowed = f"(0, {float(deepest[index]):g}] mm"
         raise DomainError("height_mm", float(height[index]), allowed, "H is at most L cos(alpha)")
-
-
-def _require_positive(name: str, value: float | Tensor) -> None:
-    """Raise DomainError unless every element is positive and finite."""
-    values = torch.as_tensor(value).detach().reshape(-1)
-    bad = ~((values > 0) & torch.isfinite(values))
-    if bad.any():
-        raise DomainError(name, float(values[bad][0]), "(0, inf)")

@@ -19,8 +19,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from model.brush import DomainError
+from model.loops import Loop, closed
+
 Floats = NDArray[np.float64]
 
+NAME = "ccd-bsm-fitted"
 DEPTH_MM = 15.0
 """Depth at which powers and edges are centred: the middle of the paper's range."""
 DEPTH_SPAN_MM, TILT_DEG = 4.5, 5.0
@@ -98,14 +102,14 @@ class FittedPress:
     edges: Floats = field(default_factory=lambda: np.zeros((2, MODES, TERMS)))
 
     def sizes(self, height_mm: float, tilt_deg: float) -> Sizes:
-        """The mark's sizes. Raises ValueError outside the domain: h <= 0, or a tilt outside [0, 80) deg."""
+        """The mark's sizes. Raises DomainError outside the domain: h <= 0, or a tilt outside [0, 80) deg."""
         p = dict(zip(NAMES, np.moveaxis(self.values, -1, 0), strict=True))
         h = height_mm + p["h0_mm"]
         if not (np.all(h > 0.0) and height_mm > 0.0):
             starts_mm = max(0.0, -float(np.min(p["h0_mm"])))
-            raise ValueError(f"height_mm = {height_mm:g}: the fitted brush starts to mark at {starts_mm:g}")
+            raise DomainError("height_mm", height_mm, f"({starts_mm:g}, inf)", "the fitted brush starts to mark there")
         if not 0.0 <= tilt_deg < 80.0:
-            raise ValueError(f"tilt_deg = {tilt_deg:g} is outside [0, 80)")
+            raise DomainError("tilt_deg", tilt_deg, "[0, 80)")
         alpha, theta = math.radians(tilt_deg), math.atan(self.radius_mm / self.length_mm)
         o3a = h * (math.tan(alpha) - math.tan(alpha - theta))
         o3c = h * (self.radius_mm / (self.length_mm * math.cos(alpha)))
@@ -142,14 +146,14 @@ class FittedPress:
         """The probability of ink (len(y_mm), len(x_mm)) if edges vary by `spread_mm`; y upward from the touch."""
         return chance_within(self.edges_at(height_mm, tilt_deg, x_mm), y_mm, spread_mm)
 
-    def outline(self, height_mm: float, tilt_deg: float, points: int = 97) -> Floats:
-        """The boundary as a counter-clockwise polygon (2 points, 2) mm, x from the point of touch, y upward."""
+    def outline(self, height_mm: float, tilt_deg: float, points: int = 97) -> Loop:
+        """The boundary through so many points of either edge (an odd number), x from the point of touch, y upward."""
         s = self.sizes(height_mm, tilt_deg)
         # Points are denser at both ends, where the outline turns fastest.
         share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, points))
         x = s.widest - s.tip + share * (s.tip + s.heel)
         top, bottom = np.maximum(self.edges_at(height_mm, tilt_deg, x), 0.0)
-        return np.concatenate([np.column_stack([x, -bottom]), np.column_stack([x, top])[::-1]])
+        return closed(np.column_stack([x, -bottom]), np.column_stack([x, top])[::-1])
 
 
 def chance_within(edges_mm: Floats, y_mm: Floats, spread_mm: float) -> Floats:

@@ -13,7 +13,8 @@ from typing import Protocol
 
 from torch import Tensor
 
-from model.ccdbsm import Brush, CcdBsm, DomainError, as_batch, ccdbsm
+from model.brush import Brush, DomainError
+from model.ccdbsm import CcdBsm, as_batch, ccdbsm
 from model.outline import Shape
 
 Number = float | Tensor

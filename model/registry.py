@@ -11,7 +11,7 @@ import math
 import pkgutil
 
 from model import strokes
-from model.ccdbsm import Brush
+from model.brush import Brush
 from model.protocol import Basis, ParameterSpec, StrokeModel
 
 __all__ = ["Basis", "ParameterSpec", "StrokeModel", "UnknownModelError", "stroke_model", "stroke_models"]

@@ -9,43 +9,17 @@ on CCD-BSM's marks at the cells of the paper and adds no information about real 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from model.ccdbsm import CcdBsm, as_batch
+from model.plane import Plane, fit_plane
 from model.protocol import Basis, Number, Values
 
 # The paper's H and alpha; H as a share of its brush's 48 mm, so that the cells lie in the domain of any brush.
 DEPTHS = tuple(height_mm / 48 for height_mm in (11.0, 13.0, 15.0, 17.0, 20.0))
 TILTS_DEG = (0.0, 5.0, 10.0)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Plane:
-    """Parameters as c0 + c1 H + c2 H alpha: `coefficients` (P, 3) for the P `names`."""
-
-    names: tuple[str, ...]
-    coefficients: Tensor
-
-    def at(self, height_mm: Number, tilt_deg: Number) -> Values:
-        """The parameters at H and alpha, scalars or (B,), each (B,)."""
-        height, tilt = as_batch(height_mm, tilt_deg)
-        c = self.coefficients.to(height)
-        return {name: c[k, 0] + height * (c[k, 1] + c[k, 2] * tilt) for k, name in enumerate(self.names)}
-
-
-def fit_plane(height_mm: Tensor, tilt_deg: Tensor, values: Values) -> Plane:
-    """The least-squares fit to values (N,) at H and alpha (N,), for captures or marks alike.
-
-    Raises ValueError if the cells do not span a plane: at least two depths and two tilts are needed.
-    """
-    design = torch.stack((torch.ones_like(height_mm), height_mm, height_mm * tilt_deg), dim=-1).double()
-    if torch.linalg.matrix_rank(design) < 3:
-        raise ValueError(f"{len(design)} cells do not span depth and tilt: two depths and two tilts are needed")
-    targets = torch.stack([value.detach().double() for value in values.values()], dim=-1)
-    return Plane(tuple(values), torch.linalg.lstsq(design, targets).solution.T)
 
 
 def regressed(basis: Basis, measure: Callable[[CcdBsm], Values]) -> Callable[[Number, Number], Values]:
@@ -63,8 +37,9 @@ def regressed(basis: Basis, measure: Callable[[CcdBsm], Values]) -> Callable[[Nu
                 length_mm * torch.tensor(DEPTHS, dtype=torch.float64), torch.tensor(TILTS_DEG, dtype=torch.float64)
             )
             height, tilt = cells.unbind(-1)
-            planes.append(fit_plane(height, tilt, measure(basis.mark(height, tilt))))
-        return planes[0].at(height_mm, tilt_deg)
+            values = measure(basis.mark(height, tilt))
+            planes.append(fit_plane(height, tilt, {name: value.detach().cpu() for name, value in values.items()}))
+        return planes[0].at(*as_batch(height_mm, tilt_deg))
 
     return press
 

@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from model.ccdbsm import DomainError
+from model.brush import DomainError
 from model.outline import Outline, evaluate, safe_sqrt, through
 
 _CAP_ARCS = 3  # arcs in a round end: each spans less than 120 degrees

@@ -12,7 +12,8 @@ import bench.__main__
 from bench import footprints, raster, rpc
 from bench.harness import BenchError, Result, interleave, percentile, results_of
 from bench.processes import started
-from model.ccdbsm import Brush, ccdbsm
+from model.brush import Brush
+from model.ccdbsm import ccdbsm
 
 ROOT = Path(__file__).resolve().parent.parent
 

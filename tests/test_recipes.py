@@ -32,7 +32,7 @@ from drivers.sim.faults.kinds import ALWAYS, KINDS, Device, Fault
 from drivers.sim.rig import LoopbackRig
 from drivers.sim.rig_toml import Addresses, rig_toml
 from model import strokes
-from model.ccdbsm import Brush
+from model.brush import Brush
 from model.coverage import coverage
 from model.registry import stroke_models
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
 
 from calibrate.board.cameras import TwoCameras, solve, two_cameras
 from calibrate.board.detect import BoardView
@@ -72,6 +71,8 @@ class Fitted:
         """Half widths of the 95 % intervals of fx and fy: for noise in these views, not for a curved board."""
         if self.focal_se_px is None:
             return None
+        from scipy.special import stdtrit  # slow to import
+
         reach = float(stdtrit(min(self.ways, MOST_LEFT_OUT) - 1, 0.975))
         return reach * self.focal_se_px[0], reach * self.focal_se_px[1]
 

@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.special import stdtrit
 
 from calibrate.board.lens import Floats, Lens
 from calibrate.errors import CalibrationError
@@ -99,6 +97,9 @@ def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_t
     corners. Raises `CalibrationError` where more than a tenth of the corners are outliers or the residual is above
     `WORST_RMS_PX`: a wrong or curled board.
     """
+    from scipy.optimize import least_squares  # slow to import
+    from scipy.special import stdtrit
+
     model = _Model.of(lens, paper_mm, radial_terms)
     start = model.start(pixels, paper_mm, where)
 
@@ -144,6 +145,8 @@ def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_t
 
 def distorted_share(pixels: Floats, paper_mm: Floats, lens: Lens, where: str) -> float:
     """Share of a flat board's squared residuals with this lens that refitting k1 would explain; outliers included."""
+
+    from scipy.optimize import least_squares
 
     def cost(radial_terms: int) -> float:
         model = _Model.of(lens, paper_mm, radial_terms)

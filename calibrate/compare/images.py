@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 import zlib
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,6 @@ from calibrate.compare.field import (
     Field,
     Image,
     Key,
-    Tone,
     captured_mm,
     captured_normalised,
     crop_at_anchor,
@@ -31,11 +31,12 @@ from calibrate.errors import CaptureRefused
 from calibrate.stroke.params import PX_PER_MM, Params
 from calibrate.stroke.preprocess import Prepared, prepare
 from calibrate.stroke.rectify import on_raster, on_window, rectify_by, rescale
+from model.brush import Brush
+from model.loops import Loop
 from sessions.reader import Capture
 from sessions.recording.schemas import Header, Stroke
 
 if TYPE_CHECKING:
-    from model.ccdbsm import Brush
     from model.outline import Shape
     from model.registry import StrokeModel
 
@@ -82,22 +83,33 @@ def captured_images(stroke_id: str, prepared: Prepared) -> dict[Key, Image]:
     return images
 
 
-def simulated(
-    model: StrokeModel, height_mm: float, tilt_deg: float, alignment: Alignment, tone: Tone, field: Field
-) -> Image:
-    """(128, 128) prediction of a press. May raise `model.ccdbsm.DomainError`."""
-    return to_tone(_drawn(model.profile(height_mm, tilt_deg), axis_mm(height_mm, tilt_deg), alignment, field), tone)
+def simulated(model: StrokeModel, height_mm: float, tilt_deg: float, field: Field) -> dict[Key, Image]:
+    """Predictions of a press in every alignment and tone, (128, 128) each. May raise `model.brush.DomainError`."""
+    gray = drawn(loop_of(model.profile(height_mm, tilt_deg)), axis_mm(height_mm, tilt_deg), field)
+    return {(alignment, tone): to_tone(gray[alignment], tone) for alignment, tone in KEYS}
 
 
 def simulated_pixels(model: StrokeModel, height_mm: float, tilt_deg: float, field: Field) -> Pixels:
-    """(len(KEYS), 128, 128) predictions of a press. May raise `model.ccdbsm.DomainError`."""
-    return shape_pixels(model.profile(height_mm, tilt_deg), axis_mm(height_mm, tilt_deg), field)
+    """(len(KEYS), 128, 128) predictions of a press. May raise `model.brush.DomainError`."""
+    return key_pixels(simulated(model, height_mm, tilt_deg, field))
 
 
-def shape_pixels(profile: Shape, origin_x_mm: float, field: Field) -> Pixels:
-    """(len(KEYS), 128, 128) of a shape whose origin lies `origin_x_mm` from the zero-touch point."""
-    gray = {alignment: _drawn(profile, origin_x_mm, alignment, field) for alignment in Alignment}
-    return np.stack([to_pixels(to_tone(gray[alignment], tone)) for alignment, tone in KEYS])
+def loop_pixels(loop: Loop, field: Field) -> Pixels:
+    """(len(KEYS), 128, 128) of a mark whose x is from the zero-touch point."""
+    gray = drawn(loop, 0.0, field)
+    return key_pixels({(alignment, tone): to_tone(gray[alignment], tone) for alignment, tone in KEYS})
+
+
+def key_pixels(images: dict[Key, Image]) -> Pixels:
+    """Images of every key as levels, (len(KEYS), 128, 128)."""
+    return np.stack([to_pixels(images[key]) for key in KEYS])
+
+
+def loop_of(shape: Shape) -> Loop:
+    """The outline of a shape, as numbers without gradients."""
+    outline, ends = shape.outline(), (shape.x_min_mm, shape.x_max_mm)
+    points, weights = (part[0].detach().double().cpu().numpy() for part in (outline.points, outline.weights))
+    return Loop(points, weights, *(float(end[0]) for end in ends))
 
 
 def axis_mm(height_mm: float, tilt_deg: float) -> float:
@@ -108,25 +120,32 @@ def axis_mm(height_mm: float, tilt_deg: float) -> float:
     return height_mm * math.tan(math.radians(tilt_deg))
 
 
-def _drawn(profile: Shape, origin_x_mm: float, alignment: Alignment, field: Field) -> Image:
-    """(128, 128) coverage of one shape; `origin_x_mm` places it on the millimetre field."""
-    from model.coverage import centred_origin, coverage
+def drawn(loop: Loop, origin_x_mm: float, field: Field) -> dict[Alignment, Image]:
+    """(128, 128) exact coverage of a mark in each alignment.
 
-    if alignment is Alignment.MM:
-        left, top = field.anchor_mm
-        covered = coverage(profile, (left + origin_x_mm, top), size_px=SIZE_PX, px_mm=field.mm_per_px)
-    else:
-        length_mm = float(profile.x_max_mm[0] - profile.x_min_mm[0])
-        px_mm = length_mm / NORMAL_LENGTH_PX
-        origin_mm = centred_origin(profile, size_px=SIZE_PX, px_mm=px_mm)
-        covered = coverage(profile, origin_mm, size_px=SIZE_PX, px_mm=px_mm)
-    return covered[0].numpy().astype(np.float32)
+    `origin_x_mm` is the distance of the mark's origin from the zero-touch point.
+    """
+    left, top = field.anchor_mm
+    middle_mm, normal_mm = 0.5 * (loop.x_min_mm + loop.x_max_mm), (loop.x_max_mm - loop.x_min_mm) / NORMAL_LENGTH_PX
+    side_mm = SIZE_PX * normal_mm
+    views = ((field.mm_per_px, left + origin_x_mm, top), (normal_mm, 0.5 * side_mm - middle_mm, 0.5 * side_mm))
+    return dict(zip((Alignment.MM, Alignment.SIZE_NORMALISED), draw_loop(loop, views, SIZE_PX), strict=True))
+
+
+def draw_loop(loop: Loop, views: Sequence[tuple[float, float, float]], size_px: int) -> NDArray[np.float32]:
+    """Exact coverage of a mark in each view, (mm per pixel, x and y of its origin from the upper left corner, mm)."""
+    from model.raster import kernel  # numba takes a fifth of a second to import
+
+    maps = np.array([[1 / px, 0.0, x / px, 0.0, -1 / px, y / px] for px, x, y in views])
+    points, weights = (np.stack([part] * len(maps)) for part in (loop.points, loop.weights))
+    out = np.empty((len(maps), size_px, size_px), np.float32)
+    untyped: Any = kernel
+    untyped.rasterise(points, weights, maps, out)
+    return out
 
 
 def brush_of(header: Header) -> Brush:
     """The brush that a recording names; missing sizes are those of the published brush."""
-    from model.ccdbsm import Brush
-
     nominal = Brush()
     return Brush(
         radius_mm=header.brush_radius_mm or nominal.radius_mm, length_mm=header.brush_length_mm or nominal.length_mm

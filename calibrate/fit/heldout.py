@@ -9,16 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.compare.images import draw_loop
 from calibrate.compare.similarity import csim, ssim
 from calibrate.fit.fit import SPREAD_MM, Fit, Grid, Pressed, refit
 from model.fitted import FittedPress
-from model.outline import Shape
-from model.raster.compiled import coverage_numpy
-from model.regression import Plane, fit_plane
-from model.strokes.bezier import bezier
+from model.loops import BEZIER_PIECES, Loop, bezier_side, closed
+from model.plane import Plane, fit_plane
 
-TIP_SHARE = 0.9
-"""Position of the shape's origin along it; drawing moves it back, so any share gives the same mark."""
+BEZIER_SIZES = ("left_mm", "right_mm", "belly_mm", "shoulder")
 Cell = tuple[float, float]
 CEILING, FITTED, BEZIER, UNCALIBRATED = "same-cell template", "fitted", "refitted Bezier", "uncalibrated"
 Images = NDArray[np.floating]
@@ -48,21 +46,25 @@ def predictor(press: FittedPress, grid: Grid) -> Predict:
     return lambda height, tilt: press.chance(height, tilt, grid.x_mm, grid.y_mm, SPREAD_MM)
 
 
-def leave_cell_out(fit: Fit, strokes: Sequence[Pressed], grid: Grid, uncalibrated: Predict) -> list[HeldOut]:
+def leave_cell_out(fit: Fit, strokes: Sequence[Pressed], grid: Grid) -> list[HeldOut]:
     """Score each cell as predicted by fits to all other cells. Raises ValueError with fewer than two cells.
 
-    `uncalibrated` gives the image of a press before any fit. Models without enough data are left out: a template needs
-    three strokes of a cell, a regressed Bezier two depths and two tilts among the others.
+    Models without enough data are left out: a template needs three strokes of a cell, a regressed Bezier two depths
+    and two tilts among the others.
     """
     cells = by_cell(strokes)
     if len(cells) < 2:
         raise ValueError("leaving a cell out needs at least two cells")
+    published = FittedPress(fit.press.radius_mm, fit.press.length_mm)
     scores: dict[str, list[tuple[float, float]]] = {}
     for cell, held in cells.items():
         others = [stroke for key, group in cells.items() if key != cell for stroke in group]
-        images = {FITTED: predictor(refit(fit, others, grid).press, grid)(*cell), UNCALIBRATED: uncalibrated(*cell)}
+        images = {
+            FITTED: predictor(refit(fit, others, grid).press, grid)(*cell),
+            UNCALIBRATED: image_of(published.outline(*cell), grid),
+        }
         with contextlib.suppress(ValueError):  # the other cells span no plane
-            images[BEZIER] = refit_bezier(others, grid).image(*cell, grid)
+            images[BEZIER] = image_of(refit_bezier(others, grid).outline(*cell), grid)
         for k, stroke in enumerate(held):
             for name, image in images.items():
                 scores.setdefault(name, []).append(_score(image, stroke.ink))
@@ -83,35 +85,24 @@ class RefittedBezier:
 
     plane: Plane
 
-    def mark(self, height_mm: float, tilt_deg: float) -> tuple[Shape, float]:
-        """The stroke, and the x of its origin from the point of touch, mm."""
-        import torch
+    def outline(self, height_mm: float, tilt_deg: float) -> Loop:
+        """The stroke, x from the point of touch."""
+        left, right, belly, shoulder = self.plane.at(height_mm, tilt_deg).values()
+        t = np.linspace(1.0, 0.0, 2 * BEZIER_PIECES + 1)
+        right, belly, shoulder = max(right, left + 0.2), max(belly, 0.1), min(max(shoulder, 0.0), 1.0)
+        x, y = bezier_side(t, -left, right, belly, shoulder)
+        return closed(np.column_stack([x, y]), np.column_stack([x, -y])[::-1])
 
-        left, right, belly, shoulder = (float(v) for v in self.plane.at(height_mm, tilt_deg).values())
-        length = max(right - left, 0.2)
-        values = {
-            "tip_mm": TIP_SHARE * length,
-            "base_mm": (1 - TIP_SHARE) * length,
-            "belly_mm": max(belly, 0.1),
-            "shoulder": min(max(shoulder, 0.0), 1.0),
-        }
-        shape = bezier({name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()})
-        return shape, left + TIP_SHARE * length
 
-    def image(self, height_mm: float, tilt_deg: float, grid: Grid) -> np.ndarray:
-        """Coverage (len(y_mm), len(x_mm)) on the grid."""
-        shape, origin_mm = self.mark(height_mm, tilt_deg)
-        corner = (grid.x_mm[0] - 0.5 * grid.px_mm, grid.y_mm[0] + 0.5 * grid.px_mm)
-        origin = (origin_mm - corner[0], corner[1])
-        side = max(len(grid.x_mm), len(grid.y_mm))
-        image = coverage_numpy(shape, origin, size_px=side, px_mm=grid.px_mm, threads=1)[0]
-        return image[: len(grid.y_mm), : len(grid.x_mm)]
+def image_of(loop: Loop, grid: Grid) -> Images:
+    """Coverage (len(y_mm), len(x_mm)) of a mark on the grid."""
+    corner = (0.5 * grid.px_mm - float(grid.x_mm[0]), 0.5 * grid.px_mm + float(grid.y_mm[0]))
+    image = draw_loop(loop, [(grid.px_mm, *corner)], max(len(grid.x_mm), len(grid.y_mm)))[0]
+    return image[: len(grid.y_mm), : len(grid.x_mm)]
 
 
 def refit_bezier(strokes: Sequence[Pressed], grid: Grid) -> RefittedBezier:
     """Measure each stroke's ends, width and area, and regress. Raises ValueError where the cells span no plane."""
-    import torch
-
     rows: list[tuple[float, float, float, float]] = []
     for stroke in strokes:
         ink = stroke.ink > 0.5
@@ -124,11 +115,8 @@ def refit_bezier(strokes: Sequence[Pressed], grid: Grid) -> RefittedBezier:
         # The enclosed area is belly length (4 - s) / 5, as in `model.strokes.bezier`.
         area = float(stroke.ink.sum()) * grid.px_mm**2
         rows.append((left, right, width, float(np.clip(4.0 - 5.0 * area / (width * (right - left)), 0.0, 1.0))))
-    table = torch.tensor(rows, dtype=torch.float64)
-    names = ("left_mm", "right_mm", "belly_mm", "shoulder")
-    height = torch.tensor([s.height_mm for s in strokes], dtype=torch.float64)
-    tilt = torch.tensor([s.tilt_deg for s in strokes], dtype=torch.float64)
-    return RefittedBezier(fit_plane(height, tilt, dict(zip(names, table.T, strict=True))))
+    height, tilt = [s.height_mm for s in strokes], [s.tilt_deg for s in strokes]
+    return RefittedBezier(fit_plane(height, tilt, dict(zip(BEZIER_SIZES, np.array(rows).T, strict=True))))
 
 
 def _score(predicted: Images, ink: Images) -> tuple[float, float]:

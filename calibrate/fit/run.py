@@ -8,19 +8,15 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibrate.artefact import FittedValue, put_to_use
-from calibrate.compare.field import Alignment, Field, Tone
-from calibrate.compare.images import simulated
+from calibrate.compare.field import Field
 from calibrate.errors import CalibrationError
 from calibrate.fit.artefact import FOLDER, BrushFit, FittedStage
 from calibrate.fit.captures import Captures
 from calibrate.fit.fit import STAGES, Fit, Grid, Pressed, bootstrap, fit_presses, zero_touch
 from calibrate.fit.heldout import HeldOut, by_cell, leave_cell_out
-from model.ccdbsm import Brush
 from model.fitted import NAMES, FittedPress
-from model.registry import stroke_models
 
 NORMAL_95 = 1.96
 PROPORTIONAL = 3
@@ -64,13 +60,7 @@ def fit_session(captures: Captures, view: Field) -> Fitted:
             captures.header.session_id,
             f"its strokes do not even tell scale and place (condition number {first.condition:.3g})",
         )
-    brush = Brush(captures.radius_mm, captures.length_mm)
-    published = stroke_models(brush)["ccd-bsm"]
-
-    def uncalibrated(height_mm: float, tilt_deg: float) -> NDArray[np.floating]:
-        return simulated(published, height_mm, tilt_deg, Alignment.MM, Tone.BINARY, view)[captures.rows]
-
-    held_out = leave_cell_out(fit, strokes, grid, uncalibrated) if len(by_cell(strokes)) > 1 else []
+    held_out = leave_cell_out(fit, strokes, grid) if len(by_cell(strokes)) > 1 else []
     draws = bootstrap(_bare(fit.press), fit.free, fit.squares, fit.gradients)
     low, high = np.quantile(draws, [0.025, 0.975], axis=0)
     parameters = {name: FittedValue(value=v, low=None, high=None) for name, v in zip(NAMES, _floats(fit), strict=True)}

@@ -23,7 +23,7 @@ from calibrate.session import calibration_of
 from calibrate.stroke.params import PX_PER_MM, Params
 from calibrate.stroke.preprocess import prepare
 from calibrate.stroke.rectify import rescale
-from model.ccdbsm import DomainError
+from model.brush import DomainError
 from model.inversion.noise import Noise
 from model.inversion.press import Flag, Inverter, Known, Range, Recovered
 from model.protocol import Basis, StrokeModel

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from calibrate.artefact import load_artefact
 from calibrate.calibration import Calibration
-from calibrate.compare.field import KEYS, Field
+from calibrate.compare.field import Field
 from calibrate.compare.images import brush_of, captured_images, prepare_press, simulated
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.fit.artefact import BrushFit
@@ -19,13 +19,13 @@ from calibrate.loop.scores import CapturedPress, Pair, PairScore, Table1Row, Ver
 from calibrate.session import calibration_of
 from calibrate.stroke.measure import measure
 from calibrate.stroke.params import Params
-from model.ccdbsm import DomainError
-from model.fitted_shape import fitted_model
-from model.protocol import StrokeModel
-from model.registry import stroke_model
+from model.brush import DomainError
 from sessions.errors import SessionDamaged
 from sessions.reader import Capture, Recording
 from sessions.recording.schemas import Header, Source
+
+if TYPE_CHECKING:
+    from model.protocol import StrokeModel
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +126,7 @@ def pair_up(
             found.refused.append((press.stroke_id, why))
             continue
         try:
-            images = {key: simulated(model, press.height_mm, press.tilt_deg, *key, view) for key in KEYS}
+            images = simulated(model, press.height_mm, press.tilt_deg, view)
         except DomainError as error:
             found.refused.append((press.stroke_id, f"the model does not predict it: {error}"))
             continue
@@ -176,6 +176,10 @@ def _replayed(header: Header) -> str | None:
 def _model(header: Header, fit: Path | None) -> tuple[StrokeModel, str]:
     """The model and the digest of the recording that it was fitted to, empty for none."""
     if fit is None:
+        from model.registry import stroke_model  # torch, which takes seconds to load
+
         return stroke_model("ccd-bsm", brush_of(header)), ""
     artefact = load_artefact(fit, BrushFit)
+    from model.fitted_shape import fitted_model
+
     return fitted_model(artefact.press(), f"CCD-BSM fitted on {artefact.session_id}"), artefact.recording_sha256

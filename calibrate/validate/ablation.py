@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from calibrate.compare.field import KEYS, Alignment, Tone
-from calibrate.compare.images import brush_of, pack, simulated_pixels
+from calibrate.compare.images import brush_of, loop_pixels, pack
 from calibrate.fit.fit import fit_presses
 from calibrate.validate.heldout import RefitJob, bezier_body, bezier_pixels, cropped, fitted_press, press_body
 from calibrate.validate.jobs import ABSENT, ScoreJob, score_job
-from calibrate.validate.pool import Progress, Scheduler
+from calibrate.validate.pool import Scheduler
 from calibrate.validate.report.data import Step
 from calibrate.validate.run import CHUNK, Outcome
 from calibrate.validate.store import VERSION
-from model.fitted_shape import fitted_model
+from sessions.progress import Progress
 
 COUNTS = (1, 2, 3, 5, 9, 15, 30, 60)
 DRAWS = 2
@@ -99,7 +99,6 @@ def _scored(
     """Yield (model, (n, 2) CSIM and SSIM) in millimetres, binary."""
     brush, view = brush_of(outcome.sessions[trial.session].header), outcome.options.view
     press = fitted_press(fit["fitted"], float(brush.radius_mm), float(brush.length_mm))
-    model = fitted_model(press)
     cells: dict[tuple[float, float], list[int]] = {}
     for k in trial.scored:
         cells.setdefault(outcome.rows[k].cell, []).append(k)
@@ -107,7 +106,7 @@ def _scored(
     def jobs() -> Iterator[tuple[str, ScoreJob]]:
         for cell, group in cells.items():
             bezier = ABSENT if fit["bezier"] is None else pack(bezier_pixels(fit["bezier"], *cell, view))
-            predictions = (pack(simulated_pixels(model, *cell, view)), bezier)
+            predictions = (pack(loop_pixels(press.outline(*cell), view)), bezier)
             for start in range(0, len(group), CHUNK):
                 chunk = group[start : start + CHUNK]
                 presses = tuple(outcome.press(k).pixels for k in chunk)

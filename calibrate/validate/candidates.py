@@ -1,4 +1,7 @@
-"""The models compared with captures: every registered one, the fitted brush, refits to other cells, generators."""
+"""The models compared with captures: every registered one, the fitted brush, refits to other cells, generators.
+
+Models need torch, which takes seconds to load, so that they are imported when the first is made.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +10,17 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from calibrate.compare.field import Field
-from calibrate.compare.images import Pixels, brush_of, simulated_pixels
+from calibrate.compare.images import Pixels, brush_of, loop_pixels, simulated_pixels
 from calibrate.validate.heldout import Cell, bezier_pixels, fitted_press
 from calibrate.validate.sources import LoadedSession
-from model.ccdbsm import Brush, DomainError
-from model.fitted_shape import NAME, fitted_model
-from model.registry import StrokeModel, stroke_model, stroke_models
+from model.brush import Brush, DomainError
+from model.fitted import NAME
+
+if TYPE_CHECKING:
+    from model.protocol import StrokeModel
 
 FITTED = NAME
 PUBLISHED = "as published"
@@ -58,6 +63,9 @@ def generator_file(path: Path) -> Generator:
 
 def closed_forms(session: LoadedSession, view: Field, *, ablations: bool) -> list[Candidate]:
     """The registered models of the session's brush, the fitted one, and CCD-BSM at other lambdas."""
+    from model.fitted_shape import fitted_model
+    from model.registry import stroke_model, stroke_models
+
     brush = brush_of(session.header)
     found = [_of_model(model, PUBLISHED, view) for model in stroke_models(brush).values()]
     if session.fit is not None:
@@ -92,7 +100,7 @@ def held_out(fits: dict[Cell, dict[str, Any]], brush: Brush, view: Field, *, fit
     def predict_fitted(height_mm: float, tilt_deg: float) -> Pixels:
         found = _of_cell(fits, height_mm, tilt_deg, "fitted")
         press = fitted_press(found, float(brush.radius_mm), float(brush.length_mm))
-        return simulated_pixels(fitted_model(press), height_mm, tilt_deg, view)
+        return loop_pixels(press.outline(height_mm, tilt_deg), view)
 
     def predict_bezier(height_mm: float, tilt_deg: float) -> Pixels:
         return bezier_pixels(_of_cell(fits, height_mm, tilt_deg, "bezier"), height_mm, tilt_deg, view)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calibrate.compare import MM_PER_PX
 from calibrate.path_or_command import PathOrCommand
-from sessions.terminal import plain_console, say
+from sessions.terminal import say
 
 if TYPE_CHECKING:
     from calibrate.validate.diff import Difference
-    from calibrate.validate.pool import Progress
 
 
 app = typer.Typer(
@@ -61,6 +58,7 @@ def validate(
     from calibrate.validate.main import Request, check
     from calibrate.validate.main import validate as run
     from calibrate.validate.report.outputs import summary
+    from sessions.progress import shown
 
     request = Request(
         places=tuple(session),
@@ -81,7 +79,7 @@ def validate(
         scheduler=scheduler,
         workers=workers,
     )
-    with _progress_shown() as progress:
+    with shown() as progress:
         output = run(request, progress)
     if json and output.report is not None:
         say(*output.report.to_json().rstrip("\n").split("\n"))
@@ -172,40 +170,3 @@ def _print_difference(found: Difference) -> None:
             change.verdict,
         )
     say(out)
-
-
-@contextmanager
-def _progress_shown() -> Generator[Progress]:
-    """Show progress on stderr: a bar on a terminal, elsewhere a line for each tenth."""
-    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
-
-    console = plain_console(stderr=True)
-    if not console.is_terminal:
-        yield _tenths_said()
-        return
-    description = TextColumn("{task.description}", markup=False)
-    with Bar(
-        description, BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), console=console, transient=True
-    ) as bar:
-        tasks: dict[str, Any] = {}
-
-        def update(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                tasks[what] = bar.add_task(what, total=total)
-            bar.update(tasks[what], completed=done)
-
-        yield update
-
-
-def _tenths_said() -> Progress:
-    """Print progress as one line for each tenth of the work."""
-    said: dict[str, int] = {}
-
-    def update(what: str, done: int, total: int) -> None:
-        tenth = done * 10 // max(total, 1)
-        if tenth > said.get(what, 0):
-            said[what] = tenth
-            say(f"{what}: {done} of {total}", err=True)
-
-    return update

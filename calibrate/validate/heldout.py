@@ -13,16 +13,18 @@ from typing import Any
 import numpy as np
 
 from calibrate.compare.field import SIZE_PX, Field
-from calibrate.compare.images import Pixels, brush_of, shape_pixels, unpack
+from calibrate.compare.images import Pixels, brush_of, loop_pixels, unpack
 from calibrate.fit.artefact import BrushFit
 from calibrate.fit.captures import MARGIN_MM, grid_of
 from calibrate.fit.fit import Fit, Grid, Pressed, refit
-from calibrate.fit.heldout import RefittedBezier, refit_bezier
+from calibrate.fit.heldout import BEZIER_SIZES, RefittedBezier, refit_bezier
 from calibrate.validate.jobs import Row, pixels_of
-from calibrate.validate.pool import Progress, Scheduler
+from calibrate.validate.pool import Scheduler
 from calibrate.validate.sources import LoadedSession
 from calibrate.validate.store import VERSION, Store
 from model.fitted import MODES, NAMES, TERMS, FittedPress
+from model.plane import Plane
+from sessions.progress import Progress
 
 Cell = tuple[float, float]
 MAX_FOLDS = 15
@@ -114,12 +116,8 @@ def fitted_press(body: dict[str, Any], radius_mm: float, length_mm: float) -> Fi
 
 def bezier_pixels(coefficients: Sequence[float], height_mm: float, tilt_deg: float, view: Field) -> Pixels:
     """Images of a refitted Bezier, (len(KEYS), 128, 128)."""
-    import torch
-
-    from model.regression import Plane
-
-    plane = Plane(("left_mm", "right_mm", "belly_mm", "shoulder"), torch.tensor(coefficients).double().reshape(4, 3))
-    return shape_pixels(*RefittedBezier(plane).mark(height_mm, tilt_deg), view)
+    plane = Plane(BEZIER_SIZES, np.reshape(coefficients, (len(BEZIER_SIZES), 3)))
+    return loop_pixels(RefittedBezier(plane).outline(height_mm, tilt_deg), view)
 
 
 def refits_by_cell(

@@ -25,8 +25,9 @@ from sessions.errors import SessionDamaged
 from sessions.reader import Capture
 
 if TYPE_CHECKING:
-    from calibrate.validate.pool import Progress, Scheduler
+    from calibrate.validate.pool import Scheduler
     from calibrate.validate.sources import LoadedSession
+    from sessions.progress import Progress
 
 ABSENT = b""
 """Placeholder for the images of a model that does not predict this press."""

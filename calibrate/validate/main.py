@@ -21,7 +21,7 @@ from calibrate.validate.ablation import similarity_by_strokes
 from calibrate.validate.candidates import generator_file
 from calibrate.validate.extras import Extras, ExtrasRequest, find_extras
 from calibrate.validate.gates import check_gates, parse_gate
-from calibrate.validate.pool import Dask, Progress, Threads
+from calibrate.validate.pool import Dask, Threads
 from calibrate.validate.report.data import Report
 from calibrate.validate.report.figures import read_curve
 from calibrate.validate.report.outputs import summary_csv, table_3_csv, write_csv, write_parquet
@@ -29,6 +29,7 @@ from calibrate.validate.report.page import page_of
 from calibrate.validate.report.summary import report_of
 from calibrate.validate.run import Options, Outcome, validate_presses
 from calibrate.validate.sources import URL, LoadedSession, one_source, open_session
+from sessions.progress import Progress
 
 FOLDER = "validation"
 WORK = "work"

@@ -17,8 +17,6 @@ from typing import Any, ClassVar, Protocol, TypeVar
 
 from calibrate.validate import store
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, the number done and the total."""
 J = TypeVar("J")
 R = TypeVar("R")
 AHEAD = 2

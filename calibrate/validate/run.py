@@ -22,11 +22,12 @@ from calibrate.validate import candidates as who
 from calibrate.validate.candidates import Candidate, Generator
 from calibrate.validate.heldout import Cell, refits_by_cell
 from calibrate.validate.jobs import ABSENT, Press, Row, ScoreJob, pixels_of, prepared_rows, press_of, score_job
-from calibrate.validate.pool import Progress, Scheduler
+from calibrate.validate.pool import Scheduler
 from calibrate.validate.sources import LoadedSession
 from calibrate.validate.store import Store
 from calibrate.validate.tuning import FOLDS, tuned_by_cell
-from model.ccdbsm import DomainError
+from model.brush import DomainError
+from sessions.progress import Progress
 
 CEILING = "another press"
 """A capture predicted by other captures of its cell, averaged: how well one press predicts another."""
@@ -95,12 +96,8 @@ def validate_presses(
 def _validate(
     sessions: list[LoadedSession], options: Options, scheduler: Scheduler, store: Store, work: Path, progress: Progress
 ) -> Outcome:
-    # Refuse whatever cannot be used before hours of work begin.
-    known = [_known(session, options) for session in sessions]
-    every = (*dict.fromkeys(one.name for group in known for one in group), *who.HELD_OUT_NAMES)
-    for name in options.models:
-        if name not in every:
-            raise CalibrationError("--model", f"{name!r} is not one of: {', '.join(every)}")
+    # What is named is checked before hours of work begin; what is not waits, because models take seconds to load.
+    known = _known(sessions, options) if options.models or options.generators else []
     rows: list[Row] = []
     refused: list[tuple[str, str, str]] = []
     for number, session in enumerate(sessions):
@@ -109,6 +106,7 @@ def _validate(
                 refused.append((session.header.session_id, row.press.stroke_id, row.press.refused))
             else:
                 rows.append(row)
+    known = known or _known(sessions, options)
     candidates: list[list[Candidate]] = []
     for number, session in enumerate(sessions):
         mine = [row for row in rows if row.session == number]
@@ -151,9 +149,18 @@ def _validate(
     return Outcome(sessions, options, candidates, names, rows, values, refused, store)
 
 
-def _known(session: LoadedSession, options: Options) -> list[Candidate]:
-    closed = who.closed_forms(session, options.view, ablations=options.ablations)
-    return _ordered([*who.generators(session, options.generators, options.view), *closed])
+def _known(sessions: list[LoadedSession], options: Options) -> list[list[Candidate]]:
+    """The candidates of each session that need no held-out fit. Raises `CalibrationError` for an unknown --model."""
+    view = options.view
+    known = [
+        [*who.generators(one, options.generators, view), *who.closed_forms(one, view, ablations=options.ablations)]
+        for one in sessions
+    ]
+    every = (*dict.fromkeys(one.name for group in map(_ordered, known) for one in group), *who.HELD_OUT_NAMES)
+    for name in options.models:
+        if name not in every:
+            raise CalibrationError("--model", f"{name!r} is not one of: {', '.join(every)}")
+    return known
 
 
 def _held_out(

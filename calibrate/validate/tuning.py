@@ -27,13 +27,13 @@ from calibrate.validate.candidates import Generator
 from calibrate.validate.heldout import Cell, fitted_press, folds
 from calibrate.validate.sources import LoadedSession, one_source
 from calibrate.validate.store import VERSION
-from model.ccdbsm import DomainError
+from model.brush import DomainError
 from sessions.errors import SessionDamaged
 
 if TYPE_CHECKING:
-    from calibrate.validate.pool import Progress
     from model.generator.stroke import GeneratorModel
     from model.train.loop import Validation
+    from sessions.progress import Progress
 
 MAX_STROKES = 100_000
 FOLDS = 5

@@ -41,7 +41,7 @@ def plan(
     from calibrate.writing.plan import Settings
     from calibrate.writing.plan import plan as planned
     from calibrate.writing.plan_files import PICTURE, PlannedBy, write_plan
-    from model.ccdbsm import Brush, DomainError
+    from model.brush import Brush, DomainError
     from model.characters.brush import Reach
     from model.characters.plan import Cell
     from model.registry import UnknownModelError, stroke_model

@@ -19,7 +19,7 @@ from calibrate.compare.field import Image
 from calibrate.errors import CalibrationError
 from calibrate.writing.compare import WritingComparison
 from calibrate.writing.plan_files import FigureRecord, PlannedBy, PlanRecord, arrays, figure_record
-from model.ccdbsm import Brush, DomainError
+from model.brush import Brush, DomainError
 from model.characters.brush import Reach
 from model.characters.refine import refine
 from model.protocol import StrokeModel

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.ccdbsm import DomainError, as_batch
+from model.brush import DomainError
+from model.ccdbsm import as_batch
 from model.generator.network import Generator
 from model.generator.targets import Placement, Target
 from model.outline import Outline

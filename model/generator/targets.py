@@ -10,7 +10,7 @@ from enum import StrEnum
 import torch
 from torch import Tensor
 
-from model.ccdbsm import Brush, DomainError
+from model.brush import Brush, DomainError
 from model.coverage import centred_origin
 from model.generator.network import Layers
 from model.outline import Shape

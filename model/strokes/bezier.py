@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 
 from model.ccdbsm import CcdBsm
+from model.loops import BEZIER_PIECES, bezier_side
 from model.outline import Outline, through
 from model.protocol import Basis, ParameterSpec, Parametric, StrokeModel, Values
 from model.regression import regressed
 
-PIECES = 128  # parabolas per side: error below 1e-6 of a pixel for strokes of the default image
 PARAMETERS = (
     ParameterSpec("tip_mm", "mm", 0.001, 400, 17, "from the origin to the end of the tip"),
     ParameterSpec("base_mm", "mm", 0.001, 400, 2, "from the origin to the end of the base"),
@@ -36,11 +36,9 @@ def models(basis: Basis) -> tuple[StrokeModel, ...]:
 
 def bezier(values: Values) -> Outline:
     """The outline through (-tip, 0), (shoulder, h), (base, h), (base, 0) and its mirror image; h = 2/3 belly."""
-    tip, base, belly = values["tip_mm"], values["base_mm"], values["belly_mm"]
-    second = values["shoulder"] * (tip + base) - tip
-    t = torch.linspace(1, 0, 2 * PIECES + 1, dtype=tip.dtype, device=tip.device)
-    x = (1 - t) ** 3 * -tip[:, None] + 3 * t * (1 - t) ** 2 * second[:, None] + t**2 * (3 - 2 * t) * base[:, None]
-    upper = torch.stack((x, 2 * belly[:, None] * t * (1 - t)), dim=-1)
+    tip = values["tip_mm"]
+    t = torch.linspace(1, 0, 2 * BEZIER_PIECES + 1, dtype=tip.dtype, device=tip.device)
+    upper = torch.stack(bezier_side(t, *(values[spec.name][:, None] for spec in PARAMETERS)), dim=-1)
     points = torch.cat((through(upper), through(upper.flip(1) * upper.new_tensor([1, -1]))), dim=1)
     return Outline(points, torch.ones_like(points[..., 0, 0]))
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from model.ccdbsm import Brush, as_batch, ccdbsm
+from model.brush import Brush
+from model.ccdbsm import as_batch, ccdbsm
 from model.protocol import Basis, Number, ParameterSpec, Parametric, StrokeModel, Values
 
 PARAMETERS = (

@@ -19,7 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from model.ccdbsm import Brush
+from model.brush import Brush
 from model.generator.network import Generator
 from model.generator.stroke import GeneratorModel, generator_model
 from model.train.config import MAX_BYTES, MAX_WEIGHTS, TrainConfig, checked

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from model.ccdbsm import Brush, DomainError
+from model.brush import Brush, DomainError
 from model.generator.network import Generator, Layers
 from model.generator.targets import PRESETS, Placement, Target
 from model.registry import UnknownModelError, stroke_model

@@ -16,7 +16,8 @@ from calibrate.invert.files import PROTOCOL, write_inversion
 from calibrate.invert.invert import Row, Settings, align, invert_recording, off_command, spread
 from collect.protocols.config import load_protocol
 from collect.protocols.presses import ReplayConfig
-from model.ccdbsm import Brush, ccdbsm
+from model.brush import Brush
+from model.ccdbsm import ccdbsm
 from model.coverage import coverage
 from model.inversion.press import Range
 from sessions.imports.photographs import ImportOptions, import_photographs

@@ -12,7 +12,7 @@ import pytest
 from calibrate.compare.field import KEYS, Alignment, Field, Tone, best_shift
 from calibrate.compare.images import pack, simulated, simulated_pixels
 from calibrate.validate.jobs import ABSENT, PrepareJob, Press, ScoreJob, prepare_job, score_job
-from model.ccdbsm import Brush
+from model.brush import Brush
 from model.coverage import coverage
 from model.registry import stroke_models
 from sessions.reader import Capture
@@ -155,7 +155,7 @@ def test_a_press_that_tells_no_depth_is_listed_by_name() -> None:
 
 
 def test_best_shift_finds_a_shift_of_up_to_six_pixels_and_no_more() -> None:
-    image = simulated(MODELS["ccd-bsm"], 15.0, 0.0, Alignment.SIZE_NORMALISED, Tone.BINARY, Field())
+    image = simulated(MODELS["ccd-bsm"], 15.0, 0.0, Field())[Alignment.SIZE_NORMALISED, Tone.BINARY]
     moved = np.roll(image, (4, -5), axis=(0, 1))
     assert np.array_equal(best_shift(image, moved), moved)
     far = np.roll(image, 9, axis=0)
@@ -165,7 +165,7 @@ def test_best_shift_finds_a_shift_of_up_to_six_pixels_and_no_more() -> None:
 def test_the_field_holds_every_cell_of_the_grid() -> None:
     for height_mm in (11.0, 13.0, 15.0, 17.0, 20.0):
         for tilt_deg in (0.0, 5.0, 10.0):
-            image = simulated(MODELS["ccd-bsm"], height_mm, tilt_deg, Alignment.MM, Tone.GRAY, Field())
+            image = simulated(MODELS["ccd-bsm"], height_mm, tilt_deg, Field())[Alignment.MM, Tone.GRAY]
             edges = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
             assert edges.max() == 0.0
             area_mm2 = float(MODELS["ccd-bsm"].profile(height_mm, tilt_deg).area_mm2[0])

@@ -18,7 +18,7 @@ from calibrate.writing.plan import Settings, plan, read_requests
 from calibrate.writing.plan_files import PICTURE, PROTOCOL, load_plan, write_plan
 from collect.protocols.config import load_protocol
 from collect.protocols.write import WriteConfig
-from model.ccdbsm import Brush
+from model.brush import Brush
 from model.characters.brush import Reach
 from model.drag import DragModel
 from model.registry import stroke_model

@@ -18,7 +18,7 @@ BRUSH = {"radius_mm": 6.0, "length_mm": 48.0}
 def test_the_mark_is_the_one_of_the_closed_form(height_mm: float, tilt_deg: float) -> None:
     mark = published_mark(height_mm, tilt_deg, **BRUSH)
     model = stroke_model("ccd-bsm", type("Brush", (), BRUSH)())
-    exact = simulated(model, height_mm, tilt_deg, Alignment.MM, Tone.BINARY, Field()) > 0.5
+    exact = simulated(model, height_mm, tilt_deg, Field())[Alignment.MM, Tone.BINARY] > 0.5
     assert mark is not None
     assert exact.sum() > 100
     assert np.logical_xor(mark, exact).sum() <= 0.01 * exact.sum()

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from model.baselines import Capsule, Ellipse, circle, ellipse, line
-from model.ccdbsm import Brush, CcdBsm, DomainError, ccdbsm
+from model.brush import Brush, DomainError
+from model.ccdbsm import CcdBsm, ccdbsm
 from model.coverage import centred_origin, coverage
 from model.registry import stroke_models
 

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from model.baselines import circle, ellipse, line
-from model.ccdbsm import Brush, CcdBsm, ccdbsm
+from model.brush import Brush
+from model.ccdbsm import CcdBsm, ccdbsm
 from model.coverage import PX_MM, SIZE_PX, centred_origin, coverage
 from model.outline import Profile
 

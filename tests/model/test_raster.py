@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import quad
 
-from model.ccdbsm import Brush, CcdBsm, DomainError, ccdbsm
+from model.brush import Brush, DomainError
+from model.ccdbsm import CcdBsm, ccdbsm
 from model.coverage import centred_origin, coverage
 from model.outline import cross, loop
 from model.press_images import press_images

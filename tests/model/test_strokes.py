@@ -11,12 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model import strokes
-from model.ccdbsm import DILATIONS, Brush, DomainError, ccdbsm
+from model.brush import Brush, DomainError
+from model.ccdbsm import DILATIONS, ccdbsm
 from model.coverage import coverage
 from model.outline import Outline
+from model.plane import fit_plane
 from model.raster.exact import coverage_at
 from model.registry import UnknownModelError, stroke_model, stroke_models
-from model.regression import fit_plane, solve
+from model.regression import solve
 from model.sweep import swept
 
 MODELS = stroke_models(Brush())
@@ -171,7 +173,7 @@ def test_a_plane_is_found_again_and_needs_three_cells() -> None:
     height, tilt = torch.cartesian_prod(HEIGHTS, torch.tensor([0.0, 10.0], dtype=torch.float64)).unbind(-1)
     plane = fit_plane(height, tilt, {"tip_mm": 0.5 + height * (1.1 - 0.002 * tilt)})
     assert plane.coefficients[0].tolist() == pytest.approx([0.5, 1.1, -0.002])
-    assert plane.at(14.0, 5.0)["tip_mm"].tolist() == pytest.approx([15.76])
+    assert plane.at(14.0, 5.0)["tip_mm"] == pytest.approx(15.76)
     with pytest.raises(ValueError, match="two depths and two tilts"):
         fit_plane(HEIGHTS, torch.zeros(3, dtype=torch.float64), {"tip_mm": HEIGHTS})
 

@@ -18,7 +18,7 @@ from calibrate.files import read_bounded
 from calibrate.report import ink_uri, overlay_uri, plot, plot_uri
 from calibrate.validate.report.data import Report
 from calibrate.validate.run import Outcome
-from model.ccdbsm import DomainError
+from model.brush import DomainError
 
 ROWS = slice(32, 96)
 """Rows to show: the middle half of a field, as a press is at most half as thick as the field is high."""

@@ -25,7 +25,7 @@ from calibrate.validate.report.data import (
 )
 from calibrate.validate.run import CEILING, REPEATED, Outcome
 from calibrate.validate.sources import LoadedSession, one_source
-from model.ccdbsm import DomainError, ccdbsm
+from model.brush import DomainError
 from sessions.history import history_of
 from sessions.show import details
 
@@ -220,6 +220,8 @@ def _collected(one: LoadedSession) -> Collected | None:
 
 def _ratios(one: LoadedSession, mine: list[Row]) -> tuple[float | None, float | None]:
     """Mean ratio of length and width of uncut marks to those of CCD-BSM for a brush of this size."""
+    from model.ccdbsm import ccdbsm
+
     brush = brush_of(one.header)
     drawn: dict[tuple[float, float], tuple[float, float]] = {}
     found: list[tuple[float, float]] = []

@@ -4,9 +4,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.fit.fit import STAGES, Grid, Pressed, bootstrap, condition_number, fit_presses, refit, zero_touch
-from calibrate.fit.heldout import CEILING, FITTED, leave_cell_out, predictor
-from model.fitted import NAMES, FittedPress, published
+from calibrate.fit.fit import STAGES, Grid, Pressed, bootstrap, condition_number, draw, fit_presses, refit, zero_touch
+from calibrate.fit.heldout import CEILING, FITTED, leave_cell_out
+from model.fitted import NAMES, PARAMETERS, FittedPress, published
 
 PX_MM = 0.4
 GRID = Grid((np.arange(100) + 0.5) * PX_MM - 31.0, 8.0 - (np.arange(40) + 0.5) * PX_MM)
@@ -77,6 +77,24 @@ def test_intervals_narrow_with_strokes() -> None:
     assert width(6) < 0.8 * width(1)
 
 
+def test_products_of_the_jacobian_are_those_of_the_whole_image() -> None:
+    edges = np.zeros_like(a_brush().edges)
+    edges[:, :2, 0] = [[0.5, -0.2], [0.1, 0.3]]  # the two edges differ
+    brush = replace(a_brush(), edges=edges)
+    drawn = draw(brush, NAMES, 15.0, 5.0, GRID)
+    columns = []
+    for k, parameter in enumerate(PARAMETERS):
+        step = np.zeros(len(NAMES))
+        step[k] = 1e-6 * parameter.spread
+        ahead, behind = (replace(brush, values=brush.values + way * step) for way in (1, -1))
+        images = [one.chance(15.0, 5.0, GRID.x_mm, GRID.y_mm, 0.15) for one in (ahead, behind)]
+        columns.append((images[0] - images[1]).ravel() / 2e-6)
+    jacobian, residual = np.array(columns), np.random.default_rng(0).normal(size=drawn.ink.shape)
+    assert drawn.ink == pytest.approx(brush.chance(15.0, 5.0, GRID.x_mm, GRID.y_mm, 0.15))
+    assert drawn.square() == pytest.approx(jacobian @ jacobian.T, rel=1e-2, abs=1e-2)
+    assert drawn.pull(residual) == pytest.approx(jacobian @ residual.ravel(), rel=2e-2, abs=2e-2)
+
+
 def test_edges_that_the_profile_lacks_are_found() -> None:
     truth = replace(a_brush(), edges=np.zeros_like(a_brush().edges))
     truth.edges[0, 1, 0] = 0.5
@@ -87,7 +105,7 @@ def test_edges_that_the_profile_lacks_are_found() -> None:
 def test_held_out_cells_are_scored_beside_the_template() -> None:
     strokes = presses(a_brush(), CELLS * 3, noise=0.05)
     fit = fit_presses(strokes, GRID, 6.0, 48.0, stages=STAGES[:4])
-    rows = {row.model: row for row in leave_cell_out(fit, strokes, GRID, predictor(FittedPress(6.0, 48.0), GRID))}
+    rows = {row.model: row for row in leave_cell_out(fit, strokes, GRID)}
     assert rows[FITTED].n == rows[CEILING].n == 15
     assert rows["uncalibrated"].csim + 5.0 < rows[FITTED].csim <= 100.0
     assert rows[FITTED].csim > rows[CEILING].csim - 2.0

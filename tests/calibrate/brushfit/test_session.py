@@ -18,7 +18,7 @@ from calibrate.fit.captures import read_presses
 from calibrate.fit.run import correction, fit_session
 from calibrate.validate.report.data import load_report
 from drivers.sim.brush.brush import Brush, BrushSpec
-from model.fitted_shape import NAME
+from model.fitted import NAME
 from sessions.imports.photographs import ImportOptions, import_photographs
 
 pytestmark = pytest.mark.xdist_group("fitted")  # one session of photographs

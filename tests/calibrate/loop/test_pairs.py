@@ -12,7 +12,7 @@ from calibrate.compare.field import Alignment, Field, Tone
 from calibrate.compare.stats import interval_over_groups
 from calibrate.loop.compare import Pairs, pair_up
 from calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, score_pairs, summary_of, verdicts
-from model.ccdbsm import Brush
+from model.brush import Brush
 from model.coverage import coverage
 from model.registry import stroke_model
 from sessions.reader import Capture

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from brushloop import app
 from calibrate.compare.field import Alignment, Tone
 from calibrate.validate.report.data import load_report
-from model.ccdbsm import Brush
+from model.brush import Brush
 from model.train.checkpoint import load_generator, load_weights
 from model.train.data import load_captures
 from model.train.errors import TrainError

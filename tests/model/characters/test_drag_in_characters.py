@@ -7,7 +7,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from model.ccdbsm import Brush
+from model.brush import Brush
 from model.characters.brush import Reach, dragged_depth_of
 from model.characters.drag import dragged, trail
 from model.characters.ink import swept, written

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from model.ccdbsm import Brush
+from model.brush import Brush
 from model.characters.brush import Reach, depth_of
 from model.characters.glyph import parse_glyph
 from model.characters.ink import dense, reference, stamped, swept, written

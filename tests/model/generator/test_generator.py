@@ -7,7 +7,8 @@ import math
 import pytest
 import torch
 
-from model.ccdbsm import Brush, DomainError, ccdbsm
+from model.brush import Brush, DomainError
+from model.ccdbsm import ccdbsm
 from model.coverage import centred_origin, coverage
 from model.generator.basis import FieldBasis, fit_basis, signed_distance
 from model.generator.metrics import quality

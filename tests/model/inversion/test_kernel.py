@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from model.ccdbsm import Brush, ccdbsm
+from model.brush import Brush
+from model.ccdbsm import ccdbsm
 from model.inversion.forward import PARAMETERS, Outlines, Rendered
 from model.inversion.jets import analytic, of_model
 from model.outline import Outline

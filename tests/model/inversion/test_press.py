@@ -11,7 +11,8 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from model.ccdbsm import Brush, ccdbsm
+from model.brush import Brush
+from model.ccdbsm import ccdbsm
 from model.inversion.noise import Noise
 from model.inversion.press import Flag, Inverter, Known, Range, invert_rendered
 from model.protocol import Basis
