@@ -40,23 +40,32 @@ class CellPicture(Widget):
     def __init__(self, id: str | None = None) -> None:  # noqa: A002 - textual's name
         super().__init__(id=id)
         self._image: NDArray[np.uint8] | None = None
-        self._strips: list[Strip] = []
+        self._lines: NDArray[np.int64] | None = None
         self._made_for: Size | None = None
 
     def show(self, image: NDArray[np.uint8] | None) -> None:
-        """Draw this picture, unless it is the same object."""
-        if image is not self._image:
-            self._image, self._made_for = image, None
+        """Draw the lines of this picture that changed; nothing where it is the same object."""
+        if image is self._image:
+            return
+        self._image, before = image, self._lines
+        self._fit(before)
+        if before is None or self._lines is None or before.shape != self._lines.shape:
             self.refresh()
+            return
+        for y in (before != self._lines).any(axis=1).nonzero()[0].tolist():
+            self.refresh(Region(0, y, self.size.width, 1))
 
     def render_line(self, y: int) -> Strip:
         """Draw one line of half-cells."""
         if self._made_for != self.size:
-            self._strips, self._made_for = half_cells(self._image, self.size), self.size
+            self._fit(None)
         width, ground = self.size.width, self.rich_style
-        if y >= len(self._strips):
+        if self._lines is None or y >= len(self._lines):
             return Strip.blank(width, ground)
-        return self._strips[y].extend_cell_length(width, ground)
+        return _strip(self._lines[y]).extend_cell_length(width, ground)
+
+    def _fit(self, before: NDArray[np.int64] | None) -> None:
+        self._lines, self._made_for = half_cells(self._image, self.size, before), self.size
 
 
 class SixelPicture(Container):
@@ -191,14 +200,25 @@ def binary_picture(binary: NDArray[np.bool_]) -> NDArray[np.uint8]:
     return np.where(binary, 0, 255).astype(np.uint8)
 
 
-def half_cells(image: NDArray[np.uint8] | None, size: Size) -> list[Strip]:
-    """The picture fitted into `size` cells, one strip of half-cells for each line that it reaches."""
+def half_cells(
+    image: NDArray[np.uint8] | None, size: Size, before: NDArray[np.int64] | None = None
+) -> NDArray[np.int64] | None:
+    """The picture fitted into `size` cells: (lines, columns) of pairs of grays, upper * LEVELS + lower; None for none.
+
+    `before` are the pairs of the picture before, of which those stay that are still right; see `fitted`.
+    """
     if image is None or not image.size or size.width < 1 or size.height < 1:
-        return []
+        return None
+    import numpy as np
+
+    grays = None if before is None else np.stack(divmod(before, LEVELS), axis=1).reshape(-1, before.shape[1])
     # A cell is about twice as high as wide: a half-cell is a square.
-    levels = fitted(image, size.width, 2 * size.height, LEVELS, step=2)
-    pairs = levels[::2] * LEVELS + levels[1::2]
-    return [Strip([Segment(HALF * count, _style(pair)) for pair, count in runs(row)], len(row)) for row in pairs]
+    levels = fitted(image, size.width, 2 * size.height, LEVELS, step=2, before=grays)
+    return levels[::2] * LEVELS + levels[1::2]
+
+
+def _strip(pairs: NDArray[np.int64]) -> Strip:
+    return Strip([Segment(HALF * count, _style(pair)) for pair, count in runs(pairs)], len(pairs))
 
 
 @lru_cache(maxsize=LEVELS * LEVELS)

@@ -18,7 +18,7 @@ from collect.tui.keys import RUN_BAR, keys_in
 from collect.tui.panes import LEGEND, CapturePane, Grid, figures_content, sheet_content, sheet_title
 from collect.tui.pictures import Pictures
 from collect.tui.text import SHORT_STOP, SOFTWARE_STOP, one_line, plain, plot
-from collect.tui.widgets import KeyBar, Line
+from collect.tui.widgets import KeyBar, Line, entitle
 
 OVER = "Over: q leaves"
 GOES_ON = "The same command goes on from here; this screen does not."
@@ -90,17 +90,19 @@ class RunScreen(Screen[None]):
         super().__init__()
         # Kept, not queried: a snapshot may come before the parts are mounted or after they are gone.
         self._session, self._source = Line("session"), Line("source")
-        self._state, self._figures = Line("state"), Line("figures")
+        self._state, self._figures = Line("state", sized=True), Line("figures", sized=True)
         self._why, self._why_pane = Line("why"), VerticalScroll(id="why-pane")
         self._grid, self._grid_pane = Grid(), ScrollableContainer(id="grid-pane", classes="pane")
         self._sheet = Line("sheet-pane", classes="pane")
-        self._trace = Line("trace-pane", classes="pane")
+        self._trace = Line("trace-pane", classes="pane", sized=True)
         self._log, self._log_pane = Line("log"), VerticalScroll(id="log-pane", classes="pane")
         self._capture = CapturePane(pictures)
         self._camera, self._with_camera = pictures.make("camera-pane"), pictures.camera_shown
-        self._note, self._keys = Line("note"), KeyBar(RUN_BAR)
+        self._note, self._keys = Line("note", sized=True), KeyBar(RUN_BAR)
         self._messages: tuple[str, ...] = ()
         self._pane = 0
+        self._doing: tuple[State, str] | None = None
+        self._turn = 0
         self._stop_sent = False
         self._grid_pane.border_title = "Strokes done/planned by depth H and tilt α"
         self._legend = Line("legend")
@@ -160,25 +162,33 @@ class RunScreen(Screen[None]):
         self._state.set_class(True, "-stopping")
 
     def show(self, now: Snapshot) -> None:
-        """Draw what differs from the snapshot before."""
+        """Draw what differs from the snapshot before.
+
+        What changes all the time takes turns (figures 5 times a second, camera 5, trace 2.5), because textual goes
+        through every widget between two that it draws at once. A new state or step is shown at once.
+        """
+        self._turn = 0 if self._doing != (now.state, now.step) else self._turn + 1
+        self._doing = now.state, now.step
+        figures_turn, trace_turn = self._turn % 2 == 0, self._turn % 4 == 1
         self._session.show(f"brushloop  {one_line(now.session_id) or 'no session yet'}")
         self._source.show(f"source: {one_line(now.source) or 'not known yet'}")
         self._show_state(now)
-        self._figures.show(figures_content(now, self._figures.content_size.width))
+        if figures_turn:
+            self._figures.show(figures_content(now, self._figures.content_size.width))
         self.set_class(bool(now.error), "-wrong")
         failed = now.state is State.FAILED
-        self._why_pane.border_title = "Why it failed" if failed else "Why it stopped"
+        entitle(self._why_pane, "Why it failed" if failed else "Why it stopped")
         self._why.show(plain(now.error))
         self._grid.show(now.grid, self._grid_pane.scrollable_content_region.width)
         self._sheet.show(sheet_content(now.sheet))
-        self._sheet.border_title = sheet_title(now.sheet)
-        if self._trace.display:
+        entitle(self._sheet, sheet_title(now.sheet))
+        if self._trace.display and trace_turn:
             self._trace.show(plot(now.trace_n, self._trace.content_size.width, TRACE_ROWS))
         if now.messages != self._messages:
             self._messages = now.messages
             self._log.show(Content("\n").join(_message_content(line) for line in now.messages))
         self._capture.show(now.last)
-        if now.picture is not None and self._camera.display:
+        if now.picture is not None and self._camera.display and not figures_turn:
             self._camera.show(now.picture.image)
         self._note.show(_note_content(now))
         self._keys.show(keys_in(now.state, RUN_BAR))

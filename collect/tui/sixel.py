@@ -23,18 +23,33 @@ NOTHING = -1
 VT340_CELL_PX = (10, 20)
 
 
-def fitted(image: NDArray[np.uint8], width: int, height: int, levels: int, step: int = 1) -> NDArray[np.int64]:
+STEADY = 0.8
+"""A level is kept while the picture is within this many levels of it: most of a camera's changes are its noise."""
+
+
+def fitted(
+    image: NDArray[np.uint8],
+    width: int,
+    height: int,
+    levels: int,
+    step: int = 1,
+    before: NDArray[np.int64] | None = None,
+) -> NDArray[np.int64]:
     """Scale the (h, w) gray picture into `width` x `height`, its shape kept, in grays 0 to `levels` - 1.
 
-    The rows of the result are a multiple of `step`, and at least one.
+    The rows of the result are a multiple of `step`, and at least one. Levels of the picture `before` that are still
+    right within `STEADY` stay.
     """
     import cv2
     import numpy as np
 
     scale = min(width / image.shape[1], height / image.shape[0])
     columns, rows = max(1, int(image.shape[1] * scale)), max(1, int(image.shape[0] * scale / step)) * step
-    small = np.asarray(cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA), np.int64)
-    return (small * (levels - 1) + 127) // 255
+    small = np.asarray(cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA), np.int64) * (levels - 1)
+    made = (small + 127) // 255
+    if before is None or before.shape != made.shape:
+        return made
+    return np.where(np.abs(small - 255 * before) < 255 * STEADY, before, made)
 
 
 def runs(values: NDArray[np.int64]) -> list[tuple[int, int]]:

@@ -27,16 +27,24 @@ def app_of(node: DOMNode) -> App[None]:
 class Line(Static):
     """Literal text, never read as markup, drawn again only when it changed."""
 
-    def __init__(self, place: str, classes: str | None = None) -> None:
+    def __init__(self, place: str, classes: str | None = None, *, sized: bool = False) -> None:
+        """`sized`: its place does not depend on its text, so that new text moves nothing."""
         super().__init__(id=place, classes=classes, markup=False)
         self._shown: Content | None = None
+        self._sized = sized
 
     def show(self, content: Content | str) -> None:
         """Draw this text, if it is new."""
         content = Content(content) if isinstance(content, str) else content
         if self._shown is None or not content.is_same(self._shown):
             self._shown = content
-            self.update(content)
+            self.update(content, layout=not self._sized)
+
+
+def entitle(widget: Widget, title: str) -> None:
+    """Set the title in a widget's border, if it is new: textual draws the whole widget again."""
+    if widget.border_title != title:
+        widget.border_title = title
 
 
 class Rows(OptionList):

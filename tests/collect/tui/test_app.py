@@ -6,10 +6,12 @@ import asyncio
 import re
 import time
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from textual.geometry import Region
 from textual.pilot import Pilot
+from textual.widget import Widget
 from textual.widgets import Static
 
 from collect.engine.control import FINAL, State
@@ -446,3 +448,22 @@ async def test_an_error_of_the_engine_is_a_crash_not_a_blank() -> None:
     with pytest.raises(ZeroDivisionError):
         async with OperatorApp(Broken(DONE)).run_test() as pilot:
             await pilot.pause(0.5)
+
+
+async def test_what_did_not_change_is_not_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = FakeEngine(full_picture())
+    app = OperatorApp(engine)
+    async with app.run_test(size=(120, 40)) as pilot:
+        for _ in range(3):
+            await look(app, pilot)
+        drawn: list[Widget] = []
+        refresh = Widget.refresh
+
+        def noted(self: Widget, *regions: Region, **options: Any) -> Widget:
+            drawn.append(self)
+            return refresh(self, *regions, **options)
+
+        monkeypatch.setattr(Widget, "refresh", noted)
+        for _ in range(3):
+            await look(app, pilot)
+        assert drawn == []

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from textual.app import App
 from textual.geometry import Size
 from textual.pilot import Pilot
@@ -216,11 +217,23 @@ async def test_pictures_by_the_extra_are_shown_and_changed() -> None:
 
 def test_a_picture_fits_its_place_and_keeps_its_shape() -> None:
     image = np.tile(np.arange(64, dtype=np.uint8) * 4, (32, 1))
-    strips = half_cells(image, Size(40, 30))
-    assert (len(strips), strips[0].cell_length) == (10, 40)
-    assert {segment.text[0] for strip in strips for segment in strip} == {HALF}
-    assert half_cells(None, Size(40, 30)) == []
-    assert half_cells(image, Size(0, 0)) == []
+    pairs = half_cells(image, Size(40, 30))
+    assert pairs is not None
+    assert pairs.shape == (10, 40)
+    assert half_cells(None, Size(40, 30)) is None
+    assert half_cells(image, Size(0, 0)) is None
+
+
+def test_the_noise_of_a_camera_is_not_drawn_and_a_change_is() -> None:
+    rng = np.random.default_rng(0)
+
+    def frame(gray: float) -> NDArray[np.uint8]:
+        return np.clip(rng.normal(gray, 3.0, (32, 64)), 0, 255).astype(np.uint8)
+
+    dark = half_cells(frame(100.0), Size(64, 16))
+    assert dark is not None
+    assert (half_cells(frame(100.0), Size(64, 16), dark) == dark).mean() > 0.95
+    assert (half_cells(frame(115.0), Size(64, 16), dark) != dark).mean() > 0.95
 
 
 def test_a_force_is_drawn_to_scale_and_noise_does_not_fill_its_place() -> None:
