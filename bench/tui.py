@@ -17,11 +17,13 @@ import tempfile
 import termios
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from bench.harness import BenchError, Result, machine, percentile
+from bench.processes import started
+from bench.tui_process import LOAD
 
 ROOT = Path(__file__).resolve().parent.parent
 COLUMNS, ROWS = 120, 40
@@ -91,7 +93,8 @@ def _share(runs: list[Measured], name: str) -> float:
 
 
 def _measured(kind: str, file: Path) -> Measured:
-    with _terminal() as (ours, theirs):
+    feeding = started("bench.tui_process", "feed", str(file.with_suffix(LOAD))) if kind == "ours" else nullcontext()
+    with feeding, _terminal() as (ours, theirs):
         began = time.monotonic()
         process = subprocess.Popen(
             [sys.executable, "-m", "bench.tui_process", kind, str(SECONDS), str(file)],

@@ -19,11 +19,13 @@ from typing import Any
 from textual.app import App, ComposeResult
 from textual.widgets import Static
 
-from bench.processes import started, tell
+from bench.processes import tell
 
 TICK_S = 0.01
 READY = "brushloop"
 STOPPING_S = 0.15
+LOAD = ".load"
+"""Suffix of the file that `feed` writes, beside the one for the figures."""
 
 
 class Lag:
@@ -167,10 +169,8 @@ def main(kind: str, seconds: float, file: Path) -> None:
     else:
         from collect.tui.app import OperatorApp
 
-        load = file.with_suffix(".load")
-        with started("bench.tui_process", "feed", str(load)):
-            engine = busy_engine(Values(load))
-            figures = measured(OperatorApp(engine), seconds)
+        engine = busy_engine(Values(file.with_suffix(LOAD)))
+        figures = measured(OperatorApp(engine), seconds)
         stops_ns = engine.stops_ns
     file.write_text(json.dumps({**figures, "stops_ns": stops_ns}), encoding="utf-8")
 

@@ -228,7 +228,7 @@ def test_the_noise_of_a_camera_is_not_drawn_and_a_change_is() -> None:
     rng = np.random.default_rng(0)
 
     def frame(gray: float) -> NDArray[np.uint8]:
-        return np.clip(rng.normal(gray, 3.0, (32, 64)), 0, 255).astype(np.uint8)
+        return np.clip(rng.normal(gray, 3.0, (160, 320)), 0, 255).astype(np.uint8)
 
     dark = half_cells(frame(100.0), Size(64, 16))
     assert dark is not None
