@@ -89,7 +89,8 @@ def generators(session: LoadedSession, files: Sequence[Generator], view: Field) 
         name = (
             model.name if number == 0 or model.name not in {one.name for one in found} else f"{model.name}-{number + 1}"
         )
-        basis = "trained, then tuned on captures" if model.fitted else "trained on exact images"
+        images = f"trained on exact images of {model.target.model.label}"
+        basis = f"{images}, then tuned on captures" if model.fitted else images
         found.append(replace(_of_model(model, basis, view, name, model.label), file=file.path))
     return found
 

@@ -19,7 +19,7 @@ from collect.rig.config import RigConfig, load_rig
 START_S = 60.0
 IDLE_EXIT_S = 180.0
 """Longer than the evaluation between two collections takes on a busy computer."""
-FPS = 16
+FPS = 12
 """Pictures per second: a photograph waits for several. Drawing and decoding more would cost what they save."""
 MAX_CONTROL_BYTES = 100
 

@@ -100,10 +100,10 @@ def findings(report: Report) -> Iterator[str]:
         yield f"A Bézier stroke fitted to the same captures reaches {_interval(bezier)}{peer}."
     yield from _pressed_again(report)
     yield from _characters(report)
-    published = [(name, stat) for name in ("ccd-bsmg", "ccd-bsm") if (stat := _avg(report, name)) is not None]
-    for name, stat in published:
-        label = _label(report, name)
-        yield f"{label} as published, given only the brush's size, H and α, reaches {_interval(stat)}."
+    published = [(rival, _avg(report, rival.name)) for rival in report.rivals if rival.name in ("ccd-bsmg", "ccd-bsm")]
+    for rival, stat in published:
+        if stat is not None:
+            yield f"{rival.label} {rival.basis}, given only the brush's size, H and α, reaches {_interval(stat)}."
     if published:
         yield from _sizes(report)
     if held is None and report.source != Source.IMPORT:

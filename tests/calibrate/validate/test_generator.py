@@ -67,7 +67,7 @@ def test_a_generator_is_scored_beside_what_it_was_trained_on(session: Path, gene
     training = generator.parent
     given = ("--generator", generator, "--curves", f"CCD-BSMG={training}", "--no-held-out")
     said = invoke("validate", session, "--out", tmp_path, *given)
-    assert "CCD-BSMG as published" in said
+    assert "CCD-BSMG trained on exact images of CCD-BSM, given only the brush's size" in said
     report = load_report(tmp_path / "report.json")
     mine, exact = (
         report.stat(name, Alignment.SIZE_NORMALISED, Tone.BINARY, "csim") for name in ("ccd-bsmg", "ccd-bsm")
@@ -77,7 +77,7 @@ def test_a_generator_is_scored_beside_what_it_was_trained_on(session: Path, gene
     assert mine.n == exact.n == 10
     assert mine.avg == pytest.approx(exact.avg, abs=6.0)
     [rival] = [one for one in report.rivals if one.name == "ccd-bsmg"]
-    assert rival.basis == "trained on exact images"
+    assert rival.basis == "trained on exact images of CCD-BSM"
     assert len(rival.sha256) == 64
 
 
