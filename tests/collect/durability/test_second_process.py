@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import time
 import tomllib
 from typing import TYPE_CHECKING
+
+import pytest
 
 from drivers.sim.config import SimConfig
 from drivers.sim.rig import LoopbackRig
 from sessions.repair.verify import verify_session
 from tests.collect.conftest import SMALL_VIEW, serving
 from tests.collect.durability.conftest import the_session
+from tests.command import brushloop
 
 if TYPE_CHECKING:
     from tests.collect.conftest import Lab
@@ -31,20 +31,21 @@ def where(rig: LoopbackRig) -> dict[str, str]:
     }
 
 
-def test_a_session_that_is_open_elsewhere_is_refused_before_anything_is_powered(lab: Lab) -> None:
-    lab.write_protocol(repeats=4)
-    protocol = lab.folder / "protocol.toml"  # each press takes a second: the first run outlives the second's start
+def test_a_session_that_is_open_elsewhere_is_refused_before_anything_is_powered(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab.write_protocol(repeats=3)
+    protocol = lab.folder / "protocol.toml"  # each press takes a second: the first run outlives the second
     protocol.write_text(protocol.read_text().replace("dwell_s = 0.0", "dwell_s = 60.0"))
-    first = lab.process()
-    deadline = time.monotonic() + 60
-    while len(lab.rig.world.presses) < 2:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
     with serving(SimConfig(rate=60.0, view=SMALL_VIEW)) as rig:
-        command = [sys.executable, "-m", "brushloop", "collect", "--no-tui", *lab.options]
-        second = subprocess.run(
-            command, env={**os.environ, **where(rig)}, capture_output=True, text=True, timeout=60, check=False
-        )
+        first = lab.process()
+        deadline = time.monotonic() + 60
+        while not lab.rig.world.presses:
+            assert time.monotonic() < deadline, "waited 60 s for the first press"
+            time.sleep(0.01)
+        for name, value in where(rig).items():
+            monkeypatch.setenv(name, value)
+        second = brushloop("collect", "--no-tui", *lab.options)  # this process is the second
         assert second.returncode == 2, second.stderr
         assert second.stderr.splitlines()[-1].endswith("another brushloop has this session open")
         assert rig.arcs.mode == "PowerOff"
