@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import cv2
 import pytest
 
 from bench import curves
+from model.train.config import preset
 
 
 def test_every_kind_of_stroke_is_learned_by_the_same_network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(curves, "VALIDATION_IMAGES", 8)
+    monkeypatch.setattr(curves, "preset", functools.partial(preset, batch=8))
     done = curves.trained(3, seed=0)
     assert set(done) == {"press", "all", "bezier", "qbc"}
     assert {one.config.target.model for one in done.values()} == {"ccd-bsm", "bezier", "qbc"}
