@@ -98,6 +98,11 @@ class TeachApp(PlainApp):
                 return
         await super().on_event(event)
 
+    @property
+    def asking(self) -> bool:
+        """Whether the question of the moment is on the screen."""
+        return self._screen.asking
+
     def action_stop(self) -> None:
         """Stop whatever is under way, and say so at once."""
         self.teaching.stop()
@@ -124,7 +129,7 @@ class TeachApp(PlainApp):
     def action_go_on(self) -> None:
         """After a stop, begin again where the notebook is."""
         if self.teaching.finished and self.teaching.stopped and self.teaching.error is None:
-            self.teaching = Teaching(self._work)
+            self.teaching = Teaching(self._work, self.teaching.guide.view.findings)
             self._screen.follow(self.teaching.guide)
             self.teaching.start()
 

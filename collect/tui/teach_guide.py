@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from collect.errors import CollectAborted
 from collect.operator import Choice
 from collect.teach.guide import (
     Brought,
@@ -49,6 +50,8 @@ class Question:
     low: float = 0.0
     high: float = 0.0
     jog: JogView | None = None
+    target: Target | None = None
+    """What the tip is to be brought to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +73,10 @@ class TeachView:
 class ScreenGuide:
     """`Guide` for a screen. The methods that a step awaits run in the steps' event loop, all others in any thread."""
 
-    def __init__(self) -> None:
+    def __init__(self, findings: tuple[Shown, ...] = ()) -> None:
+        """`findings` are those of an earlier run, which was stopped."""
         self._lock = threading.Lock()
-        self._view = TeachView()
+        self._view = TeachView(findings=findings)
         self._count = 0
         self._open: tuple[asyncio.AbstractEventLoop, asyncio.Future[Answer]] | None = None
         self._leaving = False
@@ -111,7 +115,7 @@ class ScreenGuide:
 
     async def bring(self, target: Target, how: str) -> Brought:
         """Wait until the person says that the tip is there."""
-        answer = await self._ask("bring", how)
+        answer = await self._ask("bring", how, target=target)
         assert isinstance(answer, Brought)
         return answer
 
@@ -184,8 +188,10 @@ class ScreenGuide:
 class Teaching:
     """The steps in a thread of their own, so that nothing they compute keeps a stop waiting on the screen."""
 
-    def __init__(self, work: Callable[[ScreenGuide], Coroutine[Any, Any, Path | None]]) -> None:
-        self.guide = ScreenGuide()
+    def __init__(
+        self, work: Callable[[ScreenGuide], Coroutine[Any, Any, Path | None]], findings: tuple[Shown, ...] = ()
+    ) -> None:
+        self.guide = ScreenGuide(findings)
         self.error: BaseException | None = None
         """What ended it, other than a stop."""
         self.written: Path | None = None
@@ -234,6 +240,10 @@ class Teaching:
             # The notes say whether the arm was seen at rest.
             if notes := getattr(stopped, "__notes__", []):
                 self.error = StopUnsure(" ".join(notes))
+        except CollectAborted as error:
+            # A run within the steps has its own word for the stop that it was sent.
+            self.stopped = self._cancelled_s > -math.inf
+            self.error = None if self.stopped else error
         except BaseException as error:
             self.error = error
         finally:

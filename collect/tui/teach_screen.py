@@ -141,14 +141,15 @@ class TeachScreen(Screen[None]):
         self._steps.show(_steps_content(now.steps, summaries=self.size.height >= HIGH_ROWS))
         self._live.show(_live_text(now))
         self._picture.show(_gray(now.live if self._guide.looking and now.live is not None else now.picture))
-        if before is None or before.findings != now.findings:
+        if before is None or before.findings is not now.findings:
             self._found.show(Content("\n").join(_finding(shown) for shown in now.findings))
-            # Only after the layout is it known where the end is.
-            found = self.query_one("#teach-found", VerticalScroll)
-            self.call_after_refresh(found.scroll_end, animate=False)
         if before is None or before.question != now.question or over != self._over:
             self._over = over
             self._ask(now.question, over)
+        if before is None or before.findings is not now.findings or before.question is not now.question:
+            # Only after the layout is it known where the end is: the question takes its room from the findings.
+            found = self.query_one("#teach-found", VerticalScroll)
+            self.call_after_refresh(found.scroll_end, animate=False)
 
     def _ask(self, question: Question | None, over: str) -> None:
         """Show a question, or that something is at work, or that it is over."""
@@ -193,8 +194,7 @@ class TeachScreen(Screen[None]):
             return
         line = event.value.strip() or question.default
         if question.kind == "text":
-            if line:
-                self._guide.answer(question.number, line)
+            self._guide.answer(question.number, line)
             return
         try:
             value = float(line.replace(",", "."))
@@ -260,7 +260,7 @@ def _finding(shown: Shown) -> Content:
 
 def _live_text(now: TeachView) -> str:
     if now.tip is None:
-        return "no arm yet"
+        return "no pose: the arm is not read now"
     return f"{'tip' if now.tip_known else 'flange'}  {tip_text(now.tip.position_mm)}"
 
 

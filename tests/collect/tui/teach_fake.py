@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from collect.errors import CollectAborted
 from collect.operator import Choice
 from collect.teach.guide import Brought, JogView, Shown, StepState, Target
 from collect.tui.teach_app import TeachApp
@@ -57,6 +58,8 @@ class Asking:
                 return await guide.number("Squares along its longer side", "squares", 3, 50, None)
             case "text":
                 return await guide.text("Address of the cabinet", "192.0.2.7")
+            case "empty":
+                return await guide.text("CAN bus of the force sensor; Enter: no sensor", "")
             case "bring":
                 await guide.show(Shown(("the board as the camera sees it",), board()))
                 how = "Guide the tip to the pin by hand, the brush leaning toward the window, then press Enter."
@@ -66,14 +69,16 @@ class Asking:
                     self.answers.append(answer)
                 return answer
             case _:
-                return await self._move()
+                return await self._move(kind)
 
-    async def _move(self) -> None:
-        """A move that a driver stops when it is cancelled."""
+    async def _move(self, kind: str) -> None:
+        """A move that a driver stops when it is cancelled, or a run that ends by itself then."""
         try:
             await asyncio.sleep(60.0)
         except asyncio.CancelledError:
             self.stopped_arm = True
+            if kind == "run":
+                raise CollectAborted("stopped") from None
             raise
 
 

@@ -50,6 +50,7 @@ async def seen(app: TeachApp, pilot: Pilot[None], condition: Callable[[], bool])
         ("choose", ["enter"], "y"),
         ("number", ["2", "6", "enter"], 26.0),
         ("text", ["enter"], "192.0.2.7"),
+        ("empty", ["enter"], ""),
         ("text", ["s", "q", "1", "enter"], "sq1"),
         ("bring", ["enter"], Brought.DONE),
         ("bring", ["k"], Brought.SKIP),
@@ -92,9 +93,9 @@ async def test_escape_leaves_the_step_and_q_the_day(keys: list[str], raised: typ
     assert isinstance(app.teaching.error, raised)
 
 
-@pytest.mark.parametrize("key", ["s", "ctrl+c"])
-async def test_a_stop_key_stops_what_is_at_work_and_g_goes_on(key: str) -> None:
-    asking = Asking("choose", "move")
+@pytest.mark.parametrize(("key", "work"), [("s", "move"), ("ctrl+c", "move"), ("s", "run")])
+async def test_a_stop_key_stops_what_is_at_work_and_g_goes_on(key: str, work: str) -> None:
+    asking = Asking("choose", work)
     async with running(asking) as (app, pilot):
         await pilot.press("y")
         await seen(app, pilot, lambda: not app._screen.asking)
