@@ -54,6 +54,13 @@ def columns(q: Quaternion) -> tuple[Vector, Vector, Vector]:
     )
 
 
+def turned(q: Quaternion, v: Sequence[float]) -> Vector:
+    """Where a unit quaternion turns a vector to."""
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = columns(q)
+    x, y, z = v
+    return ax * x + bx * y + cx * z, ay * x + by * y + cy * z, az * x + bz * y + cz * z
+
+
 def of_matrix(m: Sequence[Sequence[float]]) -> Quaternion:
     """The rotation of an orthogonal (3, 3) matrix, by the largest of its diagonal and trace."""
     (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = m

@@ -36,6 +36,44 @@ def test_the_version_is_printed_and_the_module_runs_under_the_commands_name() ->
     assert ran.stdout.split() == ["brushloop", version("brushloop")]
 
 
+COMMANDS = (
+    "collect --config no.toml --protocol no.toml --no-tui",
+    "collect plan --config no.toml --protocol no.toml",
+    "doctor --config no.toml",
+    "calibrate nowhere",
+    "fit nowhere",
+    "validate nowhere",
+    "loop compare nowhere nowhere",
+    "sessions verify nowhere",
+    "sessions export nowhere out",
+    "sessions merge out.mcap nowhere nowhere",
+    "sessions import nowhere --csv no.csv",
+)
+SLOW = ("torch", "scipy", "numba", "matplotlib", "skimage", "textual", "jinja2")
+"""Packages that take from a tenth of a second to seconds to import, which no command needs to begin."""
+
+
+def test_a_command_begins_to_work_before_anything_slow_is_imported(tmp_path: Path) -> None:
+    program = f"""
+import json, os, brushloop
+os.chdir({str(tmp_path)!r})
+found = {{}}
+for command in {COMMANDS!r}:
+    sys.argv = ["brushloop", *command.split()]
+    before = set(sys.modules)
+    try:
+        brushloop.main()
+    except SystemExit as end:
+        assert end.code == 2, (command, end.code)
+    slow = sorted(name for name in {SLOW!r} if name in set(sys.modules) - before)
+    if slow:
+        found[command] = slow
+sys.stderr.write(json.dumps(found))
+"""
+    ran = subprocess.run([sys.executable, "-c", f"import sys\n{program}"], capture_output=True, text=True, check=True)
+    assert ran.stderr.splitlines()[-1] == "{}"
+
+
 def test_a_rig_pc_collects_without_torch_and_a_validator_without_devices() -> None:
     assert "torch" not in loaded(
         "import collect.engine.engine, collect.headless, collect.engine.open_or_resume, collect.tui.app"

@@ -10,8 +10,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from scipy.spatial.transform import Rotation
-
 from collect.errors import ConfigError, StepError
 from collect.motion.moves import park_moves
 from collect.planning.walk import moves_of, sheet_of, steps_on
@@ -29,6 +27,7 @@ from drivers.arcs.robot import AUBOPE_PORT
 from drivers.arcs.rpc import RpcConnection, open_arcs
 from drivers.errors import LimitExceeded, ProtocolViolation
 from drivers.geometry import from_wire, to_wire
+from drivers.rotation import inverse, product, turned
 from drivers.samples import Pose
 
 TOUCH_CLEAR_MM = 5.0
@@ -262,8 +261,7 @@ def _six(op: str, values: Any) -> list[float]:
 def _for_tool(tip: Pose, ours: list[float], theirs: list[float]) -> Pose:
     """Pose of the controller's tool while our tip is at `tip`: tip * ours^-1 * theirs. Tools as on the wire."""
     our, their = from_wire(ours), from_wire(theirs)
-    flange = Rotation.from_quat(tip.quaternion) * Rotation.from_quat(our.quaternion).inv()
-    shift_mm = flange.apply([t - o for t, o in zip(their.position_mm, our.position_mm, strict=True)])
-    qx, qy, qz, qw = (float(v) for v in (flange * Rotation.from_quat(their.quaternion)).as_quat())
-    px, py, pz = (p + float(s) for p, s in zip(tip.position_mm, shift_mm, strict=True))
-    return Pose(px, py, pz, qx, qy, qz, qw)
+    flange = product(tip.quaternion, inverse(our.quaternion))
+    shift_mm = turned(flange, [t - o for t, o in zip(their.position_mm, our.position_mm, strict=True)])
+    px, py, pz = (p + s for p, s in zip(tip.position_mm, shift_mm, strict=True))
+    return Pose(px, py, pz, *product(flange, their.quaternion))

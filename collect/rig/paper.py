@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from collect.errors import SheetFull, StepError
 from collect.rig.config import PaperConfig
 from drivers.geometry import brush_pose
+from drivers.rotation import Quaternion, of_angles, product, turned, unit
 from drivers.samples import Pose
 
 
@@ -169,20 +169,20 @@ class PaperPlane:
         level = brush_pose(base_x, base_y, z_mm, heading_deg=paper.yaw_deg + turn_deg, tilt_deg=tilt_deg)
         if self.slope_x == self.slope_y == 0.0:
             return level
-        qx, qy, qz, qw = (float(v) for v in (self._lean(paper) * Rotation.from_quat(level.quaternion)).as_quat())
-        return Pose(base_x, base_y, z_mm, qx, qy, qz, qw)
+        return Pose(base_x, base_y, z_mm, *product(self._lean(paper), level.quaternion))
 
     def frame(self, paper: PaperConfig) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
         """Origin in mm and quaternion (x, y, z, w) of the paper frame in the base frame: yaw, then the lean."""
-        yaw = Rotation.from_euler("z", paper.yaw_deg, degrees=True)
-        qx, qy, qz, qw = (float(v) for v in (self._lean(paper) * yaw).as_quat())
-        return (*paper.origin_mm, self.z0_mm), (qx, qy, qz, qw)
+        return (*paper.origin_mm, self.z0_mm), product(self._lean(paper), _yaw(paper))
 
-    def _lean(self, paper: PaperConfig) -> Rotation:
+    def _lean(self, paper: PaperConfig) -> Quaternion:
         """The shortest turn that brings the base's z to the paper's normal."""
-        normal = Rotation.from_euler("z", paper.yaw_deg, degrees=True).apply(self.normal)
-        lean, _ = Rotation.align_vectors([normal], [[0.0, 0.0, 1.0]])
-        return lean
+        nx, ny, nz = turned(_yaw(paper), self.normal)
+        return unit((-ny, nx, 0.0, 1.0 + nz))  # z x n and 1 + z n: half of the angle between them
+
+
+def _yaw(paper: PaperConfig) -> Quaternion:
+    return of_angles(0.0, 0.0, math.radians(paper.yaw_deg))
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from collect.rig.config_devices import RobotConfig
 from drivers.geometry import brush_pose, from_wire
+from drivers.rotation import inverse, product, turned
 from drivers.samples import Pose
 
 SHOULDER_MM = 122.0
@@ -40,9 +40,9 @@ def tool_of(robot: RobotConfig) -> Pose:
 
 def _wrist_and_axis(tip: Pose, tool: Pose) -> tuple[Vector, Vector]:
     """(where the wrist's last two axes meet in mm, direction of the flange's axis) in the base frame."""
-    flange = Rotation.from_quat(tip.quaternion) * Rotation.from_quat(tool.quaternion).inv()
-    along: Vector = flange.apply([0.0, 0.0, 1.0])
-    return np.array(tip.position_mm) - flange.apply(tool.position_mm) - FLANGE_MM * along, along
+    flange = product(tip.quaternion, inverse(tool.quaternion))
+    along = np.array(turned(flange, (0.0, 0.0, 1.0)))
+    return np.array(tip.position_mm) - turned(flange, tool.position_mm) - FLANGE_MM * along, along
 
 
 def reach_left_mm(tip: Pose, tool: Pose) -> float:
