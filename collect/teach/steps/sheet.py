@@ -50,7 +50,7 @@ class SheetStep:
                         await day.touch(reader, Target(kind, number, corner), how, f"{kind} {number} {corner}")
                     if kind == BOARD:
                         with day.touched_again_if_refused(BOARD):
-                            check_board(corners(day.notebook, BOARD), board_of(day.notebook))
+                            check_board(all_corners(day.notebook, BOARD, "board"), board_of(day.notebook))
                 with day.touched_again_if_refused(SHEET):
                     fit = fitted(day.notebook)
                 await day.say(*in_words(fit))
@@ -129,18 +129,22 @@ def corners(notebook: Notebook, kind: str) -> dict[str, list[Point]]:
     return dict(found)
 
 
-def fitted(notebook: Notebook) -> SheetFit:
-    """The sheet from everything touched so far. Raises `CannotTeach` where a corner was skipped."""
-    board, sheet = corners(notebook, BOARD), corners(notebook, SHEET)
-    missing = [
-        f"{thing} {name}" for thing, of in (("board", board), ("sheet", sheet)) for name in CORNERS if name not in of
-    ]
+def all_corners(notebook: Notebook, kind: str, thing: str) -> dict[str, list[Point]]:
+    """As `corners`. Raises `CannotTeach` where a corner was skipped."""
+    found = corners(notebook, kind)
+    missing = [f"{thing} {name}" for name in CORNERS if name not in found]
     if missing:
         raise CannotTeach(
             f"not touched: {', '.join(missing)}.",
             "All four corners of both are needed. What the arm does not reach by hand is out of its reach: move the "
             "board with the sheet nearer to it, and touch all corners again.",
         )
+    return found
+
+
+def fitted(notebook: Notebook) -> SheetFit:
+    """The sheet from everything touched so far. Raises `CannotTeach` where a corner was skipped."""
+    board, sheet = all_corners(notebook, BOARD, "board"), all_corners(notebook, SHEET, "sheet")
     return fit_sheet(board, sheet, board_of(notebook))
 
 
