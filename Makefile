@@ -22,7 +22,7 @@ $(STAMP)-dev: requirements/run.lock requirements/dev.lock requirements/install.p
 	$(BIN)/python requirements/install.py dev --torch $(TORCH)
 	@touch $(STAMP) $@
 
-demo: $(STAMP)  ## collect, calibrate and validate a short session on the loopback rig
+demo: $(STAMP)  ## press, calibrate, press again and validate on the loopback rig; `brushloop demo --full` does more
 	$(BIN)/brushloop demo
 
 test: $(STAMP)-dev  ## lint, layers, types, and the tests; types are checked beside the tests

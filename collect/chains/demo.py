@@ -53,7 +53,7 @@ SESSION_S = 8.0
 """A collection without its strokes: start, camera delay, board, merge."""
 STROKE_S, MOTION_S, WRITING_MOTION_S = 0.6, 20.0, 150.0
 """A stroke without its motion; the motion of a press and of a written character, in simulated seconds."""
-COMMAND_S, FIT_CELL_S, VALIDATE_CELL_S = 2.0, 0.6, 0.6
+COMMAND_S, FIT_CELL_S, VALIDATE_CELL_S = 2.0, 0.4, 0.4
 """A command that only computes; fit and validation of one cell of the grid."""
 
 
@@ -139,6 +139,7 @@ class Demo:
             self._session = session
             return
         earlier = self._sessions.is_dir() and any(self._sessions.iterdir()) and not open_sessions(self._sessions)
+        say("the loopback rig starts in the background; its log is rig.log")
         if earlier:
             self._rig.start()
         else:
