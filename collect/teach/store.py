@@ -91,6 +91,10 @@ class Notebook(Config):
         done = {name: at for name, at in self.done.items() if name not in reopens}
         return self.model_copy(update={"done": {**done, step: now_utc()}})
 
+    def reopened(self, step: StepName) -> Notebook:
+        """The same with this step to be done again."""
+        return self.model_copy(update={"done": {name: at for name, at in self.done.items() if name != step}})
+
     def get(self, field: str) -> Value | None:
         """The value of a field; None where it was not taught."""
         taught = self.values.get(field)

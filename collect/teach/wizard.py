@@ -54,7 +54,7 @@ class Wizard:
                 f"`{name}` rests on {', '.join(missing)}, not taught yet: `brushloop rig new` goes on from there"
             )
         if name in self._day.notebook.done:
-            self._day.save(step.forget(self._day.notebook))
+            self._day.save(step.forget(self._day.notebook).reopened(step.name))
         await self._taught(step)
         rest = [one.name for one in self._steps if one.name not in self._day.notebook.done]
         if rest and rest != ["proof"]:

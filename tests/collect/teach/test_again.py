@@ -1,0 +1,42 @@
+"""A step that is taught again, and what becomes of it if the person leaves off in the middle."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from collect.errors import CollectAborted
+from collect.teach.day import Day
+from collect.teach.guide import LeftOff, Shown, StepState
+from collect.teach.steps.camera import CameraStep
+from collect.teach.store import Notebook, Taught, TaughtFile, now_utc
+from collect.teach.wizard import Wizard
+from drivers.clock import HostClock
+
+
+class Leaving:
+    """A person who leaves at the first question."""
+
+    async def overview(self, steps: tuple[StepState, ...]) -> None:
+        pass
+
+    async def show(self, what: Shown) -> None:
+        pass
+
+    async def number(self, *_: object) -> float:
+        raise LeftOff
+
+
+async def test_a_step_that_is_taught_again_stays_open_until_it_is_done(tmp_path: Path) -> None:
+    values = {
+        "camera.source": Taught(value="http://192.0.2.8/", how="typed", at=now_utc(), step="camera"),
+        "aside.frame_rate_hz": Taught(value=10.0, how="counted", at=now_utc(), step="camera"),
+    }
+    taught = Notebook().with_values(values).finished("arm").finished("camera")
+    TaughtFile(tmp_path / "rig.toml").save(taught)
+    day = Day(Leaving(), tmp_path / "rig.toml", HostClock(), armed=False)  # type: ignore[arg-type]
+    with pytest.raises(CollectAborted):
+        await Wizard(day, (CameraStep(),)).again("camera")
+    assert set(day.notebook.done) == {"arm"}
+    assert day.notebook.values == {}
