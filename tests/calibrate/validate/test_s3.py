@@ -6,6 +6,7 @@ import hashlib
 import re
 import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,9 +23,9 @@ from sessions.recording.schemas import Stroke
 if TYPE_CHECKING:
     from conftest import Photographed
 
-s3fs = pytest.importorskip("s3fs", reason="needs the extra [s3]")
-server = pytest.importorskip("moto.server", reason="needs moto")
-boto3 = pytest.importorskip("boto3")
+NEEDED = ("s3fs", "moto", "boto3")
+# Looked for and not imported: every worker collects this file, and one of them runs it.
+pytestmark = pytest.mark.skipif(not all(map(find_spec, NEEDED)), reason="needs the extra [s3], and moto")
 
 PRESSED = ((11.0, 0.0), (13.0, 5.0))
 
@@ -53,7 +54,9 @@ def calibrated(photographed: Photographed, tmp_path_factory: pytest.TempPathFact
 
 @pytest.fixture(scope="module")
 def endpoint() -> Iterator[str]:
-    running = server.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    from moto.server import ThreadedMotoServer
+
+    running = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     running.start()
     host, port = running.get_host_and_port()
     yield f"http://{host}:{port}"
@@ -71,12 +74,16 @@ def account(endpoint: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> I
     monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "none"))
     monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
     yield
+    import s3fs
+
     s3fs.S3FileSystem.clear_instance_cache()
 
 
 @pytest.fixture
 def bucket(account: None, endpoint: str, calibrated: Path) -> Iterator[Any]:
     """`s3://lab/grid-01`: the recording, its checksum beside, its calibration."""
+    import boto3
+
     client = boto3.client("s3")
     client.create_bucket(Bucket="lab")
     data = (calibrated / "grid-01.mcap").read_bytes()
