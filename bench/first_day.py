@@ -27,8 +27,8 @@ from collect.tui.teach_guide import Question, ScreenGuide
 from drivers.clock import HostClock
 from drivers.sim.lab.lab import UnknownLab
 
-SIZE = (100, 30)
-RATE = 8.0
+SIZE = (120, 34)
+RATE = 4.0
 WAIT_S = 420.0
 """Longest time between two questions: the proof's runs have no question."""
 PICTURES = {
@@ -156,6 +156,8 @@ async def _day(lab: UnknownLab, loop: asyncio.AbstractEventLoop, out: Path) -> i
     async with app.run_test(size=SIZE) as pilot:
         person = _Person(app, pilot, lab, loop)
         while (question := await person.question()) is not None:
+            if question.text.startswith("How to go on"):
+                raise RuntimeError("\n".join(app.teaching.guide.view.findings[-1].lines))
             words = question.text.lower()
             for name in (name for part, name in PICTURES.items() if part in words and name not in taken):
                 taken.add(name)

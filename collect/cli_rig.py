@@ -122,8 +122,10 @@ def check(rig: RigFile, as_json: Json = False) -> None:
 
     from collect.rig.check import check_page, check_rig, contradictions
     from collect.rig.config import load_rig
+    from collect.teach.doubts import gaps
+    from collect.teach.store import TaughtFile
 
-    checks = check_rig(load_rig(rig))
+    checks = [*check_rig(load_rig(rig)), *gaps(TaughtFile(rig).load())]
     if as_json:
         say(json.dumps({"contradictions": contradictions(checks), "checks": [c.as_json() for c in checks]}))
     else:

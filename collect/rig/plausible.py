@@ -80,7 +80,7 @@ def brush_square(rotation_deg: tuple[float, float, float]) -> Check:
 def brush_shorter_than_tool(offset_mm: tuple[float, float, float], length_mm: float) -> Check:
     """The hair of the brush is a part of the tool."""
     remedy = "The hair is longer than the whole tool: measure brush.length_mm, or teach the tip."
-    return within("hair of the brush", length_mm, 5.0, math.hypot(*offset_mm), "mm", remedy)
+    return within("hair of the brush", length_mm, 5.0, round(math.hypot(*offset_mm), 1), "mm", remedy)
 
 
 def deepest_press(max_depth_mm: float, length_mm: float) -> Check:
@@ -91,8 +91,9 @@ def deepest_press(max_depth_mm: float, length_mm: float) -> Check:
 
 def payload(kg: float | None) -> Check:
     """Mass at the flange, which the controller's collision detection relies on."""
-    if kg is None:
-        return unmeasured("payload", "the pendant's", "Weigh holder, brush and sensor: robot.payload_kg.")
+    if not kg:
+        value = "the pendant's" if kg is None else "0 kg: never set"
+        return unmeasured("payload", value, "Weigh holder, brush and sensor: robot.payload_kg.")
     return within("payload", kg, 0.05, 5.0, "kg", "Weigh holder, brush and sensor; an i5 carries 5 kg.")
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import Field, ValidationError
 
@@ -27,6 +27,7 @@ FieldName = Annotated[str, Field(min_length=3, max_length=100, pattern=r"^[a-z0-
 ThingName = Annotated[str, Field(max_length=60)]
 StepName = Literal["arm", "camera", "tip", "sheet", "places", "brush", "force", "limits", "proof"]
 """In the order in which they are taught: the box of the limits needs the deepest press."""
+STEPS: tuple[StepName, ...] = get_args(StepName)
 
 
 class Taught(Config):

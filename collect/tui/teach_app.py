@@ -18,7 +18,7 @@ from collect.headless import REFRESH_S, stop_signals
 from collect.tui.pictures import Pictures
 from collect.tui.question_screens import Confirm
 from collect.tui.teach_guide import ScreenGuide, Teaching
-from collect.tui.teach_screen import TeachScreen
+from collect.tui.teach_screen import GO_ON, LEAVE, TeachScreen
 from collect.tui.terminal import PlainApp, TerminalDriver
 from collect.tui.text import SOFTWARE_STOP
 
@@ -152,7 +152,8 @@ class TeachApp(PlainApp):
                 self.exit()
                 return
             over = describe(error) + "\nq  leave" if error is not None else STOPPED if self.teaching.stopped else DONE
-        self._screen.show(self.teaching.guide.view, over)
+        keys = GO_ON if over == STOPPED else LEAVE
+        self._screen.show(self.teaching.guide.view, over, keys)
 
 
 def run_teaching(work: Work, name: str, pictures: Pictures | None = None) -> Path | None:

@@ -48,7 +48,8 @@ KEYS: dict[str, tuple[Key, ...]] = {
     ),
     "busy": (("s", "STOP"), *BASE_KEYS),
 }
-OVER_KEYS: tuple[Key, ...] = (("g", "go on"), ("q", "leave"))
+LEAVE: tuple[Key, ...] = (("q", "leave"),)
+GO_ON: tuple[Key, ...] = (("g", "go on"), *LEAVE)
 
 
 class TeachScreen(Screen[None]):
@@ -134,8 +135,8 @@ class TeachScreen(Screen[None]):
         """Show at once that a stop key was pressed."""
         self._note.show(Content.styled(" STOP SENT ", "bold reverse"))
 
-    def show(self, now: TeachView, over: str = "") -> None:
-        """Draw what differs. `over` says how it ended, once it has."""
+    def show(self, now: TeachView, over: str = "", keys: tuple[Key, ...] = ()) -> None:
+        """Draw what differs. `over` says how it ended, once it has, and `keys` what can be done then."""
         before, self._drawn = self._drawn, now
         self._title.show(f"First day   {one_line(self._name)}{_where(now.steps)}")
         self._steps.show(_steps_content(now.steps, summaries=self.size.height >= HIGH_ROWS))
@@ -145,13 +146,13 @@ class TeachScreen(Screen[None]):
             self._found.show(Content("\n").join(_finding(shown) for shown in now.findings))
         if before is None or before.question != now.question or over != self._over:
             self._over = over
-            self._ask(now.question, over)
+            self._ask(now.question, over, keys)
         if before is None or before.findings is not now.findings or before.question is not now.question:
             # Only after the layout is it known where the end is: the question takes its room from the findings.
             found = self.query_one("#teach-found", VerticalScroll)
             self.call_after_refresh(found.scroll_end, animate=False)
 
-    def _ask(self, question: Question | None, over: str) -> None:
+    def _ask(self, question: Question | None, over: str, keys: tuple[Key, ...]) -> None:
         """Show a question, or that something is at work, or that it is over."""
         self._question = question
         self.set_class(question is not None or bool(over), "-asking")
@@ -159,7 +160,7 @@ class TeachScreen(Screen[None]):
         if question is None:
             self.set_focus(None)
             self._asked.show(over)
-            self._keys.show(OVER_KEYS if over else KEYS["busy"])
+            self._keys.show(keys if over else KEYS["busy"])
             self._note.show("" if over else f"at work; {SHORT_STOP}")
             return
         self._asked.show(_question_content(question, self._step_mm))

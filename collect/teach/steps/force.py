@@ -30,6 +30,7 @@ STRAIGHT = 0.8
 """Least share of the push along the sensor's z."""
 LEAN_ROOM_DEG = 0.3
 """Room for another sheet on the same table."""
+LOOPBACK_STALE_MS = 1000.0
 INSET_MM = 6.0
 """Distance of the touch points from the sheet's edges: in its margin, where they cost no cell."""
 
@@ -49,6 +50,9 @@ class ForceStep:
             bus = (await day.guide.text(question, "")).strip()
             for field, value in _addressed(bus).items():
                 day.keep("force", f"force.{field}", value, "typed")
+            if day.notebook.get("force.channel") == LOOPBACK_CHANNEL:
+                how = "simulated time may run faster than rounds arrive: allowed on the loopback rig's bus alone"
+                day.keep("force", "force.stale_ms", LOOPBACK_STALE_MS, how, unit="ms")
             day.keep("force", "aside.bus", bus, "typed")
         if not day.notebook.get("aside.bus"):
             await day.say(

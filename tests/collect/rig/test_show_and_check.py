@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import pytest
 
+from collect.teach.store import Notebook, Taught, TaughtFile, now_utc
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml
 from tests.command import brushloop
@@ -106,3 +107,13 @@ def test_a_picture_has_the_format_of_its_ending(rig: Path, tmp_path: Path) -> No
     refused = brushloop("rig", "show", rig, "--picture", tmp_path / "rig.gif")
     assert refused.returncode == 2
     assert "must end in" in refused.stderr
+
+
+def test_what_was_taught_says_what_was_never_measured(rig: Path) -> None:
+    mass = Taught(value=0.0, unit="kg", how="as set on the pendant", known="not weighed", at=now_utc(), step="arm")
+    TaughtFile(rig).save(Notebook().with_values({"robot.payload_kg": mass}).finished("arm"))
+    checks = {check["name"]: check for check in json.loads(brushloop("rig", "check", rig, "--json").stdout)["checks"]}
+    assert checks["robot.payload_kg"]["remedy"] == "as set on the pendant, not weighed"
+    assert checks["step proof"]["remedy"] == "brushloop rig teach proof --arm"
+    assert checks["step proof"]["verdict"] == "not measured"
+    assert "step arm" not in checks
