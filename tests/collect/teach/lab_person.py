@@ -109,7 +109,8 @@ class LabPerson:
         if "arm moves by itself" in question:
             return "a"
         if question.startswith("What keeps the ink well filled"):
-            return "p" if self.lab.find("ink .*modbus") else "s" if self.lab.find("ink .*station") else "n"
+            device = next((kind for kind in ("pump", "station") if self.lab.find(f"^ink .*{kind} on")), "by hand")
+            return next(choice.key for choice in choices if device in choice.label)
         if question.startswith("Is there a pot of water"):
             return "y"
         return default
