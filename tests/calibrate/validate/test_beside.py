@@ -231,7 +231,10 @@ def test_table_3_has_the_papers_rows_beside_and_figure_13(lab: Path, place: Path
     assert {row["source"] for row in rows} == {"imported photographs"}
     page = (folder / "report.html").read_text()
     assert page.count("Figure 13") >= 2
-    assert all(src.startswith("data:image/png;base64,") for src in re.findall(r'src="([^"]*)"', page))
+    assert all(
+        src.startswith(("data:image/png;base64,", "data:image/svg+xml;base64,"))
+        for src in re.findall(r'src="([^"]*)"', page)
+    )
 
     invoke(place)
     assert not (folder / "table3.csv").exists()
