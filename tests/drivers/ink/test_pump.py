@@ -25,7 +25,8 @@ from drivers.sim.faults.kinds import InkFault
 from drivers.sim.instruments.ink_station import PtyLine
 from drivers.sim.instruments.modbus_pump import PumpFirmware
 
-TIMEOUT_S = 0.08
+TIMEOUT_S = 0.3
+"""Long enough for a busy machine to answer where an answer comes."""
 ML_PER_REV = 0.12  # at 50 rpm: 0.1 ml/s
 PROBE = bytes.fromhex("01 06 00 04 00 00 37 F4")  # a stop with a wrong CRC
 STOP = bytes.fromhex("01 06 00 04 00 00 C8 0B")
@@ -83,7 +84,7 @@ async def test_a_line_that_echoes_is_refused(expected_protocol):
 
 async def test_where_no_pump_answers_nothing_stays_open(expected_protocol):
     with expected_protocol([(PROBE, b""), (STOP, b""), (STOP, b""), (STOP, b"")]) as path:
-        pump = pump_at(path, timeout_s=0.05)
+        pump = pump_at(path)
         with pytest.raises(DeviceTimeout, match="stop"):
             await pump.connect()
         with pytest.raises(NotConnected):
@@ -112,7 +113,7 @@ async def test_a_start_without_a_reply_is_stopped(expected_protocol):
 async def test_a_stop_without_a_reply_is_sent_three_times_and_closing_tries_again(expected_protocol):
     silent = (STOP, b"")
     with expected_protocol([*HELLO, (SPEED, SPEED), (START, START), *[silent] * 3, *[silent] * 3]) as path:
-        pump = pump_at(path, timeout_s=0.05)
+        pump = pump_at(path)
         await pump.connect()
         with pytest.raises(DeviceTimeout, match="may still be running"):
             await pump.dose(0.01)

@@ -24,7 +24,8 @@ from drivers.protocols import Ink
 from drivers.sim.faults.kinds import InkFault
 from drivers.sim.instruments.ink_station import PtyLine, StationFirmware
 
-TIMEOUT_S = 0.07
+TIMEOUT_S = 0.3
+"""Long enough for a busy machine to answer where an answer comes."""
 HELLO = (b"000 identify*6A60\n", b"000 ok ink-station 1 1.0.0 real*8310\n")
 
 

