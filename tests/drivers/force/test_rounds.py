@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from drivers.force.rounds import RoundAssembler, Wrench, encode_round
 
-THOROUGH = settings(max_examples=2000, deadline=None)
+THOROUGH = settings(max_examples=10 * settings.default.max_examples, deadline=None)
 SOME = settings(max_examples=100, deadline=None)
 WRENCH: Wrench = (1.0, -2.0, 3.5, 0.25, -0.5, 0.125)
 FLOATS = st.floats(-100.0, 100.0, width=32)

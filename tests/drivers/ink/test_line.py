@@ -13,7 +13,7 @@ from drivers.ink.station import MAX_LINE_BYTES, Line, Reply, find_reply, number_
 from drivers.sim.instruments.ink_station import StationFirmware
 
 DOC = Path(__file__).parents[3] / "docs" / "ink-station.md"
-THOROUGH = settings(max_examples=2000, deadline=None)
+THOROUGH = settings(max_examples=10 * settings.default.max_examples, deadline=None)
 SOME = settings(max_examples=100, deadline=None)
 TEXTS = st.text(st.characters(min_codepoint=32, max_codepoint=126, exclude_characters="*"), max_size=60)
 NUMBERS = st.integers(0, 999)

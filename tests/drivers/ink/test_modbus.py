@@ -8,7 +8,7 @@ from drivers.errors import ProtocolViolation
 from drivers.ink.modbus import exception, find_reply, read_write, seal, unseal, write_register
 from drivers.sim.instruments.modbus_pump import PumpFirmware
 
-THOROUGH = settings(max_examples=2000, deadline=None)
+THOROUGH = settings(max_examples=10 * settings.default.max_examples, deadline=None)
 SOME = settings(max_examples=100, deadline=None)
 WORDS = st.integers(0, 0xFFFF)
 START = write_register(1, 4, 1)
