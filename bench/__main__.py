@@ -9,6 +9,7 @@ import argparse
 import sys
 
 from bench import (
+    analysis,
     brushfit,
     curves,
     generator,
@@ -34,6 +35,7 @@ from bench.harness import Bench, BenchError, results_of
 def benches() -> dict[str, Bench]:
     """Every benchmark by name; a new one is added here."""
     return {
+        "analysis": analysis.run,
         "brushfit": brushfit.run,
         "curves": curves.run,
         "generator": generator.run,

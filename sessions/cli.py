@@ -72,9 +72,11 @@ def verify(session: Session) -> None:
 
     Exit code 0: everything is intact. 6: something is damaged, and is named.
     """
+    from sessions.progress import shown
     from sessions.repair.verify import verify_session
 
-    verdict = verify_session(session)
+    with shown() as progress:
+        verdict = verify_session(session, progress)
     for finding in verdict.findings:
         say(f"damaged: {finding.file}: {finding.what}")
     for note in verdict.notes:
@@ -132,8 +134,12 @@ def _import(
     import time
     from importlib.metadata import version
 
+    from sessions.progress import shown
+
     target = out or Path("sessions") / folder.resolve().name
-    path = run(folder, table, target, options, f"brushloop {version('brushloop')}", time.time_ns, *more)
+    with shown() as progress:
+        software = f"brushloop {version('brushloop')}"
+        path = run(folder, table, target, options, software, time.time_ns, *more, progress=progress)
     say(f"Imported into {path}")
 
 
@@ -217,8 +223,11 @@ def merge(
     The camera must not have been moved between them: the merged file is calibrated as one.
     """
     from sessions.merge import merge_recordings
+    from sessions.progress import shown
 
-    say(f"Merged into {merge_recordings(parts, out)}")
+    with shown() as progress:
+        merged = merge_recordings(parts, out, progress)
+    say(f"Merged into {merged}")
 
 
 @app.command()
@@ -229,5 +238,8 @@ def export(
 ) -> None:
     """Export strokes and poses: images with CSV, NumPy arrays, or Parquet that Hugging Face `datasets` loads."""
     from sessions.export.export import export as write
+    from sessions.progress import shown
 
-    say(f"Exported into {write(session, out, kind)}")
+    with shown() as progress:
+        folder = write(session, out, kind, progress)
+    say(f"Exported into {folder}")

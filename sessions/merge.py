@@ -13,6 +13,7 @@ from sessions.errors import InputError, SessionDamaged, disk_error
 from sessions.journal.codec import Line
 from sessions.journal.journal import Replay
 from sessions.names import SESSION_ID, SNAPSHOT_NAMES
+from sessions.progress import Progress, counted, unseen
 from sessions.reader import Recording
 from sessions.recording import container
 from sessions.recording.container import Record
@@ -69,7 +70,7 @@ def merge_session(folder: Path, state: Replay, header: Header, tag: str = "super
     return final
 
 
-def merge_recordings(sources: list[Path], out: Path) -> Path:
+def merge_recordings(sources: list[Path], out: Path, progress: Progress = unseen) -> Path:
     """Merge session folders or MCAP files into `out` (a new .mcap file), read it back, and return it.
 
     It holds every message of every part, in the order of the parts; strokes are named `<session>/<stroke>` if the
@@ -94,7 +95,7 @@ def merge_recordings(sources: list[Path], out: Path) -> Path:
         part.unlink(missing_ok=True)  # left by a killed merge: only a copy
         notes = {PARTS_NOTE: {"parts": [_provenance(one) for one in parts]}}
         with new_mcap(part, header, notes, attachments) as copy:
-            for one in parts:
+            for one in counted(parts, "recordings merged", len(parts), progress):
                 for record in _renumbered(one):
                     copy.add(*record)
         if count_messages(part) != dict(copy.counts):

@@ -26,6 +26,7 @@ from calibrate.stroke.params import PX_PER_MM, Params
 from calibrate.stroke.preprocess import prepare
 from calibrate.stroke.rectify import on_raster, rectify_by, rescale
 from sessions.errors import SessionDamaged
+from sessions.progress import Progress, counted, unseen
 from sessions.reader import Capture, Recording
 from sessions.recording.schemas import Header, Stroke
 
@@ -62,7 +63,9 @@ class Drawn:
         return float(self.x_mm[1] - self.x_mm[0])
 
 
-def read_drags(session: Path, mm_per_px: float, calibration_path: Path | None = None) -> Drawn:
+def read_drags(
+    session: Path, mm_per_px: float, calibration_path: Path | None = None, progress: Progress = unseen
+) -> Drawn:
     """Read every usable drag or drawn figure. Raises `CalibrationError` if a session holds none."""
     recording = Recording(session)
     digest, strokes = recording.sha256, list(recording.stroke_records())
@@ -76,7 +79,7 @@ def read_drags(session: Path, mm_per_px: float, calibration_path: Path | None = 
     images: list[NDArray[np.float32]] = []
     names: list[str] = []
     refused: list[tuple[str, str]] = []
-    for capture in recording.captures():
+    for capture in counted(recording.captures(), "drags read", len(strokes), progress):
         name = capture.stroke.stroke_id
         try:
             if calibration is not None:

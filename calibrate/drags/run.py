@@ -16,6 +16,7 @@ from calibrate.drags.captures import Drawn
 from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, DragFit, bootstrap, chance, fit_drags
 from calibrate.errors import CalibrationError
 from model.drag import DragModel
+from sessions.progress import Progress, counted, unseen
 
 FOLDER = "dragfit"
 SCHEMA_VERSION = 1
@@ -76,7 +77,7 @@ class FittedDrags:
     artefact: DragArtefact
 
 
-def fit_drawn(drawn: Drawn) -> FittedDrags:
+def fit_drawn(drawn: Drawn, progress: Progress = unseen) -> FittedDrags:
     """Fit all images, leave out each fifth of them in turn, and make the artefact.
 
     Raises `CalibrationError` for fewer than three images.
@@ -100,7 +101,7 @@ def fit_drawn(drawn: Drawn) -> FittedDrags:
         spread_mm=fit.spread_mm,
         parameters={n: FittedValue(value=float(v), low=float(a), high=float(b)) for n, v, a, b in values},
         condition=fit.condition,
-        held_out=_held_out(drawn) if len(drawn.ink) >= FOLDS else {},
+        held_out=_held_out(drawn, progress) if len(drawn.ink) >= FOLDS else {},
     )
     return FittedDrags(fit, artefact)
 
@@ -120,10 +121,10 @@ def _fit(drawn: Drawn, images: NDArray[np.int64], *, lag: bool) -> DragFit:
     return fit_drags(paths, drawn.ink[images], drawn.x_mm, drawn.y_mm, lag=lag, groups=groups)
 
 
-def _held_out(drawn: Drawn) -> dict[str, DragScore]:
+def _held_out(drawn: Drawn, progress: Progress) -> dict[str, DragScore]:
     order = np.random.default_rng(0).permutation(len(drawn.ink))
     scores: dict[str, list[tuple[float, float]]] = {LAGGING: [], STAMPS: []}
-    for k in range(FOLDS):
+    for k in counted(range(FOLDS), "fifths left out in turn", FOLDS, progress):
         left, others = order[k::FOLDS], np.sort(np.setdiff1d(order, order[k::FOLDS]))
         for name, lag in ((LAGGING, True), (STAMPS, False)):
             fit = _fit(drawn, others, lag=lag)

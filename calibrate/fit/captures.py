@@ -16,6 +16,7 @@ from calibrate.fit.fit import Grid, Pressed
 from calibrate.session import calibration_of
 from calibrate.stroke.params import Params
 from sessions.errors import SessionDamaged
+from sessions.progress import Progress, counted, unseen
 from sessions.reader import Recording
 from sessions.recording.schemas import Header
 
@@ -47,7 +48,9 @@ def grid_of(view: Field) -> Grid:
     return Grid(np.asarray(centres - left), np.asarray(top - centres))
 
 
-def read_presses(session: Path, view: Field, calibration_path: Path | None = None) -> Captures:
+def read_presses(
+    session: Path, view: Field, calibration_path: Path | None = None, progress: Progress = unseen
+) -> Captures:
     """Read every usable press of a session. Raises `CalibrationError` where it holds none, or was not calibrated."""
     recording = Recording(session)
     digest = recording.sha256
@@ -59,7 +62,7 @@ def read_presses(session: Path, view: Field, calibration_path: Path | None = Non
     pressed: list[Pressed] = []
     names: list[str] = []
     refused: list[tuple[str, str]] = []
-    for capture in recording.captures():
+    for capture in counted(recording.captures(), "presses read", len(strokes), progress):
         stroke = capture.stroke
         try:
             prepared = prepare_press(capture, calibration, params, view)

@@ -46,12 +46,14 @@ def fit(
     from calibrate.fit.captures import read_presses
     from calibrate.fit.run import correction as corrected
     from calibrate.fit.run import fit_session, save
+    from sessions.progress import shown
     from sessions.reader import Recording
 
     before = load_artefact(reference, BrushFit) if reference is not None else None
     view = Field(mm_per_px=mm_per_px or MM_PER_PX)
-    captures = read_presses(session, view, calibration)
-    fitted = fit_session(captures, view)
+    with shown() as progress:
+        captures = read_presses(session, view, calibration, progress)
+        fitted = fit_session(captures, view, progress)
     path = save(fitted, Recording(session).path.parent)
     say(*_tables(captures, fitted))
     if correction:
@@ -65,10 +67,12 @@ def _fit_drags(session: Path, mm_per_px: float, calibration: Path | None) -> Non
     from calibrate.drags.captures import read_drags
     from calibrate.drags.run import fit_drawn, save
     from calibrate.report import source_note
+    from sessions.progress import shown
     from sessions.reader import Recording
 
-    drawn = read_drags(session, mm_per_px, calibration)
-    fitted = fit_drawn(drawn)
+    with shown() as progress:
+        drawn = read_drags(session, mm_per_px, calibration, progress)
+        fitted = fit_drawn(drawn, progress)
     artefact = fitted.artefact
     say(
         f"{source_note(drawn.header.source)}; {artefact.strokes} dragged strokes in {artefact.images} images; "

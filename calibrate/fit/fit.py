@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.fitted import MODES, NAMES, PARAMETERS, FittedPress, chance_within, command_terms, modes
+from sessions.progress import Progress, counted, unseen
 
 Floats = NDArray[np.float64]
 
@@ -89,6 +90,7 @@ def fit_presses(
     *,
     edges: bool = True,
     stages: Sequence[tuple[str, tuple[str, ...]]] = STAGES,
+    progress: Progress = unseen,
 ) -> Fit:
     """Fit all stages that the strokes determine, then the edges. Raises ValueError without a stroke."""
     if not strokes:
@@ -96,7 +98,7 @@ def fit_presses(
     press = FittedPress(radius_mm, length_mm)
     free: tuple[str, ...] = ()
     made: list[Stage] = []
-    for name, parameters in stages:
+    for name, parameters in counted(stages, "stages fitted", len(stages), progress):
         wanted = (*free, *parameters)
         # Judged at the end of the stage's fit, as the published start is far from any brush.
         fitted = _minimise(press, wanted, strokes, grid)

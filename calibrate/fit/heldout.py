@@ -15,6 +15,7 @@ from calibrate.fit.fit import SPREAD_MM, Fit, Grid, Pressed, refit
 from model.fitted import FittedPress
 from model.loops import BEZIER_PIECES, Loop, bezier_side, closed
 from model.plane import Plane, fit_plane
+from sessions.progress import Progress, counted, unseen
 
 BEZIER_SIZES = ("left_mm", "right_mm", "belly_mm", "shoulder")
 Cell = tuple[float, float]
@@ -46,7 +47,7 @@ def predictor(press: FittedPress, grid: Grid) -> Predict:
     return lambda height, tilt: press.chance(height, tilt, grid.x_mm, grid.y_mm, SPREAD_MM)
 
 
-def leave_cell_out(fit: Fit, strokes: Sequence[Pressed], grid: Grid) -> list[HeldOut]:
+def leave_cell_out(fit: Fit, strokes: Sequence[Pressed], grid: Grid, progress: Progress = unseen) -> list[HeldOut]:
     """Score each cell as predicted by fits to all other cells. Raises ValueError with fewer than two cells.
 
     Models without enough data are left out: a template needs three strokes of a cell, a regressed Bezier two depths
@@ -57,7 +58,7 @@ def leave_cell_out(fit: Fit, strokes: Sequence[Pressed], grid: Grid) -> list[Hel
         raise ValueError("leaving a cell out needs at least two cells")
     published = FittedPress(fit.press.radius_mm, fit.press.length_mm)
     scores: dict[str, list[tuple[float, float]]] = {}
-    for cell, held in cells.items():
+    for cell, held in counted(cells.items(), "cells left out in turn", len(cells), progress):
         others = [stroke for key, group in cells.items() if key != cell for stroke in group]
         images = {
             FITTED: predictor(refit(fit, others, grid).press, grid)(*cell),

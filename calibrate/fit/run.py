@@ -17,6 +17,7 @@ from calibrate.fit.captures import Captures
 from calibrate.fit.fit import STAGES, Fit, Grid, Pressed, bootstrap, fit_presses, zero_touch
 from calibrate.fit.heldout import HeldOut, by_cell, leave_cell_out
 from model.fitted import NAMES, FittedPress
+from sessions.progress import Progress, unseen
 
 NORMAL_95 = 1.96
 PROPORTIONAL = 3
@@ -47,20 +48,20 @@ class Fitted:
     """Empty with one cell only."""
 
 
-def fit_session(captures: Captures, view: Field) -> Fitted:
+def fit_session(captures: Captures, view: Field, progress: Progress = unseen) -> Fitted:
     """Fit, leave each cell out in turn, and make the artefact.
 
     Raises `CalibrationError` where the strokes determine no stage.
     """
     grid, strokes = captures.grid, captures.strokes
-    fit = fit_presses(strokes, grid, captures.radius_mm, captures.length_mm)
+    fit = fit_presses(strokes, grid, captures.radius_mm, captures.length_mm, progress=progress)
     if not fit.free:
         first = fit.stages[0]
         raise CalibrationError(
             captures.header.session_id,
             f"its strokes do not even tell scale and place (condition number {first.condition:.3g})",
         )
-    held_out = leave_cell_out(fit, strokes, grid) if len(by_cell(strokes)) > 1 else []
+    held_out = leave_cell_out(fit, strokes, grid, progress) if len(by_cell(strokes)) > 1 else []
     draws = bootstrap(_bare(fit.press), fit.free, fit.squares, fit.gradients)
     low, high = np.quantile(draws, [0.025, 0.975], axis=0)
     parameters = {name: FittedValue(value=v, low=None, high=None) for name, v in zip(NAMES, _floats(fit), strict=True)}

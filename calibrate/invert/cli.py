@@ -39,6 +39,7 @@ def invert(
     from calibrate.invert.files import write_inversion
     from calibrate.invert.invert import Settings, invert_recording, off_command
     from model.inversion.press import Range
+    from sessions.progress import shown
 
     check_target(out, ".csv")
     try:
@@ -65,7 +66,8 @@ def invert(
             raise CalibrationError("--height-range", f"ends before the fitted brush marks, at {least:.2f} mm")
         within = Range((least, within.height_mm[1]), within.tilt_deg)
     settings = Settings(model, fitted, lam, within, anchor_sd, assume_tilt, Field(mm_per_px=mm_per_px))
-    made = invert_recording(session, settings, calibration, presses)
+    with shown() as progress:
+        made = invert_recording(session, settings, calibration, presses, progress)
     protocol = write_inversion(made, out, repeats, seed)
     say(f"{made.header.session_id}: {len(made.rows)} presses recovered by {model} ({made.header.source})")
     for name, mean, sd, inside, n in off_command(made.rows):

@@ -29,6 +29,7 @@ from model.inversion.press import Flag, Inverter, Known, Range, Recovered
 from model.protocol import Basis, StrokeModel
 from model.registry import UnknownModelError, stroke_model
 from sessions.errors import SessionDamaged
+from sessions.progress import Progress, counted, unseen
 from sessions.reader import Capture, Recording
 from sessions.recording.schemas import Header, Stroke
 
@@ -93,7 +94,11 @@ class AlignedStroke:
 
 
 def invert_recording(
-    session: Path, settings: Settings, calibration_path: Path | None, presses: int | None = None
+    session: Path,
+    settings: Settings,
+    calibration_path: Path | None,
+    presses: int | None = None,
+    progress: Progress = unseen,
 ) -> Inversion:
     """Recover every press of a session, or `presses` of them, spread evenly over the order in which they were made.
 
@@ -111,7 +116,7 @@ def invert_recording(
     anchored, loose = _inverters(recording.header, settings)
     waiting: dict[bool, list[AlignedStroke]] = {True: [], False: []}
     chosen = {stroke.stroke_id for stroke in spread(strokes, presses)}
-    for capture in recording.captures():
+    for capture in counted(recording.captures(), "presses recovered", len(strokes), progress):
         if capture.stroke.stroke_id not in chosen:
             continue
         try:

@@ -6,6 +6,8 @@ import asyncio
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -85,9 +87,15 @@ class FinishScreen(ModalScreen[None]):
         if self._open or self._busy:
             return
         self._busy = True
-        self._said.show(f"$ brushloop {name} {self._folder}\n... may take a minute")
+        self._said.show(f"$ brushloop {name} {self._folder}\n... at work")
+
+        loop = asyncio.get_running_loop()
+
+        def told(line: str) -> None:
+            loop.call_soon_threadsafe(self._show_progress, name, line)
+
         try:
-            code, said = await asyncio.to_thread(run_command, name, self._folder)
+            code, said = await asyncio.to_thread(run_command, name, self._folder, told)
         finally:
             self._busy = False
         tail = "\n".join(plain(said).splitlines()[-MOST_LINES:])
@@ -95,6 +103,10 @@ class FinishScreen(ModalScreen[None]):
         self._said.show(f"$ brushloop {name} {self._folder}\n{tail}\n{sign}")
         # The last line names the report; what is above can be scrolled to.
         self.call_after_refresh(self.query_one(VerticalScroll).scroll_end, animate=False)
+
+    def _show_progress(self, name: str, line: str) -> None:
+        if self.is_attached and self._busy:
+            self._said.show(f"$ brushloop {name} {self._folder}\n... {plain(line)}")
 
     def _next_content(self) -> Content:
         if self._open:
@@ -118,15 +130,28 @@ def verify(folder: Path) -> Verdict:
     return verify_session(folder)
 
 
-def run_command(name: str, folder: Path) -> tuple[int, str]:
+def run_command(name: str, folder: Path, told: Callable[[str], None]) -> tuple[int, str]:
     """Run `brushloop NAME FOLDER` in a process of its own; it may take minutes.
 
-    Returns its exit code and its output, with its progress (stderr) only where it failed.
+    `told` gets each line of its progress (stderr). Returns its exit code and its output, with stderr where it failed.
     """
     command = [sys.executable, "-m", "brushloop", name, str(folder)]
     environment = os.environ | {"COLUMNS": str(COLUMNS)}
-    ran = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
-    return ran.returncode, (ran.stdout if ran.returncode == 0 else ran.stdout + ran.stderr).strip()
+    lines: list[str] = []
+    with (
+        subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+        ) as process,
+        ThreadPoolExecutor(1) as reader,
+    ):
+        assert process.stdout is not None
+        assert process.stderr is not None
+        output = reader.submit(process.stdout.read)
+        for line in process.stderr:
+            lines.append(line)
+            told(line.rstrip())
+        said = output.result()
+    return process.returncode, (said if process.returncode == 0 else said + "".join(lines)).strip()
 
 
 def verdict_content(verdict: Verdict) -> Content:

@@ -18,6 +18,7 @@ from sessions.disk import check_room, staged_folder, sync, write_durably
 from sessions.errors import InputError, disk_error
 from sessions.export.parquet import write_parquet
 from sessions.export.rows import TEXT_COLUMNS, Export, Row
+from sessions.progress import Progress, unseen
 from sessions.reader import Capture, Recording
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ DECODED_AHEAD = 2
 """Images that wait while one is packed."""
 
 
-def export(source: Path, out: Path, kind: str) -> Path:
+def export(source: Path, out: Path, kind: str, progress: Progress = unseen) -> Path:
     """Export a session into the new or empty folder `out` as `png`, `npz` or `parquet`.
 
     Raises `InputError` for an unknown format or a folder that is not empty, `SessionDamaged` for a recording that
@@ -51,7 +52,7 @@ def export(source: Path, out: Path, kind: str) -> Path:
         out.parent.mkdir(parents=True, exist_ok=True)
         check_room(out.parent, recording.path.stat().st_size)
         with staged_folder(out) as stage:
-            write(Export.of(recording), stage)
+            write(Export.of(recording, progress), stage)
     except OSError as error:
         raise disk_error(out, "cannot write", error) from error
     return out

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from sessions.errors import SessionDamaged
 from sessions.history import WAIT, unlike
+from sessions.progress import Progress, counted, unseen
 from sessions.reader import Capture, Recording
 from sessions.recording import container
 from sessions.recording.messages import PNG_START
@@ -51,18 +52,20 @@ class Export:
     """File name of each stroke's image, without a suffix; safe on any file system."""
     odd: frozenset[str] = frozenset()
     """Strokes whose wait between dip and touch differs from the others'."""
+    progress: Progress = unseen
 
     @classmethod
-    def of(cls, recording: Recording) -> Export:
+    def of(cls, recording: Recording, progress: Progress = unseen) -> Export:
         """Prepare the export of a recording. Raises `SessionDamaged` where a stroke appears twice."""
         strokes = list(recording.stroke_records())
         waits = {one.stroke_id: one.dip_to_touch_s for one in strokes}
         odd = frozenset(unlike({name: wait for name, wait in waits.items() if wait is not None}))
-        return cls(recording, _file_names(recording.path, strokes), odd)
+        return cls(recording, _file_names(recording.path, strokes), odd, progress)
 
     def captures(self) -> Iterator[tuple[Row, Capture]]:
         """Strokes as rows of plain values, None where a value is not recorded, with their photographs."""
-        for index, capture in enumerate(self.recording.captures()):
+        captures = counted(self.recording.captures(), "strokes exported", len(self.names), self.progress)
+        for index, capture in enumerate(captures):
             yield self._row(index, capture), capture
 
     def poses(self) -> Iterator[PoseRow]:

@@ -17,6 +17,7 @@ from sessions.disk import staged_folder
 from sessions.errors import InputError, SessionDamaged, in_one_line
 from sessions.imports.table import Row, parse_table, read_table, read_text
 from sessions.names import SESSION_ID
+from sessions.progress import Progress, counted, unseen
 from sessions.recording.messages import MAX_IMAGE_BYTES, PNG_START, decode_gray, encode_png, image_message
 from sessions.recording.schemas import Header, Source, Topic
 from sessions.recording.writer import Outgoing, SegmentWriter
@@ -53,13 +54,20 @@ class ImportOptions:
 
 
 def import_photographs(
-    folder: Path, table: Path, out: Path, options: ImportOptions, software: str, now_ns: Callable[[], int]
+    folder: Path,
+    table: Path,
+    out: Path,
+    options: ImportOptions,
+    software: str,
+    now_ns: Callable[[], int],
+    *,
+    progress: Progress = unseen,
 ) -> Path:
     """Import into the new session folder `out`; return its MCAP file. Raises `InputError`, leaving nothing behind."""
     check_target(folder, table, out, options)
     rows = read_table(folder, table, "press" if options.kind == "press" else "drag", options.px_per_mm)
     protocol = f"import of {len(rows)} {options.kind} strokes"
-    return store_rows(rows, folder, table, out, options, protocol, software, now_ns)
+    return store_rows(rows, folder, table, out, options, protocol, software, now_ns, progress=progress)
 
 
 def import_scans(
@@ -70,6 +78,8 @@ def import_scans(
     software: str,
     now_ns: Callable[[], int],
     dpi: float | None = None,
+    *,
+    progress: Progress = unseen,
 ) -> Path:
     """Import scans into a new session folder `out`; return its MCAP file. Raises `InputError`, leaving nothing behind.
 
@@ -103,7 +113,7 @@ def import_scans(
             )
         return encode_png(image[top : top + height, left : left + width])
 
-    return store_rows(rows, folder, table, out, options, protocol, software, now_ns, encoded=cut)
+    return store_rows(rows, folder, table, out, options, protocol, software, now_ns, encoded=cut, progress=progress)
 
 
 def dpi_of(data: bytes) -> tuple[float, float] | None:
@@ -164,6 +174,7 @@ def store_rows(
     *,
     opening: Path | None = None,
     encoded: Callable[[Row], bytes] | None = None,
+    progress: Progress = unseen,
 ) -> Path:
     """Write strokes with their photographs into the session folder `out` and return its MCAP file.
 
@@ -171,7 +182,8 @@ def store_rows(
     its file unchanged. Raises `InputError`, leaving nothing behind.
     """
     encoded = encoded or _whole
-    digests = [_check(encoded(row), row.image) for row in rows]
+    checked = counted(rows, "photographs checked", len(rows), progress)
+    digests = [_check(encoded(row), row.image) for row in checked]
     first = None if opening is None else read_bounded(opening)
     if first is not None and opening is not None:
         _check(first, opening)
@@ -188,7 +200,7 @@ def store_rows(
     )
     try:
         with staged_folder(out) as stage:
-            _write(rows, digests, stage / f"{out.name}.mcap", header, now_ns, first, encoded)
+            _write(rows, digests, stage / f"{out.name}.mcap", header, now_ns, first, encoded, progress)
     except OSError as error:
         raise InputError(out, f"cannot write: {in_one_line(error)}") from error
     return out / f"{out.name}.mcap"
@@ -202,13 +214,15 @@ def _write(
     now_ns: Callable[[], int],
     first: bytes | None,
     encoded: Callable[[Row], bytes],
+    progress: Progress,
 ) -> None:
     writer = SegmentWriter(final, header, QUEUE_LIMIT)
     try:
         if first is not None:
             t_ns = now_ns()
             writer.write(Outgoing(Topic.STILL, t_ns, t_ns, 0, image_message(t_ns, first, _kind(first))), WAIT_S)
-        for row, digest in zip(rows, digests, strict=True):
+        pairs = zip(rows, digests, strict=True)
+        for row, digest in counted(pairs, "photographs written", len(rows), progress):
             data, still = encoded(row), row.stroke.still
             if hashlib.sha256(data).digest() != digest:
                 raise InputError(row.image, "changed while it was imported")

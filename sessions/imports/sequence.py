@@ -14,6 +14,7 @@ from pathlib import Path
 from sessions.errors import InputError, SessionDamaged, in_one_line
 from sessions.imports.photographs import ImportOptions, check_target, read_bounded, store_rows
 from sessions.imports.table import Row, parse_table, read_text
+from sessions.progress import Progress, unseen
 from sessions.recording.messages import decode_gray
 
 SEQUENCE = "page sequence"
@@ -29,6 +30,8 @@ def import_sequence(
     software: str,
     now_ns: Callable[[], int],
     page_mm: tuple[float, float] | None = None,
+    *,
+    progress: Progress = unseen,
 ) -> Path:
     """Import frames into a new session folder `out`; return its MCAP file. Raises `InputError`, leaving nothing behind.
 
@@ -52,7 +55,9 @@ def import_sequence(
             raise InputError(row.image, f"is {other[0]} x {other[1]} px, the first frame {size[0]} x {size[1]}")
     numbered = [Row(row.image, row.stroke.model_copy(update={"still": k})) for k, row in enumerate(rows, start=1)]
     protocol = f"{SEQUENCE}: {len(rows)} strokes on one page, one new stroke a frame"
-    return store_rows(numbered, folder, named, out, options, protocol, software, now_ns, opening=opening)
+    return store_rows(
+        numbered, folder, named, out, options, protocol, software, now_ns, opening=opening, progress=progress
+    )
 
 
 def _by_table(table: Path) -> tuple[list[str], str]:

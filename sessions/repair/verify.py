@@ -14,6 +14,7 @@ from sessions.folders import check_name, not_a_session
 from sessions.journal.codec import Line
 from sessions.journal.journal import JOURNAL_NAME
 from sessions.names import SEGMENT_NAME
+from sessions.progress import Progress, counted, unseen
 from sessions.reader import Recording
 from sessions.recording.mcap_file import check_digest
 from sessions.recording.messages import decode_gray, decode_still
@@ -54,14 +55,14 @@ class Verdict:
         return not self.findings
 
 
-def verify_session(path: Path) -> Verdict:
+def verify_session(path: Path, progress: Progress = unseen) -> Verdict:
     """Check a session's folder, or one MCAP file.
 
     Raises `InputError` where it is neither, was renamed, or holds links.
     """
     check_name(path)
     if path.is_file():
-        return _verify_file(path, path.name)
+        return _verify_file(path, path.name, progress)
     if not path.is_dir():
         raise InputError(path, "no such session: give a session's folder or its .mcap file")
     name = path.resolve().name
@@ -70,8 +71,8 @@ def verify_session(path: Path) -> Verdict:
         final = path / f"{name}.mcap"
         if not final.is_file():
             raise not_a_session(path)
-        return _verify_file(final, name)
-    return _verify_folder(path.resolve())
+        return _verify_file(final, name, progress)
+    return _verify_folder(path.resolve(), progress)
 
 
 def step_words(line: Line) -> str:
@@ -80,9 +81,9 @@ def step_words(line: Line) -> str:
     return f"{line.get('kind', 'step')} {stroke}".strip().replace("_", " ")
 
 
-def _verify_file(path: Path, name: str) -> Verdict:
+def _verify_file(path: Path, name: str, progress: Progress) -> Verdict:
     verdict = Verdict(name, "recording", files=1)
-    found, problems = file_problems(path)
+    found, problems = file_problems(path, progress)
     verdict.findings += [Finding(path.name, problem) for problem in problems]
     if not problems:
         try:
@@ -93,7 +94,7 @@ def _verify_file(path: Path, name: str) -> Verdict:
     return verdict
 
 
-def _verify_folder(folder: Path) -> Verdict:
+def _verify_folder(folder: Path, progress: Progress) -> Verdict:
     verdict = Verdict(folder.name, "open")
     try:
         evidence = gather(folder)
@@ -102,7 +103,7 @@ def _verify_folder(folder: Path) -> Verdict:
         return verdict
     _journal(verdict, evidence)
     state = evidence.state
-    for line in state.segments:
+    for line in counted(state.segments, "files of steps read", len(state.segments), progress):
         verdict.findings += _segment(verdict, folder, line)
     for name, text in (state.opened or {}).get("snapshots", {}).items():
         path = folder / str(name)
@@ -112,7 +113,7 @@ def _verify_folder(folder: Path) -> Verdict:
             verdict.findings.append(Finding(str(name), "has changed since the session was started"))
     if state.closed is not None:
         verdict.state = "closed"
-        _final(verdict, folder, evidence)
+        _final(verdict, folder, evidence, progress)
     elif (final := folder / f"{folder.name}.mcap").is_file():
         # Left by an interrupted close, or by one whose line in the journal is lost.
         verdict.files += 1
@@ -200,7 +201,7 @@ def _segment(verdict: Verdict, folder: Path, line: Line) -> list[Finding]:
     return [Finding(path.name, f"({step}) {problem}") for problem in problems]
 
 
-def _final(verdict: Verdict, folder: Path, evidence: Evidence) -> None:
+def _final(verdict: Verdict, folder: Path, evidence: Evidence, progress: Progress) -> None:
     state = evidence.state
     closed = state.closed or {}
     path = folder / f"{folder.name}.mcap"
@@ -214,14 +215,14 @@ def _final(verdict: Verdict, folder: Path, evidence: Evidence) -> None:
         verdict.findings.append(Finding(path.name, error.what))
     if not path.is_file():
         return
-    found, problems = file_problems(path)
+    found, problems = file_problems(path, progress)
     expected = closed.get("counts", state.counts())
     if dict(found.counts) != expected and not problems:
         problems.append(f"holds {dict(found.counts)}, but the journal says {expected}")
     verdict.findings += [Finding(path.name, problem) for problem in problems]
 
 
-def file_problems(path: Path) -> tuple[Scan, list[str]]:
+def file_problems(path: Path, progress: Progress = unseen) -> tuple[Scan, list[str]]:
     """Read a file in full and list what is wrong with its chunks, index, images, and the stills of its strokes."""
     found = scan(path)
     problems = list(found.damage)
@@ -229,9 +230,12 @@ def file_problems(path: Path) -> tuple[Scan, list[str]]:
         problems.append(f"holds {dict(found.counts)}, but its index says {found.stated}")
     stills: set[int] = set()
     strokes: set[str] = set()
+    images = 0
     try:
         for _schema, channel, message in salvaged(found):
             if channel.topic in IMAGES:
+                progress(f"{path.name}: images decoded", images, sum(found.counts[topic] for topic in IMAGES))
+                images += 1
                 decode_gray(decode_still(message.data), f"the image {message.sequence} on {channel.topic}")
             if channel.topic == Topic.STILL:
                 stills.add(message.sequence)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import builtins
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +18,7 @@ from textual.pilot import Pilot
 
 from collect.errors import ConfigError
 from collect.tui.app import OperatorApp
-from collect.tui.finish_screen import FinishScreen, verdict_content
+from collect.tui.finish_screen import FinishScreen, run_command, verdict_content
 from collect.tui.pictures import HALF, CellPicture, ImagePicture, Pictures, half_cells
 from collect.tui.question_screens import Confirm
 from collect.tui.start_screen import StartScreen
@@ -171,8 +174,9 @@ async def test_no_note_is_typed_while_the_arm_is_at_work(tmp_path: Path) -> None
 async def test_finishing_verifies_and_runs_what_comes_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ran: list[tuple[str, Path]] = []
 
-    def command(name: str, folder: Path) -> tuple[int, str]:
+    def command(name: str, folder: Path, told: Callable[[str], None]) -> tuple[int, str]:
         ran.append((name, folder))
+        told("captures: 3 of 30, about 5 s left")
         return 0, "\n".join(f"line {n}" for n in range(30))
 
     monkeypatch.setattr("collect.tui.finish_screen.run_command", command)
@@ -188,6 +192,20 @@ async def test_finishing_verifies_and_runs_what_comes_next(tmp_path: Path, monke
         assert ran == [("calibrate", tmp_path)]
         assert "line 29" in text
     assert "! damaged" in verdict_content(Verdict("s", "closed", findings=[Finding("a.mcap", "is cut")])).plain
+
+
+def test_a_command_tells_its_progress_and_keeps_it_where_it_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    program = "import sys; print('said'); print('3 of 30', file=sys.stderr); sys.exit(int(sys.argv[1] == 'fail'))"
+    lines: list[str] = []
+    popen = subprocess.Popen
+
+    def started(command: list[str], **options: Any) -> subprocess.Popen[str]:
+        return popen([sys.executable, "-c", program, command[3]], **options)
+
+    monkeypatch.setattr(subprocess, "Popen", started)
+    assert run_command("work", Path("s"), lines.append) == (0, "said")
+    assert run_command("fail", Path("s"), lines.append) == (1, "said\n3 of 30")
+    assert lines == ["3 of 30", "3 of 30"]
 
 
 def test_pictures_work_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
