@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 from typing import Any, Literal, Protocol
 
 from scipy.spatial.transform import Rotation
@@ -226,11 +227,18 @@ def _at_sensor(config: SimConfig, wrench: Wrench) -> Wrench:
     """The wrench as the sensor reports it, whose axes and sign depend on how it is mounted."""
     if (config.tool_lean_deg, config.sensor_turn_deg, config.sensor_sign) == ((0.0, 0.0), 0.0, 1):
         return wrench
-    brush = Rotation.from_euler("xy", config.tool_lean_deg, degrees=True)
-    at_sensor = Rotation.from_euler("z", config.sensor_turn_deg, degrees=True).inv() * brush
-    force, torque = (config.sensor_sign * at_sensor.apply(part) for part in (wrench[:3], wrench[3:]))
-    fx, fy, fz, mx, my, mz = (float(v) for v in (*force, *torque))
+    axes = _axes_of_sensor(config.tool_lean_deg, config.sensor_turn_deg, config.sensor_sign)
+    fx, fy, fz, mx, my, mz = (
+        sum(a * v for a, v in zip(row, part, strict=True)) for part in (wrench[:3], wrench[3:]) for row in axes
+    )
     return fx, fy, fz, mx, my, mz
+
+
+@functools.lru_cache(maxsize=8)
+def _axes_of_sensor(lean_deg: tuple[float, float], turn_deg: float, sign: int) -> list[list[float]]:
+    """(3, 3) from the brush's axes to the sensor's, with its sign; solved once, as a round comes 200 times a second."""
+    brush = Rotation.from_euler("xy", lean_deg, degrees=True)
+    return (sign * (Rotation.from_euler("z", turn_deg, degrees=True).inv() * brush).as_matrix()).tolist()
 
 
 def _ink(world: World, device: Literal["station", "pump"]) -> Instrument:
