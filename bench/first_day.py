@@ -29,8 +29,8 @@ from drivers.sim.lab.lab import UnknownLab
 
 SIZE = (120, 34)
 RATE = 4.0
-WAIT_S = 420.0
-"""Longest time between two questions: the proof's runs have no question."""
+WAIT_S = 1800.0
+"""Longest time between two questions: the runs of the proof ask nothing while the brush feels for the paper."""
 PICTURES = {
     "address of the cabinet": "arm",
     "hold the board": "camera",

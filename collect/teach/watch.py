@@ -68,9 +68,8 @@ async def _poses(day: Day, see: See) -> None:
 
 
 async def _pictures(day: Day, see: Callable[[Picture | None], None], wanted: Callable[[], bool]) -> None:
-    source = str(day.notebook.get("camera.source") or "")
-    if "://" not in source or not wanted():
-        return
+    while not (wanted() and "://" in str(day.notebook.get("camera.source") or "")):
+        await asyncio.sleep(POSE_S)
     try:
         async with taught_camera(day.notebook, day.clock) as camera:
             after = Stamp(0)
