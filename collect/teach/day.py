@@ -30,12 +30,14 @@ class Day:
         self.rig_path = rig_path
         self.clock = clock
         self.armed = armed
+        self._held = False
         self._file = TaughtFile(rig_path)
         self.notebook: Notebook = self._file.load()
 
     def save(self, notebook: Notebook) -> None:
         """Take this as what is known."""
-        self._file.save(notebook)
+        if not self._held:
+            self._file.save(notebook)
         self.notebook = notebook
 
     def keep(
@@ -52,6 +54,19 @@ class Day:
         """Note one value."""
         taught = Taught(value=value, unit=unit, how=how, sigma=sigma, known=known, at=now_utc(), step=step)
         self.save(self.notebook.with_values({field: taught}))
+
+    @contextlib.contextmanager
+    def together(self) -> Generator[None]:
+        """Values kept in the block are on disk together at its end: all of them are known, or none."""
+        before, self._held = self.notebook, True
+        try:
+            yield
+        except BaseException:
+            self.notebook = before
+            raise
+        finally:
+            self._held = False
+        self.save(self.notebook)
 
     async def say(self, *lines: str, tone: Tone = "finding", picture: Picture | None = None) -> None:
         """Show lines to the person."""

@@ -32,11 +32,15 @@ class Wizard:
     async def run(self) -> Path:
         """Teach every step that is not done, then write `rig.toml`; returns its path.
 
-        Raises `CollectAborted` where the person leaves off: the same command goes on from there.
+        It is written before the proof too, and says then that it is not proven. Raises `CollectAborted` where the
+        person leaves off: the same command goes on from there.
         """
         for step in self._steps:
-            if step.name not in self._day.notebook.done:
-                await self._taught(step)
+            if step.name in self._day.notebook.done:
+                continue
+            if step.name == "proof":
+                await self._written()
+            await self._taught(step)
         await self._overview(None)
         return await self._written()
 

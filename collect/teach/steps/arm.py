@@ -46,7 +46,10 @@ class ArmStep:
                 "Look at the pendant; nothing is cleared from here.",
                 tone="warning",
             )
-        await self._keep(day, address, cabinet)
+        rtde = await self._rtde(day, address)
+        pushed = await answers(address.host, rtde)
+        with day.together():
+            self._keep(day, address, cabinet, rtde if pushed else None)
 
     async def _address(self, day: Day) -> Address:
         known = day.notebook.get("robot.host")
@@ -63,12 +66,12 @@ class ArmStep:
             raise CannotTeach(*_silent(address, older=True))
         return address
 
-    async def _keep(self, day: Day, address: Address, cabinet: Cabinet) -> None:
+    def _keep(self, day: Day, address: Address, cabinet: Cabinet, rtde: int | None) -> None:
         day.keep("arm", "robot.kind", "aubo-arcs", f"{cabinet.model} ({cabinet.box}) answered, {cabinet.firmware}")
         day.keep("arm", "robot.host", address.host, "typed, and answered")
         day.keep("arm", "robot.port", address.port, "answered")
         day.keep("arm", "robot.framing", cabinet.framing, "the first that was answered")
-        if await answers(address.host, rtde := await self._rtde(day, address)):
+        if rtde is not None:
             day.keep("arm", "robot.rtde_port", rtde, "answered: poses are pushed")
         day.keep("arm", "robot.payload_kg", cabinet.payload_kg, "as set on the pendant", unit="kg", known="not weighed")
         cog_mm = [float(v) for v in cabinet.payload_cog_mm]

@@ -46,20 +46,28 @@ class BrushStep:
         if check.verdict == "contradicts":
             raise CannotTeach(f"a press {deepest_mm:g} mm deep cannot be ({check.allowed}).", check.remedy)
         name = await day.guide.text("Name of the brush, for the record", "brush")
-        day.keep("brush", "brush.name", name, "typed")
-        day.keep("brush", "brush.radius_mm", radius_mm, calipers, unit="mm", sigma=0.1)
-        day.keep("brush", "brush.length_mm", length_mm, calipers, unit="mm", sigma=0.5)
-        day.keep("brush", "brush.max_depth_mm", deepest_mm, f"agreed; {DEEPEST_SHARE:.0%} of L is cautious", unit="mm")
+        with day.together():
+            day.keep("brush", "brush.name", name, "typed")
+            day.keep("brush", "brush.radius_mm", radius_mm, calipers, unit="mm", sigma=0.1)
+            day.keep("brush", "brush.length_mm", length_mm, calipers, unit="mm", sigma=0.5)
+            day.keep(
+                "brush", "brush.max_depth_mm", deepest_mm, f"agreed; {DEEPEST_SHARE:.0%} of L is cautious", unit="mm"
+            )
 
     async def _ink(self, day: Day) -> None:
         kind = await day.guide.choose("What keeps the ink well filled?", (NONE, STATION, PUMP), NONE.key)
+        config: InkDeviceConfig | None = None
         if kind != NONE.key:
             port = await day.guide.text("Its serial line, as /dev/ttyUSB0", "")
-            await self._device(day, kind, port)
-        day.keep("brush", "ink.name", await day.guide.text("Name of the ink, for the record", "ink"), "typed")
-        day.keep("brush", "aside.ink", kind, "answered")
+            config = await self._device(day, kind, port)
+        name = await day.guide.text("Name of the ink, for the record", "ink")
+        with day.together():
+            if config is not None:
+                self._keep_device(day, config)
+            day.keep("brush", "ink.name", name, "typed")
+            day.keep("brush", "aside.ink", kind, "answered")
 
-    async def _device(self, day: Day, kind: str, port: str) -> None:
+    async def _device(self, day: Day, kind: str, port: str) -> InkDeviceConfig:
         config: InkDeviceConfig
         if kind == STATION.key:
             config = InkStationConfig(kind="ink-station", port=port)
@@ -68,8 +76,11 @@ class BrushStep:
             ml = await day.guide.number(question, "ml", 0.001, 10.0, None)
             config = ModbusPumpConfig(kind="modbus-pump", port=port, ml_per_revolution=ml)
         await self._primed(day, config, day.clock)
+        return config
+
+    def _keep_device(self, day: Day, config: InkDeviceConfig) -> None:
         day.keep("brush", "ink.device.kind", config.kind, "answered on its line")
-        day.keep("brush", "ink.device.port", port, "typed, and answered")
+        day.keep("brush", "ink.device.port", config.port, "typed, and answered")
         if isinstance(config, ModbusPumpConfig):
             how = "weighed and typed"
             day.keep("brush", "ink.device.ml_per_revolution", config.ml_per_revolution, how, unit="ml")

@@ -152,10 +152,11 @@ class CameraStep:
             )
         except ValueError as error:
             raise CannotTeach(f"no such board: {error}".splitlines()[0] + ".", "Read the print again.") from None
-        day.keep("camera", "board.squares", [int(across), int(along)], how)
-        day.keep("camera", "board.square_mm", square_mm, how, unit="mm")
-        day.keep("camera", "board.marker_mm", marker_mm, how, unit="mm")
-        day.keep("camera", "board.dictionary", dictionary, how)
+        with day.together():
+            day.keep("camera", "board.squares", [int(across), int(along)], how)
+            day.keep("camera", "board.square_mm", square_mm, how, unit="mm")
+            day.keep("camera", "board.marker_mm", marker_mm, how, unit="mm")
+            day.keep("camera", "board.dictionary", dictionary, how)
 
     async def _first_look(self, day: Day, picture: Gray) -> None:
         """The board where it lies: a mirrored camera and a wrong print show at once."""

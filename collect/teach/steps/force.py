@@ -48,18 +48,20 @@ class ForceStep:
         question = "CAN bus of the force sensor: an interface such as can0, or HOST:PORT of a gateway; Enter: no sensor"
         if "aside.bus" not in day.notebook.values:
             bus = (await day.guide.text(question, "")).strip()
-            for field, value in _addressed(bus).items():
-                day.keep("force", f"force.{field}", value, "typed")
-            if day.notebook.get("force.channel") == LOOPBACK_CHANNEL:
-                how = "simulated time may run faster than rounds arrive: allowed on the loopback rig's bus alone"
-                day.keep("force", "force.stale_ms", LOOPBACK_STALE_MS, how, unit="ms")
-            day.keep("force", "aside.bus", bus, "typed")
+            with day.together():
+                for field, value in _addressed(bus).items():
+                    day.keep("force", f"force.{field}", value, "typed")
+                if day.notebook.get("force.channel") == LOOPBACK_CHANNEL:
+                    how = "simulated time may run faster than rounds arrive: allowed on the loopback rig's bus alone"
+                    day.keep("force", "force.stale_ms", LOOPBACK_STALE_MS, how, unit="ms")
+                day.keep("force", "aside.bus", bus, "typed")
         if not day.notebook.get("aside.bus"):
             await day.say(
                 "Without a force sensor the height of the paper is found by jogging with keys, when a session starts."
             )
             return
-        await self._pushed(day)
+        if "touch.force.push_axis" not in day.notebook.values:
+            await self._pushed(day)
 
     async def _pushed(self, day: Day) -> None:
         samples = list[ForceSample]()
@@ -89,8 +91,9 @@ class ForceStep:
                 "The sensor counts a push toward the flange as positive: it is mounted, or wired, the other way round "
                 "than usual. push_axis takes this into account; nothing has to be changed."
             )
-        day.keep("force", "touch.force.push_axis", axis, how, known="direction within 35 deg, sign certain")
-        day.keep("force", "aside.force_noise_n", noise_n, f"{REST_S:g} s with nothing touching", unit="N")
+        with day.together():
+            day.keep("force", "touch.force.push_axis", axis, how, known="direction within 35 deg, sign certain")
+            day.keep("force", "aside.force_noise_n", noise_n, f"{REST_S:g} s with nothing touching", unit="N")
 
     async def _push(self, samples: list[ForceSample]) -> NDArray[np.float64]:
         """Mean force of the strongest tenth of a second, once the push is over or has been waited for."""

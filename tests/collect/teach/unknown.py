@@ -1,0 +1,206 @@
+"""A first day in an unknown lab: a person who reads what is printed there, and passes requests on to the hand."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from collect.errors import CollectAborted
+from collect.operator import Choice
+from collect.rig.config import load_rig
+from collect.rig.paper import to_base
+from collect.teach.day import Day
+from collect.teach.guide import Brought, JogStep, JogView, LeftOff, Shown, StepState, Target
+from collect.teach.wizard import Wizard
+from drivers.clock import HostClock
+from drivers.sim.lab.lab import UnknownLab
+from drivers.sim.lab.seen import Seen, truth
+from drivers.sim.lab.traps import Trap
+
+KIND = {"ink-station": "i", "modbus-pump": "p"}
+
+
+@dataclass
+class InLab:
+    """A person in an unknown lab, whose servers run in another thread."""
+
+    lab: UnknownLab
+    loop: asyncio.AbstractEventLoop
+    lines: list[str] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)
+    brought: list[Target] = field(default_factory=list)
+    leave_after: int | None = None
+    """Number of requests to bring something after which the session is cut."""
+    mends: bool = False
+    """Whether the person sees to what the wizard names, and goes on."""
+
+    async def overview(self, steps: tuple[StepState, ...]) -> None:
+        self.lines.append(f"steps: {' '.join(f'{step.name}:{step.state}' for step in steps)}")
+
+    async def show(self, what: Shown) -> None:
+        self.lines += [f"{what.tone}: {line}" for line in what.lines]
+
+    async def choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
+        self._asked(question)
+        keys = {choice.key for choice in choices}
+        if question.startswith("How to go on"):
+            if self.mends:
+                await self._in_lab(self.lab.mend())
+                self.mends = False
+                return "a"
+            return "q"
+        if question.startswith("What keeps the ink well filled"):
+            return "n" if self.seen.ink is None else KIND[self.seen.ink[0]]
+        if "The arm moves by itself" in question:
+            return "a"
+        assert default in keys, question
+        return default
+
+    async def number(self, question: str, unit: str, low: float, high: float, default: float | None) -> float:
+        self._asked(question)
+        seen = self.seen
+        printed = {
+            "Squares along its longer": seen.squares[0],
+            "Squares along its shorter": seen.squares[1],
+            "Side of a square": seen.square_mm,
+            "Side of a marker": seen.marker_mm,
+            "R:": seen.radius_mm,
+            "L:": seen.length_mm,
+            "Deepest press": seen.max_depth_mm,
+            "Delivery per revolution": 0.1,
+        }
+        value = next((float(v) for start, v in printed.items() if question.startswith(start)), default)
+        assert value is not None, question
+        assert low <= value <= high, question
+        return value
+
+    async def text(self, question: str, default: str) -> str:
+        self._asked(question)
+        seen = self.seen
+        read = {
+            "Address of the cabinet": seen.host,
+            "Address of the camera": " ".join(seen.streams),
+            "Markers of the print": seen.dictionary,
+            "Its serial line": "" if seen.ink is None else seen.ink[1],
+            "CAN bus": f"{seen.can[0]}:{seen.can[1]}/{seen.can[2]}",
+        }
+        return next((v for start, v in read.items() if question.startswith(start)), default)
+
+    async def bring(self, target: Target, how: str) -> Brought:
+        if self.leave_after is not None and len(self.brought) >= self.leave_after:
+            raise LeftOff
+        self.brought.append(target)
+        answer = await self._in_lab(self.lab.hand.bring(target.kind, target.index, target.corner))
+        self.lines.append(f"person: {answer['says']}")
+        return Brought.DONE if answer["reached"] else Brought.SKIP
+
+    async def jog(self, view: JogView) -> JogStep | Brought:
+        return Brought.DONE
+
+    @property
+    def seen(self) -> Seen:
+        return self.lab.seen()
+
+    @property
+    def trouble(self) -> str:
+        return " ".join(line.partition(": ")[2] for line in self.lines if line.startswith("trouble"))
+
+    async def _in_lab(self, work: Any) -> Any:
+        return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(work, self.loop))
+
+    def _asked(self, question: str) -> None:
+        self.asked.append(question)
+
+
+@contextlib.contextmanager
+def in_lab(seed: int, trap: Trap | None = None, **options: Any) -> Iterator[InLab]:
+    """The lab serves from a thread of its own until the block ends."""
+    ready: Future[tuple[UnknownLab, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
+
+    async def serve() -> None:
+        over = asyncio.Event()
+        try:
+            async with UnknownLab(seed, trap, **options) as lab:
+                ready.set_result((lab, asyncio.get_running_loop(), over))
+                await over.wait()
+        except BaseException as error:
+            if not ready.done():
+                ready.set_exception(error)
+            raise
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve()), name="unknown lab", daemon=True)
+    thread.start()
+    lab, loop, over = ready.result(timeout=60)
+    try:
+        yield InLab(lab, loop)
+    finally:
+        loop.call_soon_threadsafe(over.set)
+        thread.join(timeout=30)
+        assert not thread.is_alive(), "waited 30 s for the lab to end"
+
+
+async def first_day(person: InLab, rig_path: Path, *, armed: bool = True) -> Path | None:
+    """Run the wizard once; None where the person left off."""
+    try:
+        return await Wizard(Day(person, rig_path, HostClock(), armed=armed)).run()
+    except CollectAborted:
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """What a first day got wrong; base frame, against the truth."""
+
+    tcp_mm: float
+    origin_mm: float
+    yaw_deg: float
+    touch_mm: float
+    """Of the true tip above the true sheet at the touch point, with the arm at the taught height."""
+    delay_share: float
+
+    @property
+    def within(self) -> bool:
+        """Whether all are within the limits that a first day promises."""
+        return (
+            self.tcp_mm <= 0.5
+            and self.origin_mm <= 0.5
+            and self.yaw_deg <= 0.2
+            and self.touch_mm <= 0.1
+            and self.delay_share <= 0.2
+        )
+
+    def __str__(self) -> str:
+        return (
+            f"TCP {self.tcp_mm:.2f} mm, origin {self.origin_mm:.2f} mm, yaw {self.yaw_deg:.2f} deg, touch "
+            f"{self.touch_mm:.3f} mm, delay {100 * self.delay_share:.0f} %"
+        )
+
+
+def errors(rig_path: Path, lab: UnknownLab) -> Errors:
+    """Compare a `rig.toml` with the truth of its lab."""
+    rig, true = load_rig(rig_path), truth(lab.facts, None)
+    tcp_error = np.array(rig.robot.tcp_offset_mm) - true["tool"]["tcp_offset_mm"]
+    paper = rig.paper
+    x, y = to_base(paper, *paper.touch_point_mm)
+    table = lab.facts.config.table
+    paper_x, paper_y = lab.world.to_paper(x, y)
+    # A brush held upright with a tool that is taken for too long stands that much higher.
+    axis = np.array(true["tool"]["brush_axis"])
+    true_tip_z_mm = paper.touch_z_mm + float(tcp_error @ axis)
+    delay_s = true["camera"]["delay_s"]
+    return Errors(
+        float(np.linalg.norm(tcp_error)),
+        math.dist(paper.origin_mm, table.origin_mm),
+        abs(math.remainder(paper.yaw_deg - table.yaw_deg, 360.0)),
+        abs(true_tip_z_mm - table.surface_z_mm(paper_x, paper_y)),
+        abs(rig.camera.latency_ms / 1e3 - delay_s) / delay_s,
+    )
