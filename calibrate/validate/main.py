@@ -108,7 +108,7 @@ def validate(request: Request, progress: Progress) -> ValidationOutput:
         outcome = validate_presses(sessions, options, scheduler, folder / WORK, progress)
         with outcome.store:
             steps = similarity_by_strokes(outcome, scheduler, progress) if request.ablations else ()
-            report, notes = _write(outcome, folder, request, steps, curves, extras)
+            report, notes = _write(outcome, folder, request, steps, curves, extras, progress)
             return ValidationOutput(folder, report, notes=(*extras.notes, *notes))
 
 
@@ -146,7 +146,10 @@ def _write(
     steps: tuple[Any, ...],
     curves: Sequence[Any],
     extras: Extras,
+    progress: Progress,
 ) -> tuple[Report, tuple[str, ...]]:
+    what, parts = "parts of the report made", 3
+    progress(what, 0, parts)
     digest = write_csv(outcome, folder / SCORES)
     notes: list[str] = []
     beside = [SCORES]
@@ -158,7 +161,9 @@ def _write(
             if request.parquet:
                 raise
             notes.append(f"no scores.parquet: {error.what}")
+    progress(what, 1, parts)
     report = report_of(outcome, request.command, digest, steps, extras)
+    progress(what, 2, parts)
     files = {"summary.csv": summary_csv(report)}
     if report.written:
         files[TABLE_3] = table_3_csv(report)
@@ -169,6 +174,7 @@ def _write(
     files["report.html"] = page_of(outcome, report, curves, [*beside, *files, "report.json"], extras.figures)
     files["report.json"] = report.to_json()
     write_files(folder, files)
+    progress(what, parts, parts)
     return report, tuple(notes)
 
 
