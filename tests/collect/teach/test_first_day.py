@@ -53,11 +53,13 @@ def quick_camera(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def soaking(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Simulated time runs faster than the sensor's rounds arrive, and every touch is made once."""
+    """Simulated time outruns the sensor's rounds, pictures are drawn on a busy machine, every touch is made once."""
     monkeypatch.setattr(cameras, "LATE_MS", 2500.0)
     for name, value in {
         "MOTION__LEAST_DWELL_S": 0.05 * SOAK_RATE,
         "FORCE__STALE_MS": 1000,
+        "CAMERA__MAX_JITTER_MS": 2000,
+        "CAMERA__MAX_DELAY_MS": 3000,
         "TOUCH__TOUCHES": 1,
         "TOUCH__FORCE__FAST_SAMPLES": 30,
         "TOUCH__FORCE__SLOW_SAMPLES": 300,
