@@ -40,8 +40,8 @@ lint: $(STAMP)-dev
 types: $(STAMP)-dev
 	$(BIN)/pyright
 
-bench: $(STAMP)-dev  ## every bench, one JSON object a line
-	$(BIN)/python -m bench --json
+bench: $(STAMP)-dev  ## every bench, one line a figure, kept as a table in docs/bench.md
+	$(BIN)/python -m bench --table
 
 soak: $(STAMP)-dev  ## long kill and load loops, and property tests on new examples
 	$(BIN)/python -m pytest -m soak --timeout 3600

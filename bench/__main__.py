@@ -1,4 +1,6 @@
-"""`python -m bench [NAME] [--json]`: run one benchmark, or all, and print a line for each figure.
+"""`python -m bench [NAME] [--json] [--table]`: run one benchmark, or all, and print a line for each figure.
+
+With --table, docs/bench.md gets the figures as well.
 
 Exit codes: 0 measured, 1 a benchmark could not be measured, 2 unknown name.
 """
@@ -24,6 +26,7 @@ from bench import (
     rpc,
     startup,
     structure,
+    table,
     tables,
     tui,
     validate,
@@ -64,6 +67,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench", description="Measure this project beside its peers.")
     parser.add_argument("name", nargs="?", metavar="NAME", help=f"one of {', '.join(known)}; all when left out")
     parser.add_argument("--json", action="store_true", help="one JSON object per line")
+    parser.add_argument("--table", action="store_true", help=f"renew the figures' rows in {table.OUT.name}")
     options = parser.parse_args(arguments)
     if options.name is not None and options.name not in known:
         print(f"unknown bench {options.name!r}; known: {', '.join(known)}", file=sys.stderr)
@@ -76,6 +80,8 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"{name}: {error}", file=sys.stderr)
             code = 1
             continue
+        if options.table:
+            table.renew(results)
         for before, result in zip([None, *results], results, strict=False):
             if not options.json and result.conditions and (before is None or before.conditions != result.conditions):
                 print(f"# {result.conditions}")

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -16,15 +16,20 @@ from bench.learning_to_paint import LearningToPaint
 from model.generator.basis import fit_basis
 from model.generator.metrics import Quality, quality
 from model.generator.network import Generator, parameter_count
+from model.train.batches import batches
 from model.train.checkpoint import State, put_weights
 from model.train.config import TrainConfig, preset
 from model.train.data import Exact, batch_numbers, exact_sets
+from model.train.distributed import Group
 from model.train.loop import Validation, learning_rate, new_state, train
 
 BUDGET_S = 360
 PEER_RATE = 1e-3
 _TRIAL_STEPS = 15
 _ROUNDS = 20
+_DRAWN = 200
+DRAWING_SHARE = 0.07
+"""The share that drawing had of the training on one core before presses were drawn without an outline."""
 _SHARE = 0.95  # of the budget: steps are counted out beforehand, and their cost wavers
 
 
@@ -43,8 +48,9 @@ def _compare(target: str, name: str, n: int | None, seed: int, *, with_basis: bo
 
     Both run on one thread, see the same 20,000 images in the same batches of 64, and fall in learning rate along the
     same half cosine; how many steps fit is measured beforehand. MSE, IoU, CSIM and SSIM are means over the images;
-    their ratio is the peer's shortfall over ours. `-forward` is images/s at batch 64, taking turns. The field
-    basis is an interpolator fitted by least squares, not a network.
+    their ratio is the peer's shortfall over ours. `-drawing` is the share of our time in which the batches are drawn.
+    `-forward` is images/s at batch 64, taking turns. The field basis is an interpolator fitted by least squares, not a
+    network.
     """
     budget_s = BUDGET_S if n is None else n
     if budget_s < 1:
@@ -59,7 +65,8 @@ def _compare(target: str, name: str, n: int | None, seed: int, *, with_basis: bo
         found, other = _quality(ours, validation), _quality(draw_peer, validation)
         batch = validation.inputs[: config.batch]
         with torch.no_grad():
-            forward, peer_forward = interleave(lambda: ours(batch), lambda: draw_peer(batch), _ROUNDS)
+            turns = interleave(lambda: ours(batch), lambda: draw_peer(batch), _ROUNDS)
+            drawing_s = _drawing_s(config, training, ours_steps)
             fitted = _basis_results(config, validation, other.mse, draw_peer, seed) if with_basis else []
     told = (
         f"{target}, {budget_s} s of CPU time each, one thread: ours {parameter_count(ours):,} weights, "
@@ -72,6 +79,7 @@ def _compare(target: str, name: str, n: int | None, seed: int, *, with_basis: bo
     assert found.ssim_min is not None
     assert other.ssim is not None
     assert other.ssim_min is not None
+    forward, peer_forward = turns.median_s
     rows = [
         ("mse", found.mse, "MSE", other.mse / found.mse),
         ("psnr", found.psnr_db, "dB", found.psnr_db / other.psnr_db),
@@ -86,7 +94,28 @@ def _compare(target: str, name: str, n: int | None, seed: int, *, with_basis: bo
         Result(f"{name}-{what}", value, kind, peer_name, ratio, found.images, seed, told)
         for what, value, kind, ratio in rows
     ]
-    return [*results, *fitted]
+    results[-1] = replace(results[-1], **turns.ratios())
+    share = drawing_s / ours_s
+    drawn = Result(
+        f"{name}-drawing",
+        share,
+        "of the training's CPU time",
+        f"{DRAWING_SHARE:g} of it",
+        DRAWING_SHARE / share,
+        1,
+        seed,
+        told,
+    )
+    return [*results, drawn, *fitted]
+
+
+def _drawing_s(config: TrainConfig, training: Exact, steps: int) -> float:
+    """The CPU seconds for drawing the batches of so many steps, measured on some of them."""
+    some = min(steps, _DRAWN)
+    began = time.process_time()
+    for _ in batches(config.model_copy(update={"steps": some}), training, Group(), 0):
+        pass
+    return (time.process_time() - began) * steps / some
 
 
 def _shortfall(peer: float, ours: float) -> float:
@@ -172,13 +201,22 @@ def _basis_results(
     fit_s = time.process_time() - began
     found = _quality(basis, images, with_ssim=False)
     batch = images.inputs[: config.batch]
-    forward, peer_forward = interleave(lambda: basis(batch), lambda: draw_peer(batch), _ROUNDS)
+    turns = interleave(lambda: basis(batch), lambda: draw_peer(batch), _ROUNDS)
+    forward, peer_forward = turns.median_s
     peer = "Learning-to-Paint-type network"
     told = f"interpolator, fitted in {fit_s:.1f} s of CPU time, PSNR {found.psnr_db:.1f} dB, IoU {found.iou:.5f}"
     return [
         Result("field-basis-mse", found.mse, "MSE", peer, peer_mse / found.mse, len(images), seed, told),
         Result(
-            "field-basis-forward", config.batch / forward, "images/s", peer, peer_forward / forward, _ROUNDS, seed, told
+            "field-basis-forward",
+            config.batch / forward,
+            "images/s",
+            peer,
+            peer_forward / forward,
+            _ROUNDS,
+            seed,
+            told,
+            **turns.ratios(),
         ),
     ]
 

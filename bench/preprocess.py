@@ -50,9 +50,10 @@ def run(*, n: int | None = None, seed: int = 0) -> Result:
         agree = np.mean([_iou(a, b) for a, b in zip(ours_of(ours()), ours_of(peer()), strict=True)])
         if agree < 0.97:
             raise RuntimeError(f"the two do not make the same strokes: IoU {agree:.3f}")
-        ours_s, peer_s = interleave(ours, peer, rounds)
+        turns = interleave(ours, peer, rounds)
     finally:
         cv2.setNumThreads(before)
+    ours_s, peer_s = turns.median_s
     return Result(
         name="preprocess",
         value=IMAGES / ours_s,
@@ -62,6 +63,7 @@ def run(*, n: int | None = None, seed: int = 0) -> Result:
         n=rounds,
         seed=seed,
         conditions=f"{machine()}; the strokes of both agree to IoU {agree:.3f}",
+        **turns.ratios(),
     )
 
 

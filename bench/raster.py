@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bench.harness import Result, machine
+from bench.harness import Result, interleave, machine
 from model.brush import Brush
 from model.ccdbsm import CcdBsm, ccdbsm
 from model.coverage import PX_MM, SIZE_PX, centred_origin, coverage
@@ -32,7 +31,6 @@ SCALE = 4
 POINTS = 64  # along each side of an outline
 SHIFT = 4  # fractional bits of fillPoly's fixed-point corners
 Work = Callable[[], object]
-LEAST = 0.1  # of the rounds: the share whose times count, see `_quick`
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,47 +110,35 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
         one, all_ = "cv2.fillPoly at 4x", f"cv2.fillPoly at 4x on {cores} threads"
         contests: tuple[tuple[str, Work, int, Work, int, str], ...] = (
             ("raster", level, BATCH, lambda: filled(level_polygons), BATCH, one),
-            ("raster-press", lambda: presses(*few), BATCH, lambda: filled(level_polygons), BATCH, one),
-            ("raster-press-memset", lambda: presses(*few), BATCH, lambda: cleared(*few), BATCH, "memset"),
+            ("raster-press", _many(lambda: presses(*few)), BULK, lambda: filled(level_polygons), BATCH, one),
+            ("raster-press-memset", _many(lambda: presses(*few)), BULK, lambda: cleared(*few), BATCH, "memset"),
             ("raster-press-bulk", lambda: presses(*many), BULK, lambda: shared(level_polygons), BATCH, all_),
             ("raster-press-bulk-memset", lambda: presses(*many), BULK, lambda: cleared(*many), BULK,
              f"memset on {cores} threads"),
             ("raster-any-heading", turned, BATCH, lambda: filled(polygons), BATCH, one),
-            ("raster-compiled", lambda: compiled(*few), BATCH, lambda: filled(polygons), BATCH, one),
+            ("raster-compiled", _many(lambda: compiled(*few)), BULK, lambda: filled(polygons), BATCH, one),
             ("raster-compiled-bulk", lambda: compiled(*many), BULK, lambda: shared(polygons), BATCH, all_),
             ("raster-compiled-bulk-memset", lambda: compiled(*many), BULK, lambda: cleared(*many), BULK,
              f"memset on {cores} threads"),
         )  # fmt: skip
-        return [
-            _result(name, _quick(ours, peer, rounds, calls=BULK // many), many, peers, of, rounds, seed)
-            for name, ours, many, peer, peers, of in contests
-        ]
+        results: list[Result] = []
+        for name, ours, count, peer, peers, of in contests:
+            turns = interleave(ours, peer, rounds, time.process_time)
+            # Of all threads' seconds: on two threads a second has two of them.
+            ours_s, peer_s = turns.quickest_s[0] / count, turns.quickest_s[1] / peers
+            both = turns.ratios(count / peers)
+            results.append(Result(name, 1 / ours_s, "images/s", of, peer_s / ours_s, rounds, seed, machine(), **both))
+        return results
 
 
-def _result(name: str, seconds: tuple[float, float], many: int, peers: int, peer: str, n: int, seed: int) -> Result:
-    ours_s, peer_s = seconds[0] / many, seconds[1] / peers
-    # Of all threads' seconds: on two threads a second has two of them.
-    return Result(name, 1 / ours_s, "images/s", peer, peer_s / ours_s, n, seed, machine())
+def _many(work: Work) -> Work:
+    """BULK images in calls of BATCH: a single short call would mostly measure the caches after the peer."""
 
+    def repeated() -> None:
+        for _ in range(BULK // BATCH):
+            work()
 
-def _quick(ours: Work, peer: Work, n: int, calls: int) -> tuple[float, float]:
-    """The mean CPU seconds of the quickest tenth of n rounds of ours, peer, ours, peer...; each runs once before.
-
-    A round of ours is several calls: a single short one would mostly measure how it finds the caches after the peer.
-    """
-    if n < 1:
-        raise ValueError(f"n = {n}: at least one round is needed")
-    taken: tuple[list[float], list[float]] = ([], [])
-    for round_ in range(n + 1):
-        for work, times in zip((ours, peer), taken, strict=True):
-            repeats = calls if work is ours else 1
-            start = time.process_time()
-            for _ in range(repeats):
-                work()
-            if round_:
-                times.append((time.process_time() - start) / repeats)
-    few = max(1, round(LEAST * n))
-    return statistics.fmean(sorted(taken[0])[:few]), statistics.fmean(sorted(taken[1])[:few])
+    return repeated
 
 
 def clear(images: NDArray[np.float32], pool: ThreadPoolExecutor, threads: int) -> None:

@@ -20,7 +20,8 @@ def run(*, n: int | None = None, seed: int = 0) -> Result:
     drawn, so the seed changes nothing. Raises BenchError when either command fails.
     """
     rounds = 10 if n is None else n
-    ours_s, peer_s = interleave(lambda: _call(OURS), lambda: _call(PEER), rounds)
+    turns = interleave(lambda: _call(OURS), lambda: _call(PEER), rounds)
+    ours_s, peer_s = turns.median_s
     return Result(
         name="startup",
         value=ours_s,
@@ -29,6 +30,7 @@ def run(*, n: int | None = None, seed: int = 0) -> Result:
         ratio=peer_s / ours_s,
         n=rounds,
         seed=seed,
+        **turns.ratios(),
     )
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from bench.brushfit_brushes import FROZEN
 from bench.harness import BenchError, Result, machine
+from bench.press_sessions import CELLS, session
 from bench.processes import brushloop
-from bench.validate import CELLS, session
 from calibrate.compare.field import Alignment, Tone
 from calibrate.validate.candidates import BEZIER_REFITTED, FITTED_HELD_OUT, GENERATOR_HELD_OUT
 from calibrate.validate.report.data import Report, load_report

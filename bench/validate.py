@@ -1,13 +1,13 @@
 """Validation beside a plain loop over scikit-image's SSIM, its memory by number of strokes, and Dask's second worker.
 
-Presses are of the simulated brush (loopback rig), photographed at 10 px/mm. `python -m bench.validate 20000` measures
-memory up to 20,000 strokes; by default it goes to 2,000.
+Presses are of the simulated brush (loopback rig), photographed at 10 px/mm; memory and throughput are of
+pictures with the size and noise of the loopback camera's stills. `python -m bench.validate 20000` measures
+memory up to 20,000 strokes; by default it goes to 1,000.
 """
 
 from __future__ import annotations
 
 import importlib.util
-import itertools
 import json
 import multiprocessing
 import os
@@ -27,27 +27,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.harness import BenchError, Result, interleave, machine
+from bench.peak import measure
+from bench.press_sessions import STILL, pressed, session
 from calibrate.compare.field import BEST_SHIFT_PX, KEYS, SIZE_PX, Alignment, Field
 from calibrate.compare.images import Pixels, pack, simulated_pixels, unpack
 from calibrate.compare.similarity import csim, ssim
-from calibrate.validate.jobs import ABSENT, PrepareJob, Press, ScoreJob, prepare_job, score_job
+from calibrate.validate.jobs import ABSENT, PrepareJob, ScoreJob, prepare_job, score_job
 from calibrate.validate.pool import Dask, Threads
-from drivers.sim.brush.brush import Brush, BrushSpec
 from model.brush import Brush as Bundle
 from model.registry import stroke_models
-from sessions.imports.photographs import ImportOptions, import_photographs
 from sessions.reader import Recording
 
-CELLS = tuple((height, tilt) for height in (11.0, 13.0, 15.0, 17.0, 20.0) for tilt in (0.0, 5.0, 10.0))
-PX_MM, TOUCH = 10.0, (380, 150)
-STROKES, FEW, DASK_STROKES = 2000, 100, 300
+STROKES, FEW, DASK_STROKES = 1000, 100, 60
 SAME = 1e-6
-PHOTOGRAPHS = 30
 START_S = 60.0
 
 
 def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
-    """Scores a second over 12 presses of one cell; peak memory from 100 to `n` strokes (default 2,000); and Dask.
+    """Scores a second over 12 presses of one cell; peak memory from 100 to `n` strokes (default 1,000); and Dask.
 
     ratio = ours over the plain loop; strokes over memory growth; two workers over one. Raises BenchError where the
     scores differ by more than 1e-6 from scikit-image's, or a run fails.
@@ -78,7 +75,8 @@ def scoring(seed: int, repeats: int = 12, rounds: int = 3) -> list[Result]:
     worst = float(np.nanmax(np.abs(found - plain)))
     if worst > SAME:
         raise BenchError(f"scores differ from scikit-image's by {worst:.1e}")
-    ours_s, peer_s = interleave(lambda: score_job(job), lambda: plain_scores(job), rounds)
+    turns = interleave(lambda: score_job(job), lambda: plain_scores(job), rounds)
+    ours_s, peer_s = turns.median_s
     prepare_s = min(_seconds(lambda: pressed((15.0, 5.0), 1, seed)) for _ in range(rounds))
     where = (
         f"loopback rig, one thread; {len(models)} models and 9 other presses, both alignments and tones; worst "
@@ -86,7 +84,8 @@ def scoring(seed: int, repeats: int = 12, rounds: int = 3) -> list[Result]:
         f"{machine()}"
     )
     peer = "a plain loop over scikit-image's SSIM"
-    return [Result("validate.scored", len(presses) / ours_s, "strokes/s", peer, peer_s / ours_s, rounds, seed, where)]
+    rate = len(presses) / ours_s
+    return [Result("validate.scored", rate, "strokes/s", peer, peer_s / ours_s, rounds, seed, where, **turns.ratios())]
 
 
 def plain_scores(job: ScoreJob) -> NDArray[np.float64]:
@@ -132,7 +131,7 @@ def _shifted(moving: NDArray[np.float64], fixed: NDArray[np.float64]) -> NDArray
 
 def memory(under: Path, strokes: int, seed: int) -> list[Result]:
     """Peak memory of the whole command over `FEW` strokes and over all of them."""
-    few, many = (session(under, f"of-{count}", count, seed) for count in (min(FEW, strokes), strokes))
+    few, many = (session(under, f"of-{count}", count, seed, view=STILL) for count in (min(FEW, strokes), strokes))
     small_mb, small_s = _measured(few, under / "few")
     large_mb, large_s = _measured(many, under / "many")
     grown = large_mb - small_mb
@@ -161,45 +160,37 @@ def memory(under: Path, strokes: int, seed: int) -> list[Result]:
 def threads(seed: int, strokes: int = 60) -> list[Result]:
     """Finding strokes on photographs by threads, beside as many processes that have already started."""
     with tempfile.TemporaryDirectory() as folder:
-        place = session(Path(folder), "threads", strokes, seed)
+        place = session(Path(folder), "threads", strokes, seed, view=STILL)
         jobs = [PrepareJob(capture, None, Field()) for capture in Recording(place).captures()]
     with Threads() as pool, ProcessPoolExecutor(pool.workers, multiprocessing.get_context("spawn")) as processes:
         began = time.perf_counter()
         list(processes.map(prepare_job, jobs[: 4 * pool.workers]))
         start_s = time.perf_counter() - began
         named = [(str(k), job) for k, job in enumerate(jobs)]
-        ours_s, peer_s = interleave(
+        turns = interleave(
             lambda: list(pool.run(prepare_job, iter(named))), lambda: list(processes.map(prepare_job, jobs)), 3
         )
         workers = pool.workers
-    where = f"loopback rig, photographs of 480 x 300 px, {workers} workers; starting the processes took {start_s:.1f} s"
+    ours_s, peer_s = turns.median_s
+    size = f"{STILL.width_px} x {STILL.height_px} px"
+    where = f"loopback rig, photographs of {size}, {workers} workers; starting the processes took {start_s:.1f} s"
     peer = "processes, already started"
     rate = strokes / ours_s
-    return [Result("validate.threads", rate, "strokes/s", peer, peer_s / ours_s, 3, seed, f"{where}; {machine()}")]
+    told = f"{where}; {machine()}"
+    return [Result("validate.threads", rate, "strokes/s", peer, peer_s / ours_s, 3, seed, told, **turns.ratios())]
 
 
 def _measured(place: Path, out: Path) -> tuple[float, float]:
-    """(peak MB, seconds) of `brushloop validate` in a process of its own."""
-    program = (
-        "import resource, sys, brushloop\n"
-        f"sys.argv = ['brushloop', 'validate', {str(place)!r}, '--out', {str(out)!r}, '--no-held-out']\n"
-        "try:\n    brushloop.app()\nexcept SystemExit as end:\n    code = end.code or 0\n"
-        "sys.stderr.write(f'\\n{code} {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}')\n"
-    )
-    began = time.perf_counter()
-    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    seconds = time.perf_counter() - began
-    last = ran.stderr.split("\n")[-1].split()
-    if ran.returncode or len(last) != 2 or last[0] != "0":
-        raise BenchError(f"validate failed: {ran.stderr[-300:]}")
-    return int(last[1]) / 1024, seconds
+    """(peak MB, seconds) of `brushloop validate`."""
+    used = measure(sys.executable, "-m", "brushloop", "validate", str(place), "--out", str(out), "--no-held-out")
+    return used.peak_mb, used.wall_s
 
 
 def cluster(under: Path, strokes: int, seed: int) -> list[Result]:
     """Finding strokes by one Dask worker and by two, each with one thread; nothing where Dask is missing."""
     if importlib.util.find_spec("distributed") is None:
         return []
-    place = session(under, f"dask-{strokes}", strokes, seed)
+    place = session(under, f"dask-{strokes}", strokes, seed, view=STILL)
     jobs = [(str(k), PrepareJob(one, None, Field())) for k, one in enumerate(Recording(place).captures())]
     taken: dict[int, float] = {}
     for workers in (1, 2):
@@ -245,55 +236,6 @@ def _quietly(under: Path, *words: str) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", *words]
     nowhere = subprocess.DEVNULL
     return subprocess.Popen(command, cwd=under, env=environment, stdout=nowhere, stderr=nowhere)
-
-
-def session(
-    under: Path, name: str, strokes: int, seed: int, spec: BrushSpec | None = None, distinct: int = PHOTOGRAPHS
-) -> Path:
-    """A session of so many presses; photographs repeat after the first `distinct`, which no cache here can notice."""
-    photos = under / f"{name}-photos"
-    photos.mkdir()
-    brush = Brush(spec or BrushSpec(seed=1 + seed))
-    drawn = [
-        cv2.imencode(".png", photograph(brush, *CELLS[k % len(CELLS)], seed + k))[1].tobytes()
-        for k in range(min(distinct, strokes))
-    ]
-    lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
-    for k, data in zip(range(strokes), itertools.cycle(drawn), strict=False):
-        file = f"{k:06d}.png"
-        (photos / file).write_bytes(data)
-        height, tilt = CELLS[k % len(drawn) % len(CELLS)]
-        lines.append(f"{file},{height},{tilt},{PX_MM},{TOUCH[0]},{TOUCH[1]}")
-    (photos / "strokes.csv").write_text("\n".join(lines) + "\n")
-    out = under / name
-    import_photographs(photos, photos / "strokes.csv", out, ImportOptions(kind="press"), "bench", lambda: 1)
-    return out
-
-
-def pressed(cell: tuple[float, float], repeats: int, seed: int) -> list[Press]:
-    """Presses of one cell, found on their photographs."""
-    with tempfile.TemporaryDirectory() as folder:
-        photos = Path(folder) / "photos"
-        photos.mkdir()
-        brush = Brush(BrushSpec(seed=1 + seed))
-        lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
-        for k in range(repeats):
-            cv2.imwrite(str(photos / f"{k:03d}.png"), photograph(brush, *cell, seed + k))
-            lines.append(f"{k:03d}.png,{cell[0]},{cell[1]},{PX_MM},{TOUCH[0]},{TOUCH[1]}")
-        (photos / "strokes.csv").write_text("\n".join(lines) + "\n")
-        out = Path(folder) / "presses"
-        import_photographs(photos, photos / "strokes.csv", out, ImportOptions(kind="press"), "bench", lambda: 1)
-        return [prepare_job(PrepareJob(capture, None, Field())) for capture in Recording(out).captures()]
-
-
-def photograph(brush: Brush, height_mm: float, tilt_deg: float, seed: int) -> NDArray[np.uint8]:
-    """A press on white paper, its tip touching at TOUCH."""
-    mark = brush.press(height_mm, tilt_deg, ink_load=1.0, press_seed=seed)
-    page = np.full((300, 480), 235, np.uint8)
-    rows, columns = mark.density.shape
-    left, top = TOUCH[0] - round(mark.origin_px[0]), TOUCH[1] - round(mark.origin_px[1])
-    page[top : top + rows, left : left + columns] = 235 - np.rint(200 * np.clip(mark.density, 0, 1)).astype(np.uint8)
-    return page
 
 
 def _seconds(work: Callable[[], object]) -> float:

@@ -3,14 +3,16 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import pytest
 
 import bench.__main__
-from bench import footprints, raster, rpc
+from bench import footprints, raster, rpc, table
 from bench.harness import BenchError, Result, interleave, percentile, results_of
+from bench.peak import measure
 from bench.processes import started
 from model.brush import Brush
 from model.ccdbsm import ccdbsm
@@ -21,7 +23,7 @@ ROOT = Path(__file__).resolve().parent.parent
 def test_raster_reports_the_agreed_fields() -> None:
     result = results_of(raster.run(n=1, seed=3))[0]
     fields = json.loads(result.to_json())
-    assert list(fields) == ["name", "value", "unit", "peer", "ratio", "n", "seed", "conditions"]
+    assert list(fields) == ["name", "value", "unit", "peer", "ratio", "n", "seed", "conditions", "quickest", "median"]
     assert (result.name, result.unit, result.n, result.seed) == ("raster", "images/s", 1, 3)
     assert result.value > 0
     assert result.ratio > 0
@@ -40,6 +42,36 @@ def test_contestants_take_turns_after_one_warm_up_each() -> None:
     assert calls == ["ours", "peer"] * 3
     with pytest.raises(ValueError, match="n = 0"):
         interleave(list, list, 0)
+
+
+def test_ratios_are_of_the_quickest_tenth_and_of_the_medians() -> None:
+    ticks = iter([0.0, 0.0, *(t for k in range(1, 21) for t in (0.0, float(k), 0.0, 3.0 * k + 1.0))])
+    turns = interleave(list, list, 20, clock=lambda: next(ticks))
+    assert turns.quickest_s == (1.5, 5.5)
+    assert turns.median_s == (10.5, 32.5)
+    assert turns.ratios(2.0) == {"quickest": 2 * 5.5 / 1.5, "median": 2 * 32.5 / 10.5}
+
+
+def test_the_table_keeps_rows_that_were_not_measured_and_names_missed_goals(tmp_path: Path) -> None:
+    path = tmp_path / "bench.md"
+    fast = Result("raster-press", 5e5, "images/s", "cv2", 41.0, 60, 0, quickest=41.0, median=39.5)
+    table.renew([fast, Result("startup", 0.2, "s", "import typer", 0.9, 10, 3)], path)
+    table.renew([replace(fast, ratio=12.0)], path)
+    rows = [line for line in path.read_text().splitlines() if line.startswith("| `")]
+    assert [table.name_of(line) for line in rows] == ["raster-press", "startup"]
+    assert "| `raster-press` | 500,000 images/s | 12.00 | 41.00, 39.50 | cv2 | 40, **missed** | 60 | 0 |" in rows[0]
+    assert "| 0.90 |  | import typer |  | 10 | 3 | Python" in rows[1]
+
+
+def test_peak_memory_is_of_the_command_alone() -> None:
+    ballast = b"x" * 300_000_000  # what a process that is forked from here would be charged with
+    small = measure(sys.executable, "-I", "-S", "-c", "pass")
+    large = measure(sys.executable, "-I", "-S", "-c", "b'x' * 80_000_000")
+    assert len(ballast) == 300_000_000
+    assert small.peak_mb < 40
+    assert 80 < large.peak_mb < 120
+    with pytest.raises(BenchError, match="ended with 3: no such thing"):
+        measure(sys.executable, "-S", "-c", "import sys; sys.stderr.write('no such thing'); sys.exit(3)")
 
 
 def test_the_line_for_people_says_what_the_ratio_means() -> None:

@@ -1,0 +1,50 @@
+"""The figures of all benches as one Markdown table, kept in docs/bench.md so that a regression shows in a diff."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from bench.harness import Result, machine
+
+OUT = Path(__file__).resolve().parent.parent / "docs" / "bench.md"
+GOALS = {
+    "raster-press": 40.0,
+    "raster-press-bulk": 40.0,
+    "raster-press-memset": 0.45,
+    "raster-press-bulk-memset": 0.45,
+    "raster-compiled-bulk": 25.0,
+}
+"""The ratio that was asked for, by figure; a bench without one here states its limit as its peer, and asks for 1."""
+_HEAD = """# Figures of the benches
+Written by `make bench`, which runs every bench, or by `python -m bench NAME --table`, which renews the rows of one. A
+ratio compares with the peer or limit named beside it, in the same run; above 1 is better for us. Figures of strokes and
+photographs are of the loopback rig, which is simulated.
+
+| figure | value | ratio | quickest tenth, median | peer or limit | goal | n | seed | machine |
+|---|---|---|---|---|---|---|---|---|
+"""
+
+
+def renew(results: Sequence[Result], path: Path = OUT) -> None:
+    """Write the rows of `results`; rows of figures that were not measured now stay as they are."""
+    kept = path.read_text().splitlines() if path.exists() else []
+    rows = {name_of(line): line for line in kept if line.startswith("| `")}
+    rows |= {result.name: row(result) for result in results}
+    path.write_text(_HEAD + "".join(f"{rows[name]}\n" for name in sorted(rows)))
+
+
+def name_of(line: str) -> str:
+    """The figure that a row of the table is about."""
+    return line.split("`")[1]
+
+
+def row(result: Result) -> str:
+    """One row; a goal that is missed says so."""
+    goal = GOALS.get(result.name)
+    asked = "" if goal is None else f"{goal:g}" if result.ratio >= goal else f"{goal:g}, **missed**"
+    both = "" if result.quickest is None else f"{result.quickest:.2f}, {result.median:.2f}"
+    value = f"{result.value:,.0f}" if result.value >= 1000 else f"{result.value:.3g}"
+    cells = (f"`{result.name}`", f"{value} {result.unit}", f"{result.ratio:.2f}", both, result.peer, asked,
+             str(result.n), str(result.seed), machine())  # fmt: skip
+    return f"| {' | '.join(cells)} |"
