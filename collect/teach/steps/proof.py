@@ -179,8 +179,9 @@ def read_proof(session: Path) -> Proven:
     results: list[dict[str, Any]] = [line["result"] for line in replay(session / JOURNAL_NAME).done.values()]
 
     def having(name: str) -> dict[str, Any]:
+        """The newest: a press that was not sound is made again."""
         none: dict[str, Any] = {}
-        return next((result for result in results if name in result), none)
+        return next((result for result in reversed(results) if name in result), none)
 
     touch, check, capture = having("slope_deg"), having("turn_deg"), having("kept")
     if not capture.get("kept") or capture.get("verdict"):
