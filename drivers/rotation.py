@@ -19,9 +19,11 @@ SMALL_RAD = 1e-3
 
 
 def unit(q: Quaternion) -> Quaternion:
-    """`q` scaled to length 1."""
+    """`q` scaled to length 1. Raises ValueError for (0, 0, 0, 0), which is no rotation."""
     x, y, z, w = q
     length = math.sqrt(x * x + y * y + z * z + w * w)
+    if length == 0.0:
+        raise ValueError("a quaternion of length 0 is no rotation")
     return x / length, y / length, z / length, w / length
 
 

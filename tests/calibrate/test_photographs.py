@@ -62,7 +62,7 @@ def test_the_report_is_one_file_that_fetches_nothing_and_says_what_cannot_be_com
     assert "&lt;script&gt;" in page
     sources = re.findall(r'(?:src|href)="([^"]*)"', page)
     assert sources
-    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert all(re.match(r"data:image/(png|svg\+xml);base64,", source) for source in sources)
     assert "<script" not in page
 
 

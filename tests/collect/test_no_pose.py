@@ -21,6 +21,7 @@ from drivers.samples import Identity
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml
 from tests.collect.tui.fake import SET_UP, FakeEngine, picture
+from tests.collect.tui.test_app import look
 
 WHO = Identity("robot", "aubo_i5", "", True)
 
@@ -61,26 +62,26 @@ async def test_the_run_screen_is_not_green_without_a_pose() -> None:
     engine = FakeEngine(picture())
     app = OperatorApp(engine)
     async with app.run_test(size=(80, 24)) as pilot:
-        await pilot.pause(0.15)
+        await look(app, pilot)
         state = app.screen.query_one("#state")
         green = state.styles.background
         engine.now = picture(tip_mm=None, no_pose_s=1.44)
-        await pilot.pause(0.15)
+        await look(app, pilot)
         assert str(state.render()) == "RUNNING\nno pose for 1.4 s"
         assert state.styles.background != green
         assert "no pose for 1.4 s" in str(app.screen.query_one("#figures").render())
         engine.now = picture(state=State.PAUSED, tip_mm=None, no_pose_s=75.2)
-        await pilot.pause(0.15)
+        await look(app, pilot)
         assert str(state.render()) == "PAUSED\nno pose for 75 s"
         engine.now = picture()
-        await pilot.pause(0.15)
+        await look(app, pilot)
         assert (str(state.render()), state.styles.background) == ("RUNNING", green)
 
 
 async def test_the_set_up_says_it_in_its_title_and_beside_the_tip() -> None:
     app = OperatorApp(FakeEngine(picture(set_up=SET_UP, tip_mm=None, no_pose_s=1.44)))
     async with app.run_test(size=(110, 30)) as pilot:
-        await pilot.pause(0.15)
+        await look(app, pilot)
         assert str(app.screen.query_one("#set-up-title").render()).endswith("press H15-a5-r02, no pose for 1.4 s")
         assert "Tip     no pose for 1.4 s" in str(app.screen.query_one("#live").render())
 

@@ -57,3 +57,8 @@ def test_where_the_angles_are_not_determined_the_first_is_0(ry: float) -> None:
     rx, same, rz = rotation.angles(q)
     assert (rx, same) == (0.0, pytest.approx(ry, abs=1e-7))
     assert rotation.angle_rad(rotation.product(rotation.inverse(q), rotation.of_angles(rx, same, rz))) < 1e-7
+
+
+def test_a_quaternion_of_length_0_is_refused() -> None:
+    with pytest.raises(ValueError, match="length 0"):
+        rotation.unit((0.0, 0.0, 0.0, 0.0))

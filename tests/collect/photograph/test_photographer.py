@@ -69,7 +69,7 @@ async def test_an_arm_that_is_parked_already_is_shown_once_more():
 
 async def test_a_camera_that_is_too_late_is_refused_with_the_figure_and_the_way_out():
     theatre = Theatre(lambda _t_s: 0.3)
-    with pytest.raises(CameraLate, match=r"too long: (2[5-9]|3[0-5])\d ms .*max_delay_ms = 200.* cable"):
+    with pytest.raises(CameraLate, match=r"too long: (2[5-9]|3[0-5])\d ± .*max_delay_ms = 200.* cable"):
         await theatre.photographer(max_delay_ms=200).photograph()
 
 
