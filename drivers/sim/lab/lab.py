@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+import os
 import socket
 from collections.abc import Iterator
 from dataclasses import replace
@@ -137,9 +138,12 @@ class UnknownLab:
 
 
 def _free_address(seed: int) -> str:
-    """A loopback address on which nobody uses a port of ours. Raises OSError where there is none."""
-    for last in range(10, 10 + ADDRESSES):
-        host = f"127.16.{seed % 250 + 1}.{last}"
+    """A loopback address on which nobody uses a port of ours. Raises OSError where there is none.
+
+    Each process begins its search elsewhere: two that probed one address at the same moment would both find it free.
+    """
+    for tried in range(ADDRESSES):
+        host = f"127.16.{seed % 250 + 1}.{10 + (os.getpid() + tried) % ADDRESSES}"
         with contextlib.ExitStack() as probes:
             try:
                 for port in _ports():
