@@ -201,7 +201,7 @@ def doctor_table(findings: list[Finding]) -> Table:
     """One row per device, with the verdict as a word as well as a colour."""
     table = Table("device", "verdict", "who answers", "latency", "notes, what is wrong, what to do", show_lines=True)
     for finding in findings:
-        verdict = Text("well", "green") if finding.well else Text("trouble" if finding.answers else "no answer", "red")
+        verdict = Text("ok", "green") if finding.well else Text("trouble" if finding.answers else "no answer", "red")
         who = " ".join(part for part in (finding.identity or finding.address, finding.firmware) if part)
         latency = "" if finding.latency_ms is None else f"{finding.latency_ms:.1f} ms"
         words = [finding.notes, finding.problem and f"{finding.problem}.", finding.remedy]
