@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import itertools
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -51,10 +53,9 @@ class ProofStep:
         await day.may_move(
             "Touch the sheet, press three marks and one stroke: the well must hold ink, the sheet be blank"
         )
-        with tempfile.TemporaryDirectory(prefix="brushloop-proof-") as folder:
-            session = await self._run(day, Path(folder), protocol, dry=False)
-            proven = read_proof(session)
-        await self._keep(day, proven)
+        session = await self._run(day, folder_beside(day.rig_path), protocol, dry=False)
+        await day.say(f"Recorded in {session}.")
+        await self._keep(day, read_proof(session))
 
     async def _doctor(self, day: Day, rig: RigConfig) -> None:
         findings = await examine(rig, day.clock)
@@ -202,6 +203,16 @@ def read_proof(session: Path) -> Proven:
         (float(check["offset_mm"][0]), float(check["offset_mm"][1])),
         float(check["turn_deg"]),
     )
+
+
+def folder_beside(rig_path: Path) -> Path:
+    """A new folder for the recording of a proof: `rig.proof-1`, `rig.proof-2` and so on beside `rig.toml`."""
+    for number in itertools.count(1):
+        folder = rig_path.with_name(f"{rig_path.stem}.proof-{number}")
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir()
+            return folder
+    raise AssertionError("unreachable")
 
 
 def _with_lens_at(day: Day) -> str:
