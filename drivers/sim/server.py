@@ -10,6 +10,9 @@ from typing import ClassVar
 
 from drivers.errors import ProtocolViolation
 
+TURNS_TO_BEGIN = 3
+"""Turns of the event loop from accepting a connection to the first step of its task."""
+
 
 class NotLoopback(ValueError):
     """A simulated device was asked to listen where other machines could reach it."""
@@ -47,7 +50,11 @@ class LoopbackServer(abc.ABC):
         """Close the listener and every client."""
         server, self._server = self._server, None
         if server is not None:
+            # asyncio leaves a connection open that is accepted in the turn of the loop in which the server closes.
+            await asyncio.sleep(0)
             server.close()
+            for _ in range(TURNS_TO_BEGIN):
+                await asyncio.sleep(0)
             self.drop_clients()
             await asyncio.gather(*self._clients, return_exceptions=True)
             await server.wait_closed()
