@@ -1,6 +1,6 @@
 """What the camera's driver does with frames that must not be believed, through a real decoder.
 
-How a single frame is judged is in tests/drivers/test_camera_health.py; a stream that ends, in test_camera.py.
+How a single frame is judged is in tests/drivers/camera/test_health.py; a stream that ends, in test_camera.py there.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from calibrate.board.register import register
 from calibrate.errors import CaptureRefused
 from calibrate.stroke.difference import new_stroke
 
-DATA = Path(__file__).parents[3] / "shared" / "data" / "frida_page_sequence"
+DATA = Path(__file__).parents[4] / "shared" / "data" / "frida_page_sequence"
 PAGE_MM = (203.2, 279.4)
 NAIVE_BIAS_MM, NAIVE_SD_MM = (1.0, 0.5), (4.2, 2.0)
 """Of the left end of a plain frame difference, as the data's README has it."""
