@@ -37,8 +37,10 @@ async def measure(rig: RigConfig, n: int, seed: int, conditions: str) -> list[Re
                 Result(name, ours_ms, "ms", f"the same {_how(peer)}", peer_ms / ours_ms, n, seed, conditions)
             )
         # One more on both sides: a ratio must not divide by zero, and equal counts are 1.
-        ratio, told = (missed[peer] + 1) / (missed[ours] + 1), f"the same {_how(peer)}, each plus one"
-        results.append(Result(f"telemetry {ours} missed", missed[ours], "samples", told, ratio, n, seed, conditions))
+        ratio, baseline = (missed[peer] + 1) / (missed[ours] + 1), f"the same {_how(peer)}, each plus one"
+        results.append(
+            Result(f"telemetry {ours} missed", missed[ours], "samples", baseline, ratio, n, seed, conditions)
+        )
     return results
 
 

@@ -116,7 +116,7 @@ def results(done: dict[str, Trained], seed: int) -> list[Result]:
     made: list[Result] = []
     for name, one in done.items():
         last, target = one.checks[-1], one.config.target
-        told = (
+        conditions = (
             f"{STROKES[name]} ({len(target.ranges)} inputs, {target.px_mm:g} mm a pixel), {one.config.steps} steps of "
             f"{one.config.batch} images, {one.config.weight_count():,} weights, one thread: IoU {last.iou:.4f}, CSIM "
             f"{last.csim:.5f}, ink {last.target_share:.1%} of the image; exact images, no captures; {machine()}"
@@ -124,7 +124,14 @@ def results(done: dict[str, Trained], seed: int) -> list[Result]:
         ratio = peer / last.mse if last.mse else float("inf")
         made.append(
             Result(
-                f"curves: {name}", last.mse, "MSE", "the same on CCD-BSM (H, α)", ratio, one.config.steps, seed, told
+                f"curves: {name}",
+                last.mse,
+                "MSE",
+                "the same on CCD-BSM (H, α)",
+                ratio,
+                one.config.steps,
+                seed,
+                conditions,
             )
         )
     return made

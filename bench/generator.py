@@ -68,7 +68,7 @@ def _compare(target: str, name: str, n: int | None, seed: int, *, with_basis: bo
             turns = interleave(lambda: ours(batch), lambda: draw_peer(batch), _ROUNDS)
             drawing_s = _drawing_s(config, training, ours_steps)
             fitted = _basis_results(config, validation, other.mse, draw_peer, seed) if with_basis else []
-    told = (
+    conditions = (
         f"{target}, {budget_s} s of CPU time each, one thread: ours {parameter_count(ours):,} weights, "
         f"{ours_steps} steps, {ours_s:.0f} s; peer {parameter_count(peer):,} weights, {peer_steps} steps, "
         f"{peer_s:.0f} s, "
@@ -91,7 +91,7 @@ def _compare(target: str, name: str, n: int | None, seed: int, *, with_basis: bo
     ]
     peer_name = "Learning-to-Paint-type network"
     results = [
-        Result(f"{name}-{what}", value, kind, peer_name, ratio, found.images, seed, told)
+        Result(f"{name}-{what}", value, kind, peer_name, ratio, found.images, seed, conditions)
         for what, value, kind, ratio in rows
     ]
     results[-1] = replace(results[-1], **turns.ratios())
@@ -104,7 +104,7 @@ def _compare(target: str, name: str, n: int | None, seed: int, *, with_basis: bo
         DRAWING_SHARE / share,
         1,
         seed,
-        told,
+        conditions,
     )
     return [*results, drawn, *fitted]
 
@@ -204,9 +204,9 @@ def _basis_results(
     turns = interleave(lambda: basis(batch), lambda: draw_peer(batch), _ROUNDS)
     forward, peer_forward = turns.median_s
     peer = "Learning-to-Paint-type network"
-    told = f"interpolator, fitted in {fit_s:.1f} s of CPU time, PSNR {found.psnr_db:.1f} dB, IoU {found.iou:.5f}"
+    conditions = f"interpolator, fitted in {fit_s:.1f} s of CPU time, PSNR {found.psnr_db:.1f} dB, IoU {found.iou:.5f}"
     return [
-        Result("field-basis-mse", found.mse, "MSE", peer, peer_mse / found.mse, len(images), seed, told),
+        Result("field-basis-mse", found.mse, "MSE", peer, peer_mse / found.mse, len(images), seed, conditions),
         Result(
             "field-basis-forward",
             config.batch / forward,
@@ -215,7 +215,7 @@ def _basis_results(
             peer_forward / forward,
             _ROUNDS,
             seed,
-            told,
+            conditions,
             **turns.ratios(),
         ),
     ]

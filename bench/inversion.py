@@ -82,7 +82,7 @@ def presses(count: int, seed: int, known: Known) -> Presses:
 
 def _anchored(count: int, seed: int) -> Sequence[Result]:
     drawn = presses(count, seed, Known.ANCHOR)
-    told = Told("anchor", count, seed)
+    labelled = Labelled("anchor", count, seed)
     pixel, rounded = (
         Inverter.of_brush(Basis(Brush()), noise=noise, px_mm=PX_MM) for noise in (Noise.PIXEL, Noise.QUANTISED)
     )
@@ -93,21 +93,21 @@ def _anchored(count: int, seed: int) -> Sequence[Result]:
     few = min(count, SLOW)
     autograd_ms = _ms(lambda: _autograd(drawn, few)) / few
     return [
-        *_errors(told, "clean", clean, drawn, worst=True),
-        told("clean-time", clean_ms, "ms/image", f"the {MS:g} ms asked for", MS / clean_ms),
-        told("clean-time-one", one_ms / min(count, BATCH), "ms/image", f"the {MS:g} ms asked for",
+        *_errors(labelled, "clean", clean, drawn, worst=True),
+        labelled("clean-time", clean_ms, "ms/image", f"the {MS:g} ms asked for", MS / clean_ms),
+        labelled("clean-time-one", one_ms / min(count, BATCH), "ms/image", f"the {MS:g} ms asked for",
              MS * min(count, BATCH) / one_ms),
-        told("clean-time-autograd", clean_ms, "ms/image", "the same fit by autograd", autograd_ms / clean_ms),
-        *_errors(told, "binary", binary, drawn, worst=False),
-        told("binary-time", binary_ms, "ms/image", f"the {MS:g} ms asked for", MS / binary_ms),
-        *_coverages(told, "binary", binary, drawn),
-        *_coverages(told, "noisy", noisy, drawn),
+        labelled("clean-time-autograd", clean_ms, "ms/image", "the same fit by autograd", autograd_ms / clean_ms),
+        *_errors(labelled, "binary", binary, drawn, worst=False),
+        labelled("binary-time", binary_ms, "ms/image", f"the {MS:g} ms asked for", MS / binary_ms),
+        *_coverages(labelled, "binary", binary, drawn),
+        *_coverages(labelled, "noisy", noisy, drawn),
     ]  # fmt: skip
 
 
 def _shape_only(count: int, seed: int) -> Sequence[Result]:
     drawn = presses(count, seed, Known.NOTHING)
-    told = Told("shape", count, seed)
+    labelled = Labelled("shape", count, seed)
     pixel, rounded = (
         Inverter.of_brush(Basis(Brush()), known=Known.NOTHING, noise=noise, px_mm=PX_MM)
         for noise in (Noise.PIXEL, Noise.QUANTISED)
@@ -117,17 +117,17 @@ def _shape_only(count: int, seed: int) -> Sequence[Result]:
     noisy, _ = _recovered(pixel, _noisy(drawn.images, seed), None)
     assert all(Flag.ALPHA_UNKNOWN in flags for flags in (*clean.flags, *binary.flags))
     return [
-        *_errors(told, "clean", clean, drawn, worst=True),
-        told("clean-time", clean_ms, "ms/image", f"the {MS:g} ms asked for", MS / clean_ms),
-        *_errors(told, "binary", binary, drawn, worst=False),
-        told("binary-time", binary_ms, "ms/image", f"the {MS:g} ms asked for", MS / binary_ms),
-        *_coverages(told, "binary", binary, drawn),
-        *_coverages(told, "noisy", noisy, drawn),
+        *_errors(labelled, "clean", clean, drawn, worst=True),
+        labelled("clean-time", clean_ms, "ms/image", f"the {MS:g} ms asked for", MS / clean_ms),
+        *_errors(labelled, "binary", binary, drawn, worst=False),
+        labelled("binary-time", binary_ms, "ms/image", f"the {MS:g} ms asked for", MS / binary_ms),
+        *_coverages(labelled, "binary", binary, drawn),
+        *_coverages(labelled, "noisy", noisy, drawn),
     ]
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class Labelled:
     """Makes results that share a name's beginning, n and seed."""
 
     known: str
@@ -139,19 +139,21 @@ class Told:
         return Result(f"inversion-{self.known}-{name}", value, unit, peer, ratio, self.n, self.seed, machine())
 
 
-def _errors(told: Told, name: str, found: Recovered, drawn: Presses, *, worst: bool) -> Sequence[Result]:
+def _errors(labelled: Labelled, name: str, found: Recovered, drawn: Presses, *, worst: bool) -> Sequence[Result]:
     kind = "worst" if worst else "mean"
     off_mm, off_deg = np.abs(found.height_mm - drawn.height_mm), np.abs(found.tilt_deg - drawn.tilt_deg)
     mm, deg = (float(off.max() if worst else off.mean()) for off in (off_mm, off_deg))
     asked_mm = HEIGHT_MM if worst else BINARY_MM
-    out = [told(f"{name}-H-{kind}", mm, "mm", f"the {asked_mm:g} mm asked for", asked_mm / max(mm, 1e-12))]
+    out = [labelled(f"{name}-H-{kind}", mm, "mm", f"the {asked_mm:g} mm asked for", asked_mm / max(mm, 1e-12))]
     if worst:
         asked = f"the {ALPHA_DEG:g} deg asked for"
-        return [*out, told(f"{name}-alpha-{kind}", deg, "deg", asked, ALPHA_DEG / max(deg, 1e-12))]
-    out.append(told(f"{name}-H-95", float(np.quantile(off_mm, 0.95)), "mm", "the mean", mm / np.quantile(off_mm, 0.95)))
+        return [*out, labelled(f"{name}-alpha-{kind}", deg, "deg", asked, ALPHA_DEG / max(deg, 1e-12))]
+    out.append(
+        labelled(f"{name}-H-95", float(np.quantile(off_mm, 0.95)), "mm", "the mean", mm / np.quantile(off_mm, 0.95))
+    )
     return [
         *out,
-        told(f"{name}-alpha-{kind}", deg, "deg", "an always guessed 5 deg", _guessed(drawn) / max(deg, 1e-12)),
+        labelled(f"{name}-alpha-{kind}", deg, "deg", "an always guessed 5 deg", _guessed(drawn) / max(deg, 1e-12)),
     ]
 
 
@@ -159,13 +161,13 @@ def _guessed(drawn: Presses) -> float:
     return float(np.abs(drawn.tilt_deg - 5.0).mean())
 
 
-def _coverages(told: Told, name: str, found: Recovered, drawn: Presses) -> Sequence[Result]:
+def _coverages(labelled: Labelled, name: str, found: Recovered, drawn: Presses) -> Sequence[Result]:
     out: list[Result] = []
     for parameter, true in (("height_mm", drawn.height_mm), ("tilt_deg", drawn.tilt_deg)):
         low, high = found.interval(parameter)
         share = 100 * float(((low <= true) & (true <= high)).mean())
         letter = "H" if parameter == "height_mm" else "alpha"
-        out.append(told(f"{name}-coverage-{letter}", share, "%", "the nominal 95 %", share / NOMINAL))
+        out.append(labelled(f"{name}-coverage-{letter}", share, "%", "the nominal 95 %", share / NOMINAL))
     return out
 
 

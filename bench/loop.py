@@ -22,7 +22,7 @@ REPEATS = 3
 RATE = 20.0
 GOAL_POINTS = 1.0
 ENDS = (0, 3)
-"""3 is a collection that finished without some strokes; fewer pairs are told as such."""
+"""3 is a collection that finished without some strokes; fewer pairs are named in the result."""
 
 
 def run(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
@@ -37,14 +37,16 @@ def run(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
     results: list[Result] = []
     for brush in range(brushes):
         with tempfile.TemporaryDirectory() as scratch:
-            told = close_the_loop(Path(scratch), brush, seed)
-        lost = [-verdict["difference"] for verdict in told["verdicts"]]
-        conditions = f"{told['source']}, {told['pairs']} pairs, {len(told['refused'])} not compared; {machine()}"
+            outcome = close_the_loop(Path(scratch), brush, seed)
+        lost = [-verdict["difference"] for verdict in outcome["verdicts"]]
+        conditions = (
+            f"{outcome['source']}, {outcome['pairs']} pairs, {len(outcome['refused'])} not compared; {machine()}"
+        )
         for name, points in (("worst of 8", max(lost)), ("mean of 8", sum(lost) / len(lost))):
             peer = f"the goal ({GOAL_POINTS:g} point)"
             ratio = GOAL_POINTS / max(points, 0.01)
             title = f"loop: brush {brush + 1}, {name}"
-            results.append(Result(title, points, "points lost", peer, ratio, told["pairs"], seed, conditions))
+            results.append(Result(title, points, "points lost", peer, ratio, outcome["pairs"], seed, conditions))
     return results
 
 

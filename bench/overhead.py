@@ -31,7 +31,7 @@ STEADY, FRAME, INK = "the controller calls the arm steady", "a fresh frame", "th
 WAITS = (STEADY, FRAME, INK)
 ENCODE, JUDGE, FILES, MERGE = "encode the still", "judge the capture", "journal and files", "merge and verify"
 BLANK = "check that the sheet is blank"
-"""Once a sheet, which holds dozens of strokes: told apart from what each stroke takes."""
+"""Once a sheet, which holds dozens of strokes: reported apart from what each stroke takes."""
 BEFORE, SETTLING, REST = "from a move to its motion", "from steady to the move's end", "the rest"
 PARTS = ("motion", ENCODE, JUDGE, BLANK, FILES, FRAME, INK, STEADY, BEFORE, SETTLING)
 """The first that covers an instant has it."""
@@ -82,10 +82,10 @@ def _results(watch: Watch, strokes: int, seed: int) -> list[Result]:
     once_s = took.pop(BLANK)
     waits_s = sum(took[part] for part in WAITS) / strokes
     all_s = sum(took.values()) / strokes
-    told = f"loopback rig at its real speed, {motion_s:.1f} s of motion a stroke, dwell left out; {machine()}"
+    conditions = f"loopback rig at its real speed, {motion_s:.1f} s of motion a stroke, dwell left out; {machine()}"
 
     def result(name: str, value: float, unit: str, peer: str, ratio: float) -> Result:
-        return Result(f"overhead: {name}", value, unit, peer, ratio, strokes, seed, told)
+        return Result(f"overhead: {name}", value, unit, peer, ratio, strokes, seed, conditions)
 
     results: list[Result] = []
     for name, seconds in (("software", all_s - waits_s), ("software and waits for devices", all_s)):

@@ -37,8 +37,8 @@ def measure(*command: str) -> Used:
     starter = [sys.executable, "-I", "-S", "-c", _STARTER, str(write), *command]
     ran = subprocess.run(starter, capture_output=True, text=True, check=False, pass_fds=(write,))
     os.close(write)
-    with os.fdopen(read) as told:
-        answer = told.read()
+    with os.fdopen(read) as pipe:
+        answer = pipe.read()
     if not answer:
         raise BenchError(f"{command[0]} could not be started: {ran.stderr[-300:]}")
     wall_s, cpu_s, peak_kib, code = json.loads(answer)

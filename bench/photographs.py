@@ -131,7 +131,7 @@ def _row(frame: Frame, left_s: float, took_s: float, seen: list[tuple[float, flo
     return {
         "fresh": read_strip(frame.image) / 1e9 >= parked_s - 0.005,  # the clocks of two processes
         "old_fresh": None if old is None else old >= parked_s - 0.005,
-        "told_s": None if delay is None else delay.delay_s,  # None: to be measured again
+        "measured_s": None if delay is None else delay.delay_s,  # None: to be measured again
         "first": took_s,
         "true_s": _true_s(seen),
     }
@@ -142,7 +142,7 @@ def _true_s(seen: list[tuple[float, float]]) -> float | None:
 
 
 def _blind_to_the_strip(seen: list[tuple[float, float]]) -> None:
-    """Note the truth about every frame, and hide the strip that tells it from who looks at the picture."""
+    """Note the truth about every frame, and hide the strip that holds it from those who look at the picture."""
     whole, fresh = frames_of.thumbnail, OpenCvCamera.fresh
 
     async def noted(self: OpenCvCamera, after: Stamp) -> Frame:
@@ -197,19 +197,19 @@ def _line(case: Case, rows: list[dict[str, Any]]) -> str:
     stale = sum(not row["fresh"] for row in taken)
     old = [row["old_fresh"] for row in taken if row["old_fresh"] is not None]
     refused = [row["error"] for row in rows if "error" in row]
-    told = ""
+    delays = ""
     if taken:
-        told_s, true_s = taken[0]["told_s"], taken[0]["true_s"]
-        told = f"{1e3 * told_s:.0f} / {1e3 * true_s:.0f}"
+        measured_s, true_s = taken[0]["measured_s"], taken[0]["true_s"]
+        delays = f"{1e3 * measured_s:.0f} / {1e3 * true_s:.0f}"
     took = f"{percentile([row['first'] for row in taken], 50):.2f}" if taken else ""
     errors = ", ".join(f"{refused.count(name)} {name}" for name in sorted(set(refused))) or "none"
-    return f"| {case.name} | {len(taken)} | {stale} | {old.count(False)} of {len(old)} | {told} | {took} | {errors} |"
+    return f"| {case.name} | {len(taken)} | {stale} | {old.count(False)} of {len(old)} | {delays} | {took} | {errors} |"
 
 
 def main(seed: int) -> None:
     """Measure and print the table."""
     tell(f"Photographs on the loopback rig, seed {seed}, {machine()}")
-    tell("| camera | photographs | stale | stale by the old rule | told / true delay, ms | s each | refused |")
+    tell("| camera | photographs | stale | stale by the old rule | measured / true delay, ms | s each | refused |")
     tell("|---|---|---|---|---|---|---|")
     for number, case in enumerate(cases()):
         tell(measure(number, case, seed))

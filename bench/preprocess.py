@@ -29,7 +29,7 @@ def run(*, n: int | None = None, seed: int = 0) -> Result:
 
     ratio = ours over the peer's, one thread each. Both rectify a window of 25.6 mm to 20 px/mm by a homography, flatten
     the light by a closing and a blur of the same size at an eighth of the size, gate, threshold by Otsu, keep the main
-    component without specks, and average down. Ours fits the slope of the light besides, and joins broken parts.
+    component without specks, and average down. Ours also fits the slope of the light, and joins broken parts.
     """
     rounds = 10 if n is None else n
     rng = np.random.default_rng(seed)

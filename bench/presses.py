@@ -61,9 +61,9 @@ async def measure(rig: RigConfig, controller: Process, rate: float, n: int, seed
     expected = n + len(set(wanted))
     if len(made) != expected or not all(ink_load > 0.0 for _, ink_load in made):
         raise BenchError(f"{expected} inked presses were asked for, the sheet has {len(made)}")
-    told = f"{len(press(rig, 11.0, 0.0))} moves each, dips not timed, loopback clock at {rate:g} x; {conditions}"
+    conditions = f"{len(press(rig, 11.0, 0.0))} moves each, dips not timed, loopback clock at {rate:g} x; {conditions}"
     peer = "the simulated brush alone, without arm and wire"
-    return [Result("presses", n / ours_s, "presses/s", peer, brush_s / ours_s, n, seed, told)]
+    return [Result("presses", n / ours_s, "presses/s", peer, brush_s / ours_s, n, seed, conditions)]
 
 
 def press(rig: RigConfig, height_mm: float, tilt_deg: float) -> Moves:

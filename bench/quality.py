@@ -61,11 +61,11 @@ class Score:
 
 def score(samples: Iterable[Sample | Patch], limits: QualityConfig, *, with_previous: bool = True) -> Score:
     """Judge every capture and every patch; the still before a press is withheld where `with_previous` is false."""
-    told = Score()
+    scores = Score()
     for sample in samples:
         if isinstance(sample, Patch):
             seen = cell_is_blank(sample.image, sample.plane, sample.cell, limits=limits)
-            told.patches[sample.blank, seen.passed] += 1
+            scores.patches[sample.blank, seen.passed] += 1
             continue
         began = time.perf_counter()
         verdict = check_capture(
@@ -77,9 +77,9 @@ def score(samples: Iterable[Sample | Patch], limits: QualityConfig, *, with_prev
             previous=sample.before if with_previous else None,
             sheet_mm=sample.sheet_mm,
         )
-        told.seconds.append(time.perf_counter() - began)
-        told.counts[sample.label, verdict.cause.name if verdict.cause else None] += 1
-    return told
+        scores.seconds.append(time.perf_counter() - began)
+        scores.counts[sample.label, verdict.cause.name if verdict.cause else None] += 1
+    return scores
 
 
 def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
@@ -90,31 +90,31 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """
     if n is not None and n < 1:
         raise ValueError(f"n = {n}: at least one capture is needed")
-    told = score(draw_set(seed, CAPTURES if n is None else n), QualityConfig())
-    captures, goal = len(told.seconds), f"goal {GOAL:g}, loopback rig"
+    scores = score(draw_set(seed, CAPTURES if n is None else n), QualityConfig())
+    captures, goal = len(scores.seconds), f"goal {GOAL:g}, loopback rig"
     results: list[Result] = []
     for failure in Failure:
-        recall, precision = told.recall(failure), told.precision(failure)
-        where = f"{told.of(failure)} captures, called {told.confused(failure)} besides"
+        recall, precision = scores.recall(failure), scores.precision(failure)
+        where = f"{scores.of(failure)} captures, called {scores.confused(failure)} otherwise"
         results.append(Result(f"quality.{failure}.recall", recall, "of 1", goal, recall / GOAL, captures, seed, where))
         results.append(
             Result(f"quality.{failure}.precision", precision, "of 1", goal, precision / GOAL, captures, seed, where)
         )
-    sound, alarms = told.of(None), told.false_alarms
+    sound, alarms = scores.of(None), scores.false_alarms
     at_least = max(alarms, 1.0 / sound)
-    where = f"{sound} sound captures, called {told.confused(None)} besides"
+    where = f"{sound} sound captures, called {scores.confused(None)} otherwise"
     peer = f"goal {FALSE_ALARMS_GOAL:g} at most, loopback rig"
     results.append(
         Result("quality.false-alarms", alarms, "of 1", peer, FALSE_ALARMS_GOAL / at_least, captures, seed, where)
     )
-    slow_s = percentile(told.seconds, 95.0)
+    slow_s = percentile(scores.seconds, 95.0)
     results.append(
         Result("quality.seconds", slow_s, "s (95 %)", "goal 2 s at most, loopback rig", 2.0 / slow_s, captures, seed)
     )
     return results
 
 
-def table(told: Score) -> str:
+def table(scores: Score) -> str:
     """The confusion matrix as a Markdown table: rows are what a capture was, columns what it was called."""
     words = [_word(label) for label in LABELS]
     lines = [
@@ -122,17 +122,17 @@ def table(told: Score) -> str:
         f"|---|{'---|' * (len(words) + 3)}",
     ]
     for label in LABELS:
-        counts = " | ".join(str(told.counts[label, called] or "") for called in LABELS)
-        figures = f"{told.of(label)} | {told.recall(label):.3f} | {told.precision(label):.3f}"
+        counts = " | ".join(str(scores.counts[label, called] or "") for called in LABELS)
+        figures = f"{scores.of(label)} | {scores.recall(label):.3f} | {scores.precision(label):.3f}"
         lines.append(f"| **{_word(label)}** | {counts} | {figures} |")
-    blank, inked = told.patches[True, True], told.patches[False, False]
-    blanks, inkeds = blank + told.patches[True, False], inked + told.patches[False, True]
+    blank, inked = scores.patches[True, True], scores.patches[False, False]
+    blanks, inkeds = blank + scores.patches[True, False], inked + scores.patches[False, True]
     lines += [
         "",
-        f"False alarms on sound strokes: {100.0 * told.false_alarms:.1f} %. "
+        f"False alarms on sound strokes: {100.0 * scores.false_alarms:.1f} %. "
         f"Blank cells called blank before a press: {blank} of {blanks}; cells with ink refused: {inked} of {inkeds}.",
-        f"Seconds per capture: {percentile(told.seconds, 50.0):.2f} in the middle, "
-        f"{percentile(told.seconds, 95.0):.2f} for 95 %.",
+        f"Seconds per capture: {percentile(scores.seconds, 50.0):.2f} in the middle, "
+        f"{percentile(scores.seconds, 95.0):.2f} for 95 %.",
     ]
     return "\n".join(lines)
 
@@ -151,8 +151,8 @@ def main(arguments: Sequence[str]) -> None:
     """`python -m bench.quality [CAPTURES [SEED [alone]]]`: the confusion matrix; `alone` withholds the still before."""
     captures = int(arguments[0]) if arguments else CAPTURES
     seed = int(arguments[1]) if len(arguments) > 1 else 0
-    told = score(draw_set(seed, captures), QualityConfig(), with_previous="alone" not in arguments[2:])
-    sys.stdout.write(table(told) + "\n")
+    scores = score(draw_set(seed, captures), QualityConfig(), with_previous="alone" not in arguments[2:])
+    sys.stdout.write(table(scores) + "\n")
 
 
 if __name__ == "__main__":

@@ -23,11 +23,11 @@ from collect.rig.config_quality import QualityConfig
 from collect.rig.paper import Cell
 
 WHITENED = QualityConfig(bright_level=256.0, glare_mm2=1e6)
-"""For paper that whoever published it has set to 255: neither exposure nor glare can be judged any more."""
+"""For paper that whoever published it has set to 255: neither exposure nor glare can be judged."""
 INK = (Failure.NEIGHBOUR, Failure.BLANK, Failure.DRY, Failure.FAINT)
 """What can be asked of a drag: its place and its shape are not those of a press."""
 DEPTH_MM = 9.0
-"""Where the table tells no depth."""
+"""For rows of the table without a depth."""
 
 
 def rows(folder: Path) -> list[dict[str, str]]:

@@ -32,8 +32,8 @@ CROP_MM = (-16.0, 64.0, 32.0)
 NETWORK_STEPS = 500
 CIRCLE_SPREAD_MM = 1.5
 CIRCLE_ABOVE = (0.22, 0.26, 0.3, 0.34, 0.38, 0.42)
-"""What the stamps lack strays more, so they get an edge spread of their own, and the chance from which a pixel is
-called ink that is best for them on the training strokes."""
+"""Circles predict edges less well than stamps do. They get an edge spread of their own, and the probability above which
+a pixel counts as ink that suits them best on the training strokes."""
 QUICK_SIZES, QUICK_STEPS = (20,), 120
 Floats = NDArray[np.float64]
 

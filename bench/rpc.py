@@ -78,14 +78,16 @@ async def round_trips(rig: RigConfig, echo_port: int, n: int, seed: int, conditi
             await connection.close()
     results: list[Result] = []
     peer_s, peer = took_s["echo"], f"a bare asyncio echo of {len(request)} bytes"
-    told = f"{METHOD}, one call at a time; {conditions}"
+    conditions = f"{METHOD}, one call at a time; {conditions}"
     for name in connections:
         ours_s = took_s[name]
         ours_hz, peer_hz = len(ours_s) / sum(ours_s), len(peer_s) / sum(peer_s)
-        results.append(Result(f"rpc {name}", ours_hz, "round trips/s", peer, ours_hz / peer_hz, n, seed, told))
+        results.append(Result(f"rpc {name}", ours_hz, "round trips/s", peer, ours_hz / peer_hz, n, seed, conditions))
         for percent in (50, 99):
             ours_ms, peer_ms = (1e3 * percentile(s, percent) for s in (ours_s, peer_s))
-            results.append(Result(f"rpc {name} p{percent}", ours_ms, "ms", peer, peer_ms / ours_ms, n, seed, told))
+            results.append(
+                Result(f"rpc {name} p{percent}", ours_ms, "ms", peer, peer_ms / ours_ms, n, seed, conditions)
+            )
     return results
 
 

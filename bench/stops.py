@@ -114,13 +114,13 @@ async def measure(rig: RigConfig, n: int, seed: int, conditions: str) -> list[Re
         finally:
             await robot.close()
     peer = "the same frame written bare to an idle socket"
-    told = (
+    conditions = (
         f"from robot.stop() to the frame at the controller's socket, arm moving, its moveLine unanswered; {conditions}"
     )
     results: list[Result] = []
     for what, percent in (("p50", 50.0), ("p99", 99.0), ("max", 100.0)):
         value_ms, peer_ms = percentile(ours_ms, percent), percentile(bare_ms, percent)
-        results.append(Result(f"stop latency {what}", value_ms, "ms", peer, peer_ms / value_ms, n, seed, told))
+        results.append(Result(f"stop latency {what}", value_ms, "ms", peer, peer_ms / value_ms, n, seed, conditions))
     return results
 
 

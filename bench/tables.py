@@ -63,11 +63,11 @@ def _figures(number: int, report: Report, count: int, seed: int) -> list[Result]
         top, peer = average[CEILING], average[BEZIER_REFITTED]
         values = [average[name] for name in PUBLISHED]
         held = all(a > b - ORDER_POINTS for a, b in itertools.pairwise(values))
-        told = ", ".join(f"{name} {value:.1f}" for name, value in average.items())
+        averages = ", ".join(f"{name} {value:.1f}" for name, value in average.items())
         words = (
             f"brush {number}, {alignment}, {count} presses, the paper's order {'holds' if held else 'does not hold'}"
         )
-        where = f"simulated brush (loopback rig): {words}: {told}; {machine()}"
+        where = f"simulated brush (loopback rig): {words}: {averages}; {machine()}"
         for name in (FITTED_HELD_OUT, GENERATOR_HELD_OUT):
             gap = top - average[name]
             ratio = (top - peer) / gap if gap > 0.0 else float("inf")

@@ -31,7 +31,7 @@ SECONDS = 10.0
 WAIT_S = 60.0
 READY = {"ours": b"RUNNING", "idle": b"brushloop"}
 STOPPED = (b"STOP SENT", b"STOPPING")
-"""Either tells the operator that the key was heard."""
+"""Either shows the operator that the key was noticed."""
 PRESS_EVERY_S = 0.4
 
 

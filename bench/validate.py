@@ -98,8 +98,8 @@ def plain_scores(job: ScoreJob) -> NDArray[np.float64]:
         for k, (alignment, _tone) in enumerate(KEYS):
             for m, images in enumerate(predictions):
                 out[n, m, k] = plain_score(captured[k], images[k], alignment)
-            foretold = [plain_score(captured[k], others[o][k], alignment) for o in job.predicted_by[n]]
-            out[n, -2, k] = np.mean(foretold, axis=0)
+            predicted = [plain_score(captured[k], others[o][k], alignment) for o in job.predicted_by[n]]
+            out[n, -2, k] = np.mean(predicted, axis=0)
     return out
 
 
@@ -176,8 +176,8 @@ def threads(seed: int, strokes: int = 60) -> list[Result]:
     where = f"loopback rig, photographs of {size}, {workers} workers; starting the processes took {start_s:.1f} s"
     peer = "processes, already started"
     rate = strokes / ours_s
-    told = f"{where}; {machine()}"
-    return [Result("validate.threads", rate, "strokes/s", peer, peer_s / ours_s, 3, seed, told, **turns.ratios())]
+    conditions = f"{where}; {machine()}"
+    return [Result("validate.threads", rate, "strokes/s", peer, peer_s / ours_s, 3, seed, conditions, **turns.ratios())]
 
 
 def _measured(place: Path, out: Path) -> tuple[float, float]:
@@ -208,17 +208,17 @@ def cluster(under: Path, strokes: int, seed: int) -> list[Result]:
 @contextmanager
 def _workers(under: Path, count: int) -> Iterator[str]:
     """The address of a scheduler with so many workers of one thread."""
-    told = under / f"scheduler-{count}.json"
+    scheduler_file = under / f"scheduler-{count}.json"
     here = ("--host", "127.0.0.1", "--no-dashboard")
-    words = ("distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", str(told), *here)
+    words = ("distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", str(scheduler_file), *here)
     started = [_quietly(under, *words)]
     try:
         deadline = time.monotonic() + START_S
-        while not told.is_file() or not told.read_text():
+        while not scheduler_file.is_file() or not scheduler_file.read_text():
             if time.monotonic() > deadline:
                 raise BenchError("the Dask scheduler did not start")
             time.sleep(0.05)
-        address = str(json.loads(told.read_text())["address"])
+        address = str(json.loads(scheduler_file.read_text())["address"])
         worker = ("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny", *here)
         started += [_quietly(under, *worker) for _ in range(count)]
         distributed: Any = importlib.import_module("distributed")

@@ -33,7 +33,7 @@ def run(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
     """CSIM of the captured 字 against the reference and against the simulated image, for the first `n` frozen brushes.
 
     value = average in percent over ten writings (mm, binary, ink = 1), all five brushes by default, some 4 minutes
-    each; ratio = what the unlearned round lacks to 100 over what the learned one lacks. `seed` is the rig's.
+    each; ratio = 100 less the CSIM of the unlearned round, over 100 less that of the learned one. `seed` is the rig's.
     Raises BenchError where a command fails or asks for something else than a sheet.
     """
     brushes = len(FROZEN) if n is None else n
@@ -60,19 +60,19 @@ def write_characters(folder: Path, brush: int, seed: int) -> Path:
 
 def _to_its_end(words: list[str], rig: Process) -> None:
     sheet: list[str] = []
-    told = ""
+    errors = ""
     for _ in range(MOST_SHEETS):
         command = [sys.executable, "-m", "brushloop", *words, *sheet]
         ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         if ran.returncode == 0:
             return
-        told = ran.stderr.strip()[-400:]
+        errors = ran.stderr.strip()[-400:]
         asked = ASKED.search(ran.stderr)
         if asked is None:
-            raise BenchError(f"`brushloop write` ended with {ran.returncode}: {told}")
+            raise BenchError(f"`brushloop write` ended with {ran.returncode}: {errors}")
         rig.ask()
         sheet = ["--sheet", asked[1]]
-    raise BenchError(f"`brushloop write` has asked for {MOST_SHEETS} sheets: {told}")
+    raise BenchError(f"`brushloop write` has asked for {MOST_SHEETS} sheets: {errors}")
 
 
 def _result(brush: int, pair: str, before: list[Table3Row], after: list[Table3Row], seed: int) -> Result:
@@ -80,7 +80,7 @@ def _result(brush: int, pair: str, before: list[Table3Row], after: list[Table3Ro
     paper, another = _row(after, pair, AS_THE_PAPER), _row(after, ANOTHER)
     low, value = ours.csim[1], ours.csim[2]
     ratio = (100.0 - unlearned.csim[2]) / (100.0 - value) if value < 100.0 else float("inf")
-    told = (
+    conditions = (
         f"{ours.source}, brush {brush + 1}, {CHARACTER}, {ours.n} writings after {ROUNDS} rounds of learning; CSIM "
         f"{ours.csim[0]:.1f} / {low:.1f} / {value:.1f}, SSIM {ours.ssim[0]:.1f} / {ours.ssim[1]:.1f} / "
         f"{ours.ssim[2]:.1f} (max / min / avg, mm, ink = 1); unlearned {unlearned.csim[2]:.1f} and "
@@ -89,7 +89,7 @@ def _result(brush: int, pair: str, before: list[Table3Row], after: list[Table3Ro
         f"{another.csim[2]:.1f} and {another.ssim[2]:.1f}; reference: {ours.reference}; {machine()}"
     )
     title = f"written: brush {brush + 1}, {pair}"
-    return Result(title, value, "% CSIM", "the unlearned round's shortfall", ratio, ours.n, seed, told)
+    return Result(title, value, "% CSIM", "the unlearned round's shortfall", ratio, ours.n, seed, conditions)
 
 
 def _row(rows: list[Table3Row], pair: str, key: tuple[Alignment, Tone, Polarity] = STRICT) -> Table3Row:
@@ -101,5 +101,5 @@ def _row(rows: list[Table3Row], pair: str, key: tuple[Alignment, Tone, Polarity]
 
 def _paper(row: Table3Row) -> str:
     if row.paper_csim is None or row.paper_ssim is None:
-        return "not told"
+        return "not given"
     return f"{row.paper_csim[2]:.1f} and {row.paper_ssim[2]:.1f}"

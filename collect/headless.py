@@ -46,7 +46,7 @@ def run_headless(engine: RunnableEngine) -> None:
             with contextlib.suppress(OSError, SystemExit):
                 _show(engine)
         finally:
-            # Nobody watches any more.
+            # Nobody is watching now.
             if not engine.finished:
                 engine.stop()
             engine.join()

@@ -65,7 +65,7 @@ class Asker:
             return None if self._open is None else self._open[0]
 
     def abandon(self) -> None:
-        """Fail the open question and every later one with `NeedsOperator`: nobody watches any more. From any thread."""
+        """Fail the open question and every later one with `NeedsOperator`: nobody is watching now. From any thread."""
         with self._lock:
             self._watched = False
             if self._open is not None:
@@ -105,7 +105,7 @@ class Asker:
 
 def _give_up(answered: asyncio.Future[str]) -> None:
     if not answered.done():
-        answered.set_exception(NeedsOperator("nobody is at the screen any more"))
+        answered.set_exception(NeedsOperator("nobody is at the screen now"))
 
 
 def _settle(answered: asyncio.Future[str], key: str) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 ABSENT = object()
-"""Placeholder for the value of a field that one of the two configurations lacks."""
+"""Placeholder for the value of a field that one of the two configurations does not have."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,7 +89,7 @@ def ranges(sheet: Sheet) -> str:
 
 
 def _number(value: float | None, unit: str) -> str:
-    return "not told" if value is None else f"{value:g}{unit}"
+    return "not given" if value is None else f"{value:g}{unit}"
 
 
 def _count(strokes: int, planned: int | None) -> str:

@@ -82,7 +82,9 @@ def test_the_line_for_people_says_what_the_ratio_means() -> None:
 def test_people_read_shared_conditions_once(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    results = [Result(name, 1.0, "ms", "p", 1.0, 1, 0, told) for name, told in (("a", "x"), ("b", "x"), ("c", "y"))]
+    results = [
+        Result(name, 1.0, "ms", "p", 1.0, 1, 0, conditions) for name, conditions in (("a", "x"), ("b", "x"), ("c", "y"))
+    ]
     monkeypatch.setattr(bench.__main__, "benches", lambda: {"three": lambda: results})
     assert bench.__main__.main(["three"]) == 0
     assert [line[:3] for line in capsys.readouterr().out.splitlines()] == ["# x", "a: ", "b: ", "# y", "c: "]

@@ -91,11 +91,11 @@ def test_no_command_lets_what_it_read_act_on_the_terminal(
     monkeypatch.setattr(sys, "argv", ["brushloop", *command.split()])
     with pytest.raises(SystemExit) as ended:
         brushloop.main()
-    told = capfd.readouterr()
-    assert told.out + told.err
-    assert not [char for char in ACTED_ON if char in told.out + told.err]
-    assert ended.value.code != 1, told.err
-    assert "Traceback" not in told.err
+    captured = capfd.readouterr()
+    assert captured.out + captured.err
+    assert not [char for char in ACTED_ON if char in captured.out + captured.err]
+    assert ended.value.code != 1, captured.err
+    assert "Traceback" not in captured.err
 
 
 def test_a_line_end_in_a_name_does_not_make_a_line_of_its_own() -> None:
@@ -103,7 +103,7 @@ def test_a_line_end_in_a_name_does_not_make_a_line_of_its_own() -> None:
 
 
 def test_json_keeps_its_values_and_chinese_its_characters() -> None:
-    told = {"brush": f"羊毫 \U000e0041{HOSTILE}"}
-    printed = plain(json.dumps(told, ensure_ascii=False))
-    assert json.loads(printed) == told
+    header = {"brush": f"羊毫 \U000e0041{HOSTILE}"}
+    printed = plain(json.dumps(header, ensure_ascii=False))
+    assert json.loads(printed) == header
     assert "羊毫" in printed

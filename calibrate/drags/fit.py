@@ -38,7 +38,7 @@ class DragFit:
     place_mm: Floats
     """(q, 2) shift of a stroke in x and y for each column of its place."""
     condition: float
-    """Condition number of the scaled normal equations: above about 1e4 the parameters cannot be told apart."""
+    """Condition number of the scaled normal equations: above about 1e4 the parameters cannot be distinguished."""
     cost: float
     rounds: int
     spread_mm: float = SPREAD_MM

@@ -165,7 +165,7 @@ def _changed(folder: Path, found: Sequence[Difference], given: dict[str, Path], 
 
 
 def _of_this_version(one: Difference, found: Sequence[Difference]) -> bool:
-    """Whether the software version alone explains `one`: a side lacks the field, in a table of the same kind."""
+    """Whether the software version alone explains `one`: one side has no such field, in a table of the same kind."""
     kind = (*one.field[:-1], "kind")
     known = ABSENT not in (one.old, one.new)
     return bool(one.field) and not known and not any((o.file, o.field) == (one.file, kind) for o in found)

@@ -24,7 +24,7 @@ from drivers.samples import Frame
 
 FEWEST_LOOKS, MOST_LOOKS = 2, 6
 ATTEMPTS = 4
-"""Most attempts at the measurement; another follows if a stall or an old picture has spoilt the previous one."""
+"""Most attempts at the measurement; another follows after one that a stall or an old picture made useless."""
 PATIENCE_S = 1.5
 """Waiting time beyond the longest allowed delay: distinguishes a camera that is late from one that shows nothing."""
 STAY_S = 0.15
@@ -150,9 +150,9 @@ class Photographer:
         return delay
 
     async def _trip(self, without_arm: Thumbnail, *, stay_s: float) -> tuple[Thumbnail, Look | None] | None:
-        """Go over the sheet and back; return the view afterwards, and the delay, or None if a silence has spoilt it.
+        """Go over the sheet and back; return the view afterwards, and the delay (None if the camera was silent then).
 
-        None if the picture did not change when the arm came, or did not change back when it left.
+        Returns None alone if the picture did not change when the arm came, or did not change back when it left.
         """
         within_s = self._patience_s
         async with watching(self._camera, without_arm) as frames, self._placed() as placed:

@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class Family(StrEnum):
-    """What a failure spoils, and therefore what must be done again."""
+    """What a failure makes useless, and therefore what must be done again."""
 
     PICTURE = "picture"
     """The photograph, not the stroke: remove the cause and photograph again; the stroke on paper may be sound."""
@@ -27,7 +27,7 @@ class Failure(StrEnum):
     """
 
     family: Family
-    """What it spoils."""
+    """What it makes useless."""
 
     def __new__(cls, value: str, family: Family) -> Failure:
         """Make a member that equals its text and carries its family."""

@@ -91,11 +91,11 @@ class FinishScreen(ModalScreen[None]):
 
         loop = asyncio.get_running_loop()
 
-        def told(line: str) -> None:
+        def on_line(line: str) -> None:
             loop.call_soon_threadsafe(self._show_progress, name, line)
 
         try:
-            code, said = await asyncio.to_thread(run_command, name, self._folder, told)
+            code, said = await asyncio.to_thread(run_command, name, self._folder, on_line)
         finally:
             self._busy = False
         tail = "\n".join(plain(said).splitlines()[-MOST_LINES:])
@@ -130,10 +130,10 @@ def verify(folder: Path) -> Verdict:
     return verify_session(folder)
 
 
-def run_command(name: str, folder: Path, told: Callable[[str], None]) -> tuple[int, str]:
+def run_command(name: str, folder: Path, on_line: Callable[[str], None]) -> tuple[int, str]:
     """Run `brushloop NAME FOLDER` in a process of its own; it may take minutes.
 
-    `told` gets each line of its progress (stderr). Returns its exit code and its output, with stderr where it failed.
+    `on_line` gets each line of its progress (stderr). Returns exit code and output, with stderr if it failed.
     """
     command = [sys.executable, "-m", "brushloop", name, str(folder)]
     environment = os.environ | {"COLUMNS": str(COLUMNS)}
@@ -149,7 +149,7 @@ def run_command(name: str, folder: Path, told: Callable[[str], None]) -> tuple[i
         output = reader.submit(process.stdout.read)
         for line in process.stderr:
             lines.append(line)
-            told(line.rstrip())
+            on_line(line.rstrip())
         said = output.result()
     return process.returncode, (said if process.returncode == 0 else said + "".join(lines)).strip()
 

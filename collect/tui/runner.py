@@ -44,7 +44,7 @@ def _run(app: OperatorApp) -> None:
     finally:
         engine = app.engine
         if engine is not None:
-            # However the screen ended, nobody watches the arm any more. An arm that is already parking continues.
+            # However the screen ended, nobody watches the arm from here on. An arm that is already parking continues.
             if not engine.finished and not app.leaving:
                 engine.stop()
             if not intact:

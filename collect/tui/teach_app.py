@@ -159,7 +159,7 @@ class TeachApp(PlainApp):
 def run_teaching(work: Work, name: str, pictures: Pictures | None = None) -> Path | None:
     """Show the screen until the person leaves; returns the `rig.toml` that was written, raises what ended the steps.
 
-    However the screen ends, nobody watches the arm any more: whatever moves it is stopped.
+    However the screen ends, nobody watches the arm from here on: whatever moves it is stopped.
     """
     app = TeachApp(work, name, pictures)
 

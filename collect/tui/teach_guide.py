@@ -256,7 +256,7 @@ class Teaching:
 
 
 class StopUnsure(Exception):
-    """The arm was told to stop and was not seen at rest."""
+    """The arm was asked to stop and was not seen at rest."""
 
     exit_code = 4
 

@@ -60,7 +60,7 @@ def covariance(noise: Noise, forward: Forward, found: Fit, limits: Limits, near:
             return bread @ (few * found.normal.meat + from_prior) @ bread
         case Noise.QUANTISED:
             # The errors of the prior and of rounding are independent.
-            # The spread of so few draws is itself uncertain, hence the ratio of quantiles.
+            # The spread of so few draws is itself uncertain, which is why a ratio of quantiles is used.
             return _FEW**2 * _rounding(forward, found, limits, near, prior, seed) + bread @ from_prior @ bread
 
 

@@ -28,8 +28,8 @@ def draw(marks, out):
     """
     size = out.shape[1]
     means, areas = np.empty(size, np.int32), np.zeros(size + 2)
-    columns, lacks = np.empty((2, size + 2), np.int64), np.empty((2, size + 2))
-    if not _draw_all(marks, out, means, areas, columns, lacks):
+    columns, missing = np.empty((2, size + 2), np.int64), np.empty((2, size + 2))
+    if not _draw_all(marks, out, means, areas, columns, missing):
         raise ValueError(f"a shape is not finite, or lies more than {FURTHEST:g} pixels away")
 
 
@@ -54,7 +54,7 @@ def lengths(presses, marks):
 
 
 @numba.njit(**OPTIONS, cache=True)
-def _draw_all(marks, out, means, areas, columns, lacks):
+def _draw_all(marks, out, means, areas, columns, missing):
     """Draw one image after another; false for a shape that cannot be drawn."""
     size = out.shape[1]
     unit = np.int32(1 << min(23, 30 - math.ceil(math.log2(size))))
@@ -78,11 +78,11 @@ def _draw_all(marks, out, means, areas, columns, lacks):
         flat[bottom * size :] = 0
         _rows(out[n], cy, beyond, top, bottom, unit, means)
         up, down = np.floor(cy) - beyond, np.ceil(cy) + beyond
-        count = _crossings(heel, tip, wide, cx, cy - up, size, areas, columns, lacks)
-        _correct(out[n], cy - up, count, int(up), -1, columns, lacks)
+        count = _crossings(heel, tip, wide, cx, cy - up, size, areas, columns, missing)
+        _correct(out[n], cy - up, count, int(up), -1, columns, missing)
         if not mirrored:
-            count = _crossings(heel, tip, wide, cx, down - cy, size, areas, columns, lacks)
-        _correct(out[n], down - cy, count, int(down), 1, columns, lacks)
+            count = _crossings(heel, tip, wide, cx, down - cy, size, areas, columns, missing)
+        _correct(out[n], down - cy, count, int(down), 1, columns, missing)
     return True
 
 
@@ -132,7 +132,7 @@ def _rows(image, cy, beyond, top, bottom, unit, means):
 
 
 @compiled
-def _crossings(heel, tip, wide, cx, start, size, areas, columns, lacks):
+def _crossings(heel, tip, wide, cx, start, size, areas, columns, missing):
     """Set the columns where w crosses the levels start, start + 1... on either side, and P(a) - min(m, a) there.
 
     Returns how many levels there are.
@@ -151,8 +151,8 @@ def _crossings(heel, tip, wide, cx, start, size, areas, columns, lacks):
         lack = before - areas[p] - a * (x - i)
         short = areas[q + 1] - until - a * (j + 1 - y)
         both = i == j
-        lacks[0, k] = lack + (short if both else 0.0) + max(a - areas[p + 1] + areas[p], 0.0)
-        lacks[1, k] = 0.0 if both else short + max(a - areas[q + 1] + areas[q], 0.0)
+        missing[0, k] = lack + (short if both else 0.0) + max(a - areas[p + 1] + areas[p], 0.0)
+        missing[1, k] = 0.0 if both else short + max(a - areas[q + 1] + areas[q], 0.0)
         columns[0, k], columns[1, k] = i, j
     return count
 
@@ -170,7 +170,7 @@ def _angle(sine, cosine):
 
 
 @inline
-def _correct(image, start, count, edge, way, columns, lacks):
+def _correct(image, start, count, edge, way, columns, missing):
     """Correct the pixels on both sides of each level, outermost first; `edge` is the row edge of the first level."""
     size = image.shape[0]
     inmost = 0 if start > 0.0 else 1  # nothing is crossed on the axis
@@ -179,7 +179,7 @@ def _correct(image, start, count, edge, way, columns, lacks):
         outer = inner + way
         for side in range(2):
             if k >= inmost:
-                j, by = columns[side, k], image.dtype.type(lacks[side, k])
+                j, by = columns[side, k], image.dtype.type(missing[side, k])
                 if 0 <= j < size:
                     if 0 <= inner < size:
                         image[inner, j] += by

@@ -51,7 +51,7 @@ class Diverged(TrainingStopped):
     """The loss became NaN or infinite."""
 
     def __init__(self, step: int) -> None:
-        super().__init__(step, "the loss is not a number any more; train again with a smaller learning_rate")
+        super().__init__(step, "the loss is no longer a number; train again with a smaller learning_rate")
 
 
 class MissingExtra(Exception):

@@ -85,18 +85,18 @@ def decode_line(raw: bytes, number: int, *, protected: bool) -> Entry:
 def lines_within(raw: bytes, number: int) -> tuple[list[Entry], list[bytes]]:
     """Find the lines in a span with a damaged newline, and the bytes left between them."""
     entries: list[Entry] = []
-    spoilt: list[bytes] = []
+    damaged: list[bytes] = []
     at = 0
     for match in _WHOLE.finditer(raw):
         try:
             entry = decode_line(match[0], number, protected=True)
         except BadLine:
             continue
-        spoilt.append(raw[at : match.start()])
+        damaged.append(raw[at : match.start()])
         entries.append(entry)
         at = match.end()
-    spoilt.append(raw[at:])
-    return entries, [span for span in spoilt if len(span) > 1]  # a single byte was the newline
+    damaged.append(raw[at:])
+    return entries, [span for span in damaged if len(span) > 1]  # a single byte was the newline
 
 
 def _chain(line: Line) -> Chain | None:

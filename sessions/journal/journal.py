@@ -140,7 +140,7 @@ class Account:
     state: Replay = field(default_factory=Replay)
     faults: list[Fault] = field(default_factory=list[Fault])
     """All problems, in the order of the file; every command uses this list."""
-    spoilt: list[bytes] = field(default_factory=list[bytes])
+    damaged: list[bytes] = field(default_factory=list[bytes])
     """Lines that cannot be used."""
     twice: list[Line] = field(default_factory=list[Line])
     """`done` lines of steps that were done already."""
@@ -150,7 +150,7 @@ def account(data: bytes) -> Account:
     """Read the bytes of a journal and apply its events to a new state. Never raises."""
     found = Account(read(data))
     found.faults += found.reading.faults
-    found.spoilt += [span for _, span in found.reading.spoilt]
+    found.damaged += [span for _, span in found.reading.damaged]
     for entry in found.reading.entries:
         try:
             fold(found.state, entry.line)
@@ -159,7 +159,7 @@ def account(data: bytes) -> Account:
             found.twice.append(entry.line)
         except NONSENSE as error:
             found.faults.append(Fault(entry.number, f"makes no sense: {error}"))
-            found.spoilt.append(entry.raw)
+            found.damaged.append(entry.raw)
         else:
             found.lines.append(entry.line)
     found.faults.sort(key=lambda fault: fault.number)

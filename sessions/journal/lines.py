@@ -41,7 +41,7 @@ class Reading:
     """Lines that can be trusted, in the order in which they were written."""
     faults: list[Fault] = field(default_factory=list[Fault])
     """In the order of the file; empty for a journal without damage."""
-    spoilt: list[tuple[int, bytes]] = field(default_factory=list[tuple[int, bytes]])
+    damaged: list[tuple[int, bytes]] = field(default_factory=list[tuple[int, bytes]])
     """Number and bytes of lines that can no longer be trusted."""
     gaps: int = 0
     """Number of missing lines."""
@@ -89,13 +89,13 @@ def read(data: bytes) -> Reading:
     return reading
 
 
-def accounts_for(spoilt: bytes, rebuilt: bytes) -> bool:
+def accounts_for(damaged: bytes, rebuilt: bytes) -> bool:
     """Whether a damaged line (cut short, or with wrong bytes) is what is left of `rebuilt`, which has no chain."""
     body = rebuilt[: rebuilt.rindex(b',"crc":"')]
-    if len(spoilt) < len(body) // 2:
+    if len(damaged) < len(body) // 2:
         return False
-    strange = sum(a != b for a, b in zip(spoilt, body, strict=False))
-    return strange <= min(MAX_STRANGE_BYTES, len(spoilt) // 2)
+    strange = sum(a != b for a, b in zip(damaged, body, strict=False))
+    return strange <= min(MAX_STRANGE_BYTES, len(damaged) // 2)
 
 
 def _decoded(reading: Reading, pieces: list[bytes], tail: bytes) -> list[Entry]:
@@ -111,7 +111,7 @@ def _decoded(reading: Reading, pieces: list[bytes], tail: bytes) -> list[Entry]:
             found, left = lines_within(raw, number) if crc else ([], [raw])
             reading.fault(number, "has a damaged end" if found and not left else str(error))
             entries += found
-            reading.spoilt += [(number, span) for span in left]
+            reading.damaged += [(number, span) for span in left]
     if tail:
         found, left = lines_within(tail, len(pieces) + 1)
         entries += found
@@ -119,7 +119,7 @@ def _decoded(reading: Reading, pieces: list[bytes], tail: bytes) -> list[Entry]:
             reading.torn = tail
         elif left or tail != found[-1].raw:
             reading.fault(len(pieces) + 1, "has a damaged end")
-            reading.spoilt += [(len(pieces) + 1, span) for span in left]
+            reading.damaged += [(len(pieces) + 1, span) for span in left]
     return entries
 
 
@@ -190,7 +190,7 @@ def _vouched(reading: Reading, by_seq: dict[int, list[Entry]]) -> list[Entry]:
             reading.fault(other.number, f"{'stands twice: it is' if same else 'stands in the place of'} line {seq}")
         if after is not None and prev is not None and digest(one.raw) != prev:
             reading.fault(one.number, f"was changed after it was written: line {after.number} does not follow from it")
-            reading.spoilt.append((one.number, one.raw))
+            reading.damaged.append((one.number, one.raw))
         else:
             held.append(one)
     return held[::-1]
@@ -217,11 +217,11 @@ def _misplaced(reading: Reading, held: list[Entry]) -> None:
 
 def _missing(reading: Reading, held: list[Entry], before: int) -> None:
     """Report sequence numbers that no line has, except those of lines that cannot be trusted."""
-    spoilt = {number for number, _ in reading.spoilt}
+    damaged = {number for number, _ in reading.damaged}
     known, at = before, 0
     for entry in held:
         seq = known + 1 if entry.chain is None else entry.chain.seq
-        gone = seq - known - 1 - sum(at < number < entry.number for number in spoilt)
+        gone = seq - known - 1 - sum(at < number < entry.number for number in damaged)
         if gone > 0:
             lines = "a line that is" if gone == 1 else f"{gone} lines that are"
             reading.fault(entry.number, f"comes after {lines} missing")

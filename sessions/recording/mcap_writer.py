@@ -177,8 +177,8 @@ class McapWriter:
         last_ns = max(max(index[::2]) for index in self._index.values())
         packed = self._compressor.compress(records)
         length = _CHUNK_START.size + len(packed)
-        told = (length - RECORD_START.size, first_ns, last_ns, len(records), zlib.crc32(records), 4, b"zstd")
-        self._file.write(_CHUNK_START.pack(Opcode.CHUNK, *told, len(packed)))
+        header = (length - RECORD_START.size, first_ns, last_ns, len(records), zlib.crc32(records), 4, b"zstd")
+        self._file.write(_CHUNK_START.pack(Opcode.CHUNK, *header, len(packed)))
         self._file.write(packed)
         at, offsets = start + length, dict[int, int]()
         for number, index in self._index.items():

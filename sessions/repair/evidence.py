@@ -105,15 +105,15 @@ def _lost_between(found: Evidence, twice: list[Line]) -> None:
 
 
 def _lost(journal: Account, rebuilt: list[Line]) -> int:
-    spoilt, others = list(journal.spoilt), 0
+    damaged, others = list(journal.damaged), 0
     for line in rebuilt:
         body = encode_line(int(line["t_ns"]), _without_time(line))
-        span = next((span for span in spoilt if accounts_for(span, body)), None)
+        span = next((span for span in damaged if accounts_for(span, body)), None)
         if span is None:
             others += 1
         else:
-            spoilt.remove(span)
-    return len(spoilt) + max(0, journal.reading.gaps - others)
+            damaged.remove(span)
+    return len(damaged) + max(0, journal.reading.gaps - others)
 
 
 def _place(lines: list[Line], line: Line) -> int:

@@ -70,14 +70,14 @@ def used(session: Path) -> Calibration:
     return found
 
 
-def test_show_tells_every_value_of_an_artefact_or_of_the_one_a_session_uses(pair: tuple[Path, Path, Path]) -> None:
+def test_show_shows_every_value_of_an_artefact_or_of_the_one_a_session_uses(pair: tuple[Path, Path, Path]) -> None:
     one, other, made = pair
     for what in (made, one):
-        told = run("show", what)
-        assert told.exit_code == 0
-        assert told.output.splitlines()[0] == str(made)
+        ran = run("show", what)
+        assert ran.exit_code == 0
+        assert ran.output.splitlines()[0] == str(made)
         for line in ('source = "loopback rig"', 'lens.source = "k1 fitted on the board"', "board.square_mm = 12.0"):
-            assert line in told.output
+            assert line in ran.output
     assert "is not calibrated" in str(run("show", other).exception)
 
 
@@ -85,12 +85,12 @@ def test_diff_says_what_changed_and_what_it_means_on_the_paper(pair: tuple[Path,
     one, other, made = pair
     assert run("diff", one, made).output == "they are equal\n"
     calibrate_session(other)
-    told = run("diff", one, other).output
-    assert 'session_id: "one" -> "other"' in told
-    assert "preprocess" not in told
-    assert "pix2len differs by -0.4" in told
-    assert "their intervals lie apart" in told
-    words = next(line for line in told.splitlines() if line.startswith("the same pixel lies"))
+    printed = run("diff", one, other).output
+    assert 'session_id: "one" -> "other"' in printed
+    assert "preprocess" not in printed
+    assert "pix2len differs by -0.4" in printed
+    assert "their intervals lie apart" in printed
+    words = next(line for line in printed.splitlines() if line.startswith("the same pixel lies"))
     assert float(words.split()[4]) == pytest.approx(5.0, abs=0.5)
 
 
@@ -138,13 +138,13 @@ def test_a_camera_of_another_size_cannot_be_forced(
 ) -> None:
     small = sheet(dataclasses.replace(VIEW, width_px=1000, height_px=750))
     session = photographed(tmp_path / "small", board_of(Table()), [small])
-    told = run("apply", pair[2], session, "--force")
-    assert "is 1000 x 750 px, the lens was calibrated at 1024 x 768 px" in str(told.exception)
+    ran = run("apply", pair[2], session, "--force")
+    assert "is 1000 x 750 px, the lens was calibrated at 1024 x 768 px" in str(ran.exception)
     assert not (session / "calibration").exists()
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("no json", "is no artefact: not JSON"),
         ("[" * 100_000, "is no artefact: not JSON"),
@@ -154,12 +154,12 @@ def test_a_camera_of_another_size_cannot_be_forced(
     ],
     ids=["words", "deep", "list", "another", "half"],
 )
-def test_what_is_no_artefact_is_refused_in_one_line(tmp_path: Path, text: str, told: str) -> None:
+def test_what_is_no_artefact_is_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "x.json"
     path.write_text(text)
     for ran in (run("show", path), run("diff", path, path)):
         assert isinstance(ran.exception, CalibrationError)
-        assert told in str(ran.exception)
+        assert message in str(ran.exception)
         assert "\n" not in str(ran.exception)
 
 

@@ -91,13 +91,13 @@ def test_a_session_without_a_pointer_uses_the_artefact_written_last_and_says_so(
     last = made(0.2).save(folder)
     os.utime(only, (1, 1))
     assert current(tmp_path) == last
-    [told] = caplog.messages
-    assert f"holds 2 artefacts, and no file `current` says which is in use: {last.name} is taken" in told
-    assert f"choose with `brushloop calibrate apply {folder}/<hash>.json {tmp_path}`" in told
+    [message] = caplog.messages
+    assert f"holds 2 artefacts, and no file `current` says which is in use: {last.name} is taken" in message
+    assert f"choose with `brushloop calibrate apply {folder}/<hash>.json {tmp_path}`" in message
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("", "holds no name of an artefact"),
         ("../../secret.json", "holds no name of an artefact"),
@@ -107,10 +107,12 @@ def test_a_session_without_a_pointer_uses_the_artefact_written_last_and_says_so(
     ],
     ids=["empty", "elsewhere", "two", "long", "missing"],
 )
-def test_a_pointer_that_leads_nowhere_is_refused_and_never_guessed_around(tmp_path: Path, text: str, told: str) -> None:
+def test_a_pointer_that_leads_nowhere_is_refused_and_never_guessed_around(
+    tmp_path: Path, text: str, message: str
+) -> None:
     path = put_to_use(MADE, tmp_path)
     (path.parent / "current").write_text(text)
-    with pytest.raises(CalibrationError, match=re.escape(told)) as refused:
+    with pytest.raises(CalibrationError, match=re.escape(message)) as refused:
         current(tmp_path)
     assert "\n" not in str(refused.value)
     assert put_to_use(MADE, tmp_path) == path == current(tmp_path), "calibrating again mends it"

@@ -40,7 +40,7 @@ def half(image: np.ndarray, share: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "spec", "told"),
+    ("damage", "spec", "message"),
     [
         (lambda image: np.full_like(image, 200), SPEC, "is blank"),
         (lambda image: image[:, ::-1], SPEC, "is mirrored"),
@@ -52,19 +52,19 @@ def half(image: np.ndarray, share: float) -> np.ndarray:
     ids=["blank", "mirrored", "two boards", "hidden", "a smaller board", "a wrong board"],
 )
 def test_a_session_without_a_usable_board_is_refused(
-    photographed: Photographed, tmp_path: Path, board: np.ndarray, spoil: object, spec: BoardSpec, told: str
+    photographed: Photographed, tmp_path: Path, board: np.ndarray, damage: object, spec: BoardSpec, message: str
 ) -> None:
-    assert callable(spoil)
-    session = photographed(tmp_path / "s", spec, [np.ascontiguousarray(spoil(board))])
+    assert callable(damage)
+    session = photographed(tmp_path / "s", spec, [np.ascontiguousarray(damage(board))])
     ran = CliRunner().invoke(app, ["calibrate", str(session)])
     assert isinstance(ran.exception, CalibrationError), ran.output
     assert ran.exception.exit_code == 2
-    assert told in str(ran.exception)
+    assert message in str(ran.exception)
     assert not (session / "calibration").exists()
 
 
 @pytest.mark.parametrize(
-    ("spoil", "told"),
+    ("damage", "message"),
     [
         (lambda image: half(image, 0.6), "the board is partly hidden"),
         (lambda image: np.where(image > 110, 255, image), "of the pixels are saturated"),
@@ -72,16 +72,16 @@ def test_a_session_without_a_usable_board_is_refused(
     ids=["half hidden", "saturated"],
 )
 def test_what_can_be_used_with_care_is_flagged_in_the_artefact(
-    photographed: Photographed, tmp_path: Path, board: np.ndarray, spoil: object, told: str
+    photographed: Photographed, tmp_path: Path, board: np.ndarray, damage: object, message: str
 ) -> None:
-    assert callable(spoil)
-    session = photographed(tmp_path / "s", SPEC, [np.asarray(spoil(board), np.uint8)], sheet_mm=SHEET_MM)
+    assert callable(damage)
+    session = photographed(tmp_path / "s", SPEC, [np.asarray(damage(board), np.uint8)], sheet_mm=SHEET_MM)
     ran = CliRunner().invoke(app, ["calibrate", str(session)])
     assert ran.exit_code == 0, ran.output
-    assert told in " ".join(ran.output.split())
+    assert message in " ".join(ran.output.split())
     path = current(session)
     assert path is not None
-    assert any(told in flag for flag in load_artefact(path, Calibration).flags)
+    assert any(message in flag for flag in load_artefact(path, Calibration).flags)
 
 
 def test_a_sound_board_has_no_flags(photographed: Photographed, tmp_path: Path, board: np.ndarray) -> None:

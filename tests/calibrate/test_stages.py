@@ -94,14 +94,14 @@ def test_the_command_shows_every_stage_and_writes_the_numbers(tmp_path: Path) ->
     cv2.imwrite(str(tmp_path / "a.png"), photograph((200, 150)))
     cv2.imwrite(str(tmp_path / "b.png"), photograph((200, 150), (500, 400)))
     out = tmp_path / "stages.png"
-    told = ["preprocess", str(tmp_path / "b.png"), "--px-per-mm", "10", "--out", str(out)]
-    ran = CliRunner().invoke(app, [*told, "--before", str(tmp_path / "a.png")])
+    arguments = ["preprocess", str(tmp_path / "b.png"), "--px-per-mm", "10", "--out", str(out)]
+    ran = CliRunner().invoke(app, [*arguments, "--before", str(tmp_path / "a.png")])
     assert ran.exit_code == 0, ran.output
     assert cv2.imread(str(out), 0).shape[1] > 1000
     numbers = json.loads(out.with_suffix(".json").read_text())
     assert numbers["fitted"]["components.others"] == 0
     assert numbers["params"]["join_mm"] == 1.5
-    CliRunner().invoke(app, told)
+    CliRunner().invoke(app, arguments)
     assert json.loads(out.with_suffix(".json").read_text())["fitted"]["components.others"] == 1
 
 

@@ -57,7 +57,7 @@ def on_a_terminal(rig_toml: Path, answer: str) -> tuple[int, str]:
         try:
             output, answered = "", False
             deadline = time.monotonic() + WITHIN_S
-            # Linux tells that the other end has gone by an error.
+            # Linux reports by an error that the other end has gone.
             with contextlib.suppress(OSError):
                 while time.monotonic() < deadline:
                     if not select.select([ours], [], [], 1.0)[0]:
@@ -79,7 +79,7 @@ def test_it_says_what_it_will_do_and_after_a_yes_it_moves(rig_toml: Path):
     code, output = on_a_terminal(rig_toml, "y")
     assert code == 0, output
     assert "3 passed" in output
-    for told in (
+    for expected in (
         r"1 tests are about to power an arm and move it",
         r"robot +aubo_i5 \(brushloop-loopback\).*: the loopback rig, simulated",
         r"address +127\.0\.0\.1:\d+, framing sof",
@@ -87,7 +87,7 @@ def test_it_says_what_it_will_do_and_after_a_yes_it_moves(rig_toml: Path):
         r"box +straight up by at most 5 mm from where the tip stands, and back",
         r"step +5 mm at most, at 10 mm/s",
     ):
-        assert re.search(told, output), told
+        assert re.search(expected, output), expected
 
 
 # In the soak: another answer takes the same way, and each costs a pytest of its own.
@@ -116,11 +116,13 @@ def test_what_cannot_be_used_is_one_line(tmp_path: Path):
     assert "no such file" in run.stderr
 
 
-@pytest.mark.parametrize(("toml", "processes", "told"), [("name = 1", None, "rig.toml"), ("", 2, "several processes")])
-def test_a_rig_that_cannot_be_used_is_a_usage_error(tmp_path: Path, toml: str, processes: int | None, told: str):
+@pytest.mark.parametrize(
+    ("toml", "processes", "expected"), [("name = 1", None, "rig.toml"), ("", 2, "several processes")]
+)
+def test_a_rig_that_cannot_be_used_is_a_usage_error(tmp_path: Path, toml: str, processes: int | None, expected: str):
     path = tmp_path / "rig.toml"
     path.write_text(toml, encoding="utf-8")
     config = Mock(spec=pytest.Config, stash=pytest.Stash(), option=Mock(numprocesses=processes))
     config.getoption.return_value = path
-    with pytest.raises(pytest.UsageError, match=re.escape(told)):
+    with pytest.raises(pytest.UsageError, match=re.escape(expected)):
         pytest_configure(config)

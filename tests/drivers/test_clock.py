@@ -6,7 +6,7 @@ from drivers.clock import HostClock
 from drivers.sim.world import SimClock
 
 
-def test_the_host_clock_tells_wall_time():
+def test_the_host_clock_gives_wall_time():
     assert abs(HostClock().now_ns() - time.time_ns()) < 50_000_000
 
 

@@ -74,7 +74,7 @@ def quadrature(curve: Curve, kinks: list[float], origin_mm: tuple[float, float])
     y_edges = origin_mm[1] - np.arange(SIZE_PX + 1) * PX_MM
     cuts = np.concatenate((kinks, *level_ends(curve, kinks, abs(y_edges))))
     nodes, weights = np.polynomial.legendre.leggauss(16)
-    # x = sin(pi u / 2) removes the square-root ends of a piece, which would spoil Gauss-Legendre.
+    # x = sin(pi u / 2) removes the square-root ends of a piece, for which Gauss-Legendre converges slowly.
     place, weight = np.sin(np.pi * nodes / 2), weights * np.pi / 2 * np.cos(np.pi * nodes / 2)
     image = np.zeros((SIZE_PX, SIZE_PX))
     for j, (start, stop) in enumerate(pairwise(x_edges)):

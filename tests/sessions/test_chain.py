@@ -1,4 +1,4 @@
-"""The chain of a journal: each line names the one before it, and whatever happens to whole lines is told by number."""
+"""The chain of a journal: each line names the one before it, and damage to whole lines is reported by number."""
 
 import hashlib
 import json
@@ -64,7 +64,7 @@ def test_a_torn_last_line_is_no_damage_and_its_note_is_chained(make, folder):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "expected"),
     [
         (lambda a: [*a[:4], *a[5:]], ["line 5 comes after a line that is missing"]),
         (lambda a: [*a[:4], *a[7:]], ["line 5 comes after 3 lines that are missing"]),
@@ -81,10 +81,10 @@ def test_a_torn_last_line_is_no_damage_and_its_note_is_chained(make, folder):
     ],
     ids=["deleted", "three deleted", "first deleted", "doubled", "neighbours", "exchanged"],
 )
-def test_what_happened_to_whole_lines_is_named(folder, change, told):
+def test_what_happened_to_whole_lines_is_named(folder, change, expected):
     write(folder, change(lines_of(folder)))
-    assert [fault for fault in faults(folder) if fault.startswith("line")] == told
-    with pytest.raises(SessionDamaged, match=told[0]):
+    assert [fault for fault in faults(folder) if fault.startswith("line")] == expected
+    with pytest.raises(SessionDamaged, match=expected[0]):
         replay(folder / JOURNAL_NAME)
 
 
@@ -109,7 +109,7 @@ def test_a_line_that_was_edited_with_its_crc_made_right_is_named(make, folder):
     assert make.events(folder, "done")[1]["result"]["depth_mm"] == 13.0
 
 
-def test_an_older_session_is_sound_and_told_as_unchained(folder):
+def test_an_older_session_is_sound_and_reported_as_unchained(folder):
     unchain(folder)
     verdict = verify_session(folder)
     assert verdict.sound

@@ -74,14 +74,14 @@ def test_steps_of_one_open_session_need_no_prefix(make, store, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("fields", "told"),
+    ("fields", "message"),
     [
         ({"brush": "wolf"}, "has brush = 'wolf', but monday.mcap has 'goat'"),
         ({"source": Source.REAL}, "has source = "),
     ],
 )
-def test_recordings_of_different_setups_are_refused(tmp_path, closed, fields, told):
-    with pytest.raises(InputError, match=told):
+def test_recordings_of_different_setups_are_refused(tmp_path, closed, fields, message):
+    with pytest.raises(InputError, match=message):
         merge_recordings([closed("monday"), closed("tuesday", **fields)], tmp_path / "week.mcap")
     assert not list(tmp_path.glob("*week*"))
 

@@ -43,12 +43,12 @@ def refusal(path):
     try:
         everything(path)
     except (InputError, SessionDamaged) as error:
-        told = str(error)
+        message = str(error)
     else:
         return None
-    assert told.startswith(str(path))
-    assert "\n" not in told
-    return told
+    assert message.startswith(str(path))
+    assert "\n" not in message
+    return message
 
 
 def test_a_file_cut_short_anywhere_is_refused(whole, path):

@@ -40,9 +40,9 @@ def test_png_and_csv_hold_the_photographs_byte_for_byte(make, session, to):
     assert json.loads((to / "header.json").read_text())["exported_from"]["sha256"] == Recording(session).sha256
 
 
-def test_values_that_were_commanded_are_columns_and_what_is_not_told_is_empty(make, tmp_path, to):
-    told = {"height_mm": 13.0, "anchor_mm": (1.5, 2.5), "commanded": {"length_mm": 30.0}}
-    path = make.record(tmp_path / "a.mcap", make.still(0), make.stroke(0, **told), make.still(1), make.stroke(1))
+def test_values_that_were_commanded_are_columns_and_what_is_not_given_is_empty(make, tmp_path, to):
+    values = {"height_mm": 13.0, "anchor_mm": (1.5, 2.5), "commanded": {"length_mm": 30.0}}
+    path = make.record(tmp_path / "a.mcap", make.still(0), make.stroke(0, **values), make.still(1), make.stroke(1))
     export(path, to, "png")
     with (to / "strokes.csv").open(newline="") as file:
         first, second = csv.DictReader(file)
@@ -99,7 +99,7 @@ def test_parquet_is_what_datasets_reads(make, session, to):
     assert "Source: **loopback rig**" in card
 
 
-def test_without_pyarrow_the_way_out_is_told_and_nothing_is_left(session, to, monkeypatch):
+def test_without_pyarrow_the_error_names_the_remedy_and_nothing_is_left(session, to, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(InputError, match="parquet needs pyarrow: pip install pyarrow"):
         export(session, to, "parquet")

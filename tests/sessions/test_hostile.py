@@ -69,7 +69,7 @@ def opened_outside():
 
 @pytest.fixture
 def place(make, tmp_path):
-    """`outside` with precious files, and `root` with a session to spoil, closed, its files beside it."""
+    """`outside` with precious files, and `root` with a closed session to damage, its files beside it."""
     outside = tmp_path / "outside"
     (outside / "calibration").mkdir(parents=True)
     for name in (
@@ -108,32 +108,34 @@ def named(name, event="done"):
 
 
 def snapshot(name):
-    def spoil(folder, outside):
-        told = {name.format(out=outside): "written by a stranger"}
-        rewritten(folder, lambda line: {**line, "snapshots": told} if line["event"] == "open" else line)
+    def damage(folder, outside):
+        snapshots = {name.format(out=outside): "written by a stranger"}
+        rewritten(folder, lambda line: {**line, "snapshots": snapshots} if line["event"] == "open" else line)
 
-    return spoil
+    return damage
 
 
 def linked(pattern, to):
     """A file or folder of the session is a link."""
 
-    def spoil(folder, outside):
+    def damage(folder, outside):
         path = next(iter(sorted(folder.glob(pattern))), folder / pattern)
         if path.is_dir():
             shutil.rmtree(path)
         path.unlink(missing_ok=True)
         path.symlink_to(outside / to)
 
-    return spoil
+    return damage
 
 
 def session_id(folder, _):
     """The header names a folder elsewhere."""
-    told = "../../outside/calibration"
+    session_id = "../../outside/calibration"
     rewritten(
         folder,
-        lambda line: {**line, "header": {**line["header"], "session_id": told}} if line["event"] == "open" else line,
+        lambda line: (
+            {**line, "header": {**line["header"], "session_id": session_id}} if line["event"] == "open" else line
+        ),
     )
 
 

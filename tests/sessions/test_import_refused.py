@@ -27,7 +27,7 @@ def lines(*rows):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("", "table.csv: column `file` is missing; found: none"),
         (lines("name,px_per_mm", "a.png,1"), "column `file` is missing; found: name, px_per_mm"),
@@ -89,7 +89,7 @@ def lines(*rows):
     ],
     ids=lambda value: "table" if "\n" in value else value,
 )
-def test_a_table_that_cannot_be_used_is_refused(make, tmp_path, photos, refusal, text, told):
+def test_a_table_that_cannot_be_used_is_refused(make, tmp_path, photos, refusal, text, message):
     make.photographs(photos, *ROWS)
     (tmp_path / "x.png").write_bytes(make.png())
     (photos / "link.png").symlink_to(tmp_path / "x.png")
@@ -98,7 +98,7 @@ def test_a_table_that_cannot_be_used_is_refused(make, tmp_path, photos, refusal,
     (photos / "cut.png").write_bytes(make.png()[:-20])
     (photos / "table.csv").write_text(text, encoding="utf-8", newline="")
     line = refusal()
-    assert told in line
+    assert message in line
     assert len(line) < 400
 
 
@@ -177,7 +177,7 @@ def test_a_disk_without_room_is_refused(make, photos, refusal, monkeypatch):
     assert refusal() == "sessions/from-elsewhere: cannot write: No space left on device"
 
 
-def test_a_damaged_photograph_is_told_by_us_and_not_by_a_library_on_stderr(make, photos, refusal, capfd):
+def test_a_damaged_photograph_is_reported_by_us_and_not_by_a_library_on_stderr(make, photos, refusal, capfd):
     make.photographs(photos, *ROWS)
     data = bytearray(make.png())
     data[data.index(b"IDAT") + 9] ^= 1
@@ -227,7 +227,7 @@ def test_a_png_that_would_unpack_to_gigabytes_is_refused_by_its_header(make, pho
 
 
 @pytest.mark.parametrize(
-    ("column", "value", "told"),
+    ("column", "value", "message"),
     [
         ("height_mm", "-13", "line 3, column `height_mm`: '-13', allowed: 0 to 500"),
         ("height_mm", "1e300", "line 3, column `height_mm`: '1e300', allowed: 0 to 500"),
@@ -236,7 +236,7 @@ def test_a_png_that_would_unpack_to_gigabytes_is_refused_by_its_header(make, pho
         ("bend_mm", "1e300", "line 3, column `bend_mm`: '1e300', allowed: -1e+06 to 1e+06"),
     ],
 )
-def test_a_depth_above_the_paper_or_out_of_this_world_is_refused(make, photos, refusal, column, value, told):
+def test_a_depth_above_the_paper_or_out_of_this_world_is_refused(make, photos, refusal, column, value, message):
     first, second = ({**row, "depth_mid_cm": "1.5", "bend_mm": "0"} for row in ROWS)
     make.photographs(photos, first, {**second, column: value})
-    assert refusal() == f"photos/table.csv: {told}"
+    assert refusal() == f"photos/table.csv: {message}"

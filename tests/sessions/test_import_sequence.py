@@ -61,7 +61,7 @@ def test_without_a_table_the_frames_are_taken_by_name(page: Path, make) -> None:
 
 
 @pytest.mark.parametrize(
-    ("table", "told"),
+    ("table", "message"),
     [
         ("before,file\nf0.png,f1.png\n", "column `after` is missing; found: before, file"),
         ("before,after\n", "has no rows"),
@@ -75,12 +75,12 @@ def test_without_a_table_the_frames_are_taken_by_name(page: Path, make) -> None:
         ("before,after\nf0.png\n", "line 2 has 1 fields, expected 2"),
     ],
 )
-def test_a_chain_that_is_none_is_refused_and_nothing_is_left(page: Path, make, table: str, told: str) -> None:
+def test_a_chain_that_is_none_is_refused_and_nothing_is_left(page: Path, make, table: str, message: str) -> None:
     cv2.imwrite(str(page / "small.png"), np.full((8, 8), 200, np.uint8))
     (page / "strokes.csv").write_text(table)
     with pytest.raises(InputError) as refused:
         run(page, make)
-    assert told in str(refused.value)
+    assert message in str(refused.value)
     assert not (page.parent / "sessions").exists()
 
 
@@ -91,15 +91,24 @@ def test_without_any_scale_it_is_refused(page: Path, make) -> None:
 
 def test_the_commands_import(page: Path) -> None:
     out = page.parent / "s" / "page"
-    told = ["import-sequence", str(page), "--csv", str(page / "strokes.csv"), "--page-mm", "160x120", "--out", str(out)]
-    ran = CliRunner().invoke(app, told)
+    arguments = [
+        "import-sequence",
+        str(page),
+        "--csv",
+        str(page / "strokes.csv"),
+        "--page-mm",
+        "160x120",
+        "--out",
+        str(out),
+    ]
+    ran = CliRunner().invoke(app, arguments)
     assert (ran.exit_code, ran.output) == (0, f"Imported into {out / 'page.mcap'}\n")
-    bad = CliRunner().invoke(app, [*told[:-3], "wide", "--out", str(out)])
+    bad = CliRunner().invoke(app, [*arguments[:-3], "wide", "--out", str(out)])
     assert "expected a size like 203.2x279.4" in str(bad.exception)
 
 
 def with_dpi(path: Path, image: np.ndarray, dpi: float) -> None:
-    """A PNG that tells its resolution (chunk pHYs)."""
+    """A PNG that states its resolution (chunk pHYs)."""
     data = cv2.imencode(".png", image)[1].tobytes()
     body = b"pHYs" + struct.pack(">IIB", round(dpi / 0.0254), round(dpi / 0.0254), 1)
     path.write_bytes(data[:33] + struct.pack(">I", 9) + body + struct.pack(">I", zlib.crc32(body)) + data[33:])

@@ -35,14 +35,14 @@ def test_presses_become_a_session_like_any_other(make, photos, out, run):
     assert [path.name for path in out.parent.iterdir()] == ["from-elsewhere"]
 
 
-def test_the_brush_is_as_large_as_it_was_told_to_be(make, photos, out, run):
+def test_the_brush_is_as_large_as_was_given(make, photos, out, run):
     make.photographs(photos, *ROWS)
     run(ImportOptions(kind="press", brush_radius_mm=4.0, brush_length_mm=31.0))
     header = Recording(out).header
     assert (header.brush_radius_mm, header.brush_length_mm) == (4.0, 31.0)
 
 
-def test_the_origin_is_the_folder_and_its_table_unless_it_is_told(make, photos, out, run):
+def test_the_origin_is_the_folder_and_its_table_unless_it_is_given(make, photos, out, run):
     make.photographs(photos, *ROWS)
     run(ImportOptions())
     assert Recording(out).header.origin == "photos, table.csv"
@@ -107,7 +107,7 @@ def test_the_command_imports(make, photos, out):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "told"),
+    ("damage", "message"),
     [
         (lambda photos: (photos / "b.png").unlink(), "file 'b.png' is not in photos/"),
         (lambda photos: (photos / "b.png").write_bytes(b"\x89PNG\r\n\x1a\n"), "b.png: is not a complete PNG or JPEG"),
@@ -115,14 +115,14 @@ def test_the_command_imports(make, photos, out):
     ],
     ids=["missing", "unreadable", "no scale"],
 )
-def test_a_refusal_is_one_line_on_stderr_and_exit_code_2(make, tmp_path, photos, spoil, told):
+def test_a_refusal_is_one_line_on_stderr_and_exit_code_2(make, tmp_path, photos, damage, message):
     make.photographs(photos, *ROWS)
-    spoil(photos)
+    damage(photos)
     before = make.tree(tmp_path)
     command = [sys.executable, "-m", "brushloop", "sessions", "import", "photos", "--csv", "photos/table.csv"]
     ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ran.returncode == 2
     assert ran.stdout == ""
     assert "Traceback" not in ran.stderr
-    assert told in ran.stderr.splitlines()[-1]  # on a slow machine, progress comes before it
+    assert message in ran.stderr.splitlines()[-1]  # on a slow machine, progress comes before it
     assert make.tree(tmp_path) == before

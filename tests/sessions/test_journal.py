@@ -65,7 +65,7 @@ def test_a_last_line_torn_at_any_byte_is_set_aside_and_the_rest_reads(path):
         assert torn == {"t_ns": 7, "event": "torn", "hex": whole[last_line_at:cut].hex()}
 
 
-def test_a_last_line_that_only_lacks_its_end_is_a_whole_line(path):
+def test_a_last_line_without_only_its_end_is_a_whole_line(path):
     whole = written(path, BEGIN, DONE).read_bytes()
     path.write_bytes(whole[:-1])
     assert [line["event"] for line in read_lines(path)] == ["begin", "done"]
@@ -81,7 +81,7 @@ def test_a_journal_that_is_only_a_torn_line_is_set_aside_too(path):
 
 
 @pytest.mark.parametrize(
-    ("line", "told"),
+    ("line", "message"),
     [
         (b"{oops", "line 2 is not JSON"),
         (b"\xff\xfe", "line 2 is not JSON"),
@@ -92,10 +92,10 @@ def test_a_journal_that_is_only_a_torn_line_is_set_aside_too(path):
     ],
     ids=["half", "binary", "empty", "deep", "list", "no event"],
 )
-def test_damage_in_the_middle_names_the_line(path, line, told):
+def test_damage_in_the_middle_names_the_line(path, line, message):
     whole = written(path, BEGIN).read_bytes()
     path.write_bytes(whole + line + b"\n" + whole)
-    with pytest.raises(SessionDamaged, match=told) as caught:
+    with pytest.raises(SessionDamaged, match=message) as caught:
         list(read_lines(path))
     assert caught.value.path == path
 
@@ -114,7 +114,7 @@ def test_damage_in_the_middle_names_the_line(path, line, told):
         {"event": "sheet"},
     ],
 )
-def test_an_event_that_lacks_a_field_is_damage_in_one_line(path, event):
+def test_an_event_without_a_field_is_damage_in_one_line(path, event):
     path.write_text(json.dumps({"t_ns": 1, **event}) + "\n")
     with pytest.raises(
         SessionDamaged, match=f"line 1 makes no sense: '[a-z0-9]+' of event '{event['event']}' "
@@ -140,7 +140,7 @@ def test_a_press_that_was_begun_and_never_done_has_used_its_cell(path):
     assert state.done == {}
 
 
-def test_what_does_not_fit_on_the_disk_is_an_error_and_spoils_nothing(path, monkeypatch):
+def test_what_does_not_fit_on_the_disk_is_an_error_and_damages_nothing(path, monkeypatch):
     journal = Journal(path, 1)
     journal.append(1, BEGIN)
     write = os.write

@@ -1,7 +1,7 @@
 """Bytes and whole lines of a session damaged at random: what is intact comes back once, and nothing false is sound.
 
-What is intact is told from the session as it was before, by the mcap library alone: a message is where its chunk was
-not hit, in its step's file or in the merged one.
+What is intact is computed from the session as it was before, by the mcap library alone: a message is intact if
+its chunk was not hit, in its step's file or in the merged one.
 """
 
 import io

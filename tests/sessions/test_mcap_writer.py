@@ -87,10 +87,10 @@ def test_chunks_of_another_file_are_copied_under_the_numbers_of_their_new_channe
             writer.add_contents(contents, {1: 3, 2: 2})
         writer.finish()
 
-    def told(path):
+    def messages_of(path):
         return [(c.topic, m.sequence, m.log_time, m.publish_time, m.data) for _, c, m in messages(path)]
 
-    assert told(copy) == told(source)
+    assert messages_of(copy) == messages_of(source)
     with copy.open("rb") as file:
         by_index = [m.log_time for _, _, m in make_reader(file, validate_crcs=True).iter_messages(["/bare"])]
     assert by_index == [98, 99, 100]

@@ -12,10 +12,10 @@ def test_a_line_for_each_tenth_says_how_long_the_rest_takes(capsys: pytest.Captu
     lines = Lines(lambda: next(times))
     for done in range(401):
         lines.update("captures", done, 400)
-    told = capsys.readouterr().err.splitlines()
-    assert told[:2] == ["captures: 40 of 400, about 3 min left", "captures: 80 of 400, about 3 min left"]
-    assert told[-2:] == ["captures: 360 of 400, about 20 s left", "captures: 400 of 400"]
-    assert len(told) == 10
+    printed = capsys.readouterr().err.splitlines()
+    assert printed[:2] == ["captures: 40 of 400, about 3 min left", "captures: 80 of 400, about 3 min left"]
+    assert printed[-2:] == ["captures: 360 of 400, about 20 s left", "captures: 400 of 400"]
+    assert len(printed) == 10
 
 
 def test_work_that_ends_within_two_seconds_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
@@ -33,8 +33,8 @@ def test_a_resumed_run_is_timed_by_what_it_does_itself(capsys: pytest.CaptureFix
 
 
 def test_each_item_is_reported_when_the_next_is_asked_for() -> None:
-    told: list[int] = []
-    items = counted("ab", "letters", 2, lambda _what, done, _total: told.append(done))
-    assert (next(items), told) == ("a", [0])
-    assert (list(items), told) == (["b"], [0, 1, 2])
+    counts: list[int] = []
+    items = counted("ab", "letters", 2, lambda _what, done, _total: counts.append(done))
+    assert (next(items), counts) == ("a", [0])
+    assert (list(items), counts) == (["b"], [0, 1, 2])
     unseen("letters", 2, 2)

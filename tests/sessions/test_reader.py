@@ -116,7 +116,7 @@ def test_an_mcap_file_that_is_not_ours_is_refused(path):
 
 
 @pytest.mark.parametrize(
-    "spoilt",
+    "damaged",
     [
         {"session_id": "not json"},
         {"source": '"somewhere"'},
@@ -124,17 +124,17 @@ def test_an_mcap_file_that_is_not_ours_is_refused(path):
         {"unknown": "1"},
         {"lens": "[" * 5000},
     ],
-    ids=lambda spoilt: next(iter(spoilt)),
+    ids=lambda damaged: next(iter(damaged)),
 )
-def test_a_header_that_cannot_be_read_is_told_in_one_line(make, path, spoilt):
-    foreign(path, metadata={HEADER_METADATA: header_metadata(make.header) | spoilt})
+def test_a_header_that_cannot_be_read_is_reported_in_one_line(make, path, damaged):
+    foreign(path, metadata={HEADER_METADATA: header_metadata(make.header) | damaged})
     with pytest.raises(SessionDamaged) as caught:
         Recording(path)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("topic", "data", "told"),
+    ("topic", "data", "message"),
     [
         ("/stroke", b"\xff", "Stroke"),
         ("/stroke", b'{"stroke_id":"a","kind":"press"}', r"Stroke\.still"),
@@ -145,10 +145,10 @@ def test_a_header_that_cannot_be_read_is_told_in_one_line(make, path, spoilt):
         ("/camera/still", b"\xff\xff\xff", "a still cannot be read"),
     ],
 )
-def test_a_message_that_cannot_be_read_names_its_field(make, path, topic, data, told):
+def test_a_message_that_cannot_be_read_names_its_field(make, path, topic, data, message):
     foreign(path, metadata={HEADER_METADATA: header_metadata(make.header)}, messages=[(topic, "json", data)])
     recording = Recording(path)
-    with pytest.raises(SessionDamaged, match=told) as caught:
+    with pytest.raises(SessionDamaged, match=message) as caught:
         list(recording.captures())
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)

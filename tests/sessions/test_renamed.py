@@ -95,7 +95,7 @@ LOOKS = [Recording, details, verify_session, lambda path: repair_session(path, l
 
 
 @pytest.mark.parametrize("look", LOOKS)
-def test_an_unfinished_file_is_told_as_one(make, store, look):
+def test_an_unfinished_file_is_named_as_one(make, store, look):
     store.begin("k", "press", cell=0, notes={"params": {}}).writer.abandon()
     (part,) = store.folder.glob("*.part")
     before = make.tree(store.folder)
@@ -110,7 +110,7 @@ def test_an_unfinished_file_is_told_as_one(make, store, look):
 
 
 @pytest.mark.parametrize("look", LOOKS)
-def test_a_folder_that_is_no_session_is_told_what_it_is(make, store, tmp_path, look):
+def test_a_folder_that_is_no_session_is_named_as_what_it_is(make, store, tmp_path, look):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"is no session: neither journal\.jsonl nor a recording empty\.mcap is in it"):
         look(tmp_path / "empty")

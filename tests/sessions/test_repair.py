@@ -108,7 +108,7 @@ def test_a_photograph_lost_with_its_sheet_gone_has_the_stroke_pressed_again(make
     assert set(go_on(store.folder).state.done) == {"board", "H13-a05-r01 press", "H13-a05-r01 capture"}
 
 
-def test_a_press_that_lost_some_poses_stays_done_and_tells_of_the_gap(make, folder, repair, go_on):
+def test_a_press_that_lost_some_poses_stays_done_and_reports_the_gap(make, folder, repair, go_on):
     cut(file_of(folder, "H13-a05-r00 press"), 0.3)
     report = repair(folder)
     assert report.lost == ["messages in 0002-press-H13-a05-.mcap (press H13-a05-r00): 1 of /step, 5 of /robot/tcp"]
@@ -298,7 +298,7 @@ def test_a_folder_that_may_not_be_written_is_a_session_error(folder, repair, rea
         repair(folder)
 
 
-def test_nothing_to_rebuild_from_is_told(tmp_path, repair):
+def test_nothing_to_rebuild_from_is_reported(tmp_path, repair):
     (tmp_path / JOURNAL_NAME).write_bytes(b"\x00" * 50)
     with pytest.raises(SessionDamaged, match="no file holds its header"):
         repair(tmp_path)
@@ -307,10 +307,10 @@ def test_nothing_to_rebuild_from_is_told(tmp_path, repair):
 
 
 @pytest.mark.parametrize(
-    ("damage", "code", "told"),
+    ("damage", "code", "message"),
     [(None, 0, "nothing was changed"), (40, 0, "nothing was lost"), (6000, 3, "lost: capture H13-a05-r00")],
 )
-def test_the_exit_code_tells_lossless_from_lossy(folder, damage, code, told):
+def test_the_exit_code_distinguishes_lossless_from_lossy(folder, damage, code, message):
     path = file_of(folder, "H13-a05-r00 capture")
     if damage:
         path.write_bytes(path.read_bytes()[:-damage])
@@ -318,7 +318,7 @@ def test_the_exit_code_tells_lossless_from_lossy(folder, damage, code, told):
         assert ran.exit_code == 6
         assert f"damaged: {path.name}: (capture H13-a05-r00) " in ran.output
     ran = CliRunner().invoke(app, ["repair", str(folder)])
-    assert (ran.exit_code, told in ran.output) == (code, True), ran.output
+    assert (ran.exit_code, message in ran.output) == (code, True), ran.output
     assert CliRunner().invoke(app, ["verify", str(folder)]).exit_code == 0
 
 
@@ -388,14 +388,14 @@ def test_one_flipped_byte_of_a_lone_recording_costs_one_stroke_and_names_it(make
         ("sheet", "sheet"),
     ],
 )
-def test_a_line_that_lacks_a_field_is_damage_for_every_command(folder, repair, event, field):
+def test_a_line_without_a_field_is_damage_for_every_command(folder, repair, event, field):
     lines = [*read_lines(folder / JOURNAL_NAME), {"t_ns": 1, "event": "sheet", "sheet": 0}]
     changed = [{k: v for k, v in line.items() if line["event"] != event or k != field} for line in lines]
     (folder / JOURNAL_NAME).write_bytes(b"".join(encode_line(line.pop("t_ns"), line) for line in changed))
-    told = f"'{field}' of event '{event}' is missing"
-    with pytest.raises(SessionDamaged, match=told):
+    message = f"'{field}' of event '{event}' is missing"
+    with pytest.raises(SessionDamaged, match=message):
         details(folder)
-    assert told in str(verify_session(folder).findings)
+    assert message in str(verify_session(folder).findings)
     repair(folder)
     assert verify_session(folder).sound
 

@@ -44,27 +44,27 @@ def collected(make, store):
     return store
 
 
-def test_an_open_session_tells_what_is_done_cut_and_next(collected):
-    told = details(collected.folder)
-    assert (told.state, told.strokes, told.planned, told.processes) == ("open", 2, 4, 1)
-    assert told.finished == {"press": 2, "capture": 2}
-    assert told.void == [
+def test_an_open_session_shows_what_is_done_cut_and_next(collected):
+    shown = details(collected.folder)
+    assert (shown.state, shown.strokes, shown.planned, shown.processes) == ("open", 2, 4, 1)
+    assert shown.finished == {"press": 2, "capture": 2}
+    assert shown.void == [
         "press H15-a5-r01, attempt 1: stopped",
         "press H13-a5-r02, attempt 1: the process ended during it",
     ]
-    assert told.next == "press H13-a5-r02"
-    assert told.grid == [GridCell(13.0, 5.0, 1, 2), GridCell(15.0, 5.0, 1, 2)]
-    assert told.sheets == [Sheet(1, [0, 1, 2]), Sheet(2, [0])]
-    assert told.devices["robot"] == "aubo_i5"
-    assert [segment.messages for segment in told.segments[:2]] == [{}, {"/camera/still": 1, "/stroke": 1}]
+    assert shown.next == "press H13-a5-r02"
+    assert shown.grid == [GridCell(13.0, 5.0, 1, 2), GridCell(15.0, 5.0, 1, 2)]
+    assert shown.sheets == [Sheet(1, [0, 1, 2]), Sheet(2, [0])]
+    assert shown.devices["robot"] == "aubo_i5"
+    assert [segment.messages for segment in shown.segments[:2]] == [{}, {"/camera/still": 1, "/stroke": 1}]
 
 
-def test_what_is_marked_bad_is_told_apart_from_what_counts(collected):
+def test_what_is_marked_bad_is_distinguished_from_what_counts(collected):
     [first, _] = [line["result"]["still"] for line in collected.state.segments if line["kind"] == "capture"]
     assert mark_bad_or_good(collected.folder, first, "H13-a5-r01", 1)
-    told = details(collected.folder)
-    assert (told.strokes, told.marked_bad) == (1, 1)
-    assert told.grid == [GridCell(13.0, 5.0, 0, 2), GridCell(15.0, 5.0, 1, 2)]
+    shown = details(collected.folder)
+    assert (shown.strokes, shown.marked_bad) == (1, 1)
+    assert shown.grid == [GridCell(13.0, 5.0, 0, 2), GridCell(15.0, 5.0, 1, 2)]
     ran = CliRunner(env={"COLUMNS": "160"}).invoke(app, ["show", str(collected.folder)])
     assert "1 of 4 planned, and 1 marked bad" in ran.output
 

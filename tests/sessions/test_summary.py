@@ -27,7 +27,7 @@ def root(make, tmp_path, out, photos, run):
     return root
 
 
-def test_every_session_is_told_in_one_line(root):
+def test_every_session_is_reported_in_one_line(root):
     assert list(summaries(root)) == [
         Summary("2026-01-02-grid-01", "closed", "loopback rig", 3, "2026-01-02-grid-01.mcap"),
         Summary("2026-01-02-grid-02", "open", "", 1, ""),

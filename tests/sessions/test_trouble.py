@@ -112,7 +112,7 @@ def test_a_disk_that_fills_up_during_a_step_ends_the_attempt_and_nothing_finishe
     assert verify_session(store.folder).sound
 
 
-def test_a_read_only_folder_is_told_in_one_line(make, store, read_only_disk):
+def test_a_read_only_folder_is_reported_in_one_line(make, store, read_only_disk):
     make.perform(store, "a")
     store.release()
     read_only_disk()

@@ -43,9 +43,9 @@ def test_a_flipped_bit_of_a_photograph_is_named_with_its_step(folder):
     with path.open("rb") as file:
         chunks = make_reader(file).get_summary().chunk_indexes
     flip(path, chunks[1].chunk_start_offset + chunks[1].chunk_length // 2)
-    [told] = words(folder)
-    assert told.startswith(f"{path.name}: (capture H13-a05-r00) a chunk at byte")
-    assert told.endswith("messages lost: 1 of /camera/still")
+    [finding] = words(folder)
+    assert finding.startswith(f"{path.name}: (capture H13-a05-r00) a chunk at byte")
+    assert finding.endswith("messages lost: 1 of /camera/still")
 
 
 def test_what_is_missing_is_named(folder):
@@ -57,7 +57,7 @@ def test_what_is_missing_is_named(folder):
     ]
 
 
-def test_a_damaged_journal_line_is_told_and_whether_the_files_make_up_for_it(folder):
+def test_a_damaged_journal_line_is_reported_and_whether_the_files_make_up_for_it(folder):
     journal = folder / JOURNAL_NAME
     flip(journal, journal.read_bytes().index(b'"depth_mm"'))
     assert words(folder) == ["journal.jsonl: line 8 is not JSON"]
@@ -66,8 +66,8 @@ def test_a_damaged_journal_line_is_told_and_whether_the_files_make_up_for_it(fol
 
 def test_an_image_that_does_not_decode_is_damage_though_every_crc_holds(make, store):
     make.take(store, "a", "capture", [make.still(0, b"no image"), make.stroke(0)], {})
-    [told] = words(store.folder)
-    assert told.endswith("(capture) the image 0 on /camera/still is not a complete PNG or JPEG image")
+    [finding] = words(store.folder)
+    assert finding.endswith("(capture) the image 0 on /camera/still is not a complete PNG or JPEG image")
 
 
 def test_a_stroke_without_its_still_is_damage(make, tmp_path):

@@ -50,9 +50,9 @@ def test_far_is_two_seconds_and_three_median_deviations(waits: list[float], far:
     assert list(unlike(dict(enumerate(waits)))) == far
 
 
-def test_an_export_tells_the_wait_and_whose_is_unlike(make, tmp_path):
-    told = [{"dip_to_touch_s": wait} for wait in (1.0, 1.1, 10.0, 1.2)] + [{}]
-    messages = [message for n, one in enumerate(told) for message in (make.still(n), make.stroke(n, **one))]
+def test_an_export_gives_the_wait_and_names_strokes_whose_wait_differs(make, tmp_path):
+    fields = [{"dip_to_touch_s": wait} for wait in (1.0, 1.1, 10.0, 1.2)] + [{}]
+    messages = [message for n, one in enumerate(fields) for message in (make.still(n), make.stroke(n, **one))]
     export(make.record(tmp_path / "a.mcap", *messages), tmp_path / "out", "png")
     with (tmp_path / "out" / "strokes.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))

@@ -94,7 +94,7 @@ def test_it_is_refused_without_power_and_powers_the_arm(seen: dict[str, Any]):
     assert seen["power off"] == 0
 
 
-def test_it_moves_waits_by_exec_id_and_is_told_that_it_is_there(seen: dict[str, Any]):
+def test_it_moves_waits_by_exec_id_and_hears_that_it_has_arrived(seen: dict[str, Any]):
     code, ident = seen["move"]
     assert code == 0
     assert ident >= 0
@@ -138,7 +138,7 @@ def test_its_moves_are_rounded_into_each_other(seen: dict[str, Any]):
     assert off_m < 1e-6
 
 
-def test_it_reads_limits_and_is_told_what_is_not_simulated(seen: dict[str, Any]):
+def test_it_reads_limits_and_is_refused_what_is_not_simulated(seen: dict[str, Any]):
     highest, lowest, *others = seen["limits"]
     assert lowest == [-v for v in highest]
     assert [len(v) for v in others] == [6, 6, 2, 2]
@@ -173,7 +173,7 @@ def test_it_subscribes_to_telemetry(seen: dict[str, Any]):
     assert seen["rtde connected"] is True
 
 
-def test_what_goes_wrong_is_told_in_the_way_it_knows(seen: dict[str, Any]):
+def test_what_goes_wrong_is_reported_as_the_client_expects(seen: dict[str, Any]):
     assert seen["unknown method"].startswith("AuboException: rob1.MotionControl.getEqradius--32601")
     assert seen["wrong call"].startswith("AuboException: rob1.RobotAlgorithm.forwardKinematics--32602")
     assert seen["out of reach"] == 0

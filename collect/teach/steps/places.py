@@ -39,7 +39,7 @@ class PlacesStep:
         """Have the tip brought to each place; look whether the parked arm is out of the picture."""
         async with day.arm() as reader:
             await day.touch(reader, Target("well-rim"), "Bring the tip to the rim of the ink well.", "well-rim 0")
-            how = "Bring the tip into the middle of the well, as deep as a dip shall go: a few mm above its bottom."
+            how = "Bring the tip into the middle of the well, as deep as a dip should go: a few mm above its bottom."
             await day.touch(reader, Target("well"), how, "well 0")
             with day.touched_again_if_refused("well-rim", "well"):
                 found = _check_well(day.notebook)
@@ -47,14 +47,14 @@ class PlacesStep:
             if "wash-pot 0" not in day.notebook.touches and "aside.wash" not in day.notebook.values:
                 wash = await day.yes("Is there a pot of water to wash the brush in?", default=False)
                 if wash:
-                    how = "Bring the tip into the middle of the pot of water, as deep as a wash shall go."
+                    how = "Bring the tip into the middle of the pot of water, as deep as a wash should go."
                     await day.touch(reader, Target("wash-pot"), how, "wash-pot 0")
                 day.keep("places", "aside.wash", wash, "answered")
             if not (clear := _clear_view(day.rig_path)).exists() or "clear-view 0" not in day.notebook.touches:
                 how = "Guide the arm so far away that neither it nor its shadow is in the camera's picture."
                 await day.touch(reader, Target("clear-view"), how, "clear-view 0")
                 cv2.imwrite(str(clear), (await self._seen(day)).astype(np.uint8))
-            how = "Bring the arm to where it shall wait: brush upright, above everything, out of the camera's picture."
+            how = "Bring the arm to its waiting place: brush upright, above everything, out of the camera's picture."
             await day.touch(reader, Target("park"), how, "park 0")
             await self._look(day, clear)
 

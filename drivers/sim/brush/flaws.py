@@ -29,7 +29,7 @@ SPENT = 0.7
 """Share of the ink that the other hairs of a fully dry brush lack."""
 
 PALE = 0.75
-"""Share of the tone that a fully faint ink lacks."""
+"""Share of the tone that is missing in fully faint ink."""
 
 COHESIVE_LOAD = 0.7
 """Ink load above which the film between the hairs always holds the tip together."""

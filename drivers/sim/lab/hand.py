@@ -7,7 +7,7 @@
 | `{"act": "bring", "to": "hold-board", "index": 0}` | holds the print before the camera until the next act |
 | `{"act": "bring", "to": "push-sensor", "index": 0}` | pushes the tip: 0 toward the flange, 1 and 2 aside |
 | `{"act": "measure", "to": "square"}` | measures with calipers or a ruler: `square`, `marker`, `tool` |
-| `{"act": "mend"}` | sees to what is wrong, having been told: the trap's mistake ends |
+| `{"act": "mend"}` | corrects what is wrong, once the person was asked to: the trap's mistake ends |
 | `{"act": "plug"}` | puts a cable back |
 
 Every answer has `says`, what the person would say; `bring` has `reached` too.

@@ -1,6 +1,6 @@
 """What goes wrong in a lab, one trap each: a mistake of the person, of whoever set a device up, or an accident.
 
-`spring` puts a trap into a lab, `mended` gives the lab as it is once the person has been told and has seen to it.
+`spring` puts a trap into a lab, `mended` gives the lab as it is once the person was asked to correct it and did so.
 """
 
 from __future__ import annotations

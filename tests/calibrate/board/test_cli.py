@@ -69,10 +69,10 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["camera", *map(str, arguments)])
 
 
-def refused(ran: Result, told: str) -> None:
+def refused(ran: Result, message: str) -> None:
     assert isinstance(ran.exception, CalibrationError), ran.output
     assert ran.exception.exit_code == 2
-    assert told in str(ran.exception)
+    assert message in str(ran.exception)
     assert "\n" not in str(ran.exception)
 
 
@@ -109,24 +109,24 @@ USELESS = [
 ]
 
 
-@pytest.mark.parametrize(("image", "options", "told"), USELESS)
-def test_check_refuses_a_photograph_that_tells_nothing(
-    tmp_path: Path, image: Gray, options: Sequence[str], told: str
+@pytest.mark.parametrize(("image", "options", "message"), USELESS)
+def test_check_refuses_a_photograph_that_shows_nothing(
+    tmp_path: Path, image: Gray, options: Sequence[str], message: str
 ) -> None:
-    refused(run("check", saved(tmp_path / "p.png", image), *options), told)
+    refused(run("check", saved(tmp_path / "p.png", image), *options), message)
 
 
 @pytest.mark.parametrize(
-    ("image", "told"),
+    ("image", "message"),
     [
         pytest.param(half_hidden(0.5), "the board is partly hidden", id="board half hidden"),
         pytest.param(SATURATED, "% of the pixels are saturated", id="saturated"),
     ],
 )
-def test_check_flags_what_can_be_used_with_care(tmp_path: Path, image: Gray, told: str) -> None:
+def test_check_flags_what_can_be_used_with_care(tmp_path: Path, image: Gray, message: str) -> None:
     ran = run("check", saved(tmp_path / "p.png", image), *BOARD)
     assert ran.exit_code == 5
-    assert any(line.startswith("warning: ") and told in line for line in ran.output.splitlines()), ran.output
+    assert any(line.startswith("warning: ") and message in line for line in ran.output.splitlines()), ran.output
     assert ran.output.startswith("pix2len 0.")
 
 
@@ -154,7 +154,7 @@ def test_check_names_the_remedy_for_a_lens_that_bends(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("data", "told"),
+    ("data", "message"),
     [
         (b"", "not a complete PNG or JPEG"),
         (b"\x89PNG\r\n\x1a\nabc", "not a complete PNG or JPEG"),
@@ -162,13 +162,13 @@ def test_check_names_the_remedy_for_a_lens_that_bends(tmp_path: Path) -> None:
     ],
     ids=["empty", "torn", "missing"],
 )
-def test_what_is_no_photograph_is_refused(tmp_path: Path, data: bytes | None, told: str) -> None:
+def test_what_is_no_photograph_is_refused(tmp_path: Path, data: bytes | None, message: str) -> None:
     path = tmp_path / "p.png"
     if data is not None:
         path.write_bytes(data)
-    refused(run("check", path, *BOARD), told)
-    refused(run("intrinsics", path, *BOARD, "--out", tmp_path / "out"), told)
-    refused(run("register", points(tmp_path), "--photograph", path, *FLAT, "--out", tmp_path / "out"), told)
+    refused(run("check", path, *BOARD), message)
+    refused(run("intrinsics", path, *BOARD, "--out", tmp_path / "out"), message)
+    refused(run("register", points(tmp_path), "--photograph", path, *FLAT, "--out", tmp_path / "out"), message)
     assert not (tmp_path / "out").exists()
 
 
@@ -184,7 +184,7 @@ def test_a_folder_or_a_lens_of_another_camera_is_refused(tmp_path: Path) -> None
 
 
 def points(folder: Path, change: str = "") -> Path:
-    """Five marks that a robot touched, turned by 10 degrees; `change` spoils the table."""
+    """Five marks that a robot touched, turned by 10 degrees; `change` damages the table."""
     paper = np.array([[20.0, 20.0], [150.0, 25.0], [140.0, 120.0], [30.0, 110.0], [90.0, 60.0]])
     turn = math.radians(10.0)
     rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
@@ -238,25 +238,25 @@ def test_register_finds_the_turn_and_names_all_that_it_was_made_of(tmp_path: Pat
     assert f"lens file {lens.stem}" in made["source"]
 
 
-@pytest.mark.parametrize(("image", "options", "told"), USELESS)
-def test_register_writes_nothing_by_a_photograph_that_tells_nothing(
-    tmp_path: Path, image: Gray, options: Sequence[str], told: str
+@pytest.mark.parametrize(("image", "options", "message"), USELESS)
+def test_register_writes_nothing_by_a_photograph_that_shows_nothing(
+    tmp_path: Path, image: Gray, options: Sequence[str], message: str
 ) -> None:
     photograph, out = saved(tmp_path / "p.png", image), tmp_path / "out"
-    refused(run("register", points(tmp_path), "--photograph", photograph, *options, *CORNER, "--out", out), told)
+    refused(run("register", points(tmp_path), "--photograph", photograph, *options, *CORNER, "--out", out), message)
     assert not out.exists()
 
 
 def test_register_flags_what_can_be_used_with_care(tmp_path: Path) -> None:
-    for image, told in ((half_hidden(0.5), "partly hidden"), (SATURATED, "are saturated")):
+    for image, message in ((half_hidden(0.5), "partly hidden"), (SATURATED, "are saturated")):
         photograph = saved(tmp_path / "p.png", image)
         ran = run("register", points(tmp_path), "--photograph", photograph, *FLAT, "--out", tmp_path / "out")
         assert ran.exit_code == 0, ran.output
-        assert any(line.startswith("warning: ") and told in line for line in ran.output.splitlines()), ran.output
+        assert any(line.startswith("warning: ") and message in line for line in ran.output.splitlines()), ran.output
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ("few", "2 points: at least 3 are needed"),
         ("mixed", "are their names mixed up?"),
@@ -264,14 +264,16 @@ def test_register_flags_what_can_be_used_with_care(tmp_path: Path) -> None:
         ("column", "missing: image_x_px"),
     ],
 )
-def test_register_writes_nothing_by_a_bad_table(tmp_path: Path, change: str, told: str) -> None:
+def test_register_writes_nothing_by_a_bad_table(tmp_path: Path, change: str, message: str) -> None:
     out = tmp_path / "out"
     photograph = saved(tmp_path / "p.png", board())
-    refused(run("register", points(tmp_path, change), "--photograph", photograph, *FLAT, "--out", out), told)
+    refused(run("register", points(tmp_path, change), "--photograph", photograph, *FLAT, "--out", out), message)
     assert not out.exists()
 
 
-def test_drift_tells_a_camera_that_stays_and_one_that_was_touched(photographed: Photographed, tmp_path: Path) -> None:
+def test_drift_distinguishes_a_camera_that_stays_from_one_that_was_touched(
+    photographed: Photographed, tmp_path: Path
+) -> None:
     still = photographed(tmp_path / "still", SPEC, [board(seed=k) for k in range(3)])
     ran = run("drift", still)
     assert ran.exit_code == 0, ran.output
@@ -288,17 +290,17 @@ def test_drift_tells_a_camera_that_stays_and_one_that_was_touched(photographed: 
 
 
 @pytest.mark.parametrize(
-    ("image", "told"),
+    ("image", "message"),
     [(BLANK, "is blank"), (MIRRORED, "is mirrored"), (TWO, "two boards"), (half_hidden(0.18), "corners found")],
     ids=["blank", "mirrored", "two", "hidden"],
 )
 def test_drift_refuses_a_session_in_which_no_board_is_seen(
-    photographed: Photographed, tmp_path: Path, image: Gray, told: str
+    photographed: Photographed, tmp_path: Path, image: Gray, message: str
 ) -> None:
     session = photographed(tmp_path / "s", SPEC, [image, image])
     before = sorted(tmp_path.rglob("*"))
     ran = run("drift", session)
-    refused(ran, told)
+    refused(ran, message)
     assert "is not seen in any of 2 photographs" in str(ran.exception)
     assert sorted(tmp_path.rglob("*")) == before
 
@@ -313,8 +315,8 @@ def test_intrinsics_names_every_useless_photograph_and_writes_nothing(tmp_path: 
     paths = [saved(tmp_path / f"{name}.png", image) for name, image in images.items()]
     ran = run("intrinsics", *paths, *BOARD, "--out", tmp_path / "out")
     refused(ran, "4 photographs: 1 usable views of the board, at least 4 needed")
-    for told in ("blank.png: is blank", "mirrored.png: the photograph is mirrored", "two.png: shows two boards"):
-        assert told in str(ran.exception)
+    for message in ("blank.png: is blank", "mirrored.png: the photograph is mirrored", "two.png: shows two boards"):
+        assert message in str(ran.exception)
     assert not (tmp_path / "out").exists()
 
 

@@ -35,7 +35,7 @@ def test_a_camera_that_stays_has_no_trend_and_no_warning() -> None:
     assert found.warnings == ()
 
 
-def test_a_camera_that_sinks_or_was_touched_is_told() -> None:
+def test_a_camera_that_sinks_or_was_touched_is_reported() -> None:
     stills = [(k * HOUR_NS, photograph(1.0 + 0.001 * k, seed=k)) for k in range(4)]
     sinking = drift([*stills, (5 * HOUR_NS, np.full((800, 1024), 200, np.uint8))], SPEC)
     assert sinking.trend is not None

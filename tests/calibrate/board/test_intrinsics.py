@@ -99,11 +99,11 @@ def test_a_photograph_that_is_given_again_counts_once(times: int) -> None:
     given = [jogged(view, f"{k}-{view.name}", 0.0 if k < 2 else 0.1) for view in seen for k in range(times)]
     with pytest.raises(CalibrationError) as refused:
         fit_lens(given)
-    told = str(refused.value)
-    assert told.startswith(f"{len(given)} photographs: 2 usable views of the board, at least 4 needed")
+    message = str(refused.value)
+    assert message.startswith(f"{len(given)} photographs: 2 usable views of the board, at least 4 needed")
     if times > 1:
-        assert "1-0.png, 2-0.png: shows the board where 0-0.png does: they count once" in told
-    assert "\n" not in told
+        assert "1-0.png, 2-0.png: shows the board where 0-0.png does: they count once" in message
+    assert "\n" not in message
 
 
 def test_views_given_again_do_not_make_a_lens_surer() -> None:
@@ -116,7 +116,7 @@ def test_views_given_again_do_not_make_a_lens_surer() -> None:
 
 
 @pytest.mark.parametrize("slant", [0.0, 0.4], ids=["face on", "slanted alike"])
-def test_a_board_that_is_always_held_alike_tells_no_lens(slant: float) -> None:
+def test_a_board_that_is_always_held_alike_gives_no_lens(slant: float) -> None:
     rng, made = np.random.default_rng(3), list[BoardView]()
     for view in views(10):
         turn = np.array([slant, 0.0, 0.0]) + rng.normal(0, 0.01, 3)
@@ -128,7 +128,7 @@ def test_a_board_that_is_always_held_alike_tells_no_lens(slant: float) -> None:
         fit_lens(made)
 
 
-def test_an_interval_is_told_where_the_views_earn_it_and_then_holds_the_truth() -> None:
+def test_an_interval_is_given_where_the_views_allow_it_and_then_holds_the_truth() -> None:
     few = fit_lens(views(5))
     assert few.focal_se_px is None
     assert few.focal_reach_px is None
@@ -147,14 +147,14 @@ def other_camera(f: float, x_px: float, y_px: float) -> Lens:
     return lens_of((f * fx, f * fy, cx + x_px, cy + y_px), (-0.21, 0.06, 0.001, -0.0005, 0.0), TRUE.size_px)
 
 
-def test_two_cameras_in_one_set_are_told_apart_whatever_the_files_are_called() -> None:
+def test_two_cameras_in_one_set_are_distinguished_whatever_the_files_are_called() -> None:
     one, other = views(7), views(6, seed=5, lens=other_camera(1.06, -45.0, 20.0))
     mixed = renamed([view for pair in zip(one, other, strict=False) for view in pair], "p")
     with pytest.raises(CalibrationError, match="12 photographs: are of two cameras: ") as refused:
         fit_lens(mixed)
-    told = str(refused.value)
+    message = str(refused.value)
     for part in (mixed[0::2], mixed[1::2]):
-        assert ", ".join(view.name for view in part) in told
+        assert ", ".join(view.name for view in part) in message
     assert len(fit_lens(mixed, one_camera=True).residuals_px) == 12
 
 
@@ -165,9 +165,9 @@ def test_left_and_right_cameras_mixed_are_named(opencv: list[BoardView]) -> None
     there = [(view.pixels - middle) * 1.006 + middle + [-14.0, 14.0] for view in opencv]
     names = [view.name.replace("left", "right") for view in opencv]
     right = [dataclasses.replace(v, name=n, pixels=p) for v, n, p in zip(opencv, names, there, strict=True)]
-    told = r"are of two cameras: .*left01\.jpg.* leave .*right14\.jpg"
+    message = r"are of two cameras: .*left01\.jpg.* leave .*right14\.jpg"
     for mixed in ([*opencv, *right], [*opencv[:7], *right[7:]]):
-        with pytest.raises(CalibrationError, match=told) as refused:
+        with pytest.raises(CalibrationError, match=message) as refused:
             fit_lens(mixed)
         assert "left" not in str(refused.value).split("so do")[1]
 
@@ -181,16 +181,16 @@ def test_no_choice_of_one_cameras_photographs_is_taken_for_two_cameras(opencv: l
 
 
 @pytest.mark.soak
-def test_how_often_two_cameras_are_told_and_one_is_taken_for_two() -> None:
+def test_how_often_two_cameras_are_found_and_one_is_taken_for_two() -> None:
     """A stereo pair's lenses, their axes 20 px apart; and one camera whose files are named as if there were two."""
     found, alarms = 0, 0
     for seed in range(20):
         left, right = views(7, seed=seed), views(7, seed=seed + 100, lens=other_camera(1.006, -14.0, 14.0))
         for other, is_right in ((right, True), (views(7, seed=seed + 200), False)):
             mixed = [*renamed(left, "left"), *renamed(other, "right")]
-            told = two_cameras(mixed, solve(mixed, "test")) is not None
-            found, alarms = found + (told and is_right), alarms + (told and not is_right)
-    print(f"told {found} of 20, false alarms {alarms} of 20")  # noqa: T201
+            is_flagged = two_cameras(mixed, solve(mixed, "test")) is not None
+            found, alarms = found + (is_flagged and is_right), alarms + (is_flagged and not is_right)
+    print(f"found {found} of 20, false alarms {alarms} of 20")  # noqa: T201
     assert found >= 10
     assert alarms == 0
 
@@ -222,11 +222,11 @@ def test_bad_residuals_warn_before_a_session_begins() -> None:
     assert "exceeds 0.5 px" in warning
 
 
-def test_it_says_what_to_photograph_besides() -> None:
+def test_it_says_what_else_to_photograph() -> None:
     one_corner = [view for view in views(60) if view.pixels.max(axis=0)[0] < 420][:5]
-    told = " / ".join(fit_lens(one_corner).guidance)
-    assert "take 5 more photographs" in told
-    assert "right" in told
+    message = " / ".join(fit_lens(one_corner).guidance)
+    assert "take 5 more photographs" in message
+    assert "right" in message
     assert guidance(views(40), [20.0] * 40) == ()
 
 
@@ -235,13 +235,13 @@ def test_too_few_photographs_or_mixed_sizes_are_refused() -> None:
         fit_lens(views(3))
     mixed = views(5)
     mixed[0] = BoardView("big.png", (1280, 960), mixed[0].pixels, mixed[0].board_mm, mixed[0].ids)
-    told = r"have several sizes, .*640 x 480 px: 1\.png, 2\.png, 3\.png, 4\.png; 1280 x 960 px: big\.png"
-    with pytest.raises(CalibrationError, match=told):
+    message = r"have several sizes, .*640 x 480 px: 1\.png, 2\.png, 3\.png, 4\.png; 1280 x 960 px: big\.png"
+    with pytest.raises(CalibrationError, match=message):
         fit_lens(mixed)
 
 
 @pytest.mark.parametrize(
-    ("image", "board", "told"),
+    ("image", "board", "message"),
     [
         (np.full((480, 640), 235, np.uint8), CHECKERS, "is blank"),
         (np.full((480, 640), 255, np.uint8), CHARUCO, "is blank"),
@@ -260,8 +260,8 @@ def test_too_few_photographs_or_mixed_sizes_are_refused() -> None:
     ],
     ids=["blank", "blank charuco", "smaller", "larger", "two", "two charuco", "mirrored", "few", "many", "hidden"],
 )
-def test_a_photograph_of_no_use_is_refused_with_the_reason(image: np.ndarray, board: object, told: str) -> None:
-    with pytest.raises(CalibrationError, match=told):
+def test_a_photograph_of_no_use_is_refused_with_the_reason(image: np.ndarray, board: object, message: str) -> None:
+    with pytest.raises(CalibrationError, match=message):
         find_board(image.astype(np.uint8), board, "photograph")
 
 

@@ -1,4 +1,4 @@
-"""A camera that distorts: the session's lens, or a given one, is undone first; without one the remedy is told.
+"""A camera that distorts: the session's lens, or a given one, is undone first; without one the error names the remedy.
 
 Loopback rig, its barrel camera (k1 = -0.15).
 """
@@ -213,7 +213,7 @@ def test_the_review_follows_the_calibration_in_use(
 
 
 def test_the_review_says_why_it_compares_nothing(photographed: Photographed, tmp_path: Path, shot: Shot) -> None:
-    session = collected(photographed, tmp_path / "spoilt", shot)
+    session = collected(photographed, tmp_path / "damaged", shot)
     (session / "rig.effective.json").write_text('{"board": 7}')
     review = Review(session)
     assert "rig.effective.json: board: Input should be" in review.not_compared
@@ -228,8 +228,8 @@ def test_every_stage_is_shown_with_the_lens(photographed: Photographed, tmp_path
     assert not out.exists()
     shown = CliRunner().invoke(app, [*command, "--lens", str(lens)])
     assert shown.exit_code == 0, shown.output
-    told = dict(line.split() for line in shown.output.splitlines() if line.startswith("undistort."))
-    assert float(told["undistort.k1"]) == pytest.approx(CAMERAS[BARREL].k1, abs=0.005)
+    fields = dict(line.split() for line in shown.output.splitlines() if line.startswith("undistort."))
+    assert float(fields["undistort.k1"]) == pytest.approx(CAMERAS[BARREL].k1, abs=0.005)
     # What is shown is what is measured: the same plane, the same paper cell.
     made = load_artefact(calibrate_session(session, lens), Calibration)
     shown_first = next(Recording(session).captures())

@@ -110,7 +110,7 @@ def test_a_board_that_cannot_be_is_refused(change: dict[str, object], words: str
         BoardSpec.model_validate(SPEC.model_dump() | change)
 
 
-def test_a_lens_is_told_from_a_board_that_is_curled_misread_or_noisy() -> None:
+def test_a_lens_is_distinguished_from_a_board_that_is_curled_misread_or_noisy() -> None:
     grid = np.array([(x, y) for x in range(0, 281, 20) for y in range(0, 201, 20)], np.float64)
     ring = (grid[:, 0] < 40) | (grid[:, 0] > 240) | (grid[:, 1] < 40) | (grid[:, 1] > 160)
     paper, middle = grid[ring], np.array([640.0, 480.0])

@@ -21,7 +21,7 @@ def seen(turn_deg: float = -90.0, scale: float = 1.0, noise_mm: float = 0.05) ->
     return ROBOT @ matrix.T + [110.0, 460.0] + np.random.default_rng(2).normal(0, noise_mm, ROBOT.shape)
 
 
-def test_turn_and_place_are_found_and_every_point_tells_its_residual() -> None:
+def test_turn_and_place_are_found_and_every_point_shows_its_residual() -> None:
     found = register(NAMES, ROBOT, seen())
     assert found.yaw_deg == pytest.approx(90.0, abs=0.05)
     assert found.scale == pytest.approx(1.0)

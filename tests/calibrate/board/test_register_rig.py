@@ -30,7 +30,7 @@ MARKS = [(10.0, 10.0), (230.0, 15.0), (220.0, 160.0), (15.0, 155.0), (120.0, 80.
 
 
 @dataclasses.dataclass(frozen=True)
-class Laid:
+class PlacedSheet:
     """A sheet that lies somewhere, and what an operator has of it: marks, a photograph, and an old rig.toml."""
 
     truth: PaperConfig
@@ -39,16 +39,24 @@ class Laid:
     rig: Path
 
     def register(self, *options: object) -> Result:
-        told = ["camera", "register", self.table, "--photograph", self.photograph, "--out", self.rig.parent / "camera"]
-        return CliRunner().invoke(app, [str(word) for word in (*told, *options)])
+        arguments = [
+            "camera",
+            "register",
+            self.table,
+            "--photograph",
+            self.photograph,
+            "--out",
+            self.rig.parent / "camera",
+        ]
+        return CliRunner().invoke(app, [str(word) for word in (*arguments, *options)])
 
 
 @pytest.fixture(scope="module", params=[(73.2, (431.5, -92.25)), (-110.0, (380.0, 140.0))], ids=["left", "right"])
-def laid(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Laid:
+def placed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> PlacedSheet:
     yaw_deg, origin_mm = request.param
     world = World(SimConfig(view=VIEW, table=Table(origin_mm=origin_mm, yaw_deg=yaw_deg)))
     scene = Scene(world)
-    folder = tmp_path_factory.mktemp("laid")
+    folder = tmp_path_factory.mktemp("placed")
     photograph, table, rig = folder / "marks.png", folder / "marks.csv", folder / "rig.toml"
     cv2.imwrite(str(photograph), scene.render(0, brush_pose(*world.config.home_mm)))
     truth = PaperConfig(origin_mm=origin_mm, yaw_deg=yaw_deg, touch_z_mm=120.0, size_mm=world.config.table.sheet_mm)
@@ -60,7 +68,7 @@ def laid(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
         rows.append(f"mark {k},{x:.4f},{y:.4f},{u:.3f},{v:.3f}")
     table.write_text("\n".join(rows) + "\n")
     rig.write_text(rig_toml(SimConfig(), AT).replace("yaw_deg = 90.0\n", "yaw_deg = 90.0  # by eye\n"))
-    return Laid(truth, table, photograph, rig)
+    return PlacedSheet(truth, table, photograph, rig)
 
 
 def lies_there(paper: PaperConfig, truth: PaperConfig) -> None:
@@ -70,32 +78,32 @@ def lies_there(paper: PaperConfig, truth: PaperConfig) -> None:
     assert paper.yaw_deg == pytest.approx(truth.yaw_deg, abs=0.03)
 
 
-def test_the_last_two_lines_are_those_of_the_rig(laid: Laid) -> None:
-    ran = laid.register("--config", laid.rig)
+def test_the_last_two_lines_are_those_of_the_rig(placed: PlacedSheet) -> None:
+    ran = placed.register("--config", placed.rig)
     assert ran.exit_code == 0, ran.output
     pasted = tomllib.loads("\n".join(ran.output.splitlines()[-2:]))
     assert list(pasted) == ["origin_mm", "yaw_deg"]
-    lies_there(laid.truth.model_copy(update=pasted), laid.truth)
+    lies_there(placed.truth.model_copy(update=pasted), placed.truth)
 
 
-def test_write_changes_these_two_values_and_nothing_else(laid: Laid, tmp_path: Path) -> None:
-    laid = dataclasses.replace(laid, rig=Path(shutil.copy(laid.rig, tmp_path)))
-    before, old = laid.rig.read_bytes(), load_rig(laid.rig)
-    laid.rig.chmod(0o640)
-    ran = laid.register("--write", laid.rig)
+def test_write_changes_these_two_values_and_nothing_else(placed: PlacedSheet, tmp_path: Path) -> None:
+    placed = dataclasses.replace(placed, rig=Path(shutil.copy(placed.rig, tmp_path)))
+    before, old = placed.rig.read_bytes(), load_rig(placed.rig)
+    placed.rig.chmod(0o640)
+    ran = placed.register("--write", placed.rig)
     assert ran.exit_code == 0, ran.output
-    new = load_rig(laid.rig)
-    lies_there(new.paper, laid.truth)
+    new = load_rig(placed.rig)
+    lies_there(new.paper, placed.truth)
     assert rest(new) == rest(old)
-    changed = [k for k, row in enumerate(laid.rig.read_text().splitlines()) if row != before.decode().splitlines()[k]]
+    changed = [k for k, row in enumerate(placed.rig.read_text().splitlines()) if row != before.decode().splitlines()[k]]
     assert len(changed) == 2
-    assert "  # by eye" in laid.rig.read_text().splitlines()[changed[1]]
-    assert laid.rig.with_name("rig.toml.bak").read_bytes() == before
-    assert laid.rig.stat().st_mode & 0o777 == 0o640
+    assert "  # by eye" in placed.rig.read_text().splitlines()[changed[1]]
+    assert placed.rig.with_name("rig.toml.bak").read_bytes() == before
+    assert placed.rig.stat().st_mode & 0o777 == 0o640
 
-    laid.register("--write", laid.rig)
-    assert laid.rig.with_name("rig.toml.bak").read_bytes() == before, "what was kept is never overwritten"
-    assert laid.rig.with_name("rig.toml.bak-2").exists()
+    placed.register("--write", placed.rig)
+    assert placed.rig.with_name("rig.toml.bak").read_bytes() == before, "what was kept is never overwritten"
+    assert placed.rig.with_name("rig.toml.bak-2").exists()
 
 
 def rest(rig: RigConfig) -> object:
@@ -128,7 +136,7 @@ def test_only_the_values_change_in_the_text(tmp_path: Path, text: str, expected:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         (BOARD, "paper: is not a table of its own"),
         (f"paper = {{origin_mm = [1, 2], yaw_deg = 0}}\n{BOARD}", "paper: is not a table of its own"),
@@ -139,28 +147,28 @@ def test_only_the_values_change_in_the_text(tmp_path: Path, text: str, expected:
     ],
     ids=["none", "inline", "no yaw", "two lines", "yaw in a text", "table in a text"],
 )
-def test_what_cannot_be_found_for_sure_is_not_touched(tmp_path: Path, text: str, told: str) -> None:
+def test_what_cannot_be_found_for_sure_is_not_touched(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "rig.toml"
     path.write_text(text)
     with pytest.raises(CalibrationError, match=r"nothing is written\. Put in by hand: origin_mm = ") as refused:
         read_rig(path).write(LINES)
-    assert told in str(refused.value)
+    assert message in str(refused.value)
     assert "\n" not in str(refused.value)
     assert path.read_text() == text
     assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("", "rig.toml: [board] is missing"),
         ("[board", "is not TOML"),
         ("[board]\nsquares = [9, 7]\n", "board.square_mm: Field required"),
     ],
 )
-def test_a_rig_without_a_board_is_refused_by_name(tmp_path: Path, text: str, told: str) -> None:
+def test_a_rig_without_a_board_is_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "rig.toml"
     path.write_text(text)
     with pytest.raises(CalibrationError) as refused:
         read_rig(path)
-    assert told in str(refused.value)
+    assert message in str(refused.value)

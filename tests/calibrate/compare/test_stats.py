@@ -1,4 +1,4 @@
-"""Intervals and tests behave as they must on cases that can be told by hand."""
+"""Intervals and tests behave as they must on cases that can be computed by hand."""
 
 from __future__ import annotations
 

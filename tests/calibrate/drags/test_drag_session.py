@@ -96,8 +96,8 @@ def test_the_ink_lies_where_the_command_put_it(session: Path) -> None:
 
 def test_a_drawn_figure_has_the_strokes_of_its_protocol() -> None:
     points = [[1.0, 2.0, 3.0, 4.0, 90.0], [5.0, 6.0, 7.0, 8.0, 90.0]]
-    told = {"kind": "write", "figures": [{"name": "yong", "strokes": [{"points": points}, {"points": points}]}]}
-    found = figures_of(_header(json.dumps(told)))
+    protocol = {"kind": "write", "figures": [{"name": "yong", "strokes": [{"points": points}, {"points": points}]}]}
+    found = figures_of(_header(json.dumps(protocol)))
     assert [path.tolist() for path in found["yong"]] == [[[1.0, 2.0, 3.0, 90.0], [5.0, 6.0, 7.0, 90.0]]] * 2
     with pytest.raises(CalibrationError, match="holds no trajectories"):
         figures_of(_header('{"kind": "grid"}'))

@@ -35,7 +35,7 @@ def test_lag_and_width_are_found_again() -> None:
     assert fit.condition < 1e5
 
 
-def test_the_place_on_a_page_is_told_from_the_brush() -> None:
+def test_the_place_on_a_page_is_distinguished_from_the_brush() -> None:
     paths = arcs(12, 3)
     place = np.linspace(-1.0, 1.0, 12)[:, None]
     moved = [path + np.array([0.0, 1.5 * float(p[0]), 0.0]) for path, p in zip(paths, place, strict=True)]
@@ -43,7 +43,7 @@ def test_the_place_on_a_page_is_told_from_the_brush() -> None:
     assert fit.place_mm[0] == pytest.approx([0.0, 1.5], abs=0.25)
 
 
-def test_what_the_model_lacks_is_learned_from_neighbours() -> None:
+def test_what_the_model_does_not_describe_is_learned_from_neighbours() -> None:
     commands = np.linspace(0.0, 1.0, 20)[:, None]
     base = np.zeros((20, 4, 4))
     captured = base + np.sin(3.0 * commands)[:, :, None]

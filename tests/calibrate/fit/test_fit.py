@@ -58,7 +58,7 @@ def test_the_condition_number_is_that_of_unit_columns() -> None:
     assert condition_number(np.diag([1.0, 0.0])) == math.inf
 
 
-def test_a_zero_touch_that_moved_is_told_from_an_earlier_fit() -> None:
+def test_a_zero_touch_that_moved_is_distinguished_from_an_earlier_fit() -> None:
     brush = a_brush()
     moved = replace(brush, values=brush.values.copy())
     moved.values[NAMES.index("h0_mm")] = 0.6
@@ -95,7 +95,7 @@ def test_products_of_the_jacobian_are_those_of_the_whole_image() -> None:
     assert drawn.pull(residual) == pytest.approx(jacobian @ residual.ravel(), rel=2e-2, abs=2e-2)
 
 
-def test_edges_that_the_profile_lacks_are_found() -> None:
+def test_edges_that_the_profile_does_not_have_are_found() -> None:
     truth = replace(a_brush(), edges=np.zeros_like(a_brush().edges))
     truth.edges[0, 1, 0] = 0.5
     fit = fit_presses(presses(truth, CELLS), GRID, 6.0, 48.0)

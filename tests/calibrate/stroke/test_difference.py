@@ -73,16 +73,16 @@ def test_on_a_real_page_every_stroke_is_found_and_its_start_nearer_than_by_a_pla
     }
     height, width = frames[rows[0]["before"]].shape
     scale = np.array([width / PAGE_MM[0], height / PAGE_MM[1]])
-    told = np.array([[float(row["start_x_px"]), float(row["start_y_px"])] for row in rows])
+    starts_px = np.array([[float(row["start_x_px"]), float(row["start_y_px"])] for row in rows])
     seen = np.array(
         [
             new_stroke(frames[r["before"]], frames[r["after"]], 2.7474, r["after"], near_px=tuple(start)).start_px
-            for r, start in zip(rows, told, strict=True)
+            for r, start in zip(rows, starts_px, strict=True)
         ]
     )
     assert len(seen) == 40
     # The page was rectified to proportions of its own: each start is predicted from the other 39.
-    to_page = register([row["after"] for row in rows], told / scale, seen / scale, "affine")
+    to_page = register([row["after"] for row in rows], starts_px / scale, seen / scale, "affine")
     bias, sd = np.mean(to_page.left_out_mm, axis=0), np.std(to_page.left_out_mm, axis=0)
     print(f"start: bias {bias.round(2)}, sd {sd.round(2)} mm")  # noqa: T201
     assert (np.abs(bias) < NAIVE_BIAS_MM).all()

@@ -59,7 +59,7 @@ def test_specks_and_neighbours_are_left_out() -> None:
     assert iou(prepare(page(dirty), None, "page", PARAMS).mask, truth) > 0.98
 
 
-def test_the_anchor_tells_a_small_stroke_from_a_large_neighbour() -> None:
+def test_the_anchor_distinguishes_a_small_stroke_from_a_large_neighbour() -> None:
     mine, neighbour = stroke(5.0, 3.0, (400, 400)), stroke(16.0, 8.0, (400, 700))
     found = prepare(page(mine | neighbour), (420.0, 400.0), "page", PARAMS)
     assert iou(found.mask, mine) > 0.95

@@ -66,8 +66,8 @@ def a_loop(place: Path) -> Callable[..., LoopRecord]:
     sha256 = Recording(place).sha256
 
     def make(**changes: Any) -> LoopRecord:
-        told: dict[str, Any] = {"original": place.name, "original_sha256": sha256, "source": Source.IMPORT}
-        return loop_record(**(told | changes))
+        fields: dict[str, Any] = {"original": place.name, "original_sha256": sha256, "source": Source.IMPORT}
+        return loop_record(**(fields | changes))
 
     return make
 
@@ -82,11 +82,13 @@ def picture(width: int = 40) -> bytes:
     return cv2.imencode(".png", np.full((20, width), 200, np.uint8))[1].tobytes()
 
 
-def characters(folder: Path, figure: bytes | None = None, *, named: dict[str, str] | None = None, **told: Any) -> Path:
+def characters(
+    folder: Path, figure: bytes | None = None, *, named: dict[str, str] | None = None, **fields: Any
+) -> Path:
     """A `written` folder of imported photographs: only tests have such characters."""
     data = picture() if figure is None else figure
     rows = tuple(table_of(source=Source.IMPORT, **(named or {})))
-    sealed = written_record(rows, **({"figure_13_sha256": hashlib.sha256(data).hexdigest()} | told))
+    sealed = written_record(rows, **({"figure_13_sha256": hashlib.sha256(data).hexdigest()} | fields))
     path = put(folder, sealed.to_json(), "written.json")
     if data:
         (folder / "figure-13.png").write_bytes(data)
@@ -111,9 +113,9 @@ def test_a_loop_in_the_session_is_found_and_is_the_third_row_of_table_1(
     assert row.ours == pytest.approx((94.5, 94.0, 94.25, 84.5, 84.0, 84.25))
     assert row.paper == (98.21, 89.42, 93.31, 95.62, 85.85, 90.12)
     with (folder / "summary.csv").open() as file:
-        told = [r for r in csv.DictReader(file) if r["model"] == f"robot writing ({place.name}-replay)"]
-    assert len(told) == 2 * 2 * 2
-    assert {r["source"] for r in told} == {"imported photographs"}
+        rows = [r for r in csv.DictReader(file) if r["model"] == f"robot writing ({place.name}-replay)"]
+    assert len(rows) == 2 * 2 * 2
+    assert {r["source"] for r in rows} == {"imported photographs"}
     page = (folder / "report.html").read_text()
     assert f"{place.name} pressed again as {place.name}-replay" in page
     assert loop.digest in page
@@ -135,7 +137,9 @@ def test_several_loops_are_given_by_name_and_the_same_one_counts_once(
     assert [row.label for row in tables.robot_writing(report, *NORMAL)] == ["robot writing"] * 2
 
 
-def test_presses_that_this_run_scores_itself_are_not_told_twice(place: Path, a_loop: Callable[..., LoopRecord]) -> None:
+def test_presses_that_this_run_scores_itself_are_not_listed_twice(
+    place: Path, a_loop: Callable[..., LoopRecord]
+) -> None:
     put(place / "loop", a_loop().to_json())
     invoke(place)
     report = load_report(place / "validation" / "report.json")
@@ -153,7 +157,7 @@ def test_presses_that_this_run_scores_itself_are_not_told_twice(place: Path, a_l
     assert [row.n for row in tables.robot_writing(scored, *NORMAL)] == [10]
 
 
-def test_without_a_loop_or_characters_the_page_tells_the_commands(place: Path) -> None:
+def test_without_a_loop_or_characters_the_page_names_the_commands(place: Path) -> None:
     invoke(place)
     page = " ".join((place / "validation" / "report.html").read_text().split())
     assert "“brushloop loop SESSION --config RIG” presses recovered strokes again" in page
@@ -320,13 +324,13 @@ def test_strokes_that_travel_have_no_such_tables(
 def test_a_report_of_before_there_were_such_fields_is_still_read_and_intact(place: Path) -> None:
     invoke(place)
     path = place / "validation" / "report.json"
-    told = json.loads(path.read_text())
-    del told["loops"], told["written"]
-    told["digest"] = ""
-    text = json.dumps(told, sort_keys=True, ensure_ascii=False)
-    told["digest"] = hashlib.sha256(text.encode()).hexdigest()
-    path.write_text(json.dumps(told))
+    document = json.loads(path.read_text())
+    del document["loops"], document["written"]
+    document["digest"] = ""
+    text = json.dumps(document, sort_keys=True, ensure_ascii=False)
+    document["digest"] = hashlib.sha256(text.encode()).hexdigest()
+    path.write_text(json.dumps(document))
     assert load_report(path).loops == ()
-    path.write_text(json.dumps(told | {"command": "brushloop validate another"}))
+    path.write_text(json.dumps(document | {"command": "brushloop validate another"}))
     with pytest.raises(CalibrationError, match="was edited"):
         load_report(path)

@@ -39,7 +39,7 @@ class Cluster:
 
 @contextmanager
 def cluster_of_two(folder: Path) -> Iterator[Cluster]:
-    told = folder / "scheduler.json"
+    scheduler_file = folder / "scheduler.json"
     started: list[subprocess.Popen[bytes]] = []
 
     def start(*words: str) -> subprocess.Popen[bytes]:
@@ -49,12 +49,12 @@ def cluster_of_two(folder: Path) -> Iterator[Cluster]:
 
     try:
         here = ("--host", "127.0.0.1", "--no-dashboard")
-        start("distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", str(told), *here)
+        start("distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", str(scheduler_file), *here)
         deadline = time.monotonic() + DEADLINE_S
-        while not told.is_file() or not told.read_text():
+        while not scheduler_file.is_file() or not scheduler_file.read_text():
             assert time.monotonic() < deadline, "waited for the scheduler to listen"
             time.sleep(0.05)
-        address = json.loads(told.read_text())["address"]
+        address = json.loads(scheduler_file.read_text())["address"]
         words = ("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny", *here)
         yield Cluster(address, [start(*words), start(*words)])
     finally:
@@ -96,8 +96,8 @@ def finished(work: Path) -> int:
 def two_workers_one_of_them_lost(cluster: Cluster, make_session: object, tmp_path: Path) -> None:
     session = make_session(tmp_path, "many", repeats=5)  # pyright: ignore[reportCallIssue]
     here = validate(session, tmp_path / "here")
-    _, told = here.communicate()
-    assert here.returncode == 0, told
+    _, errors = here.communicate()
+    assert here.returncode == 0, errors
 
     there = validate(session, tmp_path / "there", "--scheduler", cluster.address)
     work = tmp_path / "there" / "work" / "work.sqlite"
@@ -106,8 +106,8 @@ def two_workers_one_of_them_lost(cluster: Cluster, make_session: object, tmp_pat
         time.sleep(0.01)
     cluster.workers[0].kill()
     cluster.workers[0].wait()
-    _, told = there.communicate()
-    assert there.returncode == 0, told
+    _, errors = there.communicate()
+    assert there.returncode == 0, errors
     assert cluster.workers[0].returncode is not None
     for name in FILES:
         assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes()

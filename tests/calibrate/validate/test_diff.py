@@ -39,7 +39,7 @@ def test_a_report_does_not_differ_from_itself(before: Path) -> None:
     assert all(change.test.mean == 0.0 and change.test.n == 10 for change in found.changes)
 
 
-def test_another_scale_of_the_field_is_told_stroke_by_stroke(session: Path, before: Path, tmp_path: Path) -> None:
+def test_another_scale_of_the_field_is_reported_stroke_by_stroke(session: Path, before: Path, tmp_path: Path) -> None:
     invoke("validate", session, "--out", tmp_path, *MODELS, "--mm-per-px", "0.5")
     found = {change.series: change for change in compare(before, tmp_path).changes}
     # A coarser field: more blank paper in every window of SSIM.
@@ -73,8 +73,8 @@ def test_a_session_that_was_never_validated_is_refused_with_the_command_that_doe
         ran = CliRunner().invoke(app, ["validate", "diff", str(before), str(given)])
         assert isinstance(ran.exception, CalibrationError)
         assert ran.exception.exit_code == 2
-        told = f"{given}: was not validated: run `brushloop validate {given}` first, or give a report.json"
-        assert str(ran.exception) == told
+        message = f"{given}: was not validated: run `brushloop validate {given}` first, or give a report.json"
+        assert str(ran.exception) == message
     with pytest.raises(CalibrationError, match=r"nowhere: is not there: give a report\.json"):
         compare(tmp_path / "nowhere", before)
 

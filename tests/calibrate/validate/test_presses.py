@@ -67,9 +67,9 @@ def validate(captures: list[Capture]) -> tuple[list[Press], list[Score]]:
         return refused, []
     cell = used[0].height_mm, used[0].tilt_deg
     pixels = tuple(press.pixels for press in used)
-    foretell = tuple(tuple(k for k in range(len(used)) if k != n) for n in range(len(used)))
+    predicted_by = tuple(tuple(k for k in range(len(used)) if k != n) for n in range(len(used)))
     predictions = tuple(pack(simulated_pixels(model, *cell, Field())) for model in MODELS.values())
-    found = score_job(ScoreJob(pixels, predictions, pixels, foretell, (ABSENT,) * len(used)))
+    found = score_job(ScoreJob(pixels, predictions, pixels, predicted_by, (ABSENT,) * len(used)))
     names = [*MODELS, CEILING]
     scores = [
         Score(name, alignment, tone, *(float(v) for v in found[n, m, k]))
@@ -148,7 +148,7 @@ def test_a_still_that_is_no_image_is_listed_by_name() -> None:
     assert "image" in press.refused
 
 
-def test_a_press_that_tells_no_depth_is_listed_by_name() -> None:
+def test_a_press_without_a_depth_is_listed_by_name() -> None:
     stroke = capture("mute", drawn(11.0, 0.0), 11.0, 0.0)
     refused, _ = validate([Capture(stroke.stroke.model_copy(update={"tilt_deg": None}), stroke.still_png, "test")])
     assert [(press.stroke_id, press.refused) for press in refused] == [("mute", "has no depth or tilt")]

@@ -192,8 +192,8 @@ def test_a_capture_that_a_person_marked_bad_is_left_out_by_name(session: Path, t
     add_remark(marked, Remark(still, "003", bad=True, note="<b>hair</b> in it"))
     for out in ("before", "after"):  # also where the work of before is still there
         run(marked, "--out", tmp_path / out, "--model", "line", "--no-held-out")
-        told = {one.stroke_id: one.why for one in load_report(tmp_path / out / "report.json").refused}
-        assert told["003"] == "was marked bad: <b>hair</b> in it"
+        reasons = {one.stroke_id: one.why for one in load_report(tmp_path / out / "report.json").refused}
+        assert reasons["003"] == "was marked bad: <b>hair</b> in it"
         assert "&lt;b&gt;hair" in (tmp_path / out / "report.html").read_text()
     add_remark(marked, Remark(still, "003"))
     run(marked, "--out", tmp_path / "after", "--model", "line", "--no-held-out")
@@ -217,12 +217,12 @@ def test_ablations_show_lambda_and_the_number_of_strokes(session: Path, tmp_path
     assert "validation losses" in page
 
 
-def test_what_was_left_out_selected_or_pressed_on_other_paper_is_told_before_anyone_trusts(report: Report) -> None:
+def test_what_was_left_out_selected_or_pressed_on_other_paper_stands_above_the_results(report: Report) -> None:
     def said(**changes: object) -> str:
-        told = Collected(
+        collected = Collected(
             planned=8, photographed=8, pressed_again=(), left_out=(), touches=("taught 1 mm",), moved_mm=0.0
         )
-        session = report.sessions[0].model_copy(update={"collected": told.model_copy(update=changes)})
+        session = report.sessions[0].model_copy(update={"collected": collected.model_copy(update=changes)})
         one = report.model_copy(update={"sessions": (session,)})
         return " ".join([*(point.text for point in trust(one)), *dict(_of_session(session)).values()])
 

@@ -88,8 +88,8 @@ def bucket(account: None, endpoint: str, calibrated: Path) -> Iterator[Any]:
     client.create_bucket(Bucket="lab")
     data = (calibrated / "grid-01.mcap").read_bytes()
     client.put_object(Bucket="lab", Key="grid-01/grid-01.mcap", Body=data)
-    told = f"{hashlib.sha256(data).hexdigest()}  grid-01.mcap\n"
-    client.put_object(Bucket="lab", Key="grid-01/grid-01.mcap.sha256", Body=told.encode())
+    checksum = f"{hashlib.sha256(data).hexdigest()}  grid-01.mcap\n"
+    client.put_object(Bucket="lab", Key="grid-01/grid-01.mcap.sha256", Body=checksum.encode())
     for path in (calibrated / "calibration").iterdir():
         client.put_object(Bucket="lab", Key=f"grid-01/calibration/{path.name}", Body=path.read_bytes())
     yield client

@@ -108,7 +108,7 @@ def test_what_cannot_be_believed_is_refused_and_leaves_nothing(
 
 
 @pytest.mark.parametrize(("kind", "package"), [("s3", "s3fs"), ("gs", "gcsfs")])
-def test_a_url_whose_package_is_not_there_tells_the_extra(
+def test_a_url_whose_package_is_not_there_names_the_extra(
     kind: str, package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)

@@ -73,7 +73,7 @@ def test_every_stroke_of_a_character_counts_however_far_apart_and_the_neighbour_
     assert rows[-1] == pytest.approx(54 / 60 * 128, abs=1.5)
 
 
-def test_ink_on_the_edge_of_the_cell_is_told_and_other_cells_are_refused() -> None:
+def test_ink_on_the_edge_of_the_cell_is_reported_and_other_cells_are_refused() -> None:
     _, cut = captured(capture(page((150, 300, 500, 340))), CALIBRATION)
     assert cut
     with pytest.raises(CaptureRefused, match="must be square"):

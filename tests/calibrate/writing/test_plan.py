@@ -144,7 +144,7 @@ def test_bad_input_is_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_front_door_tells_it_in_one_line_and_exits_with_2(tmp_path: Path) -> None:
+def test_the_front_door_says_it_in_one_line_and_exits_with_2(tmp_path: Path) -> None:
     ran = brushloop("write", "plan", "一", cwd=tmp_path)
     assert ran.returncode == 2
     assert ran.stderr.count("\n") == 1

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.soak
 
 
 class WallClock:
-    """What the operating system tells of the time of day."""
+    """What the operating system reports as the time of day."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.ahead_s = 0

@@ -56,8 +56,8 @@ def test_a_disk_that_fills_up_in_mid_step_parks_the_arm_and_with_room_the_same_c
 
 def test_a_folder_that_may_not_be_written_is_refused_before_anything_is_connected(lab: Lab, disk: Disk) -> None:
     disk.read_only(True)
-    code, told = run(lab)
-    assert (code, told) == (2, f"brushloop: {lab.sessions}: may not be written: it is read-only, or another user's")
+    code, printed = run(lab)
+    assert (code, printed) == (2, f"brushloop: {lab.sessions}: may not be written: it is read-only, or another user's")
     assert lab.rig.arcs.mode == "PowerOff"
 
     disk.read_only(False)
@@ -66,9 +66,9 @@ def test_a_folder_that_may_not_be_written_is_refused_before_anything_is_connecte
     first.kill()
     first.communicate()
     disk.read_only(True)
-    code, told = run(lab)
+    code, printed = run(lab)
     folder = the_session(lab)
-    assert (code, told) == (2, f"brushloop: {folder}: may not be written: it is read-only, or another user's")
+    assert (code, printed) == (2, f"brushloop: {folder}: may not be written: it is read-only, or another user's")
     assert verify_session(folder).sound, "looking needs no right to write"
     disk.read_only(False)
     assert run(lab)[0] == 0

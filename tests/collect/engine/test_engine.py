@@ -38,7 +38,7 @@ def run_and_stop(engine: Engine, when: Callable[[Snapshot], bool]) -> None:
 
 
 @pytest.mark.xdist_group("collected")
-def test_a_whole_session_is_collected_merged_and_told(collected: Collected) -> None:
+def test_a_whole_session_is_collected_merged_and_reported(collected: Collected) -> None:
     now = collected.engine.snapshot()
     assert (now.state, now.strokes_done, now.strokes_planned) == (State.DONE, 4, 4)
     assert now.source == "loopback rig"

@@ -256,13 +256,13 @@ def test_it_listens_on_this_machine_only(live: LiveView) -> None:
     assert live.url == f"ws://127.0.0.1:{live.port}"
 
 
-def test_a_port_that_is_taken_is_told_in_one_line(live: LiveView) -> None:
+def test_a_port_that_is_taken_is_reported_in_one_line(live: LiveView) -> None:
     with pytest.raises(ConfigError, match=rf"--live: cannot listen on 127.0.0.1:{live.port}: .*in use") as caught:
         LiveView(port=live.port).start()
     assert caught.value.exit_code == 2
 
 
-def test_without_the_extra_the_way_to_get_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_the_error_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "foxglove", None)
     with pytest.raises(ConfigError, match=r"--live: needs foxglove-sdk: pip install 'brushloop\[live\]'") as caught:
         LiveView().start()

@@ -1,4 +1,4 @@
-"""An arm that tells no pose any more: the screens say so after a second, long before a call has timed out for good."""
+"""An arm that no longer sends its pose: the screens say so after a second, long before a call times out."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def test_the_snapshot_says_for_how_long_no_pose_has_come(tmp_path: Path) -> None
     assert engine.snapshot().no_pose_s is None, "no pose yet"
     robot._telemetry._take(brush_pose(300.0, 0.0, 200.0))
 
-    for seconds, told in ((0.4, None), (0.9, None), (1.4, 1.4), (20.0, 20.0)):
+    for seconds, shown_s in ((0.4, None), (0.9, None), (1.4, 1.4), (20.0, 20.0)):
         clock.seconds = seconds
         now = engine.snapshot()
-        assert now.no_pose_s == (None if told is None else pytest.approx(told))
+        assert now.no_pose_s == (None if shown_s is None else pytest.approx(shown_s))
         assert (now.tip_mm is None) is (seconds > 0.5)
     robot._telemetry._take(brush_pose(300.0, 0.0, 200.0))
-    assert engine.snapshot().no_pose_s is None, "it tells again"
+    assert engine.snapshot().no_pose_s is None, "it sends again"
     clock.seconds += 30.0
     engine._control.end(State.FAILED)
     assert engine.snapshot().no_pose_s is None, "a run that is over has let the arm go"
@@ -105,5 +105,5 @@ def test_without_a_screen_it_is_one_line_when_it_begins_and_one_when_it_ends(
     shots = [picture(messages=(), no_pose_s=s) for s in (None, None, 1.04, 1.1, 2.0, None)]
     monkeypatch.setattr(headless, "REFRESH_S", 0.0)
     headless._show(Scripted(iter([*shots, picture(state=State.DONE, messages=())])))
-    told = [line for line in capsys.readouterr().err.splitlines() if "pose" in line]
-    assert told == ["warning: no pose for 1.0 s", "the arm sends its pose again"]
+    printed = [line for line in capsys.readouterr().err.splitlines() if "pose" in line]
+    assert printed == ["warning: no pose for 1.0 s", "the arm sends its pose again"]

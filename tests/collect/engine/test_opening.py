@@ -67,7 +67,7 @@ def test_what_did_not_change_is_gone_on_with(lab: Path) -> None:
     assert find_resumable(opening()) == Path("sessions/grid-01")
 
 
-def test_file_field_old_and_new_value_are_told_and_where_the_old_file_lies(lab: Path) -> None:
+def test_file_field_old_and_new_value_are_reported_and_where_the_old_file_lies(lab: Path) -> None:
     edit("rig.toml", "cell_mm = [40.0, 24.0]", "cell_mm = [80.0, 80.0]")
     assert refused() == [
         "sessions/grid-01: was begun with another configuration:",
@@ -79,7 +79,7 @@ def test_file_field_old_and_new_value_are_told_and_where_the_old_file_lies(lab: 
     assert find_resumable(Opening.load(Path("sessions"), old / "rig.toml", Path("protocol.toml"))) == old
 
 
-def test_both_files_and_the_environment_are_told_apart(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_files_and_the_environment_are_distinguished(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     edit("rig.toml", "radius_mm = 6.0", "radius_mm = 5.0")
     edit("protocol.toml", "repeats = 2", "repeats = 3")
     monkeypatch.setenv("BRUSHLOOP_PAPER__TOUCH_Z_MM", "121.0")
@@ -127,7 +127,7 @@ def test_an_old_file_that_names_others_must_lie_beside_them(lab: Path) -> None:
     assert "(copied beside protocol.toml: it names other files)" in refused()[-1]
 
 
-def test_a_field_that_the_brushloop_of_then_did_not_know_is_told_as_that(lab: Path) -> None:
+def test_a_field_that_the_older_brushloop_did_not_know_is_reported_as_that(lab: Path) -> None:
     edit("sessions/grid-01/rig.effective.json", '"retakes": 2,', "")
     assert refused()[1:] == [
         "rig.toml: quality.retakes: not there -> 2",

@@ -43,7 +43,7 @@ def start_and_pause(engine: Engine) -> None:
 
 
 def second_client(lab: Lab, target: Pose | None = None, **calls: dict[str, Any]) -> None:
-    """Sets what it is told to set, then moves the arm, without any limits."""
+    """Sets what it is asked to set, then moves the arm, without any limits."""
 
     async def act() -> None:
         client = Controller(RpcConnection("127.0.0.1", lab.rig.arcs.port))
@@ -94,8 +94,8 @@ def test_an_arm_that_was_put_under_the_paper_in_a_pause_first_goes_up_along_its_
     assert_up_along_the_tool_first(sent)
     now = engine.snapshot()
     assert now.strokes_done == 2
-    [told] = [line for line in now.messages if "from where it was left" in line]
-    assert told.startswith("warning: ")
+    [warning] = [line for line in now.messages if "from where it was left" in line]
+    assert warning.startswith("warning: ")
 
 
 def test_an_arm_that_was_moved_at_a_question_first_goes_up_along_its_tool(lab: Lab) -> None:

@@ -47,8 +47,8 @@ def test_a_capture_is_judged_on_the_way_to_the_well_and_decided_before_the_dip(
     wait_for_end(engine)
     assert engine.snapshot().strokes_done == 2
     assert engine.snapshot().parked, "the arm does not wait over the well for a dip that does not come"
-    told = events(lab)
-    after_captures = [told[at + 1] for at, one in enumerate(told[:-1]) if one == ("begin", "capture")]
+    recorded = events(lab)
+    after_captures = [recorded[at + 1] for at, one in enumerate(recorded[:-1]) if one == ("begin", "capture")]
     assert after_captures == [("done", "capture")] * 2
 
 
@@ -94,7 +94,7 @@ async def test_a_photograph_at_fault_does_not_stop_the_arm_on_its_way() -> None:
     assert arrived
 
 
-async def test_of_a_failed_motion_and_a_failed_photograph_the_motion_is_told() -> None:
+async def test_of_a_failed_motion_and_a_failed_photograph_the_motion_is_reported() -> None:
     async def failing(error: Exception) -> None:
         raise error
 

@@ -95,7 +95,7 @@ class Outcome:
     error: type[DeviceError] | None = None
     device: str = ""
     alarm: bool = False
-    """The operator is told that the arm may still be moving, and to use the emergency stop."""
+    """The message says that the arm may still be moving, and to use the emergency stop."""
 
 
 DONE = Outcome("goes on, done")

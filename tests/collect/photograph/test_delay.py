@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from collect.photograph.delay import ArmPlace, CameraDelay, FrameChange, Look, look
 
 ENTERS = 0.4
-"""The share of its way at which the arm comes into the picture; nothing below is told of it."""
+"""The share of its way at which the arm comes into the picture; nothing below knows it."""
 
 
 def way(t_s: float, trip_s: float, stay_s: float) -> float:
@@ -48,7 +48,7 @@ def test_the_delay_is_found_within_its_resolution(
     assert found.delay_s == pytest.approx(delay_s, abs=found.resolution_s + 0.03)
 
 
-def test_a_slow_arm_is_seen_on_its_way_and_tells_the_delay_far_better_than_the_frames_come():
+def test_a_slow_arm_is_seen_on_its_way_and_gives_the_delay_far_better_than_the_frames_come():
     seen, placed = trip(0.1, period_s=0.125, phase=0.3, trip_s=2.0, stay_s=0.5)
     found = look(seen, placed)
     assert found is not None
@@ -62,18 +62,18 @@ def test_what_was_seen_for_longer_than_it_was_there_was_another_trip():
     assert look(seen, placed) is None
 
 
-def test_a_picture_that_does_not_change_tells_nothing():
+def test_a_picture_that_does_not_change_shows_nothing():
     seen, placed = trip(0.1, period_s=0.05, phase=0.0, trip_s=0.1, stay_s=0.3)
     assert look([FrameChange(one.arrival_s, 0.0) for one in seen], placed) is None
 
 
-def test_a_long_silence_tells_nothing():
+def test_a_long_silence_shows_nothing():
     seen, placed = trip(0.1, period_s=0.05, phase=0.0, trip_s=0.1, stay_s=3.0)
     assert look(seen, placed) is not None
     assert look([one for one in seen if not 1.5 < one.arrival_s < 3.0], placed) is None
 
 
-def test_several_looks_are_told_with_their_spread():
+def test_several_looks_are_reported_with_their_spread():
     delay = CameraDelay((Look(0.20, 0.02), Look(0.26, 0.04)))
     assert delay.delay_s == pytest.approx(0.23)
     assert delay.spread_s == pytest.approx(0.06)

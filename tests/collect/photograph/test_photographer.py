@@ -29,7 +29,7 @@ def arm_is_in(theatre: Theatre, frame: Frame) -> bool:
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.05, 0.4])
-async def test_a_steady_delay_is_told(delay_s: float):
+async def test_a_steady_delay_is_reported(delay_s: float):
     theatre = Theatre(lambda _t_s: delay_s)
     photographer = theatre.photographer()
     await photographer.photograph()
@@ -59,7 +59,7 @@ async def test_no_photograph_shows_the_arm_or_the_sheet_of_before(name: str, del
 
 
 async def test_an_arm_that_is_parked_already_is_shown_once_more():
-    """After a change of sheets nothing else tells a new picture from one of the old sheet."""
+    """After a change of sheets nothing else distinguishes a new picture from one of the old sheet."""
     theatre = Theatre(lambda _t_s: 0.2)
     photographer = theatre.photographer()
     await photographer.photograph()

@@ -249,7 +249,7 @@ def test_the_reach_of_a_mark_is_that_of_the_model_at_the_paper_s_own_numbers(tmp
     assert 2.0 * reach.side_mm == pytest.approx(15.950, abs=1e-3)
 
 
-def test_marks_that_leave_their_cells_and_columns_that_are_not_used_are_told(tmp_path: Path) -> None:
+def test_marks_that_leave_their_cells_and_columns_that_are_not_used_are_reported(tmp_path: Path) -> None:
     narrow = rig(tmp_path, "cell_mm = [40.0, 24.0]", "cell_mm = [24.0, 24.0]")
     [warning] = make_plan(narrow, example("protocol.toml")).warnings
     assert warning.startswith("H20-a0-r")
@@ -283,8 +283,8 @@ def test_a_self_check_takes_a_cell_before_the_first_stroke(tmp_path: Path) -> No
 def test_a_plan_says_beforehand_what_the_self_check_of_an_armed_run_adds(tmp_path: Path) -> None:
     full = 'kind = "grid"\nheights_mm = [11.0, 13.0]\ntilts_deg = [0.0]\nrepeats = {}\n'
     tight, roomy = (protocol(tmp_path, full.format(repeats)) for repeats in (21, 19))
-    told = "with --arm the self-check first takes 3 cells: 2 sheets instead of 1 (`collect plan --arm`)"
-    assert make_plan(rig(tmp_path), tight).warnings == (told,)
+    warning = "with --arm the self-check first takes 3 cells: 2 sheets instead of 1 (`collect plan --arm`)"
+    assert make_plan(rig(tmp_path), tight).warnings == (warning,)
     assert make_plan(rig(tmp_path), roomy).warnings == ()
     assert make_plan(rig(tmp_path).checking_itself(False), tight).warnings == ()
     narrow = rig(tmp_path, "[motion]", "[self_check]\nlegs_mm = [50.0, 15.0]\n\n[motion]")

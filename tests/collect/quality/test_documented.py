@@ -19,9 +19,9 @@ def rows() -> list[list[str]]:
 
 
 def test_the_table_has_every_field_in_order_with_its_default() -> None:
-    told = {name.strip("`"): json.loads(default) for name, default, _unit, _meaning in rows()}
-    assert told == QualityConfig().model_dump()
-    assert list(told) == list(QualityConfig.model_fields)
+    defaults = {name.strip("`"): json.loads(default) for name, default, _unit, _meaning in rows()}
+    assert defaults == QualityConfig().model_dump()
+    assert list(defaults) == list(QualityConfig.model_fields)
 
 
 def test_the_unit_is_the_one_in_the_name() -> None:

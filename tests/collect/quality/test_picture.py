@@ -72,7 +72,7 @@ def test_a_bare_sheet_has_no_edge_to_measure_and_is_not_called_blurred() -> None
 
 
 @pytest.mark.parametrize(("gain", "word"), [(0.2, "too dark"), (1.6, "too bright")])
-def test_exposure_is_told_in_words(gain: float, word: str) -> None:
+def test_exposure_is_described_in_words(gain: float, word: str) -> None:
     image = np.clip(stroke(paper(), 50.0, 27.0) * gain, 0.0, 255.0).astype(np.uint8)
     verdict = check_frame(image, plane(), LIMITS)
     assert verdict.cause is not None

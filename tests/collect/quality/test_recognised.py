@@ -46,36 +46,36 @@ def drawn() -> list[Sample | Patch]:
 
 
 @pytest.fixture(scope="module")
-def told(drawn: list[Sample | Patch]) -> Score:
+def scores(drawn: list[Sample | Patch]) -> Score:
     return score(drawn, LIMITS)
 
 
 @pytest.mark.parametrize("failure", list(Failure))
-def test_a_failure_is_called_by_its_name(told: Score, failure: Failure) -> None:
-    assert told.of(failure) >= EACH
-    assert told.recall(failure) == 1.0, told.confused(failure)
-    assert told.precision(failure) >= 0.66
+def test_a_failure_is_called_by_its_name(scores: Score, failure: Failure) -> None:
+    assert scores.of(failure) >= EACH
+    assert scores.recall(failure) == 1.0, scores.confused(failure)
+    assert scores.precision(failure) >= 0.66
 
 
-def test_a_sound_stroke_is_left_alone(told: Score) -> None:
-    assert told.of(None) >= SOUND
-    assert told.false_alarms == 0.0, told.confused(None)
+def test_a_sound_stroke_is_left_alone(scores: Score) -> None:
+    assert scores.of(None) >= SOUND
+    assert scores.false_alarms == 0.0, scores.confused(None)
 
 
-def test_a_cell_is_called_blank_only_where_it_is(told: Score) -> None:
-    assert told.patches[True, False] == 0
-    assert told.patches[False, True] == 0
-    assert told.patches[False, False] >= SOUND
+def test_a_cell_is_called_blank_only_where_it_is(scores: Score) -> None:
+    assert scores.patches[True, False] == 0
+    assert scores.patches[False, True] == 0
+    assert scores.patches[False, False] >= SOUND
 
 
 def test_without_a_still_from_before_the_stroke_itself_is_judged_the_same(drawn: list[Sample | Patch]) -> None:
     bristles = {None, Failure.DRY, Failure.FAINT, Failure.SPLIT, Failure.BENT, Failure.BLANK}
-    told = score([s for s in drawn if isinstance(s, Sample) and s.label in bristles], LIMITS, with_previous=False)
-    assert told.false_alarms == 0.0
-    assert sum(told.counts[label, label] for label in bristles) >= len(told.seconds) - 1
+    scores = score([s for s in drawn if isinstance(s, Sample) and s.label in bristles], LIMITS, with_previous=False)
+    assert scores.false_alarms == 0.0
+    assert sum(scores.counts[label, label] for label in bristles) >= len(scores.seconds) - 1
 
 
-def test_a_verdict_tells_the_operator_what_was_seen_and_what_to_do(drawn: list[Sample | Patch]) -> None:
+def test_a_verdict_shows_the_operator_what_was_seen_and_what_to_do(drawn: list[Sample | Patch]) -> None:
     split = next(s for s in drawn if isinstance(s, Sample) and s.label is Failure.SPLIT)
     verdict = check_capture(
         split.image, split.plane, split.cell, height_mm=split.height_mm, limits=LIMITS, previous=split.before

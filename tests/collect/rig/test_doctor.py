@@ -1,4 +1,4 @@
-"""The doctor: what answers, what is wrong, how to mend it; and nothing is powered by asking."""
+"""The doctor: what answers, what is wrong, how to put it right; and nothing is powered by asking."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from conftest import Lab
 
 
-async def test_a_rig_in_order_is_told_as_it_is_and_left_as_it_was(lab: Lab) -> None:
+async def test_a_rig_in_order_is_reported_as_it_is_and_left_as_it_was(lab: Lab) -> None:
     camera, force, ink, robot = await examine(load_rig(lab.folder / "rig.toml"), HostClock())
     assert robot.well
     assert robot.identity == "aubo_i5 (brushloop-loopback)"
@@ -37,7 +37,7 @@ async def test_a_rig_in_order_is_told_as_it_is_and_left_as_it_was(lab: Lab) -> N
     assert ink.notes == "well 71% full, simulated"
 
 
-async def test_an_instrument_that_was_unplugged_is_told_and_the_others_are_still_asked(
+async def test_an_instrument_that_was_unplugged_is_reported_and_the_others_are_still_asked(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("collect.rig.devices.FORCE_CONNECT_S", 2.0)
@@ -66,7 +66,7 @@ async def test_a_board_that_cannot_be_seen_is_a_problem_with_a_remedy(lab: Lab) 
     assert "into view" in camera.remedy
 
 
-async def test_a_protective_stop_is_told_and_not_cleared(lab: Lab) -> None:
+async def test_a_protective_stop_is_reported_and_not_cleared(lab: Lab) -> None:
     lab.rig.arcs.protective_stop(SafetyMode.PROTECTIVE_STOP)
     *_, robot = await examine(load_rig(lab.folder / "rig.toml"), HostClock())
     assert robot.answers
@@ -76,7 +76,9 @@ async def test_a_protective_stop_is_told_and_not_cleared(lab: Lab) -> None:
 
 
 @pytest.mark.parametrize("flag", [(), ("--json",)])
-def test_a_cabinet_that_does_not_answer_ends_with_code_4_and_the_rest_is_told(lab: Lab, flag: tuple[str, ...]) -> None:
+def test_a_cabinet_that_does_not_answer_ends_with_code_4_and_the_rest_is_reported(
+    lab: Lab, flag: tuple[str, ...]
+) -> None:
     path = lab.folder / "rig.toml"
     path.write_text(path.read_text().replace(f"port = {lab.rig.arcs.port}\n", "port = 9\n"))
     ran = brushloop("doctor", "--config", path, *flag)

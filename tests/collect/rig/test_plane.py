@@ -36,7 +36,7 @@ def test_three_points_give_their_plane(z0_mm: float, slope_x: float, slope_y: fl
     assert fit.worst_mm < 1e-9
 
 
-def test_the_fourth_point_leaves_residuals_that_tell_a_bump() -> None:
+def test_the_fourth_point_leaves_residuals_that_show_a_bump() -> None:
     points = touches(PaperPlane(120.0, 0.01, -0.005), CORNERS)
     x, y, z = points[3]
     fit = fit_plane([*points[:3], (x, y, z + 0.4)])

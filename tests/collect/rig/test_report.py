@@ -37,13 +37,13 @@ def test_an_archive_holds_what_every_device_answered(lab: Lab) -> None:
     assert ran.returncode == 0
     assert "Read it before you send it" in ran.stdout
     with zipfile.ZipFile(report) as archive:
-        told = json.loads(archive.read("report.json"))
+        document = json.loads(archive.read("report.json"))
         rtde = json.loads(archive.read("rtde.json"))
-    assert [finding["device"] for finding in told["findings"]] == ["camera", "force", "ink", "robot"]
-    assert told["versions"]["brushloop"]
-    assert told["versions"]["numpy"]
-    assert told["platform"]["python"]
-    assert told["rig"]["robot"]["tcp_offset_mm"] == [0.0, 0.0, 180.0]
+    assert [finding["device"] for finding in document["findings"]] == ["camera", "force", "ink", "robot"]
+    assert document["versions"]["brushloop"]
+    assert document["versions"]["numpy"]
+    assert document["platform"]["python"]
+    assert document["rig"]["robot"]["tcp_offset_mm"] == [0.0, 0.0, 180.0]
     assert len(rtde["sample"]) == 2
     lines = Archive.read(report).lines
     answered = {line["method"]: line["answer"] for line in lines}
@@ -84,11 +84,11 @@ def test_names_addresses_paths_and_the_environment_stay_in_the_lab(rig: Path, mo
         "see /home/wanghui/rig.toml and C:\\Users\\wanghui, http://wanghui:secret@cam.example/stream, "
         "on rigpc; 200 rounds/s, 0.1600 mm/px"
     )
-    told = scrubber.text(said)
+    scrubbed = scrubber.text(said)
     for secret in ("arm7", "lab.example", "wanghui", "rigpc", "192.0.2.7", "fe80", "00:1b", "secret", "cam.example"):
-        assert secret not in told, told
-    assert told.startswith("robot: connect: <host>:30004 as ")
-    assert told.endswith("on <host>; 200 rounds/s, 0.1600 mm/px")
+        assert secret not in scrubbed, scrubbed
+    assert scrubbed.startswith("robot: connect: <host>:30004 as ")
+    assert scrubbed.endswith("on <host>; 200 rounds/s, 0.1600 mm/px")
 
 
 def test_of_the_rig_only_numbers_and_fixed_words_are_sent(rig: Path) -> None:

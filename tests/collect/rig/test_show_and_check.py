@@ -38,7 +38,7 @@ def found(rig: Path) -> dict[str, dict[str, str]]:
     return wrong
 
 
-def test_the_loopback_rig_contradicts_nothing_and_what_it_lacks_is_said(rig: Path) -> None:
+def test_the_loopback_rig_contradicts_nothing_and_what_is_missing_is_said(rig: Path) -> None:
     ran = brushloop("rig", "check", rig)
     assert ran.returncode == 0
     assert "plausible     tool length" in ran.stdout

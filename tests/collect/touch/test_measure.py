@@ -79,12 +79,12 @@ async def test_the_result_goes_into_a_journal_with_its_residuals(make_bench: Mak
     bench = make_bench((0.5, 0.5))
     four = [*THREE["points_mm"], (104.0, 76.0)]
     result = await measured(bench, method="force", touches=2, points_mm=four, force={"sigma_mm": 0.03})
-    told = json.loads(json.dumps(result.as_dict()))
-    assert told["method"] == "force"
-    assert len(told["residuals_mm"]) == 4
-    assert 0.0 < max(map(abs, told["residuals_mm"])) < 0.1
-    assert [len(point["touches_mm"]) for point in told["points"]] == [2, 2, 2, 2]
-    assert all(0.0 < sigma <= 0.03 for point in told["points"] for sigma in point["sigma_mm"])
+    document = json.loads(json.dumps(result.as_dict()))
+    assert document["method"] == "force"
+    assert len(document["residuals_mm"]) == 4
+    assert 0.0 < max(map(abs, document["residuals_mm"])) < 0.1
+    assert [len(point["touches_mm"]) for point in document["points"]] == [2, 2, 2, 2]
+    assert all(0.0 < sigma <= 0.03 for point in document["points"] for sigma in point["sigma_mm"])
 
 
 async def test_touches_that_do_not_repeat_are_refused_with_their_heights(make_bench: MakeBench) -> None:

@@ -1,4 +1,4 @@
-"""The self-check: a good rig passes, a mirrored, turned, stretched or displaced one is told in words."""
+"""The self-check: a good rig passes, a mirrored, turned, stretched or displaced one is described in words."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_a_good_rig_passes_in_whatever_order_the_marks_are_found(order: list[int
         (COMMANDED + np.array([0.0, 4.0]), r"lie off by \(\+0\.00, \+4\.00\) mm"),
     ],
 )
-def test_a_rig_that_is_off_is_told_how(found: NDArray[np.float64], why: str) -> None:
+def test_a_rig_that_is_off_is_described(found: NDArray[np.float64], why: str) -> None:
     with pytest.raises(StepError, match=why):
         judge(COMMANDED, found[[2, 0, 1]], CONFIG)
 
@@ -224,8 +224,8 @@ async def test_a_camera_that_is_2_percent_wrong_is_seen_over_three_corners_but_n
     bench, places = whole_sheet(make_bench)
     board = bench.rig.config.board
     # The board was printed 2 % too small, or measured badly: every length by this camera is 2 % too large.
-    told = board.model_copy(update={"square_mm": 1.02 * board.square_mm, "marker_mm": 1.02 * board.marker_mm})
-    bench.rig = replace(bench.rig, config=bench.rig.config.model_copy(update={"board": told}))
+    wrong_board = board.model_copy(update={"square_mm": 1.02 * board.square_mm, "marker_mm": 1.02 * board.marker_mm})
+    bench.rig = replace(bench.rig, config=bench.rig.config.model_copy(update={"board": wrong_board}))
     near_origin = Sheet(bench.rig.config.paper).cell(36)
     await checked(bench, triangle_in(near_origin, CONFIG))
     with pytest.raises(

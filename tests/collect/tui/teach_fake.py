@@ -34,7 +34,7 @@ def board() -> np.ndarray:
 
 
 class Asking:
-    """Asks what it is told to, and notes the answers."""
+    """Asks the given questions, and notes the answers."""
 
     def __init__(self, *kinds: str) -> None:
         self.kinds = kinds

@@ -48,7 +48,7 @@ async def ready(app: OperatorApp, pilot: Pilot[None]) -> str:
     return shown(app)
 
 
-async def test_the_start_screen_tells_what_is_finished_void_and_next() -> None:
+async def test_the_start_screen_shows_what_is_finished_void_and_next() -> None:
     app = OperatorApp(browser=FakeBrowser())
     async with app.run_test(size=(80, 24)) as pilot:
         text = await ready(app, pilot)
@@ -174,9 +174,9 @@ async def test_no_note_is_typed_while_the_arm_is_at_work(tmp_path: Path) -> None
 async def test_finishing_verifies_and_runs_what_comes_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ran: list[tuple[str, Path]] = []
 
-    def command(name: str, folder: Path, told: Callable[[str], None]) -> tuple[int, str]:
+    def command(name: str, folder: Path, on_line: Callable[[str], None]) -> tuple[int, str]:
         ran.append((name, folder))
-        told("captures: 3 of 30, about 5 s left")
+        on_line("captures: 3 of 30, about 5 s left")
         return 0, "\n".join(f"line {n}" for n in range(30))
 
     monkeypatch.setattr("collect.tui.finish_screen.run_command", command)
@@ -194,7 +194,7 @@ async def test_finishing_verifies_and_runs_what_comes_next(tmp_path: Path, monke
     assert "! damaged" in verdict_content(Verdict("s", "closed", findings=[Finding("a.mcap", "is cut")])).plain
 
 
-def test_a_command_tells_its_progress_and_keeps_it_where_it_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_command_shows_its_progress_and_keeps_it_where_it_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     program = "import sys; print('said'); print('3 of 30', file=sys.stderr); sys.exit(int(sys.argv[1] == 'fail'))"
     lines: list[str] = []
     popen = subprocess.Popen

@@ -104,7 +104,7 @@ async def test_what_a_press_depends_on_is_read_back_before_each_way_down(
     assert distance(cabinet._world.tool(), LOW)[0] < 0.05
 
 
-async def test_a_safety_stop_is_told_before_what_it_changes(arm: AuboArcs, other: Controller, cabinet: ArcsServer):
+async def test_a_safety_stop_is_reported_before_what_it_changes(arm: AuboArcs, other: Controller, cabinet: ArcsServer):
     await arm.move(ABOVE, **QUICK)
     await other.ask("RobotManage.setOperationalMode", mode="Manual")
     cabinet.protective_stop()

@@ -144,7 +144,7 @@ async def test_a_stop_by_somebody_else_is_noticed_and_not_driven_over(cabinet: A
     assert await rests_short(cabinet)
 
 
-async def test_a_protective_stop_in_mid_path_is_told_as_such(cabinet: ArcsServer, way: asyncio.Task[None]):
+async def test_a_protective_stop_in_mid_path_is_reported_as_such(cabinet: ArcsServer, way: asyncio.Task[None]):
     cabinet.protective_stop()
     with pytest.raises(RobotNotSafe, match="ProtectiveStop"):
         await way
@@ -192,15 +192,15 @@ async def test_a_line_that_is_refused_in_mid_path_ends_it(arm: AuboArcs, cabinet
     assert await rests_short(cabinet)
 
 
-async def test_a_way_that_is_fed_too_slowly_goes_on_and_is_told(
+async def test_a_way_that_is_fed_too_slowly_goes_on_and_is_reported(
     arm: AuboArcs, cabinet: ArcsServer, monkeypatch: pytest.MonkeyPatch
 ):
-    told: list[str] = []
-    arm._notice = told.append
+    reported: list[str] = []
+    arm._notice = reported.append
     monkeypatch.setattr(queueing, "MOST_QUEUED", 1)
     await arm.follow(line(4), **WAY)
     assert distance(cabinet._world.tool(), line(4)[-1])[0] <= 0.05
-    assert told[0] == "the arm halted at point 1 of 4: lines did not reach the controller in time"
+    assert reported[0] == "the arm halted at point 1 of 4: lines did not reach the controller in time"
 
 
 async def test_an_arm_that_does_not_advance_is_not_waited_for_for_ever(

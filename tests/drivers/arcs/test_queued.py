@@ -35,13 +35,13 @@ def before_each(cabinet: ArcsServer, method: str, act: Callable[[int], object]) 
     """Call `act` with the number of the request, from 1, before the controller carries it out."""
     carry_out, number = cabinet._methods[method], 0
 
-    def told(params: dict[str, Any]) -> Any:
+    def noted(params: dict[str, Any]) -> Any:
         nonlocal number
         number += 1
         act(number)
         return carry_out(params)
 
-    cabinet._methods[method] = told
+    cabinet._methods[method] = noted
 
 
 async def nothing_is_left(cabinet: ArcsServer) -> bool:
@@ -136,7 +136,7 @@ async def test_a_process_that_died_while_the_path_was_held_does_not_hold_up_the_
     arm: AuboArcs, cabinet: ArcsServer, arm_at: Callable[[int], AuboArcs]
 ):
     await arm.close()
-    cabinet.cabinet.hold()  # and no line was sent any more
+    cabinet.cabinet.hold()  # and no further line was sent
     other = arm_at(cabinet.port)
     await other.connect()
     await other.enable()

@@ -66,7 +66,7 @@ async def test_an_arm_that_is_not_on_automatic_is_neither_set_nor_powered(
     assert cabinet.tcp_offset == [0.0] * 6
 
 
-async def test_a_cabinet_without_operational_modes_is_told_of(
+async def test_a_cabinet_without_operational_modes_is_reported(
     make_arm: MakeArm, cabinet: ArcsServer, notices: list[str]
 ):
     cabinet.cabinet.operational_mode = "Disabled"
@@ -110,7 +110,7 @@ async def test_what_the_controller_does_not_take_keeps_the_power_off(
     assert cabinet.mode == RobotMode.POWER_OFF
 
 
-async def test_reduced_mode_is_allowed_and_told_of_once(make_arm: MakeArm, cabinet: ArcsServer, notices: list[str]):
+async def test_reduced_mode_is_allowed_and_reported_once(make_arm: MakeArm, cabinet: ArcsServer, notices: list[str]):
     arm = await enabled(make_arm)
     cabinet.safety = SafetyMode.REDUCED
     await arm.move(NEAR, **QUICK)
@@ -185,7 +185,7 @@ async def test_no_watchdog_where_none_is_wanted(make_arm: MakeArm, cabinet: Arcs
     assert cabinet.cabinet.watchdogs == {}
 
 
-async def test_a_controller_that_knows_no_watchdog_is_told_of_and_used(
+async def test_a_controller_that_knows_no_watchdog_is_reported_and_used(
     make_arm: MakeArm, cabinet: ArcsServer, notices: list[str]
 ):
     del cabinet._methods["RegisterControl.setWatchDog"]
@@ -195,7 +195,7 @@ async def test_a_controller_that_knows_no_watchdog_is_told_of_and_used(
     assert "no watchdog" in notices[0]
 
 
-async def test_a_watchdog_that_is_refused_is_told_of(make_arm: MakeArm, cabinet: ArcsServer, notices: list[str]):
+async def test_a_watchdog_that_is_refused_is_reported(make_arm: MakeArm, cabinet: ArcsServer, notices: list[str]):
     cabinet._methods["RegisterControl.setWatchDog"] = lambda _: -6
     await enabled(make_arm, watchdog_s=2.0)
     assert "refused it with -6" in notices[0]

@@ -35,7 +35,7 @@ SLOW = {"speed_mm_s": 5.0, "acc_mm_s2": 800.0}
 ArmAt = Callable[[int], AuboArcs]
 
 
-async def test_connecting_tells_who_answers_and_where_the_tool_is(cabinet: ArcsServer, arm_at: ArmAt):
+async def test_connecting_reports_who_answers_and_where_the_tool_is(cabinet: ArcsServer, arm_at: ArmAt):
     arm = arm_at(cabinet.port)
     assert isinstance(arm, Robot)
     with pytest.raises(NotConnected):

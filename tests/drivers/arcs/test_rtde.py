@@ -173,7 +173,7 @@ LONG_FRAME = b"SOF\x01\x7f\xff\xff\xff"
         (says(GREETING, encode_sample(7, [1])), DeviceTimeout),
     ],
 )
-async def test_what_is_no_telemetry_is_told_apart(served: Any, script: Serve, error: type[Exception]):
+async def test_what_is_no_telemetry_is_distinguished(served: Any, script: Serve, error: type[Exception]):
     with pytest.raises(error):
         await outcome(await served(script))
 
@@ -248,7 +248,9 @@ async def test_poses_are_pushed_at_the_frequency_that_was_asked_for(
     assert rtde.clients == 0
 
 
-async def test_a_closed_port_is_told_and_poses_are_polled(make_arm: MakeArm, notices: list[str], unused_tcp_port: int):
+async def test_a_closed_port_is_reported_and_poses_are_polled(
+    make_arm: MakeArm, notices: list[str], unused_tcp_port: int
+):
     arm = make_arm(unused_tcp_port)
     assert (await arm.connect()).firmware == "interface 24000, telemetry by polling"
     assert len(await samples_of(arm, 0.2)) >= 3
@@ -280,7 +282,7 @@ async def test_a_silence_that_ends_is_bridged_by_asking(rtde: RtdeServer, make_a
 
 
 @pytest.mark.parametrize("fault", ["mute", "hang up"])
-async def test_a_stream_that_ends_later_is_told_and_poses_go_on(
+async def test_a_stream_that_ends_later_is_reported_and_poses_go_on(
     rtde: RtdeServer, make_arm: MakeArm, notices: list[str], fault: str, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(telemetry, "MOST_SILENCES", 0)

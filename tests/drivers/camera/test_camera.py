@@ -46,7 +46,7 @@ def grabbers() -> int:
     return sum(t.name == "camera grabber" for t in threading.enumerate())
 
 
-async def test_connecting_waits_for_the_first_frame_and_tells_its_size(stream: MjpegServer):
+async def test_connecting_waits_for_the_first_frame_and_reports_its_size(stream: MjpegServer):
     camera = camera_at(stream.port)
     assert isinstance(camera, Camera)
     identity = await camera.connect()
@@ -93,7 +93,7 @@ async def test_the_first_frame_counts_from_when_the_camera_was_opened(stream: Mj
     await camera.close()
 
 
-async def test_a_stream_that_ends_is_opened_again_and_both_are_told(small_view: View):
+async def test_a_stream_that_ends_is_opened_again_and_both_are_reported(small_view: View):
     notices: list[str] = []
     scene = Scene(World(SimConfig(view=small_view)))
     first = MjpegServer(scene, fps=15.0, jpeg_quality=90)

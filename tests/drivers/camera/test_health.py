@@ -138,7 +138,7 @@ class FakeDevice:
         pass
 
 
-async def test_settings_are_locked_read_back_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_settings_are_locked_read_back_and_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     device = FakeDevice()
     monkeypatch.setattr(cv2, "VideoCapture", lambda *_: device)
     options = CameraOptions("0", locked=Locked(width=640, height=480, exposure=150.0, gain=4.0, focus=30.0))

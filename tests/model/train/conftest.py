@@ -40,7 +40,7 @@ def tiny() -> TrainConfig:
 
 
 class Notes:
-    """A watcher that keeps what it is told."""
+    """A watcher that keeps what is reported to it."""
 
     def __init__(self) -> None:
         self.losses: list[float] = []

@@ -70,8 +70,8 @@ HOSTILE: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_what_is_no_checkpoint_is_refused_in_one_line(good: Path, kind: str) -> None:
-    spoil, words = HOSTILE[kind]
-    spoil(good)
+    damage, words = HOSTILE[kind]
+    damage(good)
     with pytest.raises(TrainError) as caught:
         load_checkpoint(good)
     assert words in str(caught.value)

@@ -25,13 +25,13 @@ from model.train.config import load_config
 from model.train.distributed import Group
 from model.train.run import run_training
 
-class Told:
+class Reporter:
     def stepped(self, step, loss):
-        told.send(step)
+        steps.send(step)
     def validated(self, validation):
         pass
 
-run_training(load_config(Path(toml)), Path(out), Group(), Told(), lambda: False)
+run_training(load_config(Path(toml)), Path(out), Group(), Reporter(), lambda: False)
 """
 SHARING = """
 import os, sys
@@ -78,11 +78,11 @@ def test_killed_at_random_and_resumed_it_gives_the_same_bits(
 ) -> None:
     toml.write_text("checkpoint_every = 3\n" + toml.read_text().replace("checkpoint_every = 10\n", ""))
     last = random.randint(1, 28)
-    told, tell = processes.Pipe(duplex=False)
-    names = {"toml": str(toml), "out": str(tmp_path), "told": tell}
+    steps, tell = processes.Pipe(duplex=False)
+    names = {"toml": str(toml), "out": str(tmp_path), "steps": tell}
     child = processes.Process(target=exec, args=(TELLING, names))
     child.start()
-    while told.recv() != last:
+    while steps.recv() != last:
         pass
     child.kill()
     child.join()

@@ -31,8 +31,8 @@ CORNER = at(100.0)
 BEYOND = at(100.0, 100.0)
 
 
-class Told:
-    """A queue and the stretches that it told of."""
+class RecordedQueue:
+    """A queue, and the stretches that it reported."""
 
     def __init__(self) -> None:
         self.stretches: list[tuple[Pose, Pose]] = []
@@ -55,7 +55,7 @@ def speeds(walk: np.ndarray, dt_s: float = DT_S) -> np.ndarray:
 
 
 def test_a_corner_is_rounded_within_its_radius_and_taken_without_a_rest():
-    walk = walked(Told().corner(20.0), 2.5)
+    walk = walked(RecordedQueue().corner(20.0), 2.5)
     near = np.linalg.norm(walk[:, 1:] - CORNER.position_mm, axis=1)
     assert 3.0 < near.min() < 20.0
     off_the_lines = np.minimum(np.abs(walk[:, 2]), np.abs(walk[:, 1] - 100.0))
@@ -66,14 +66,14 @@ def test_a_corner_is_rounded_within_its_radius_and_taken_without_a_rest():
 
 
 def test_without_a_radius_the_arm_rests_at_the_corner():
-    told = Told()
-    walk = walked(told.corner(0.0), 3.0)
+    recorded = RecordedQueue()
+    walk = walked(recorded.corner(0.0), 3.0)
     assert np.linalg.norm(walk[:, 1:] - CORNER.position_mm, axis=1).min() < 0.1
-    assert len(told.stretches) == 2
+    assert len(recorded.stretches) == 2
 
 
 def test_the_next_id_comes_without_a_gap_and_steady_only_at_the_end():
-    queue = Told().corner(20.0)
+    queue = RecordedQueue().corner(20.0)
     seen = [(queue.exec_id(t), queue.steady(t)) for t in np.arange(0.0, 3.0, DT_S)]
     assert [ident for ident, _ in itertools.groupby(ident for ident, _ in seen)] == [0, 1, -1]
     assert not any(steady for ident, steady in seen if ident >= 0)
@@ -120,47 +120,47 @@ def test_no_way_is_taken_faster_or_harder_than_allowed_and_all_of_them_arrive(
 @settings(deadline=None, max_examples=20)
 @given(st.floats(0.0, 1.04), st.lists(st.floats(0.0, 3.0), max_size=8))
 def test_the_path_depends_neither_on_who_looks_nor_on_when_the_next_move_came(second_s: float, looks: list[float]):
-    def told(second_s: float, looks: list[float]) -> list[tuple[Pose, Pose]]:
-        told = Told()
-        told.queue.add(CORNER, V, A, 0.0, blend_mm=5.0)
+    def stretches_of(second_s: float, looks: list[float]) -> list[tuple[Pose, Pose]]:
+        recorded = RecordedQueue()
+        recorded.queue.add(CORNER, V, A, 0.0, blend_mm=5.0)
         for t in (t for t in looks if t < second_s):
-            told.queue.pose(t)
-        told.queue.add(BEYOND, V, A, second_s)
+            recorded.queue.pose(t)
+        recorded.queue.add(BEYOND, V, A, second_s)
         for t in (t for t in looks if t >= second_s):
-            told.queue.pose(t)
-        told.queue.advance(10.0)
+            recorded.queue.pose(t)
+        recorded.queue.advance(10.0)
         # when it began to slow down for the corner (5 mm at 1 m/s2), the second must be there
-        return told.stretches
+        return recorded.stretches
 
-    one, two = told(min(second_s, 0.9), sorted(looks)), told(0.0, [])
+    one, two = stretches_of(min(second_s, 0.9), sorted(looks)), stretches_of(0.0, [])
     assert one == two
 
 
 def test_a_move_that_comes_too_late_begins_at_rest():
-    walk = walked(Told().corner(20.0, second_s=1.09), 3.0)
+    walk = walked(RecordedQueue().corner(20.0, second_s=1.09), 3.0)
     assert np.linalg.norm(walk[:, 1:] - CORNER.position_mm, axis=1).min() < 1e-3
 
 
 def test_a_corner_is_never_larger_than_half_of_its_moves():
-    told = Told()
-    told.queue.add(at(10.0), V, A, 0.0, blend_mm=50.0)
-    told.queue.add(at(10.0, 100.0), V, A, 0.0)
-    told.queue.advance(10.0)
-    assert told.stretches[0][1].x_mm == pytest.approx(5.0)
+    recorded = RecordedQueue()
+    recorded.queue.add(at(10.0), V, A, 0.0, blend_mm=50.0)
+    recorded.queue.add(at(10.0, 100.0), V, A, 0.0)
+    recorded.queue.advance(10.0)
+    assert recorded.stretches[0][1].x_mm == pytest.approx(5.0)
 
 
 def test_a_turn_on_the_spot_is_not_rounded():
-    told = Told()
-    told.queue.add(CORNER, V, A, 0.0, blend_mm=20.0)
-    told.queue.add(at(100.0, heading_deg=30.0), V, A, 0.0, blend_mm=20.0)
-    told.queue.advance(100.0)
-    assert told.stretches[0][1] == CORNER
+    recorded = RecordedQueue()
+    recorded.queue.add(CORNER, V, A, 0.0, blend_mm=20.0)
+    recorded.queue.add(at(100.0, heading_deg=30.0), V, A, 0.0, blend_mm=20.0)
+    recorded.queue.advance(100.0)
+    assert recorded.stretches[0][1] == CORNER
 
 
 @pytest.mark.parametrize("stop_s", [0.3, 0.85, 0.9, 1.0, 1.5])
 @pytest.mark.parametrize("acc", [50.0, 400.0, 5000.0])
 def test_a_stop_follows_the_path_through_the_corner(stop_s: float, acc: float):
-    free, stopped = walked(Told().corner(20.0), 4.0), Told().corner(20.0)
+    free, stopped = walked(RecordedQueue().corner(20.0), 4.0), RecordedQueue().corner(20.0)
     stopped.pose(stop_s)
     stopped.stop(acc, 10.0, stop_s)
     walk = walked_from(stopped, stop_s, 6.0)
@@ -179,8 +179,8 @@ def walked_from(queue: MotionQueue, begin_s: float, until_s: float) -> np.ndarra
 @pytest.mark.parametrize("hold_s", [0.05, 0.5, 0.8, 0.86, 0.9, 1.1])
 @pytest.mark.parametrize("acc", [200.0, 2000.0])
 def test_a_path_held_anywhere_goes_on_along_itself(hold_s: float, acc: float):
-    free, told = walked(Told().corner(20.0), 4.0), Told()
-    queue = told.corner(20.0)
+    free, recorded = walked(RecordedQueue().corner(20.0), 4.0), RecordedQueue()
+    queue = recorded.corner(20.0)
     queue.pose(hold_s)
     queue.hold(acc, 10.0, hold_s)
     before = queue.exec_id(hold_s)
@@ -196,12 +196,12 @@ def test_a_path_held_anywhere_goes_on_along_itself(hold_s: float, acc: float):
     queue.advance(20.0)
     assert queue.exec_id(20.0) == -1
     assert queue._moves == []
-    for (_, a), (b, _) in itertools.pairwise(told.stretches):
+    for (_, a), (b, _) in itertools.pairwise(recorded.stretches):
         assert distance(a, b)[0] < 1e-6
 
 
 def test_a_slower_fraction_applies_after_the_corner_that_is_planned_and_nothing_is_faster():
-    queue = Told().corner(20.0)
+    queue = RecordedQueue().corner(20.0)
     queue.pose(0.5)
     queue.set_fraction(0.25, 0.5)
     walk = walked_from(queue, 0.5, 8.0)
@@ -238,9 +238,9 @@ RATES = (20.0, 500.0)
 
 def test_the_same_moves_leave_the_same_path_at_any_rate():
     def stretches(rate: float) -> list[tuple[Pose, Pose]]:
-        told: list[tuple[Pose, Pose]] = []
+        stretches: list[tuple[Pose, Pose]] = []
         world = World(SimConfig(rate=rate))
-        world.motion._on_path = lambda a, b: told.append((a, b))
+        world.motion._on_path = lambda a, b: stretches.append((a, b))
         # held until all of them are there: what a client can do that sends slower than the arm moves
         world.motion.hold(A, 1.0, world.clock.now_s())
         for x, y in ((300.0, -230.0), (300.0, -180.0), (340.0, -180.0)):
@@ -248,7 +248,7 @@ def test_the_same_moves_leave_the_same_path_at_any_rate():
         world.motion.resume(world.clock.now_s())
         while world.motion.exec_id(world.clock.now_s()) != -1:
             world.tool()
-        return told
+        return stretches
 
     slow, quick = (stretches(rate) for rate in RATES)
     assert len(slow) > 20

@@ -236,7 +236,7 @@ def test_a_joint_move_can_be_stopped_and_another_started(on: Any):
     assert on.ask("RobotState.getJointPositions") == pytest.approx(HOME, abs=1e-5)
 
 
-def test_what_is_out_of_reach_is_accepted_and_told_by_a_message(on: Any):
+def test_what_is_out_of_reach_is_accepted_and_reported_by_a_message(on: Any):
     assert on.ask("Trace.peek", num=10, last_time=0) == []
     on.line(NEAR)
     on.clock.s += 0.5
@@ -303,7 +303,7 @@ def test_the_brush_pushes_back_only_while_it_is_on_the_paper(on: Any):
 
 
 async def bitten(on: Any) -> None:
-    """Return once no watchdog waits any more."""
+    """Return once no watchdog is waiting."""
     async with asyncio.timeout(5.0):
         while on.cabinet._timers:
             await asyncio.sleep(0.01)

@@ -152,7 +152,7 @@ async def test_nothing_is_left_when_a_subscriber_goes(rtde: RtdeServer, client: 
             await asyncio.sleep(0.005)
 
 
-async def test_where_the_arm_rested_between_two_pushes_is_told_where_time_runs_fast(
+async def test_where_the_arm_rested_between_two_pushes_is_reported_where_time_runs_fast(
     client: Client, cabinet: ArcsServer
 ):
     await client.greeting()

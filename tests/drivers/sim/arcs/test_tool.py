@@ -36,13 +36,13 @@ def test_an_offset_that_is_too_short_presses_deeper_by_as_much(on: Any, configur
 
 def test_with_a_forgotten_offset_the_controller_speaks_of_the_flange(on: Any):
     on.ask("RobotConfig.setTcpOffset", offset=[0.0] * 6)
-    tip, told = on.world.tool(), from_wire(on.ask("RobotState.getTcpPose"))
-    assert told.z_mm - tip.z_mm == pytest.approx(180.0)
+    tip, reported = on.world.tool(), from_wire(on.ask("RobotState.getTcpPose"))
+    assert reported.z_mm - tip.z_mm == pytest.approx(180.0)
     flange, _ = on.ask("RobotAlgorithm.forwardKinematics", q=on.ask("RobotState.getJointPositions"))
     assert flange[:3] == pytest.approx(on.ask("RobotState.getTcpPose")[:3], abs=1e-6)
 
 
-def test_configuring_moves_nothing_but_what_is_told(on: Any):
+def test_configuring_changes_only_what_is_configured(on: Any):
     tip, joints = on.world.tool(), on.ask("RobotState.getJointPositions")
     on.ask("RobotConfig.setTcpOffset", offset=tool(150.0, x_mm=20.0))
     assert on.world.tool() == tip

@@ -122,7 +122,7 @@ async def test_bare_replies_end_with_their_last_bracket(cabinet: ArcsServer):
     await writer.wait_closed()
 
 
-async def test_a_bare_client_that_sends_no_json_is_told_and_hung_up_on(cabinet: ArcsServer):
+async def test_a_bare_client_that_sends_no_json_gets_an_error_and_is_disconnected(cabinet: ArcsServer):
     (reply,) = await bare(cabinet, b"{]", count=2)
     assert reply["error"]["code"] == -32700
 

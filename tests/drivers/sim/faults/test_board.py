@@ -13,7 +13,7 @@ from drivers.sim.faults.phases import Phase
 
 @dataclass
 class Scripted:
-    """A world that says what it is told, and a clock beside it."""
+    """A world whose state is set by the test, and a clock."""
 
     presses: int = 0
     sim_s: float = 0.0

@@ -60,7 +60,7 @@ async def test_frames_that_are_no_picture_are_a_timeout_that_names_them_and_then
 ):
     ident = rig.faults.hang(view(kind, count=ALWAYS))
     with pytest.raises(DeviceTimeout, match=words):
-        # The first of equal frames cannot be told from a new one: ask for what is exposed well after it.
+        # The first of equal frames cannot be distinguished from a new one: ask for what is exposed well after it.
         await camera.fresh(Stamp(CLOCK.now_ns() + 10**9))
     assert kind in notices[-1]
     rig.faults.board.take(ident)
@@ -86,7 +86,9 @@ async def test_of_a_backlog_that_comes_at_once_nothing_is_taken_for_new(rig: Loo
         await asyncio.sleep(0.05)
 
 
-async def test_a_dropped_stream_is_opened_again_and_told(rig: LoopbackRig, camera: OpenCvCamera, notices: list[str]):
+async def test_a_dropped_stream_is_opened_again_and_reported(
+    rig: LoopbackRig, camera: OpenCvCamera, notices: list[str]
+):
     rig.faults.hang(view("drop"))
     await asyncio.sleep(0.3)
     asked_ns = CLOCK.now_ns()

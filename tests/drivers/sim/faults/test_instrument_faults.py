@@ -66,7 +66,7 @@ async def test_garbage_again_ends_the_dose_and_says_what_may_be_in_the_well(rig:
 
 
 @pytest.mark.parametrize(("kind", "error"), [("mute", DeviceTimeout), ("unplug", ConnectionLost)])
-async def test_a_silent_and_an_unplugged_station_are_told_apart(
+async def test_a_silent_and_an_unplugged_station_are_distinguished(
     rig: LoopbackRig, station: InkStation, kind: str, error: type[Exception]
 ):
     rig.faults.hang(Fault(device=Device.INK, kind=kind, count=2))

@@ -79,7 +79,7 @@ async def test_a_line_that_never_arrives_is_a_timeout_and_nothing_has_moved(arm:
 
 
 @pytest.mark.parametrize("kind", ["mute", "deaf"])
-async def test_a_controller_that_falls_silent_is_told_as_an_arm_that_may_still_move(
+async def test_a_controller_that_falls_silent_is_reported_as_an_arm_that_may_still_move(
     arm: AuboArcs, cabinet: ArcsServer, kind: str
 ):
     """`mute` carries out the stop and cannot say so, `deaf` does not: from outside both look alike."""
@@ -204,7 +204,7 @@ async def test_the_switches_of_the_servers_hang_faults_on_the_rigs_board(rig: Lo
 
 
 @pytest.mark.parametrize("kind", ["mute", "deaf", "drop"])
-async def test_a_stop_that_nobody_confirms_is_told_in_time_however_many_calls_hang(
+async def test_a_stop_that_nobody_confirms_is_reported_in_time_however_many_calls_hang(
     arm: AuboArcs, cabinet: ArcsServer, kind: str
 ):
     cabinet.faults.hang(robot(kind, count=ALWAYS))

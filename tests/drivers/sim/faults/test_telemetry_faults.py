@@ -1,4 +1,4 @@
-"""What becomes of the pose when its stream fails: polling takes over, once told.
+"""What becomes of the pose when its stream fails: polling takes over, which is reported once.
 
 What the bytes may be is in tests/drivers/arcs/test_rtde.py.
 """
@@ -23,7 +23,7 @@ from drivers.sim.rig import HOST, LoopbackRig
     ("kind", "words"),
     [("mute", "no sample"), ("malformed", "neither CBOR nor JSON"), ("drop", "closed the connection")],
 )
-async def test_a_stream_that_fails_is_told_once_and_poses_go_on(
+async def test_a_stream_that_fails_is_reported_once_and_poses_go_on(
     rig: LoopbackRig, limits: Limits, kind: str, words: str
 ):
     notices: list[str] = []

@@ -44,7 +44,7 @@ def test_a_trap_changes_the_lab_and_the_way_out_ends_it(trap: Trap):
     assert mended(caught, clean, trap) != caught
 
 
-async def test_swapped_corners_are_taken_for_each_other_until_told():
+async def test_swapped_corners_are_taken_for_each_other_until_corrected():
     lab = trapped(4, Trap.SWAPPED_CORNER)
     assert lab.facts.swapped is not None
     asked, went = lab.facts.swapped
@@ -118,10 +118,10 @@ async def test_a_sensor_with_the_wrong_sign_is_pulled_where_it_is_pushed():
     lab.world.push_n = (0.0, 0.0, 2.0)
     pushed = lab.world.wrench()[2]
     board_of = lab.rig.force.board
-    told = [board_of._force(0.0)[2]]
+    forces = [board_of._force(0.0)[2]]
     await lab.hand.obey({"act": "mend"})
-    told.append(board_of._force(0.0)[2])
-    assert told == pytest.approx([-pushed, pushed], abs=0.2)
+    forces.append(board_of._force(0.0)[2])
+    assert forces == pytest.approx([-pushed, pushed], abs=0.2)
 
 
 async def test_far_corners_are_out_of_reach_until_the_sheet_is_moved():

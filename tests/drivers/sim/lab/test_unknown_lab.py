@@ -115,10 +115,10 @@ async def test_what_a_client_reads_agrees_with_the_truth(lab: UnknownLab, contro
     await lab.hand.bring("pin", 2)
     joints = await controller.joint_positions()
     tcp = from_wire(await controller.ask("RobotConfig.getTcpOffset"))
-    told = await controller.pose()
+    reported = await controller.pose()
     assert [*map(float, matrix_of(tcp)[:3, 3])] == pytest.approx(list(lab.facts.cabinet_tcp[:3]))
-    assert pose_of(forward(joints) @ matrix_of(tcp)).position_mm == pytest.approx(told.position_mm, abs=1e-3)
-    flange = matrix_of(told) @ inverted(matrix_of(tcp))
+    assert pose_of(forward(joints) @ matrix_of(tcp)).position_mm == pytest.approx(reported.position_mm, abs=1e-3)
+    flange = matrix_of(reported) @ inverted(matrix_of(tcp))
     tip = pose_of(flange @ tool_of(lab.facts.config))
     assert tip.position_mm == pytest.approx(lab.world.tool().position_mm, abs=1e-3)
     assert (await controller.ask("RobotConfig.getPayload"))[0] == lab.facts.payload_kg
