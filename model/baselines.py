@@ -28,12 +28,12 @@ class Ellipse:
 
     @property
     def x_min_mm(self) -> Tensor:
-        """The end on the tip side, (B,)."""
+        """x of the end on the tip side, (B,)."""
         return self.centre_mm - self.semi_x_mm
 
     @property
     def x_max_mm(self) -> Tensor:
-        """The end on the heel side, (B,)."""
+        """x of the end on the heel side, (B,)."""
         return self.centre_mm + self.semi_x_mm
 
     @property
@@ -84,12 +84,12 @@ class Capsule:
 
     @property
     def x_min_mm(self) -> Tensor:
-        """The end on the tip side, (B,)."""
+        """x of the end on the tip side, (B,)."""
         return self.centre_mm - self.reach_x_mm - self.radius_mm
 
     @property
     def x_max_mm(self) -> Tensor:
-        """The end on the heel side, (B,)."""
+        """x of the end on the heel side, (B,)."""
         return self.centre_mm + self.reach_x_mm + self.radius_mm
 
     @property

@@ -68,7 +68,7 @@ def _nearest(nodes, a, b, gx, gy):
 
 @_compile
 def _nearest_of(nodes, starts, first, last, gx, gy):
-    """As `_nearest`, over several trails."""
+    """The same as `_nearest`, over several trails."""
     found = _nearest(nodes, starts[first], starts[first + 1], gx, gy)
     for i in range(first + 1, last):
         other = _nearest(nodes, starts[i], starts[i + 1], gx, gy)

@@ -123,7 +123,7 @@ def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats, model: Mod
 
 
 def mixed_up(names: Sequence[str], robot_mm: Floats, seen_mm: Floats) -> str:
-    """What explains that points do not fit: a mirror, or two names that were exchanged; empty if they fit, or nothing
+    """Why the points do not fit: a mirror, or two names that were exchanged; empty if they fit, or if nothing
     explains it.
 
     `robot_mm` and `seen_mm` are (n, 2). An explanation counts if it leaves a fifth of the largest misfit or less.

@@ -74,7 +74,7 @@ def calibration_plane(
 
 
 def lens_problem(plane: Plane, *, known: bool) -> str:
-    """What to do about the lens; empty if it distorts little or as its file says."""
+    """Advice about the lens; empty if it distorts little, or as its file says."""
     if plane.distortion_px <= (REMAINING_PX if known else VISIBLE_PX):
         return ""
     advice = OTHER_LENS if known else NO_LENS_FILE

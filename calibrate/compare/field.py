@@ -36,7 +36,7 @@ class Alignment(StrEnum):
 
 
 class Tone(StrEnum):
-    """What a pixel holds."""
+    """Meaning of a pixel's value."""
 
     BINARY = "binary"
     GRAY = "gray"

@@ -164,7 +164,7 @@ def bootstrap(fit: DragFit, draws: int = 500, seed: int = 0, start: DragModel | 
 
 @dataclass(frozen=True, slots=True)
 class Residual:
-    """What the lag model misses, as a function of the stroke's command: kernel ridge on clipped signed distance."""
+    """Deviation from the lag model as a function of the stroke's command: kernel ridge on clipped signed distance."""
 
     commands: Floats
     weights: Floats

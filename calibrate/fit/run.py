@@ -102,7 +102,7 @@ def proportional_zero(strokes: list[Pressed], grid: Grid, radius_mm: float, leng
 
 
 def correction(captures: Captures, artefact: BrushFit, reference: BrushFit | None) -> Correction:
-    """The correction of the rig's zero touch, relative to an earlier fit of the same brush or absolute."""
+    """Correction of the rig's zero touch: relative to an earlier fit of the same brush if given, else absolute."""
     if reference is not None:
         before = reference.press()
         now, errors = zero_touch(before, captures.strokes, captures.grid)

@@ -36,7 +36,7 @@ POSE_PERIOD_S = 0.005
 
 @dataclass(frozen=True, slots=True)
 class ArmTrips:
-    """How the arm gets over the sheet and away again."""
+    """Moves of the arm over the sheet and away again."""
 
     over_mm: tuple[float, float, float]
     """Position of the tip over the middle of the sheet, in the base frame."""

@@ -31,7 +31,7 @@ class PointRow(Config):
 
     @property
     def point(self) -> TrajectoryPoint:
-        """The row as the protocol keeps it."""
+        """The row as a tuple, in the order of `points` in a protocol."""
         return self.x_mm, self.y_mm, self.height_mm, self.tilt_deg, self.heading_deg
 
 

@@ -33,7 +33,7 @@ def check_rig(config: RigConfig) -> list[Check]:
 
 
 def contradictions(checks: list[Check]) -> int:
-    """How many of them contradict something."""
+    """Number of checks that found a contradiction."""
     return sum(check.verdict == "contradicts" for check in checks)
 
 

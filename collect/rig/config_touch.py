@@ -65,7 +65,7 @@ class CameraTouchConfig(Config):
 
     @property
     def extent_mm(self) -> float:
-        """Length of a row."""
+        """Length of a row of touches."""
         return (self.columns - 1) * self.pitch_mm
 
 

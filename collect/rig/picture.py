@@ -169,5 +169,5 @@ def _within(axes: Axes, points: Sequence[tuple[float, ...]]) -> None:
 
 
 def _plain(name: str) -> str:
-    """Nothing that is read as TeX."""
+    """Escape what matplotlib would read as TeX."""
     return name.replace("$", r"\$")

@@ -160,7 +160,7 @@ def in_reach(places: Sequence[Place]) -> list[Check]:
 
 
 def in_box(places: Sequence[Place], box_mm: Box) -> list[Check]:
-    """How far inside the box the places lie, each at its lowest and its highest."""
+    """Distance of the places from the walls of the box, each at its lowest and its highest point."""
     remedy = "Outside the box of limits: brushloop rig teach limits, or correct the place."
     return _worst(
         "inside the box",
@@ -175,7 +175,7 @@ def _inside_mm(place: Place, box_mm: Box) -> float:
 
 
 def _worst(name: str, checks: list[Check], worst: Place) -> list[Check]:
-    """Those that contradict; if none does, the tightest, as one check of all places."""
+    """The checks that fail; if none does, the one with the least margin, as one check of all places."""
     if wrong := [check for check in checks if check.verdict == "contradicts"]:
         return wrong
     [tightest] = [check for check in checks if check.name.endswith(f", {worst.name}")]
@@ -184,7 +184,7 @@ def _worst(name: str, checks: list[Check], worst: Place) -> list[Check]:
 
 
 def box_not_loose(places: Sequence[Place], box_mm: Box) -> Check:
-    """How far the box reaches beyond everything that the tip goes to."""
+    """Distance by which the box extends beyond all places that the tip goes to."""
     ends = [p.at_mm for p in places] + [(p.at_mm[0], p.at_mm[1], p.top_mm) for p in places]
     room_mm = max(
         max(min(along) - low, high - max(along))

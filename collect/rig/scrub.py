@@ -1,4 +1,4 @@
-"""Takes out of a report what belongs to a person or a network: it is sent to people who are not of the lab."""
+"""Remove what identifies a person or a network from a report, because reports are sent to people outside the lab."""
 
 from __future__ import annotations
 

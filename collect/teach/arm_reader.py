@@ -71,7 +71,7 @@ class Address:
 
 @dataclass(frozen=True, slots=True)
 class Cabinet:
-    """What a cabinet says of itself and of its arm."""
+    """What a cabinet reports about itself and its arm."""
 
     framing: Framing
     model: str
@@ -112,7 +112,7 @@ class ArmReader:
         return tuple(_six("getTcpOffset", await self.ask("RobotConfig.getTcpOffset")))
 
     async def flange(self) -> Pose:
-        """Where the flange is in the base frame, once the arm is held still.
+        """Wait until the arm is held still, and return the pose of the flange in the base frame.
 
         From the cabinet's tool pose, with its tool taken off again: whatever is set there does not matter. Raises
         `DeviceTimeout` if the arm keeps moving.
@@ -133,7 +133,7 @@ class ArmReader:
             ) from None
 
     async def flange_now(self) -> Pose:
-        """Where the flange is, whether or not the arm rests. Raises `DeviceError`."""
+        """Pose of the flange in the base frame, whether or not the arm rests. Raises `DeviceError`."""
         tool = await self.tool()
         at = from_wire(_six("getTcpPose", await self.ask("RobotState.getTcpPose")))
         turn = Rotation.from_quat(at.quaternion) * Rotation.from_euler("ZYX", tool[5:2:-1]).inv()
@@ -180,7 +180,7 @@ def _six(op: str, answer: Any) -> list[float]:
 
 @contextlib.asynccontextmanager
 async def reading(address: Address, framing: Framing) -> AsyncGenerator[ArmReader]:
-    """A reader on an open connection, closed at the end. Raises `WrongGeneration` and other `DeviceError`s."""
+    """Connect to a controller, yield a reader, and disconnect. Raises `WrongGeneration` and other `DeviceError`s."""
     connection = RpcConnection(address.host, address.port, framing=framing)
     try:
         await open_arcs(connection, AUBOPE_PORT)

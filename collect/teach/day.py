@@ -133,7 +133,7 @@ class Step(Protocol):
         ...
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
-        """What follows from the notebook alone: computed again whenever something that it rests on has changed."""
+        """Values that follow from the notebook alone; computed again whenever a value they depend on changes."""
         ...
 
     def forget(self, notebook: Notebook) -> Notebook:

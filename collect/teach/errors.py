@@ -1,4 +1,4 @@
-"""What the first day cannot go on from."""
+"""Errors that end the first day."""
 
 from __future__ import annotations
 

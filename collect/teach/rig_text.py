@@ -86,7 +86,7 @@ def _tables(notebook: Notebook, rig_path: Path) -> dict[str, Any]:
 
 
 def _rounded(value: Value) -> Any:
-    """As it is written: 0.001 mm and 0.0001 deg are below what anything is known to."""
+    """Round a value as it is written: no value is known better than 0.001 mm or 0.0001 deg."""
     if isinstance(value, list):
         return [_rounded(v) for v in value]
     return round(value, 4) + 0.0 if isinstance(value, float) else value

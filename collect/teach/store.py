@@ -52,7 +52,7 @@ class Taught(Config):
 
 
 class Touch(Config):
-    """Where the flange stood while the tip was at a thing, in the base frame."""
+    """Pose of the flange in the base frame while the tip was at a thing, and when."""
 
     position_mm: tuple[Finite, Finite, Finite]
     quaternion: tuple[Finite, Finite, Finite, Finite]
@@ -150,10 +150,10 @@ class TaughtFile:
 
 
 def now_utc() -> str:
-    """The time to the second, as notes give it."""
+    """The current time in UTC as text, to the second, as the notebook keeps it."""
     return datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
 def touch_of(pose: Pose) -> Touch:
-    """A touch from where the flange stands now."""
+    """The pose of the flange as a touch, with the current time."""
     return Touch(position_mm=pose.position_mm, quaternion=pose.quaternion, at=now_utc())

@@ -60,7 +60,7 @@ class KnownHeights:
 def _unknown_mm(
     config: TouchConfig, known_mm: tuple[float, float], x_mm: float, y_mm: float, extent_mm: float
 ) -> float:
-    """How far the sheet may rise or fall from the place of a known height."""
+    """How far the sheet may rise or fall within a distance of a point whose height is known."""
     return math.tan(math.radians(config.lean_deg)) * (math.dist((x_mm, y_mm), known_mm) + extent_mm)
 
 

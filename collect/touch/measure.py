@@ -106,7 +106,7 @@ def _by_jog(arm: TouchArm, config: TouchConfig, points: int, next_jog: NextJog |
 
 @dataclass(frozen=True, slots=True)
 class Jogged:
-    """Where the tip is, for the operator."""
+    """Position of the tip, as the operator sees it."""
 
     above_mm: float
     """Height above the expected one."""

@@ -208,7 +208,7 @@ def _linear(commanded_mm: Floats, found_mm: Floats) -> Floats:
 
 
 def _second_best(commanded_mm: Floats) -> float:
-    """How badly the best wrong order of a triangle's corners keeps its angles."""
+    """Error in the angles for the best of the wrong orders of a triangle's corners."""
     wrong = list(itertools.permutations(range(3)))[1:]
     return min(_unlike(_linear(commanded_mm, commanded_mm[list(order)])) for order in wrong)
 

@@ -127,7 +127,7 @@ class TeachApp(PlainApp):
             self.action_stop()
 
     def action_go_on(self) -> None:
-        """After a stop, begin again where the notebook is."""
+        """After a stop, start the steps again; what the notebook already holds is not asked again."""
         if self.teaching.finished and self.teaching.stopped and self.teaching.error is None:
             self.teaching = Teaching(self._work, self.teaching.guide.view.findings)
             self._screen.follow(self.teaching.guide)

@@ -37,7 +37,7 @@ MOST_FINDINGS = 200
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What the steps wait for."""
+    """A question that the steps wait for."""
 
     number: int
     """From 1; an answer to an older question is dropped."""
@@ -83,7 +83,7 @@ class ScreenGuide:
 
     @property
     def view(self) -> TeachView:
-        """What there is to show now."""
+        """What the screen should show now."""
         with self._lock:
             return self._view
 

@@ -54,7 +54,7 @@ async def survey(host: str, port: int, framing: Framing) -> list[Exchange]:
 
 
 async def _asked(connection: RpcConnection) -> AsyncIterator[Exchange]:
-    """As the driver does: a version before the login, then the names of the robots, then everything of the first."""
+    """Ask in the driver's order: version before login, then names of the robots, then everything about the first."""
     try:
         await open_arcs(connection, AUBOPE_PORT)
     except DeviceError as error:

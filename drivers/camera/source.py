@@ -138,7 +138,7 @@ class FolderSource:
         return cast("NDArray[np.uint8]", image)
 
     def release(self) -> None:
-        """Nothing to release."""
+        """Do nothing: a folder has nothing to release."""
 
 
 class CaptureSource:

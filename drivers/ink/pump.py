@@ -135,7 +135,7 @@ class ModbusPump:
         return False
 
     async def level(self) -> float | None:
-        """None: the pump has no gauge, and what is in the well is unknown."""
+        """None, because the pump has no gauge: how much is in the well is unknown."""
         if not self._connected:
             raise NotConnected(DEVICE, "level", "not connected")
         return None

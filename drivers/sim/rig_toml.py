@@ -126,7 +126,7 @@ def _dwell(config: SimConfig) -> str:
 
 
 def _staleness(config: SimConfig) -> str:
-    """As for a real sensor, unless simulated time is fast: then the age of a sample says nothing about the arm."""
+    """That of a real sensor, unless simulated time is fast: then the age of a sample says nothing about the arm."""
     if config.rate <= 1.0:
         return "stale_ms = 100.0\n"
     return f"stale_ms = 1000.0    # allowed on this bus alone: simulated time runs at {config.rate:g} times real time\n"

@@ -40,7 +40,7 @@ class Flag(StrEnum):
 
 
 class Known(StrEnum):
-    """What is known of the place of a press."""
+    """What is known about the place of a press."""
 
     ANCHOR = "anchor"
     """The zero-touch point, where the tip first touches the paper, and the heading: alpha moves the mark off it."""

@@ -113,7 +113,7 @@ def _columns(heel, tip, wide, cx, left, right, beyond, unit, means, areas):
 
 @inline
 def _rows(image, cy, beyond, top, bottom, unit, means):
-    """Fill the rows that the mark reaches as if no level were crossed."""
+    """Fill the rows that the mark reaches, ignoring crossings of row edges; `_correct` corrects those pixels."""
     size = image.shape[0]
     zero = np.int32(0)
     share = image.dtype.type(1.0 / unit)

@@ -52,7 +52,7 @@ def with_crc(body: bytes) -> bytes:
 
 
 def digest(data: bytes) -> str:
-    """SHA-256 of what precedes a chained line."""
+    """SHA-256 of everything that precedes a chained line."""
     return hashlib.sha256(data).hexdigest()
 
 

@@ -171,7 +171,7 @@ def _first_of_cells(outcome: Outcome, most: int) -> list[int]:
 
 
 def extreme(outcome: Outcome, session_id: str, stroke_id: str, model: str) -> dict[str, str]:
-    """Captured, predicted and difference of one stroke."""
+    """Captured, predicted and difference image of one stroke, as data URIs."""
     k = next(
         k
         for k, row in enumerate(outcome.rows)
@@ -181,7 +181,7 @@ def extreme(outcome: Outcome, session_id: str, stroke_id: str, model: str) -> di
 
 
 def triple(outcome: Outcome, k: int, model: str) -> dict[str, str]:
-    """Captured, predicted and difference of one stroke; captured alone if the model does not predict it."""
+    """Captured, predicted and difference image as data URIs; captured alone if the model does not predict the press."""
     captured, image = captured_image(outcome, k), predicted(outcome, k, model)
     if image is None:
         return {"captured": _ink(captured)}

@@ -89,7 +89,7 @@ class ArmStep:
         return int(text) if text.isdecimal() and 0 < int(text) < 65536 else RTDE_PORT
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
-        """Nothing: all of it was read."""
+        """No derived values: all values of this step were read."""
         return {}
 
     def forget(self, notebook: Notebook) -> Notebook:

@@ -103,7 +103,7 @@ class BrushStep:
             await device.close()
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
-        """Nothing: all of it was asked."""
+        """No derived values: all values of this step were asked."""
         return {}
 
     def forget(self, notebook: Notebook) -> Notebook:

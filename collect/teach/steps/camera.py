@@ -238,7 +238,7 @@ class CameraStep:
         )
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
-        """Nothing: all of it was measured."""
+        """No derived values: all values of this step were measured."""
         return {}
 
     def forget(self, notebook: Notebook) -> Notebook:

@@ -149,7 +149,7 @@ def sheet_corners(notebook: Notebook) -> list[Point]:
 
 
 def _check_well(notebook: Notebook) -> str:
-    """What was found of the well. Raises `CannotTeach` where rim and dip contradict each other."""
+    """Describe the well. Raises `CannotTeach` if rim and dip contradict each other."""
     (rim_x, rim_y, rim_z), (x, y, z) = tips(notebook)["well-rim 0"], tips(notebook)["well 0"]
     radius_mm = math.dist((rim_x, rim_y), (x, y))
     if not LEAST_RADIUS_MM <= radius_mm <= MOST_RADIUS_MM:

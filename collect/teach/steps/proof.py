@@ -133,7 +133,7 @@ class ProofStep:
         await day.say("READY")
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
-        """Nothing: all of it was measured."""
+        """No derived values: all values of this step were measured."""
         return {}
 
     def forget(self, notebook: Notebook) -> Notebook:

@@ -130,7 +130,7 @@ def corners(notebook: Notebook, kind: str) -> dict[str, list[Point]]:
 
 
 def all_corners(notebook: Notebook, kind: str, thing: str) -> dict[str, list[Point]]:
-    """As `corners`. Raises `CannotTeach` where a corner was skipped."""
+    """The same as `corners`. Raises `CannotTeach` where a corner was skipped."""
     found = corners(notebook, kind)
     missing = [f"{thing} {name}" for name in CORNERS if name not in found]
     if missing:
@@ -158,7 +158,7 @@ def check_known(fit: SheetFit) -> None:
 
 
 def in_words(fit: SheetFit) -> tuple[str, ...]:
-    """What was found, for the person."""
+    """The result in words for the person."""
     (x, y), (width, height) = fit.origin_mm, fit.size_mm
     worst = max(fit.residuals_mm, key=lambda name: fit.residuals_mm[name])
     return (

@@ -55,7 +55,7 @@ class Power:
         return ReturnCode.OK
 
     def power_off(self) -> int:
-        """Brakes on, power off."""
+        """Engage the brakes and switch the arm off."""
         if self.mode != RobotMode.POWER_OFF:
             self._then((0.0, RobotMode.POWERING_OFF), (POWER_OFF_S, RobotMode.POWER_OFF))
         return ReturnCode.OK

@@ -51,7 +51,7 @@ class InSpace:
     """A path that is given in space only."""
 
     def joints(self, done: float) -> Joints | None:
-        """None: not given in joints."""
+        """None, because the path is not given in joints."""
         return None
 
 
@@ -170,12 +170,12 @@ class Part:
 
     @property
     def angular(self) -> bool:
-        """As for the whole path."""
+        """The same as for the whole path."""
         return self.whole.angular
 
     @property
     def stretches(self) -> int:
-        """As for the whole path."""
+        """The same as for the whole path."""
         return self.whole.stretches
 
     def pose(self, done: float) -> Pose:
@@ -183,7 +183,7 @@ class Part:
         return self.whole.pose(self.begin + done)
 
     def joints(self, done: float) -> Joints | None:
-        """As for the whole path."""
+        """The same as for the whole path."""
         return self.whole.joints(self.begin + done)
 
 

@@ -42,7 +42,7 @@ class ArmQueue(MotionQueue):
         return self._held is not None
 
     def add_joints(self, joints: Joints, speed_rad_s: float, acc_rad_s2: float, now_s: float, least_s: float) -> bool:
-        """Append a move that is straight in joints, from rest to rest; False if the arm will be there already."""
+        """Append a straight move in joint space, from rest to rest; False if the queue already ends there."""
         self.advance(now_s)
         target = pose_of(forward(joints) @ self.tool)
         travel_mm, turn_deg = distance(self._last(), target)

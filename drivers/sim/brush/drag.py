@@ -121,7 +121,7 @@ STAMP_MARGIN_MM = 1.5
 
 @dataclass(frozen=True)
 class Stances:
-    """How one brush stands on the paper at each depth: pressed straight down, and dragged. Both start unloaded."""
+    """Shapes of one brush on the paper at each depth: pressed straight down, and dragged. Both start unloaded."""
 
     pressed: tuple[SpineShape, ...]
     pulled: tuple[SpineShape, ...]

@@ -36,7 +36,7 @@ class Optics:
         return np.asarray(distorted, np.float64).reshape(-1, 2)
 
     def straight(self, paper_mm: Floats) -> Floats:
-        """As `image_of`, through a lens without distortion."""
+        """The same as `image_of`, through a lens without distortion."""
         mapped = np.column_stack([paper_mm, np.ones(len(paper_mm))]) @ self.homography.T
         return np.asarray(mapped[:, :2] / mapped[:, 2:], np.float64)
 

@@ -80,7 +80,7 @@ class Aims:
         return _unsteady(aimed, SQUARE_DEG if to == "upright" else UPRIGHT_DEG, rng)
 
     def board(self, index: int) -> Held:
-        """How the board is held before the camera: each time slanted another way, in another part of the picture."""
+        """How the board is held before the camera: each time at another slant and in another part of the picture."""
         facts, rng = self._facts(), self._drawn("hold-board", index, "")
         view, table = facts.config.view, facts.config.table
         pose = HELD[index] if index < len(HELD) else _any_way(rng)

@@ -194,7 +194,7 @@ def _beside(rng: np.random.Generator, table: Table, clear_mm: float) -> tuple[fl
 
 
 def _typed_tcp(rng: np.random.Generator, config: SimConfig) -> tuple[float, ...]:
-    """Nothing, another tool's, or this one's by a ruler."""
+    """The tool offset set on the pendant: none, that of another tool, or this one measured with a ruler."""
     ruler_m = (config.tool_mm + float(rng.normal(0.0, 2.0))) / 1e3
     other_m = float(rng.uniform(0.05, 0.2))
     return ((0.0,) * 6, (0.0, 0.03, other_m, 0.0, 0.0, 0.5), (0.0, 0.0, ruler_m, 0.0, 0.0, 0.0))[rng.integers(3)]

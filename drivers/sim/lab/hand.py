@@ -47,11 +47,11 @@ HALVINGS = 5
 
 
 class Lab(Protocol):
-    """What a person can lay hands on."""
+    """The things in a lab that a person can handle."""
 
     @property
     def facts(self) -> Facts:
-        """How the lab is now."""
+        """The current state of the lab."""
         ...
 
     @property
