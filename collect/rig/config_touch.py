@@ -20,12 +20,13 @@ class ForceTouchConfig(Config):
     fast_step_mm: Step = 0.5
     fast_samples: Annotated[int, Field(ge=4, le=10_000)] = 60
     """Samples averaged at each rest of the fast approach."""
-    medium_step_mm: Step = 0.1
-    medium_samples: Annotated[int, Field(ge=4, le=10_000)] = 150
-    slow_samples: Annotated[int, Field(ge=10, le=100_000)] = 1000
+    medium_step_mm: Step = 0.15
+    medium_samples: Annotated[int, Field(ge=4, le=10_000)] = 80
+    slow_samples: Annotated[int, Field(ge=10, le=100_000)] = 600
     """Samples averaged over the three rests of one slow descent."""
-    sigma_mm: Annotated[float, Field(ge=0.001, le=0.5)] = 0.0135
-    """Slow descents are repeated until the contact is known to this standard error."""
+    sigma_mm: Annotated[float, Field(ge=0.001, le=0.5)] = 0.04
+    """Slow descents are repeated until the contact is known to this standard error; three touches average to 0.6 of
+    it."""
     max_samples: Annotated[int, Field(ge=100, le=1_000_000)] = 60_000
     """Most samples of one touch; if they are not enough, the sensor is too noisy for the brush."""
     linear_mm: Annotated[float, Field(ge=0.05, le=5.0)] = 0.45
@@ -83,7 +84,8 @@ class TouchConfig(Config):
     touches: Annotated[int, Field(ge=1, le=50)] = 3
     """Number of touches at each point."""
     repeatability_mm: Positive = 0.15
-    """How far the touches of one point may spread; beyond it the run stops and names the heights."""
+    """How far the touches of one point may spread, or five of their standard errors if that is more; beyond it the run
+    stops and names the heights."""
     residual_mm: Positive = 0.2
     """How far a point may lie from the plane through all of them; three points have no residuals."""
     above_mm: Annotated[float, Field(gt=0.0, le=20.0)] = 2.0

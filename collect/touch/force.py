@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -16,6 +17,22 @@ from collect.touch.heights import Reach
 Floats = NDArray[np.float64]
 
 
+SPRING_CHANGES = 0.05
+"""Share by which a brush's stiffness may change from one touch to the next, as it dries or meets a leaning sheet."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spring:
+    """The brush's stiffness near to the paper, and its standard error."""
+
+    n_mm: float
+    sigma_n_mm: float
+
+    def next(self) -> Spring:
+        """What it says about the stiffness in the next touch."""
+        return Spring(self.n_mm, math.hypot(self.sigma_n_mm, SPRING_CHANGES * self.n_mm))
+
+
 @dataclass(frozen=True, slots=True)
 class Contact:
     """The height at which the force leaves zero."""
@@ -23,26 +40,33 @@ class Contact:
     z_mm: float
     sigma_mm: float
     """Standard error from the noise of the samples alone, without the error of taking the brush for a hinge."""
-    stiffness_n_mm: float
+    spring: Spring
     misfit: float
     """Chi-square per degree of freedom: about 1 if the brush is a linear spring this near to the paper."""
     samples: int
 
 
 def find_contact(
-    z_mm: Floats, force_n: Floats, samples: NDArray[np.int64], sample_sd_n: float, run: NDArray[np.int64] | None = None
+    z_mm: Floats,
+    force_n: Floats,
+    samples: NDArray[np.int64],
+    sample_sd_n: float,
+    run: NDArray[np.int64] | None = None,
+    spring: Spring | None = None,
 ) -> Contact:
     """Least squares of force = offset + stiffness * max(0, contact - z) through means at rest.
 
     All arrays are (m,): height, mean force, number of samples in the mean, and descent (0, 1, ...) that it belongs to.
     Each descent has its own offset, so that a slow drift of the sensor is not taken for force. `sample_sd_n` is the
-    standard deviation of one sample. The join is solved exactly between neighbouring heights (D. J. Hudson, Fitting
+    standard deviation of one sample. `spring` is what is known of the stiffness from elsewhere; it counts as one more
+    observation. The join is solved exactly between neighbouring heights (D. J. Hudson, Fitting
     segmented curves whose join points have to be estimated, J. Am. Stat. Assoc. 61, 1966).
-    Raises `StepError` where the force does not rise over at least two heights.
+    Raises `StepError` where the force does not rise over at least two heights, or one if the stiffness is known.
     """
     heights = np.unique(z_mm)
-    if len(heights) < 3 or sample_sd_n <= 0.0:
-        raise StepError(f"a contact needs rests at three heights or more, there are {len(heights)}")
+    needed = 3 if spring is None else 2
+    if len(heights) < needed or sample_sd_n <= 0.0:
+        raise StepError(f"rests at {len(heights)} heights give no contact, {needed} are needed")
     weights = samples.astype(np.float64)
     runs = np.zeros(len(z_mm), np.int64) if run is None else run
     descents = np.unique(runs)[:, None] == runs[None, :]
@@ -53,22 +77,27 @@ def find_contact(
         means = rows @ of.T / of.sum(axis=1)
         return np.asarray(rows - means @ descents, np.float64)
 
+    # An observation of the stiffness alone, in units of one sample.
+    known = 0.0 if spring is None else (sample_sd_n / spring.sigma_n_mm) ** 2
+    known_n_mm = 0.0 if spring is None else known * spring.n_mm
     force = free_of_offsets(force_n)
     # (j, m): one row for each height but the highest, taken as the uppermost below the join.
     below = z_mm[None, :] <= heights[:-1, None]
     step, ramp = free_of_offsets(below.astype(np.float64)), free_of_offsets(np.where(below, -z_mm, 0.0))
     # Below the join, force = offset + stiffness * contact - stiffness * z, linear in both: 2 x 2 normal equations.
     ss, sr, rr = ((a * b) @ weights for a, b in ((step, step), (step, ramp), (ramp, ramp)))
-    sf, rf = step @ (weights * force), ramp @ (weights * force)
+    sf, rf = step @ (weights * force), ramp @ (weights * force) + known_n_mm
+    rr = rr + known
     determinant = ss * rr - sr**2
     with np.errstate(divide="ignore", invalid="ignore"):
         inside = (rr * sf - sr * rf) / (ss * rf - sr * sf)
     solvable = (determinant > 1e-9 * ss * rr) & (inside >= heights[:-1]) & (inside <= heights[1:])
     joins = np.concatenate((inside[solvable], heights[1:]))
     springs = free_of_offsets(np.maximum(0.0, joins[:, None] - z_mm[None, :]))
-    stretch, pull = (springs**2) @ weights, springs @ (weights * force)
+    stretch, pull = (springs**2) @ weights + known, springs @ (weights * force) + known_n_mm
     # A force that falls on the way down is no contact, and one height below the join does not give a stiffness.
-    rises = (pull > 0.0) & (stretch > 1e-12) & ((heights[None, :] < joins[:, None]).sum(axis=1) >= 2)
+    least = 2 if spring is None else 1
+    rises = (pull > 0.0) & (stretch > 1e-12) & ((heights[None, :] < joins[:, None]).sum(axis=1) >= least)
     if not rises.any():
         raise StepError("no contact: the force does not rise over two of these heights")
     squares = np.where(rises, -(pull**2) / np.where(rises, stretch, 1.0), np.inf)
@@ -77,15 +106,17 @@ def find_contact(
     moved = free_of_offsets(
         np.stack((stiffness * (z_mm < contact), np.maximum(0.0, contact - z_mm))).astype(np.float64)
     )
-    variance = np.linalg.pinv((moved * weights) @ moved.T, hermitian=True) * sample_sd_n**2
-    freedom = max(len(z_mm) - len(descents) - 2, 1)
-    left = float((force**2) @ weights + squares[best]) / sample_sd_n**2
-    return Contact(contact, math.sqrt(variance[0, 0]), stiffness, left / freedom, int(samples.sum()))
+    variance = np.linalg.pinv((moved * weights) @ moved.T + np.diag((0.0, known)), hermitian=True) * sample_sd_n**2
+    sigma_mm, sigma_n_mm = (math.sqrt(float(v)) for v in np.diag(variance))
+    freedom = max(len(z_mm) - len(descents) - (2 if spring is None else 1), 1)
+    left = float(((force - stiffness * moved[1]) ** 2) @ weights) / sample_sd_n**2
+    return Contact(contact, sigma_mm, Spring(stiffness, sigma_n_mm), left / freedom, int(samples.sum()))
 
 
-SLOW_MM = (-0.15, 0.08, 0.4)
+SLOW_MM = (-0.8, 0.08, 0.4)
 """Depths of the three rests of a slow descent. Two fix the hinge's arms, the middle one the join: a row of equal
-steps needs more than twice the samples for the same error."""
+steps needs more than twice the samples for the same error. The first is so high that it is in the air even where the
+paper has risen since the last touch."""
 SLOW_SHARES = (0.38, 0.42, 0.2)
 FELT_SIGMAS = 4.0
 """A mean force this many standard errors from zero is a push."""
@@ -94,6 +125,10 @@ LATE_STEPS = 2
 CLEAR_STEPS = 4
 """Number of rests in the air at the start of the medium approach."""
 ROUGH_RUN = 0
+SPRING_SHARE = 0.1
+"""Largest standard error of the stiffness, as a share of it, with which a touch ends."""
+BESIDE_MM = 0.1
+"""How far the last descent may have lain beside the contact: its rests must lie above and below it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +155,7 @@ class Probe(Protocol):
 class _Log:
     """The readings of one touch so far."""
 
+    spring: Spring | None
     readings: list[tuple[Reading, int]] = field(default_factory=list[tuple[Reading, int]])
 
     @property
@@ -127,10 +163,16 @@ class _Log:
         return sum(reading.samples for reading, _ in self.readings)
 
     def contact(self, config: ForceTouchConfig) -> Contact:
-        """Fit the hinge to the readings of the linear part; iterated, because that part depends on the hinge."""
+        """Fit the hinge to the readings of the linear part; iterated, because that part depends on the hinge.
+
+        All readings are taken while no more than those in the air are left: the descent lay too low.
+        """
         found = self._fit(-math.inf)
         for _ in range(3):
-            found = self._fit(found.z_mm - config.linear_mm)
+            lowest_z_mm = found.z_mm - config.linear_mm
+            if not any(lowest_z_mm <= reading.z_mm < found.z_mm for reading, _ in self.readings):
+                break
+            found = self._fit(lowest_z_mm)
         return found
 
     def _fit(self, lowest_z_mm: float) -> Contact:
@@ -143,37 +185,60 @@ class _Log:
             np.array([r.samples for r, _ in used]),
             sd_n,
             np.array([run for _, run in used]),
+            self.spring,
         )
 
 
 async def touch_by_force(
-    probe: Probe, reach: Reach, config: ForceTouchConfig, near_z_mm: float | None = None
+    probe: Probe,
+    reach: Reach,
+    config: ForceTouchConfig,
+    spring: Spring | None = None,
+    near_z_mm: float | None = None,
+    report: Callable[[str], None] = lambda _doing: None,
 ) -> Contact:
     """Touch once; the probe is left down.
 
-    `near_z_mm` is the height of the last touch, and makes the fast approach unnecessary. Raises `StepError` if nothing
+    `spring` is the stiffness that the last touch found. With it and `near_z_mm`, the height of the last touch at this
+    point, only the slow descents are left to do. `report` gets a few words on each part. Raises `StepError` if nothing
     is felt over the whole travel, if something is felt at its start, or if the noise leaves the contact unknown.
     """
-    lowest_z_mm = reach.lowest_z_mm
-    if near_z_mm is None:
+    log, lowest_z_mm = _Log(None if spring is None else spring.next()), reach.lowest_z_mm
+    if near_z_mm is None or spring is None:
+        report(f"down to the paper in steps of {config.fast_step_mm:g} mm")
         felt_z_mm = await _fast(probe, reach.start_z_mm, lowest_z_mm, config)
-        near_z_mm = felt_z_mm + LATE_STEPS * config.fast_step_mm
-    log = await _medium(probe, near_z_mm + CLEAR_STEPS * config.medium_step_mm, lowest_z_mm, config)
-    run = ROUGH_RUN
-    contact = log.contact(config)
-    while run == ROUGH_RUN or contact.sigma_mm > config.sigma_mm:
+        start_z_mm = felt_z_mm + LATE_STEPS * config.fast_step_mm + CLEAR_STEPS * config.medium_step_mm
+        report(f"steps of {config.medium_step_mm:g} mm around {felt_z_mm:.1f} mm")
+        await _medium(probe, log, start_z_mm, lowest_z_mm, config)
+        near_z_mm = log.contact(config).z_mm
+    run, left = ROUGH_RUN, ""
+    while True:
+        run += 1
+        report(f"slow descent {run}{left}")
+        for depth_mm, share in zip(SLOW_MM, SLOW_SHARES, strict=True):
+            z_mm = max(near_z_mm - depth_mm, lowest_z_mm)
+            log.readings.append((await probe.rest(z_mm, max(4, round(share * config.slow_samples))), run))
+        contact = log.contact(config)
+        if _known(contact, near_z_mm, config):
+            return contact
         if log.samples > config.max_samples:
             raise StepError(
                 f"the contact is known to {contact.sigma_mm:.3f} mm only after {log.samples} samples of the force, "
                 f"{config.sigma_mm:g} mm are asked for: the sensor is too noisy for this brush"
             )
-        run += 1
-        for depth_mm, share in zip(SLOW_MM, SLOW_SHARES, strict=True):
-            samples = max(4, round(share * config.slow_samples))
-            z_mm = max(contact.z_mm - depth_mm, lowest_z_mm)
-            log.readings.append((await probe.rest(z_mm, samples), run))
-        contact = log.contact(config)
-    return contact
+        near_z_mm = contact.z_mm
+        more = max(1, math.ceil(log.samples * ((contact.sigma_mm / config.sigma_mm) ** 2 - 1.0) / config.slow_samples))
+        left = f", about {more} to go: known to {contact.sigma_mm:.3f} mm, {config.sigma_mm:g} mm asked for"
+
+
+def _known(contact: Contact, tried_z_mm: float, config: ForceTouchConfig) -> bool:
+    """Whether the contact is known well enough, after a descent around `tried_z_mm`.
+
+    Its standard error is computed from the stiffness. Where that is known badly, or where the descent lay beside the
+    contact, the error can be much larger than it seems.
+    """
+    sure = contact.spring.sigma_n_mm <= SPRING_SHARE * contact.spring.n_mm
+    return sure and abs(contact.z_mm - tried_z_mm) <= BESIDE_MM and contact.sigma_mm <= config.sigma_mm
 
 
 async def _fast(probe: Probe, start_z_mm: float, lowest_z_mm: float, config: ForceTouchConfig) -> float:
@@ -192,14 +257,14 @@ async def _fast(probe: Probe, start_z_mm: float, lowest_z_mm: float, config: For
     raise StepError(f"nothing was touched down to {lowest_z_mm:.2f} mm: the force stayed below {1e3 * felt_n:.1f} mN")
 
 
-async def _medium(probe: Probe, start_z_mm: float, lowest_z_mm: float, config: ForceTouchConfig) -> _Log:
+async def _medium(probe: Probe, log: _Log, start_z_mm: float, lowest_z_mm: float, config: ForceTouchConfig) -> None:
     """Go down in smaller steps until something is felt at two rests in a row."""
-    log, z_mm, before_n = _Log(), start_z_mm, 0.0
+    z_mm, before_n = start_z_mm, 0.0
     while True:
         reading = await probe.rest(z_mm, config.medium_samples)
         log.readings.append((reading, ROUGH_RUN))
         if min(before_n, reading.force_n) > _felt_n(reading, config) and len(log.readings) > CLEAR_STEPS:
-            return log
+            return
         if z_mm <= lowest_z_mm + 1e-6:
             raise StepError(f"nothing was touched down to {z_mm:.2f} mm, in steps of {config.medium_step_mm:g} mm")
         z_mm, before_n = max(z_mm - config.medium_step_mm, lowest_z_mm), reading.force_n

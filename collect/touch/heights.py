@@ -12,6 +12,9 @@ from collect.rig.config import PaperConfig
 from collect.rig.config_touch import Method, TouchConfig
 from collect.rig.paper import PaperPlane, fit_plane
 
+SPAN_SIGMAS = 5.0
+"""Three touches at one height span more than this many of their standard errors once in a thousand times."""
+
 
 @dataclass(frozen=True, slots=True)
 class Reach:
@@ -127,18 +130,19 @@ class PlaneResult:
 
 
 def at_one_point(touches: list[Touch], config: TouchConfig, guide: PaperPlane | None = None) -> PointTouches:
-    """Compare the touches of one point. Raises `StepError` if they span too much.
+    """Compare the touches of one point. Raises `StepError` if they span more than their own errors explain.
 
     `guide` is the known lean of the sheet, for touches that lie some millimetres apart.
     """
     lean = guide or PaperPlane(0.0)
     heights = [t.z_mm - lean.touch_z_mm(t.x_mm, t.y_mm) for t in touches]
     span_mm = max(heights) - min(heights)
-    if span_mm > config.repeatability_mm:
+    limit_mm = max(config.repeatability_mm, SPAN_SIGMAS * max(t.sigma_mm or 0.0 for t in touches))
+    if span_mm > limit_mm:
         listed = ", ".join(f"{t.z_mm:.3f}" for t in touches)
         raise StepError(
             f"zero touch does not repeat at ({touches[0].x_mm:.0f}, {touches[0].y_mm:.0f}) mm: the heights {listed} mm "
-            f"span {span_mm:.3f} mm, limit {config.repeatability_mm:g} mm. Is the paper flat and the brush firm?"
+            f"span {span_mm:.3f} mm, limit {limit_mm:.3g} mm. Is the paper flat and the brush firm?"
         )
     return PointTouches(tuple(touches), span_mm)
 

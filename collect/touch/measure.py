@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
@@ -12,7 +13,7 @@ from collect.rig.devices import Rig
 from collect.rig.paper import PaperPlane
 from collect.touch.arm import ForceTap, RigProbe, TouchArm, TouchEffector
 from collect.touch.camera import FirstInkTouch
-from collect.touch.force import touch_by_force
+from collect.touch.force import Spring, touch_by_force
 from collect.touch.heights import KnownHeights, PlaneResult, PointTouches, Reach, Touch, at_one_point, through
 
 
@@ -77,17 +78,25 @@ def _by_force(
     if rig.force is None or tap is None:
         raise StepError("zero touch by force needs a force sensor: [force] is missing")
 
+    spring: Spring | None = None
+
     async def touch(number: int, point: Point, reach: Reach) -> list[Touch]:
+        nonlocal spring
         probe = RigProbe(arm, tap, rig.clock, point, config.force)
         near_z_mm, touches = None, list[Touch]()
         for k in range(config.touches):
-            tell(f"point {number + 1} of {max(len(config.points_mm), 1)}, touch {k + 1} of {config.touches}")
-            contact = await touch_by_force(probe, reach, config.force, near_z_mm)
-            near_z_mm = contact.z_mm
+            place = f"point {number + 1} of {max(len(config.points_mm), 1)}, touch {k + 1} of {config.touches}"
+            report = functools.partial(_report, tell, place)
+            contact = await touch_by_force(probe, reach, config.force, spring, near_z_mm, report)
+            near_z_mm, spring = contact.z_mm, contact.spring
             touches.append(Touch(*point, contact.z_mm, contact.sigma_mm))
         return touches
 
     return touch
+
+
+def _report(tell: Callable[[str], None], place: str, doing: str) -> None:
+    tell(f"{place}: {doing}")
 
 
 def _by_jog(arm: TouchArm, config: TouchConfig, points: int, next_jog: NextJog | None) -> TouchPoint:

@@ -10,14 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers import rotation
 from drivers.force.rounds import Wrench
 from drivers.geometry import brush_pose, from_wire, lean
 from drivers.samples import Pose
 from drivers.sim.arm.kinematics import Matrix, matrix_of
 from drivers.sim.arm.queue import ArmQueue
 from drivers.sim.brush.brush import MAX_TILT_DEG, Brush
-from drivers.sim.brush.contact import Contact, ContactWatch, Reaction, leaning_with
+from drivers.sim.brush.contact import Contact, ContactWatch, Reaction, bent_toward, leaning_with
 from drivers.sim.brush.drag import Waypoint, ink_left
 from drivers.sim.brush.flaws import Flaw, flaw_of_load, natural_split
 from drivers.sim.brush.paper import Paper
@@ -79,11 +78,6 @@ class Well:
 
 INK_PER_PRESS = 0.12
 """Share of a full brush's ink that a press uses, or the landing of a drag."""
-
-
-SET_DEG = 2.0
-"""Lean of the brush that would turn the bend by 45 deg from the hair's own set, which is 8 deg at the tip."""
-ALONG_RAD = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,21 +273,8 @@ class World:
         """(tilt_deg, heading_deg) in the paper frame; tilt from the sheet's normal."""
         on_paper = leaning_with(pose, self._normal)
         tilt_deg, base_heading_deg = lean(on_paper)
-        return tilt_deg, _bent_toward(on_paper, tilt_deg, base_heading_deg) - self.config.table.yaw_deg
-
-
-def _bent_toward(pose: Pose, tilt_deg: float, heading_deg: float) -> float:
-    """Direction into which the bundle bends: that of the lean, and for a brush almost upright that of its own set.
-
-    Hair that has been pressed keeps a set, along the wrist's x here. Without it, a brush that leans by a tenth of a
-    degree would bend into any direction.
-    """
-    along, _, _ = rotation.columns(rotation.unit(pose.quaternion))
-    wrist_deg = math.degrees(math.atan2(along[1], along[0]))
-    off = math.radians(math.remainder(heading_deg - wrist_deg, 360.0))
-    if abs(off) < ALONG_RAD:
-        return heading_deg
-    return wrist_deg + math.degrees(math.atan2(tilt_deg * math.sin(off), tilt_deg * math.cos(off) + SET_DEG))
+        bent_deg = bent_toward(on_paper, tilt_deg, base_heading_deg, self.brush.set_lean_deg)
+        return tilt_deg, bent_deg - self.config.table.yaw_deg
 
 
 def tool_of(config: SimConfig) -> Matrix:

@@ -1,4 +1,4 @@
-"""Step 9: the proof. Every device answers, a dry run 30 mm above, a touch, the self-check, and one judged press."""
+"""Step 9: the proof. Every device answers, a dry run 30 mm above, a touch, the self-check, and six judged presses."""
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ from sessions.journal.journal import JOURNAL_NAME, replay
 
 ABOVE_MM = 30.0
 SLOW_MM_S = 45.0
+PRESSES = 6
+"""Presses that all have to count."""
 PRESS_SHARE = 0.6
-"""Depth of the judged press as a share of the deepest."""
+"""Depth of the judged presses as a share of the deepest."""
 DEEPEST_DRY_MM = 24.0
 SLOW_CAMERA_MS = 600.0
 """A camera that is later than this makes every photograph slow, and says that something buffers its pictures."""
@@ -37,7 +39,7 @@ class ProofStep:
 
     name: StepName = "proof"
     title = "Proof"
-    minutes = 6
+    minutes = 12
     needs: tuple[StepName, ...] = ("arm", "camera", "tip", "sheet", "places", "brush", "force", "limits")
 
     async def teach(self, day: Day) -> None:
@@ -45,13 +47,13 @@ class ProofStep:
         rig = rig_of(day.notebook, day.rig_path)
         await self._doctor(day, rig)
         depth_mm = min(PRESS_SHARE * rig.brush.max_depth_mm, DEEPEST_DRY_MM)
-        protocol = f'kind = "grid"\nheights_mm = [{depth_mm:g}]\ntilts_deg = [0.0]\nrepeats = 1\n'
+        protocol = f'kind = "grid"\nheights_mm = [{depth_mm:g}]\ntilts_deg = [0.0]\nrepeats = {PRESSES}\n'
         await day.may_move(f"Dry run, {ABOVE_MM:g} mm above the sheet")
         with tempfile.TemporaryDirectory(prefix="brushloop-proof-") as folder:
             await self._run(day, Path(folder), protocol, dry=True)
         await day.say("The dry run made every move of a press, and nothing was met.")
         await day.may_move(
-            "Touch the sheet, press three marks and one stroke: the well must hold ink, the sheet be blank"
+            f"Touch the sheet, press three marks and {PRESSES} strokes: the well must hold ink, the sheet be blank"
         )
         session = await self._run(day, folder_beside(day.rig_path), protocol, dry=False)
         await day.say(f"Recorded in {session}.")
@@ -93,8 +95,8 @@ class ProofStep:
         return Path(engine.snapshot().folder)
 
     async def _followed(self, day: Day, engine: Engine) -> None:
-        """Show what the run reports, and pass its questions on to the person."""
-        shown = 0
+        """Show what the run does and reports, and pass its questions on to the person."""
+        shown, doing = 0, ""
         while True:
             over, now = engine.finished, engine.snapshot()
             if lines := now.messages[max(shown - now.messages_before, 0) :]:
@@ -102,6 +104,9 @@ class ProofStep:
             shown = now.messages_before + len(now.messages)
             if over:
                 return
+            if now.step != doing:
+                doing = now.step
+                await day.say(doing)
             if (asked := now.prompt) is not None:
                 engine.answer(asked.number, await day.guide.choose(asked.question, asked.choices, asked.default))
             await asyncio.sleep(POLL_S)
@@ -122,7 +127,7 @@ class ProofStep:
             f"touch height {z_mm:.3f} mm ({z_mm - by_hand_mm:+.2f} mm from the touch by hand), {known}",
             f"self-check: marks {proven.offset_mm[0]:+.1f}, {proven.offset_mm[1]:+.1f} mm from where they were "
             f"commanded, turned by {proven.turn_deg:+.2f} deg",
-            f"one press was judged sound; camera delay {delay_ms:.0f} ms",
+            f"{proven.sound} presses were judged sound, {proven.again} were made again; camera delay {delay_ms:.0f} ms",
         )
         if delay_ms > SLOW_CAMERA_MS:
             await day.say(
@@ -173,10 +178,14 @@ class Proven:
     jitter_ms: float
     offset_mm: tuple[float, float]
     turn_deg: float
+    sound: int
+    """Presses that count."""
+    again: int
+    """Presses that were not sound and were made again on another cell."""
 
 
 def read_proof(session: Path) -> Proven:
-    """From the journal of the session. Raises `CannotTeach` where the press was not judged sound."""
+    """From the journal of the session. Raises `CannotTeach` unless all presses were judged sound."""
     results: list[dict[str, Any]] = [line["result"] for line in replay(session / JOURNAL_NAME).done.values()]
 
     def having(name: str) -> dict[str, Any]:
@@ -185,10 +194,13 @@ def read_proof(session: Path) -> Proven:
         return next((result for result in reversed(results) if name in result), none)
 
     touch, check, capture = having("slope_deg"), having("turn_deg"), having("kept")
-    if not capture.get("kept") or capture.get("verdict"):
+    presses = [result for result in results if "kept" in result and not result["retake"]]
+    sound = [press for press in presses if press["kept"] and not press["verdict"]]
+    if len(sound) < PRESSES:
+        why = sorted({str(press["verdict"]) or "left out" for press in presses if press not in sound})
         raise CannotTeach(
-            f"the press was not judged sound ({capture.get('verdict') or 'it was left out'}).",
-            "Look at its picture above: ink, light, sheet; then prove again.",
+            f"{len(sound)} of {PRESSES} presses were judged sound ({', '.join(why) or 'the others were not made'}).",
+            "Look at their pictures above: ink, light, sheet; then prove again.",
         )
     if not touch or not check:
         raise CannotTeach("the run had no touch or no self-check.", "Report this as a defect.")
@@ -202,6 +214,8 @@ def read_proof(session: Path) -> Proven:
         float(capture["camera_jitter_ms"]),
         (float(check["offset_mm"][0]), float(check["offset_mm"][1])),
         float(check["turn_deg"]),
+        len(sound),
+        sum(1 for result in results if result.get("retake")),
     )
 
 

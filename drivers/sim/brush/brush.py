@@ -107,6 +107,14 @@ class Brush:
         spine = _spine(self.spec, float(depth_mm), float(tilt_deg))
         return print_footprint(spine, self._tuft(press_seed, trouble), ink_load, px_per_mm, self._paper(press_seed))
 
+    @property
+    def set_lean_deg(self) -> float:
+        """Lean of the ferrule that would carry the tip of a straight bundle as far aside as the set carries it.
+
+        The mean of the set's angle over the length: a sixth of `set_deg`, because the set lies in the outer half.
+        """
+        return math.degrees(float(np.cumsum(self._bundle.rest_bend_rad).mean()))
+
     def deepest_mm(self, tilt_deg: float) -> float:
         """Depth at which the ferrule is about to hit the paper."""
         return MAX_DEPTH * self.spec.length_mm * math.cos(math.radians(min(tilt_deg, MAX_TILT_DEG)))

@@ -69,6 +69,7 @@ def _sideways_mm(a: Pose, b: Pose) -> float:
 TILTS_DEG = (0.0, 7.5, 15.0, 30.0)
 """Tilts for which the push is solved; between them it is interpolated."""
 GRAVITY_M_S2 = 9.81
+ALONG_RAD = 1e-6
 LEVEL = (0.0, 0.0, 1.0)
 
 
@@ -128,6 +129,22 @@ def leaning_with(pose: Pose, normal: tuple[float, float, float]) -> Pose:
     share = math.acos(nz) / math.hypot(nx, ny)  # of (ny, -nx, 0), the cross product of the normal and the level one
     level = rotation.of_vector((share * ny, share * -nx, 0.0))
     return Pose(*pose.position_mm, *rotation.product(level, rotation.unit(pose.quaternion)))
+
+
+def bent_toward(pose: Pose, tilt_deg: float, heading_deg: float, set_lean_deg: float) -> float:
+    """Direction into which the bundle bends: that of the lean, and for a brush almost upright that of its own set.
+
+    The paper pushes at the tip, so the bundle bends to where its tip lies beside the ferrule's axis. The lean carries
+    the tip toward `heading_deg`, and the set of hair that has been pressed carries it along the wrist's x as far as a
+    lean of `set_lean_deg` would. Without the set, a brush that leans by a tenth of a degree would bend into any
+    direction.
+    """
+    along, _, _ = rotation.columns(rotation.unit(pose.quaternion))
+    wrist_deg = math.degrees(math.atan2(along[1], along[0]))
+    off = math.radians(math.remainder(heading_deg - wrist_deg, 360.0))
+    if abs(off) < ALONG_RAD:
+        return heading_deg
+    return wrist_deg + math.degrees(math.atan2(tilt_deg * math.sin(off), tilt_deg * math.cos(off) + set_lean_deg))
 
 
 @functools.lru_cache(maxsize=8)

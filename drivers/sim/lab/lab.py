@@ -29,6 +29,8 @@ from drivers.sim.world import World
 ARCS_PORT, RTDE_PORT, CAN_PORT = 30004, 30010, 29536
 CAMERA_PORTS = (8080, 8081)
 ROOM_FPS = 5.0
+MOST_ROUNDS = 3.0
+"""The sensor's rounds come faster with simulated time, up to this many times: what one process can send and read."""
 ADDRESSES = 200
 """How many labs of one seed can be open at once on a machine."""
 
@@ -54,7 +56,10 @@ class UnknownLab:
         self.facts = self._clean if trap is None else spring(self._clean, trap)
         self.host = _free_address(seed)
         ports = {"arcs_port": ARCS_PORT, "rtde_port": RTDE_PORT, "force_port": CAN_PORT}
-        config = replace(self.facts.config, camera_port=CAMERA_PORTS[self.facts.sheet_camera], **ports)
+        force_hz = self.facts.config.force_hz * min(max(rate, 1.0), MOST_ROUNDS)
+        config = replace(
+            self.facts.config, camera_port=CAMERA_PORTS[self.facts.sheet_camera], force_hz=force_hz, **ports
+        )
         self.rig = LoopbackRig(config, self.host)
         self.world: World = self.rig.world
         self.cabinet: Cabinet = self.rig.arcs.cabinet

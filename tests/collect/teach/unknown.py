@@ -156,6 +156,12 @@ async def first_day(person: InLab, rig_path: Path, *, armed: bool = True) -> Pat
         return None
 
 
+def newest_session(rig_path: Path) -> Path:
+    """The folder of the last proof's recording."""
+    proofs = sorted(rig_path.parent.glob("rig.proof-*"), key=lambda folder: int(folder.name.rpartition("-")[2]))
+    return max((proofs[-1] / "sessions").iterdir())
+
+
 @dataclass(frozen=True, slots=True)
 class Errors:
     """What a first day got wrong; base frame, against the truth."""

@@ -28,7 +28,7 @@ def test_a_clean_hinge_is_found_exactly(contact_mm: float, stiffness: float, off
     z_mm = np.arange(120.6, 119.5, -step_mm)
     found = find_contact(z_mm, hinge(z_mm, contact_mm, stiffness, offset_n), np.full(z_mm.size, 50), NOISE_N)
     assert found.z_mm == pytest.approx(contact_mm, abs=1e-5)
-    assert found.stiffness_n_mm == pytest.approx(stiffness, rel=1e-4)
+    assert found.spring.n_mm == pytest.approx(stiffness, rel=1e-4)
     assert found.samples == 50 * z_mm.size
 
 
@@ -74,7 +74,7 @@ def test_no_rise_is_no_contact(force_n: np.ndarray) -> None:
 
 
 def test_two_heights_are_too_few() -> None:
-    with pytest.raises(StepError, match="three heights"):
+    with pytest.raises(StepError, match="3 are needed"):
         find_contact(np.array([120.0, 119.0]), np.array([0.0, 1.0]), np.array([9, 9]), NOISE_N)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from collect.errors import StepError
 from collect.rig.config_touch import ForceTouchConfig
 from collect.touch.force import Contact, Reading, touch_by_force
-from collect.touch.heights import Reach
+from collect.touch.heights import SPAN_SIGMAS, Reach
 from drivers.sim.brush.brush import Brush, BrushSpec
 from drivers.sim.brush.contact import Reaction
 from drivers.sim.config import SimConfig
@@ -34,12 +35,19 @@ class Felt:
         self.noise_n = NOISE_N
         self.samples = 0
         self.deepest_mm = -math.inf
+        self.rests = 0
+        self.way_mm = 0.0
+        self._z_mm: float | None = None
 
     async def rest(self, z_mm: float, samples: int) -> Reading:
         depth_mm = (self._touch_z_mm - z_mm) * math.cos(math.radians(self._lean_deg))
         self.deepest_mm = max(self.deepest_mm, depth_mm)
         push_n = self._reaction.push_n(depth_mm, self._lean_deg) + self.drift_n * self.samples
         self.samples += samples
+        self.rests += 1
+        if self._z_mm is not None:
+            self.way_mm += abs(z_mm - self._z_mm) + (2.0 if z_mm > self._z_mm else 0.0)
+        self._z_mm = z_mm
         drawn = self._rng.normal(push_n, self.noise_n, samples)
         return Reading(z_mm, float(drawn.mean()), samples, float(drawn.std(ddof=1)))
 
@@ -63,29 +71,73 @@ async def touched(
     return contact.z_mm - truth, contact, probe
 
 
-async def test_200_touches_lie_within_50_um_of_the_truth_at_3_sigma(reaction: Reaction) -> None:
+async def test_200_touches_lie_within_a_tenth_of_the_truth_at_3_sigma(reaction: Reaction) -> None:
     found = [await touched(reaction, seed, ForceTouchConfig()) for seed in range(200)]
     errors = np.array([error for error, _, _ in found])
-    assert abs(errors.mean()) + 3.0 * errors.std(ddof=1) < 0.05
-    assert abs(errors.mean()) < 0.005
+    sys.stdout.write(
+        f"bias {errors.mean():+.4f} mm, sd {errors.std(ddof=1):.4f} mm, largest error {np.abs(errors).max():.3f} mm, "
+        f"{np.mean([probe.samples for _, _, probe in found]):.0f} samples a touch\n"
+    )
+    assert abs(errors.mean()) + 3.0 * errors.std(ddof=1) < 0.1
+    assert abs(errors.mean()) < 0.01
     # what a touch says of its own error is true
     assert errors.std(ddof=1) == pytest.approx(float(np.mean([c.sigma_mm for _, c, _ in found])), rel=0.2)
     assert max(probe.deepest_mm for _, _, probe in found) < 2.0, "a touch is no press"
 
 
+SENSOR_HZ, TOUCH_MM_S, REST_S = 200.0, 5.0, 0.3
+"""Rounds of the sensor, speed of a touch, and what a rest takes beside its samples and its way."""
+
+
+async def test_three_touches_at_each_of_four_points_take_three_minutes(reaction: Reaction) -> None:
+    spans, centres, minutes = list[float](), list[float](), list[float]()
+    for seed in range(40):
+        rng, spring, found, took_s = np.random.default_rng(seed), None, list[float](), 0.0
+        for _ in range(4):
+            truth, near_z_mm, touches = 120.0 + rng.uniform(-1.0, 1.0), None, list[float]()
+            for _ in range(3):
+                probe = Felt(reaction, truth, rng, lean_deg=rng.uniform(0.0, 1.0))
+                contact = await touch_by_force(probe, REACH, ForceTouchConfig(), spring, near_z_mm)
+                spring, near_z_mm = contact.spring, contact.z_mm
+                touches.append(contact.z_mm - truth)
+                took_s += probe.samples / SENSOR_HZ + probe.way_mm / TOUCH_MM_S + probe.rests * REST_S
+            found.append(float(np.mean(touches)))
+            spans.append(max(touches) - min(touches))
+        centres.append(float(np.mean(found)))
+        minutes.append(took_s / 60.0)
+    sys.stdout.write(
+        f"{np.mean(minutes):.1f} min (most {max(minutes):.1f}); middle of the plane: bias {np.mean(centres):+.4f} mm, "
+        f"sd {np.std(centres):.4f} mm; largest span of three touches {max(spans):.3f} mm\n"
+    )
+    assert max(minutes) < 4.5
+    assert np.mean(minutes) < 3.5
+    assert max(abs(centre) for centre in centres) < 0.05
+    assert max(spans) < SPAN_SIGMAS * ForceTouchConfig().sigma_mm
+
+
 async def test_a_touch_that_begins_where_the_last_one_was_is_as_good(reaction: Reaction) -> None:
-    rng, errors = np.random.default_rng(7), list[float]()
-    near_z_mm: float | None = None
-    for _ in range(40):
-        near_z_mm = (await touch_by_force(Felt(reaction, 120.4, rng), REACH, ForceTouchConfig(), near_z_mm)).z_mm
-        errors.append(near_z_mm - 120.4)
-    assert abs(float(np.mean(errors))) + 3.0 * float(np.std(errors)) < 0.06
+    rng = np.random.default_rng(7)
+    first = await touch_by_force(Felt(reaction, 120.4, rng), REACH, ForceTouchConfig())
+    probes = [Felt(reaction, 120.4, rng) for _ in range(40)]
+    found = [await touch_by_force(probe, REACH, ForceTouchConfig(), first.spring, first.z_mm) for probe in probes]
+    errors = np.array([contact.z_mm for contact in found]) - 120.4
+    assert abs(errors.mean()) + 3.0 * errors.std(ddof=1) < 0.15
+    assert np.mean([probe.samples for probe in probes]) < 2000
+
+
+@pytest.mark.parametrize("moved_mm", [-0.7, -0.3, 0.3, 0.7])
+async def test_a_sheet_that_moved_since_the_last_touch_is_found(reaction: Reaction, moved_mm: float) -> None:
+    rng = np.random.default_rng(3)
+    first = await touch_by_force(Felt(reaction, 120.0, rng), REACH, ForceTouchConfig())
+    moved = Felt(reaction, 120.0 + moved_mm, rng)
+    contact = await touch_by_force(moved, REACH, ForceTouchConfig(), first.spring, first.z_mm)
+    assert contact.z_mm == pytest.approx(120.0 + moved_mm, abs=0.13)
 
 
 async def test_a_slow_drift_of_the_sensor_is_no_force(reaction: Reaction) -> None:
     # a tenth of a mN every 1000 samples: over a touch as much as the brush pushes at half a mm
     errors = [(await touched(reaction, seed, ForceTouchConfig(), drift_n=1e-7))[0] for seed in range(30)]
-    assert abs(float(np.mean(errors))) < 0.02
+    assert abs(float(np.mean(errors))) < 0.03
 
 
 async def test_a_quieter_sensor_needs_fewer_samples(reaction: Reaction) -> None:
@@ -110,6 +162,6 @@ async def test_a_brush_that_touches_at_the_start_is_refused(reaction: Reaction) 
 
 
 async def test_a_sensor_that_is_too_noisy_says_so(reaction: Reaction) -> None:
-    config = ForceTouchConfig(max_samples=8000)
+    config = ForceTouchConfig(max_samples=2000)
     with pytest.raises(StepError, match="too noisy for this brush"):
         await touch_by_force(Felt(reaction, 120.0, np.random.default_rng(1)), REACH, config)

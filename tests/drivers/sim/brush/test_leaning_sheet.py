@@ -10,7 +10,8 @@ import pytest
 
 from drivers.geometry import brush_pose
 from drivers.samples import Pose
-from drivers.sim.brush.contact import leaning_with
+from drivers.sim.brush.brush import Brush, BrushSpec
+from drivers.sim.brush.contact import bent_toward, leaning_with
 from drivers.sim.config import SimConfig, Table
 from drivers.sim.world import World
 
@@ -84,3 +85,12 @@ def test_the_push_is_along_the_normal() -> None:
     assert np.linalg.norm(push) > 0.05
     # seen by a tool that points straight down, its x along the paper's
     assert push / np.linalg.norm(push) == pytest.approx([nx, -ny, -nz], abs=1e-9)
+
+
+def test_a_lean_across_the_set_turns_the_bend_by_45_deg_where_both_carry_the_tip_equally_far() -> None:
+    set_deg = Brush(BrushSpec(set_deg=9.0)).set_lean_deg
+    assert set_deg == pytest.approx(9.0 / 6.0, rel=0.06), "cut into links, a little more"
+    upright = brush_pose(0.0, 0.0, 0.0)
+    wrist_deg = bent_toward(upright, 0.0, 90.0, set_deg)
+    assert bent_toward(upright, set_deg, wrist_deg + 90.0, set_deg) == pytest.approx(wrist_deg + 45.0)
+    assert bent_toward(upright, 20.0 * set_deg, wrist_deg + 90.0, set_deg) == pytest.approx(wrist_deg + 90.0, abs=3.0)
