@@ -119,7 +119,7 @@ class _Person:
 
     def _typed(self, words: str) -> str:
         seen = self._lab.seen()
-        host, port, _ = seen.can
+        host, port, bus = seen.can
         answers = {
             "address of the cabinet": seen.host,
             "stream": " ".join(seen.streams),
@@ -129,7 +129,7 @@ class _Person:
             "side of a marker": f"{seen.marker_mm:g}",
             "r: radius": f"{seen.radius_mm:g}",
             "l: length": f"{seen.length_mm:g}",
-            "can bus": f"{host}:{port}",
+            "can bus": f"{host}:{port}/{bus}",
             "serial line": "" if seen.ink is None else seen.ink[1],
         }
         return next((answer for part, answer in answers.items() if part in words), "")

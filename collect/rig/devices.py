@@ -129,9 +129,9 @@ def _resolved(host: str) -> str:
 
 
 @contextlib.contextmanager
-def sole_driver(config: RigConfig) -> Generator[None]:
+def sole_driver(host: str, port: int) -> Generator[None]:
     """Reserve the arm at this address against other processes of this machine, of any user. Raises `ConfigError`."""
-    address = f"{_resolved(config.robot.host)}:{config.robot.port}"
+    address = f"{_resolved(host)}:{port}"
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(claimed(f"brushloop-arm-{hashlib.sha256(address.encode()).hexdigest()[:16]}"))
@@ -149,7 +149,7 @@ async def connected(config: RigConfig, clock: Clock, on_notice: Callable[[str], 
     brushloop on this machine drives the arm: closing ours would stop its motion.
     """
     async with contextlib.AsyncExitStack() as stack:
-        stack.enter_context(sole_driver(config))
+        stack.enter_context(sole_driver(config.robot.host, config.robot.port))
         camera = make_camera(config, clock, on_notice)
         stack.push_async_callback(camera.close)
         camera_identity = await camera.connect()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import AsyncGenerator, Generator
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
@@ -11,7 +12,8 @@ from collect.errors import StepError
 from collect.operator import Choice
 from collect.teach.arm_reader import Address, ArmReader, reading
 from collect.teach.errors import CannotTeach
-from collect.teach.guide import Brought, Guide, Picture, Shown, Target, Tone, WentBack
+from collect.teach.guide import Brought, Guide, Picture, Shown, Target, TargetKind, Tone, WentBack
+from collect.teach.jog import jogged
 from collect.teach.store import Notebook, StepName, Taught, TaughtFile, Value, now_utc, touch_of
 from drivers.clock import Clock
 from drivers.samples import Pose
@@ -19,6 +21,10 @@ from drivers.samples import Pose
 ARM = Choice("a", "let it move: I look at the cell, my hand is at the emergency stop")
 STAY = Choice("x", "leave it where it is")
 YES, NO = Choice("y", "yes"), Choice("n", "no")
+JOGGED: frozenset[TargetKind] = frozenset(
+    {"pin", "board-corner", "sheet-corner", "well", "well-rim", "wipe", "wash-pot", "park"}
+)
+"""Places to which the last millimetres may be jogged."""
 
 
 class Day:
@@ -72,6 +78,10 @@ class Day:
         """Show lines to the person."""
         await self.guide.show(Shown(lines, picture, tone))
 
+    async def working(self, what: str) -> None:
+        """Say what is at work until the next finding or question."""
+        await self.say(what, tone="progress")
+
     async def yes(self, question: str, *, default: bool) -> bool:
         """Ask for yes or no."""
         return await self.guide.choose(question, (YES, NO), "y" if default else "n") == "y"
@@ -104,16 +114,25 @@ class Day:
     async def touch(self, reader: ArmReader, target: Target, how: str, name: str) -> Pose | None:
         """Have the tip brought to a thing, and note where the flange is then; None if the person skips it.
 
-        A thing that was touched before is not asked for again. Raises `WentBack`.
+        A thing that was touched before is not asked for again. The person may jog to it where the arm is armed.
+        Raises `WentBack`.
         """
         if name in self.notebook.touches:
             return self.notebook.touches[name].pose()
-        match await self.guide.bring(target, how):
+        target = replace(target, may_jog=self.armed and target.kind in JOGGED)
+        brought = await self.guide.bring(target, how)
+        while brought is Brought.JOG:
+            if not target.may_jog:
+                await self.say("Nothing is moved without --arm: guide the arm by hand.", tone="warning")
+            elif await jogged(self, how) is Brought.DONE:
+                break
+            brought = await self.guide.bring(target, how)
+        match brought:
             case Brought.BACK:
                 raise WentBack
             case Brought.SKIP:
                 return None
-            case Brought.DONE:
+            case Brought.DONE | Brought.JOG:
                 flange = await reader.flange()
                 self.save(self.notebook.with_touch(name, touch_of(flange)))
                 return flange

@@ -21,6 +21,7 @@ TargetKind = Literal[
     "sheet-corner",
     "well",
     "well-rim",
+    "wipe",
     "wash-pot",
     "park",
     "hold-board",
@@ -38,6 +39,8 @@ class Target:
     """Which one, from 0: direction of the pin, turn of the wrist of an upright brush, pose of a held board."""
     corner: str = ""
     """Which corner: `lower left`, `lower right`, `upper right` or `upper left`, as the print names it."""
+    may_jog: bool = False
+    """Whether the tip may also be brought there by keys: the arm was armed."""
 
 
 class Brought(StrEnum):
@@ -48,9 +51,11 @@ class Brought(StrEnum):
     """Leave this step; what it had measured so far is forgotten."""
     SKIP = "skip"
     """Go on without it, where the step can."""
+    JOG = "jog"
+    """Bring it there by keys; only where the target may be jogged to."""
 
 
-Tone = Literal["finding", "warning", "trouble"]
+Tone = Literal["finding", "warning", "trouble", "progress"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +65,8 @@ class Shown:
     lines: tuple[str, ...]
     picture: Picture | None = None
     tone: Tone = "finding"
-    """A warning can be gone on from; trouble ends the step, and its last line names the way out."""
+    """A warning can be gone on from; trouble ends the step, and its last line names the way out. Progress says what is
+    at work now, and need not be kept."""
 
 
 @dataclass(frozen=True, slots=True)

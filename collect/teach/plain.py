@@ -11,7 +11,7 @@ from collect.operator import Choice
 from collect.teach.guide import Brought, JogStep, JogView, LeftOff, Shown, StepState, Target, WentBack
 from sessions.terminal import say
 
-BACK, SKIP, QUIT = "back", "skip", "quit"
+BACK, SKIP, JOG, QUIT = "back", "skip", "jog", "quit"
 MARKS = {"open": "  ", "current": "->", "taught": "ok"}
 AXES = {"x", "y", "z"}
 
@@ -40,7 +40,7 @@ class PlainGuide:
 
     async def show(self, what: Shown) -> None:
         """Print the lines; write a picture into the folder and print its path."""
-        head = {"finding": "", "warning": "warning: ", "trouble": "TROUBLE: "}[what.tone]
+        head = {"finding": "", "warning": "warning: ", "trouble": "TROUBLE: ", "progress": "... "}[what.tone]
         for number, line in enumerate(what.lines):
             say(f"  {head if number == 0 else ''}{line}")
         if what.picture is not None:
@@ -80,7 +80,8 @@ class PlainGuide:
 
     async def bring(self, target: Target, how: str) -> Brought:
         """Print the request and wait for Enter."""
-        say(how, f"  Enter: it is there; {SKIP}; {BACK}")
+        jog = f"{JOG}: by keys; " if target.may_jog else ""
+        say(how, f"  Enter: it is there; {jog}{SKIP}; {BACK}")
         while True:
             match (await self._raw()).strip().lower():
                 case "":
@@ -89,8 +90,10 @@ class PlainGuide:
                     return Brought.SKIP
                 case "back":
                     return Brought.BACK
+                case "jog" if target.may_jog:
+                    return Brought.JOG
                 case other:
-                    say(f"  {other!r} is none of Enter, {SKIP}, {BACK}")
+                    say(f"  {other!r} is none of Enter, {f'{JOG}, ' if target.may_jog else ''}{SKIP}, {BACK}")
 
     async def jog(self, view: JogView) -> JogStep | Brought:
         """Read a step such as `z -0.1`."""

@@ -168,6 +168,9 @@ class ImagePicture(Container):
         self._inner.image = Image.fromarray(image)
 
 
+AnyPicture = CellPicture | SixelPicture | ImagePicture
+
+
 class Pictures:
     """Makes picture widgets of the kind that this terminal shows best. Make it before the app takes the terminal."""
 
@@ -175,7 +178,7 @@ class Pictures:
         self.camera_shown = preview != "off"
         self._make = _best_kind() if preview == "auto" else CellPicture
 
-    def make(self, id: str) -> CellPicture | SixelPicture | ImagePicture:  # noqa: A002 - textual's name
+    def make(self, id: str) -> AnyPicture:  # noqa: A002 - textual's name
         """Make a widget."""
         return self._make(id)
 

@@ -17,6 +17,7 @@ from collect.headless import no_pose_text
 from collect.tui.keys import RUN_BAR, keys_in
 from collect.tui.panes import LEGEND, CapturePane, Grid, figures_content, sheet_content, sheet_title
 from collect.tui.pictures import Pictures
+from collect.tui.steps_screen import NARROW_COLUMNS
 from collect.tui.text import SHORT_STOP, SOFTWARE_STOP, one_line, plain, plot
 from collect.tui.widgets import KeyBar, Line, entitle
 
@@ -24,7 +25,7 @@ OVER = "Over: q leaves"
 GOES_ON = "The same command goes on from here; this screen does not."
 STOP_SENT = "STOP SENT"
 WARNING = "warning: "
-NARROW_COLUMNS, TALL_ROWS = 110, 36
+TALL_ROWS = 36
 PANES = ("overview", "capture", "camera")
 TRACE_ROWS = 4
 

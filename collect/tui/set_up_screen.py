@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from textual import events
-from textual.app import ComposeResult
-from textual.binding import Binding, BindingType
-from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
-from textual.screen import Screen
 
 from collect.engine.snapshot import EngineView, Fact, SetUpStep, Snapshot, Standing
 from collect.headless import no_pose_text
@@ -19,9 +13,8 @@ from collect.tui.keys import SET_UP_BAR, keys_in
 from collect.tui.panes import target_text
 from collect.tui.pictures import Pictures
 from collect.tui.question_screens import answer_by_key, choices_content
-from collect.tui.run_screen import NARROW_COLUMNS
+from collect.tui.steps_screen import StepsScreen
 from collect.tui.text import SOFTWARE_STOP, force_bar, one_line, plain, spark, tip_text
-from collect.tui.widgets import KeyBar, Line
 
 SIGNS = {
     Standing.TO_COME: ("·", "dim"),
@@ -36,63 +29,17 @@ FORCE_SCALE_N = 0.1
 BAR_COLUMNS = 30
 
 
-class SetUpScreen(Screen[None]):
+class SetUpScreen(StepsScreen):
     """One screen for all steps: the list, what was measured, the live figures, the question."""
 
     DEFAULT_CSS = """
-    SetUpScreen #set-up-title { height: 1; padding: 0 1; background: $panel; text-style: bold; text-wrap: nowrap; }
-    SetUpScreen #set-up-title.-silent { background: $error; color: $text; }
-    SetUpScreen #set-up-body { height: 1fr; }
-    SetUpScreen #steps { width: 26; padding: 0 1; border-right: solid $foreground 40%; height: 100%; }
-    SetUpScreen #found { width: 1fr; height: 1fr; padding: 0 1; }
-    SetUpScreen #set-up-camera { width: 34%; height: 100%; padding: 0 1; }
-    SetUpScreen.-narrow #set-up-camera { display: none; }
-    SetUpScreen.-picture #set-up-camera { display: block; width: 100%; }
-    SetUpScreen.-narrow.-picture #steps, SetUpScreen.-narrow.-picture #found-pane { display: none; }
-    SetUpScreen #live { height: 5; padding: 0 1; border-top: solid $foreground 40%; text-wrap: nowrap; }
-    SetUpScreen #question-box { height: auto; max-height: 13; padding: 0 1; border: heavy $warning; display: none; }
-    SetUpScreen.-asking #question-box { display: block; }
-    SetUpScreen #set-up-note { height: 1; padding: 0 1; background: $panel; }
+    SetUpScreen #title.-silent { background: $error; color: $text; }
     """
-    BINDINGS: ClassVar[list[BindingType]] = [Binding("tab", "picture", "Camera")]
 
     def __init__(self, engine: EngineView, pictures: Pictures) -> None:
-        super().__init__()
+        super().__init__(pictures.make("picture") if pictures.camera_shown else None, SET_UP_BAR)
         self._engine = engine
         self._prompt: Prompt | None = None
-        self._title, self._steps, self._found = Line("set-up-title"), Line("steps"), Line("found-text")
-        self._live, self._question, self._note = Line("live"), Line("question-text"), Line("set-up-note")
-        self._keys = KeyBar(SET_UP_BAR)
-        self._camera = pictures.make("set-up-camera")
-        self._with_camera = pictures.camera_shown
-
-    def compose(self) -> ComposeResult:
-        """Lay out list, measurements, live figures, question."""
-        yield self._title
-        with Horizontal(id="set-up-body"):
-            yield self._steps
-            with Vertical(id="found-pane"), VerticalScroll(id="found"):
-                yield self._found
-            if self._with_camera:
-                yield self._camera
-        yield self._live
-        with VerticalScroll(id="question-box") as box:
-            box.can_focus = False
-            yield self._question
-        yield self._note
-        yield self._keys
-
-    def on_resize(self, event: events.Resize) -> None:
-        """Show the camera beside the measurements where there is room."""
-        self.set_class(event.size.width < NARROW_COLUMNS, "-narrow")
-
-    def action_picture(self) -> None:
-        """Show the camera instead of the measurements, on a narrow screen."""
-        self.toggle_class("-picture")
-
-    def stop_sent(self) -> None:
-        """Show at once that a stop key was pressed."""
-        self._note.show(Content.styled(" STOP SENT ", "bold reverse"))
 
     def show(self, now: Snapshot) -> None:
         """Draw what differs."""
@@ -103,13 +50,13 @@ class SetUpScreen(Screen[None]):
         self._steps.show(_steps_content(now.set_up))
         self._found.show(_found_content(now.set_up))
         self._live.show(_live_content(now))
-        if now.picture is not None and self._camera.display:
-            self._camera.show(now.picture.image)
+        if now.picture is not None and self._picture is not None and self._picture.display:
+            self._picture.show(now.picture.image)
         self._prompt = now.prompt
         self.set_class(now.prompt is not None, "-asking")
         if now.prompt is not None:
             question = Content.styled(plain(now.prompt.question), "bold")
-            self._question.show(Content("\n").join((question, choices_content(now.prompt))))
+            self._asked.show(Content("\n").join((question, choices_content(now.prompt))))
         self._note.show(SOFTWARE_STOP)
         self._keys.show(keys_in(now.state, SET_UP_BAR))
 

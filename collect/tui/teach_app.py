@@ -34,10 +34,13 @@ q         leave; everything taught is kept, the same command goes on
 ctrl-q    the same while you type
 s, ctrl-c stop the arm at once (ctrl-c while you type)
 tab       picture, on a narrow screen
+page up   older findings; page down: newer ones
+j         with --arm: bring the tip the last millimetres by keys
 
-Jog: arrows move along base x and y, page up and down along z, 1 to 9
+Jog: arrows move along base x and y, page up and down along z, 1 to 4
 choose the size of a step. Every step is checked against the box that is
-known so far, and is slower than 50 mm/s.
+known so far: 25 mm around all that was touched and where your hand left
+the arm, 5 mm below. The arm makes it at 20 mm/s.
 
 {SOFTWARE_STOP}"""
 

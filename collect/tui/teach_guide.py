@@ -53,6 +53,11 @@ class Question:
     target: Target | None = None
     """What the tip is to be brought to."""
 
+    @property
+    def may_jog(self) -> bool:
+        """Whether it may be brought there by keys."""
+        return self.target is not None and self.target.may_jog
+
 
 @dataclass(frozen=True, slots=True)
 class TeachView:
@@ -68,6 +73,10 @@ class TeachView:
     tip_known: bool = False
     live: Picture | None = None
     """What the camera sees now, where that is known."""
+    doing: str = ""
+    """What is at work while nothing is asked; empty where no step has said so."""
+    doing_since_s: float = 0.0
+    """Since when, by `time.monotonic`."""
 
 
 class ScreenGuide:
@@ -76,7 +85,7 @@ class ScreenGuide:
     def __init__(self, findings: tuple[Shown, ...] = ()) -> None:
         """`findings` are those of an earlier run, which was stopped."""
         self._lock = threading.Lock()
-        self._view = TeachView(findings=findings)
+        self._view = TeachView(findings=findings, doing_since_s=time.monotonic())
         self._count = 0
         self._open: tuple[asyncio.AbstractEventLoop, asyncio.Future[Answer]] | None = None
         self._leaving = False
@@ -94,7 +103,10 @@ class ScreenGuide:
         self._change(steps=steps)
 
     async def show(self, what: Shown) -> None:
-        """Add a finding, and show its picture if it has one."""
+        """Add a finding, and show its picture if it has one; progress is shown until there is something newer."""
+        if what.tone == "progress":
+            self._change(doing=" ".join(what.lines), doing_since_s=time.monotonic())
+            return
         findings = (*self.view.findings, what)[-MOST_FINDINGS:]
         self._change(findings=findings, picture=self.view.picture if what.picture is None else what.picture)
 
@@ -178,7 +190,7 @@ class ScreenGuide:
         finally:
             with self._lock:
                 self._open = None
-                self._view = replace(self._view, question=None)
+                self._view = replace(self._view, question=None, doing="", doing_since_s=time.monotonic())
 
     def _change(self, **fields: Any) -> None:
         with self._lock:

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+import time
+from collections.abc import Iterable
 
 from textual import events
-from textual.app import ComposeResult
-from textual.binding import Binding, BindingType
-from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
-from textual.screen import Screen
+from textual.widget import Widget
 from textual.widgets import Input
 
 from collect.rig.optics import gray
 from collect.teach.guide import Brought, JogStep, JogView, Picture, Shown, StepState
 from collect.tui.pictures import Pictures
+from collect.tui.steps_screen import StepsScreen
 from collect.tui.teach_guide import Question, ScreenGuide, TeachView
 from collect.tui.text import SHORT_STOP, one_line, plain, tip_text
-from collect.tui.widgets import Key, KeyBar, Line
+from collect.tui.widgets import Key
 
 SIGNS = {"open": ("·", "dim"), "current": ("▶", "bold reverse"), "taught": ("✓", "bold $text-success")}
 TONES = {"finding": ("", ""), "warning": ("! ", "bold $text-warning"), "trouble": ("✗ ", "bold $text-error")}
-NARROW_COLUMNS = 110
 HIGH_ROWS = 32
 """Height from which there is room for what was taught, below each step."""
 JOG_KEYS = {
@@ -32,17 +30,19 @@ JOG_KEYS = {
     "pagedown": ("z", -1.0),
     "pageup": ("z", 1.0),
 }
-BASE_KEYS: tuple[Key, ...] = (("q", "leave, all is kept"), ("tab", "picture"), ("?", "help"))
+TYPING_STOP = "ctrl-c: software stop; red button: emergency stop"
+JOG: Key = ("j", "jog")
+BASE_KEYS: tuple[Key, ...] = (("q", "leave"), ("tab", "picture"), ("?", "help"))
 KEYS: dict[str, tuple[Key, ...]] = {
     "choose": (("s", "STOP"), ("enter", "default"), ("esc", "back"), *BASE_KEYS),
-    "number": (("ctrl-c", "STOP"), ("enter", "take"), ("esc", "back"), ("ctrl-q", "leave, all is kept")),
-    "text": (("ctrl-c", "STOP"), ("enter", "take"), ("esc", "back"), ("ctrl-q", "leave, all is kept")),
+    "number": (("ctrl-c", "STOP"), ("enter", "take"), ("esc", "back"), ("ctrl-q", "leave: all is kept")),
+    "text": (("ctrl-c", "STOP"), ("enter", "take"), ("esc", "back"), ("ctrl-q", "leave: all is kept")),
     "bring": (("s", "STOP"), ("enter", "it is there"), ("k", "skip"), ("esc", "back"), *BASE_KEYS),
     "jog": (
         ("s", "STOP"),
         ("arrows", "x y"),
         ("page up/down", "z"),
-        ("1-9", "step"),
+        ("1-4", "step"),
         ("enter", "there"),
         ("esc", "back"),
     ),
@@ -52,70 +52,29 @@ LEAVE: tuple[Key, ...] = (("q", "leave"),)
 GO_ON: tuple[Key, ...] = (("g", "go on"), *LEAVE)
 
 
-class TeachScreen(Screen[None]):
+class TeachScreen(StepsScreen):
     """Shows a `TeachView`; its keys answer the question."""
 
     DEFAULT_CSS = """
-    TeachScreen #teach-title { height: 1; padding: 0 1; background: $panel; text-style: bold; text-wrap: nowrap; }
-    TeachScreen #teach-body { height: 1fr; }
-    TeachScreen #teach-steps {
-        width: 27; height: 100%; padding: 0 1; border-right: solid $foreground 40%;
-        text-wrap: nowrap; text-overflow: ellipsis;
-    }
-    TeachScreen #teach-title { text-overflow: ellipsis; }
-    TeachScreen #teach-found { width: 1fr; height: 1fr; padding: 0 1; }
-    TeachScreen #teach-picture { width: 38%; height: 100%; padding: 0 1; }
-    TeachScreen.-narrow #teach-picture { display: none; }
-    TeachScreen.-narrow.-picture #teach-picture { display: block; width: 1fr; }
-    TeachScreen.-narrow.-picture #teach-found-pane { display: none; }
-    TeachScreen #teach-live { height: 1; padding: 0 1; background: $boost; text-wrap: nowrap; }
-    TeachScreen #teach-box { height: auto; max-height: 12; padding: 0 1; border: heavy $warning; display: none; }
-    TeachScreen.-asking #teach-box { display: block; }
-    TeachScreen #teach-input { display: none; height: 1; border: none; padding: 0; background: $boost; }
-    TeachScreen.-typing #teach-input { display: block; }
-    TeachScreen #teach-note { height: 1; padding: 0 1; background: $panel; text-wrap: nowrap; }
+    TeachScreen #answer { display: none; height: 1; border: none; padding: 0; background: $boost; }
+    TeachScreen.-typing #answer { display: block; }
     """
-    BINDINGS: ClassVar[list[BindingType]] = [Binding("tab", "picture", "Picture", priority=True)]
 
     def __init__(self, guide: ScreenGuide, name: str, pictures: Pictures) -> None:
-        super().__init__()
+        super().__init__(pictures.make("picture"), KEYS["busy"])
         self._guide = guide
         self._name = name
         self._question: Question | None = None
         self._drawn: TeachView | None = None
         self._step_mm = 0
         """Index of the size of a step by jog."""
-        self._title, self._steps, self._found = Line("teach-title"), Line("teach-steps"), Line("teach-found-text")
-        self._live, self._asked, self._note = Line("teach-live"), Line("teach-asked"), Line("teach-note")
-        self._input = Input(id="teach-input", select_on_focus=False)
-        self._picture = pictures.make("teach-picture")
-        self._keys = KeyBar(KEYS["busy"])
+        self._input = Input(id="answer", select_on_focus=False)
         self._over = ""
+        self._stop_sent = False
 
-    def compose(self) -> ComposeResult:
-        """Lay out steps, findings, picture, live pose, question, keys."""
-        yield self._title
-        with Horizontal(id="teach-body"):
-            yield self._steps
-            with Vertical(id="teach-found-pane"), VerticalScroll(id="teach-found") as found:
-                found.can_focus = False
-                yield self._found
-            yield self._picture
-        yield self._live
-        with VerticalScroll(id="teach-box") as box:
-            box.can_focus = False
-            yield self._asked
-            yield self._input
-        yield self._note
-        yield self._keys
-
-    def on_resize(self, event: events.Resize) -> None:
-        """Show the picture beside the findings where there is room."""
-        self.set_class(event.size.width < NARROW_COLUMNS, "-narrow")
-
-    def action_picture(self) -> None:
-        """Show the picture instead of the findings, on a narrow screen."""
-        self.toggle_class("-picture")
+    def below_the_question(self) -> Iterable[Widget]:
+        """The line that is typed."""
+        yield self._input
 
     @property
     def typing(self) -> bool:
@@ -133,7 +92,8 @@ class TeachScreen(Screen[None]):
 
     def stop_sent(self) -> None:
         """Show at once that a stop key was pressed."""
-        self._note.show(Content.styled(" STOP SENT ", "bold reverse"))
+        super().stop_sent()
+        self._stop_sent = True
 
     def show(self, now: TeachView, over: str = "", keys: tuple[Key, ...] = ()) -> None:
         """Draw what differs. `over` says how it ended, once it has, and `keys` what can be done then."""
@@ -141,6 +101,7 @@ class TeachScreen(Screen[None]):
         self._title.show(f"First day   {one_line(self._name)}{_where(now.steps)}")
         self._steps.show(_steps_content(now.steps, summaries=self.size.height >= HIGH_ROWS))
         self._live.show(_live_text(now))
+        assert self._picture is not None
         self._picture.show(_gray(now.live if self._guide.looking and now.live is not None else now.picture))
         if before is None or before.findings is not now.findings:
             self._found.show(Content("\n").join(_finding(shown) for shown in now.findings))
@@ -149,23 +110,24 @@ class TeachScreen(Screen[None]):
             self._ask(now.question, over, keys)
         if before is None or before.findings is not now.findings or before.question is not now.question:
             # Only after the layout is it known where the end is: the question takes its room from the findings.
-            found = self.query_one("#teach-found", VerticalScroll)
-            self.call_after_refresh(found.scroll_end, animate=False)
+            self.call_after_refresh(self._found_pane.scroll_end, animate=False)
+        if now.question is None and not over and not self._stop_sent:
+            self._note.show(_busy_text(now, time.monotonic()))
 
     def _ask(self, question: Question | None, over: str, keys: tuple[Key, ...]) -> None:
         """Show a question, or that something is at work, or that it is over."""
-        self._question = question
+        self._question, self._stop_sent = question, False
         self.set_class(question is not None or bool(over), "-asking")
         self.set_class(self.typing, "-typing")
         if question is None:
             self.set_focus(None)
             self._asked.show(over)
             self._keys.show(keys if over else KEYS["busy"])
-            self._note.show("" if over else f"at work; {SHORT_STOP}")
+            self._note.show("")
             return
         self._asked.show(_question_content(question, self._step_mm))
-        self._note.show(SHORT_STOP)
-        self._keys.show(KEYS[question.kind])
+        self._note.show(TYPING_STOP if self.typing else SHORT_STOP)
+        self._keys.show(_keys_of(question))
         if self.typing:
             self._input.value = ""
             self._input.placeholder = f"Enter: {question.default}" if question.default else ""
@@ -183,8 +145,8 @@ class TeachScreen(Screen[None]):
             self._guide.back(question.number)
         elif question.kind == "choose":
             self._chosen(question, event)
-        elif question.kind == "bring" and event.key in ("enter", "k"):
-            self._guide.answer(question.number, Brought.DONE if event.key == "enter" else Brought.SKIP)
+        elif question.kind == "bring":
+            self._brought(question, event)
         elif question.kind == "jog" and question.jog is not None:
             self._jogged(question, question.jog, event)
 
@@ -215,11 +177,17 @@ class TeachScreen(Screen[None]):
             event.stop()
             self._guide.answer(question.number, str(event.character))
 
+    def _brought(self, question: Question, event: events.Key) -> None:
+        answers = {"enter": Brought.DONE, "k": Brought.SKIP} | ({"j": Brought.JOG} if question.may_jog else {})
+        if event.key in answers:
+            self._guide.answer(question.number, answers[event.key])
+
     def _jogged(self, question: Question, jog: JogView, event: events.Key) -> None:
         if event.key == "enter":
             self._guide.answer(question.number, Brought.DONE)
         elif event.key in JOG_KEYS:
             event.stop()
+            event.prevent_default()
             axis, sign = JOG_KEYS[event.key]
             size_mm = jog.steps_mm[min(self._step_mm, len(jog.steps_mm) - 1)]
             self._guide.answer(question.number, JogStep(axis, sign * size_mm))  # pyright: ignore[reportArgumentType]
@@ -257,6 +225,17 @@ def _finding(shown: Shown) -> Content:
     sign, style = TONES[shown.tone]
     first, *rest = shown.lines
     return Content.styled("\n".join([f"{sign}{plain(first)}", *(plain(line) for line in rest)]), style)
+
+
+def _keys_of(question: Question) -> tuple[Key, ...]:
+    keys = KEYS[question.kind]
+    return (*keys[:2], JOG, *keys[2:]) if question.may_jog else keys
+
+
+def _busy_text(now: TeachView, now_s: float) -> str:
+    """What is at work, and for how long: nothing may look as if it hung."""
+    what, since_s = now.doing or "at work", now.doing_since_s
+    return f"{one_line(what)}, {max(now_s - since_s, 0.0):.0f} s; {SHORT_STOP}"
 
 
 def _live_text(now: TeachView) -> str:

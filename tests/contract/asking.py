@@ -19,7 +19,7 @@ QUESTION = "Keep a hand at the emergency stop. May the arm move? [y/N] "
 
 def permission_refused(config: pytest.Config, rig: RigConfig, tests: int) -> str | None:
     """Tell and ask; None for a yes, else why no test may move the arm. Raises what connecting raises."""
-    with sole_driver(rig):
+    with sole_driver(rig.robot.host, rig.robot.port):
         identity, where, condition = asyncio.run(_look(rig))
     capture = config.pluginmanager.getplugin("capturemanager")
     assert capture is not None

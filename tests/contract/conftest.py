@@ -102,7 +102,7 @@ async def rig(request: pytest.FixtureRequest) -> AsyncIterator[RigConfig]:
 
 @pytest.fixture
 def the_only_driver(rig: RigConfig) -> Iterator[None]:
-    with sole_driver(rig):
+    with sole_driver(rig.robot.host, rig.robot.port):
         yield
 
 

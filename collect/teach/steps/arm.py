@@ -28,6 +28,7 @@ class ArmStep:
     async def teach(self, day: Day) -> None:
         """Ask for the address and read everything else. Raises `CannotTeach`, `DeviceError`."""
         address = await self._address(day)
+        await day.working(f"asking {address} who it is")
         framing = await find_framing(address)
         async with reading(address, framing) as reader:
             cabinet = await reader.cabinet(framing)

@@ -86,6 +86,7 @@ class BrushStep:
             day.keep("brush", "ink.device.ml_per_revolution", config.ml_per_revolution, how, unit="ml")
 
     async def _primed(self, day: Day, config: InkDeviceConfig, clock: Clock) -> None:
+        await day.working(f"asking {config.port} who it is")
         device = make_ink(config, clock)
         try:
             identity = await device.connect()
@@ -95,6 +96,7 @@ class BrushStep:
             while await day.yes(
                 f"Give {PRIME_ML:g} ml, to fill its tube? The well must stand under it.", default=False
             ):
+                await day.working(f"giving {PRIME_ML:g} ml")
                 await device.dose(min(PRIME_ML, config.dose_ml))
                 level = await device.level()
                 if level is not None:

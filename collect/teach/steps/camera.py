@@ -54,7 +54,7 @@ class CameraStep:
     """Source, settings, frame rate, print of the board, lens."""
 
     name: StepName = "camera"
-    title = "Find the camera, its settings and its lens"
+    title = "Find the camera"
     minutes = 12
     needs: tuple[StepName, ...] = ("arm",)
 
@@ -65,6 +65,7 @@ class CameraStep:
         if "camera.source" not in day.notebook.values:
             await self._source(day)
         async with taught_camera(day.notebook, day.clock) as camera:
+            await day.working("counting frames, looking for the board")
             if "aside.frame_rate_hz" not in day.notebook.values:
                 rate_hz = await frame_rate_hz(camera)
                 day.keep("camera", "aside.frame_rate_hz", rate_hz, "frames counted", unit="Hz")
@@ -119,6 +120,7 @@ class CameraStep:
 
     async def _looked_at(self, day: Day, source: str) -> int | None:
         """Show a picture of a camera; return how many corners of the board it shows, None where it gives none."""
+        await day.working(f"waiting for a picture of {source}")
         try:
             async with opened(source, day.clock) as camera:
                 picture = await still(camera, day.clock)
@@ -138,7 +140,9 @@ class CameraStep:
         await day.say("The board: a print of `brushloop camera board`. Its name stands along its lower edge.")
         across = await day.guide.number("Squares along its longer side, as printed", "squares", 3, 50, None)
         along = await day.guide.number("Squares along its shorter side, as printed", "squares", 3, 50, None)
-        square_mm = await day.guide.number("Side of a square (ten of them by calipers)", "mm", 2.0, 100.0, None)
+        square_mm = await day.guide.number(
+            "Side of one square (ten of them by calipers, divided by ten)", "mm", 2.0, 100.0, None
+        )
         marker_mm = await day.guide.number("Side of a marker", "mm", 1.0, 100.0, 0.75 * square_mm)
         dictionary = await day.guide.text("Markers of the print", "DICT_5X5_1000")
         how = "typed from the board's print"
@@ -195,6 +199,7 @@ class CameraStep:
                 return None
             if views and (todo := still_missing(views)):
                 await day.say(*todo, picture=coverage_picture(views))
+        await day.working("computing the lens")
         fitted = await asyncio.to_thread(fit_lens, views)
         for warning in (*fitted.warnings, *fitted.guidance):
             await day.say(warning, tone="warning")
@@ -204,13 +209,13 @@ class CameraStep:
         """Take one photograph of the held board; False where the person skips it."""
         target = Target("hold-board", int(path.stem))
         how = f"Cover the sheet, and hold the board before the camera, {where}, all of it sharp; keep still."
-        match await day.guide.bring(target, how):
-            case Brought.BACK:
-                raise WentBack
-            case Brought.SKIP:
-                return False
-            case Brought.DONE:
-                picture = await take()
+        brought = await day.guide.bring(target, how)
+        if brought is Brought.BACK:
+            raise WentBack
+        if brought is not Brought.DONE:
+            return False
+        await day.working("looking for the board in the picture")
+        picture = await take()
         try:
             view = await asyncio.to_thread(find_board, picture, board_of(day.notebook), path.name)
         except CalibrationError as error:
@@ -236,6 +241,7 @@ class CameraStep:
             known=f"residual {fitted.rms_px:.2f} px"
             + ("" if reach is None else f", focal length to +-{max(reach):.1f} px (95 %)"),
         )
+        await day.say(f"Lens: residual {fitted.rms_px:.2f} px over {len(fitted.residuals_px)} photographs.")
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """No derived values: all values of this step were measured."""

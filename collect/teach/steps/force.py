@@ -19,6 +19,8 @@ from collect.teach.store import Notebook, StepName, Taught, now_utc
 from drivers.force.rounds import LOOPBACK_CHANNEL
 from drivers.samples import ForceSample
 
+CHANNEL = "can0"
+"""Of a gateway, where none was typed."""
 REST_S = 1.0
 """How long the sensor is listened to with nothing touching."""
 WAIT_S = 3.0
@@ -45,7 +47,7 @@ class ForceStep:
 
     async def teach(self, day: Day) -> None:
         """Find the sensor and have it pushed. Raises `CannotTeach`, `DeviceError`."""
-        question = "CAN bus of the force sensor: an interface such as can0, or HOST:PORT of a gateway; Enter: no sensor"
+        question = "CAN bus of the force sensor: can0, or HOST:PORT/can0 of a gateway; Enter: no sensor"
         if "aside.bus" not in day.notebook.values:
             bus = (await day.guide.text(question, "")).strip()
             with day.together():
@@ -67,6 +69,7 @@ class ForceStep:
         samples = list[ForceSample]()
         sensor = make_force(config_of(day.notebook), day.clock)
         try:
+            await day.working("listening to the sensor; let nothing touch the brush")
             identity = await sensor.connect()
             await sensor.bias(REST_S)
             sensor.listen(samples.append)
@@ -80,6 +83,7 @@ class ForceStep:
             )
             if await day.guide.bring(Target("push-sensor"), how) is not Brought.DONE:
                 raise WentBack
+            await day.working("waiting for the end of the push")
             force_n = await self._push(samples)
         finally:
             sensor.listen(None)
@@ -148,8 +152,8 @@ def _addressed(bus: str) -> dict[str, str | int]:
         return {"kind": "sri-m8123", "interface": "socketcan", "channel": bus}
     port, _, channel = rest.partition("/")
     if not port.isdecimal() or not 0 < int(port) < 65536:
-        raise CannotTeach(f"{bus!r} is no bus.", "Type can0, or HOST:PORT or HOST:PORT/CHANNEL of a gateway.")
-    at = {"kind": "sri-m8123", "interface": "socketcand", "channel": channel or LOOPBACK_CHANNEL}
+        raise CannotTeach(f"{bus!r} is no bus.", "Type can0, or HOST:PORT/can0 of a gateway.")
+    at = {"kind": "sri-m8123", "interface": "socketcand", "channel": channel or CHANNEL}
     return {**at, "host": host, "port": int(port)}
 
 

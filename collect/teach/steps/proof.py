@@ -60,6 +60,7 @@ class ProofStep:
         await self._keep(day, read_proof(session))
 
     async def _doctor(self, day: Day, rig: RigConfig) -> None:
+        await day.working("asking every device")
         findings = await examine(rig, day.clock)
         for finding in findings:
             await day.say(f"{finding.device}: {finding.identity or finding.address}; {finding.notes}")
@@ -106,7 +107,7 @@ class ProofStep:
                 return
             if now.step != doing:
                 doing = now.step
-                await day.say(doing)
+                await day.working(f"run: {doing}")
             if (asked := now.prompt) is not None:
                 engine.answer(asked.number, await day.guide.choose(asked.question, asked.choices, asked.default))
             await asyncio.sleep(POLL_S)

@@ -87,7 +87,7 @@ class TipStep:
         x, y, z = fit.offset_mm
         await day.say(
             f"{len(touches)} touches: the tip is at ({x:.2f}, {y:.2f}, {z:.2f}) mm from the flange, known to "
-            f"{fit.error_mm:.2f} mm (goal {GOOD_MM:g}); the touches scatter by {max(fit.residuals_mm):.2f} mm at most."
+            f"{fit.error_mm:.3f} mm (goal {GOOD_MM:g}); the touches scatter by {max(fit.residuals_mm):.2f} mm at most."
         )
         return fit.error_mm <= GOOD_MM
 

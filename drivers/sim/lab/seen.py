@@ -46,7 +46,7 @@ class Seen:
             "an unknown lab; simulated: nothing measured in it is a result on paper",
             f"robot     the pendant shows the address {self.host}",
             *(f"camera    {stream}" for stream in self.streams),
-            f"force     SRI M8123 on the socketcand gateway {host} port {port}, bus {bus}",
+            f"force     SRI M8123 on the gateway {host}:{port}/{bus}",
             f"ink       {ink}",
             f"print     ChArUco, {self.squares[0]} x {self.squares[1]} squares of {self.square_mm:g} mm, "
             f"markers of {self.marker_mm:g} mm, {self.dictionary}",

@@ -132,7 +132,7 @@ def test_an_interval_is_given_where_the_views_allow_it_and_then_holds_the_truth(
     few = fit_lens(views(5))
     assert few.focal_se_px is None
     assert few.focal_reach_px is None
-    assert any("more ways (5 so far): fewer than 6 earn no interval" in line for line in few.guidance)
+    assert any("1 more way (5 so far): 6 are needed" in line for line in few.guidance)
     held = 0
     for seed in range(6):
         fitted = fit_lens(views(7, seed=seed))

@@ -82,7 +82,7 @@ async def test_the_set_up_says_it_in_its_title_and_beside_the_tip() -> None:
     app = OperatorApp(FakeEngine(picture(set_up=SET_UP, tip_mm=None, no_pose_s=1.44)))
     async with app.run_test(size=(110, 30)) as pilot:
         await look(app, pilot)
-        assert str(app.screen.query_one("#set-up-title").render()).endswith("press H15-a5-r02, no pose for 1.4 s")
+        assert str(app.screen.query_one("#title").render()).endswith("press H15-a5-r02, no pose for 1.4 s")
         assert "Tip     no pose for 1.4 s" in str(app.screen.query_one("#live").render())
 
 

@@ -26,7 +26,7 @@ from collect.rig.devices import sole_driver
 rig = load_rig(Path(sys.argv[1]))
 if len(sys.argv) > 2:
     os.setuid(int(sys.argv[2]))
-with sole_driver(rig):
+with sole_driver(rig.robot.host, rig.robot.port):
     print("has it", flush=True)
     time.sleep(600)
 """
@@ -75,10 +75,10 @@ def test_another_temporary_folder_gets_no_second_driver_and_the_first_is_named(
 ):
     process = holder()
     with pytest.raises(ConfigError, match=rf"another brushloop is driving the arm at 127.*: process {process.pid} of "):
-        sole_driver(rig).__enter__()
+        sole_driver(rig.robot.host, rig.robot.port).__enter__()
     process.kill()
     process.wait()
-    with sole_driver(rig):
+    with sole_driver(rig.robot.host, rig.robot.port):
         pass
 
 
@@ -88,10 +88,10 @@ def test_another_user_is_refused_while_it_lasts_and_not_afterwards(
 ):
     process = holder(str(NOBODY))
     with pytest.raises(ConfigError, match=rf"process {process.pid} of (nobody|user {NOBODY})"):
-        sole_driver(rig).__enter__()
+        sole_driver(rig.robot.host, rig.robot.port).__enter__()
     process.kill()
     process.wait()
-    with sole_driver(rig):
+    with sole_driver(rig.robot.host, rig.robot.port):
         pass
 
 
@@ -100,18 +100,18 @@ def test_nothing_is_left_that_could_refuse_anybody(rig: RigConfig, tmp_path: Pat
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
     (tmp_path / "tmp").mkdir()
     for _ in range(2):
-        with sole_driver(rig):
+        with sole_driver(rig.robot.host, rig.robot.port):
             for _ in range(sole.WAITING + 10):
                 with pytest.raises(ConfigError, match="another brushloop"):
-                    sole_driver(rig).__enter__()
+                    sole_driver(rig.robot.host, rig.robot.port).__enter__()
             assert not list((tmp_path / "tmp").iterdir())
 
 
 def test_where_the_kernel_keeps_no_names_a_lock_that_all_may_open_does(rig: RigConfig, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sole.sys, "platform", "darwin")
     for _ in range(2):
-        with sole_driver(rig), pytest.raises(ConfigError, match="cannot be named"):
-            sole_driver(rig).__enter__()
+        with sole_driver(rig.robot.host, rig.robot.port), pytest.raises(ConfigError, match="cannot be named"):
+            sole_driver(rig.robot.host, rig.robot.port).__enter__()
     for left in Path("/tmp").glob("brushloop-arm-*.lock"):
         assert left.stat().st_mode & 0o777 == 0o666
         left.unlink()

@@ -17,7 +17,7 @@ from drivers.geometry import brush_pose
 
 STEPS = (
     StepState("arm", "Find the arm", 3, "taught", "192.0.2.7:30004"),
-    StepState("camera", "Find the camera, its settings and its lens", 12, "taught", "2048 x 1536, 8 Hz"),
+    StepState("camera", "Find the camera", 12, "taught", "2048 x 1536, 8 Hz"),
     StepState("tip", "Tip of the brush", 8, "current"),
     *(StepState(name, name.capitalize(), 5, "open") for name in ("sheet", "places", "brush", "force", "limits")),
     StepState("proof", "Proof", 6, "open"),
@@ -25,7 +25,12 @@ STEPS = (
 FOUND = Shown(("five directions: the tip is known to 0.11 mm", "residuals 0.10, 0.24, 0.08, 0.17, 0.21 mm"))
 WARNED = Shown(("direction 2 is like direction 1: lean the brush farther",), tone="warning")
 YES, NO = Choice("y", "yes, take it"), Choice("n", "no, touch it again")
-JOG = JogView("Lower the tip onto the paper.", (0.0, 0.1, -1.3), (0.02, 0.1, 1.0), "z = 97.900 mm is outside the box")
+JOG = JogView(
+    "Lower the tip onto the paper.",
+    (0.0, 0.1, -1.3),
+    (0.1, 0.5, 2.0, 5.0),
+    "not made: z = 97.900 mm is outside [98.200, 148.000] mm. Guide the arm by hand to go farther",
+)
 
 
 def board() -> np.ndarray:
@@ -63,7 +68,7 @@ class Asking:
             case "bring":
                 await guide.show(Shown(("the board as the camera sees it",), board()))
                 how = "Guide the tip to the pin by hand, the brush leaning toward the window, then press Enter."
-                return await guide.bring(Target("pin", 2), how)
+                return await guide.bring(Target("pin", 2, may_jog=True), how)
             case "jog":
                 while not isinstance(answer := await guide.jog(JOG), Brought):
                     self.answers.append(answer)

@@ -1,0 +1,127 @@
+"""Jog: the arm brings the tip to a place in small steps by key, each checked against the box that is known so far."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import AsyncGenerator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from scipy.spatial.transform import Rotation
+
+from collect.rig.devices import sole_driver
+from collect.teach.guide import Brought, JogStep, JogView, WentBack
+from collect.teach.maths.box import hull
+from collect.teach.maths.tip import tip_of
+from collect.teach.store import Notebook
+from drivers.arcs.robot import ArcsOptions, AuboArcs
+from drivers.errors import LimitExceeded
+from drivers.geometry import lean
+from drivers.limits import Limits
+from drivers.protocols import Robot
+from drivers.samples import Pose
+
+if TYPE_CHECKING:
+    from collect.teach.day import Day
+
+STEPS_MM = (0.1, 0.5, 2.0, 5.0)
+SPEED_MM_S, ACC_MM_S2 = 20.0, 200.0
+MOST_MM_S = 50.0
+"""The driver refuses anything faster."""
+ROOM_MM, BELOW_MM = 25.0, 5.0
+"""Room around what is known to be free: beside and above it, and below its lowest place."""
+LEAST_CONE_DEG, CONE_ROOM_DEG = 15.0, 1.0
+Tool = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Flange to tip: the offset in mm, and the turn about x, y and z of the flange in deg."""
+
+
+async def jogged(day: Day, what: str) -> Brought:
+    """Let the person jog until the tip is there: DONE, or BACK where the person leaves the jog.
+
+    Asks for the key that lets the arm move. Raises `CannotTeach` without `--arm`, `ConfigError`, and `DeviceError`
+    where the arm cannot make a step that the box allows.
+    """
+    try:
+        await day.may_move(f"Jog in steps of at most {STEPS_MM[-1]:g} mm, at {SPEED_MM_S:g} mm/s")
+    except WentBack:
+        return Brought.BACK
+    await day.working("powering the arm")
+    async with _enabled(day) as robot:
+        began, refused = await robot.where(), ""
+        while True:
+            here = await robot.where()
+            x, y, z = (now - then for now, then in zip(here.position_mm, began.position_mm, strict=True))
+            try:
+                answer = await day.guide.jog(JogView(what, (x, y, z), STEPS_MM, refused))
+            except WentBack:
+                return Brought.BACK
+            if isinstance(answer, Brought):
+                return answer
+            refused = await _step(robot, answer)
+
+
+async def _step(robot: Robot, step: JogStep) -> str:
+    """Make one step, or return why it is not made."""
+    if not any(math.isclose(abs(step.mm), size) for size in STEPS_MM):
+        return f"{step.mm:g} mm is none of the steps"
+    here = await robot.take_up()
+    x, y, z = (v + step.mm * (name == step.axis) for name, v in zip("xyz", here.position_mm, strict=True))
+    try:
+        await robot.move(replace(here, x_mm=x, y_mm=y, z_mm=z), speed_mm_s=SPEED_MM_S, acc_mm_s2=ACC_MM_S2)
+    except LimitExceeded as error:
+        return f"not made: {error.what}. Guide the arm by hand to go farther"
+    return ""
+
+
+@contextlib.asynccontextmanager
+async def _enabled(day: Day) -> AsyncGenerator[Robot]:
+    """The arm, powered, with its limits around what is known; stopped and left where it is at the end."""
+    book = day.notebook
+    host, port = str(book.get("robot.host")), int(book.number("robot.port"))
+    async with day.arm() as reader:
+        flange, cabinet = await reader.flange(), await reader.tool()
+    tool = taught_tool(book) or _as_set(cabinet)
+    robot = AuboArcs(_options(book, host, port, tool), limits_so_far(book, flange, tool), day.clock)
+    with sole_driver(host, port):
+        try:
+            await robot.connect()
+            await robot.enable()
+            await robot.take_up()
+            yield robot
+        finally:
+            await robot.close()
+
+
+def _options(book: Notebook, host: str, port: int, tool: Tool) -> ArcsOptions:
+    """As the pendant has it set, apart from the tool once that is taught."""
+    return ArcsOptions(host, port, *tool, framing="bare" if book.get("robot.framing") == "bare" else "sof")
+
+
+def taught_tool(book: Notebook) -> Tool | None:
+    """The tool as it was taught; None before that."""
+    if "robot.tcp_offset_mm" not in book.values:
+        return None
+    x, y, z = book.numbers("robot.tcp_offset_mm")
+    rx, ry, rz = book.numbers("robot.tcp_rotation_deg")
+    return (x, y, z), (rx, ry, rz)
+
+
+def _as_set(wire: Sequence[float]) -> Tool:
+    x, y, z, rx, ry, rz = wire
+    return (1e3 * x, 1e3 * y, 1e3 * z), (math.degrees(rx), math.degrees(ry), math.degrees(rz))
+
+
+def limits_so_far(book: Notebook, flange: Pose, tool: Tool) -> Limits:
+    """The smallest box around everything touched and where the hand has left the arm now, with some room.
+
+    The cone is as wide as the brush leans now: a jog turns nothing.
+    """
+    offset_mm, turn_deg = tool
+    here_mm = tip_of(flange, offset_mm)
+    touched = [tip_of(touch.pose(), offset_mm) for touch in book.touches.values()]
+    x_mm, y_mm, (low_mm, high_mm) = hull([here_mm, *touched], ROOM_MM)
+    turn = Rotation.from_quat(flange.quaternion) * Rotation.from_euler("ZYX", turn_deg[::-1], degrees=True)
+    qx, qy, qz, qw = (float(v) for v in turn.as_quat())
+    cone_deg = max(lean(Pose(*here_mm, qx, qy, qz, qw))[0] + CONE_ROOM_DEG, LEAST_CONE_DEG)
+    return Limits(x_mm, y_mm, (low_mm - BELOW_MM, high_mm), cone_deg, MOST_MM_S, ACC_MM_S2)

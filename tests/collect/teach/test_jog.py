@@ -1,0 +1,179 @@
+"""Jog by keys: nothing moves without `--arm` and its key, and no step leads out of the box that is known so far."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from collect.operator import Choice
+from collect.teach.day import Day
+from collect.teach.guide import Brought, JogStep, JogView, Shown, Target
+from collect.teach.jog import BELOW_MM, ROOM_MM, SPEED_MM_S
+from collect.teach.plain import PlainGuide
+from collect.teach.store import touch_of
+from collect.tui.teach_app import TeachApp
+from collect.tui.teach_guide import ScreenGuide
+from drivers.clock import HostClock
+from drivers.geometry import brush_pose
+from drivers.sim.arcs.server import ArcsServer
+from drivers.sim.config import SimConfig
+from drivers.sim.world import World
+
+HOME_MM = (250.0, -230.0, 260.0)
+TIP = [0.0, 0.0, 180.0]
+
+
+@dataclass
+class Jogger:
+    """A person who jogs by a list of steps, then says that the tip is there."""
+
+    steps: list[JogStep]
+    allows: bool = True
+    said: list[str] = field(default_factory=list)
+    views: list[JogView] = field(default_factory=list)
+    asked: int = 0
+
+    async def show(self, what: Shown) -> None:
+        self.said += what.lines
+
+    async def choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
+        return "a" if self.allows else default
+
+    async def bring(self, target: Target, how: str) -> Brought:
+        self.asked += 1
+        return Brought.JOG if self.asked == 1 else Brought.SKIP
+
+    async def jog(self, view: JogView) -> JogStep | Brought:
+        self.views.append(view)
+        return self.steps.pop(0) if self.steps else Brought.DONE
+
+
+@pytest.fixture
+async def server() -> AsyncIterator[ArcsServer]:
+    server = ArcsServer(World(SimConfig(rate=10.0)))
+    await server.start("127.0.0.1", 0)
+    yield server
+    await server.stop()
+
+
+def day_of(port: int, person: object, folder: Path, *, armed: bool) -> Day:
+    day = Day(person, folder / "rig.toml", HostClock(), armed=armed)  # type: ignore[arg-type]
+    for name, value in (("host", "127.0.0.1"), ("port", port), ("framing", "sof")):
+        day.keep("arm", f"robot.{name}", value, "typed")
+    day.keep("tip", "robot.tcp_offset_mm", TIP, "typed", unit="mm")
+    day.keep("tip", "robot.tcp_rotation_deg", [0.0, 0.0, 0.0], "typed", unit="deg")
+    return day
+
+
+async def touched(day: Day) -> None:
+    async with asyncio.timeout(20.0), day.arm() as reader:
+        await day.touch(reader, Target("well"), "Bring the tip into the well.", "well 0")
+
+
+def sent(server: ArcsServer) -> int:
+    """Number of lines that the controller was given."""
+    return server.cabinet.world.motion._next_id
+
+
+async def test_steps_move_the_tip_along_the_base_and_the_place_is_kept(server: ArcsServer, tmp_path: Path) -> None:
+    person = Jogger([JogStep("x", 5.0), JogStep("y", -0.5), JogStep("z", -2.0)])
+    day = day_of(server.port, person, tmp_path, armed=True)
+    await touched(day)
+    assert person.views[-1].moved_mm == pytest.approx((5.0, -0.5, -2.0), abs=0.05)
+    x, y, z = HOME_MM
+    assert day.notebook.touches["well 0"].position_mm == pytest.approx((x + 5.0, y - 0.5, z + 180.0 - 2.0), abs=0.05)
+    assert sent(server) == 3
+
+
+async def test_without_arm_nothing_moves_even_if_a_jog_is_asked_for(server: ArcsServer, tmp_path: Path) -> None:
+    person = Jogger([JogStep("x", 5.0)])
+    await touched(day_of(server.port, person, tmp_path, armed=False))
+    assert person.views == []
+    assert any("Nothing is moved without --arm" in line for line in person.said)
+    assert sent(server) == 0
+    assert server.mode == "PowerOff"
+
+
+async def test_without_the_key_nothing_moves(server: ArcsServer, tmp_path: Path) -> None:
+    person = Jogger([JogStep("x", 5.0)], allows=False)
+    await touched(day_of(server.port, person, tmp_path, armed=True))
+    assert person.views == []
+    assert sent(server) == 0
+    assert server.mode == "PowerOff"
+
+
+async def test_a_step_out_of_the_box_is_refused_and_said(server: ArcsServer, tmp_path: Path) -> None:
+    down = [JogStep("z", -5.0)] * (int(BELOW_MM / 5.0) + 1)
+    person = Jogger([*down, JogStep("x", -5.0), JogStep("x", 100.0)])
+    day = day_of(server.port, person, tmp_path, armed=True)
+    x, y, z = HOME_MM
+    day.save(day.notebook.with_touch("pin 0", touch_of(brush_pose(x + 40.0, y, z + 190.0))))
+    await touched(day)
+    refused = [view.refused for view in person.views]
+    assert refused[:2] == ["", ""]
+    assert refused[2].startswith("not made: z = 250.000 mm is outside [255.000,")
+    assert refused[3:] == ["", "100 mm is none of the steps"]
+    assert sent(server) == 2
+
+
+async def test_the_box_reaches_a_little_beyond_what_was_touched(server: ArcsServer, tmp_path: Path) -> None:
+    person = Jogger([JogStep("y", 5.0)] * (int(ROOM_MM / 5.0) + 1))
+    await touched(day_of(server.port, person, tmp_path, armed=True))
+    assert person.views[-1].refused.startswith("not made: y =")
+    assert person.views[-1].moved_mm[1] == pytest.approx(ROOM_MM, abs=0.05)
+
+
+async def test_a_stop_in_the_middle_of_a_step_stops_the_arm(tmp_path: Path) -> None:
+    server = ArcsServer(World(SimConfig(rate=0.5)))
+    await server.start("127.0.0.1", 0)
+    motion = server.cabinet.world.motion
+    task = asyncio.create_task(touched(day_of(server.port, Jogger([JogStep("x", 5.0)]), tmp_path, armed=True)))
+    async with asyncio.timeout(20.0):
+        while motion.running is None:
+            await asyncio.sleep(0.005)
+            server.cabinet.world.tool()
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+    server.cabinet.world.tool()
+    assert motion.running is None
+    assert server.cabinet.world.tool().x_mm < HOME_MM[0] + 4.0
+    await server.stop()
+
+
+async def test_on_the_screen_the_tip_is_jogged_by_keys(server: ArcsServer, tmp_path: Path) -> None:
+    port = server.port
+    made: list[Day] = []
+
+    async def work(guide: ScreenGuide) -> None:
+        made.append(day_of(port, guide, tmp_path, armed=True))
+        await touched(made[0])
+
+    app, number = TeachApp(work, "rig.toml"), 0
+    async with app.run_test(size=(80, 24)) as pilot, asyncio.timeout(60.0):
+        for keys in (["j"], ["a"], ["4", "right"], ["3", "pagedown"], ["enter"]):
+            while app._screen._question is None or app._screen._question.number <= number:
+                await pilot.pause(0.02)
+            number = app._screen._question.number
+            await pilot.press(*keys)
+        while not app.teaching.finished:
+            await pilot.pause(0.02)
+    app.teaching.join()
+    x, y, z = HOME_MM
+    assert made[0].notebook.touches["well 0"].position_mm == pytest.approx((x + 5.0, y, z + 178.0), abs=0.05)
+
+
+async def test_in_lines_the_tip_is_jogged_by_words(server: ArcsServer, tmp_path: Path) -> None:
+    typed = iter(["jog", "a", "x 5", "z 7", "z -2", ""])
+    day = day_of(server.port, PlainGuide(tmp_path, lambda: next(typed)), tmp_path, armed=True)
+    await touched(day)
+    x, y, z = HOME_MM
+    assert day.notebook.touches["well 0"].position_mm == pytest.approx((x + 5.0, y, z + 178.0), abs=0.05)
+
+
+def test_a_jog_is_slower_than_50_mm_s() -> None:
+    assert SPEED_MM_S < 50.0
