@@ -112,7 +112,7 @@ class TeachScreen(StepsScreen):
             # Only after the layout is it known where the end is: the question takes its room from the findings.
             self.call_after_refresh(self._found_pane.scroll_end, animate=False)
         if now.question is None and not over and not self._stop_sent:
-            self._note.show(_busy_text(now, time.monotonic()))
+            self._note.show(_busy_text(now, time.monotonic(), self.size.width - 2))
 
     def _ask(self, question: Question | None, over: str, keys: tuple[Key, ...]) -> None:
         """Show a question, or that something is at work, or that it is over."""
@@ -232,10 +232,11 @@ def _keys_of(question: Question) -> tuple[Key, ...]:
     return (*keys[:2], JOG, *keys[2:]) if question.may_jog else keys
 
 
-def _busy_text(now: TeachView, now_s: float) -> str:
-    """What is at work, and for how long: nothing may look as if it hung."""
-    what, since_s = now.doing or "at work", now.doing_since_s
-    return f"{one_line(what)}, {max(now_s - since_s, 0.0):.0f} s; {SHORT_STOP}"
+def _busy_text(now: TeachView, now_s: float, columns: int) -> str:
+    """What is at work, and for how long: nothing may look as if it hung. How to stop is never cut off."""
+    after = f", {max(now_s - now.doing_since_s, 0.0):.0f} s; {SHORT_STOP}"
+    what, room = one_line(now.doing or "at work"), max(columns - len(after), 0)
+    return (what if len(what) <= room else f"{what[: room - 1]}…") + after
 
 
 def _live_text(now: TeachView) -> str:
