@@ -89,6 +89,7 @@ loop = typer.Typer(
 loop.command("session")(collect.cli.loop)
 loop.command("compare")(calibrate.loop.cli.compare)
 app.add_typer(loop, name="loop")
+sessions.cli.app.command("export")(calibrate.cli.export)
 app.add_typer(sessions.cli.app, name="sessions")
 write = typer.Typer(
     cls=PathOrCommand,

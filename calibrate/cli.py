@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calibrate.path_or_command import PathOrCommand
 from sessions.terminal import say
+
+if TYPE_CHECKING:
+    from sessions.export.rows import Cropper
+    from sessions.reader import Recording
+
+LEFT_OUT = 3
+"""Exit code of an export that left strokes out."""
 
 
 def calibrate(
@@ -105,3 +112,40 @@ def preprocess(
     for flag in trace.flags:
         say(f"flag: {flag}")
     say(str(out))
+
+
+def export(
+    session: Annotated[Path, typer.Argument(help="A closed session's folder, or an .mcap file.")],
+    out: Annotated[Path, typer.Argument(help="The new folder.")],
+    kind: Annotated[str, typer.Option("--format", help="png (images and CSV), npz, or parquet.")] = "png",
+    crops: Annotated[
+        bool, typer.Option("--crops", help="Rectified crops at 20 px/mm with masks, instead of photographs.")
+    ] = False,
+    frames: Annotated[bool, typer.Option("--frames", help="With --crops: the whole photographs as well.")] = False,
+    calibration: Annotated[
+        Path | None, typer.Option(help="With --crops: the calibration; the one in use by default.")
+    ] = None,
+) -> None:
+    """Export strokes, poses and forces: images with CSV, NumPy arrays, or Parquet for Hugging Face `datasets`.
+
+    Ends with exit code 3 if strokes could not be cropped; they are named.
+    """
+    from calibrate.errors import CalibrationError
+    from sessions.export.export import export as write
+    from sessions.progress import shown
+
+    if not crops and (frames or calibration is not None):
+        raise CalibrationError("--frames" if frames else "--calibration", "goes with --crops only")
+
+    def make_cropper(recording: Recording) -> Cropper:
+        from calibrate.crops import cropper_of
+
+        return cropper_of(recording, calibration)
+
+    with shown() as progress:
+        left_out = write(session, out, kind, progress, make_cropper if crops else None, frames=frames)
+    say(f"Exported into {out}")
+    for stroke_id, reason in left_out:
+        say(f"left out: {stroke_id}: {reason}", err=True)
+    if left_out:
+        raise typer.Exit(LEFT_OUT)

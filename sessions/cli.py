@@ -1,4 +1,6 @@
-"""`brushloop sessions ...`: inspect, check, repair, import, merge and export recordings.
+"""`brushloop sessions ...`: inspect, check, repair, import and merge recordings.
+
+`export` needs calibrations for its crops: the front door adds it from `calibrate/cli.py`.
 
 Heavy imports wait until a command runs. Additional exit codes: 3 repaired, but something is lost; 6 damaged.
 """
@@ -228,18 +230,3 @@ def merge(
     with shown() as progress:
         merged = merge_recordings(parts, out, progress)
     say(f"Merged into {merged}")
-
-
-@app.command()
-def export(
-    session: Annotated[Path, typer.Argument(help="A closed session's folder, or an .mcap file.")],
-    out: Annotated[Path, typer.Argument(help="The new folder.")],
-    kind: Annotated[str, typer.Option("--format", help="png (images and CSV), npz, or parquet.")] = "png",
-) -> None:
-    """Export strokes and poses: images with CSV, NumPy arrays, or Parquet that Hugging Face `datasets` loads."""
-    from sessions.export.export import export as write
-    from sessions.progress import shown
-
-    with shown() as progress:
-        folder = write(session, out, kind, progress)
-    say(f"Exported into {folder}")

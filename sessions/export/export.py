@@ -1,14 +1,14 @@
 """Export a recording for other tools: images with CSV tables, NumPy arrays, or Parquet.
 
 Every export is a folder, written under a temporary name and renamed when complete; a folder that is not empty is never
-written to. The images are the photographs as they were recorded, byte for byte.
+written to. The images are the photographs as they were recorded, byte for byte, or crops and masks by a cropper.
 """
 
 from __future__ import annotations
 
 import zipfile
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,27 +17,37 @@ from sessions.cells import CsvWriter
 from sessions.disk import check_room, staged_folder, sync, write_durably
 from sessions.errors import InputError, disk_error
 from sessions.export.parquet import write_parquet
-from sessions.export.rows import TEXT_COLUMNS, Export, Row
+from sessions.export.rows import Cropper, Export, ForceRow, PoseRow, Row
 from sessions.progress import Progress, unseen
-from sessions.reader import Capture, Recording
+from sessions.reader import Recording
+from sessions.recording.messages import decode_gray
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-POSE_COLUMNS = (
-    *("episode_index", "frame_index", "t_ns", "log_ns", "sequence"),
-    *("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw"),
-)
+SAMPLE_COLUMNS = ("episode_index", "frame_index", "t_ns", "log_ns", "sequence")
+POSE_COLUMNS = (*SAMPLE_COLUMNS, "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
+FORCE_COLUMNS = (*SAMPLE_COLUMNS, "fx_n", "fy_n", "fz_n", "mx_nm", "my_nm", "mz_nm")
 
 DECODED_AHEAD = 2
 """Images that wait while one is packed."""
 
 
-def export(source: Path, out: Path, kind: str, progress: Progress = unseen) -> Path:
+def export(
+    source: Path,
+    out: Path,
+    kind: str,
+    progress: Progress = unseen,
+    make_cropper: Callable[[Recording], Cropper] | None = None,
+    *,
+    frames: bool = False,
+) -> list[tuple[str, str]]:
     """Export a session into the new or empty folder `out` as `png`, `npz` or `parquet`.
 
-    Raises `InputError` for an unknown format or a folder that is not empty, `SessionDamaged` for a recording that
+    With `make_cropper`, every photograph is replaced by a crop and its mask; `frames` keeps the whole photograph as
+    well. Returns (stroke, reason) of the strokes that could not be cropped. Raises `InputError` for an unknown format,
+    a folder that is not empty, or a session of which no stroke can be cropped, `SessionDamaged` for a recording that
     cannot be read; nothing is left behind then.
     """
     writers = {"png": write_png, "npz": write_npz, "parquet": write_parquet}
@@ -51,19 +61,29 @@ def export(source: Path, out: Path, kind: str, progress: Progress = unseen) -> P
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         check_room(out.parent, recording.path.stat().st_size)
+        cropper = None if make_cropper is None else make_cropper(recording)
         with staged_folder(out) as stage:
-            write(Export.of(recording, progress), stage)
+            exported = Export.of(recording, progress, cropper, frames=frames)
+            write(exported, stage)
+            if len(exported.left_out) == len(exported.names):
+                stroke_id, reason = exported.left_out[0]
+                raise InputError(recording.path, f"holds no stroke that can be cropped: {stroke_id} {reason}")
     except OSError as error:
         raise disk_error(out, "cannot write", error) from error
-    return out
+    return exported.left_out
 
 
 def write_png(export: Export, folder: Path) -> None:
-    """Write `images/`, `strokes.csv`, `poses.csv` and `header.json`."""
-    (folder / "images").mkdir()
+    """Write `images/`, `strokes.csv`, `poses.csv`, `forces.csv` where there are any, and `header.json`.
+
+    With a cropper also `masks/`, and `frames/` if asked.
+    """
+    for name in export.pictures:
+        (folder / f"{name}s").mkdir()
     rows: list[Row] = []
-    for row, capture in export.captures():
-        write_durably(folder / str(row["file"]), capture.still_png)
+    for row, pictures in export.captures():
+        for name, data in pictures.items():
+            write_durably(folder / str(row["file" if name == "image" else f"{name}_file"]), data)
         rows.append(row)
     columns = list(dict.fromkeys(name for row in rows for name in row))
     with (folder / "strokes.csv").open("x", newline="", encoding="utf-8") as file:
@@ -71,22 +91,32 @@ def write_png(export: Export, folder: Path) -> None:
         table.writerow(columns)
         table.writerows([row.get(name) for name in columns] for row in rows)
         sync(file)
-    with (folder / "poses.csv").open("x", newline="", encoding="utf-8") as file:
-        lines = CsvWriter(file, "\r\n")
-        lines.writerow(POSE_COLUMNS)
-        lines.writerows(
-            [p.episode_index, p.frame_index, p.t_ns, p.log_ns, p.sequence, *p.position_mm, *p.quaternion]
-            for p in export.poses()
-        )
-        sync(file)
+    _write_samples(
+        folder / "poses.csv", POSE_COLUMNS, ([*_when(p), *p.position_mm, *p.quaternion] for p in export.poses())
+    )
+    if export.has_force:
+        _write_samples(folder / "forces.csv", FORCE_COLUMNS, ([*_when(one), *one.wrench] for one in export.forces()))
     write_durably(folder / "header.json", export.header_json())
+
+
+def _when(sample: PoseRow | ForceRow) -> list[float]:
+    return [getattr(sample, name) for name in SAMPLE_COLUMNS]
+
+
+def _write_samples(path: Path, columns: tuple[str, ...], rows: Iterable[list[float]]) -> None:
+    with path.open("x", newline="", encoding="utf-8") as file:
+        lines = CsvWriter(file, "\r\n")
+        lines.writerow(columns)
+        lines.writerows(rows)
+        sync(file)
 
 
 def write_npz(export: Export, folder: Path) -> None:
     """Write `strokes.npz` (loads without pickle) and `header.json`.
 
     One array per column of the table of strokes, (n,), NaN where a value is missing; `image_0000`, ... (h, w) uint8
-    gray; `pose_<column>` (m,), `pose_position_mm` (m, 3) and `pose_quaternion` (m, 4).
+    gray; `pose_<column>` (m,), `pose_position_mm` (m, 3) and `pose_quaternion` (m, 4). With a force sensor also
+    `force_<column>` (k,) and `force_wrench` (k, 6), with a cropper `mask_0000`, and `frame_0000` if asked.
     """
     import numpy as np
 
@@ -98,34 +128,46 @@ def write_npz(export: Export, folder: Path) -> None:
             ThreadPoolExecutor(2) as threads,
         ):
             reading = threads.submit(lambda: list(export.poses()))
-            for row, image in _decoded(threads, export.captures()):
-                _add(archive, f"image_{len(rows):04d}", image)
+            for row, images in _decoded(threads, export.captures()):
+                for name, image in images.items():
+                    _add(archive, f"{name}_{len(rows):04d}", image)
                 rows.append(row)
             for name in dict.fromkeys(name for row in rows for name in row):
                 values = [row.get(name) for row in rows]
-                text = name in TEXT_COLUMNS
+                text = name in export.text_columns
                 _add(archive, name, np.array(values) if text else np.array(values, np.float64))
             poses = reading.result()
-            for name in POSE_COLUMNS[:5]:
+            for name in SAMPLE_COLUMNS:
                 _add(archive, f"pose_{name}", np.array([getattr(pose, name) for pose in poses], np.int64))
             positions = np.array([pose.position_mm for pose in poses], np.float64).reshape(-1, 3)
             _add(archive, "pose_position_mm", positions)
             quaternions = np.array([pose.quaternion for pose in poses], np.float64).reshape(-1, 4)
             _add(archive, "pose_quaternion", quaternions)
+            if export.has_force:
+                forces = list(export.forces())
+                for name in SAMPLE_COLUMNS:
+                    _add(archive, f"force_{name}", np.array([getattr(one, name) for one in forces], np.int64))
+                _add(archive, "force_wrench", np.array([one.wrench for one in forces], np.float64).reshape(-1, 6))
         sync(file)
     write_durably(folder / "header.json", export.header_json())
 
 
-def _decoded(threads: Executor, captures: Iterable[tuple[Row, Capture]]) -> Iterator[tuple[Row, NDArray[np.uint8]]]:
-    """Rows with their images; the next images are decoded while one is packed."""
-    ahead: deque[tuple[Row, Future[NDArray[np.uint8]]]] = deque()
-    for row, capture in captures:
-        ahead.append((row, threads.submit(capture.image)))
+def _decoded(
+    threads: Executor, captures: Iterable[tuple[Row, dict[str, bytes]]]
+) -> Iterator[tuple[Row, dict[str, NDArray[np.uint8]]]]:
+    """Rows with their pictures; the next ones are decoded while one is packed."""
+
+    def decode(row: Row, pictures: dict[str, bytes]) -> dict[str, NDArray[np.uint8]]:
+        return {name: decode_gray(data, f"stroke {row['stroke_id']}") for name, data in pictures.items()}
+
+    ahead: deque[tuple[Row, Future[dict[str, NDArray[np.uint8]]]]] = deque()
+    for row, pictures in captures:
+        ahead.append((row, threads.submit(decode, row, pictures)))
         if len(ahead) > DECODED_AHEAD:
-            row, image = ahead.popleft()
-            yield row, image.result()
-    for row, image in ahead:
-        yield row, image.result()
+            row, images = ahead.popleft()
+            yield row, images.result()
+    for row, images in ahead:
+        yield row, images.result()
 
 
 def _add(archive: zipfile.ZipFile, name: str, array: NDArray[np.generic]) -> None:

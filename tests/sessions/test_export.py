@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sessions.cli import app
+from brushloop import app
 from sessions.errors import InputError, SessionError
 from sessions.export.export import export
 from sessions.reader import Recording
 from sessions.recording.messages import decode_gray
+from sessions.recording.schemas import Check, Quality, Topic, Wrench
+from sessions.recording.writer import Outgoing
 
 
 @pytest.fixture
@@ -65,6 +67,56 @@ def test_the_poses_of_each_press_are_a_time_series_of_its_stroke(make, session, 
     assert [int(row["sequence"]) for row in rows[5:]] == [100, 101, 102, 103, 104]
     assert int(rows[5]["t_ns"]) == make.pose(100).publish_ns
     assert [float(rows[0][c]) for c in ("x_mm", "y_mm", "z_mm", "qw")] == [1.0, 2.0, 3.0, 1.0]
+
+
+@pytest.fixture
+def felt(make, tmp_path):
+    """A recording of a judged press with two samples of force."""
+    store = make.store(tmp_path / "felt")
+    pushes = [
+        Outgoing(
+            Topic.WRENCH, 10 + n, 10 + n, n, Wrench(fx_n=0.1, fy_n=0.0, fz_n=-float(n), mx_nm=0.0, my_nm=0.0, mz_nm=0.0)
+        )
+        for n in range(2)
+    ]
+    make.take(store, "a press", "press", [*pushes, make.pose(0)], {"stroke_id": "H13-a05-r00"}, 0)
+    checks = (Check(name="dry", passed=False, reason="is dry"), Check(name="faint", passed=True))
+    judged = Outgoing(Topic.QUALITY, 30, 30, 0, Quality(stroke_id="H13-a05-r00", checks=checks))
+    taken = [make.still(0), judged, make.stroke(0)]
+    make.take(store, "a capture", "capture", taken, {"stroke_id": "H13-a05-r00", "still": 0})
+    store.close()
+    store.release()
+    return store.folder
+
+
+def test_force_and_quality_are_exported_with_each_stroke(felt, to):
+    export(felt, to, "png")
+    with (to / "forces.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["episode_index"], row["frame_index"], row["fz_n"]) for row in rows] == [
+        ("0", "0", "-0.0"),
+        ("0", "1", "-1.0"),
+    ]
+    with (to / "strokes.csv").open(newline="") as file:
+        [stroke] = csv.DictReader(file)
+    assert (stroke["quality"], stroke["marked_bad"]) == ("failed: dry", "")
+
+
+def test_force_is_an_array_of_its_own_in_npz(felt, to):
+    export(felt, to, "npz")
+    with np.load(to / "strokes.npz", allow_pickle=False) as arrays:
+        assert arrays["force_wrench"].shape == (2, 6)
+        assert arrays["quality"].tolist() == ["failed: dry"]
+
+
+@pytest.mark.soak  # importing `datasets` takes longer than everything else here
+def test_hugging_face_datasets_loads_poses_and_forces(felt, to):
+    datasets = pytest.importorskip("datasets")
+    export(felt, to, "parquet")
+    forces = datasets.load_dataset(str(to), "forces", split="train", cache_dir=str(to.parent / "cache"))
+    assert forces[1]["observation.force"] == [0.1, 0.0, -1.0, 0.0, 0.0, 0.0]
+    poses = datasets.load_dataset(str(to), "poses", split="train", cache_dir=str(to.parent / "cache"))
+    assert poses[0]["observation.state"][:3] == [1.0, 2.0, 3.0]
 
 
 def test_npz_loads_without_pickle(make, session, to):
@@ -125,7 +177,8 @@ def test_a_folder_that_holds_anything_is_left_as_it_is(session, to):
 
 def test_an_empty_folder_is_used(session, to):
     to.mkdir()
-    assert (export(session, to, "png") / "strokes.csv").is_file()
+    export(session, to, "png")
+    assert (to / "strokes.csv").is_file()
 
 
 def test_names_that_a_file_system_would_refuse_become_names(make, tmp_path, to):
@@ -145,5 +198,5 @@ def test_an_unknown_format_and_an_open_session_are_refused(make, store, to):
 
 
 def test_the_command(session, to):
-    ran = CliRunner().invoke(app, ["export", str(session), str(to), "--format", "npz"])
+    ran = CliRunner().invoke(app, ["sessions", "export", str(session), str(to), "--format", "npz"])
     assert (ran.exit_code, ran.output) == (0, f"Exported into {to}\n")

@@ -1,9 +1,11 @@
 """A reader that is not ours and not in Python: `@mcap/core` for JavaScript counts the same messages."""
 
 import json
+import re
 import shutil
 import subprocess
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
@@ -11,8 +13,7 @@ PACKAGES = ("@mcap/core@2.2.2", "fzstd@0.1.1")
 
 COUNT = """
 const fs = require("fs/promises");
-const { McapIndexedReader } = require("@mcap/core");
-const fzstd = require("fzstd");
+const { McapIndexedReader } = require("@mcap/core"), fzstd = require("fzstd");
 (async () => {
   const handle = await fs.open(process.argv[2], "r");
   const readable = {
@@ -40,6 +41,13 @@ const fzstd = require("fzstd");
   await handle.close();
 })();
 """
+
+
+def test_the_documented_lines_are_those_that_are_run_here() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "session-format.md").read_text(encoding="utf-8")
+    [block] = re.findall(r"^```js\n(.*?)^```", text, re.M | re.S)
+    assert len(block.splitlines()) == 3
+    assert [line for line in block.splitlines() if line not in COUNT] == []
 
 
 @pytest.fixture(scope="module")

@@ -50,7 +50,8 @@ def test_both_ways_out_work(copy, tmp_path):
     recording = copy / "2026-01-02-grid-01.mcap"
     assert verify_session(recording).sound
     assert Recording(recording).strokes() == 2
-    assert export(recording, tmp_path / "exported", "png").is_dir()
+    export(recording, tmp_path / "exported", "png")
+    assert (tmp_path / "exported" / "strokes.csv").is_file()
     back = copy.rename(copy.with_name("2026-01-02-grid-01"))
     assert verify_session(back).sound
     assert repair_session(back, lambda: 0).did == []

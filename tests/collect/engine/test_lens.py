@@ -66,10 +66,10 @@ def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> No
 
     [folder] = bent_lab.sessions.iterdir()
     [(schema, _, message)] = container.messages(Recording(folder).path, [str(Topic.CALIBRATION)])
-    lens = CameraCalibration.FromString(message.data)
+    recorded = CameraCalibration.FromString(message.data)
     assert schema is not None
-    assert (schema.name, lens.width, lens.height) == ("foxglove.CameraCalibration", 1024, 768)
-    assert (list(lens.D), lens.K[0]) == ([K1, 0.0, 0.0, 0.0, 0.0], 1024.0)
+    assert (schema.name, recorded.width, recorded.height) == ("foxglove.CameraCalibration", 1024, 768)
+    assert (list(recorded.D), recorded.K[0]) == ([K1, 0.0, 0.0, 0.0, 0.0], 1024.0)
 
     # The review looks through the recorded lens: the file that rig.toml names does not lie beside its snapshot.
     review = Review(folder)
