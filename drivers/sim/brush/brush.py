@@ -5,7 +5,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -15,6 +14,7 @@ from drivers.sim.brush.drag import Stances, Waypoint, draw_drag
 from drivers.sim.brush.flaws import Flaw, Trouble, draw_trouble
 from drivers.sim.brush.footprint import Tuft, blank_footprint, draw_wander, grow_bristles, print_footprint
 from drivers.sim.brush.paper import Footprint
+from drivers.sim.brush.spec import BrushSpec, within
 from drivers.sim.brush.spine import Bundle, SpineShape, Vector, press_spine, pull_spine, rest_spine
 
 __all__ = ["Brush", "BrushSpec", "Flaw", "Footprint", "Waypoint"]
@@ -30,51 +30,13 @@ REMEMBERED_SPINES = 64
 REMEMBERED_STANCES = 8
 
 
-@dataclass(frozen=True, slots=True)
-class BrushSpec:
-    """Properties of one individual brush; raises ValueError, naming value and range, if one is out of range."""
-
-    radius_mm: float = 6.0
-    """Largest radius of the bundle."""
-    length_mm: float = 48.0
-    """Free length of the bundle, ferrule to tip."""
-    stiffness_n_mm2: float = 200.0
-    """Flexural rigidity of the wet bundle where it is thickest, N times mm^2."""
-    stiffness_power: float = 3.5
-    """Rigidity falls with this power of the local radius: 4 = a solid rod, 2 = hairs that slide freely."""
-    squash_n_per_mm2: float = 0.008
-    """Sideways stiffness of the bundle: force per mm of length and mm of squash."""
-    suction_n_per_mm2: float = 0.003
-    """Peak capillary stress that draws the wet bundle down: 2 x 0.072 N/m over pores of 0.05 mm radius."""
-    friction: float = 0.22
-    """Coulomb coefficient of wet hair on paper. From about 0.35 an upright tip sticks where it touched."""
-    set_deg: float = 8.0
-    """Set of the tip half toward -x, from the last wipe; never 0, or an upright brush stands on its tip."""
-    bristles: int = 400
-    """Number of hairs simulated one by one; each stands for several real ones."""
-    seed: int = 1
-    """Seed of the individual: its bristles and how they clump."""
-
-    def __post_init__(self) -> None:
-        _within("radius_mm", self.radius_mm, 1.0, 20.0)
-        _within("length_mm", self.length_mm, 3.0 * self.radius_mm, 120.0)
-        _within("stiffness_n_mm2", self.stiffness_n_mm2, 10.0, 1000.0)
-        _within("stiffness_power", self.stiffness_power, 2.0, 4.0)
-        _within("squash_n_per_mm2", self.squash_n_per_mm2, 0.001, 0.5)
-        _within("suction_n_per_mm2", self.suction_n_per_mm2, 0.0, 0.01)
-        _within("friction", self.friction, 0.0, 0.8)
-        _within("set_deg", self.set_deg, 1.0, 30.0)
-        _within("bristles", self.bristles, 50, 5000)
-        _within("seed", self.seed, 0, 2**63 - 1)
-
-
 class Brush:
     """One brush. Pressing has no memory: each press starts from the same wiped bundle."""
 
     def __init__(self, spec: BrushSpec) -> None:
         self.spec = spec
         self._bundle = _bundle(spec)
-        self._bristles = grow_bristles(spec.bristles, np.random.default_rng(spec.seed))
+        self._bristles = grow_bristles(spec, np.random.default_rng(spec.seed))
 
     def press(
         self,
@@ -97,7 +59,7 @@ class Brush:
         or `press_seed` is negative.
         """
         self._check(depth_mm, tilt_deg, ink_load, press_seed, px_per_mm)
-        _within("severity", severity, 0.0, 1.0)
+        within("severity", severity, 0.0, 1.0)
         if depth_mm <= 0.0:
             return blank_footprint(px_per_mm)
         trouble: Trouble | None = None
@@ -157,16 +119,16 @@ class Brush:
         )
 
     def _check(self, depth_mm: float, tilt_deg: float, ink_load: float, press_seed: int, px_per_mm: float) -> None:
-        _within("tilt_deg", tilt_deg, 0.0, MAX_TILT_DEG)
-        _within("ink_load", ink_load, 0.0, 1.0)
-        _within("px_per_mm", px_per_mm, 2.0, 40.0)
-        _within("press_seed", press_seed, 0, 2**63 - 1)
-        _within("depth_mm", depth_mm, -math.inf, self.deepest_mm(tilt_deg))
+        within("tilt_deg", tilt_deg, 0.0, MAX_TILT_DEG)
+        within("ink_load", ink_load, 0.0, 1.0)
+        within("px_per_mm", px_per_mm, 2.0, 40.0)
+        within("press_seed", press_seed, 0, 2**63 - 1)
+        within("depth_mm", depth_mm, -math.inf, self.deepest_mm(tilt_deg))
 
     # two random streams, so that the paper does not change with the number of bristles
     def _tuft(self, press_seed: int, trouble: Trouble | None) -> Tuft:
         lie_rng = np.random.default_rng([self.spec.seed, press_seed, 0])
-        return Tuft(self._bundle, self._bristles, draw_wander(self.spec.bristles, lie_rng), trouble)
+        return Tuft(self.spec, self._bundle, self._bristles, draw_wander(self.spec, lie_rng), trouble)
 
     def _paper(self, press_seed: int) -> np.random.Generator:
         return np.random.default_rng([self.spec.seed, press_seed, 1])
@@ -206,13 +168,9 @@ def _bundle(spec: BrushSpec) -> Bundle:
 
 
 def _profile(spec: BrushSpec, from_ferrule_mm: NDArray[np.floating]) -> Vector:
-    """Free radius along the bundle: a slight belly at 0.3 of the length, then a hollow taper to a fine tip."""
+    """Free radius along the bundle: a slight belly, then a taper to a fine tip."""
     u = np.asarray(from_ferrule_mm / spec.length_mm, np.float64)
-    root = 0.95 + 0.05 * np.sin(0.5 * np.pi * np.minimum(u / 0.3, 1.0))
-    taper = 1.0 - np.clip((u - 0.3) / 0.7, 0.0, 1.0) ** 0.85
-    return spec.radius_mm * np.maximum(np.where(u < 0.3, root, taper), 0.04)
-
-
-def _within(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise ValueError(f"{name} = {value:g} is outside {low:g} .. {high:g}")
+    belly = spec.belly_share
+    root = 0.95 + 0.05 * np.sin(0.5 * np.pi * np.minimum(u / belly, 1.0))
+    taper = 1.0 - np.clip((u - belly) / (1.0 - belly), 0.0, 1.0) ** spec.taper_power
+    return spec.radius_mm * np.maximum(np.where(u < belly, root, taper), 0.04)

@@ -206,7 +206,7 @@ def draw_drag(
     for stamp, moment in laid:
         column, row = origin[0] + moment.x_mm * px_per_mm, origin[1] - moment.y_mm * px_per_mm
         _lay(wet, load_map, stamp, column, row, moment.heading_rad, moment.length)
-    density = soak(wet, load_map, px_per_mm, paper_rng)
+    density = soak(wet, load_map, px_per_mm, paper_rng, tuft.spec)
     force = float(stances.at(max(w.depth_mm for w in path), True).normal_n.sum())
     return Footprint(density, px_per_mm, origin, force)
 
@@ -224,7 +224,7 @@ def _stamp(shape: SpineShape, tuft: Tuft, load: float, px_per_mm: float) -> _Sta
     dots = tuft.touch(shape, load)
     dots = Dots(dots.x_mm - middle_mm(shape), dots.y_mm, dots.ink)
     shape_px, origin = frame_around([dots], px_per_mm, STAMP_MARGIN_MM)
-    return _Stamp(scatter(dots, shape_px, origin, px_per_mm, load), origin, load)
+    return _Stamp(scatter(dots, shape_px, origin, px_per_mm, load, tuft.spec), origin, load)
 
 
 def _corners_mm(stamp: _Stamp, moment: Moment, px_per_mm: float) -> Vector:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from drivers.sim.brush.flaws import Trouble
 from drivers.sim.brush.paper import Dots, Footprint, scatter, soak
+from drivers.sim.brush.spec import BrushSpec
 from drivers.sim.brush.spine import Bundle, SpineShape, Vector
 
 STATION_MM = 0.25
@@ -57,9 +58,10 @@ class Wander:
     """(m,) sideways stray of each hair."""
 
 
-def grow_bristles(count: int, rng: np.random.Generator) -> Bristles:
-    """Draw `count` bristles evenly over the unit disc, clumped by nearest of `CLUMPS` random centres."""
+def grow_bristles(spec: BrushSpec, rng: np.random.Generator) -> Bristles:
+    """Draw the bristles evenly over the unit disc, clumped by nearest of `CLUMPS` random centres."""
     # sunflower spiral with jitter: even cover without a visible lattice
+    count = spec.bristles
     k = np.arange(count) + 0.5
     ring = np.sqrt(k / count)
     turn = k * np.pi * (3.0 - np.sqrt(5.0)) + rng.normal(0.0, 0.15, count)
@@ -69,16 +71,16 @@ def grow_bristles(count: int, rng: np.random.Generator) -> Bristles:
         across[:, None] - centre_ring * np.cos(centre_turn),
         outward[:, None] - centre_ring * np.sin(centre_turn),
     )
-    short = np.abs(rng.normal(0.0, 4.0, count)) * np.sqrt(ring)
+    short = np.abs(rng.normal(0.0, spec.uneven_mm, count)) * np.sqrt(ring)
     phase = STATION_MM * (rng.random(count) - 0.5)
-    return Bristles(across, outward, short, phase, far.argmin(axis=1), float(rng.normal(0.0, 0.25)))
+    return Bristles(across, outward, short, phase, far.argmin(axis=1), float(rng.normal(0.0, spec.bow_mm)))
 
 
-def draw_wander(count: int, rng: np.random.Generator) -> Wander:
-    """Draw the natural variation of one press: 1.5 % of width, and 0.1 to 0.2 mm in where the tip lies."""
-    spread = float(np.exp(0.015 * rng.standard_normal()))
-    reach, bow = rng.normal(0.0, 0.15), rng.normal(0.0, 0.12)
-    return Wander(spread, float(reach), float(bow), rng.random(CLUMPS), rng.normal(0.0, 0.06, count))
+def draw_wander(spec: BrushSpec, rng: np.random.Generator) -> Wander:
+    """Draw the natural variation of one press."""
+    spread = float(np.exp(spec.spread_wander * rng.standard_normal()))
+    reach, bow = rng.normal(0.0, spec.reach_wander_mm), rng.normal(0.0, spec.bow_wander_mm)
+    return Wander(spread, float(reach), float(bow), rng.random(CLUMPS), rng.normal(0.0, spec.strand_mm, spec.bristles))
 
 
 def clump_flow(clump_ink: Vector, ink_load: float) -> Vector:
@@ -89,18 +91,18 @@ def clump_flow(clump_ink: Vector, ink_load: float) -> Vector:
 MARGIN_MM = 3.0
 """Blank border around the mark."""
 
+DRY_FILM_MM = 0.12
+"""Height over the paper within which a hair gives ink when the brush is all but empty."""
+
 TRAIL_STEPS = 2
 """Load steps between the moments at which the sliding bundle is printed: about 1 mm of descent."""
-
-SPREAD_POWER = 1.7
-"""Half width of a flattened section as a power of its mean flattening: 1 would keep its area, more lets
-the hairs part."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tuft:
     """A wet brush as it meets the paper: its mechanics, its hairs, how they lie in this press, and any flaw."""
 
+    spec: BrushSpec
     bundle: Bundle
     bristles: Bristles
     wander: Wander
@@ -114,13 +116,13 @@ class Tuft:
         """Where the bristles of one spine shape come within the ink film of the paper.
 
         A section that would reach below the paper is cut off flat by it, which lowers its mean half thickness
-        from r to r - squash / 2; the half width rises to r (r / (r - squash / 2))^SPREAD_POWER.
+        from r to r - squash / 2; the half width rises to r (r / (r - squash / 2))^splay_power.
         """
         bundle, bristles, wander = self.bundle, self.bristles, self.wander
         flow = clump_flow(wander.clump_ink, load)[bristles.clump]
         if self.trouble is not None:
             flow = self.trouble.flow(flow)
-        film_mm = 0.12 + 0.38 * load
+        film_mm = DRY_FILM_MM + (self.spec.film_mm - DRY_FILM_MM) * load
         link_mm = bundle.link_mm
         node = np.arange(bundle.radius_mm.size, dtype=np.float64)
         near = np.flatnonzero(shape.squash_mm > -film_mm)
@@ -132,7 +134,7 @@ class Tuft:
         x, z, phi, radius = (np.interp(at, node, v) for v in (shape.x_mm, shape.z_mm, shape.phi_rad, bundle.radius_mm))
         squash = np.interp(at, node, np.maximum(_smooth(shape.squash_mm, 3.0 / link_mm), 0.0))
         flatter = radius / (radius - 0.5 * np.minimum(squash, 0.9 * radius))
-        half_width = wander.spread * radius * flatter**SPREAD_POWER
+        half_width = wander.spread * radius * flatter**self.spec.splay_power
 
         # (m, stations): rows are bristles
         outward, across = bristles.outward[:, None], bristles.across[:, None]
@@ -163,8 +165,8 @@ def print_footprint(
     # hairs slide over their own wet trail: the sheet keeps the wettest moment, not the sum
     wet = np.zeros(shape_px, np.float32)
     for d in dots:
-        np.maximum(wet, scatter(d, shape_px, origin, px_per_mm, load), out=wet)
-    density = soak(wet, load, px_per_mm, paper_rng)
+        np.maximum(wet, scatter(d, shape_px, origin, px_per_mm, load, tuft.spec), out=wet)
+    density = soak(wet, load, px_per_mm, paper_rng, tuft.spec)
     if tuft.trouble is not None:
         density = density * np.float32(tuft.trouble.tone)
     return Footprint(density, px_per_mm, origin, force)

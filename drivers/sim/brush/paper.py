@@ -12,12 +12,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.sim.brush.spec import BrushSpec
 from drivers.sim.brush.spine import Vector
 
 Image = NDArray[np.float32]
 
 TEXTURE_PX_PER_MM = 10.0
 """Paper texture is drawn at this scale and resized, so that fibres keep their size on any raster."""
+
+DRY_WICK_MM = 0.04
+"""Capillary spread of the last ink of a brush."""
 
 HAIR_MM = 0.1
 """Spread of ink around one wet hair."""
@@ -48,7 +52,12 @@ class Footprint:
 
 
 def scatter(
-    dots: Dots, shape_px: tuple[int, int], origin: tuple[float, float], px_per_mm: float, ink_load: float
+    dots: Dots,
+    shape_px: tuple[int, int],
+    origin: tuple[float, float],
+    px_per_mm: float,
+    ink_load: float,
+    spec: BrushSpec,
 ) -> Image:
     """Ink offered per area, (h, w): dots spread by the width of a wet hair and its meniscus."""
     h, w = shape_px
@@ -59,17 +68,18 @@ def scatter(
     lines = np.asarray(cv2.GaussianBlur(per_mm2, (0, 0), HAIR_MM * px_per_mm), np.float32)
     # hairs on top of each other, as at the tip, hold no more ink between them than the film does
     np.minimum(lines, FULL_PER_MM2, out=lines)
-    return np.asarray(cv2.GaussianBlur(lines, (0, 0), (0.04 + 0.18 * ink_load) * px_per_mm), np.float32)
+    wick_mm = DRY_WICK_MM + (spec.wick_mm - DRY_WICK_MM) * ink_load
+    return np.asarray(cv2.GaussianBlur(lines, (0, 0), wick_mm * px_per_mm), np.float32)
 
 
-def soak(wet: Image, ink_load: float | Image, px_per_mm: float, rng: np.random.Generator) -> Image:
+def soak(wet: Image, ink_load: float | Image, px_per_mm: float, rng: np.random.Generator, spec: BrushSpec) -> Image:
     """Ink absorbed, (h, w) in 0 .. 1: fibres decide at the edge and, when the brush is dry, everywhere.
 
     `ink_load` is one number, or for a drag the load of the brush when it passed each pixel.
     """
     texture = _paper(wet.shape, px_per_mm, rng)
     # a drier brush wets only the peaks of the paper
-    need = (3.5 + 6.0 * (1.0 - ink_load) ** 2) * np.exp((0.2 + 0.9 * (1.0 - ink_load)) * texture)
+    need = (spec.need_per_mm2 + 6.0 * (1.0 - ink_load) ** 2) * np.exp((0.2 + 0.9 * (1.0 - ink_load)) * texture)
     cover = wet**3 / (wet**3 + need**3)
     cover = np.asarray(cv2.GaussianBlur(cover.astype(np.float32), (0, 0), 0.05 * px_per_mm), np.float32)
     pooled = 1.0 - np.exp(-wet / 6.0)

@@ -1,0 +1,85 @@
+"""The constants of one individual simulated brush, with their allowed ranges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class BrushSpec:
+    """Properties of one individual brush; raises ValueError, naming value and range, if one is out of range."""
+
+    radius_mm: float = 6.0
+    """Largest radius of the bundle."""
+    length_mm: float = 48.0
+    """Free length of the bundle, ferrule to tip."""
+    stiffness_n_mm2: float = 200.0
+    """Flexural rigidity of the wet bundle where it is thickest, N times mm^2."""
+    stiffness_power: float = 3.5
+    """Rigidity falls with this power of the local radius: 4 = a solid rod, 2 = hairs that slide freely."""
+    squash_n_per_mm2: float = 0.008
+    """Sideways stiffness of the bundle: force per mm of length and mm of squash."""
+    suction_n_per_mm2: float = 0.003
+    """Peak capillary stress that draws the wet bundle down: 2 x 0.072 N/m over pores of 0.05 mm radius."""
+    friction: float = 0.22
+    """Coulomb coefficient of wet hair on paper. From about 0.35 an upright tip sticks where it touched."""
+    set_deg: float = 8.0
+    """Set of the tip half toward -x, from the last wipe; never 0, or an upright brush stands on its tip."""
+    belly_share: float = 0.3
+    """Share of the length, from the ferrule, over which the bundle stays thick; it tapers from there to the tip."""
+    taper_power: float = 0.85
+    """Shape of the taper: 1 = a cone, less = hollow, more = full like a bullet."""
+    splay_power: float = 1.7
+    """Half width of a flattened section as a power of its mean flattening: 1 keeps its area, more lets hairs part."""
+    film_mm: float = 0.5
+    """Height over the paper within which a freshly dipped hair gives ink."""
+    uneven_mm: float = 4.0
+    """How far short of the tip the outer hairs end, standard deviation."""
+    wick_mm: float = 0.22
+    """Capillary spread of a full brush's ink in the paper, standard deviation."""
+    need_per_mm2: float = 3.5
+    """Deposits per area below which the paper stays white under a full brush."""
+    bow_mm: float = 0.25
+    """Sideways offset of the pressed tip, standard deviation between brushes."""
+    spread_wander: float = 0.015
+    """Relative width, standard deviation between presses."""
+    reach_wander_mm: float = 0.15
+    """Extra reach of the tip along the paper, standard deviation between presses."""
+    bow_wander_mm: float = 0.12
+    """Sideways offset of the tip, standard deviation between presses."""
+    strand_mm: float = 0.06
+    """Sideways stray of each hair, standard deviation in each press."""
+    bristles: int = 400
+    """Number of hairs simulated one by one; each stands for several real ones."""
+    seed: int = 1
+    """Seed of the individual: its bristles and how they clump."""
+
+    def __post_init__(self) -> None:
+        within("radius_mm", self.radius_mm, 1.0, 20.0)
+        within("length_mm", self.length_mm, 3.0 * self.radius_mm, 120.0)
+        within("stiffness_n_mm2", self.stiffness_n_mm2, 10.0, 1000.0)
+        within("stiffness_power", self.stiffness_power, 2.0, 4.0)
+        within("squash_n_per_mm2", self.squash_n_per_mm2, 0.001, 0.5)
+        within("suction_n_per_mm2", self.suction_n_per_mm2, 0.0, 0.01)
+        within("friction", self.friction, 0.0, 0.8)
+        within("set_deg", self.set_deg, 1.0, 30.0)
+        within("belly_share", self.belly_share, 0.1, 0.7)
+        within("taper_power", self.taper_power, 0.5, 3.0)
+        within("splay_power", self.splay_power, 1.0, 4.0)
+        within("film_mm", self.film_mm, 0.12, 2.0)
+        within("uneven_mm", self.uneven_mm, 0.0, 12.0)
+        within("wick_mm", self.wick_mm, 0.04, 1.0)
+        within("need_per_mm2", self.need_per_mm2, 0.5, 15.0)
+        within("bow_mm", self.bow_mm, 0.0, 3.0)
+        within("spread_wander", self.spread_wander, 0.0, 0.3)
+        within("reach_wander_mm", self.reach_wander_mm, 0.0, 3.0)
+        within("bow_wander_mm", self.bow_wander_mm, 0.0, 3.0)
+        within("strand_mm", self.strand_mm, 0.0, 1.0)
+        within("bristles", self.bristles, 50, 5000)
+        within("seed", self.seed, 0, 2**63 - 1)
+
+
+def within(name: str, value: float, low: float, high: float) -> None:
+    """Raise ValueError, naming value and range, unless `low` <= `value` <= `high`."""
+    if not low <= value <= high:
+        raise ValueError(f"{name} = {value:g} is outside {low:g} .. {high:g}")
