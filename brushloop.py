@@ -112,6 +112,9 @@ def sim(
     camera_port: Annotated[int, typer.Option(min=0, max=65535, help="Camera port; 0: any.")] = 0,
     fps: Annotated[float, typer.Option(min=1, max=60, help="Camera's pictures per real second.")] = 8.0,
     idle_exit: Annotated[float, typer.Option(min=0, help="End after so many seconds without clients; 0: never.")] = 0.0,
+    brush: Annotated[
+        Path | None, typer.Option(help="A described brush, brush.toml; `paper` for the paper's. By default any brush.")
+    ] = None,
     faults: Annotated[Path | None, typer.Option(help="A script of faults, faults.toml.")] = None,
     control: Annotated[Path | None, typer.Option(help="Make a control socket here, for `fault` and `hand`.")] = None,
     unknown: Annotated[
@@ -126,18 +129,27 @@ def sim(
     that is what `brushloop rig new` finds out there.
     """
     from drivers.sim.brush.brush import BrushSpec
+    from drivers.sim.brush_file import NamedBrush, load_brush
     from drivers.sim.config import SimConfig, View
     from drivers.sim.serve import LabRefused, serve, serve_unknown
 
     if unknown is not None:
-        if write_rig is not None or faults is not None or arcs_port or camera_port:
+        if write_rig is not None or brush is not None or faults is not None or arcs_port or camera_port:
             raise LabRefused("--unknown: goes with --trap, --truth, --control, --rate and --idle-exit alone")
         serve_unknown(unknown, trap, rate, idle_exit, say, truth=truth, control=control)
         return
     if trap is not None or truth is not None:
         raise LabRefused("--trap and --truth: go with --unknown SEED")
-    brush, view = BrushSpec(seed=seed), View(fps=fps)
-    config = SimConfig(seed=seed, rate=rate, arcs_port=arcs_port, camera_port=camera_port, brush=brush, view=view)
+    pressed = NamedBrush(BrushSpec(seed=seed), "") if brush is None else load_brush(brush)
+    config = SimConfig(
+        seed=seed,
+        rate=rate,
+        arcs_port=arcs_port,
+        camera_port=camera_port,
+        brush=pressed.spec,
+        brush_name=pressed.name,
+        view=View(fps=fps),
+    )
     serve(config, write_rig, idle_exit, say, faults=faults, control=control)
 
 
@@ -190,11 +202,14 @@ def demo(
     repeats: Annotated[int, typer.Option(min=1, max=2, help="Presses per (H, alpha); one sheet holds two.")] = 2,
     rate: Annotated[float, typer.Option(min=0.01, max=1000, help="Simulated seconds per real second.")] = 60.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the rig and of the order of presses.")] = 1,
+    brush: Annotated[
+        str | None, typer.Option(help="The rig's brush, as for `brushloop sim`: a brush.toml, or `paper`.")
+    ] = None,
 ) -> None:
     """Press, calibrate, press again and validate on the loopback rig. Run again, it goes on where it stopped."""
     from collect.chains.demo import FULL, QUICK, Demo
 
-    if code := Demo(out, FULL if full else QUICK, repeats, rate, seed).run():
+    if code := Demo(out, FULL if full else QUICK, repeats, rate, seed, brush).run():
         raise typer.Exit(code)
 
 

@@ -69,14 +69,14 @@ class Step:
 class Demo:
     """Collect, calibrate, press again, write if asked, and validate, all under `out`."""
 
-    def __init__(self, out: Path, size: Size, repeats: int, rate: float, seed: int) -> None:
+    def __init__(self, out: Path, size: Size, repeats: int, rate: float, seed: int, brush: str | None = None) -> None:
         self._out = out
         self._size = size
         self._repeats = repeats
         self._rate = rate
         self._seed = seed
         self._protocol, self._sessions = out / "protocol.toml", out / "sessions"
-        self._rig = DemoRig(out, rate=rate, seed=seed)
+        self._rig = DemoRig(out, rate=rate, seed=seed, brush=brush)
         self._session: Path | None = None
         self._collect_code = 0
 

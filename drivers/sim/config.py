@@ -139,5 +139,7 @@ class SimConfig:
     sensor_sign: Literal[1, -1] = 1
     """-1 for a sensor that reports the push of the tool on the paper instead of the paper's on the tool."""
     brush: BrushSpec = field(default_factory=BrushSpec)
+    brush_name: str = ""
+    """How recordings call the brush; by default a simulated bundle with its seed."""
     table: Table = field(default_factory=Table)
     view: View = field(default_factory=View)

@@ -60,7 +60,7 @@ max_jitter_ms = 2000.0
 lens = "simulated, {view.px_per_mm:g} px/mm, no distortion"
 
 [brush]
-name = "simulated bristle bundle, seed {brush.seed}"
+name = "{config.brush_name or f"simulated bristle bundle, seed {brush.seed}"}"
 radius_mm = {brush.radius_mm}
 length_mm = {brush.length_mm}
 max_depth_mm = 22.0

@@ -132,7 +132,7 @@ class Tuft:
         first = max(0.0, float(near[0]) - 1.0)
         at = np.arange(first, node[-1], STATION_MM / link_mm)
         x, z, phi, radius = (np.interp(at, node, v) for v in (shape.x_mm, shape.z_mm, shape.phi_rad, bundle.radius_mm))
-        squash = np.interp(at, node, np.maximum(_smooth(shape.squash_mm, 3.0 / link_mm), 0.0))
+        squash = np.interp(at, node, np.maximum(_smooth(shape.squash_mm, self.spec.splay_reach_mm / link_mm), 0.0))
         flatter = radius / (radius - 0.5 * np.minimum(squash, 0.9 * radius))
         half_width = wander.spread * radius * flatter**self.spec.splay_power
 

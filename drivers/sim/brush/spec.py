@@ -31,6 +31,8 @@ class BrushSpec:
     """Shape of the taper: 1 = a cone, less = hollow, more = full like a bullet."""
     splay_power: float = 1.7
     """Half width of a flattened section as a power of its mean flattening: 1 keeps its area, more lets hairs part."""
+    splay_reach_mm: float = 3.0
+    """Distance along the hairs over which they stay parted beside a flattened section, standard deviation."""
     film_mm: float = 0.5
     """Height over the paper within which a freshly dipped hair gives ink."""
     uneven_mm: float = 4.0
@@ -66,6 +68,7 @@ class BrushSpec:
         within("belly_share", self.belly_share, 0.1, 0.7)
         within("taper_power", self.taper_power, 0.5, 3.0)
         within("splay_power", self.splay_power, 1.0, 4.0)
+        within("splay_reach_mm", self.splay_reach_mm, 1.0, 12.0)
         within("film_mm", self.film_mm, 0.12, 2.0)
         within("uneven_mm", self.uneven_mm, 0.0, 12.0)
         within("wick_mm", self.wick_mm, 0.04, 1.0)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Iterable
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from drivers.sim.described import SimFileError, complaint, load_described
 from drivers.sim.faults.phases import Phase
 
 ALWAYS = 1_000_000
@@ -155,19 +155,8 @@ class Fault(BaseModel):
         return self.on is None or op == self.on or op.endswith(f".{self.on}")
 
 
-MAX_BYTES = 256 * 1024
-
-
-class FaultScriptError(Exception):
+class FaultScriptError(SimFileError):
     """The script cannot be used: file, field, what is allowed."""
-
-    exit_code: ClassVar[int] = 2
-
-    def __init__(self, path: Path, field: str, what: str) -> None:
-        self.path = path
-        self.field = field
-        self.what = what
-        super().__init__(f"{path}: {field}: {what}" if field else f"{path}: {what}")
 
 
 class _Script(BaseModel):
@@ -178,20 +167,7 @@ class _Script(BaseModel):
 
 def load_faults(path: Path) -> tuple[Fault, ...]:
     """Read the script. Raises `FaultScriptError` naming file, field and range."""
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise FaultScriptError(path, "", f"is larger than {MAX_BYTES} bytes")
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise FaultScriptError(path, "", "no such file") from None
-    except OSError as error:
-        raise FaultScriptError(path, "", error.strerror or str(error)) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise FaultScriptError(path, "", f"is not TOML: {error}") from None
-    try:
-        return tuple(_Script.model_validate(values).fault)
-    except ValidationError as error:
-        raise FaultScriptError(path, *complaint(error)) from None
+    return tuple(load_described(path, _Script, FaultScriptError).fault)
 
 
 def hang_script(path: Path, hang: Callable[[Fault], int], faults: Iterable[Fault]) -> None:
@@ -210,17 +186,3 @@ def fault_of(values: dict[str, Any]) -> Fault:
     except ValidationError as error:
         field, what = complaint(error)
         raise ValueError(f"{field}: {what}" if field else what) from None
-
-
-def complaint(error: ValidationError) -> tuple[str, str]:
-    """(field, what is wrong with it), one line; an unknown key first, as it is often a misspelt one."""
-    first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-    field = ".".join(str(part) for part in first["loc"])
-    given = "" if first["type"] in ("missing", "value_error") else f" (given: {str(first['input'])[:60]!r})"
-    more = f"; and {error.error_count() - 1} more" if error.error_count() > 1 else ""
-    return _plain(field), _plain(f"{first['msg'].removeprefix('Value error, ')}{given}{more}")
-
-
-def _plain(text: str) -> str:
-    """One printable line, whatever the file holds."""
-    return "".join(char if char.isprintable() else "?" for char in text)[:300]

@@ -155,7 +155,12 @@ def test_the_command_passes_on_what_was_asked_for(monkeypatch: pytest.MonkeyPatc
     words = ["demo", "--out", str(tmp_path)]
     assert CliRunner().invoke(brushloop.app, words).exit_code == GIVEN_UP
     assert CliRunner().invoke(brushloop.app, [*words, "--full", "--repeats", "1", "--seed", "5"]).exit_code == GIVEN_UP
-    assert asked == [(tmp_path, QUICK, 2, 60.0, 1), (tmp_path, FULL, 1, 60.0, 5)]
+    assert CliRunner().invoke(brushloop.app, [*words, "--brush", "paper"]).exit_code == GIVEN_UP
+    assert asked == [
+        (tmp_path, QUICK, 2, 60.0, 1, None),
+        (tmp_path, FULL, 1, 60.0, 5, None),
+        (tmp_path, QUICK, 2, 60.0, 1, "paper"),
+    ]
 
 
 def test_the_sheet_is_not_changed_under_a_session_that_has_begun(chain: Chain, tmp_path: Path) -> None:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.sim.faults.kinds import MAX_BYTES, Device, FaultScriptError, fault_of, hang_script, load_faults
+from drivers.sim.described import MAX_BYTES
+from drivers.sim.faults.kinds import Device, FaultScriptError, fault_of, hang_script, load_faults
 
 SCRIPT = """
 [[fault]]

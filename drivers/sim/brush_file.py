@@ -1,0 +1,49 @@
+"""A brush described in a TOML file: `brushloop sim --brush FILE`.
+
+```toml
+name = "our goat-hair brush no. 3, simulated"   # in every recording and report made with it
+[brush]
+stiffness_n_mm2 = 150.0                         # the fields of `BrushSpec`; the default of each that is left out
+```
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from drivers.sim.brush.spec import BrushSpec
+from drivers.sim.described import SimFileError, load_described
+
+PAPER = "paper"
+"""Name under which the brush of `PAPER_FILE` is chosen."""
+PAPER_FILE = Path(__file__).with_name("brush") / "paper_brush.toml"
+"""The brush made to agree with the paper's Table 2 (`python -m bench paper-brush`)."""
+
+
+class BrushFileError(SimFileError):
+    """The brush cannot be used: file, field, what is allowed."""
+
+
+@dataclass(frozen=True, slots=True)
+class NamedBrush:
+    """A brush, and the name under which it is recorded."""
+
+    spec: BrushSpec
+    name: str
+
+
+class _File(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    name: Annotated[str, Field(min_length=1, max_length=120, pattern=r'^[^\x00-\x1f\x7f"\\]+$')]
+    brush: BrushSpec
+
+
+def load_brush(path: Path) -> NamedBrush:
+    """Read the file, or the shipped brush if `path` is just `paper`. Raises `BrushFileError`."""
+    found = load_described(PAPER_FILE if str(path) == PAPER else path, _File, BrushFileError)
+    return NamedBrush(found.brush, found.name)

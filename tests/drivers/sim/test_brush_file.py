@@ -1,0 +1,93 @@
+"""A brush described in a TOML file, and the frozen brushes, which press as they did when they were frozen."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import brushloop
+from bench.brushfit_brushes import FROZEN
+from drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
+from drivers.sim.brush_file import BrushFileError, load_brush
+from drivers.sim.serve import LabRefused
+
+PRESSED = (
+    (3986.908, 3129.639, 3100.391),
+    (4034.102, 3255.779, 3098.008),
+    (4272.797, 3165.911, 3266.336),
+    (4235.855, 3262.018, 3449.286),
+    (3842.285, 2882.832, 2868.087),
+)
+"""Ink of a press, a drag and a split press of each frozen brush, as pressed before its constants could be chosen."""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "brush.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_brush_is_read_and_what_is_left_out_is_the_default(tmp_path: Path) -> None:
+    found = load_brush(written(tmp_path, 'name = "our goat-hair brush"\n[brush]\nfriction = 0.3\nseed = 4\n'))
+    assert found.name == "our goat-hair brush"
+    assert found.spec == BrushSpec(friction=0.3, seed=4)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("friction = 3.0", r"brush: friction = 3 is outside 0 \.\. 0\.8"),
+        ("frictoin = 0.3", r"brush\.frictoin: "),
+        ("friction = nan", r"brush\.friction: .*finite"),
+        ("bristles = 400.5", r"brush\.bristles: .*integer"),
+        ("radius_mm = 19.0\nlength_mm = 40.0", r"brush: length_mm = 40 is outside 57 \.\. 120"),
+        ("friction = ", "is not TOML"),
+    ],
+)
+def test_a_brush_out_of_range_is_refused_with_file_field_and_range(tmp_path: Path, text: str, message: str) -> None:
+    path = written(tmp_path, f'name = "any"\n[brush]\n{text}\n')
+    with pytest.raises(BrushFileError, match=message) as refused:
+        load_brush(path)
+    assert str(refused.value).startswith(f"{path}: ")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["", "two\\nlines", 'a \\"quote\\"', "x" * 121])
+def test_a_name_that_would_not_fit_in_a_rig_toml_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(BrushFileError, match="name: "):
+        load_brush(written(tmp_path, f'name = "{name}"\n[brush]\n'))
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BrushFileError, match="no such file"):
+        load_brush(tmp_path / "brush.toml")
+
+
+def test_the_rig_is_served_with_the_brush_and_records_its_name(tmp_path: Path) -> None:
+    path = written(tmp_path, 'name = "our goat-hair brush"\n[brush]\nradius_mm = 5.0\nlength_mm = 45.0\n')
+    rig = tmp_path / "rig.toml"
+    words = ["sim", "--brush", str(path), "--write-rig", str(rig), "--idle-exit", "0.1"]
+    assert CliRunner().invoke(brushloop.app, words).exit_code == 0
+    brush = tomllib.loads(rig.read_text())["brush"]
+    assert (brush["name"], brush["radius_mm"], brush["length_mm"]) == ("our goat-hair brush", 5.0, 45.0)
+
+
+def test_a_lab_that_nobody_has_measured_has_a_brush_of_its_own(tmp_path: Path) -> None:
+    ran = CliRunner().invoke(brushloop.app, ["sim", "--unknown", "1", "--brush", str(tmp_path / "brush.toml")])
+    assert isinstance(ran.exception, LabRefused)
+
+
+def test_the_frozen_brushes_press_and_draw_what_they_always_did() -> None:
+    # the bytes agreed too; another processor may round the last bit differently
+    ink: list[list[float]] = []
+    for spec in FROZEN:
+        brush = Brush(spec)
+        press = brush.press(12.0, 5.0, ink_load=0.8, press_seed=3)
+        split = brush.press(9.0, 0.0, ink_load=1.0, press_seed=4, flaw=Flaw.SPLIT, severity=0.7)
+        path = [Waypoint(0, 0, 0), Waypoint(0, 0, 5), Waypoint(12, 4, 5)]
+        drag = brush.drag(path, 0, 0, ink_load=1.0, press_seed=1)
+        ink.append([float(mark.density.sum(dtype=float)) for mark in (press, drag, split)])
+    assert ink == [pytest.approx(row, rel=1e-5) for row in PRESSED]
