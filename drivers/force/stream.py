@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -121,13 +119,16 @@ class RoundStream:
         try:
             self.channel_info, self.virtual = str(bus.channel_info), _is_virtual(self._settings)
             bus.send(command(START), timeout=1.0)
-            heard_s = math.inf
+            heard, quiet_s = False, 0.0
             while self.loss is None and not self._closing.is_set():
                 message = bus.recv(RECEIVE_S)
                 if message is not None:
-                    heard_s = time.monotonic()
+                    heard, quiet_s = True, 0.0
                     self._take(message)
-                elif time.monotonic() - heard_s > SILENT_S:
+                    continue
+                # Only time in which the bus was listened to: a computer that was held up has missed nothing.
+                quiet_s += RECEIVE_S
+                if heard and quiet_s > SILENT_S:
                     self._lose_bus(f"has been silent for {SILENT_S:g} s")
                 elif bus.state is can.BusState.ERROR:
                     self._lose_bus("is off")

@@ -119,11 +119,14 @@ class ProofStep:
         known = f"residuals up to {proven.worst_mm:.3f} mm; by hand it was {by_hand_mm:.2f} mm"
         sigma = max(proven.sigma_mm, 0.01)
         how = f"touched by {proven.method}, leaning by {plane.slope_deg:.2f} deg"
-        day.keep("proof", "paper.touch_z_mm", z_mm, how, unit="mm", sigma=sigma, known=known)
-        day.keep("proof", "aside.plane", [plane.z0_mm, plane.slope_x, plane.slope_y], how, unit="mm", sigma=sigma)
-        delay_ms = proven.delay_ms
-        how = "the arm was seen to leave the picture later than it did"
-        day.keep("proof", "camera.latency_ms", delay_ms, how, unit="ms", known=f"varying by {proven.jitter_ms:.0f} ms")
+        with day.together():
+            day.keep("proof", "paper.touch_z_mm", z_mm, how, unit="mm", sigma=sigma, known=known)
+            plane_mm = [plane.z0_mm, plane.slope_x, plane.slope_y]
+            day.keep("proof", "aside.plane", plane_mm, how, unit="mm", sigma=sigma)
+            delay_ms = proven.delay_ms
+            how = "the arm was seen to leave the picture later than it did"
+            known_to = f"varying by {proven.jitter_ms:.0f} ms"
+            day.keep("proof", "camera.latency_ms", delay_ms, how, unit="ms", known=known_to)
         await day.say(
             f"touch height {z_mm:.3f} mm ({z_mm - by_hand_mm:+.2f} mm from the touch by hand), {known}",
             f"self-check: marks {proven.offset_mm[0]:+.1f}, {proven.offset_mm[1]:+.1f} mm from where they were "

@@ -45,6 +45,8 @@ def torn(jpeg: bytes) -> bytes:
 SPOILED: dict[str, Callable[[bytes], bytes]] = {"torn": torn}
 """Faults of a single picture: JPEG in, JPEG out."""
 BOUNDARY = "brushloop"
+NEXT_S = 1e-6
+"""Time between two pictures that are due at once: timers of one time run in any order."""
 BACKLOG = 64
 """Images that a stalled stream keeps, as the buffers of a real one do."""
 
@@ -56,8 +58,12 @@ class _Line:
         self._view = view
         self._writer = writer
         self._loop = asyncio.get_running_loop()
-        self._began_s = self._last_s = self._loop.time()
+        self._began_s = self._last_s = self._exposed_s = self._loop.time()
         self._random = random.Random(0)
+
+    def exposed(self) -> None:
+        """The next picture shows the world as it is now: its delay is counted from here, and drawing it is a part."""
+        self._exposed_s = self._loop.time()
 
     async def send(self, data: bytes) -> None:
         """Send now, or as soon as it is due."""
@@ -69,7 +75,7 @@ class _Line:
             return
         if self._writer.is_closing():  # nothing is drained here that would notice
             raise ConnectionResetError("the client has gone")
-        self._last_s = max(self._last_s, now_s + late_s)
+        self._last_s = max(self._last_s + NEXT_S, self._exposed_s + late_s)
         self._loop.call_at(self._last_s, self._write, data)
 
     def _write(self, data: bytes) -> None:
@@ -134,18 +140,18 @@ class MjpegServer(LoopbackServer):
                 case "drop":
                     return
                 case "stale":
-                    held.append(await self._jpeg())
+                    held.append(await self._jpeg(line))
                 case "black":
-                    held.append(await self._jpeg(black=True))
+                    held.append(await self._jpeg(line, black=True))
                     shown = await self._send(held, line)
                 case "frozen":
-                    held.append(renumbered(shown or await self._jpeg(), time.time_ns()))
+                    held.append(renumbered(shown or await self._jpeg(line), time.time_ns()))
                     shown = await self._send(held, line)
                 case kind if kind in SPOILED:
-                    held.append(SPOILED[kind](await self._jpeg()))
+                    held.append(SPOILED[kind](await self._jpeg(line)))
                     await self._send(held, line)
                 case _:
-                    held.append(await self._jpeg())
+                    held.append(await self._jpeg(line))
                     shown = await self._send(held, line)
             due = max(due + self._period_s, loop.time())
             await asyncio.sleep(due - loop.time())
@@ -163,11 +169,12 @@ class MjpegServer(LoopbackServer):
             await line.send(head.encode() + image + b"\r\n")
         return image
 
-    async def _jpeg(self, *, black: bool = False) -> bytes:
+    async def _jpeg(self, line: _Line, *, black: bool = False) -> bytes:
         async with self._rendering:  # the scene keeps a cache: one thread at a time
             # Read the time first, so that no frame shows anything older than its stamp. Read the tool here, because
             # the motion queue belongs to the event loop's thread.
             host_ns, tool = time.time_ns(), self._scene.tool()
+            line.exposed()
             return await asyncio.to_thread(self._encode, host_ns, tool, black)
 
     def _encode(self, host_ns: int, tool: Pose, black: bool) -> bytes:

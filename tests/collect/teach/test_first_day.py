@@ -10,14 +10,17 @@ from pathlib import Path
 
 import pytest
 
-from collect.rig.config import load_rig
+from collect.rig.config import RigConfig, load_rig
+from collect.rig.doctor import Finding
+from collect.rig.paper import PaperPlane
 from collect.teach import cameras
 from collect.teach.day import Day
 from collect.teach.guide import Brought, Target
-from collect.teach.steps.proof import read_proof
+from collect.teach.steps import proof
+from collect.teach.steps.proof import ProofStep, Proven, read_proof
 from collect.teach.store import Notebook, TaughtFile
 from collect.teach.wizard import Wizard
-from drivers.clock import HostClock
+from drivers.clock import Clock, HostClock
 from drivers.sim.lab.traps import Trap
 from tests.collect.teach.unknown import Errors, InLab, errors, first_day, in_lab, newest_session
 
@@ -41,6 +44,10 @@ IN_PASSING = {
     Trap.FORCE_SIGN: "The sensor counts a push toward the flange as positive",
     Trap.SLOW_CAMERA: "The camera is slow",
 }
+
+
+PROVEN = Proven(PaperPlane(100.0), "force", 0.01, 0.04, 170.0, 20.0, (0.5, 0.2), 0.1, proof.PRESSES, 0)
+"""What a run of the proof may have measured."""
 
 
 class Killed(BaseException):
@@ -129,6 +136,48 @@ async def test_killed_again_and_again_it_asks_nothing_twice_and_a_step_taught_ag
     assert rig.with_name("rig.toml.bak").read_text(encoding="utf-8") == text
     assert any("Changed with it, because it rests on this step:" in line for line in person.lines)
 
+    await _killed_in_each_part_of_the_proof(person, rig, monkeypatch)
+    assert "NOT PROVEN" not in rig.read_text(encoding="utf-8")
+    assert load_rig(rig).camera.latency_ms == PROVEN.delay_ms
+
+
+async def _killed_in_each_part_of_the_proof(person: InLab, rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Devices are examined and values kept as ever; the two runs, which take minutes, are left out."""
+    parts, examine, save = ["doctor", "dry run", "presses", "values"], proof.examine, TaughtFile.save
+    brought, asked = len(person.brought), len(person.asked)
+
+    def reached(part: str) -> None:
+        if parts and parts[0] == part:
+            parts.pop(0)
+            raise Killed
+
+    async def examined(config: RigConfig, clock: Clock) -> list[Finding]:
+        found = await examine(config, clock)
+        reached("doctor")
+        return found
+
+    async def run(_step: ProofStep, _day: Day, folder: Path, _protocol: str, *, dry: bool) -> Path:
+        reached("dry run" if dry else "presses")
+        return folder
+
+    def saved(self: TaughtFile, notebook: Notebook) -> None:
+        save(self, notebook)
+        if notebook.values["camera.latency_ms"].step == "proof":
+            reached("values")
+
+    with monkeypatch.context() as proving:
+        proving.setattr(proof, "examine", examined)
+        proving.setattr(ProofStep, "_run", run)
+        proving.setattr(proof, "read_proof", lambda _session: PROVEN)
+        proving.setattr(TaughtFile, "save", saved)
+        for left in (3, 2, 1, 0):
+            with pytest.raises(Killed):
+                await first_day(person, rig)
+            assert len(parts) == left
+        assert await first_day(person, rig) == rig
+    assert len(person.brought) == brought, "something was brought again"
+    assert all("The arm moves by itself" in question for question in person.asked[asked:])
+
 
 def _within_a_hands_error(found: Errors, latency_ms: float) -> None:
     """By hand alone: without the arm's own touch, heights are known to a few tenths, and the delay is not."""
@@ -172,7 +221,11 @@ async def test_thirty_labs(seed: int, tmp_path: Path) -> None:
     trap, began_s = TRAPPED.get(seed), time.monotonic()
     with in_lab(seed, trap, rate=SOAK_RATE) as person:
         person.mends = trap is not None
-        made = await first_day(person, tmp_path / "rig.toml")
+        rig = tmp_path / "rig.toml"
+        made = await first_day(person, rig)
+        if trap is Trap.WRONG_BOARD_SIZE:  # the way out that is named: the camera's step rests on the board's size
+            assert await Wizard(Day(person, rig, HostClock(), armed=True)).again("camera") is None
+            made = await first_day(person, rig)
         assert trap is None or _named(person, trap), person.trouble
         if trap is not None:
             sys.stdout.write(f"{seed:2d} {trap}: {_words_on(person, trap)}\n")
@@ -181,4 +234,4 @@ async def test_thirty_labs(seed: int, tmp_path: Path) -> None:
         took_s = time.monotonic() - began_s
         sys.stdout.write(f"{seed:2d}: {found}, {proven.sound} presses, {proven.again} made again, {took_s:.0f} s\n")
         assert found.within, found
-        assert proven.sound == 6
+        assert proven.sound == proof.PRESSES
