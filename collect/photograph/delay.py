@@ -56,8 +56,13 @@ class CameraDelay:
 
     @property
     def delay_s(self) -> float:
-        """Mean time from an event to the arrival of the first frame that shows it."""
-        return float(np.mean([look.delay_s for look in self.looks]))
+        """Mean time from an event to the arrival of the first frame that shows it, without trips in which something
+        stalled: those are farther from the median than the periods of camera and arm explain."""
+        delays_s = np.array([look.delay_s for look in self.looks])
+        off_s = np.abs(delays_s - np.median(delays_s))
+        typical_s = float(np.median([look.resolution_s for look in self.looks]))
+        near = off_s <= max(2.0 * typical_s, GOOD_S, float(off_s.min()))
+        return float(delays_s[near].mean())
 
     @property
     def spread_s(self) -> float:

@@ -79,3 +79,11 @@ def test_several_looks_are_reported_with_their_spread():
     assert delay.spread_s == pytest.approx(0.06)
     assert delay.bound_s == pytest.approx(0.30)
     assert str(delay) == "230 ± 21 ms, varying by 60 ms over 2 trips"
+
+
+def test_a_trip_in_which_the_computer_stalled_does_not_make_the_camera_later() -> None:
+    delay = CameraDelay((Look(0.41, 0.03), Look(0.65, 0.03), Look(0.42, 0.03), Look(0.40, 0.03)))
+    assert delay.delay_s == pytest.approx(0.41)
+    assert delay.spread_s == pytest.approx(0.25), "it still counts as unsteady"
+    assert delay.bound_s == pytest.approx(0.68), "and a photograph waits for the longest"
+    assert CameraDelay((Look(0.40, 0.03), Look(0.65, 0.03))).delay_s == pytest.approx(0.525), "either may have stalled"
