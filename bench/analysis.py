@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bench.harness import BenchError, Result, machine
-from bench.validate import session
+from bench.validate import Presses, session
 
 ROOT = Path(__file__).resolve().parent.parent
 PRESSES = 30
@@ -33,7 +33,7 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
         raise ValueError(f"n = {rounds}: at least one round is needed")
     with tempfile.TemporaryDirectory() as folder:
         under = Path(folder)
-        place = session(under, "presses", PRESSES, seed)
+        place = session(under, "presses", Presses(PRESSES, seed))
         starts = [_timed(name, "nowhere", code=2)[1] for _ in range(rounds) for name in STARTED]
         fits = [_timed("fit", str(place))[1] for _ in range(rounds)]
         reports = [_timed("validate", str(place), "--out", str(under / f"report-{k}")) for k in range(rounds)]

@@ -37,48 +37,48 @@ STILL = View(2048, 1536, (1100, 768), 2.0)
 """As the loopback camera takes it: where time and memory count."""
 
 
-def session(
-    under: Path,
-    name: str,
-    strokes: int,
-    seed: int,
-    spec: BrushSpec | None = None,
-    distinct: int = PHOTOGRAPHS,
-    view: View = CLOSE,
-) -> Path:
-    """A session of so many presses; photographs repeat after the first `distinct`, which no cache here can notice."""
-    photos = photographs(under / f"{name}-photos", strokes, seed, spec, distinct, view)
+@dataclass(frozen=True, slots=True)
+class Presses:
+    """Which presses are photographed, and how."""
+
+    strokes: int
+    seed: int
+    spec: BrushSpec | None = None
+    """The brush; by default one that the seed chooses."""
+    distinct: int = PHOTOGRAPHS
+    """How many photographs are drawn; after them they repeat, which no cache here can notice."""
+    view: View = CLOSE
+
+
+def session(under: Path, name: str, presses: Presses) -> Path:
+    """A session of these presses."""
+    photos = photographs(under / f"{name}-photos", presses)
     out = under / name
     import_photographs(photos, photos / "strokes.csv", out, ImportOptions(kind="press"), "bench", lambda: 1)
     return out
 
 
-def photographs(
-    photos: Path,
-    strokes: int,
-    seed: int,
-    spec: BrushSpec | None = None,
-    distinct: int = PHOTOGRAPHS,
-    view: View = CLOSE,
-) -> Path:
-    """A folder of so many photographs, with the table for an import, `strokes.csv`; files that repeat are links."""
+def photographs(photos: Path, presses: Presses) -> Path:
+    """A new folder of these photographs, with the table for an import, `strokes.csv`; files that repeat are links."""
     photos.mkdir()
-    brush = Brush(spec or BrushSpec(seed=1 + seed))
-    drawn = [
-        cv2.imencode(".png", photograph(brush, *CELLS[k % len(CELLS)], seed + k, view))[1].tobytes()
-        for k in range(min(distinct, strokes))
-    ]
-    lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
-    for k in range(strokes):
-        file = f"{k:06d}.png"
-        if k < len(drawn):
-            (photos / file).write_bytes(drawn[k])
-        else:
-            (photos / file).hardlink_to(photos / f"{k % len(drawn):06d}.png")
-        height, tilt = CELLS[k % len(drawn) % len(CELLS)]
-        lines.append(f"{file},{height},{tilt},{PX_MM},{view.touch_px[0]},{view.touch_px[1]}")
-    (photos / "strokes.csv").write_text("\n".join(lines) + "\n")
+    view, seed = presses.view, presses.seed
+    drawn = min(presses.distinct, presses.strokes)
+    brush = Brush(presses.spec or BrushSpec(seed=1 + seed))
+    for k in range(drawn):
+        cv2.imwrite(str(photos / f"{k:06d}.png"), photograph(brush, *CELLS[k % len(CELLS)], seed + k, view))
+    for k in range(drawn, presses.strokes):
+        (photos / f"{k:06d}.png").hardlink_to(photos / f"{k % drawn:06d}.png")
+    write_table(photos, presses)
     return photos
+
+
+def write_table(photos: Path, presses: Presses) -> None:
+    """Write `strokes.csv`, the table for an import of the first `presses.strokes` photographs."""
+    lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
+    for k in range(presses.strokes):
+        height, tilt = CELLS[k % presses.distinct % len(CELLS)]
+        lines.append(f"{k:06d}.png,{height},{tilt},{PX_MM},{presses.view.touch_px[0]},{presses.view.touch_px[1]}")
+    (photos / "strokes.csv").write_text("\n".join(lines) + "\n")
 
 
 def pressed(cell: tuple[float, float], repeats: int, seed: int) -> list[Press]:

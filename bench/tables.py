@@ -13,7 +13,7 @@ from pathlib import Path
 
 from bench.brushfit_brushes import FROZEN
 from bench.harness import BenchError, Result, machine
-from bench.press_sessions import CELLS, session
+from bench.press_sessions import CELLS, Presses, session
 from bench.processes import brushloop
 from calibrate.compare.field import Alignment, Tone
 from calibrate.validate.candidates import BEZIER_REFITTED, FITTED_HELD_OUT, GENERATOR_HELD_OUT
@@ -44,7 +44,7 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
         )
         for number, spec in enumerate(brushes, 1):
             count = REPEATS * len(CELLS)
-            place = session(under, f"brush-{number}", count, seed, spec, count)
+            place = session(under, f"brush-{number}", Presses(count, seed, spec, count))
             brushloop("fit", str(place))
             generator = ("--generator", str(under / "generator" / "generator.safetensors"))
             report = under / f"report-{number}"

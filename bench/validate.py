@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from bench.harness import BenchError, Result, interleave, machine
 from bench.peak import measure
-from bench.press_sessions import STILL, pressed, session
+from bench.press_sessions import STILL, Presses, pressed, session
 from calibrate.compare.field import BEST_SHIFT_PX, KEYS, SIZE_PX, Alignment, Field
 from calibrate.compare.images import Pixels, pack, simulated_pixels, unpack
 from calibrate.compare.similarity import csim, ssim
@@ -131,7 +131,7 @@ def _shifted(moving: NDArray[np.float64], fixed: NDArray[np.float64]) -> NDArray
 
 def memory(under: Path, strokes: int, seed: int) -> list[Result]:
     """Peak memory of the whole command over `FEW` strokes and over all of them."""
-    few, many = (session(under, f"of-{count}", count, seed, view=STILL) for count in (min(FEW, strokes), strokes))
+    few, many = (session(under, f"of-{count}", Presses(count, seed, view=STILL)) for count in (min(FEW, strokes), strokes))
     small_mb, small_s = _measured(few, under / "few")
     large_mb, large_s = _measured(many, under / "many")
     grown = large_mb - small_mb
@@ -160,7 +160,7 @@ def memory(under: Path, strokes: int, seed: int) -> list[Result]:
 def threads(seed: int, strokes: int = 60) -> list[Result]:
     """Finding strokes on photographs by threads, beside as many processes that have already started."""
     with tempfile.TemporaryDirectory() as folder:
-        place = session(Path(folder), "threads", strokes, seed, view=STILL)
+        place = session(Path(folder), "threads", Presses(strokes, seed, view=STILL))
         jobs = [PrepareJob(capture, None, Field()) for capture in Recording(place).captures()]
     with Threads() as pool, ProcessPoolExecutor(pool.workers, multiprocessing.get_context("spawn")) as processes:
         began = time.perf_counter()
@@ -190,7 +190,7 @@ def cluster(under: Path, strokes: int, seed: int) -> list[Result]:
     """Finding strokes by one Dask worker and by two, each with one thread; nothing where Dask is missing."""
     if importlib.util.find_spec("distributed") is None:
         return []
-    place = session(under, f"dask-{strokes}", strokes, seed, view=STILL)
+    place = session(under, f"dask-{strokes}", Presses(strokes, seed, view=STILL))
     jobs = [(str(k), PrepareJob(one, None, Field())) for k, one in enumerate(Recording(place).captures())]
     taken: dict[int, float] = {}
     for workers in (1, 2):
