@@ -98,7 +98,8 @@ def results(points: Sequence[Point], seed: int) -> list[Result]:
             f"{point.used.peak_mb:.0f} MB"
             for point in mine
         )
-        where = f"loopback rig, stills of {STILL.width_px} x {STILL.height_px} px with noise; {command}: {each}; {machine()}"
+        size = f"{STILL.width_px} x {STILL.height_px} px"
+        where = f"loopback rig, stills of {size} with noise; {command}: {each}; {machine()}"
         first_ms, last_ms = each_ms(a, b), each_ms(y, z)
         peak_mb, level_mb = z.used.peak_mb, level.used.peak_mb
         made += [

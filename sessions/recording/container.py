@@ -10,7 +10,9 @@ import io
 import os
 import struct
 import zlib
+from array import array
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,9 +20,20 @@ import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import FOOTER_SIZE, SeekingReader
-from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
-from mcap.summary import Summary
+from mcap.reader import FOOTER_SIZE
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Message,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
+from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from sessions.errors import InputError, SessionDamaged, in_one_line
@@ -46,6 +59,20 @@ Record = tuple[Schema | None, Channel, Message]
 _T = TypeVar("_T")
 
 
+@dataclass(slots=True)
+class Index:
+    """The index at the end of a file; of each chunk only its place and its channels, a few bytes."""
+
+    statistics: Statistics
+    schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
+    channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
+    chunk_offsets: array[int] = field(default_factory=lambda: array("Q"))
+    chunk_channels: list[frozenset[int]] = field(default_factory=list[frozenset[int]])
+    """Numbers of the channels of each chunk; empty where the index does not list them."""
+    attachments: list[AttachmentIndex] = field(default_factory=list[AttachmentIndex])
+    metadata: list[MetadataIndex] = field(default_factory=list[MetadataIndex])
+
+
 def messages(path: Path, topics: list[str] | None = None) -> Iterator[Record]:
     """Messages in the order in which they were written, every CRC checked. Raises `SessionDamaged`.
 
@@ -54,7 +81,7 @@ def messages(path: Path, topics: list[str] | None = None) -> Iterator[Record]:
     return _guarded(path, lambda file: _messages(file, topics))
 
 
-def chunks(path: Path) -> Iterator[tuple[Contents, Summary]]:
+def chunks(path: Path) -> Iterator[tuple[Contents, Index]]:
     """Chunks in the order in which they were written, every CRC checked, and the file's index. Raises
     `SessionDamaged`."""
     return _guarded(path, lambda file: _chunks(file, None))
@@ -62,7 +89,7 @@ def chunks(path: Path) -> Iterator[tuple[Contents, Summary]]:
 
 def metadata(path: Path) -> Iterator[Metadata]:
     """Metadata records. Raises `SessionDamaged`."""
-    return _guarded(path, lambda file: indexed(file)[0].iter_metadata())
+    return _guarded(path, _metadata)
 
 
 def attachments(path: Path) -> Iterator[Attachment]:
@@ -110,19 +137,43 @@ def _guarded(path: Path, read: Callable[[BoundedFile], Iterator[_T]]) -> Iterato
             yield item
 
 
-def indexed(file: BoundedFile) -> tuple[SeekingReader, Summary]:
-    """Return a reader, and the index at the end of the file with its CRC checked. Raises any of `UNREADABLE`."""
-    file.seek(0)
-    reader = SeekingReader(file, validate_crcs=True, record_size_limit=MAX_RECORD_BYTES)
-    _check_summary_crc(file)
-    summary = reader.get_summary()
-    if summary is None or summary.statistics is None:
+def indexed(file: BoundedFile) -> Index:
+    """Return the index at the end of the file, its CRC checked. Raises any of `UNREADABLE`."""
+    found = Index(Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0))
+    known: dict[frozenset[int], frozenset[int]] = {}  # nearly all chunks have the same channels
+    unfinished = True
+    for record in index_records(file):
+        match record:
+            case Statistics():
+                found.statistics, unfinished = record, False
+            case Schema():
+                found.schemas[record.id] = record
+            case Channel():
+                found.channels[record.id] = record
+            case ChunkIndex():
+                numbers = frozenset(record.message_index_offsets)
+                found.chunk_offsets.append(record.chunk_start_offset)
+                found.chunk_channels.append(known.setdefault(numbers, numbers))
+            case AttachmentIndex():
+                found.attachments.append(record)
+            case MetadataIndex():
+                found.metadata.append(record)
+            case _:
+                pass
+    if unfinished:
         raise McapError("has no index: it was not finished")
-    return reader, summary
+    return found
 
 
-def _check_summary_crc(file: BoundedFile) -> None:
-    """Check the CRC of the index: otherwise one wrong bit in it could silently hide strokes."""
+def index_records(file: BoundedFile) -> Iterator[object]:
+    """Records of the index at the end of the file, its CRC checked. Raises any of `UNREADABLE`."""
+    file.seek(_summary_start(file))
+    untyped: Iterator[object] = StreamReader(file, skip_magic=True, record_size_limit=MAX_RECORD_BYTES).records
+    return untyped
+
+
+def _summary_start(file: BoundedFile) -> int:
+    """Check the CRC of the index: otherwise one wrong bit in it could silently hide strokes. Return its place."""
     footer_at = file.size - FOOTER_SIZE - len(MCAP0_MAGIC)
     file.seek(footer_at)
     _opcode, _length, summary_start, _offsets, expected = struct.unpack("<BQQQI", file.read(FOOTER_SIZE))
@@ -135,34 +186,35 @@ def _check_summary_crc(file: BoundedFile) -> None:
         crc, left = zlib.crc32(piece, crc), left - len(piece)
     if crc != expected:
         raise McapError("the index does not match its CRC")
+    return summary_start
 
 
 def _messages(file: BoundedFile, topics: list[str] | None) -> Iterator[Record]:
-    for contents, summary in _chunks(file, topics):
+    for contents, index in _chunks(file, topics):
         channels = {
             number: channel
-            for number, channel in summary.channels.items()
+            for number, channel in index.channels.items()
             if number in contents.index and (topics is None or channel.topic in topics)
         }
         schemas = {
-            number: summary.schemas[channel.schema_id] for number, channel in channels.items() if channel.schema_id
+            number: index.schemas[channel.schema_id] for number, channel in channels.items() if channel.schema_id
         }
         for message in contents.each(channels):
             yield schemas.get(message.channel_id), channels[message.channel_id], message
 
 
-def _chunks(file: BoundedFile, topics: list[str] | None) -> Iterator[tuple[Contents, Summary]]:
+def _chunks(file: BoundedFile, topics: list[str] | None) -> Iterator[tuple[Contents, Index]]:
     """Chunks that may hold messages on `topics`."""
-    _reader, summary = indexed(file)
-    if not summary.chunk_indexes and (summary.statistics is None or summary.statistics.message_count):
+    index = indexed(file)
+    if not index.chunk_offsets and index.statistics.message_count:
         raise McapError("has messages outside chunks, which no CRC protects")
-    wanted = {number for number, channel in summary.channels.items() if topics is None or channel.topic in topics}
-    for index in summary.chunk_indexes:
-        if topics is None or not index.message_index_offsets or wanted & index.message_index_offsets.keys():
-            contents = chunk_at(file, index.chunk_start_offset)
-            if not contents.index.keys() <= summary.channels.keys():
+    wanted = {number for number, channel in index.channels.items() if topics is None or channel.topic in topics}
+    for offset, channels in zip(index.chunk_offsets, index.chunk_channels, strict=True):
+        if topics is None or not channels or wanted & channels:
+            contents = chunk_at(file, offset)
+            if not contents.index.keys() <= index.channels.keys():
                 raise McapError("a chunk has messages of a channel that the index does not list")
-            yield contents, summary
+            yield contents, index
 
 
 def chunk_at(file: BoundedFile, offset: int) -> Contents:
@@ -194,18 +246,34 @@ def check_chunk_at(file: BoundedFile, offset: int) -> None:
         raise McapError(f"chunk of {size} bytes exceeds {MAX_RECORD_BYTES}")
 
 
+def _metadata(file: BoundedFile) -> Iterator[Metadata]:
+    for one in indexed(file).metadata:
+        record = _record_at(file, one.offset)
+        if not isinstance(record, Metadata):
+            raise McapError("the index names metadata where there is none")
+        yield record
+
+
 def _attachments(file: BoundedFile) -> Iterator[Attachment]:
-    reader, summary = indexed(file)
-    for index, attachment in zip(summary.attachment_indexes, reader.iter_attachments(), strict=True):
+    for one in indexed(file).attachments:
+        record = _record_at(file, one.offset)
+        if not isinstance(record, Attachment):
+            raise McapError("the index names an attachment where there is none")
         again = RecordBuilder()
-        attachment.write(again)
-        file.seek(index.offset)
-        if file.read(index.length) != again.end():  # the reader skips the CRC of an attachment
-            raise McapError(f"attachment {attachment.name!r} does not match its CRC")
-        yield attachment
+        record.write(again)
+        file.seek(one.offset)
+        if file.read(one.length) != again.end():  # the reader skips the CRC of an attachment
+            raise McapError(f"attachment {record.name!r} does not match its CRC")
+        yield record
+
+
+def _record_at(file: BoundedFile, offset: int) -> object:
+    file.seek(offset)
+    untyped: Iterator[object] = StreamReader(file, skip_magic=True, record_size_limit=MAX_RECORD_BYTES).records
+    return next(untyped)
 
 
 def _indexed_counts(file: BoundedFile) -> Iterator[dict[str, int]]:
-    _reader, summary = indexed(file)
-    counts = summary.statistics.channel_message_counts if summary.statistics else {}
-    yield {summary.channels[channel_id].topic: count for channel_id, count in counts.items()}
+    index = indexed(file)
+    counts = index.statistics.channel_message_counts
+    yield {index.channels[channel_id].topic: count for channel_id, count in counts.items()}

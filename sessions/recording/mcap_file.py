@@ -63,10 +63,10 @@ class Copy:
 
     def add_file(self, path: Path) -> None:
         """Add all messages of a file, chunk by chunk, every CRC checked. Raises `SessionDamaged`."""
-        for contents, summary in container.chunks(path):
-            channels = {number: summary.channels[number] for number in contents.index}
+        for contents, found in container.chunks(path):
+            channels = {number: found.channels[number] for number in contents.index}
             numbers = {
-                number: self._number(summary.schemas[channel.schema_id] if channel.schema_id else None, channel)
+                number: self._number(found.schemas[channel.schema_id] if channel.schema_id else None, channel)
                 for number, channel in channels.items()
             }
             self._writer.add_contents(contents, numbers)
@@ -134,9 +134,9 @@ def read_note(metadata: dict[str, str]) -> dict[str, Any] | None:
 def count_messages(path: Path) -> dict[str, int]:
     """Number of messages by topic, with every chunk's CRC checked. Raises `SessionDamaged`."""
     counts: Counter[str] = Counter()
-    for contents, summary in container.chunks(path):
+    for contents, found in container.chunks(path):
         for number, index in contents.index.items():
-            counts[summary.channels[number].topic] += len(index) // 2
+            counts[found.channels[number].topic] += len(index) // 2
     return dict(counts)
 
 

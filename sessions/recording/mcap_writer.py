@@ -8,9 +8,10 @@ Format: https://mcap.dev/spec
 from __future__ import annotations
 
 import struct
+import tempfile
 import zlib
 from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import IO, Protocol
 
 import zstandard
@@ -39,6 +40,8 @@ _CHUNK_START = struct.Struct("<BQQQQII4sQ")
 _INDEX_START = struct.Struct("<BQHI")
 _FOOTER_START = struct.Struct("<BQQQ")
 _CHANNEL = struct.Struct("<H")
+INDEX_IN_MEMORY_BYTES = 64 * 1024
+"""A longer index of chunks waits in a temporary file: some 100 bytes for each chunk."""
 
 
 class _Writable(Protocol):
@@ -57,7 +60,9 @@ class McapWriter:
         """Log time and offset of each message of that chunk, one after the other, by channel."""
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
-        self._chunks: list[ChunkIndex] = []
+        self._chunks = tempfile.SpooledTemporaryFile(INDEX_IN_MEMORY_BYTES)  # noqa: SIM115, `finish` closes it
+        """Their records in the index of the file."""
+        self._chunk_count, self._first_ns, self._last_ns = 0, 0, 0
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._counts: Counter[int] = Counter()
@@ -132,39 +137,44 @@ class McapWriter:
         self._end_chunk()
         self._write(DataEnd(0))
         summary_start = self._file.tell()
-        groups: list[tuple[Opcode, list[_Writable]]] = [
-            (Opcode.SCHEMA, [*self._schemas]),
-            (Opcode.CHANNEL, [*self._channels]),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, [*self._chunks]),
-            (Opcode.ATTACHMENT_INDEX, [*self._attachments]),
-            (Opcode.METADATA_INDEX, [*self._metadata]),
+        groups: list[tuple[Opcode, Iterable[bytes]]] = [
+            (Opcode.SCHEMA, map(_packed, self._schemas)),
+            (Opcode.CHANNEL, map(_packed, self._channels)),
+            (Opcode.STATISTICS, [_packed(self._statistics())]),
+            (Opcode.CHUNK_INDEX, self._chunk_indexes()),
+            (Opcode.ATTACHMENT_INDEX, map(_packed, self._attachments)),
+            (Opcode.METADATA_INDEX, map(_packed, self._metadata)),
         ]
-        summary = RecordBuilder()
-        offsets: list[SummaryOffset] = []
-        for opcode, records in groups:
-            start = summary.count
-            for record in records:
-                record.write(summary)
-            offsets.append(SummaryOffset(opcode, summary_start + start, summary.count - start))
-        offsets_start = summary_start + summary.count
-        for offset in offsets:
-            offset.write(summary)
-        data = summary.end()
-        footer = _FOOTER_START.pack(Opcode.FOOTER, 8 + 8 + 4, summary_start, offsets_start)
-        self._file.write(data)
-        self._write(Footer(summary_start, offsets_start, zlib.crc32(footer, zlib.crc32(data))))
+        crc, at = 0, summary_start
+        offsets: list[bytes] = []
+        for opcode, pieces in groups:
+            begin = at
+            for piece in pieces:
+                crc, at = zlib.crc32(piece, crc), at + self._file.write(piece)
+            offsets.append(_packed(SummaryOffset(opcode, begin, at - begin)))
+        for piece in offsets:
+            crc = zlib.crc32(piece, crc)
+            self._file.write(piece)
+        footer = _FOOTER_START.pack(Opcode.FOOTER, 8 + 8 + 4, summary_start, at)
+        self._write(Footer(summary_start, at, zlib.crc32(footer, crc)))
         self._file.write(MCAP0_MAGIC)
+
+    def _chunk_indexes(self) -> Iterator[bytes]:
+        """Their packed records, in pieces."""
+        with self._chunks as packed:
+            packed.seek(0)
+            while piece := packed.read(INDEX_IN_MEMORY_BYTES):
+                yield piece
 
     def _statistics(self) -> Statistics:
         return Statistics(
             attachment_count=len(self._attachments),
             channel_count=len(self._channels),
             channel_message_counts=dict(self._counts),
-            chunk_count=len(self._chunks),
+            chunk_count=self._chunk_count,
             message_count=self._counts.total(),
-            message_end_time=max((chunk.message_end_time for chunk in self._chunks), default=0),
-            message_start_time=min((chunk.message_start_time for chunk in self._chunks), default=0),
+            message_end_time=self._last_ns,
+            message_start_time=self._first_ns,
             metadata_count=len(self._metadata),
             schema_count=len(self._schemas),
         )
@@ -188,19 +198,21 @@ class McapWriter:
             self._file.write(struct.pack(f"<{len(index)}Q", *index))
             at += _INDEX_START.size + size
             self._counts[number] += len(index) // 2
-        self._chunks.append(
-            ChunkIndex(
-                chunk_length=length,
-                chunk_start_offset=start,
-                compression="zstd",
-                compressed_size=len(packed),
-                message_end_time=last_ns,
-                message_index_length=at - start - length,
-                message_index_offsets=offsets,
-                message_start_time=first_ns,
-                uncompressed_size=len(records),
-            )
+        self._first_ns = min(first_ns, self._first_ns) if self._chunk_count else first_ns
+        self._last_ns = max(last_ns, self._last_ns)
+        self._chunk_count += 1
+        index_record = ChunkIndex(
+            chunk_length=length,
+            chunk_start_offset=start,
+            compression="zstd",
+            compressed_size=len(packed),
+            message_end_time=last_ns,
+            message_index_length=at - start - length,
+            message_index_offsets=offsets,
+            message_start_time=first_ns,
+            uncompressed_size=len(records),
         )
+        self._chunks.write(_packed(index_record))
         self._index.clear()
         self._records = bytearray()
 

@@ -10,6 +10,7 @@ import io
 import re
 import struct
 import zlib
+from array import array
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -19,7 +20,7 @@ from typing import Any
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from sessions.errors import InputError, in_one_line
@@ -31,6 +32,7 @@ from sessions.recording.container import (
     Record,
     check_chunk_at,
     chunk_at,
+    index_records,
     indexed,
 )
 from sessions.recording.mcap_file import HEADER_METADATA, header_crc, read_note
@@ -61,8 +63,6 @@ class Scan:
     """Known chunks, in order."""
     complete: bool = False
     """Whether all chunks are known: the walk reached the end, or the index is intact."""
-    indexed: dict[int, dict[int, int]] = field(default_factory=dict[int, dict[int, int]])
-    """Number of messages by chunk offset and channel number, from the index records after each chunk."""
     schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
     channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
     notes: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
@@ -90,10 +90,11 @@ def scan(path: Path) -> Scan:
     with file:
         try:
             offsets = _walk(file, found)
-            offsets += _from_index(file, found, set(offsets))
+            offsets.extend(_from_index(file, found, offsets))
         except OSError as error:
             found.damage.append(f"cannot be read: {in_one_line(error)}")
             return found
+        known: dict[frozenset[tuple[str, int]], Counter[str]] = {}  # nearly all chunks hold the same numbers
         for offset in sorted(offsets):
             try:
                 counts = Counter(channel.topic for _schema, channel, _message in _chunk(file, offset, found))
@@ -102,19 +103,52 @@ def scan(path: Path) -> Scan:
                 found.parts.append(Part(offset, None, sound=False))
             else:
                 found.counts += counts
-                found.parts.append(Part(offset, counts, sound=True))
-    found.parts = [
-        part if part.sound else Part(part.offset, _indexed_counts(found, part.offset), False) for part in found.parts
-    ]
+                found.parts.append(Part(offset, known.setdefault(frozenset(counts.items()), counts), sound=True))
+        found.parts = [
+            part if part.sound else Part(part.offset, _indexed_counts(file, found, part.offset), False)
+            for part in found.parts
+        ]
     return found
 
 
-def _indexed_counts(found: Scan, offset: int) -> Counter[str] | None:
+def _indexed_counts(file: BoundedFile, found: Scan, offset: int) -> Counter[str] | None:
     """Number of messages in a chunk by topic, from the index records after it; None without them."""
-    by_channel = found.indexed.get(offset)
+    try:
+        by_channel = _after_chunk(file, offset) or _named_by_index(file, offset)
+    except UNREADABLE:
+        return None
     if not by_channel or not by_channel.keys() <= found.channels.keys():
         return None
     return Counter({found.channels[number].topic: count for number, count in by_channel.items()})
+
+
+def _after_chunk(file: BoundedFile, offset: int) -> dict[int, int]:
+    """Number of messages by channel, from the index records that follow the chunk; none if its length is wrong."""
+    by_channel: dict[int, int] = {}
+    at = offset
+    while True:
+        file.seek(at)
+        start = file.read(RECORD_START.size)
+        if len(start) < RECORD_START.size:
+            return by_channel
+        opcode, length = RECORD_START.unpack(start)
+        if opcode == Opcode.MESSAGE_INDEX:
+            by_channel |= _message_index(file)
+        elif at != offset:
+            return by_channel
+        at += RECORD_START.size + length
+
+
+def _named_by_index(file: BoundedFile, offset: int) -> dict[int, int]:
+    """The same from the index records that the index of the file names. Raises any of `UNREADABLE`."""
+    by_channel: dict[int, int] = {}
+    for record in index_records(file):
+        if isinstance(record, ChunkIndex) and record.chunk_start_offset == offset:
+            for place in record.message_index_offsets.values():
+                file.seek(place + RECORD_START.size)
+                by_channel |= _message_index(file)
+            break
+    return by_channel
 
 
 def salvaged(found: Scan) -> Iterator[Record]:
@@ -160,9 +194,9 @@ def _unpacked(data: bytes) -> bytes:
     return bytes(unpacked)
 
 
-def _walk(file: BoundedFile, found: Scan) -> list[int]:
+def _walk(file: BoundedFile, found: Scan) -> array[int]:
     """Offsets of possible chunks, up to the end or to the first record that cannot be read."""
-    offsets: list[int] = []
+    offsets = array("Q")
     if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         found.damage.append("does not begin as an MCAP file does")
     at = len(MCAP0_MAGIC)
@@ -181,9 +215,7 @@ def _walk(file: BoundedFile, found: Scan) -> list[int]:
             return offsets
         if opcode == Opcode.CHUNK:
             offsets.append(at)
-        elif opcode == Opcode.MESSAGE_INDEX and offsets:
-            _message_index(file, found, offsets[-1])
-        else:
+        elif opcode != Opcode.MESSAGE_INDEX:
             _record(file, found, opcode, at, length)
         at += RECORD_START.size + length
         if opcode == Opcode.DATA_END:
@@ -191,12 +223,13 @@ def _walk(file: BoundedFile, found: Scan) -> list[int]:
             return offsets
 
 
-def _message_index(file: BoundedFile, found: Scan, chunk: int) -> None:
-    """Count a channel's messages in the chunk: the record holds the channel's number and 16 bytes a message."""
+def _message_index(file: BoundedFile) -> dict[int, int]:
+    """A channel's number of messages in a chunk: the record holds the channel's number and 16 bytes a message."""
     start = file.read(_MESSAGE_INDEX.size)
-    if len(start) == _MESSAGE_INDEX.size:
-        channel, length = _MESSAGE_INDEX.unpack(start)
-        found.indexed.setdefault(chunk, {})[channel] = length // 16
+    if len(start) < _MESSAGE_INDEX.size:
+        return {}
+    channel, length = _MESSAGE_INDEX.unpack(start)
+    return {channel: length // 16}
 
 
 def _record_at(file: BoundedFile, found: Scan, offset: int) -> None:
@@ -236,30 +269,28 @@ def _metadata(record: Metadata, found: Scan) -> None:
             found.notes[record.name] = values
 
 
-def _from_index(file: BoundedFile, found: Scan, known: set[int]) -> list[int]:
+def _from_index(file: BoundedFile, found: Scan, known: array[int]) -> list[int]:
     """Return offsets of chunks that only the index lists, and add its channels, which a lost chunk may have held."""
     try:
-        _reader, summary = indexed(file)
+        index = indexed(file)
     except UNREADABLE as error:
         found.damage.append(f"its index cannot be read ({in_one_line(error)})")
         return []
-    found.schemas.update(summary.schemas)
-    found.channels.update(summary.channels)
-    counts = summary.statistics.channel_message_counts if summary.statistics else {}
+    found.schemas.update(index.schemas)
+    found.channels.update(index.channels)
+    counts = index.statistics.channel_message_counts
     found.stated = {found.channels[key].topic: count for key, count in counts.items() if key in found.channels}
-    found.stated_attachments = len(summary.attachment_indexes)
-    found.stated_notes = len({index.name for index in summary.metadata_indexes} - {HEADER_METADATA})
+    found.stated_attachments = len(index.attachments)
+    found.stated_notes = len({one.name for one in index.metadata} - {HEADER_METADATA})
     found.complete = True
-    for index in summary.chunk_indexes:
-        if index.chunk_start_offset not in known:
-            for offset in index.message_index_offsets.values():
-                file.seek(offset + RECORD_START.size)
-                _message_index(file, found, index.chunk_start_offset)
-    missed = [index.chunk_start_offset for index in summary.chunk_indexes if index.chunk_start_offset not in known]
-    for index in summary.metadata_indexes:
-        if index.name not in found.metadata:
-            _record_at(file, found, index.offset)
-    if len(missed) + len(known) > len(summary.chunk_indexes):
+    for one in index.metadata:
+        if one.name not in found.metadata:
+            _record_at(file, found, one.offset)
+    if known == index.chunk_offsets:
+        return []  # without the memory that two sets take
+    walked = set(known)
+    missed = [offset for offset in index.chunk_offsets if offset not in walked]
+    if len(missed) + len(known) > len(index.chunk_offsets):
         found.damage.append("holds chunks that its index does not list")
     return missed
 
