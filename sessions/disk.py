@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import shutil
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -55,6 +55,15 @@ def write_durably(path: Path, data: bytes) -> None:
         sync(file)
 
 
+def _folders(top: Path) -> Iterator[Path]:
+    """The folder and all within it, without a list of their files, of which there may be many."""
+    yield top
+    with os.scandir(top) as entries:
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=False):
+                yield from _folders(Path(entry.path))
+
+
 @contextmanager
 def staged_folder(out: Path) -> Generator[Path]:
     """Yield a folder beside `out` to write into; it is renamed to `out` at the end, and removed after an exception.
@@ -66,7 +75,7 @@ def staged_folder(out: Path) -> Generator[Path]:
         shutil.rmtree(stage, ignore_errors=True)  # left by a killed process: only a copy
         stage.mkdir(parents=True)
         yield stage
-        for path in (stage, *(inside for inside in stage.rglob("*") if inside.is_dir())):
+        for path in _folders(stage):
             fsync_folder(path)
         stage.rename(out)
         fsync_folder(out.parent)

@@ -151,7 +151,8 @@ def _parts(recordings: list[Recording]) -> list[_Part]:
     several = len({recording.header.session_id for recording in recordings}) > 1
     parts: list[_Part] = []
     digests: dict[str, Path] = {}
-    strokes: dict[tuple[str, str], Path] = {}
+    strokes: dict[Path, set[int]] = {}
+    """Hashes of what the strokes of each are called, and in which session: the names would take more memory."""
     offset = 0
     for recording in recordings:
         session, merged = recording.header.session_id, _merged(recording)
@@ -159,11 +160,12 @@ def _parts(recordings: list[Recording]) -> list[_Part]:
             if digest in digests:
                 raise InputError(recording.path, f"is, or holds, the same recording as {digests[digest]}")
             digests[digest] = recording.path
+        mine = strokes[recording.path] = set[int]()
         for stroke in recording.stroke_records():
-            whose, name = _origin(merged, session, stroke.stroke_id)
-            if (whose, name) in strokes:
-                raise InputError(recording.path, f"holds stroke {name} of {whose}, as does {strokes[whose, name]}")
-            strokes[whose, name] = recording.path
+            origin = whose, name = _origin(merged, session, stroke.stroke_id)
+            if (path := next((path for path, known in strokes.items() if hash(origin) in known), None)) is not None:
+                raise InputError(recording.path, f"holds stroke {name} of {whose}, as does {path}")
+            mine.add(hash(origin))
         parts.append(_Part(recording, f"{session}/" if several else "", offset))
         stills = container.messages(recording.path, [Topic.STILL])
         offset += 1 + max((message.sequence for _, _, message in stills), default=-1)

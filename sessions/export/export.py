@@ -6,6 +6,7 @@ written to. The images are the photographs as they were recorded, byte for byte,
 
 from __future__ import annotations
 
+import json
 import zipfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -21,6 +22,7 @@ from sessions.export.rows import Cropper, Export, ForceRow, PoseRow, Row
 from sessions.progress import Progress, unseen
 from sessions.reader import Recording
 from sessions.recording.messages import decode_gray
+from sessions.spool import Spool
 
 if TYPE_CHECKING:
     import numpy as np
@@ -80,12 +82,13 @@ def write_png(export: Export, folder: Path) -> None:
     """
     for name in export.pictures:
         (folder / f"{name}s").mkdir()
-    rows: list[Row] = []
+    rows: Spool[Row] = Spool(json.dumps, json.loads)
+    columns: dict[str, None] = {}
     for row, pictures in export.captures():
         for name, data in pictures.items():
             write_durably(folder / str(row["file" if name == "image" else f"{name}_file"]), data)
         rows.append(row)
-    columns = list(dict.fromkeys(name for row in rows for name in row))
+        columns |= dict.fromkeys(row)
     with (folder / "strokes.csv").open("x", newline="", encoding="utf-8") as file:
         table = CsvWriter(file, "\r\n")
         table.writerow(columns)

@@ -82,8 +82,8 @@ class Export:
     """Recording to export, and the rows from which every format is written."""
 
     recording: Recording
-    names: dict[str, str]
-    """File name of each stroke's image, without a suffix; safe on any file system."""
+    numbers: dict[str, int]
+    """Number of each stroke, in the order of the table of strokes."""
     odd: frozenset[str] = frozenset()
     """Strokes whose wait between dip and touch differs from the others'."""
     quality: dict[str, str] = field(default_factory=dict[str, str])
@@ -101,11 +101,15 @@ class Export:
         cls, recording: Recording, progress: Progress = unseen, cropper: Cropper | None = None, *, frames: bool = False
     ) -> Export:
         """Prepare the export of a recording. Raises `SessionDamaged` where a stroke appears twice."""
-        strokes = list(recording.stroke_records())
-        waits = {one.stroke_id: one.dip_to_touch_s for one in strokes}
-        odd = frozenset(unlike({name: wait for name, wait in waits.items() if wait is not None}))
-        names = _file_names(recording.path, strokes)
-        return cls(recording, names, odd, _qualities(recording.path), progress, cropper, frames)
+        numbers: dict[str, int] = {}
+        waits: dict[str, float] = {}
+        for number, stroke in enumerate(recording.stroke_records()):
+            if numbers.setdefault(stroke.stroke_id, number) != number:
+                raise SessionDamaged(recording.path, f"holds stroke {stroke.stroke_id} twice")
+            if stroke.dip_to_touch_s is not None:
+                waits[stroke.stroke_id] = stroke.dip_to_touch_s
+        odd = frozenset(unlike(waits))
+        return cls(recording, numbers, odd, _qualities(recording.path), progress, cropper, frames)
 
     @property
     def pictures(self) -> tuple[str, ...]:
@@ -122,10 +126,10 @@ class Export:
 
     def captures(self) -> Iterator[tuple[Row, dict[str, bytes]]]:
         """Strokes as rows of plain values, None where a value is not recorded, with their encoded pictures by name."""
-        captures = counted(self.recording.captures(), "strokes exported", len(self.names), self.progress)
+        captures = counted(self.recording.captures(), "strokes exported", len(self.numbers), self.progress)
         for index, capture in enumerate(captures):
             row = self.row(index, capture.stroke) | {"marked_bad": capture.bad}
-            name, suffix = self.names[capture.stroke.stroke_id], _suffix(capture.still_png)
+            name, suffix = _file_name(index, capture.stroke.stroke_id), _suffix(capture.still_png)
             if self.cropper is None:
                 yield row | {"file": f"images/{name}.{suffix}"}, {"image": capture.still_png}
                 continue
@@ -170,7 +174,6 @@ class Export:
 
     def _samples(self, topic: Topic) -> Iterator[tuple[int, int, int, int, int, bytes]]:
         """(episode, frame, t_ns, log_ns, sequence, data) of a topic's messages during presses."""
-        index = {stroke_id: number for number, stroke_id in enumerate(self.names)}
         current, frame = -1, 0
         for _schema, channel, message in container.messages(self.recording.path, [Topic.STEP, topic]):
             if channel.topic == Topic.STEP:
@@ -179,7 +182,7 @@ class Export:
                 except ValidationError:
                     raise self._damaged(Topic.STEP) from None
                 pressed = event.phase == "begin" and event.kind != "capture"
-                current, frame = index.get(str(event.params.get("stroke_id")), -1) if pressed else -1, 0
+                current, frame = self.numbers.get(str(event.params.get("stroke_id")), -1) if pressed else -1, 0
             elif current >= 0:
                 yield current, frame, message.publish_time, message.log_time, message.sequence, message.data
                 frame += 1
@@ -252,12 +255,7 @@ def _pair(stem: str, unit: str, values: tuple[float, float] | None) -> Row:
     return {f"{stem}_x{end}": first, f"{stem}_y{end}": second}
 
 
-def _file_names(path: Path, strokes: list[Stroke]) -> dict[str, str]:
-    """Readable, safe and distinct file names, whatever the strokes are called."""
-    names: dict[str, str] = {}
-    for number, stroke in enumerate(strokes):
-        if stroke.stroke_id in names:
-            raise SessionDamaged(path, f"holds stroke {stroke.stroke_id} twice")
-        safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stroke.stroke_id)[:80]
-        names[stroke.stroke_id] = f"{number:04d}-{safe}"
-    return names
+def _file_name(index: int, stroke_id: str) -> str:
+    """A readable name without a suffix, safe on any file system and distinct whatever the strokes are called."""
+    safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stroke_id)[:80]
+    return f"{index:04d}-{safe}"

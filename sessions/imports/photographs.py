@@ -21,6 +21,7 @@ from sessions.progress import Progress, counted, unseen
 from sessions.recording.messages import MAX_IMAGE_BYTES, PNG_START, decode_gray, encode_png, image_message
 from sessions.recording.schemas import Header, Source, Topic
 from sessions.recording.writer import Outgoing, SegmentWriter
+from sessions.spool import Spool
 
 if TYPE_CHECKING:
     import numpy as np
@@ -96,7 +97,7 @@ def import_scans(
         raise InputError(table, "has a px_per_mm column: the scale of a scan is its dpi")
     kind = "press" if options.kind == "press" else "drag"
     # 1.0 stands for the scale until it is known from the file.
-    rows = [_scaled(row, dpi) for row in parse_table(folder, table, text, kind, 1.0)]
+    rows = Row.spooled(_scaled(row, dpi) for row in parse_table(folder, table, text, kind, 1.0))
     protocol = f"import of {len(rows)} {options.kind} strokes from scans"
     gray = lru_cache(maxsize=SCANS_KEPT)(_gray)
 
@@ -163,7 +164,7 @@ def check_target(folder: Path, table: Path, out: Path, options: ImportOptions) -
 
 
 def store_rows(
-    rows: list[Row],
+    rows: Spool[Row],
     folder: Path,
     table: Path,
     out: Path,
@@ -207,7 +208,7 @@ def store_rows(
 
 
 def _write(
-    rows: list[Row],
+    rows: Spool[Row],
     digests: list[bytes],
     final: Path,
     header: Header,

@@ -53,7 +53,8 @@ def import_sequence(
     for row in rows:
         if (other := _size(row.image)) != size:
             raise InputError(row.image, f"is {other[0]} x {other[1]} px, the first frame {size[0]} x {size[1]}")
-    numbered = [Row(row.image, row.stroke.model_copy(update={"still": k})) for k, row in enumerate(rows, start=1)]
+    stills = enumerate(rows, start=1)
+    numbered = Row.spooled(Row(row.image, row.stroke.model_copy(update={"still": k})) for k, row in stills)
     protocol = f"{SEQUENCE}: {len(rows)} strokes on one page, one new stroke a frame"
     return store_rows(
         numbered, folder, named, out, options, protocol, software, now_ns, opening=opening, progress=progress

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import csv
-import io
+import json
 import math
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,6 +14,7 @@ from typing import Literal
 from sessions.cells import as_text
 from sessions.errors import InputError, in_one_line
 from sessions.recording.schemas import MAX_PX_PER_MM, MIN_PX_PER_MM, Stroke
+from sessions.spool import Spool
 
 MAX_TABLE_BYTES = 16 * 1024 * 1024
 MAX_ROWS = 100_000
@@ -30,6 +32,8 @@ STEEPEST_DEG = 90.0
 MOST = 1e6
 """Limit of any other number: a length of a kilometre is a typing error."""
 MAX_NAME_CHARS = 100
+LINE = re.compile(r"[^\r\n]*(?:\r\n|\r|\n)|[^\r\n]+")
+"""A line with its end, whatever system wrote it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +42,21 @@ class Row:
 
     image: Path
     stroke: Stroke
+
+    def to_line(self) -> str:
+        """The row as a line of text."""
+        return json.dumps([str(self.image), self.stroke.model_dump_json()])
+
+    @staticmethod
+    def of_line(line: str) -> Row:
+        """A row from `to_line`."""
+        image, stroke = json.loads(line)
+        return Row(Path(image), Stroke.model_validate_json(stroke))
+
+    @staticmethod
+    def spooled(rows: Iterable[Row]) -> Spool[Row]:
+        """Rows that may be too many for memory."""
+        return Spool(Row.to_line, Row.of_line, rows)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,18 +72,19 @@ class _Columns:
     """Stored name and unit factor of each column that is not in `SPECIAL`."""
 
 
-def read_table(folder: Path, table: Path, kind: Literal["press", "drag"], px_per_mm: float | None) -> list[Row]:
+def read_table(folder: Path, table: Path, kind: Literal["press", "drag"], px_per_mm: float | None) -> Spool[Row]:
     """Read and check every line, without opening a photograph. Raises `InputError` naming line and column."""
     return parse_table(folder, table, read_text(table), kind, px_per_mm)
 
 
 def parse_table(
     folder: Path, table: Path, text: str, kind: Literal["press", "drag"], px_per_mm: float | None
-) -> list[Row]:
+) -> Spool[Row]:
     """Parse the table in `text`; errors name the path `table`."""
-    lines = csv.reader(io.StringIO(text, newline=""), strict=True)
-    rows: list[Row] = []
-    seen: set[str] = set()
+    lines = csv.reader((found[0] for found in LINE.finditer(text)), strict=True)
+    rows = Row.spooled(())
+    seen: set[int] = set()
+    """Hashes of the names: a third of the memory that the names take."""
     no_names: list[str] = []
     try:
         columns = _columns(folder, table, kind, px_per_mm, [name.strip() for name in next(lines, no_names)])
@@ -72,13 +92,13 @@ def parse_table(
             if len(rows) == MAX_ROWS:
                 raise InputError(table, f"has more than {MAX_ROWS} rows")
             row = _row(columns, lines.line_num, [as_text(cell.strip()) for cell in cells], still=len(rows))
-            if row.stroke.stroke_id in seen:
+            if hash(row.stroke.stroke_id) in seen:
                 raise InputError(table, f"line {lines.line_num}: stroke {row.stroke.stroke_id} appears twice")
-            seen.add(row.stroke.stroke_id)
+            seen.add(hash(row.stroke.stroke_id))
             rows.append(row)
     except csv.Error as error:
         raise InputError(table, f"line {lines.line_num}: {error}") from None
-    if not rows:
+    if not len(rows):
         raise InputError(table, "has no rows")
     return rows
 

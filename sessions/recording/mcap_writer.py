@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 import tempfile
+import weakref
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
@@ -60,8 +61,9 @@ class McapWriter:
         """Log time and offset of each message of that chunk, one after the other, by channel."""
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
-        self._chunks = tempfile.SpooledTemporaryFile(INDEX_IN_MEMORY_BYTES)  # noqa: SIM115, `finish` closes it
+        self._chunks = tempfile.SpooledTemporaryFile(INDEX_IN_MEMORY_BYTES)  # noqa: SIM115
         """Their records in the index of the file."""
+        weakref.finalize(self, self._chunks.close)
         self._chunk_count, self._first_ns, self._last_ns = 0, 0, 0
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
@@ -161,10 +163,9 @@ class McapWriter:
 
     def _chunk_indexes(self) -> Iterator[bytes]:
         """Their packed records, in pieces."""
-        with self._chunks as packed:
-            packed.seek(0)
-            while piece := packed.read(INDEX_IN_MEMORY_BYTES):
-                yield piece
+        self._chunks.seek(0)
+        while piece := self._chunks.read(INDEX_IN_MEMORY_BYTES):
+            yield piece
 
     def _statistics(self) -> Statistics:
         return Statistics(

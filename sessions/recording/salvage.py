@@ -12,10 +12,10 @@ import struct
 import zlib
 from array import array
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import zstandard
 from mcap.data_stream import ReadDataStream
@@ -54,12 +54,40 @@ class Part:
     """Whether it can be read and matches its CRC."""
 
 
+class Parts(Sequence[Part]):
+    """The chunks of a file, 16 bytes for each; nearly all of them hold the same numbers of messages."""
+
+    def __init__(self) -> None:
+        self._offsets = array("Q")
+        self._kinds: list[Part] = []
+        """A part of this kind, for each."""
+        self._known: dict[tuple[bool, frozenset[tuple[str, int]] | None], Part] = {}
+
+    def append(self, part: Part) -> None:
+        """Add a chunk."""
+        kind = part.sound, None if part.counts is None else frozenset(part.counts.items())
+        self._offsets.append(part.offset)
+        self._kinds.append(self._known.setdefault(kind, part))
+
+    def __len__(self) -> int:
+        return len(self._offsets)
+
+    @overload
+    def __getitem__(self, at: int) -> Part: ...
+    @overload
+    def __getitem__(self, at: slice) -> list[Part]: ...
+    def __getitem__(self, at: int | slice) -> Part | list[Part]:
+        if isinstance(at, slice):
+            return [self[k] for k in range(len(self))[at]]
+        return replace(self._kinds[at], offset=self._offsets[at])
+
+
 @dataclass(slots=True)
 class Scan:
     """Where the sound parts of a file lie, and what is wrong with the rest."""
 
     path: Path
-    parts: list[Part] = field(default_factory=list[Part])
+    parts: Parts = field(default_factory=Parts)
     """Known chunks, in order."""
     complete: bool = False
     """Whether all chunks are known: the walk reached the end, or the index is intact."""
@@ -90,24 +118,25 @@ def scan(path: Path) -> Scan:
     with file:
         try:
             offsets = _walk(file, found)
-            offsets.extend(_from_index(file, found, offsets))
+            if missed := _from_index(file, found, offsets):
+                offsets = array("Q", sorted([*offsets, *missed]))
         except OSError as error:
             found.damage.append(f"cannot be read: {in_one_line(error)}")
             return found
-        known: dict[frozenset[tuple[str, int]], Counter[str]] = {}  # nearly all chunks hold the same numbers
-        for offset in sorted(offsets):
+        for offset in offsets:
+            counts = None
             try:
                 counts = Counter(channel.topic for _schema, channel, _message in _chunk(file, offset, found))
+                found.counts += counts
             except UNREADABLE as error:
                 found.damage.append(f"a chunk at byte {offset} cannot be read ({in_one_line(error)})")
-                found.parts.append(Part(offset, None, sound=False))
-            else:
-                found.counts += counts
-                found.parts.append(Part(offset, known.setdefault(frozenset(counts.items()), counts), sound=True))
-        found.parts = [
-            part if part.sound else Part(part.offset, _indexed_counts(file, found, part.offset), False)
-            for part in found.parts
-        ]
+            found.parts.append(Part(offset, counts, sound=counts is not None))
+        if any(not part.sound for part in found.parts):
+            sound, found.parts = found.parts, Parts()
+            for part in sound:  # every channel is known only now
+                found.parts.append(
+                    part if part.sound else Part(part.offset, _indexed_counts(file, found, part.offset), False)
+                )
     return found
 
 
