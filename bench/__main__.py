@@ -1,4 +1,4 @@
-"""`python -m bench [NAME] [--json] [--table]`: run one benchmark, or all, and print a line for each figure.
+"""`python -m bench [NAME] [-n N] [--json] [--table]`: run one benchmark, or all, and print a line for each figure.
 
 With --table, docs/bench.md gets the figures as well.
 
@@ -15,6 +15,7 @@ from bench import (
     brushfit,
     curves,
     generator,
+    growth,
     inversion,
     loop,
     overhead,
@@ -43,6 +44,7 @@ def benches() -> dict[str, Bench]:
         "curves": curves.run,
         "generator": generator.run,
         "generator-qbc": generator.run_qbc,
+        "growth": growth.run,
         "inversion": inversion.run,
         "loop": loop.run,
         "overhead": overhead.run,
@@ -68,6 +70,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("name", nargs="?", metavar="NAME", help=f"one of {', '.join(known)}; all when left out")
     parser.add_argument("--json", action="store_true", help="one JSON object per line")
     parser.add_argument("--table", action="store_true", help=f"renew the figures' rows in {table.OUT.name}")
+    parser.add_argument("-n", "--largest", type=int, dest="n", help="rounds, or strokes, or the largest of `growth`")
     options = parser.parse_args(arguments)
     if options.name is not None and options.name not in known:
         print(f"unknown bench {options.name!r}; known: {', '.join(known)}", file=sys.stderr)
@@ -75,7 +78,7 @@ def main(arguments: list[str] | None = None) -> int:
     code = 0
     for name in known if options.name is None else [options.name]:
         try:
-            results = results_of(known[name]())
+            results = results_of(known[name](n=options.n))
         except BenchError as error:
             print(f"{name}: {error}", file=sys.stderr)
             code = 1

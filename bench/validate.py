@@ -1,8 +1,7 @@
-"""Validation beside a plain loop over scikit-image's SSIM, its memory by number of strokes, and Dask's second worker.
+"""Validation beside a plain loop over scikit-image's SSIM, beside processes, and on one Dask worker and two.
 
-Presses are of the simulated brush (loopback rig), photographed at 10 px/mm; memory and throughput are of
-pictures with the size and noise of the loopback camera's stills. `python -m bench.validate 20000` measures
-memory up to 20,000 strokes; by default it goes to 1,000.
+Presses are of the simulated brush (loopback rig), photographed at 10 px/mm; throughput is of pictures with the size and
+noise of the loopback camera's stills. Time and memory of the whole command by number of strokes: `bench growth`.
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.harness import BenchError, Result, interleave, machine
-from bench.peak import measure
 from bench.press_sessions import STILL, Presses, pressed, session
 from calibrate.compare.field import BEST_SHIFT_PX, KEYS, SIZE_PX, Alignment, Field
 from calibrate.compare.images import Pixels, pack, simulated_pixels, unpack
@@ -38,28 +36,25 @@ from model.brush import Brush as Bundle
 from model.registry import stroke_models
 from sessions.reader import Recording
 
-STROKES, FEW, DASK_STROKES = 1000, 100, 60
+STROKES = 60
 SAME = 1e-6
 START_S = 60.0
 
 
 def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
-    """Scores a second over 12 presses of one cell; peak memory from 100 to `n` strokes (default 1,000); and Dask.
+    """Scores a second over 12 presses of one cell; strokes found on `n` photographs (60) by threads, and by Dask.
 
-    ratio = ours over the plain loop; strokes over memory growth; two workers over one. Raises BenchError where the
-    scores differ by more than 1e-6 from scikit-image's, or a run fails.
+    ratio = ours over the plain loop, over processes; two workers over one. Raises BenchError where the scores differ
+    by more than 1e-6 from scikit-image's, or a run fails.
     """
     strokes = STROKES if n is None else n
     if strokes < 1:
         raise ValueError(f"n = {n}: at least one stroke is needed")
     with tempfile.TemporaryDirectory() as folder:
         under = Path(folder)
-        return [
-            *scoring(seed),
-            *threads(seed),
-            *memory(under, strokes, seed),
-            *cluster(under, min(strokes, DASK_STROKES), seed),
-        ]
+        place = session(under, "presses", Presses(strokes, seed, view=STILL))
+        jobs = [PrepareJob(capture, None, Field()) for capture in Recording(place).captures()]
+        return [*scoring(seed), *threads(jobs, seed), *cluster(under, jobs, seed)]
 
 
 def scoring(seed: int, repeats: int = 12, rounds: int = 3) -> list[Result]:
@@ -129,39 +124,8 @@ def _shifted(moving: NDArray[np.float64], fixed: NDArray[np.float64]) -> NDArray
     return np.pad(moving, reach)[row : row + SIZE_PX, column : column + SIZE_PX]
 
 
-def memory(under: Path, strokes: int, seed: int) -> list[Result]:
-    """Peak memory of the whole command over `FEW` strokes and over all of them."""
-    few, many = (session(under, f"of-{count}", Presses(count, seed, view=STILL)) for count in (min(FEW, strokes), strokes))
-    small_mb, small_s = _measured(few, under / "few")
-    large_mb, large_s = _measured(many, under / "many")
-    grown = large_mb - small_mb
-    times = strokes / min(FEW, strokes)
-    where = (
-        f"loopback rig; {min(FEW, strokes)} strokes: {small_mb:.0f} MB, {small_s:.1f} s; {strokes} strokes: "
-        f"{large_mb:.0f} MB, {large_s:.1f} s; {machine()}"
-    )
-    peer = f"{times:.0f} times as many strokes in {large_mb / small_mb:.2f} times the memory"
-    rates = strokes / large_s, min(FEW, strokes) / small_s
-    return [
-        Result("validate.memory", grown, "MB more", peer, times * small_mb / large_mb, 1, seed, where),
-        Result(
-            "validate.whole",
-            rates[0],
-            "strokes/s",
-            f"the whole command over {min(FEW, strokes)} strokes",
-            rates[0] / rates[1],
-            1,
-            seed,
-            where,
-        ),
-    ]
-
-
-def threads(seed: int, strokes: int = 60) -> list[Result]:
+def threads(jobs: Sequence[PrepareJob], seed: int) -> list[Result]:
     """Finding strokes on photographs by threads, beside as many processes that have already started."""
-    with tempfile.TemporaryDirectory() as folder:
-        place = session(Path(folder), "threads", Presses(strokes, seed, view=STILL))
-        jobs = [PrepareJob(capture, None, Field()) for capture in Recording(place).captures()]
     with Threads() as pool, ProcessPoolExecutor(pool.workers, multiprocessing.get_context("spawn")) as processes:
         began = time.perf_counter()
         list(processes.map(prepare_job, jobs[: 4 * pool.workers]))
@@ -175,23 +139,16 @@ def threads(seed: int, strokes: int = 60) -> list[Result]:
     size = f"{STILL.width_px} x {STILL.height_px} px"
     where = f"loopback rig, photographs of {size}, {workers} workers; starting the processes took {start_s:.1f} s"
     peer = "processes, already started"
-    rate = strokes / ours_s
+    rate = len(jobs) / ours_s
     conditions = f"{where}; {machine()}"
     return [Result("validate.threads", rate, "strokes/s", peer, peer_s / ours_s, 3, seed, conditions, **turns.ratios())]
 
 
-def _measured(place: Path, out: Path) -> tuple[float, float]:
-    """(peak MB, seconds) of `brushloop validate`."""
-    used = measure(sys.executable, "-m", "brushloop", "validate", str(place), "--out", str(out), "--no-held-out")
-    return used.peak_mb, used.wall_s
-
-
-def cluster(under: Path, strokes: int, seed: int) -> list[Result]:
+def cluster(under: Path, found: Sequence[PrepareJob], seed: int) -> list[Result]:
     """Finding strokes by one Dask worker and by two, each with one thread; nothing where Dask is missing."""
     if importlib.util.find_spec("distributed") is None:
         return []
-    place = session(under, f"dask-{strokes}", Presses(strokes, seed, view=STILL))
-    jobs = [(str(k), PrepareJob(one, None, Field())) for k, one in enumerate(Recording(place).captures())]
+    jobs = [(str(k), job) for k, job in enumerate(found)]
     taken: dict[int, float] = {}
     for workers in (1, 2):
         with _workers(under, workers) as address, Dask(address) as pool:
@@ -200,8 +157,8 @@ def cluster(under: Path, strokes: int, seed: int) -> list[Result]:
             list(pool.run(prepare_job, iter(jobs)))
             taken[workers] = time.perf_counter() - began
     speed = taken[1] / taken[2]
-    where = f"loopback rig, {strokes} strokes, dask {version('distributed')}; {machine()}"
-    rate = strokes / taken[2]
+    where = f"loopback rig, {len(jobs)} strokes, dask {version('distributed')}; {machine()}"
+    rate = len(jobs) / taken[2]
     return [Result("validate.dask", rate, "strokes/s", "one worker; two here", speed, 1, seed, where)]
 
 
@@ -242,8 +199,3 @@ def _seconds(work: Callable[[], object]) -> float:
     began = time.perf_counter()
     work()
     return time.perf_counter() - began
-
-
-if __name__ == "__main__":
-    for line in run(n=int(sys.argv[1]) if len(sys.argv) > 1 else None):
-        sys.stdout.write(f"# {line.conditions}\n{line.to_line()}\n")
