@@ -67,7 +67,7 @@ def export(
         with staged_folder(out) as stage:
             exported = Export.of(recording, progress, cropper, frames=frames)
             write(exported, stage)
-            if len(exported.left_out) == len(exported.names):
+            if len(exported.left_out) == len(exported.numbers):
                 stroke_id, reason = exported.left_out[0]
                 raise InputError(recording.path, f"holds no stroke that can be cropped: {stroke_id} {reason}")
     except OSError as error:
