@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 TORCH ?= auto
 
-.PHONY: demo test suite lint types bench soak clean
+.PHONY: demo test suite lint types bench docs soak clean
 .DELETE_ON_ERROR:
 
 $(VENV)/bin/python:
@@ -43,9 +43,12 @@ types: $(STAMP)-dev
 bench: $(STAMP)-dev  ## every bench, one line a figure, kept as a table in docs/bench.md
 	$(BIN)/python -m bench --table
 
+docs: $(STAMP)-dev  ## the documentation as a site, in build/site/index.html; warnings are errors
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+
 soak: $(STAMP)-dev  ## long kill and load loops, and property tests on new examples
 	$(BIN)/python -m pytest -m soak --timeout 3600
 	$(BIN)/python -m pytest --hypothesis-profile search
 
 clean:
-	rm -rf $(VENV) demo-run .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) build demo-run .pytest_cache .ruff_cache .hypothesis .import_linter_cache

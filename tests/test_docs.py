@@ -1,11 +1,19 @@
-"""What the documents name is there."""
+"""What the documents name is there, the commands that they show exist, and the site is built without a warning."""
 
 from __future__ import annotations
 
 import re
+import shlex
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
+
+import brushloop
+from calibrate.path_or_command import PathOrCommand
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
@@ -37,3 +45,45 @@ def test_files_and_folders_of_ours_that_a_document_names_are_there(document: Pat
         r"`((?:collect|calibrate|drivers|sessions|model|bench|tests|examples)/[\w/.-]*)`", document.read_text()
     )
     assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+def commands_in(document: Path) -> list[str]:
+    """Lines of a document's blocks that begin with `brushloop`, without their comments."""
+    blocks = re.findall(r"^```(?:sh)?\n(.*?)^```", document.read_text(encoding="utf-8"), re.M | re.S)
+    lines = [line.strip() for block in blocks for line in block.splitlines()]
+    return [line for line in lines if re.match(r"brushloop( |$)", line)]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_commands_that_a_document_shows_exist_with_their_options(document: Path) -> None:
+    """Only the tutorial's commands are run as well (tests/test_tutorial.py): others need an arm or a long session."""
+    for line in commands_in(document):
+        command: Any = typer.main.get_command(brushloop.app)
+        words = shlex.split(line.split(" | ")[0], comments=True)[1:]
+        while words:
+            word = words.pop(0)
+            further = getattr(command, "commands", {})
+            if word.startswith("--"):
+                options = {name: one for one in command.params for name in (*one.opts, *one.secondary_opts)}
+                assert word in options or word == "--help", line
+                if word in options and options[word].type_descriptor.annotation is not bool:
+                    words = words[options[word].nargs :]
+            elif set(word.split("|")) <= further.keys():
+                command = further[word.split("|")[0]]
+            elif isinstance(command, PathOrCommand):
+                command = next(iter(further.values()))
+            else:
+                assert not further, line
+
+
+def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs")
+    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--site-dir", str(tmp_path / "site")]
+    ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (0, "", "")
+    page = (tmp_path / "site" / "reference" / "commands.html").read_text(encoding="utf-8")
+    assert "brushloop sessions export" in page
+    pages = "".join(path.read_text(encoding="utf-8") for path in (tmp_path / "site").rglob("*.html"))
+    assert re.findall(r"<(?:script|link|img)[^>]*(?:src|href)=\"(?:https?:)?//[^>]*>", pages) == [], (
+        "nothing is fetched"
+    )
