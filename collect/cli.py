@@ -160,11 +160,13 @@ def doctor(
     from collect.rig.doctor import examine
     from drivers.clock import HostClock
 
-    rig = load_rig(config)
     if report is not None:
         from collect.rig.report import check_report
 
         check_report(report)
+        if not config.exists() and _first_report(config, report):
+            return
+    rig = load_rig(config)
     findings = asyncio.run(examine(rig, HostClock()))
     if as_json:
         say(*(json.dumps(finding.as_json()) for finding in findings))
@@ -179,6 +181,21 @@ def doctor(
         say(f"{report} holds what was asked and answered. Read it before you send it.", err=as_json)
     if not all(finding.well for finding in findings):
         raise typer.Exit(4)
+
+
+def _first_report(config: Path, report: Path) -> bool:
+    """Write the archive from what was taught so far, where there is no rig.toml yet; False if nothing was."""
+    import asyncio
+
+    from collect.teach.report import write_first_report
+    from collect.teach.store import TaughtFile
+
+    taught = TaughtFile(config)
+    if not taught.path.exists():
+        return False
+    asyncio.run(write_first_report(report, taught.load()))
+    say(f"There is no {config} yet: {report} holds what {taught.path} knows and what the arm answered. Read it first.")
+    return True
 
 
 def loop(

@@ -24,7 +24,8 @@ from collect.errors import ConfigError
 from collect.rig.check import check_rig
 from collect.rig.config import RigConfig
 from collect.rig.doctor import Finding
-from collect.rig.scrub import Scrubber, numbers_only
+from collect.rig.scrub import Scrubber, numbers_only, scrubber_of
+from drivers.arcs.rpc import Framing
 from drivers.arcs.survey import Exchange, rtde_answers, survey
 
 FORMAT = 1
@@ -54,19 +55,28 @@ async def write_report(path: Path, config: RigConfig, findings: list[Finding]) -
 
     Raises OSError if it cannot be written.
     """
-    robot, scrubber = config.robot, Scrubber(config)
-    exchanges = await survey(robot.host, robot.port, robot.framing)
+    robot, scrubber = config.robot, scrubber_of(config)
     files = {
-        "README.txt": ABOUT,
         "report.json": json.dumps(_report(config, findings, scrubber), indent=2),
-        "arcs.jsonl": "".join(json.dumps(scrubber.value(_line(exchange))) + "\n" for exchange in exchanges),
+        "arcs.jsonl": await transcript(robot.host, robot.port, robot.framing, scrubber),
     }
     if robot.rtde_port is not None:
         answers = await rtde_answers(robot.host, robot.rtde_port)
         files["rtde.json"] = json.dumps(scrubber.value(answers), indent=2)
+    write_archive(path, files)
+
+
+def write_archive(path: Path, files: dict[str, str]) -> None:
+    """Write these files, and the one that says what they are. Raises OSError."""
     with path.open("xb") as out, zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, text in files.items():
+        for name, text in {"README.txt": ABOUT, **files}.items():
             archive.writestr(name, text)
+
+
+async def transcript(host: str, port: int, framing: Framing, scrubber: Scrubber) -> str:
+    """Every question to the controller and its answer, one JSON object a line, without names."""
+    exchanges = await survey(host, port, framing)
+    return "".join(json.dumps(scrubber.value(_line(exchange))) + "\n" for exchange in exchanges)
 
 
 def _line(exchange: Exchange) -> dict[str, Any]:
@@ -75,8 +85,18 @@ def _line(exchange: Exchange) -> dict[str, Any]:
 
 def _report(config: RigConfig, findings: list[Finding], scrubber: Scrubber) -> dict[str, Any]:
     return {
-        "format": FORMAT,
+        **about_this_machine(),
         "framing": config.robot.framing,
+        "findings": scrubber.value([finding.as_json() for finding in findings]),
+        "rig": numbers_only(config.model_dump(mode="json")),
+        "checks": scrubber.value([check.as_json() for check in check_rig(config)]),
+    }
+
+
+def about_this_machine() -> dict[str, Any]:
+    """What every report begins with: its format, versions and the platform."""
+    return {
+        "format": FORMAT,
         "versions": _versions(),
         "platform": {
             "system": platform.system(),
@@ -85,9 +105,6 @@ def _report(config: RigConfig, findings: list[Finding], scrubber: Scrubber) -> d
             "python": platform.python_version(),
             "cores": os.cpu_count(),
         },
-        "findings": scrubber.value([finding.as_json() for finding in findings]),
-        "rig": numbers_only(config.model_dump(mode="json")),
-        "checks": scrubber.value([check.as_json() for check in check_rig(config)]),
     }
 
 

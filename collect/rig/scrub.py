@@ -30,20 +30,17 @@ KEPT = frozenset({"kind", "interface", "framing", "dictionary", "method"})
 class Scrubber:
     """Replaces names of hosts and users, addresses, paths, and values of environment variables."""
 
-    def __init__(self, config: RigConfig) -> None:
-        force, device = config.force, config.ink.device
+    def __init__(self, known: Mapping[str, str]) -> None:
+        """`known` are names of this rig, and what stands for each."""
         names = {value: "<environment>" for name, value in os.environ.items() if name.upper().startswith(PREFIX)}
+        names |= known
         names |= {
-            config.robot.host: "<host>",
-            config.camera.source: "<camera>",
             socket.gethostname(): "<host>",
             socket.getfqdn(): "<host>",
             _user(): "<user>",
             str(Path.home()): "<path>",
             str(Path.cwd()): "<path>",
         }
-        names |= {force.host or "": "<host>"} if force is not None else {}
-        names |= {device.port: "<port>"} if device is not None else {}
         self._names = sorted(((k, v) for k, v in names.items() if len(k) >= SHORTEST), key=lambda pair: -len(pair[0]))
 
     def text(self, text: str) -> str:
@@ -65,6 +62,15 @@ class Scrubber:
                 return [self.value(inner) for inner in cast("list[Any]", value)]
             case _:
                 return value
+
+
+def scrubber_of(config: RigConfig) -> Scrubber:
+    """One that knows the names in `rig.toml`."""
+    force, device = config.force, config.ink.device
+    names = {config.robot.host: "<host>", config.camera.source: "<camera>"}
+    names |= {force.host or "": "<host>"} if force is not None else {}
+    names |= {device.port: "<port>"} if device is not None else {}
+    return Scrubber(names)
 
 
 def numbers_only(table: Mapping[str, Any]) -> dict[str, Any]:

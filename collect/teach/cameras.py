@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from collect.rig.config_devices import LockedConfig
 from collect.rig.optics import gray
 from collect.teach.store import Notebook
-from drivers.camera import CameraOptions, Locked, OpenCvCamera
+from drivers.camera import CameraOptions, Locked, OpenCvCamera, found_settings
 from drivers.clock import Clock
 from drivers.samples import Stamp
 
@@ -69,32 +69,6 @@ async def frame_rate_hz(camera: OpenCvCamera) -> float:
     return (count - 1) / (time.monotonic() - began_s)
 
 
-def found_settings(source: str) -> dict[str, float]:
-    """What a device chose by itself, once it has settled: size, exposure, gain, white balance, focus.
-
-    A property that the device does not have is left out. Blocks for some seconds.
-    """
-    import cv2
-
-    properties = {
-        "width": cv2.CAP_PROP_FRAME_WIDTH,
-        "height": cv2.CAP_PROP_FRAME_HEIGHT,
-        "exposure": cv2.CAP_PROP_EXPOSURE,
-        "gain": cv2.CAP_PROP_GAIN,
-        "white_balance_k": cv2.CAP_PROP_WB_TEMPERATURE,
-        "focus": cv2.CAP_PROP_FOCUS,
-    }
-    capture = cv2.VideoCapture(int(source))
-    try:
-        until_s = time.monotonic() + RATE_S
-        while time.monotonic() < until_s and capture.read()[0]:
-            pass
-        found = {name: float(capture.get(number)) for name, number in properties.items()}
-    finally:
-        capture.release()
-    return {name: value for name, value in found.items() if value > 0.0 or (name == "exposure" and value < -0.5)}
-
-
 async def locked_settings(source: str) -> dict[str, float]:
-    """`found_settings`, for the event loop; nothing for a stream, whose settings only its own set-up can change."""
-    return await asyncio.to_thread(found_settings, source) if source.isdecimal() else {}
+    """What a device chose by itself; nothing for a stream, whose settings only its own set-up can change."""
+    return await asyncio.to_thread(found_settings, int(source), RATE_S) if source.isdecimal() else {}

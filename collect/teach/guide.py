@@ -21,7 +21,6 @@ TargetKind = Literal[
     "sheet-corner",
     "well",
     "well-rim",
-    "wipe",
     "wash-pot",
     "park",
     "hold-board",

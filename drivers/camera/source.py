@@ -193,14 +193,7 @@ class CaptureSource:
                 f"{names} cannot be set through {options.source}",
                 remedy="Lock them in the camera's own set-up and leave them out of the configuration.",
             )
-        properties = {
-            "width": cv2.CAP_PROP_FRAME_WIDTH,
-            "height": cv2.CAP_PROP_FRAME_HEIGHT,
-            "exposure": cv2.CAP_PROP_EXPOSURE,
-            "gain": cv2.CAP_PROP_GAIN,
-            "white_balance_k": cv2.CAP_PROP_WB_TEMPERATURE,
-            "focus": cv2.CAP_PROP_FOCUS,
-        }
+        properties = _properties()
         automatic = {
             # V4L2's menu: 1 is manual, 3 aperture priority.
             "exposure": (cv2.CAP_PROP_AUTO_EXPOSURE, 1.0),
@@ -223,3 +216,35 @@ class CaptureSource:
                 )
             settings[name] = got
         return settings
+
+
+def _properties() -> dict[str, int]:
+    """OpenCV's number of each setting in `Locked`."""
+    import cv2
+
+    return {
+        "width": cv2.CAP_PROP_FRAME_WIDTH,
+        "height": cv2.CAP_PROP_FRAME_HEIGHT,
+        "exposure": cv2.CAP_PROP_EXPOSURE,
+        "gain": cv2.CAP_PROP_GAIN,
+        "white_balance_k": cv2.CAP_PROP_WB_TEMPERATURE,
+        "focus": cv2.CAP_PROP_FOCUS,
+    }
+
+
+def found_settings(device: int, settle_s: float) -> dict[str, float]:
+    """What a device chose by itself within `settle_s`, by the names of `Locked`. Blocks for that long.
+
+    A setting that the device does not have is left out.
+    """
+    import cv2
+
+    capture = cv2.VideoCapture(device)
+    try:
+        until_s = time.monotonic() + settle_s
+        while time.monotonic() < until_s and capture.read()[0]:
+            pass
+        found = {name: float(capture.get(number)) for name, number in _properties().items()}
+    finally:
+        capture.release()
+    return {name: value for name, value in found.items() if value > 0.0 or (name == "exposure" and value < -0.5)}

@@ -53,13 +53,13 @@ class ArmStep:
             self._keep(day, address, cabinet, rtde if pushed else None)
 
     async def _address(self, day: Day) -> Address:
-        known = day.notebook.get("robot.host")
-        default = "" if known is None else f"{known}:{day.notebook.get('robot.port')}"
+        default = str(day.notebook.get("aside.address") or "")
         question = "Address of the cabinet (pendant: Settings, Network), as 192.0.2.7 or 192.0.2.7:30004"
         try:
             address = Address.of(await day.guide.text(question, default))
         except ValueError as error:
             raise CannotTeach(f"{error}.", "Type the address that the pendant shows.") from None
+        day.keep("arm", "aside.address", str(address), "typed")
         if not await answers(address.host, address.port):
             older = await answers(address.host, AUBOPE_PORT)
             raise CannotTeach(*_silent(address, older=older))

@@ -141,7 +141,7 @@ class CameraStep:
         across = await day.guide.number("Squares along its longer side, as printed", "squares", 3, 50, None)
         along = await day.guide.number("Squares along its shorter side, as printed", "squares", 3, 50, None)
         square_mm = await day.guide.number(
-            "Side of one square (ten of them by calipers, divided by ten)", "mm", 2.0, 100.0, None
+            "Side of a square (ten of them by calipers, divided by ten)", "mm", 2.0, 100.0, None
         )
         marker_mm = await day.guide.number("Side of a marker", "mm", 1.0, 100.0, 0.75 * square_mm)
         dictionary = await day.guide.text("Markers of the print", "DICT_5X5_1000")

@@ -70,7 +70,7 @@ class LimitsStep:
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """The box around what was taught, and the defaults that were not taught otherwise."""
         x_mm, y_mm, z_mm = hull(_within(notebook), MARGIN_MM)
-        how = f"the smallest around sheet, well, pot and park position, and {MARGIN_MM:g} mm beside and above"
+        how = f"the smallest around sheet, well, wipe, pot and park position, and {MARGIN_MM:g} mm beside and above"
         floor = f"{BELOW_MM:g} mm below the deepest press and the dip; {MARGIN_MM:g} mm above travel and park"
 
         def taught(value: Value, unit: str, how: str) -> Taught:

@@ -1,4 +1,4 @@
-"""Step 5: well, pot of water and park position, taught by going there."""
+"""Step 5: well, wipe, pot of water and park position, taught by going there."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumbnail
 from collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig
 from collect.rig.paper import to_base, to_paper
+from collect.teach.arm_reader import ArmReader
 from collect.teach.cameras import still, taught_camera
 from collect.teach.day import Day
 from collect.teach.errors import CannotTeach
@@ -23,6 +24,8 @@ TRAVEL_MM = 60.0
 """Travel height above the highest corner of the sheet: room for a dry run 30 mm above it."""
 RIM_CLEAR_MM = TRAVEL_CLEARANCE_MM + 5.0
 """Travel height above the rim of any pot: a drop hangs from the tip."""
+WIPE_PAST_MM, WIPE_BELOW_MM = 6.0, 1.5
+"""A wipe ends so far beyond the rim, with the tip so far below it: the hair is drawn over the rim."""
 LEAST_RADIUS_MM, MOST_RADIUS_MM = 5.0, 100.0
 """From the rim of a well to its middle."""
 
@@ -44,6 +47,7 @@ class PlacesStep:
             with day.touched_again_if_refused("well-rim", "well"):
                 found = _check_well(day.notebook)
             await day.say(found)
+            await self._wipe(day, reader)
             if "wash-pot 0" not in day.notebook.touches and "aside.wash" not in day.notebook.values:
                 wash = await day.yes("Is there a pot of water to wash the brush in?", default=False)
                 if wash:
@@ -57,6 +61,25 @@ class PlacesStep:
             how = "Bring the arm to its waiting place: brush upright, above everything, out of the camera's picture."
             await day.touch(reader, Target("park"), how, "park 0")
             await self._look(day, clear)
+
+    async def _wipe(self, day: Day, reader: ArmReader) -> None:
+        """Have the side of the rim touched at which a drop is wiped off, if there is to be a wipe."""
+        if "aside.wipe" in day.notebook.values:
+            return
+        wipe = "well-rim 1" in day.notebook.touches or await day.yes(
+            "Shall each dip end with a wipe across the rim of the well, which takes the drop off?", default=False
+        )
+        if wipe:
+            how = "Bring the tip to the rim on the side where the drop shall be wiped off: the one away from the sheet."
+            wipe = await day.touch(reader, Target("well-rim", 1), how, "well-rim 1") is not None
+        if wipe:
+            try:
+                check_wipe(day.notebook)
+            except CannotTeach:
+                kept = {name: touch for name, touch in day.notebook.touches.items() if name != "well-rim 1"}
+                day.save(day.notebook.model_copy(update={"touches": kept}))
+                raise
+        day.keep("places", "aside.wipe", wipe, "answered")
 
     async def _seen(self, day: Day) -> Thumbnail:
         async with taught_camera(day.notebook, day.clock) as camera:
@@ -80,7 +103,8 @@ class PlacesStep:
         """Places in the sheet's frame, and the travel height."""
         paper, places = paper_of(notebook), tips(notebook)
         x, y, dip_z_mm = places["well 0"]
-        rim_x, rim_y, rim_z_mm = places["well-rim 0"]
+        rim_x, rim_y, _ = places["well-rim 0"]
+        rim_z_mm = max(z for name, (_, _, z) in places.items() if name.startswith("well-rim "))
         safe_mm = max(max(sheet_heights(notebook)) + TRAVEL_MM, rim_z_mm + RIM_CLEAR_MM)
         by_hand = "the tip was brought there by hand"
 
@@ -103,6 +127,11 @@ class PlacesStep:
                 by_hand + ("" if park_z >= safe_mm else ", and lifted to travel height"),
             ),
         }
+        if "well-rim 1" in places:
+            end, z_mm = wipe_of(notebook)
+            how = f"{WIPE_PAST_MM:g} mm beyond the rim, which was touched there by hand"
+            found["ink.wipe.rim_mm"] = taught(list(end), how)
+            found["ink.wipe.z_mm"] = taught(z_mm, f"{WIPE_BELOW_MM:g} mm below the rim, which was touched by hand")
         if "wash-pot 0" in places:
             wash_x, wash_y, wash_z = places["wash-pot 0"]
             found["ink.wash.pot_mm"] = taught(list(to_paper(paper, wash_x, wash_y)))
@@ -111,7 +140,7 @@ class PlacesStep:
 
     def forget(self, notebook: Notebook) -> Notebook:
         """Without what was touched here."""
-        gone = {"aside.wash", "ink.wash.pot_mm", "ink.wash.dip_z_mm"}
+        gone = {"aside.wipe", "ink.wipe.rim_mm", "ink.wipe.z_mm", "aside.wash", "ink.wash.pot_mm", "ink.wash.dip_z_mm"}
         kept = {field: taught for field, taught in notebook.values.items() if field not in gone}
         cleared = notebook.without_touches("well-rim", "well", "wash-pot", "park", "clear-view")
         return cleared.model_copy(update={"values": kept})
@@ -160,6 +189,33 @@ def _check_well(notebook: Notebook) -> str:
     if z >= rim_z:
         raise CannotTeach("the dip is no deeper than the rim of the well.", "Bring the tip into the ink.")
     return f"well of radius {radius_mm:.0f} mm, its rim {rim_z - z:.1f} mm above the bottom of a dip"
+
+
+def wipe_of(notebook: Notebook) -> tuple[tuple[float, float], float]:
+    """Where a wipe from the middle of the well ends, in the paper frame, and the height of the tip during it."""
+    (x, y, _), (rim_x, rim_y, rim_z) = tips(notebook)["well 0"], tips(notebook)["well-rim 1"]
+    longer = 1.0 + WIPE_PAST_MM / max(math.dist((x, y), (rim_x, rim_y)), 1e-9)
+    end = to_paper(paper_of(notebook), x + longer * (rim_x - x), y + longer * (rim_y - y))
+    return end, rim_z - WIPE_BELOW_MM
+
+
+def check_wipe(notebook: Notebook) -> None:
+    """Raise `CannotTeach` for a wipe that leads over the sheet, or that begins elsewhere than in the well."""
+    (x, y), z_mm = wipe_of(notebook)
+    (well_x, well_y, dip_z), (rim_x, rim_y, _) = tips(notebook)["well 0"], tips(notebook)["well-rim 1"]
+    radius_mm = math.dist((well_x, well_y), (rim_x, rim_y))
+    width, height = notebook.numbers("paper.size_mm")
+    if not LEAST_RADIUS_MM <= radius_mm <= MOST_RADIUS_MM or z_mm <= dip_z:
+        raise CannotTeach(
+            f"that place is {radius_mm:.0f} mm from the middle of the well and {z_mm - dip_z:+.1f} mm above the bottom "
+            "of a dip, which no rim is.",
+            "Touch the rim of the same well; only this place is asked again.",
+        )
+    if 0.0 <= x <= width and 0.0 <= y <= height:
+        raise CannotTeach(
+            "the wipe would end over the sheet, and the drop would fall on it.",
+            "Touch the rim on another side; only this place is asked again.",
+        )
 
 
 def _clear_view(rig_path: Path) -> Path:

@@ -12,7 +12,8 @@ import pytest
 from collect.rig.config import load_rig
 from collect.rig.doctor import Finding
 from collect.rig.report import write_report
-from collect.rig.scrub import Scrubber, numbers_only
+from collect.rig.scrub import numbers_only, scrubber_of
+from collect.teach.store import Notebook, Taught, TaughtFile, now_utc
 from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml
@@ -78,7 +79,7 @@ def test_names_addresses_paths_and_the_environment_stay_in_the_lab(rig: Path, mo
     monkeypatch.setenv("BRUSHLOOP_ROBOT__HOST", "arm7.lab.example")
     monkeypatch.setenv("LOGNAME", "wanghui")
     monkeypatch.setattr("socket.gethostname", lambda: "rigpc")
-    scrubber = Scrubber(load_rig(rig))
+    scrubber = scrubber_of(load_rig(rig))
     said = (
         "robot: connect: arm7.lab.example:30004 as wanghui@rigpc from 192.0.2.7 (fe80::1:2:3, 00:1b:44:11:3a:b7); "
         "see /home/wanghui/rig.toml and C:\\Users\\wanghui, http://wanghui:secret@cam.example/stream, "
@@ -106,3 +107,24 @@ def test_nothing_is_overwritten(rig: Path, tmp_path: Path) -> None:
     assert ran.returncode == 2
     assert "nothing is overwritten" in ran.stderr
     assert report.read_bytes() == b"mine"
+
+
+def test_on_the_first_day_there_is_no_rig_yet_and_the_archive_holds_what_is_known(lab: Lab) -> None:
+    robot = load_rig(lab.folder / "rig.toml").robot
+    rig, report = lab.folder / "new.toml", lab.folder / "report.zip"
+    address = Taught(value=f"{robot.host}:{robot.port}", how="typed", at=now_utc(), step="arm")
+    stream = Taught(value="http://cam.example/stream", how="typed", at=now_utc(), step="camera")
+    squares = Taught(value=[26, 20], how="typed", at=now_utc(), step="camera")
+    values = {"aside.address": address, "camera.source": stream, "board.squares": squares}
+    TaughtFile(rig).save(Notebook().with_values(values))
+    ran = brushloop("doctor", "--config", rig, "--report", report)
+    assert ran.returncode == 0, ran.stderr
+    assert "new.toml yet" in ran.stdout
+    archive = Archive.read(report)
+    answered = {line["method"]: line["answer"] for line in archive.lines}
+    assert answered["rob1.RobotState.getSafetyModeType"] == {"result": "Normal"}
+    with zipfile.ZipFile(report) as held:
+        text = held.read("report.json").decode()
+    assert json.loads(text)["taught"]["board.squares"] == [26, 20]
+    assert robot.host not in text
+    assert "cam.example" not in text

@@ -1,0 +1,65 @@
+"""The wipe at the well's rim: taught by going there, and refused where it cannot be one."""
+
+from __future__ import annotations
+
+import pytest
+
+from collect.teach.errors import CannotTeach
+from collect.teach.steps.places import PlacesStep, check_wipe
+from collect.teach.store import Notebook, Taught, now_utc, touch_of
+from drivers.geometry import brush_pose
+
+WELL = (300.0, 40.0, 121.0)
+
+
+def taught(rim: tuple[float, float, float]) -> Notebook:
+    """A well right of a level sheet of 240 x 160 mm at the origin of the base frame, and a side of its rim."""
+    values = {
+        "robot.tcp_offset_mm": [0.0, 0.0, 0.0],
+        "paper.origin_mm": [0.0, 0.0],
+        "paper.yaw_deg": 0.0,
+        "paper.size_mm": [240.0, 160.0],
+        "paper.touch_z_mm": 120.0,
+        "paper.touch_point_mm": [4.0, 4.0],
+        "aside.plane": [120.0, 0.0, 0.0],
+    }
+    notebook = Notebook().with_values(
+        {k: Taught(value=v, how="typed", at=now_utc(), step="tip") for k, v in values.items()}
+    )
+    touched = {"well 0": WELL, "well-rim 0": (300.0, 56.0, 132.0), "well-rim 1": rim, "park 0": (200.0, -300.0, 300.0)}
+    for name, place in touched.items():
+        notebook = notebook.with_touch(name, touch_of(brush_pose(*place)))
+    return notebook
+
+
+def test_a_wipe_goes_from_the_well_over_the_touched_rim_a_little_below_it() -> None:
+    notebook = taught((316.0, 40.0, 133.0))
+    check_wipe(notebook)
+    found = PlacesStep().derived(notebook)
+    assert found["ink.wipe.rim_mm"].value == pytest.approx([322.0, 40.0])
+    assert found["ink.wipe.z_mm"].value == pytest.approx(131.5)
+    assert "touched there by hand" in found["ink.wipe.rim_mm"].how
+    safe_mm = found["motion.safe_z_mm"].value
+    assert isinstance(safe_mm, float)
+    assert safe_mm >= 133.0 + 15.0
+
+
+def test_without_a_second_touch_of_the_rim_there_is_no_wipe() -> None:
+    notebook = taught((316.0, 40.0, 133.0))
+    touches = {name: touch for name, touch in notebook.touches.items() if name != "well-rim 1"}
+    found = PlacesStep().derived(notebook.model_copy(update={"touches": touches}))
+    assert not any(field.startswith("ink.wipe") for field in found)
+
+
+@pytest.mark.parametrize(
+    ("rim", "said"),
+    [
+        ((236.0, 40.0, 133.0), "would end over the sheet"),
+        ((420.0, 40.0, 133.0), "120 mm from the middle of the well"),
+        ((316.0, 40.0, 121.0), "which no rim is"),
+    ],
+)
+def test_a_wipe_that_cannot_be_one_is_refused_with_the_way_out(rim: tuple[float, float, float], said: str) -> None:
+    with pytest.raises(CannotTeach, match=said) as refused:
+        check_wipe(taught(rim))
+    assert "only this place is asked again" in refused.value.way_out
