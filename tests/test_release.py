@@ -1,0 +1,70 @@
+"""What is released works without the repository: the wheel, the source archive, and completion in shells."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tarfile
+import venv
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+def run(*command: object, cwd: Path, **environment: str) -> str:
+    """Run a command to its end and return its output; PYTHONPATH and the like are not passed on."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    words = [str(word) for word in command]
+    ran = subprocess.run(words, cwd=cwd, env=kept | environment, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, f"{words}\n{ran.stdout}{ran.stderr}"
+    return ran.stdout
+
+
+@pytest.fixture(scope="module")
+def brushloop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The command of an environment with the wheel, built from the source archive; packages are those of this one."""
+    folder = tmp_path_factory.mktemp("release")
+    run(sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", folder, cwd=ROOT)
+    [archive] = folder.glob("*.tar.gz")
+    with tarfile.open(archive) as file:
+        file.extractall(folder, filter="data")
+    source = folder / archive.name.removesuffix(".tar.gz")
+    run(sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder, cwd=source)
+    [wheel] = folder.glob("*.whl")
+    venv.create(folder / "clean", with_pip=False)
+    [packages] = (folder / "clean" / "lib").glob("python*/site-packages")
+    # A path in a .pth file is searched, but its own .pth files, such as that of an editable installation, are not read.
+    (packages / "here.pth").write_text("\n".join(path for path in sys.path if path.endswith("site-packages")) + "\n")
+    python = folder / "clean" / "bin" / "python"
+    run(python, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--ignore-installed", wheel, cwd=folder)
+    where = run(python, "-c", "import brushloop; print(brushloop.__file__)", cwd=folder).strip()
+    assert Path(where).is_relative_to(packages), "the wheel's, not the repository's"
+    return folder / "clean" / "bin" / "brushloop"
+
+
+@pytest.mark.soak  # builds, installs, and takes as long as `make demo`
+@pytest.mark.timeout(1800)
+def test_the_demo_runs_from_the_wheel_in_an_empty_folder(brushloop: Path, tmp_path: Path) -> None:
+    assert run(brushloop, "--version", cwd=tmp_path) == "brushloop 0.1.0\n"
+    run(brushloop, "demo", cwd=tmp_path)
+    [report] = tmp_path.rglob("validation/report.html")
+    assert "loopback rig" in report.read_text(encoding="utf-8")
+
+
+COMPLETIONS = [
+    ("bash", {"COMP_WORDS": "brushloop sess", "COMP_CWORD": "1"}, "sessions"),
+    ("zsh", {"_TYPER_COMPLETE_ARGS": "brushloop sessions ex"}, "export"),
+]
+
+
+@pytest.mark.parametrize(("shell", "typed", "completed"), COMPLETIONS, ids=["bash", "zsh"])
+def test_a_shell_is_given_what_completes_a_command(
+    tmp_path: Path, shell: str, typed: dict[str, str], completed: str
+) -> None:
+    command = Path(sys.executable).with_name("brushloop")
+    if not command.is_file():
+        pytest.skip("brushloop is not installed beside this Python")
+    assert completed in run(command, cwd=tmp_path, _BRUSHLOOP_COMPLETE=f"complete_{shell}", **typed)
