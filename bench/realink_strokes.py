@@ -1,4 +1,4 @@
-"""Real dragged strokes for `bench realink`: FRIDA's big brush, ink as images, and the path that was commanded.
+"""Real dragged strokes for `bench realink`: FRIDA's brushes, ink as images, and the path that was commanded.
 
 The strokes sit in a GPL-3.0 repository and are read from where they lie; nothing of them is kept here. The path follows
 the source's public stroke format: a cubic Bezier curve with control points (0, 0), (L/3, bend), (2L/3, bend), (L, 0),
@@ -16,12 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.harness import BenchError
+from calibrate.drags.captures import Drawn, commanded_path
+from calibrate.drags.defects import defects
+from sessions.recording.schemas import Header, Source
 
-FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data" / "frida_bigbrush_tilt_16x20"
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+BIG, SMALL_A, SMALL_B = "frida_bigbrush_tilt_16x20", "frida_smallbrush_16x20_a", "frida_smallbrush_16x20_b"
+TRAVEL_MM = {BIG: 18.0, SMALL_A: 1.5, SMALL_B: 3.0}
+END_SHARE = 0.2
 PX_PER_MM = 2.5
+CROP_MM = (-16.0, 76.0, 32.0)
 DARK = 0.5
-TRAVEL_MM = 18.0
-NODES = 28
 SECOND_PAGE = 97
 """The stroke that begins the second page: the placement of the training strokes jumps there."""
 ACROSS = 9
@@ -37,7 +42,8 @@ class Strokes:
     commands: Floats
     """(n, 4): length mm, bend mm, z as a share of the travel, tilt deg."""
     paths: tuple[Floats, ...]
-    """(28, 3) each: x, y, depth in mm."""
+    """(28, 4) each: x, y, depth in mm, heading in deg."""
+    travel_mm: float
     ink: NDArray[np.bool_]
     """(n, rows, columns)."""
     x_mm: Floats
@@ -46,14 +52,15 @@ class Strokes:
     """(n, 3): row and column on the page, about -1 to 1, and the page: from the order of the strokes."""
 
 
-def load(folder: Path = FOLDER) -> Strokes:
+def load(name: str = BIG, data: Path = DATA) -> Strokes:
     """Read the strokes; blank ones and those that reach the edge of their image are left out.
 
     Raises BenchError where the data set is not at hand.
     """
+    folder, travel_mm = data / name, TRAVEL_MM[name]
     table = folder / "strokes.csv"
     if not table.exists():
-        raise BenchError("the real strokes (frida_bigbrush_tilt_16x20) are not beside this checkout")
+        raise BenchError(f"the real strokes ({name}) are not beside this checkout")
     with table.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     kept: list[int] = []
@@ -71,26 +78,44 @@ def load(folder: Path = FOLDER) -> Strokes:
     y_mm = start[1] - (np.arange(images[0].shape[0]) + 0.5) / PX_PER_MM
     on_page = np.array([k - SECOND_PAGE if k >= SECOND_PAGE else k for k in kept])
     place = np.column_stack([on_page // ACROSS / 5.0 - 1, on_page % ACROSS / 4.0 - 1, np.array(kept) >= SECOND_PAGE])
-    paths = tuple(commanded_path(*command[:3]) for command in commands)
+    ends_mm = END_SHARE * travel_mm
+    paths = tuple(commanded_path(length, bend, z * travel_mm, ends_mm) for length, bend, z, _ in commands)
     names = tuple(rows[k]["file"] for k in kept)
-    return Strokes(names, commands, paths, np.array(images), x_mm, y_mm, place.astype(np.float64))
+    return Strokes(names, commands, paths, travel_mm, np.array(images), x_mm, y_mm, place.astype(np.float64))
 
 
-def commanded_path(length_mm: float, bend_mm: float, z_share: float) -> Floats:
-    """(28, 3) x, y, depth of the tip, mm, y upward."""
-    t = np.linspace(0.0, 1.0, NODES)
-    z = np.interp(t, [0.0, 1 / 3, 2 / 3, 1.0], [0.2, z_share, z_share, 0.2])
-    return np.column_stack([length_mm * t, 3.0 * bend_mm * t * (1.0 - t), TRAVEL_MM * z])
+def region(strokes: Strokes) -> tuple[slice, slice, slice]:
+    """Rows and columns that hold every stroke; the network is trained on them."""
+    left, right, reach = CROP_MM
+    columns = np.flatnonzero((strokes.x_mm > left) & (strokes.x_mm < right))
+    rows = np.flatnonzero(np.abs(strokes.y_mm) < reach)
+    return slice(None), slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
-def captured_distance(ink: NDArray[np.bool_]) -> Floats:
-    """Signed distance to the edge of captured ink, positive inside, (n, rows, columns) mm."""
-    out = np.empty(ink.shape)
-    for k, mask in enumerate(ink):
-        inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5) - 0.5
-        outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) - 0.5
-        out[k] = np.where(mask, inside, -outside) / PX_PER_MM
-    return out
+def drawn(strokes: Strokes, name: str) -> Drawn:
+    """The strokes as `calibrate.drags` reads them from a session, on the grid of the bench."""
+    length, bend, z, tilt = strokes.commands.T
+    depth, ends = z * strokes.travel_mm, np.full(len(z), END_SHARE * strokes.travel_mm)
+    return Drawn(
+        header=Header(session_id=name, source=Source.IMPORT, software="bench", protocol=""),
+        recording_sha256="",
+        calibration=None,
+        x_mm=strokes.x_mm,
+        y_mm=strokes.y_mm,
+        paths=list(strokes.paths),
+        groups=np.arange(len(z) + 1),
+        ink=strokes.ink.astype(np.float32),
+        stroke_ids=list(strokes.names),
+        refused=[],
+        commands=np.column_stack([length, bend, depth, ends, tilt]),
+        flags=[defects(_at_20_px(mask)) for mask in strokes.ink],
+        ends="z_frac_ends",
+    )
+
+
+def _at_20_px(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Strokes are judged at 20 px/mm; these were read at 2.5."""
+    return np.repeat(np.repeat(mask, 8, axis=0), 8, axis=1)
 
 
 def _gray(path: Path, px_per_mm: float) -> NDArray[np.float64]:

@@ -88,8 +88,9 @@ def signed(nodes, starts, groups, x, y, out):
 
 
 @_compile
-def normal_equations(nodes, starts, groups, slopes, x, y, target, spread, square, gradient):
-    """Add J'J and J'r of ink minus target over every pixel; returns half the sum of squares.
+def normal_equations(nodes, starts, groups, slopes, x, y, target, weights, spread, square, gradient):
+    """Add J'J and J'r of ink minus target over every pixel; returns half the sum of squares. Image i counts
+    `weights[i]` times.
 
     `slopes` (nodes, 3, P) are the nodes' derivatives. The position t of the nearest disc is held constant.
     """
@@ -103,7 +104,7 @@ def normal_equations(nodes, starts, groups, slopes, x, y, target, spread, square
                 u = value / spread
                 seen = 1.0 / (1.0 + math.exp(-min(max(u, -40.0), 40.0)))
                 miss = seen - target[i, r, c]
-                cost += 0.5 * miss * miss
+                cost += 0.5 * weights[i] * miss * miss
                 if abs(u) > _FAR:
                     continue
                 slope = seen * (1.0 - seen) / spread
@@ -112,7 +113,8 @@ def normal_equations(nodes, starts, groups, slopes, x, y, target, spread, square
                     after = slopes[k + 1, 2, m] + ux * slopes[k + 1, 0, m] + uy * slopes[k + 1, 1, m]
                     j[m] = slope * ((1.0 - t) * before + t * after)
                 for m in range(count):
-                    gradient[m] += j[m] * miss
+                    weighted = weights[i] * j[m]
+                    gradient[m] += weighted * miss
                     for n in range(m + 1):
-                        square[m, n] += j[m] * j[n]
+                        square[m, n] += weighted * j[n]
     return cost

@@ -2,8 +2,8 @@
 
 The protocol in a recording holds the trajectories that were drawn. Imported photographs come with numbers:
 `length_mm` along x from the start, a depth (`depth_mm`, ...), and optionally `bend_mm` (the distance of both inner
-control points of a cubic Bezier curve to the left of the line) and `depth_ends_mm` (the depth at both ends, reached
-from the middle over a third of the length).
+control points of a cubic Bezier curve to the left of the line) and the depth at both ends, reached from the middle
+over a third of the length: `depth_ends_mm`, or `z_frac_ends`, as a share of the travel like `z_frac_mid`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.calibration import Calibration
+from calibrate.drags.defects import FLAGGED_WEIGHT, prepare_drag
 from calibrate.drags.measure import DEPTH_NAMES, LENGTH_NAME
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.session import calibration_of
@@ -34,6 +35,8 @@ Floats = NDArray[np.float64]
 MARGIN_MM = 16.0
 """Margin around an imported stroke's path: wider than any mark."""
 NODES = 28
+COMMANDS = ("length_mm", "bend_mm", "depth_mm", "depth_ends_mm", "tilt_deg")
+ENDS, SHARE_ENDS, SHARE_MID = "depth_ends_mm", "z_frac_ends", "z_frac_mid"
 SPECK_SHARE = 0.002
 """Lower than for a press: relative to its longest stroke, a figure's dot is smaller than a drop is to a press."""
 
@@ -56,6 +59,17 @@ class Drawn:
     stroke_ids: list[str]
     refused: list[tuple[str, str]]
     """(stroke, why): captures that cannot be used, or that are cut by the edge of their photograph."""
+    commands: Floats | None
+    """(B, 5) `COMMANDS` of imported strokes; None for figures, which no five numbers describe."""
+    flags: list[tuple[str, ...]]
+    """Defects of each image (`calibrate.drags.defects`)."""
+    ends: str
+    """The column that gave the depth at the ends; empty where there was none."""
+
+    @property
+    def weights(self) -> Floats:
+        """(B,) weight of each image in a fit: flagged ones count less."""
+        return np.array([FLAGGED_WEIGHT if flags else 1.0 for flags in self.flags])
 
     @property
     def mm_per_px(self) -> float:
@@ -74,8 +88,14 @@ def read_drags(
         raise CalibrationError(where, "holds no strokes that travel: fit its presses without --drags")
     calibration = calibration_of(recording, strokes[0], digest, calibration_path)
     figures = figures_of(recording.header) if calibration is not None else {}
-    x_mm, y_mm = _cell_grid(strokes, mm_per_px, where) if calibration is not None else _grid(strokes, mm_per_px, where)
+    ends, travel_mm = _ends(strokes)
+    if calibration is not None:
+        x_mm, y_mm = _cell_grid(strokes, mm_per_px, where)
+    else:
+        x_mm, y_mm = _grid(strokes, mm_per_px, travel_mm, where)
     paths: list[list[Floats]] = []
+    commands: list[tuple[float, ...]] = []
+    flags: list[tuple[str, ...]] = []
     images: list[NDArray[np.float32]] = []
     names: list[str] = []
     refused: list[tuple[str, str]] = []
@@ -83,20 +103,37 @@ def read_drags(
         name = capture.stroke.stroke_id
         try:
             if calibration is not None:
-                drawn, image = _figure(capture, calibration, figures, x_mm, y_mm)
+                drawn, (image, found) = _figure(capture, calibration, figures, x_mm, y_mm)
             else:
-                drawn, image = [_path(capture.stroke)], _photograph(capture, x_mm, y_mm)
+                command = command_of(capture.stroke, travel_mm)
+                drawn, (image, found) = [commanded_path(*command[:4])], _photograph(capture, x_mm, y_mm)
+                commands.append(command)
         except (CaptureRefused, SessionDamaged) as error:
             refused.append((name, error.what))
             continue
         paths.append(drawn)
         images.append(image)
+        flags.append(found)
         names.append(name)
     if not images:
         raise CalibrationError(where, f"holds no usable stroke: {refused[0][0]}: {refused[0][1]}")
     groups = np.cumsum([0, *(len(one) for one in paths)])
     flat = [path for one in paths for path in one]
-    return Drawn(recording.header, digest, calibration, x_mm, y_mm, flat, groups, np.array(images), names, refused)
+    return Drawn(
+        recording.header,
+        digest,
+        calibration,
+        x_mm,
+        y_mm,
+        flat,
+        groups,
+        np.array(images),
+        names,
+        refused,
+        np.array(commands) if commands else None,
+        flags,
+        ends,
+    )
 
 
 def figures_of(header: Header) -> dict[str, list[Floats]]:
@@ -122,19 +159,38 @@ def commanded_path(length_mm: float, bend_mm: float, depth_mm: float, depth_ends
     return np.column_stack([length_mm * t, 3.0 * bend_mm * t * (1.0 - t), depth, np.zeros(NODES)])
 
 
-def _path(stroke: Stroke) -> Floats:
+def command_of(stroke: Stroke, travel_mm: float | None) -> tuple[float, float, float, float, float]:
+    """`COMMANDS` of an imported stroke; the depth at the ends is that of the middle where the table has none.
+
+    Raises `CaptureRefused` without length or depth.
+    """
     commanded = dict(stroke.commanded)
     depth = next((commanded[name] for name in DEPTH_NAMES if name in commanded), stroke.height_mm)
     if LENGTH_NAME not in commanded or depth is None:
         raise CaptureRefused(stroke.stroke_id, f"has no {LENGTH_NAME} or no depth")
-    return commanded_path(
-        commanded[LENGTH_NAME], commanded.get("bend_mm", 0.0), depth, commanded.get("depth_ends_mm", depth)
-    )
+    ends = commanded.get(ENDS)
+    if ends is None:
+        share = commanded.get(SHARE_ENDS)
+        ends = depth if share is None or travel_mm is None else share * travel_mm
+    return commanded[LENGTH_NAME], commanded.get("bend_mm", 0.0), depth, ends, stroke.tilt_deg or 0.0
+
+
+def _ends(strokes: list[Stroke]) -> tuple[str, float | None]:
+    """The column that gives the depth at the ends, and the travel in mm of which it is a share."""
+    if any(ENDS in dict(stroke.commanded) for stroke in strokes):
+        return ENDS, None
+    travels: list[float] = []
+    for commanded in (dict(stroke.commanded) for stroke in strokes):
+        depth = next((commanded[name] for name in DEPTH_NAMES if name in commanded), None)
+        share = commanded.get(SHARE_MID, 0.0)
+        if depth is not None and share > 0.0 and SHARE_ENDS in commanded:
+            travels.append(depth / share)
+    return (SHARE_ENDS, float(np.median(travels))) if travels else ("", None)
 
 
 def _figure(
     capture: Capture, calibration: Calibration, figures: dict[str, list[Floats]], x_mm: Floats, y_mm: Floats
-) -> tuple[list[Floats], NDArray[np.float32]]:
+) -> tuple[list[Floats], tuple[NDArray[np.float32], tuple[str, ...]]]:
     stroke = capture.stroke
     paths = figures.get(stroke.stroke_id.rpartition("-r")[0])
     if paths is None or stroke.cell_mm is None:
@@ -147,15 +203,16 @@ def _figure(
     prepared = prepare(raster, None, capture.where, Params(**(calibration.preprocess | reach)))
     if prepared.cut:
         raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph or cell")
-    return paths, _shrunk(prepared.mask, x_mm, y_mm)
+    return paths, (_shrunk(prepared.mask, x_mm, y_mm), ())
 
 
-def _photograph(capture: Capture, x_mm: Floats, y_mm: Floats) -> NDArray[np.float32]:
+def _photograph(capture: Capture, x_mm: Floats, y_mm: Floats) -> tuple[NDArray[np.float32], tuple[str, ...]]:
     stroke = capture.stroke
     if stroke.px_per_mm is None or stroke.anchor_px is None:
         raise CaptureRefused(stroke.stroke_id, "has no scale or no start (start_x_px, start_y_px)")
     anchor = on_raster(stroke.anchor_px, stroke.px_per_mm)
-    prepared = prepare(rescale(capture.image(), stroke.px_per_mm, capture.where), anchor, capture.where, Params())
+    raster = rescale(capture.image(), stroke.px_per_mm, capture.where)
+    prepared, flags = prepare_drag(raster, anchor, capture.where, Params())
     if prepared.cut:
         raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph")
     half = 0.5 * float(x_mm[1] - x_mm[0])
@@ -164,7 +221,7 @@ def _photograph(capture: Capture, x_mm: Floats, y_mm: Floats) -> NDArray[np.floa
     height, width = (round(2 * half * len(axis) * PX_PER_MM) for axis in (y_mm, x_mm))
     pad = max(height, width) + abs(left) + abs(top)
     mask = np.pad(prepared.mask, pad)[top + pad : top + pad + height, left + pad : left + pad + width]
-    return _shrunk(mask, x_mm, y_mm)
+    return _shrunk(mask, x_mm, y_mm), flags
 
 
 def _shrunk(mask: NDArray[np.bool_], x_mm: Floats, y_mm: Floats) -> NDArray[np.float32]:
@@ -182,19 +239,21 @@ def _cell_grid(strokes: list[Stroke], mm_per_px: float, where: str) -> tuple[Flo
     return x_mm, height_mm - (np.arange(rows) + 0.5) * height_mm / rows
 
 
-def _grid(strokes: list[Stroke], mm_per_px: float, where: str) -> tuple[Floats, Floats]:
-    paths = list(_paths(strokes))
+def _grid(strokes: list[Stroke], mm_per_px: float, travel_mm: float | None, where: str) -> tuple[Floats, Floats]:
+    paths = list(_paths(strokes, travel_mm))
     if not paths:
         raise CalibrationError(where, f"no stroke has {LENGTH_NAME} and a depth: its path is unknown")
     places = np.concatenate(paths)
-    low, high = places[:, :2].min(axis=0) - MARGIN_MM, places[:, :2].max(axis=0) + MARGIN_MM
-    columns, rows = (int(n) for n in np.ceil((high - low) / mm_per_px))
-    return low[0] + (np.arange(columns) + 0.5) * mm_per_px, high[1] - (np.arange(rows) + 0.5) * mm_per_px
+    # Pixel k covers [k, k + 1) mm_per_px in every session, so that one session's ink lies on the other's grid.
+    left, low = (int(k) for k in np.floor((places[:, :2].min(axis=0) - MARGIN_MM) / mm_per_px))
+    right, high = (int(k) for k in np.ceil((places[:, :2].max(axis=0) + MARGIN_MM) / mm_per_px))
+    x_mm, y_mm = (np.arange(left, right) + 0.5) * mm_per_px, (np.arange(high, low, -1) - 0.5) * mm_per_px
+    return np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64)
 
 
-def _paths(strokes: list[Stroke]) -> Iterator[Floats]:
+def _paths(strokes: list[Stroke], travel_mm: float | None) -> Iterator[Floats]:
     for stroke in strokes:
         try:
-            yield _path(stroke)
+            yield commanded_path(*command_of(stroke, travel_mm)[:4])
         except CaptureRefused:
             continue

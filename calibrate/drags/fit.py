@@ -1,4 +1,4 @@
-"""Fit bristle lag and width of `model.drag` to dragged strokes, and the rest by kernel ridge regression.
+"""Fit bristle lag and width of `model.drag` to dragged strokes; `calibrate.drags.residual` learns the rest.
 
 The fit minimises the squared difference between captured ink and the model's probability of ink, with an edge that
 varies by `SPREAD_MM` from stroke to stroke. This gives the best image on average, and so the best cosine similarity.
@@ -8,7 +8,7 @@ arm against camera there.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,6 +28,8 @@ PRIOR = (2.0, 0.2, 0.01, 3.0, 1.0, 4.0, 1.5, 1.5, 0.2, 0.2, 3.0, 3.0, 0.5, 0.5)
 """How far each parameter may be from its start before it costs as much as one pixel of wrong ink."""
 PLACE_PRIOR_MM = 1.5
 ROUNDS = 25
+UNDETERMINED = 0.5
+"""A parameter keeps no interval if the strokes reduce the variance of its weak prior by less than this share."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,10 @@ class DragFit:
     spread_mm: float = SPREAD_MM
     """Variation of an edge from stroke to stroke (scale of the logistic)."""
 
+    centre: Floats = field(default_factory=lambda: DragModel().vector())
+    """(14,) parameters that the prior pulls towards."""
+    scale: Floats = field(default_factory=lambda: np.array(PRIOR))
+    """(14,) how far each may be from there."""
     squares: Floats = field(default_factory=lambda: np.zeros((0, 0, 0)))
     """(images, P, P) scaled J'J of each image at the end, for the P free parameters."""
     gradients: Floats = field(default_factory=lambda: np.zeros((0, 0)))
@@ -75,11 +81,14 @@ def fit_drags(
     lag: bool = True,
     spread_mm: float = SPREAD_MM,
     groups: Indices | None = None,
+    weights: Floats | None = None,
+    only: Mapping[str, float] | None = None,
 ) -> DragFit:
     """Fit by Levenberg-Marquardt to (B, len(y_mm), len(x_mm)) ink; `place` is (B, q).
 
     Paths `groups[i]` to `groups[i + 1]` are the strokes of image i; without `groups` each image shows one stroke.
-    Without `lag` the disc stays at the tip, except for drift; its width still settles along the path.
+    Without `lag` the disc stays at the tip, except for drift; its width still settles along the path. `weights` are one
+    for each image. `only` names the parameters that are fitted, and how far each may be from `start`.
     Raises ValueError if the sizes of paths, ink and place do not match.
     """
     from model import drag_kernel
@@ -94,9 +103,13 @@ def fit_drags(
     columns = np.zeros((len(paths), 0)) if place is None else np.repeat(place, np.diff(each), axis=0).astype(np.float64)
     begin = start or (DragModel() if lag else DragModel(leash_mm=0.0, leash_per_mm=0.0, front=0.0))
     first = np.concatenate([begin.vector(), np.zeros(2 * columns.shape[1])])
-    scale = np.concatenate([np.array(PRIOR), np.full(2 * columns.shape[1], PLACE_PRIOR_MM)])
+    prior = np.array([(only or {}).get(name, sd) for name, sd in zip(DragModel.names(), PRIOR, strict=True)])
+    scale = np.concatenate([prior, np.full(2 * columns.shape[1], PLACE_PRIOR_MM)])
+    counted = np.ones(shown) if weights is None else np.asarray(weights, np.float64)
     free = np.ones(len(first), np.bool_)
-    if not lag:
+    if only is not None:
+        free[:14] = [name in only for name in DragModel.names()]
+    elif not lag:
         held = ("leash_mm", "leash_per_mm", "land_mm", "back_mm", "front", "front_width")
         free[[DragModel.names().index(name) for name in held]] = False
 
@@ -104,7 +117,9 @@ def fit_drags(
         nodes, starts, slopes = _linearised(paths, vector, scale, columns)
         square, gradient = np.zeros((len(vector), len(vector))), np.zeros(len(vector))
         cost = float(
-            kernel.normal_equations(nodes, starts, each, slopes, x_mm, y_mm, images, spread_mm, square, gradient)
+            kernel.normal_equations(
+                nodes, starts, each, slopes, x_mm, y_mm, images, counted, spread_mm, square, gradient
+            )
         )
         off = (vector - first) / scale
         square = np.tril(square) + np.tril(square, -1).T + np.eye(len(vector))
@@ -130,7 +145,7 @@ def fit_drags(
                 break
     spread = np.sqrt(np.diag(square))
     condition = float(np.linalg.cond(square / np.outer(spread, spread)))
-    squares, gradients = _by_image(paths, each, images, x_mm, y_mm, vector, scale, columns, spread_mm)
+    squares, gradients = _by_image(paths, each, images, counted, x_mm, y_mm, vector, scale, columns, spread_mm)
     names = tuple(name for name, is_free in zip(DragModel.names(), free, strict=False) if is_free)
     return DragFit(
         DragModel.of(vector[:14]),
@@ -139,20 +154,22 @@ def fit_drags(
         cost,
         done,
         spread_mm,
+        begin.vector(),
+        prior,
         squares[:, free][:, :, free],
         gradients[:, free],
         names,
     )
 
 
-def bootstrap(fit: DragFit, draws: int = 500, seed: int = 0, start: DragModel | None = None) -> Floats:
+def bootstrap(fit: DragFit, draws: int = 500, seed: int = 0) -> Floats:
     """(draws, P) values of the free parameters, by bootstrap over images; a draw is one Gauss-Newton step from the fit.
 
     With fewer than some 8 images the intervals are too short.
     """
     at = [DragModel.names().index(name) for name in fit.free]
-    scale, found = np.array(PRIOR)[at], fit.model.vector()[at]
-    off = (found - (start or DragModel()).vector()[at]) / scale
+    scale, found = fit.scale[at], fit.model.vector()[at]
+    off = (found - fit.centre[at]) / scale
     count, total = len(fit.squares), fit.squares.shape[1]
     weights = np.random.default_rng(seed).multinomial(count, np.full(count, 1.0 / count), draws).astype(np.float64)
     prior = np.zeros((draws, total))
@@ -162,37 +179,16 @@ def bootstrap(fit: DragFit, draws: int = 500, seed: int = 0, start: DragModel | 
     return found + scale * steps[:, : len(at)]
 
 
-@dataclass(frozen=True, slots=True)
-class Residual:
-    """Deviation from the lag model as a function of the stroke's command: kernel ridge on clipped signed distance."""
-
-    commands: Floats
-    weights: Floats
-    scales: Floats
-    REACH_MM = 6.0
-
-    @staticmethod
-    def fit(commands: Floats, base_mm: Floats, captured_mm: Floats, scales: Floats, ridge: float = 1.0) -> Residual:
-        """Fit to (B, d) commands and to the model's and the captured signed distances (B, h, w)."""
-        scaled = commands / scales
-        miss = (clipped(captured_mm) - clipped(base_mm)).reshape(len(commands), -1)
-        kernel = _kernel(scaled, scaled) + ridge * np.eye(len(commands))
-        return Residual(scaled, np.asarray(np.linalg.solve(kernel, miss), np.float64), scales)
-
-    def add(self, commands: Floats, base_mm: Floats) -> Floats:
-        """The corrected signed distances, (B, h, w)."""
-        kernel = _kernel(commands / self.scales, self.commands)
-        return clipped(base_mm) + (kernel @ self.weights).reshape(base_mm.shape)
+def determined(fit: DragFit) -> NDArray[np.bool_]:
+    """(P,) whether the strokes determine each free parameter, rather than the prior."""
+    unit = np.eye(fit.squares.shape[1])
+    variance = np.asarray(np.linalg.solve(fit.squares.sum(axis=0) + unit, unit), np.float64)
+    return np.diag(variance)[: len(fit.free)] < 1.0 - UNDETERMINED
 
 
 def chance(distance_mm: Floats, spread_mm: float = SPREAD_MM) -> Floats:
     """The probability of ink at a signed distance from the edge."""
     return ink(distance_mm, spread_mm)
-
-
-def clipped(distance_mm: Floats) -> Floats:
-    """Signed distance that levels off at `Residual.REACH_MM`: far from the edge it says nothing."""
-    return Residual.REACH_MM * np.tanh(distance_mm / Residual.REACH_MM)
 
 
 def _each(paths: Sequence[Floats], groups: Indices | None) -> Indices:
@@ -203,6 +199,7 @@ def _by_image(
     paths: Sequence[Floats],
     each: Indices,
     images: NDArray[np.float32],
+    weights: Floats,
     x_mm: Floats,
     y_mm: Floats,
     vector: Floats,
@@ -219,14 +216,20 @@ def _by_image(
     for i in range(len(images)):
         one = each[i : i + 2]
         kernel.normal_equations(
-            nodes, starts, one, slopes, x_mm, y_mm, images[i : i + 1], spread_mm, squares[i], gradients[i]
+            nodes,
+            starts,
+            one,
+            slopes,
+            x_mm,
+            y_mm,
+            images[i : i + 1],
+            weights[i : i + 1],
+            spread_mm,
+            squares[i],
+            gradients[i],
         )
         squares[i] = np.tril(squares[i]) + np.tril(squares[i], -1).T
     return squares, gradients
-
-
-def _kernel(a: Floats, b: Floats) -> Floats:
-    return np.exp(-0.5 * ((a[:, None] - b[None]) ** 2).sum(axis=-1))
 
 
 def _shifted(nodes: Floats, starts: NDArray[np.int64], place: Floats | None, by: Floats) -> Floats:

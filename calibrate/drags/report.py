@@ -71,6 +71,16 @@ def drags_csv(results: DragResults, source: str) -> str:
     return csv_text(head, rows)
 
 
+def ends_sentence(ends: str) -> str:
+    """Where the depth at both ends of a stroke comes from."""
+    if not ends:
+        return (
+            "The table gives no depth at the ends (depth_ends_mm, or z_frac_ends beside z_frac_mid): "
+            "the depth is taken as constant."
+        )
+    return f"The depth at both ends is that of the column {ends}."
+
+
 def fit_sentences(results: DragResults) -> Iterator[str]:
     """Sentences on the fits of an imported session, and how they relate to CCD-BSM."""
     width, length = results.width_on_depth, results.length_on_commanded

@@ -1,72 +1,38 @@
-"""Fit bristle lag to a session of dragged strokes: parameters with intervals, held-out scores, and the artefact."""
+"""Fit dragged strokes of a session: parameters with intervals, held-out scores, and the artefact.
+
+A brush known from another session is adapted by its place and its width alone: these change whenever a brush is
+mounted and its zero set.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, model_validator
 
-from calibrate.artefact import Artefact, FittedValue, put_to_use
+from calibrate.artefact import FittedValue, put_to_use
+from calibrate.drags.artefact import DragArtefact, DragScore
 from calibrate.drags.captures import Drawn
-from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, DragFit, bootstrap, chance, fit_drags
+from calibrate.drags.fit import DragFit, bootstrap, determined, fit_drags
+from calibrate.drags.predict import Predictor, chosen, coarse, learn, predictors, scores, stamps_of
 from calibrate.errors import CalibrationError
 from model.drag import DragModel
 from sessions.progress import Progress, counted, unseen
 
 FOLDER = "dragfit"
-SCHEMA_VERSION = 1
 FOLDS = 5
 LEAST = 3
 """Least number of images: fewer do not distinguish lag from drift."""
-LAGGING, STAMPS = "bristle lag", "circle stamps"
+PREDICTED, LAGGING, STAMPS = "bristle lag, corrected", "bristle lag", "circle stamps"
+SESSION_MM = {"drift_x_mm": 1.0, "drift_y_mm": 1.0, "half_mm": 0.4}
+"""How far place and half width change from one session to another of the same brush (standard deviation)."""
+STROKE_MM2 = 0.14
+"""Weight of a square millimetre of wrong ink in such a fit: one stroke then tells its place to about 1 mm, which is how
+far strokes of one session scatter."""
 Floats = NDArray[np.float64]
-
-
-class DragScore(BaseModel):
-    """Score of one model on images that it was not fitted to, ink as 0 or 1, at the commanded place."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    csim_percent: float
-    iou_percent: float
-    images: int
-
-
-class DragArtefact(Artefact):
-    """The fitted drag model on disk. Equal inputs give an equal file."""
-
-    schema_version: int = SCHEMA_VERSION
-    session_id: str
-    source: str
-    recording_sha256: str
-    calibration: str
-    """Digest of the calibration that the captures were rectified with; empty for an import."""
-    software: str
-    images: int
-    strokes: int
-    mm_per_px: float
-    spread_mm: float
-    """Variation of an edge from stroke to stroke (scale of the logistic)."""
-    parameters: dict[str, FittedValue]
-    condition: float
-    """Condition number of the scaled normal equations: above about 1e4 the parameters cannot be distinguished."""
-    held_out: dict[str, DragScore]
-    """Scores by model; empty with too few images to leave any out."""
-
-    def model(self) -> DragModel:
-        """The fitted drag model."""
-        return DragModel(**{name: value.value for name, value in self.parameters.items()})
-
-    @model_validator(mode="after")
-    def _whole(self) -> Self:
-        if set(self.parameters) != set(DragModel.names()):
-            raise ValueError(f"parameters: expected {', '.join(DragModel.names())}")
-        return self
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,24 +52,66 @@ def fit_drawn(drawn: Drawn, progress: Progress = unseen) -> FittedDrags:
         raise CalibrationError(
             drawn.header.session_id, f"{len(drawn.ink)} images of dragged strokes, at least {LEAST} are needed"
         )
-    fit = _fit(drawn, np.arange(len(drawn.ink)), lag=True)
-    low, high = np.quantile(bootstrap(fit), [0.025, 0.975], axis=0)
-    values = zip(fit.free, fit.model.vector(), low, high, strict=True)
-    artefact = DragArtefact(
-        session_id=drawn.header.session_id,
-        source=drawn.header.source,
-        recording_sha256=drawn.recording_sha256,
-        calibration=drawn.calibration.digest if drawn.calibration else "",
-        software=f"brushloop {version('brushloop')}",
-        images=len(drawn.ink),
-        strokes=len(drawn.paths),
-        mm_per_px=drawn.mm_per_px,
-        spread_mm=fit.spread_mm,
-        parameters={n: FittedValue(value=float(v), low=float(a), high=float(b)) for n, v, a, b in values},
-        condition=fit.condition,
-        held_out=_held_out(drawn, progress) if len(drawn.ink) >= FOLDS else {},
+    learned = learn(drawn, np.arange(len(drawn.ink)))
+    artefact = _artefact(drawn, learned.fit, len(drawn.ink), _values(learned.fit)).model_copy(
+        update={
+            "ink_above": learned.predictor.above,
+            "stamps": stamps_of(learned.stamps),
+            "kept": learned.predictor.kept,
+            "held_out": _held_out(drawn, progress) if len(drawn.ink) >= FOLDS else {},
+        }
+    )
+    return FittedDrags(learned.fit, artefact)
+
+
+def refit_drawn(drawn: Drawn, prior: DragArtefact, where: str, strokes: int) -> FittedDrags:
+    """Adapt a known brush to the first `strokes` images of a session, by the parameters `SESSION_MM`.
+
+    Raises `CalibrationError` if the session has fewer images, or if its scale is not that of `prior`.
+    """
+    if not 1 <= strokes <= len(drawn.ink):
+        raise CalibrationError("--strokes", f"{strokes}: allowed 1 to {len(drawn.ink)}, the usable strokes")
+    if abs(drawn.mm_per_px - prior.mm_per_px) > 1e-6:
+        raise CalibrationError(where, f"mm_per_px is {prior.mm_per_px:g}, here {drawn.mm_per_px:g}")
+    first = np.arange(strokes)
+    ours, stamps = predictors(prior, where)
+    fit = adapt(drawn, first, ours)
+    moved = None if stamps is None else stamps_of(adapted(stamps, adapt(drawn, first, stamps)))
+    values = {name: value for name, value in _values(fit).items() if name in SESSION_MM}
+    artefact = _artefact(drawn, fit, strokes, prior.parameters | values).model_copy(
+        update={
+            "ink_above": prior.ink_above,
+            "stamps": moved,
+            "kept": prior.kept,
+            "prior": prior.digest,
+            "prior_session": f"{prior.session_id}, {prior.source}",
+            "refitted": tuple(SESSION_MM),
+        }
     )
     return FittedDrags(fit, artefact)
+
+
+def adapt(drawn: Drawn, images: NDArray[np.int64], known: Predictor) -> DragFit:
+    """Fit place and width of a known brush to these images."""
+    paths, groups = chosen(drawn, images)
+    ink, x_mm, y_mm = coarse(drawn, images)
+    weights = drawn.weights[images] * STROKE_MM2 * float(x_mm[1] - x_mm[0]) ** 2
+    return fit_drags(
+        paths,
+        ink,
+        x_mm,
+        y_mm,
+        start=known.model,
+        spread_mm=known.spread_mm,
+        groups=groups,
+        weights=weights,
+        only=SESSION_MM,
+    )
+
+
+def adapted(known: Predictor, fit: DragFit) -> Predictor:
+    """The known brush with the adapted parameters; what was learned about its shape is kept."""
+    return replace(known, model=fit.model)
 
 
 def save(fitted: FittedDrags, session: Path) -> Path:
@@ -111,38 +119,51 @@ def save(fitted: FittedDrags, session: Path) -> Path:
     return put_to_use(fitted.artefact, session, FOLDER)
 
 
-def _chosen(drawn: Drawn, images: NDArray[np.int64]) -> tuple[list[Floats], NDArray[np.int64]]:
-    each = [drawn.paths[drawn.groups[i] : drawn.groups[i + 1]] for i in images]
-    return [path for one in each for path in one], np.cumsum([0, *(len(one) for one in each)])
+def _values(fit: DragFit) -> dict[str, FittedValue]:
+    """All parameters; those that the strokes do not determine have no interval."""
+    low, high = np.quantile(bootstrap(fit), [0.025, 0.975], axis=0)
+    known = determined(fit)
+    values = {
+        name: FittedValue(value=float(value), low=None, high=None)
+        for name, value in zip(DragModel.names(), fit.model.vector(), strict=True)
+    }
+    for name, a, b, is_known in zip(fit.free, low, high, known, strict=True):
+        if is_known:
+            values[name] = FittedValue(value=values[name].value, low=float(a), high=float(b))
+    return values
 
 
-def _fit(drawn: Drawn, images: NDArray[np.int64], *, lag: bool) -> DragFit:
-    paths, groups = _chosen(drawn, images)
-    return fit_drags(paths, drawn.ink[images], drawn.x_mm, drawn.y_mm, lag=lag, groups=groups)
+def _artefact(drawn: Drawn, fit: DragFit, images: int, values: dict[str, FittedValue]) -> DragArtefact:
+    return DragArtefact(
+        session_id=drawn.header.session_id,
+        source=drawn.header.source,
+        recording_sha256=drawn.recording_sha256,
+        calibration=drawn.calibration.digest if drawn.calibration else "",
+        software=f"brushloop {version('brushloop')}",
+        images=images,
+        strokes=int(drawn.groups[images]),
+        mm_per_px=round(drawn.mm_per_px, 9),
+        spread_mm=fit.spread_mm,
+        parameters=values,
+        condition=fit.condition,
+        held_out={},
+        fitted_strokes=tuple(drawn.stroke_ids[:images]),
+    )
 
 
 def _held_out(drawn: Drawn, progress: Progress) -> dict[str, DragScore]:
     order = np.random.default_rng(0).permutation(len(drawn.ink))
-    scores: dict[str, list[tuple[float, float]]] = {LAGGING: [], STAMPS: []}
+    found: dict[str, list[Floats]] = {}
     for k in counted(range(FOLDS), "fifths left out in turn", FOLDS, progress):
-        left, others = order[k::FOLDS], np.sort(np.setdiff1d(order, order[k::FOLDS]))
-        for name, lag in ((LAGGING, True), (STAMPS, False)):
-            fit = _fit(drawn, others, lag=lag)
-            paths, groups = _chosen(drawn, left)
-            seen = chance(fit.distance(paths, drawn.x_mm, drawn.y_mm, groups=groups), SPREAD_MM) > INK_ABOVE
-            scores[name] += [_score(a, b) for a, b in zip(seen, drawn.ink[left] > 0.5, strict=True)]
+        left, others = np.sort(order[k::FOLDS]), np.sort(np.setdiff1d(order, order[k::FOLDS]))
+        learned, truth = learn(drawn, others), drawn.ink[left] > 0.5
+        if learned.predictor.kept is not None:
+            found.setdefault(PREDICTED, []).append(scores(learned.predictor.ink(drawn, left), truth))
+        lag = learned.predictor.ink(drawn, left, corrected=False)
+        found.setdefault(LAGGING, []).append(scores(lag, truth))
+        found.setdefault(STAMPS, []).append(scores(learned.stamps.ink(drawn, left), truth))
+    means = {name: (100.0 * np.concatenate(each).mean(axis=0)).tolist() for name, each in found.items()}
     return {
-        name: DragScore(
-            csim_percent=100.0 * float(np.mean([csim for csim, _ in each])),
-            iou_percent=100.0 * float(np.mean([iou for _, iou in each])),
-            images=len(each),
-        )
-        for name, each in scores.items()
+        name: DragScore(csim_percent=csim, iou_percent=iou, images=len(drawn.ink))
+        for name, (csim, iou) in means.items()
     }
-
-
-def _score(seen: NDArray[np.bool_], truth: NDArray[np.bool_]) -> tuple[float, float]:
-    both = float(np.count_nonzero(seen & truth))
-    norm = float(np.sqrt(np.count_nonzero(seen) * np.count_nonzero(truth)))
-    union = float(np.count_nonzero(seen | truth))
-    return (both / norm if norm else 0.0), (both / union if union else 0.0)

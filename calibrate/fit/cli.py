@@ -13,11 +13,15 @@ from sessions.terminal import say
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from calibrate.drags.artefact import DragArtefact
+    from calibrate.drags.captures import Drawn
     from calibrate.fit.captures import Captures
     from calibrate.fit.run import Correction, Fitted
 
-DRAG_MM_PER_PX = 0.6
+DRAG_MM_PER_PX = 0.4
 """Scale of the images that drags are fitted to."""
+MOST_RIDGE = 1e5
+"""A ridge this strong corrects nothing."""
 
 
 def fit(
@@ -32,12 +36,18 @@ def fit(
     drags: Annotated[
         bool, typer.Option("--drags", help="Fit bristle lag to strokes that travel; writes dragfit/<hash>.json.")
     ] = False,
+    prior: Annotated[
+        Path | None, typer.Option(help="With --drags: a dragfit of this brush, whose place and width are adapted.")
+    ] = None,
+    strokes: Annotated[int | None, typer.Option(min=1, help="With --prior: only the first so many strokes.")] = None,
 ) -> None:
     """Fit the stroke model to a session's presses; writes an immutable brushfit/<hash>.json."""
+    if (prior is not None and not drags) or (strokes is not None and prior is None):
+        raise typer.BadParameter("--prior goes with --drags, and --strokes with --prior")
     if drags:
         if correction or reference is not None:
             raise typer.BadParameter("--correction and --reference are for presses, not for --drags")
-        _fit_drags(session, mm_per_px or DRAG_MM_PER_PX, calibration)
+        _fit_drags(session, mm_per_px, calibration, prior, strokes)
         return
 
     from calibrate.artefact import load_artefact
@@ -61,37 +71,68 @@ def fit(
     say(f"Fit: {path}")
 
 
-def _fit_drags(session: Path, mm_per_px: float, calibration: Path | None) -> None:
-    from rich.table import Table
-
+def _fit_drags(
+    session: Path, mm_per_px: float | None, calibration: Path | None, prior: Path | None, strokes: int | None
+) -> None:
+    from calibrate.artefact import load_artefact
+    from calibrate.drags.artefact import DragArtefact
     from calibrate.drags.captures import read_drags
-    from calibrate.drags.run import fit_drawn, save
-    from calibrate.report import source_note
+    from calibrate.drags.run import fit_drawn, refit_drawn, save
     from sessions.progress import shown
     from sessions.reader import Recording
 
+    before = load_artefact(prior, DragArtefact) if prior is not None else None
+    scale = mm_per_px or (before.mm_per_px if before is not None else DRAG_MM_PER_PX)
     with shown() as progress:
-        drawn = read_drags(session, mm_per_px, calibration, progress)
-        fitted = fit_drawn(drawn, progress)
-    artefact = fitted.artefact
-    say(
+        drawn = read_drags(session, scale, calibration, progress)
+        if before is not None:
+            fitted = refit_drawn(drawn, before, str(prior), strokes if strokes is not None else len(drawn.ink))
+        else:
+            fitted = fit_drawn(drawn, progress)
+    say(*_drag_tables(drawn, fitted.artefact))
+    say(f"Fit: {save(fitted, Recording(session).path.parent)}")
+
+
+def _drag_tables(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:
+    from rich.table import Table
+
+    from calibrate.drags.report import ends_sentence
+    from calibrate.report import source_note
+
+    yield (
         f"{source_note(drawn.header.source)}; {artefact.strokes} dragged strokes in {artefact.images} images; "
         f"condition number {artefact.condition:.3g}"
     )
     for name, why in drawn.refused:
-        say(f"left out: {name}: {why}")
+        yield f"left out: {name}: {why}"
+    for name, flags in zip(drawn.stroke_ids, drawn.flags, strict=True):
+        if flags:
+            yield f"counts less: {name}: {'; '.join(flags)}"
+    if drawn.commands is not None:
+        yield ends_sentence(drawn.ends)
+    if artefact.prior:
+        adapted = ", ".join(artefact.refitted)
+        yield f"The brush of {artefact.prior_session} (fit {artefact.prior}), of which are adapted: {adapted}."
     out = Table("parameter", "fitted", "95 %", title="drag model, mm")
     for name, found in artefact.parameters.items():
-        out.add_row(name, f"{found.value:.3f}", f"{found.low:.3f} to {found.high:.3f}")
-    say(out)
+        interval = "not determined" if found.low is None else f"{found.low:.3f} to {found.high:.3f}"
+        if artefact.prior and name not in artefact.refitted:
+            interval = "as before"
+        out.add_row(name, f"{found.value:.3f}", interval)
+    yield out
+    if artefact.kept is not None:
+        corrected = "nothing" if artefact.kept.ridge > MOST_RIDGE else f"ridge {artefact.kept.ridge:g}"
+        yield (
+            f"Chosen by leaving out one training stroke at a time: {corrected} for what the lag misses, share of the "
+            f"ridge straight on the distance {artefact.kept.share:g}, ink above {artefact.ink_above:g}."
+        )
     if artefact.held_out:
         out = Table("model", "n", "CSIM", "IoU", title="a fifth left out in turn, where the command put it, percent")
         for name, score in artefact.held_out.items():
             out.add_row(name, str(score.images), f"{score.csim_percent:.2f}", f"{score.iou_percent:.2f}")
-        say(out)
-    else:
-        say("Fewer than five images: none can be left out.")
-    say(f"Fit: {save(fitted, Recording(session).path.parent)}")
+        yield out
+    elif not artefact.prior:
+        yield "Fewer than five images: none can be left out."
 
 
 def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:

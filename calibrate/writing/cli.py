@@ -35,7 +35,7 @@ def plan(
     import math
 
     from calibrate.artefact import load_artefact
-    from calibrate.drags.run import DragArtefact
+    from calibrate.drags.artefact import DragArtefact
     from calibrate.errors import CalibrationError
     from calibrate.files import check_folder
     from calibrate.writing.plan import Settings

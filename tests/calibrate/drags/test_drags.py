@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.drags.fit import INK_ABOVE, Residual, chance, fit_drags
+from calibrate.drags.fit import INK_ABOVE, chance, determined, fit_drags
+from calibrate.drags.residual import Choice, Residual, choose
 from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from model.drag import DragModel
 
@@ -43,12 +44,54 @@ def test_the_place_on_a_page_is_distinguished_from_the_brush() -> None:
     assert fit.place_mm[0] == pytest.approx([0.0, 1.5], abs=0.25)
 
 
-def test_what_the_model_does_not_describe_is_learned_from_neighbours() -> None:
-    commands = np.linspace(0.0, 1.0, 20)[:, None]
+def test_what_the_model_lacks_is_learned_from_neighbours() -> None:
+    commands = np.column_stack([np.linspace(0.0, 1.0, 20), np.zeros(20)])
     base = np.zeros((20, 4, 4))
-    captured = base + np.sin(3.0 * commands)[:, :, None]
-    residual = Residual.fit(commands[::2], base[::2], captured[::2], np.array([0.5]), ridge=0.01)
+    captured = base + np.sin(3.0 * commands[:, 0])[:, None, None]
+    residual = Residual.fit(commands[::2], base[::2], captured[::2], Choice(ridge=0.01))
     assert np.abs(residual.add(commands[1:-1:2], base[1:-1:2]) - captured[1:-1:2]).max() < 0.05
+
+
+def test_the_strength_of_the_correction_follows_from_the_training_strokes_alone() -> None:
+    rng = np.random.default_rng(0)
+    commands = np.column_stack([np.linspace(0.0, 1.0, 24), np.zeros(24)])
+    x = np.linspace(-4.0, 4.0, 33)
+    base = np.broadcast_to(3.0 - np.abs(x), (24, 33, 33)).copy()
+    wider = base + np.where(commands[:, 0] > 0.5, 0.9, -0.9)[:, None, None]  # depends on the command
+    scattered = base + rng.normal(0.0, 0.9, 24)[:, None, None]  # does not
+    assert choose(commands, base, wider).ridge < 10.0
+    assert choose(commands, base, scattered).ridge >= 10.0
+
+
+def test_a_parameter_that_the_strokes_do_not_determine_is_named() -> None:
+    """At a constant depth the width has nothing to settle from."""
+    paths = arcs(6, 1)
+    fit = fit_drags(paths, drawn(TRUTH, paths), X_MM, Y_MM)
+    known = dict(zip(fit.free, determined(fit), strict=True))
+    assert not known["settle_mm"]
+    assert known["half_mm"]
+    assert known["drift_y_mm"]
+
+
+def test_a_known_brush_is_adapted_by_its_place_alone() -> None:
+    paths = arcs(3, 5)
+    moved = replace(TRUTH, drift_x_mm=0.8, drift_y_mm=-0.6)
+    only = {"drift_x_mm": 1.0, "drift_y_mm": 1.0}
+    fit = fit_drags(paths, drawn(moved, paths), X_MM, Y_MM, start=TRUTH, only=only)
+    assert (fit.model.drift_x_mm, fit.model.drift_y_mm) == pytest.approx((0.8, -0.6), abs=0.1)
+    assert replace(fit.model, drift_x_mm=0.0, drift_y_mm=0.5) == TRUTH
+    assert fit.free == ("drift_x_mm", "drift_y_mm")
+
+
+def test_a_stroke_that_counts_less_moves_the_fit_less() -> None:
+    paths = arcs(4, 6)
+    images = drawn(TRUTH, paths)
+    images[0] = drawn(replace(TRUTH, half_mm=3.0), paths[:1])[0]
+    even, less = (
+        fit_drags(paths, images, X_MM, Y_MM, start=TRUTH, only={"half_mm": 2.0}, weights=np.array([w, 1.0, 1.0, 1.0]))
+        for w in (1.0, 0.1)
+    )
+    assert TRUTH.half_mm <= less.model.half_mm < even.model.half_mm - 0.1
 
 
 def test_the_simulated_brush_trails_and_the_fit_sees_it() -> None:

@@ -9,15 +9,17 @@ import pytest
 
 from bench import realink
 from bench.realink import circles, predict, score, split
-from bench.realink_strokes import FOLDER, captured_distance, commanded_path, load
+from bench.realink_strokes import BIG, DATA, PX_PER_MM, load
+from calibrate.drags.captures import commanded_path
+from calibrate.drags.residual import captured_distance
 
-real = pytest.mark.skipif(not FOLDER.is_dir(), reason="the folder of real strokes is not here")
+real = pytest.mark.skipif(not (DATA / BIG).is_dir(), reason="the folder of real strokes is not here")
 
 
 def test_the_commanded_path_is_the_curve_of_its_four_control_points() -> None:
-    path = commanded_path(30.0, 12.0, 0.8)
-    assert path[0].tolist() == pytest.approx([0.0, 0.0, 0.2 * 18.0])
-    assert path[-1].tolist() == pytest.approx([30.0, 0.0, 0.2 * 18.0])
+    path = commanded_path(30.0, 12.0, 0.8 * 18.0, 0.2 * 18.0)
+    assert path[0].tolist() == pytest.approx([0.0, 0.0, 0.2 * 18.0, 0.0])
+    assert path[-1].tolist() == pytest.approx([30.0, 0.0, 0.2 * 18.0, 0.0])
     assert path[:, 1].max() == pytest.approx(0.75 * 12.0, abs=0.02)
     assert path[:, 2].max() == pytest.approx(0.8 * 18.0)
 
@@ -29,8 +31,9 @@ def test_lag_beats_circle_stamps_on_strokes_that_were_never_fitted() -> None:
     assert len(strokes.paths) == 187
     train, test = split(187)
     chosen = np.random.default_rng(5).permutation(train)[:20]
-    captured = captured_distance(strokes.ink)
-    ours = score(strokes, test, predict(strokes, captured, chosen, test)[1])
+    captured = captured_distance(strokes.ink, 1.0 / PX_PER_MM)
+    _, corrected, above = predict(strokes, captured, chosen, test)
+    ours = score(strokes, test, corrected, above)
     stamps = circles(strokes, chosen, test)
     assert ours.csim > 0.82
     assert ours.iou > 0.70
@@ -40,7 +43,7 @@ def test_lag_beats_circle_stamps_on_strokes_that_were_never_fitted() -> None:
 def test_without_the_strokes_the_comparison_is_skipped_and_says_so(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(realink, "load", lambda: load(tmp_path))
+    monkeypatch.setattr(realink, "load", lambda: load(BIG, tmp_path))
     assert realink.run(n=1) == []
     assert "skipped: the real strokes" in capsys.readouterr().err
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from brushloop import app
 from calibrate.artefact import FittedValue
-from calibrate.drags.run import DragArtefact
+from calibrate.drags.artefact import DragArtefact
 from calibrate.errors import CalibrationError
 from calibrate.writing.plan import Settings, plan, read_requests
 from calibrate.writing.plan_files import PICTURE, PROTOCOL, load_plan, write_plan

@@ -1,0 +1,114 @@
+"""One session of a small brush predicted from another: real ink, two sessions of different travel.
+
+In each split a quarter of the target session is scored. The fit within the session and the one of the other session
+have the same number of training strokes. A third contestant is the other session's brush with place and width adapted
+to the first strokes of the target session that are not scored (`brushloop fit --drags --prior --strokes`). Every
+setting was chosen on training strokes of the big brush, or by the fit itself on its own training strokes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.harness import BenchError, Result, machine
+from bench.realink_network import train_and_predict
+from bench.realink_strokes import SMALL_A, SMALL_B, Strokes, drawn, load, region
+from calibrate.drags.captures import Drawn
+from calibrate.drags.predict import learn, scores
+from calibrate.drags.run import adapt, adapted
+
+SESSION_SPLITS = 5
+STROKES = 90
+SCORED = 0.25
+FIRST = 10
+"""Strokes of the target session that a known brush is adapted to."""
+NETWORK_STEPS = 500
+SHORT = {SMALL_A: "a", SMALL_B: "b"}
+Floats = NDArray[np.float64]
+
+
+def measure_sessions(splits: int, seed: int, network_steps: int = NETWORK_STEPS) -> list[Result]:
+    """Both directions; empty where the strokes are not beside the checkout. Raises ValueError for splits < 1."""
+    if splits < 1:
+        raise ValueError(f"splits = {splits}: at least one is needed")
+    try:
+        strokes = {name: load(name) for name in (SMALL_A, SMALL_B)}
+    except BenchError:
+        return []
+    read = {name: drawn(strokes[name], name) for name in strokes}
+    results: list[Result] = []
+    for source, target in ((SMALL_A, SMALL_B), (SMALL_B, SMALL_A)):
+        found = _compare(read[source], read[target], strokes, source, target, splits, seed, network_steps)
+        results += _results(found, f"{SHORT[source]}-to-{SHORT[target]}", splits, seed, network_steps)
+    return results
+
+
+def _compare(
+    source: Drawn,
+    target: Drawn,
+    strokes: dict[str, Strokes],
+    source_name: str,
+    target_name: str,
+    splits: int,
+    seed: int,
+    network_steps: int,
+) -> dict[str, Floats]:
+    """(splits, 2) mean CSIM and IoU of every contestant; the network is trained once, for the first split."""
+    found: dict[str, list[Floats]] = {}
+    for k in range(splits):
+        rng = np.random.default_rng([seed, k])
+        order, other = rng.permutation(len(target.ink)), np.sort(rng.permutation(len(source.ink))[:STROKES])
+        test = np.sort(order[: round(SCORED * len(order))])
+        left = np.sort(order[len(test) :])
+        truth = target.ink[test] > 0.5
+        within = learn(target, np.sort(order[-STROKES:])).predictor
+        across = learn(source, other)
+        known = across.predictor
+        seen = {
+            "within": within.ink(target, test),
+            "zero-shot": known.ink(target, test),
+            "lag, zero-shot": known.ink(target, test, corrected=False),
+            "adapted": adapted(known, adapt(target, left[:FIRST], known)).ink(target, test),
+            "circles": across.stamps.ink(target, test),
+        }
+        if k == 0:
+            seen["network"] = _network(strokes[source_name], other, strokes[target_name], test, seed, network_steps)
+        for name, ink in seen.items():
+            found.setdefault(name, []).append(scores(ink, truth).mean(axis=0))
+    return {name: np.array(each) for name, each in found.items()}
+
+
+def _network(
+    source: Strokes, chosen: NDArray[np.int64], target: Strokes, test: NDArray[np.int64], seed: int, steps: int
+) -> NDArray[np.bool_]:
+    shown = region(target)
+    seen = train_and_predict(source.commands[chosen], source.ink[chosen][shown], target.commands[test], seed, steps)
+    whole = np.zeros((len(test), *target.ink.shape[1:]), np.bool_)
+    whole[shown] = seen > 0.42
+    return whole
+
+
+def _results(found: dict[str, Floats], way: str, splits: int, seed: int, steps: int) -> Sequence[Result]:
+    words = "; ".join(
+        f"{name} {each[:, 0].mean():.3f} / {each[:, 1].mean():.3f} (sd {each[:, 0].std():.3f})"
+        for name, each in found.items()
+    )
+    conditions = (
+        f"real ink, small brush, {way}, {STROKES} training strokes, adapted to {FIRST}; CSIM / IoU: {words}; network: "
+        f"first split only, at most {steps} steps; {machine()}"
+    )
+    results: list[Result] = []
+    for name in ("zero-shot", "adapted"):
+        for column, what in enumerate(("csim", "iou")):
+            ours = found[name][:, column]
+            for peer, against in (("a fit within the session", "within"), ("a network of FRIDA's shape", "network")):
+                other = found[against][:, column]
+                ratio = float(ours[: len(other)].mean() / other.mean())
+                label = f"realink.{way}.{name}.{what}" + (".first" if against == "network" else "")
+                results.append(
+                    Result(label, float(ours[: len(other)].mean()), "of 1", peer, ratio, len(other), seed, conditions)
+                )
+    return results

@@ -1,0 +1,131 @@
+"""Predict the ink of dragged strokes: fitted on some images of a session, or read from an artefact."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.drags.artefact import DragArtefact, Stamps
+from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, DragFit, chance, fit_drags
+from calibrate.drags.kept import Kept
+from calibrate.drags.residual import Residual, captured_distance, choose, clipped
+from calibrate.errors import CalibrationError
+from model.drag import DragModel, distances, trails
+
+if TYPE_CHECKING:
+    from calibrate.drags.captures import Drawn
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+FIT_MM = 0.8
+"""Scale of the images that the parameters are fitted to: finer ones do not change the fit."""
+STAMP_SPREAD_MM = 1.5
+STAMP_ABOVE = (0.22, 0.26, 0.3, 0.34, 0.38, 0.42)
+"""What the stamps lack varies more, so they get an edge spread of their own, and the threshold that is best for them on
+the training strokes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Predictor:
+    """A drag model with its edge, its threshold and what it learned from its training strokes."""
+
+    model: DragModel
+    spread_mm: float = SPREAD_MM
+    above: float = INK_ABOVE
+    kept: Kept | None = None
+    learned: tuple[Residual, DragModel] | None = None
+    """The ridges over `kept`, and the model that they correct."""
+
+    def ink(self, drawn: Drawn, images: Indices, *, corrected: bool = True) -> NDArray[np.bool_]:
+        """The ink that these images should show, (n, len(y_mm), len(x_mm)); `corrected` by the ridges if there are."""
+        paths, groups = chosen(drawn, images)
+        nodes, starts = trails(paths, self.model.vector())
+        away = distances(nodes, starts, drawn.x_mm, drawn.y_mm, groups)
+        if corrected and self.kept is not None and self.learned is not None and drawn.commands is not None:
+            residual, model = self.learned
+            base = self.kept.base(model, paths)
+            change = residual.add(drawn.commands[images], base) - clipped(base)
+            away = clipped(away) + self.kept.placed(change, drawn.x_mm, drawn.y_mm)
+        return chance(away, self.spread_mm) > self.above
+
+
+@dataclass(frozen=True, slots=True)
+class Learned:
+    """Fits to one set of images."""
+
+    fit: DragFit
+    predictor: Predictor
+    stamps: Predictor
+
+
+def learn(drawn: Drawn, images: Indices) -> Learned:
+    """Fit lag, correction, threshold and circle stamps to these images of a session."""
+    paths, groups = chosen(drawn, images)
+    fit = _fit(drawn, images, lag=True, spread_mm=SPREAD_MM)
+    kept, learned, above = None, None, INK_ABOVE
+    if drawn.commands is not None and len(images) > 1:
+        ink = drawn.ink[images] > 0.5
+        commands = drawn.commands[images]
+        base = fit.distance(paths, drawn.x_mm, drawn.y_mm, groups=groups)
+        choice = choose(commands, base, captured_distance(ink, drawn.mm_per_px))
+        above = choice.above
+        kept = Kept.of(commands, ink, drawn.x_mm, drawn.y_mm, fit.model, choice)
+        learned = kept.residual() if kept is not None else None
+    stamps = _fit(drawn, images, lag=False, spread_mm=STAMP_SPREAD_MM)
+    return Learned(fit, Predictor(fit.model, fit.spread_mm, above, kept, learned), _stamps(drawn, images, stamps))
+
+
+def predictors(artefact: DragArtefact, where: str) -> tuple[Predictor, Predictor | None]:
+    """What an artefact predicts with, and its circle stamps. Raises `CalibrationError` for ink that cannot be read."""
+    try:
+        learned = artefact.kept.residual() if artefact.kept is not None else None
+    except (ValueError, np.linalg.LinAlgError) as error:
+        raise CalibrationError(where, f"kept: {error}") from None
+    ours = Predictor(artefact.model(), artefact.spread_mm, artefact.ink_above, artefact.kept, learned)
+    stamps = artefact.stamps
+    if stamps is None:
+        return ours, None
+    return ours, Predictor(DragModel.of(np.array(stamps.parameters)), stamps.spread_mm, stamps.ink_above)
+
+
+def stamps_of(predictor: Predictor) -> Stamps:
+    """Circle stamps as they go into an artefact."""
+    vector = [float(value) for value in predictor.model.vector()]
+    return Stamps(parameters=vector, spread_mm=predictor.spread_mm, ink_above=predictor.above)
+
+
+def chosen(drawn: Drawn, images: Indices) -> tuple[list[Floats], Indices]:
+    """The paths of these images, and where each image's begin."""
+    each = [drawn.paths[drawn.groups[i] : drawn.groups[i + 1]] for i in images]
+    return [path for one in each for path in one], np.cumsum([0, *(len(one) for one in each)])
+
+
+def coarse(drawn: Drawn, images: Indices) -> tuple[NDArray[np.float32], Floats, Floats]:
+    """Ink, x and y of these images at about `FIT_MM` a pixel."""
+    step = max(1, round(FIT_MM / drawn.mm_per_px))
+    return drawn.ink[images][:, ::step, ::step], drawn.x_mm[::step], drawn.y_mm[::step]
+
+
+def scores(seen: NDArray[np.bool_], truth: NDArray[np.bool_]) -> Floats:
+    """(n, 2) CSIM and IoU of ink as 0 or 1, without a search for a shift; 0 where nothing is predicted."""
+    both = np.count_nonzero(seen & truth, axis=(1, 2)).astype(np.float64)
+    one, other = np.count_nonzero(seen, axis=(1, 2)), np.count_nonzero(truth, axis=(1, 2))
+    norm, union = np.sqrt(one * other.astype(np.float64)), one + other - both
+    return np.column_stack([both / np.maximum(norm, 1.0), both / np.maximum(union, 1.0)])
+
+
+def _fit(drawn: Drawn, images: Indices, *, lag: bool, spread_mm: float) -> DragFit:
+    paths, groups = chosen(drawn, images)
+    ink, x_mm, y_mm = coarse(drawn, images)
+    weights = drawn.weights[images]
+    return fit_drags(paths, ink, x_mm, y_mm, lag=lag, spread_mm=spread_mm, groups=groups, weights=weights)
+
+
+def _stamps(drawn: Drawn, images: Indices, fit: DragFit) -> Predictor:
+    truth = drawn.ink[images] > 0.5
+    each = [Predictor(fit.model, fit.spread_mm, above) for above in STAMP_ABOVE]
+    return max(each, key=lambda one: float(scores(one.ink(drawn, images), truth)[:, 0].mean()))
