@@ -85,7 +85,7 @@ def test_people_read_shared_conditions_once(
     results = [
         Result(name, 1.0, "ms", "p", 1.0, 1, 0, conditions) for name, conditions in (("a", "x"), ("b", "x"), ("c", "y"))
     ]
-    monkeypatch.setattr(bench.__main__, "benches", lambda: {"three": lambda: results})
+    monkeypatch.setattr(bench.__main__, "benches", lambda: {"three": lambda n=None: results})
     assert bench.__main__.main(["three"]) == 0
     assert [line[:3] for line in capsys.readouterr().out.splitlines()] == ["# x", "a: ", "b: ", "# y", "c: "]
 
@@ -95,7 +95,7 @@ def test_one_bench_may_return_several_results_a_line_each(
 ) -> None:
     one, two = (Result(name, 1.0, "ms", "p", 1.0, 1, 0) for name in ("one", "two"))
     assert list(results_of(one)) == [one]
-    monkeypatch.setattr(bench.__main__, "benches", lambda: {"both": lambda: [one, two]})
+    monkeypatch.setattr(bench.__main__, "benches", lambda: {"both": lambda n=None: [one, two]})
     assert bench.__main__.main(["both", "--json"]) == 0
     assert [json.loads(line)["name"] for line in capsys.readouterr().out.splitlines()] == ["one", "two"]
 

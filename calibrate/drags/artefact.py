@@ -53,7 +53,7 @@ class DragArtefact(Artefact):
     """Variation of an edge from stroke to stroke (scale of the logistic)."""
     parameters: dict[str, FittedValue]
     condition: float
-    """Condition number of the scaled normal equations: above about 1e4 the parameters cannot be told apart."""
+    """Condition number of the scaled normal equations: above about 1e4 the parameters cannot be distinguished."""
     held_out: dict[str, DragScore]
     """Scores by model; empty with too few images to leave any out."""
     ink_above: Annotated[float, Field(gt=0.0, lt=1.0)] = INK_ABOVE
