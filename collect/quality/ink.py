@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -31,6 +32,8 @@ class Patch:
     """(h, w) 0 = paper, 1 = reflects nothing; 0 beyond the frame."""
     in_view: Mask
     """(h, w) False where the photograph does not reach."""
+    pixel_mm: float
+    """Side of a pixel of the photograph, on the paper."""
 
     def to_px(self, point_mm: Point) -> Point:
         """(x, y) on the raster, where pixel j covers [j, j + 1)."""
@@ -60,7 +63,9 @@ def take(image: Gray, image_to_paper: Floats, window_mm: Rect, params: Params) -
     raster = rectify(image, image_to_paper, window_mm)
     in_view = _in_view(image, image_to_paper, window_mm, raster)
     dark = np.where(in_view, 1.0 - flatten(raster, params), 0.0).astype(np.float32)
-    return Patch(window_mm, raster, dark, in_view)
+    seen = apply(np.asarray(np.linalg.inv(image_to_paper), np.float64), corners(window_mm))
+    pixel_mm = math.sqrt(window_mm[2] * window_mm[3] / cv2.contourArea(seen.astype(np.float32)))
+    return Patch(window_mm, raster, dark, in_view, pixel_mm)
 
 
 def around(rect_mm: Rect, margin_mm: float, sheet_mm: tuple[float, float] | None) -> Rect:

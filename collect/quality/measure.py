@@ -109,6 +109,8 @@ CLEFT_MM = 0.5
 """A gap wider than this is not a streak: the tuft has parted there."""
 RIM_MM = 0.5
 """The edge of a stroke is never as dark as its middle."""
+RIM_PX = 2.3
+"""Pixels of the photograph over which an edge is blurred: in a coarse one they are wider than `RIM_MM`."""
 HEAD_SHARE = 0.4
 """Share of the length, from the head, that shows where the stroke begins and in what direction."""
 TIP_SHARE = 0.1
@@ -160,7 +162,7 @@ def measure_mark(ink: Ink, anchor_mm: Point) -> Mark | None:
     reach_mm = max((1.0 - 0.5 * (HEAD_SHARE + TIP_SHARE)) * length / PX_PER_MM, 1e-3)
     return Mark(
         tone=tone,
-        uneven=_unevenness(own, dark, tone),
+        uneven=_unevenness(own, dark, tone, max(RIM_MM, RIM_PX * ink.patch.pixel_mm)),
         head_mm=(float(left_mm if flip else right_mm), head),
         gap_mm=_gap_mm(hairs),
         bent_deg=float(np.degrees(np.arctan2(abs(tip - head), reach_mm))),
@@ -190,14 +192,14 @@ def _gap_mm(hairs: Mask) -> float:
     return float(np.convolve(widest, np.ones(run) / run, mode="valid").max()) / PX_PER_MM
 
 
-def _unevenness(own: Mask, dark: Soft, tone: float) -> float:
+def _unevenness(own: Mask, dark: Soft, tone: float, rim_mm: float) -> float:
     side = round(OUTLINE_MM * PX_PER_MM)
     padded = np.pad(own.astype(np.uint8), side)
     darkness = np.pad(dark, side)
     outline = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, _disc(OUTLINE_MM))
     hollow = ((outline > 0) & (darkness < 0.5 * tone)).astype(np.uint8)
-    cleft = cv2.dilate(cv2.morphologyEx(hollow, cv2.MORPH_OPEN, _disc(CLEFT_MM)), _disc(2 * RIM_MM))
-    core = (cv2.erode(outline, _disc(2 * RIM_MM)) > 0) & (cleft == 0)
+    cleft = cv2.dilate(cv2.morphologyEx(hollow, cv2.MORPH_OPEN, _disc(CLEFT_MM)), _disc(2 * rim_mm))
+    core = (cv2.erode(outline, _disc(2 * rim_mm)) > 0) & (cleft == 0)
     if np.count_nonzero(core) < LEAST_CORE_MM2 * PX_PER_MM**2:
         # Hardly more than rim or cleft: a few hairs, or crumbs.
         core = outline > 0
