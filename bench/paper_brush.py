@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from bench.harness import BenchError, Result
-from bench.press_sessions import CELLS, session
+from bench.press_sessions import CELLS, Presses, session
 from bench.processes import brushloop
 from calibrate.compare.field import Alignment, Tone
 from calibrate.compare.paper import TABLE_2
@@ -42,7 +42,7 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
         raise ValueError(f"n = {n}: at least one press of each cell is needed")
     with tempfile.TemporaryDirectory() as folder:
         under, count = Path(folder), repeats * len(CELLS)
-        place = session(under, "paper-brush", count, seed, load_brush(Path(PAPER)).spec, count)
+        place = session(under, "paper-brush", Presses(count, seed, load_brush(Path(PAPER)).spec, count))
         brushloop("validate", place, "--out", under / "report", "--generator", SHIPPED_GENERATOR, "--no-held-out")
         report = load_report(under / "report" / "report.json")
     found = [*_rows(report, SEARCHED, "paper-brush", count, seed)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import OrderedDict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -46,6 +46,18 @@ class Capture:
         return decode_gray(self.still_png, self.where)
 
 
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a stroke and the still that shows it lie in a recording, for whoever reads only these."""
+
+    stroke_id: str
+    offsets: tuple[int, ...]
+    """Chunks to read."""
+    topics: dict[int, str]
+    bad: str = ""
+    """See `Capture`."""
+
+
 class Recording:
     """One finished recording, opened by its folder or its MCAP file."""
 
@@ -76,21 +88,14 @@ class Recording:
 
     def captures(self) -> Iterator[Capture]:
         """Strokes with their stills, in order of capture. Raises `SessionDamaged`."""
+        return _captures(self.path, self._messages([Topic.STILL, Topic.STROKE]), self.marked_bad())
+
+    def places(self) -> Iterator[Place]:
+        """Where each stroke lies, in order of capture, without reading a still. Raises `SessionDamaged`."""
         bad = self.marked_bad()
-        stills: OrderedDict[int, bytes] = OrderedDict()
-        for topic, sequence, data in self._messages([Topic.STILL, Topic.STROKE]):
-            if topic == Topic.STILL:
-                stills[sequence] = _still(self.path, data)
-                while len(stills) > STILLS_KEPT:
-                    stills.popitem(last=False)
-                continue
-            stroke = _event(self.path, Stroke, data)
-            if stroke.still not in stills:
-                raise SessionDamaged(
-                    self.path, f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there"
-                )
-            where = f"{self.path} stroke {stroke.stroke_id}"
-            yield Capture(stroke, stills[stroke.still], where, bad.get(stroke.still, ""))
+        for offsets, topics, message in container.chunks_before(self.path, Topic.STROKE, [Topic.STILL]):
+            stroke = _event(self.path, Stroke, message.data)
+            yield Place(stroke.stroke_id, offsets, topics, bad.get(stroke.still, ""))
 
     def marked_bad(self) -> dict[int, str]:
         """Reasons why captures were marked bad, by number of the still. Raises `SessionDamaged`."""
@@ -110,6 +115,31 @@ class Recording:
     def _messages(self, topics: list[Topic]) -> Iterator[tuple[str, int, bytes]]:
         for _schema, channel, message in container.messages(self.path, [str(topic) for topic in topics]):
             yield channel.topic, message.sequence, message.data
+
+
+def capture_at(path: Path, place: Place) -> Capture:
+    """The stroke at a place of the recording `path`, with its still. Raises `SessionDamaged` if they are not there."""
+    found = ((topic, one.sequence, one.data) for topic, one in container.messages_at(path, place.offsets, place.topics))
+    for capture in _captures(path, found, {}):
+        if capture.stroke.stroke_id == place.stroke_id:
+            return replace(capture, bad=place.bad)
+    raise SessionDamaged(path, f"stroke {place.stroke_id} is not where the index says")
+
+
+def _captures(path: Path, messages: Iterator[tuple[str, int, bytes]], bad: dict[int, str]) -> Iterator[Capture]:
+    """Strokes with their stills, from messages on both topics."""
+    stills: OrderedDict[int, bytes] = OrderedDict()
+    for topic, sequence, data in messages:
+        if topic == Topic.STILL:
+            stills[sequence] = _still(path, data)
+            while len(stills) > STILLS_KEPT:
+                stills.popitem(last=False)
+            continue
+        stroke = _event(path, Stroke, data)
+        if stroke.still not in stills:
+            raise SessionDamaged(path, f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there")
+        where = f"{path} stroke {stroke.stroke_id}"
+        yield Capture(stroke, stills[stroke.still], where, bad.get(stroke.still, ""))
 
 
 def _find_mcap(path: Path) -> Path:

@@ -6,8 +6,11 @@ Nothing here imports torch, which preparing and scoring do not need.
 from __future__ import annotations
 
 import hashlib
+import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -22,7 +25,7 @@ from calibrate.stroke.measure import Measured, measure
 from calibrate.stroke.params import Params
 from calibrate.validate.store import VERSION, Store
 from sessions.errors import SessionDamaged
-from sessions.reader import Capture
+from sessions.reader import Capture, Place, Recording, capture_at
 
 if TYPE_CHECKING:
     from calibrate.validate.pool import Scheduler
@@ -39,6 +42,18 @@ class PrepareJob:
     """Find the stroke in its photograph and resample it to the pixels that are compared."""
 
     capture: Capture
+    calibration: Calibration | None
+    view: Field
+
+
+@dataclass(frozen=True, slots=True)
+class ReadJob:
+    """The same, for a worker that reads the photograph itself."""
+
+    session: str
+    """Path or URL of the recording."""
+    sha256: str
+    place: Place
     calibration: Calibration | None
     view: Field
 
@@ -93,6 +108,29 @@ def prepare_job(job: PrepareJob) -> Press:
     return Press(stroke.stroke_id, height, tilt, again, pixels, measured, prepared.cut, prepared.flags, "")
 
 
+@lru_cache(maxsize=8)
+def opened(session: str, sha256: str) -> Path:
+    """The recording as a file of this machine, checked once; a URL is copied. Raises what reading it raises."""
+    from calibrate.validate.sources import URL, fetched
+
+    if URL.match(session):
+        address = session.partition("#")[0]
+        return fetched(f"{address}#sha256={sha256}", Path(tempfile.gettempdir()) / "brushloop-recordings")
+    recording = Recording(Path(session))
+    if recording.sha256 != sha256:
+        raise SessionDamaged(recording.path, "is another recording there: its SHA-256 differs")
+    return recording.path
+
+
+def read_job(job: ReadJob) -> Press | None:
+    """Read a capture and prepare it; None where it does not follow the stroke before, as our recordings have it."""
+    try:
+        capture = capture_at(opened(job.session, job.sha256), job.place)
+    except SessionDamaged:
+        return None
+    return prepare_job(PrepareJob(capture, job.calibration, job.view))
+
+
 @dataclass(frozen=True, slots=True)
 class Row:
     """A captured stroke without its pixels; `key` finds them in the store."""
@@ -119,6 +157,20 @@ def prepared_rows(
     what = f"{session.header.session_id}: found"
     missing = [key for key in keys if key not in store]
     done = len(keys) - len(missing)
+    if missing and scheduler.opens(session.place, session.sha256):
+        waiting = set(missing)
+
+        def reading() -> Iterator[tuple[str, ReadJob]]:
+            for key, place in zip(keys, session.recording.places(), strict=True):
+                if key in waiting:
+                    yield key, ReadJob(session.place, session.sha256, place, session.calibration, view)
+
+        for key, read in scheduler.run(read_job, reading()):
+            if read is not None:
+                store.put(key, read.to_body())
+                done += 1
+                progress(what, done, len(keys))
+        missing = [key for key in missing if key not in store]
     if missing:
         waiting = set(missing)
 

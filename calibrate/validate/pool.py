@@ -40,6 +40,10 @@ class Scheduler(Protocol):
         """Number of jobs that run at a time."""
         ...
 
+    def opens(self, session: str, sha256: str) -> bool:
+        """Whether the jobs should read the recording at this path or URL themselves."""
+        ...
+
     def run(self, function: Callable[[J], R], jobs: Iterator[tuple[str, J]]) -> Iterator[tuple[str, R]]:
         """Yield (name, result) as jobs finish. A job is taken from the iterator only when there is room for it."""
         ...
@@ -50,12 +54,17 @@ class Threads(AbstractContextManager["Threads"]):
 
     def __init__(self, workers: int | None = None) -> None:
         self.workers = workers or _cores()
+        self.notes: list[str] = []
         self._pool = ThreadPoolExecutor(self.workers)
         import cv2
 
         # One job per core keeps the cores busy; threads inside a job would only compete with each other.
         self._before = cv2.getNumThreads()
         cv2.setNumThreads(1)
+
+    def opens(self, session: str, sha256: str) -> bool:
+        """Never: what this process reads costs the threads nothing."""
+        return False
 
     def run(self, function: Callable[[J], R], jobs: Iterator[tuple[str, J]]) -> Iterator[tuple[str, R]]:
         """See `Scheduler.run`."""
@@ -102,6 +111,8 @@ class Dask(AbstractContextManager["Dask"]):
             self._client: Any = untyped(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError, ImportError) as error:
             raise ClusterError(f"--scheduler {address}: no Dask scheduler there ({_line(error)})") from None
+        self.notes: list[str] = []
+        """What a person should know of how the work was done."""
         try:
             self.workers = self._check(address)
         except BaseException:
@@ -118,6 +129,19 @@ class Dask(AbstractContextManager["Dask"]):
                 words = _line(answer) if isinstance(answer, BaseException) else f"has {answer}"
                 raise ClusterError(f"--scheduler {address}: worker {worker} {words}; {software()} is needed there")
         return sum(threads.values())
+
+    def opens(self, session: str, sha256: str) -> bool:
+        """Whether every worker has the recording there; if not, photographs are sent and `notes` says why."""
+        from calibrate.validate.jobs import opened
+
+        found: dict[str, Any] = self._client.run(opened, session, sha256, on_error="return")
+        for worker, answer in found.items():
+            if isinstance(answer, BaseException):
+                self.notes.append(
+                    f"photographs were sent to the workers: {worker} cannot read {session} ({_line(answer)})"
+                )
+                return False
+        return True
 
     def run(self, function: Callable[[J], R], jobs: Iterator[tuple[str, J]]) -> Iterator[tuple[str, R]]:
         """See `Scheduler.run`."""

@@ -59,6 +59,8 @@ class LoadedSession:
     fit: BrushFit | None
     kinds: frozenset[str]
     count: int
+    place: str
+    """Path or URL by which workers may open the recording."""
 
     @property
     def header(self) -> Header:
@@ -86,6 +88,7 @@ def open_session(place: str, work: Path, calibration: Path | None, fit: Path | N
         load_artefact(found, BrushFit) if found is not None else None,
         kinds,
         len(strokes),
+        place if URL.match(place) else str(recording.path.resolve()),
     )
 
 

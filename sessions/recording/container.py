@@ -11,7 +11,7 @@ import os
 import struct
 import zlib
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -79,6 +79,40 @@ def messages(path: Path, topics: list[str] | None = None) -> Iterator[Record]:
     They are not sorted by log time: a stroke would precede its still if the host's clock was set back between the two.
     """
     return _guarded(path, lambda file: _messages(file, topics))
+
+
+def messages_at(path: Path, offsets: Sequence[int], topics: Mapping[int, str]) -> Iterator[tuple[str, Message]]:
+    """Topics and messages of the chunks at these places, by the channels' numbers; the index is not read. Raises
+    `SessionDamaged`."""
+
+    def read(file: BoundedFile) -> Iterator[tuple[str, Message]]:
+        for offset in offsets:
+            for message in chunk_at(file, offset).each(topics):
+                yield topics[message.channel_id], message
+
+    return _guarded(path, read)
+
+
+def chunks_before(
+    path: Path, last: str, kept: Sequence[str]
+) -> Iterator[tuple[tuple[int, ...], dict[int, str], Message]]:
+    """Each message on the topic `last`, with the places of its chunk and of those with messages on `kept` since the
+    chunk of the one before, and the channels of all. Raises `SessionDamaged`."""
+
+    def read(file: BoundedFile) -> Iterator[tuple[tuple[int, ...], dict[int, str], Message]]:
+        index = indexed(file)
+        topics = {number: channel.topic for number, channel in index.channels.items() if channel.topic in (last, *kept)}
+        ends = {number for number, topic in topics.items() if topic == last}
+        before: list[int] = []
+        for offset, channels in zip(index.chunk_offsets, index.chunk_channels, strict=True):
+            if not channels or channels & topics.keys():
+                before.append(offset)
+            if ends & channels:
+                for message in chunk_at(file, offset).each(ends):
+                    yield tuple(before), topics, message
+                before = []
+
+    return _guarded(path, read)
 
 
 def chunks(path: Path) -> Iterator[tuple[Contents, Index]]:
