@@ -125,7 +125,7 @@ class _Person:
             "stream": " ".join(seen.streams),
             "longer side": str(seen.squares[0]),
             "shorter side": str(seen.squares[1]),
-            "side of one square": f"{seen.square_mm:g}",
+            "side of a square": f"{seen.square_mm:g}",
             "side of a marker": f"{seen.marker_mm:g}",
             "r: radius": f"{seen.radius_mm:g}",
             "l: length": f"{seen.length_mm:g}",

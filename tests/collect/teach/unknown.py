@@ -71,7 +71,7 @@ class InLab:
         printed = {
             "Squares along its longer": seen.squares[0],
             "Squares along its shorter": seen.squares[1],
-            "Side of one square": seen.square_mm,
+            "Side of a square": seen.square_mm,
             "Side of a marker": seen.marker_mm,
             "R:": seen.radius_mm,
             "L:": seen.length_mm,
