@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.drags.defects import prepare_drag
 from calibrate.errors import CaptureRefused
 from calibrate.line import Line, fit_line
 from calibrate.stroke.measure import Measured, measure
 from calibrate.stroke.params import Params
-from calibrate.stroke.preprocess import prepare
 from calibrate.stroke.rectify import on_raster, rescale
 from sessions.errors import SessionDamaged
 from sessions.reader import Capture
@@ -25,6 +25,8 @@ from sessions.reader import Capture
 THUMB_PX = 160
 DEPTH_NAMES = ("depth_mm", "depth_mid_mm", "depth_mid_mm_nominal", "height_mm")
 LENGTH_NAME = "length_mm"
+LEVEL_DEG = 20.0
+"""Bent strokes along x have a rectangle that is a little tilted: only strokes of another direction are turned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +38,8 @@ class Drag:
     measured: Measured
     cut: bool
     """True where the photograph cuts the stroke."""
+    flags: tuple[str, ...]
+    """Defects (`calibrate.drags.defects`)."""
     thumbnail: NDArray[np.uint8]
     """(160, 160) gray photograph with the stroke's outline drawn in."""
 
@@ -79,13 +83,33 @@ def _measure(capture: Capture, params: Params) -> Drag:
         raise CaptureRefused(stroke.stroke_id, "has no scale (px_per_mm)")
     raster = rescale(capture.image(), stroke.px_per_mm, capture.where)
     anchor = on_raster(stroke.anchor_px, stroke.px_per_mm) if stroke.anchor_px is not None else None
-    prepared = prepare(raster, anchor, capture.where, params)
+    prepared, flags = prepare_drag(raster, anchor, capture.where, params)
     commanded = dict(stroke.commanded)
     if stroke.height_mm is not None:
         commanded["height_mm"] = stroke.height_mm
     if stroke.tilt_deg is not None:
         commanded["tilt_deg"] = stroke.tilt_deg
-    return Drag(stroke.stroke_id, commanded, measure(prepared.mask), prepared.cut, _thumbnail(raster, prepared.mask))
+    # A start in the table means a commanded path, which runs along x. Scanned strokes have neither.
+    size = measure(along_axis(prepared.mask) if anchor is None else prepared.mask)
+    return Drag(stroke.stroke_id, commanded, size, prepared.cut, flags, _thumbnail(raster, prepared.mask))
+
+
+def along_axis(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The mask turned until the stroke's longer axis, that of its smallest enclosing rectangle, is the x axis.
+
+    A mask whose axis is within `LEVEL_DEG` of x is returned as it is.
+    """
+    points = cv2.findNonZero(mask.astype(np.uint8))
+    centre, (width, height), angle = cv2.minAreaRect(points)
+    turn = angle if width >= height else angle - 90.0
+    turn = (turn + 90.0) % 180.0 - 90.0
+    if abs(turn) < LEVEL_DEG:
+        return mask
+    side = int(np.hypot(*mask.shape)) + 2
+    matrix = cv2.getRotationMatrix2D(centre, turn, 1.0)
+    matrix[:, 2] += 0.5 * side - np.array(centre)
+    turned = cv2.warpAffine(255 * mask.astype(np.uint8), matrix, (side, side), flags=cv2.INTER_LINEAR)
+    return np.asarray(turned > 127, np.bool_)
 
 
 def _thumbnail(raster: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:

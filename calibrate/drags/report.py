@@ -10,13 +10,15 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from rich.table import Table
+from rich.table import Column, Table
 
 from calibrate.drags.measure import DEPTH_NAMES, LENGTH_NAME, DragResults
-from calibrate.report import csv_text, image_uri, plot, plot_uri, render, source_note, write_files
+from calibrate.drags.predicted import CEILING, OURS, Predictions
+from calibrate.report import csv_text, image_uri, overlay_uri, plot, plot_uri, render, source_note, write_files
 from sessions.recording.schemas import Header
 
 MAX_THUMBNAILS = 60
+MAX_WORST = 12
 LIMITS = (
     "These are strokes that travel along the paper, by a brush whose radius and bundle length are not known. "
     "CCD-BSM describes one vertical press: its length, outline, CSIM and SSIM cannot be compared with a drag, and are "
@@ -32,6 +34,8 @@ class DragValidation:
     recording: Path
     recording_sha256: str
     results: DragResults
+    predictions: Predictions | None = None
+    """With a fit of drags: what it predicts of this session."""
 
 
 def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
@@ -47,28 +51,76 @@ def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
         strokes=len(results.strokes),
         limits=LIMITS,
         sentences=list(fit_sentences(results)),
-        plot=_plot(results) if results.strokes else "",
+        plot=_plot(results, str(validation.header.source)) if results.strokes else "",
         drags=results.strokes,
         names=sorted({name for drag in results.strokes for name in drag.commanded}),
         thumbnails=[(d.stroke_id, image_uri(d.thumbnail)) for d in results.strokes[::step]],
         cut=[d.stroke_id for d in results.strokes if d.cut],
+        flagged=[(d.stroke_id, "; ".join(d.flags)) for d in results.strokes if d.flags],
+        predictions=validation.predictions,
+        predicted_by=list(prediction_sentences(validation.predictions)) if validation.predictions else [],
+        worst=_worst(validation.predictions) if validation.predictions else [],
     )
-    write_files(folder, {"measured.csv": drags_csv(results, validation.header.source), "report.html": page})
+    files = {"measured.csv": drags_csv(results, validation.header.source), "report.html": page}
+    if validation.predictions is not None:
+        files["report.json"] = validation.predictions.to_json()
+    write_files(folder, files)
     return folder / "report.html"
 
 
 def drags_csv(results: DragResults, source: str) -> str:
     """CSV of commanded and measured values, one row per stroke."""
     names = sorted({name for drag in results.strokes for name in drag.commanded})
-    sizes = ["measured_length_mm", "measured_width_mm", "measured_mid_width_mm", "measured_area_mm2", "cut", "source"]
-    head = ["stroke_id", *(f"commanded_{name}" for name in names), *sizes]
+    sizes = [
+        "measured_length_mm",
+        "measured_width_mm",
+        "measured_mid_width_mm",
+        "measured_area_mm2",
+        "cut",
+        "flags",
+        "source",
+    ]
+    head = ["stroke_id", *(f"commanded_{name}" for name in names), *sizes, "cut", "flags", "source"]
     rows: list[list[object]] = []
     for drag in results.strokes:
         m = drag.measured
         measured = [f"{v:.3f}" for v in (m.length_mm, m.width_mm, m.mid_width_mm, m.area_mm2)]
         commanded = [drag.commanded.get(name, "") for name in names]
-        rows.append([drag.stroke_id, *commanded, *measured, int(drag.cut), source])
+        rows.append([drag.stroke_id, *commanded, *measured, int(drag.cut), "; ".join(drag.flags), source])
     return csv_text(head, rows)
+
+
+def prediction_sentences(predictions: Predictions) -> Iterator[str]:
+    """What predicted these strokes, and what the scores are over."""
+    fit, header = predictions.artefact, predictions.drawn.header
+    adapted = f", adapted to {fit.images} strokes of {fit.session_id}" if fit.prior else ""
+    origin = fit.prior_session if fit.prior else f"{fit.session_id}, {fit.source}"
+    yield (
+        f"{len(predictions.scored)} strokes ({header.source}) predicted by the fit {fit.digest} of {origin}{adapted}; "
+        f"ink as 0 or 1 at the commanded place, {fit.mm_per_px:g} mm a pixel, no shift."
+    )
+    if predictions.in_sample:
+        yield "In sample: the fit was fitted to every one of these strokes."
+    elif len(predictions.scored) < len(predictions.strokes):
+        yield f"{len(predictions.strokes) - len(predictions.scored)} strokes that were fitted are not in the means."
+    if CEILING not in predictions.means():
+        yield "No command was repeated: how well one stroke predicts another of its kind, the ceiling, is not known."
+    if predictions.drawn.commands is not None:
+        yield ends_sentence(predictions.drawn.ends)
+
+
+def _worst(predictions: Predictions) -> list[tuple[str, float, float, str]]:
+    """Name, CSIM, IoU and overlay of the worst predicted strokes."""
+    out: list[tuple[str, float, float, str]] = []
+    for k in predictions.worst(MAX_WORST):
+        stroke, seen, ink = predictions.strokes[k], predictions.seen[k], predictions.drawn.ink[k]
+        both = seen | (ink > 0.5)
+        rows, columns = np.flatnonzero(both.any(axis=1)), np.flatnonzero(both.any(axis=0))
+        window = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+        csim, iou = stroke.scores[OURS]
+        uri = overlay_uri(ink[window].astype(np.float64), seen[window].astype(np.float64))
+        out.append((stroke.stroke_id, csim, iou, uri))
+    return out
 
 
 def ends_sentence(ends: str) -> str:
@@ -108,7 +160,7 @@ def fit_sentences(results: DragResults) -> Iterator[str]:
         )
 
 
-def _plot(results: DragResults) -> str:
+def _plot(results: DragResults, source: str) -> str:
     """Width against depth and length against commanded length, with the fitted lines."""
     figure, axes = plot(1, 2, (10.0, 3.4))
     whole = [drag for drag in results.strokes if not drag.cut]
@@ -119,6 +171,7 @@ def _plot(results: DragResults) -> str:
             results.length_on_commanded,
         ),
     )
+    figure.suptitle(source)
     titles = (
         ("commanded depth, mm", "measured width at the middle, mm"),
         ("commanded length, mm", "measured length, mm"),
@@ -158,20 +211,47 @@ def summary(validation: DragValidation) -> Iterator[Table | str]:
     yield f"{validation.header.session_id}: {source_note(validation.header.source)}"
     yield _drags(results)
     yield from fit_sentences(results)
+    if validation.predictions is not None:
+        yield from prediction_sentences(validation.predictions)
+        yield from _predicted(validation.predictions)
+    for drag in results.strokes:
+        if drag.flags:
+            yield f"counts less: {drag.stroke_id}: {'; '.join(drag.flags)}"
     for stroke_id, why in results.refused:
         yield f"not used: {stroke_id}: {why}"
+
+
+def _predicted(predictions: Predictions) -> Iterator[Table]:
+    out = Table("", "n", "CSIM", "sd", "IoU", title=f"over all, percent ({predictions.drawn.header.source})")
+    for name, (csim, iou, sd, count) in predictions.means().items():
+        out.add_row(name, str(count), f"{100 * csim:.2f}", f"{100 * sd:.2f}", f"{100 * iou:.2f}")
+    yield out
+    out = Table("worst", "CSIM", "IoU", "flags", title="predicted worst, percent")
+    for k in predictions.worst(MAX_WORST):
+        stroke = predictions.strokes[k]
+        csim, iou = stroke.scores[OURS]
+        out.add_row(stroke.stroke_id, f"{100 * csim:.2f}", f"{100 * iou:.2f}", "; ".join(stroke.flags))
+    yield out
 
 
 def _drags(results: DragResults) -> Table:
     names = sorted({name for drag in results.strokes for name in drag.commanded})
     # The rest of what was commanded is in the CSV and the report: a terminal is 80 columns wide.
     shown = [n for n in (LENGTH_NAME, *DEPTH_NAMES, "tilt_deg") if n in names]
-    columns = [*(f"commanded {n}" for n in shown), "length mm", "width mm", "at middle", "area mm²", "whole"]
-    out = Table("stroke", *columns, title="commanded beside measured")
-    out.columns[0].overflow = "fold"
+    heads = [*(f"asked {_short(n)}" for n in shown), "length mm", "width mm", "at middle", "area mm²", "whole"]
+    # As wide as the longest word of its head: a narrow terminal breaks heads between words, never within one.
+    columns = [Column(head, min_width=max(len(word) for word in head.split())) for head in heads]
+    out = Table(Column("stroke", overflow="fold"), *columns, title="commanded beside measured", padding=(0, 0, 0, 1))
     for drag in results.strokes:
         m = drag.measured
         sizes = (f"{m.length_mm:.2f}", f"{m.width_mm:.2f}", f"{m.mid_width_mm:.2f}", f"{m.area_mm2:.1f}")
         values = (f"{drag.commanded[n]:.2f}" if n in drag.commanded else "" for n in shown)
-        out.add_row(drag.stroke_id, *values, *sizes, "no" if drag.cut else "yes")
+        whole = "cut" if drag.cut else "torn" if any(flag.startswith("torn") for flag in drag.flags) else "yes"
+        out.add_row(drag.stroke_id, *values, *sizes, whole)
     return out
+
+
+def _short(name: str) -> str:
+    """`depth_mid_mm_nominal` as `depth mm`: what a narrow column has room for."""
+    quantity = name.split("_")[0]
+    return f"{quantity} {'deg' if name.endswith('_deg') else 'mm'}"

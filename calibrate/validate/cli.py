@@ -28,7 +28,7 @@ def validate(
     generator: Annotated[list[Path] | None, typer.Option(help="A trained generator.safetensors.")] = None,
     mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = MM_PER_PX,
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
-    fit: Annotated[Path | None, typer.Option(help="Brush fit; the one in use by default.")] = None,
+    fit: Annotated[Path | None, typer.Option(help="Brush fit, the one in use by default; of drags, a dragfit.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the report; <session>/validation by default.")] = None,
     gate: Annotated[
         list[str] | None, typer.Option(help="Like 'csim_avg>=0.90', quoted; exit code 5 if missed.")
@@ -81,8 +81,10 @@ def validate(
     )
     with shown() as progress:
         output = run(request, progress)
-    if json and output.report is not None:
-        say(*output.report.to_json().rstrip("\n").split("\n"))
+    predicted = [drags.predictions for drags in output.drags if drags.predictions is not None]
+    if json and (output.report is not None or predicted):
+        for text in [output.report.to_json()] if output.report is not None else [one.to_json() for one in predicted]:
+            say(*text.rstrip("\n").split("\n"))
     else:
         for drags in output.drags:
             say(*drag_summary(drags))

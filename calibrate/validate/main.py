@@ -12,6 +12,7 @@ from filelock import FileLock, Timeout
 
 from calibrate.compare.field import Field
 from calibrate.drags.measure import validate_drags
+from calibrate.drags.predicted import predict_session
 from calibrate.drags.report import DragValidation, write_drags
 from calibrate.errors import CalibrationError
 from calibrate.files import check_folder
@@ -94,7 +95,7 @@ def validate(request: Request, progress: Progress) -> ValidationOutput:
             _drop_empty(folder)
         raise
     if kind == "drag":
-        return _drags(request, sessions, folder)
+        return _drags(request, sessions, folder, progress)
     options = Options(
         request.models,
         request.view,
@@ -178,12 +179,15 @@ def _write(
     return report, tuple(notes)
 
 
-def _drags(request: Request, sessions: list[LoadedSession], folder: Path) -> ValidationOutput:
+def _drags(request: Request, sessions: list[LoadedSession], folder: Path, progress: Progress) -> ValidationOutput:
     validated: list[DragValidation] = []
     for one in sessions:
         params = Params(**one.calibration.preprocess) if one.calibration is not None else Params()
         results = validate_drags(one.recording.captures(), params)
-        validation = DragValidation(one.header, one.recording.path, one.sha256, results)
+        predictions = None
+        if request.fit is not None:
+            predictions = predict_session(one.recording.path, request.fit, request.calibration, progress)
+        validation = DragValidation(one.header, one.recording.path, one.sha256, results, predictions)
         target = folder / one.header.session_id if len(sessions) > 1 else folder
         write_drags(validation, target, request.command)
         validated.append(validation)

@@ -80,7 +80,8 @@ def open_session(place: str, work: Path, calibration: Path | None, fit: Path | N
     kinds = frozenset(stroke.kind for stroke in strokes)
     if len(kinds) > 1:
         raise CalibrationError(str(recording.path), "mixes presses and drags; validate them as two sessions")
-    found = fit or current(recording.path.parent, FITS)
+    # A fit of drags is read with the strokes that it predicts.
+    found = None if "drag" in kinds else fit or current(recording.path.parent, FITS)
     return LoadedSession(
         recording,
         digest,

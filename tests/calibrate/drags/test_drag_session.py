@@ -15,6 +15,7 @@ from calibrate.artefact import current, load_artefact
 from calibrate.drags.artefact import DragArtefact
 from calibrate.drags.captures import commanded_path, figures_of, read_drags
 from calibrate.drags.fit import chance, fit_drags
+from calibrate.drags.predict import predictors
 from calibrate.drags.run import FOLDER, LAGGING, STAMPS
 from calibrate.errors import CalibrationError
 from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
@@ -70,10 +71,59 @@ def test_dragged_strokes_are_fitted_and_written(session: Path) -> None:
     assert "no depth at the ends" in " ".join(ran.output.split())
 
 
+def test_another_session_is_predicted_stroke_by_stroke(session: Path, tmp_path: Path) -> None:
+    """Here the session itself, so that the report has to say "in sample"."""
+    assert CliRunner().invoke(app, ["fit", str(session), "--drags", "--mm-per-px", "1.0"]).exit_code == 0
+    fit = current(session, FOLDER)
+    out = tmp_path / "report"
+    ran = CliRunner().invoke(app, ["validate", str(session), "--fit", str(fit), "--out", str(out)])
+    assert ran.exit_code == 0, ran.output
+    words = " ".join(ran.output.split())
+    for part in ("circle stamps", "bristle lag alone", "predicted worst", "In sample", "No command was repeated"):
+        assert part in words
+    said = json.loads((out / "report.json").read_text())
+    assert said["source"] == "imported photographs"
+    assert said["over_all"]["predicted"]["csim"] > said["over_all"]["circle stamps"]["csim"]
+    assert len(said["strokes"]) == 6
+    assert "captured and predicted ink" in (out / "report.html").read_text()
+
+
+def test_a_known_brush_is_adapted_to_the_first_strokes(session: Path) -> None:
+    run = CliRunner()
+    assert run.invoke(app, ["fit", str(session), "--drags", "--mm-per-px", "1.0"]).exit_code == 0
+    prior = current(session, FOLDER)
+    assert prior is not None
+    ran = run.invoke(app, ["fit", str(session), "--drags", "--prior", str(prior), "--strokes", "2"])
+    assert ran.exit_code == 0, ran.output
+    adapted = load_artefact(current(session, FOLDER) or prior, DragArtefact)
+    before = load_artefact(prior, DragArtefact)
+    assert (adapted.prior, adapted.images) == (before.digest, 2)
+    assert adapted.parameters["leash_mm"] == before.parameters["leash_mm"]
+    assert adapted.kept == before.kept
+    many = run.invoke(app, ["fit", str(session), "--drags", "--prior", str(prior), "--strokes", "7"])
+    assert "allowed 1 to 6" in str(many.exception)
+
+
+def test_hostile_ink_in_an_artefact_is_refused(session: Path) -> None:
+    run = CliRunner().invoke(app, ["fit", str(session), "--drags", "--mm-per-px", "1.0"])
+    assert run.exit_code == 0
+    path = current(session, FOLDER)
+    assert path is not None
+    fit = load_artefact(path, DragArtefact)
+    assert fit.kept is not None
+    for ink in ("not base64!", fit.kept.ink[:40], ""):
+        bad = fit.model_copy(update={"kept": fit.kept.model_copy(update={"ink": ink})})
+        with pytest.raises(CalibrationError, match="kept: ink"):
+            predictors(bad, "fit.json")
+
+
 def test_equal_inputs_give_an_equal_file_and_an_edited_one_is_refused(session: Path, tmp_path: Path) -> None:
+    names: set[str] = set()
     for _ in range(2):
         assert CliRunner().invoke(app, ["fit", str(session), "--drags", "--mm-per-px", "1.0"]).exit_code == 0
-    [path] = (session / FOLDER).glob("*.json")
+        names.add((session / FOLDER / "current").read_text())
+    assert len(names) == 1
+    path = session / FOLDER / names.pop().strip()
     edited = tmp_path / path.name
     edited.write_text(path.read_text().replace('"leash_mm"', '"leash_m"'))
     with pytest.raises(CalibrationError, match="leash_mm"):
