@@ -8,6 +8,7 @@ With h = H + h0, c = h / 15 mm, and CCD-BSM's own O3A, O4O3 and O3C at (h, alpha
     the heel and 1 at the tip).
 The widest place lies at lean H tan(alpha) + origin_mm + origin_gain h from the point where the tip touched, in the
 direction in which the ferrule leans; friction holds the tip back, so lean may be < 1.
+The two ends may differ from these lengths, and the edges from the profile, by what `FittedPress` calls residuals.
 The defaults are CCD-BSM as published. No torch here, so that a rig PC can evaluate it too.
 """
 
@@ -28,7 +29,7 @@ NAME = "ccd-bsm-fitted"
 DEPTH_MM = 15.0
 """Depth at which powers and edges are centred: the middle of the paper's range."""
 DEPTH_SPAN_MM, TILT_DEG = 4.5, 5.0
-TERMS = 5
+TERMS = 6
 MODES = 10
 """Number of sines along the mark by which each edge may differ from the profile."""
 
@@ -90,16 +91,18 @@ class Sizes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedPress:
-    """A calibrated brush: `values` (17,) in the order of `PARAMETERS`, `edges` (2, MODES, TERMS) mm.
+    """A calibrated brush: `values` (17,) in the order of `PARAMETERS`, with residuals in mm.
 
-    The edges are the residuals of the upper and the lower edge from the profile: sines along the mark, each with the
-    terms of `command_terms`. With `values` (K, 17) it is a batch of K brushes, whose widths and edges come as (K, ...).
+    `edges` (2, MODES, TERMS) are the residuals of the upper and the lower edge from the profile: sines along the mark,
+    each with the terms of `command_terms`. `ends` (2, TERMS) are those of the lengths of the tip's and the heel's side.
+    With `values` (K, 17) it is a batch of K brushes, whose widths and edges come as (K, ...).
     """
 
     radius_mm: float
     length_mm: float
     values: Floats = field(default_factory=published)
     edges: Floats = field(default_factory=lambda: np.zeros((2, MODES, TERMS)))
+    ends: Floats = field(default_factory=lambda: np.zeros((2, TERMS)))
 
     def sizes(self, height_mm: float, tilt_deg: float) -> Sizes:
         """The mark's sizes. Raises DomainError outside the domain: h <= 0, or a tilt outside [0, 80) deg."""
@@ -119,7 +122,11 @@ class FittedPress:
         wide = share ** (p["width_power"] - 1.0) * np.maximum(0.05, 1.0 + p["width_tilt"] * tilt_deg)
         widest = p["lean"] * height_mm * math.tan(alpha) + p["origin_mm"] + p["origin_gain"] * h
         heel = p["heel_gain"] * o3a * long * np.maximum(0.05, 1.0 + p["heel_tilt"] * tilt_deg)
-        return Sizes(widest, p["tip_gain"] * o4o3 * long, heel, p["lam"] * o3c * wide)
+        tip = p["tip_gain"] * o4o3 * long
+        if self.ends.any():
+            further = self.ends @ command_terms(height_mm, tilt_deg)
+            tip, heel = (np.maximum(side + add, 0.3 * side) for side, add in zip((tip, heel), further, strict=True))
+        return Sizes(widest, tip, heel, p["lam"] * o3c * wide)
 
     def half_width(self, height_mm: float, tilt_deg: float, x_mm: Floats) -> Floats:
         """Half width of the profile at x (N,) from the point of touch, mm; beyond an end, minus the distance to it."""
@@ -169,6 +176,6 @@ def modes(share: Floats) -> Floats:
 
 
 def command_terms(height_mm: float, tilt_deg: float) -> Floats:
-    """The terms of an edge, (TERMS,): 1, depth, tilt, their product and depth squared, centred on their middles."""
+    """The terms of a residual, (TERMS,): 1, depth, tilt, their product and their squares, centred on their middles."""
     h, a = (height_mm - DEPTH_MM) / DEPTH_SPAN_MM, (tilt_deg - TILT_DEG) / TILT_DEG
-    return np.array([1.0, h, a, h * a, h * h])
+    return np.array([1.0, h, a, h * a, h * h, a * a])

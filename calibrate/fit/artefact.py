@@ -12,6 +12,7 @@ from model.fitted import MODES, NAMES, TERMS, FittedPress
 
 SCHEMA_VERSION = 1
 FOLDER = "brushfit"
+EARLIER_TERMS = 5
 
 
 class FittedStage(BaseModel):
@@ -40,6 +41,8 @@ class BrushFit(Artefact):
     mm_per_px: float
     parameters: dict[str, FittedValue]
     edges_mm: tuple[tuple[tuple[float, ...], ...], ...]
+    ends_mm: tuple[tuple[float, ...], ...] = ((0.0,) * TERMS,) * 2
+    """Missing in files of earlier versions, whose edges also lack the last term."""
     stages: tuple[FittedStage, ...]
     proportional_h0_mm: float
     """Absolute zero offset, with every size held proportional to depth; see docs/brushfit.md."""
@@ -50,11 +53,17 @@ class BrushFit(Artefact):
     def press(self) -> FittedPress:
         """The fitted brush."""
         values = np.array([self.parameters[name].value for name in NAMES])
-        return FittedPress(self.radius_mm, self.length_mm, values, np.array(self.edges_mm))
+        edges = np.array(self.edges_mm)
+        missing = TERMS - edges.shape[-1]
+        edges = np.pad(edges, ((0, 0), (0, 0), (0, missing)))
+        return FittedPress(self.radius_mm, self.length_mm, values, edges, np.array(self.ends_mm))
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
-        shape = (2, MODES, TERMS)
-        if set(self.parameters) != set(NAMES) or np.array(self.edges_mm).shape != shape:
-            raise ValueError(f"parameters: expected {', '.join(NAMES)}, and edges of shape {shape}")
+        shapes = [(2, MODES, terms) for terms in (EARLIER_TERMS, TERMS)]
+        edges, ends = np.array(self.edges_mm).shape, np.array(self.ends_mm).shape
+        if set(self.parameters) != set(NAMES) or edges not in shapes or ends != (2, TERMS):
+            raise ValueError(
+                f"parameters: expected {', '.join(NAMES)}, edges of shape {shapes[-1]} and ends (2, {TERMS})"
+            )
         return self

@@ -12,7 +12,7 @@ from calibrate.calibration import Calibration
 from calibrate.compare.field import SIZE_PX, Field
 from calibrate.compare.images import brush_of, prepare_press
 from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.fit.fit import Grid, Pressed
+from calibrate.fit.strokes import Grid, Pressed
 from calibrate.session import calibration_of
 from calibrate.stroke.params import Params
 from sessions.errors import SessionDamaged

@@ -150,13 +150,13 @@ def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
     out = Table("parameter", "unit", "published", "fitted", "95 %", title="brush")
     for name, parameter in zip(NAMES, PARAMETERS, strict=True):
         found = artefact.parameters[name]
-        interval = "not fitted" if found.low is None else f"{found.low:.3f} to {found.high:.3f}"
+        interval = "from known brushes" if found.low is None else f"{found.low:.3f} to {found.high:.3f}"
         out.add_row(name, parameter.unit, f"{parameter.start:.3f}", f"{found.value:.3f}", interval)
     yield out
     out = Table("stage", "condition", "", title=f"stages, refused beyond {WORST_CONDITION:g}")
     for stage in artefact.stages:
         condition = "infinite" if stage.condition is None else f"{stage.condition:.1f}"
-        out.add_row(stage.name, condition, "refused: the strokes do not tell it" if stage.refused else "fitted")
+        out.add_row(stage.name, condition, "refused: the strokes do not determine it" if stage.refused else "fitted")
     yield out
     if not fitted.held_out:
         yield "One cell only: nothing can be held out."

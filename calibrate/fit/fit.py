@@ -1,20 +1,26 @@
-"""Staged least squares of `model.fitted` on coverage images, with a condition number for each stage. No torch."""
+"""Least squares of `model.fitted` on coverage images with a prior, and a condition number for each stage. No torch.
+
+No press repeats exactly: width, place and lengths differ from press to press, each by one amount along the whole mark.
+These strays (`STRAYS`) are integrated out of the likelihood, linearised at the fit.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.fitted import MODES, NAMES, PARAMETERS, FittedPress, chance_within, command_terms, modes
+from calibrate.fit.prior import Prior, learned, spreads, wide
+from calibrate.fit.residual import fit_residual
+from calibrate.fit.strokes import SPREAD_MM, Grid, Pressed
+from model.fitted import NAMES, PARAMETERS, FittedPress, chance_within, published
 from sessions.progress import Progress, counted, unseen
 
 Floats = NDArray[np.float64]
 
-SPREAD_MM = 0.15
-"""Variation of an edge from press to press (scale of a logistic)."""
 STAGES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("scale and place", ("lam", "tip_gain", "origin_mm")),
     ("heel", ("heel_gain",)),
@@ -30,31 +36,8 @@ WORST_CONDITION = 300.0
 ROUNDS = 40
 STEP = 1e-4
 """Step of a derivative, as a share of the parameter's spread."""
-EDGE_SPREAD_MM = (1.2, 0.4, 0.3, 0.15, 0.15)
-"""Expected size of an edge's terms; for the k-th sine it falls as 1 / k."""
-EDGE_NOISE_MM = 0.25
-
-
-@dataclass(frozen=True, slots=True)
-class Grid:
-    """Pixel centres of an image around the point of touch, mm: x toward the heel, y upward."""
-
-    x_mm: Floats
-    y_mm: Floats
-
-    @property
-    def px_mm(self) -> float:
-        """The pixel's side."""
-        return float(self.x_mm[1] - self.x_mm[0])
-
-
-@dataclass(frozen=True, slots=True)
-class Pressed:
-    """One captured press: its command and its ink, (len(y_mm), len(x_mm)) from 0 to 1."""
-
-    height_mm: float
-    tilt_deg: float
-    ink: NDArray[np.floating]
+STRAYS = {"lam": 0.09, "origin_mm": 0.3, "heel_gain": 0.3, "tip_gain": 0.04}
+"""Standard deviations by which single presses of a brush differ: some 5 % of width and lengths, .3 mm of place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,42 +71,47 @@ def fit_presses(
     radius_mm: float,
     length_mm: float,
     *,
-    edges: bool = True,
+    residual: bool = True,
     stages: Sequence[tuple[str, tuple[str, ...]]] = STAGES,
+    prior: Prior | None = None,
     progress: Progress = unseen,
 ) -> Fit:
-    """Fit all stages that the strokes determine, then the edges. Raises ValueError without a stroke."""
+    """Fit the parameters of the stages, then what they cannot express. The prior is the learned one by default.
+
+    Parameters that the strokes do not determine have the values that the prior expects beside the others.
+    Raises ValueError without a stroke.
+    """
     if not strokes:
         raise ValueError("a fit needs at least one stroke")
-    press = FittedPress(radius_mm, length_mm)
+    prior = learned() if prior is None else prior
+    press = FittedPress(radius_mm, length_mm, prior.values)
     free: tuple[str, ...] = ()
     made: list[Stage] = []
+    if not prior.gradual:
+        press = _minimise(press, tuple(name for _, names in stages for name in names), strokes, grid, prior)
     for name, parameters in counted(stages, "stages fitted", len(stages), progress):
         wanted = (*free, *parameters)
         # Judged at the end of the stage's fit, as the published start is far from any brush.
-        fitted = _minimise(press, wanted, strokes, grid)
-        condition = condition_number(_normal(fitted, wanted, strokes, grid)[0].sum(axis=0))
+        fitted = _minimise(press, wanted, strokes, grid, prior) if prior.gradual else press
+        condition = condition_number(_squares(fitted, wanted, strokes, grid))
         refused = not condition <= WORST_CONDITION
         made.append(Stage(name, parameters, condition, refused))
         if not refused:
             press, free = fitted, wanted
     squares, gradients, _ = _normal(press, free, strokes, grid)
-    if edges:
-        press = replace(press, edges=fit_edges(press, strokes, grid))
+    if residual:
+        press = fit_residual(press, strokes, grid)
     return Fit(press, free, tuple(made), squares, gradients, len(strokes))
 
 
 def refit(fit: Fit, strokes: Sequence[Pressed], grid: Grid) -> Fit:
-    """Fit the same parameters to other strokes of the same brush, starting from the fit.
-
-    Raises ValueError as `fit_presses`.
-    """
+    """Fit other strokes of the same brush, starting from the fit. Raises ValueError as `fit_presses`."""
     if not strokes:
         raise ValueError("a fit needs at least one stroke")
-    bare = replace(fit.press, edges=FittedPress(fit.press.radius_mm, fit.press.length_mm).edges)
-    press = _minimise(bare, fit.free, strokes, grid)
+    bare = FittedPress(fit.press.radius_mm, fit.press.length_mm, fit.press.values)
+    press = _minimise(bare, NAMES, strokes, grid, learned())
     squares, gradients, _ = _normal(press, fit.free, strokes, grid)
-    press = replace(press, edges=fit_edges(press, strokes, grid))
+    press = fit_residual(press, strokes, grid)
     return replace(fit, press=press, squares=squares, gradients=gradients, strokes=len(strokes))
 
 
@@ -133,15 +121,21 @@ def zero_touch(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> tu
     Returns the brush and the standard errors of (h0_mm, origin_mm), by bootstrap over strokes.
     """
     free = ("h0_mm", "origin_mm")
-    edges = press.edges
-    held = _minimise(replace(press, edges=np.zeros_like(edges)), free, strokes, grid)
+    bare = FittedPress(press.radius_mm, press.length_mm, press.values)
+    held = _minimise(bare, free, strokes, grid, wide())
     squares, gradients, _ = _normal(held, free, strokes, grid)
-    errors = bootstrap(held, free, squares, gradients).std(axis=0)
-    return replace(held, edges=edges), errors
+    errors = bootstrap(held, free, squares, gradients, wide()).std(axis=0)
+    return replace(held, edges=press.edges, ends=press.ends), errors
 
 
 def bootstrap(
-    press: FittedPress, free: Sequence[str], squares: Floats, gradients: Floats, draws: int = 500, seed: int = 0
+    press: FittedPress,
+    free: Sequence[str],
+    squares: Floats,
+    gradients: Floats,
+    prior: Prior | None = None,
+    draws: int = 500,
+    seed: int = 0,
 ) -> Floats:
     """(draws, P) values of the free parameters, by bootstrap over strokes.
 
@@ -149,12 +143,12 @@ def bootstrap(
     second; with fewer than some 8 strokes the intervals are too short.
     """
     at = [NAMES.index(name) for name in free]
-    spread = np.array([PARAMETERS[k].spread for k in at])
-    off = (press.values[at] - np.array([PARAMETERS[k].start for k in at])) / spread
+    spread = spreads()[at]
+    pull, stiff = _prior_terms(press, at, learned() if prior is None else prior)
     count = len(squares)
     weights = np.random.default_rng(seed).multinomial(count, np.full(count, 1.0 / count), draws).astype(np.float64)
-    square = np.tensordot(weights, squares, 1) + np.eye(len(at))
-    steps = np.asarray(np.linalg.solve(square, -(weights @ gradients + off)[..., None]), np.float64)[..., 0]
+    square = np.tensordot(weights, squares, 1) + stiff
+    steps = np.asarray(np.linalg.solve(square, -(weights @ gradients + pull)[..., None]), np.float64)[..., 0]
     low, high = (np.array([getattr(PARAMETERS[k], end) for k in at]) for end in ("low", "high"))
     return np.clip(press.values[at] + spread * steps, low, high)
 
@@ -210,37 +204,24 @@ def draw(press: FittedPress, free: Sequence[str], height_mm: float, tilt_deg: fl
     return Drawn(ink, ink * (1.0 - ink) / SPREAD_MM, grid.y_mm > 0.0, moved.reshape(len(free), -1))
 
 
-def fit_edges(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> Floats:
-    """(2, MODES, TERMS) deviations of the captured edges from the profile, by ridge regression."""
-    weights = np.outer(1.0 / np.arange(1, MODES + 1), EDGE_SPREAD_MM).ravel()
-    square = np.eye(len(weights))
-    right = np.zeros((len(weights), 2))
-    above = grid.y_mm > 0.0
-    for stroke in strokes:
-        s = press.sizes(stroke.height_mm, stroke.tilt_deg)
-        share = (grid.x_mm - s.widest + s.tip) / (s.tip + s.heel)
-        on = (share > 0.0) & (share < 1.0)
-        design = np.einsum("xk,t->xkt", modes(share[on]), command_terms(stroke.height_mm, stroke.tilt_deg))
-        design = design.reshape(int(on.sum()), -1) * weights / EDGE_NOISE_MM
-        width = press.half_width(stroke.height_mm, stroke.tilt_deg, grid.x_mm[on])
-        square += design.T @ design
-        for side, rows in enumerate((above, ~above)):
-            edge = stroke.ink[rows][:, on].sum(axis=0) * grid.px_mm
-            right[:, side] += design.T @ ((edge - width) / EDGE_NOISE_MM)
-    return (np.linalg.solve(square, right) * weights[:, None]).T.reshape(2, MODES, -1)
-
-
-def _minimise(press: FittedPress, free: tuple[str, ...], strokes: Sequence[Pressed], grid: Grid) -> FittedPress:
-    """Levenberg-Marquardt from `press`; a parameter one spread from its start costs as much as a pixel of wrong ink."""
+def _minimise(
+    press: FittedPress, free: tuple[str, ...], strokes: Sequence[Pressed], grid: Grid, prior: Prior
+) -> FittedPress:
+    """Levenberg-Marquardt from `press`; a parameter one standard deviation off the prior costs as much as a pixel of
+    wrong ink."""
     at = [NAMES.index(name) for name in free]
-    spread = np.array([PARAMETERS[k].spread for k in at])
-    start = np.array([PARAMETERS[k].start for k in at])
+    spread = spreads()[at]
     low, high = (np.array([getattr(PARAMETERS[k], end) for k in at]) for end in ("low", "high"))
 
     def equations(trial: FittedPress) -> tuple[float, Floats, Floats]:
         squares, gradients, cost = _normal(trial, free, strokes, grid)
-        off = (trial.values[at] - start) / spread
-        return cost + 0.5 * float(off @ off), squares.sum(axis=0) + np.eye(len(at)), gradients.sum(axis=0) + off
+        pull, stiff = _prior_terms(trial, at, prior)
+        off = _off(trial, prior)
+        return (
+            cost + 0.5 * float(off @ prior.precision @ off),
+            squares.sum(axis=0) + stiff,
+            gradients.sum(axis=0) + pull,
+        )
 
     cost, square, gradient = equations(press)
     damping = 1e-2
@@ -265,11 +246,32 @@ def _minimise(press: FittedPress, free: tuple[str, ...], strokes: Sequence[Press
     return press
 
 
+def _squares(press: FittedPress, free: Sequence[str], strokes: Sequence[Pressed], grid: Grid) -> Floats:
+    """J'J of all strokes without strays, (P, P)."""
+    cells = Counter((stroke.height_mm, stroke.tilt_deg) for stroke in strokes)
+    return np.sum([count * draw(press, free, *cell, grid).square() for cell, count in cells.items()], axis=0)
+
+
+def _off(press: FittedPress, prior: Prior) -> Floats:
+    """Distance of the parameters from the prior's mean, over their spreads, (17,)."""
+    return (press.values - published()) / spreads() - prior.mean
+
+
+def _prior_terms(press: FittedPress, at: Sequence[int], prior: Prior) -> tuple[Floats, Floats]:
+    """Gradient and second derivative of the prior's cost by the parameters `at`, the others held."""
+    return (prior.precision @ _off(press, prior))[at], prior.precision[np.ix_(at, at)]
+
+
 def _normal(
     press: FittedPress, free: Sequence[str], strokes: Sequence[Pressed], grid: Grid
 ) -> tuple[Floats, Floats, float]:
-    """J'J and J'r of each stroke, and half the sum of squares. A cell is drawn once for all its strokes."""
-    drawn: dict[tuple[float, float], tuple[Drawn, Floats]] = {}
+    """J'J and J'r of each stroke, and half the sum of squares, its strays integrated out.
+
+    A cell is drawn once for all its strokes.
+    """
+    stray = [k for k, name in enumerate(free) if name in STRAYS]
+    sizes = np.array([STRAYS[free[k]] / PARAMETERS[NAMES.index(free[k])].spread for k in stray])
+    drawn: dict[tuple[float, float], tuple[Drawn, Floats, Floats, Floats]] = {}
     squares: list[Floats] = []
     gradients: list[Floats] = []
     cost = 0.0
@@ -277,10 +279,14 @@ def _normal(
         cell = (stroke.height_mm, stroke.tilt_deg)
         if cell not in drawn:
             made = draw(press, free, *cell, grid)
-            drawn[cell] = made, made.square()
-        made, square = drawn[cell]
+            square = made.square()
+            inverse = np.asarray(np.linalg.inv(square[np.ix_(stray, stray)] + np.diag(sizes**-2.0)), np.float64)
+            taken = inverse @ square[stray]
+            drawn[cell] = made, square - square[:, stray] @ taken, taken, inverse
+        made, square, taken, inverse = drawn[cell]
         miss = made.ink - stroke.ink
+        pull = made.pull(miss)
         squares.append(square)
-        gradients.append(made.pull(miss))
-        cost += 0.5 * float(np.vdot(miss, miss))
+        gradients.append(pull - taken.T @ pull[stray])
+        cost += 0.5 * float(np.vdot(miss, miss) - pull[stray] @ inverse @ pull[stray])
     return np.array(squares), np.array(gradients), cost

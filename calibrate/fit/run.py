@@ -14,8 +14,10 @@ from calibrate.compare.field import Field
 from calibrate.errors import CalibrationError
 from calibrate.fit.artefact import FOLDER, BrushFit, FittedStage
 from calibrate.fit.captures import Captures
-from calibrate.fit.fit import STAGES, Fit, Grid, Pressed, bootstrap, fit_presses, zero_touch
+from calibrate.fit.fit import STAGES, Fit, bootstrap, fit_presses, zero_touch
 from calibrate.fit.heldout import HeldOut, by_cell, leave_cell_out
+from calibrate.fit.prior import wide
+from calibrate.fit.strokes import Grid, Pressed
 from model.fitted import NAMES, FittedPress
 from sessions.progress import Progress, unseen
 
@@ -80,6 +82,7 @@ def fit_session(captures: Captures, view: Field, progress: Progress = unseen) ->
         mm_per_px=view.mm_per_px,
         parameters=parameters,
         edges_mm=tuple(tuple(tuple(terms) for terms in side) for side in fit.press.edges.tolist()),
+        ends_mm=tuple(tuple(terms) for terms in fit.press.ends.tolist()),
         stages=tuple(
             FittedStage(name=s.name, condition=s.condition if math.isfinite(s.condition) else None, refused=s.refused)
             for s in fit.stages
@@ -93,11 +96,11 @@ def fit_session(captures: Captures, view: Field, progress: Progress = unseen) ->
 
 def proportional_zero(strokes: list[Pressed], grid: Grid, radius_mm: float, length_mm: float) -> tuple[float, float]:
     """(h0, its standard error) in mm with every size proportional to depth; (0, 1e9) if one depth leaves it open."""
-    fit = fit_presses(strokes, grid, radius_mm, length_mm, edges=False, stages=STAGES[:PROPORTIONAL])
+    fit = fit_presses(strokes, grid, radius_mm, length_mm, residual=False, stages=STAGES[:PROPORTIONAL], prior=wide())
     if "h0_mm" not in fit.free:
         return 0.0, 1e9
     at = fit.free.index("h0_mm")
-    draws = bootstrap(fit.press, fit.free, fit.squares, fit.gradients)[:, at]
+    draws = bootstrap(fit.press, fit.free, fit.squares, fit.gradients, wide())[:, at]
     return float(fit.press.values[NAMES.index("h0_mm")]), float(draws.std())
 
 
@@ -129,4 +132,4 @@ def _floats(fit: Fit) -> list[float]:
 
 
 def _bare(press: FittedPress) -> FittedPress:
-    return replace(press, edges=np.zeros_like(press.edges))
+    return replace(press, edges=np.zeros_like(press.edges), ends=np.zeros_like(press.ends))

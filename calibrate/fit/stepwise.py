@@ -21,7 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.compare.field import SIZE_PX, Field
-from calibrate.fit.fit import EDGE_NOISE_MM, EDGE_SPREAD_MM, SPREAD_MM, Fit, Grid, Pressed, draw, fit_presses
+from calibrate.fit.fit import Fit, draw, fit_presses
+from calibrate.fit.prior import learned
+from calibrate.fit.strokes import SPREAD_MM, Grid, Pressed
 from model.fitted import MODES, NAMES, FittedPress, command_terms
 
 Floats = NDArray[np.float64]
@@ -38,6 +40,8 @@ FIELD = Field()
 REACH_MM = 12.0
 """Reach to either side of the axis: no press of the loopback rig's or the paper's brushes is wider."""
 LEVELS = 15
+EDGE_SPREAD_MM = (1.2, 0.4, 0.3, 0.15, 0.15, 0.15)
+EDGE_NOISE_MM = 0.25
 GIVEN_UP = 2
 """Number of captures without a whole stroke after which a cell is not chosen again."""
 
@@ -114,7 +118,7 @@ def next_cell(design: Design, seen: Sequence[CapturedPress]) -> Next:
         return Next(None, 100.0, 100.0, len(strokes), digest, why)
     grid, brush = field_grid(), FittedPress(design.radius_mm, design.length_mm)
     if strokes:
-        brush = fit_presses(strokes, grid, design.radius_mm, design.length_mm, edges=False).press
+        brush = fit_presses(strokes, grid, design.radius_mm, design.length_mm, residual=False).press
     done = [(s.height_mm, s.tilt_deg) for s in strokes]
     choice = next_press(brush, done, left, grid, enough_points=design.enough_points, least=design.least)
     points, after = min(choice.points, 100.0), min(choice.points_after, 100.0)
@@ -160,7 +164,7 @@ def next_press(
     press = fit if isinstance(fit, FittedPress) else fit.press
     # Parameters that a stage refused count as well: the next press should determine them.
     views = {cell: _look(press, cell, grid) for cell in {*done, *candidates}}
-    information = np.eye(len(NAMES)) + sum((views[cell].square for cell in done), np.zeros((len(NAMES), len(NAMES))))
+    information = learned().precision + sum((views[cell].square for cell in done), np.zeros((len(NAMES), len(NAMES))))
     terms = _terms_information(done, views, grid)
     now = _points(information, terms, candidates, views, grid)
     after = [

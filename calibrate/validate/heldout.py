@@ -16,8 +16,9 @@ from calibrate.compare.field import SIZE_PX, Field
 from calibrate.compare.images import Pixels, brush_of, loop_pixels, unpack
 from calibrate.fit.artefact import BrushFit
 from calibrate.fit.captures import MARGIN_MM, grid_of
-from calibrate.fit.fit import Fit, Grid, Pressed, refit
+from calibrate.fit.fit import Fit, refit
 from calibrate.fit.heldout import BEZIER_SIZES, RefittedBezier, refit_bezier
+from calibrate.fit.strokes import Grid, Pressed
 from calibrate.validate.jobs import Row, pixels_of
 from calibrate.validate.pool import Scheduler
 from calibrate.validate.sources import LoadedSession
@@ -85,7 +86,7 @@ def refit_job(job: RefitJob) -> dict[str, Any]:
 
 def press_body(press: FittedPress) -> dict[str, Any]:
     """A fitted brush as plain data."""
-    return {"values": press.values.tolist(), "edges": press.edges.ravel().tolist()}
+    return {"values": press.values.tolist(), "edges": press.edges.ravel().tolist(), "ends": press.ends.ravel().tolist()}
 
 
 def bezier_body(strokes: Sequence[Pressed], grid: Grid) -> list[float] | None:
@@ -111,7 +112,7 @@ def cropped(job: RefitJob) -> tuple[list[Pressed], Grid]:
 def fitted_press(body: dict[str, Any], radius_mm: float, length_mm: float) -> FittedPress:
     """The fitted brush in the result of a finished job."""
     edges = np.array(body["edges"]).reshape(2, MODES, TERMS)
-    return FittedPress(radius_mm, length_mm, np.array(body["values"]), edges)
+    return FittedPress(radius_mm, length_mm, np.array(body["values"]), edges, np.array(body["ends"]).reshape(2, TERMS))
 
 
 def bezier_pixels(coefficients: Sequence[float], height_mm: float, tilt_deg: float, view: Field) -> Pixels:

@@ -4,8 +4,8 @@ import sys
 import numpy as np
 import pytest
 
-from calibrate.fit.fit import Grid
 from calibrate.fit.stepwise import next_press
+from calibrate.fit.strokes import Grid
 from model.fitted import FittedPress
 
 GRID = Grid((np.arange(80) + 0.5) * 0.5 - 31.0, 8.0 - (np.arange(32) + 0.5) * 0.5)

@@ -1,0 +1,114 @@
+"""The presses that `bench brushfit` and `bench inversion` score on: one array of ink for each brush.
+
+Brushes of the loopback rig are drawn by `drivers.sim.brush`, each press with a full load of ink. The two bristle sets
+are photographs from an independent simulation (`../shared/data`), imported and cut out as any photographs.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.harness import BenchError
+from calibrate.compare.field import Field
+from calibrate.fit.captures import read_presses
+from calibrate.fit.strokes import Grid, Pressed
+from drivers.sim.brush.brush import Brush, BrushSpec
+from drivers.sim.brush.paper import Footprint
+from sessions.imports.photographs import ImportOptions, import_photographs
+
+PX_MM, SIZE_PX = 0.3, 128
+LEFT_MM, TOP_MM = 29.1, 19.2
+ROWS = slice(28, 100)
+"""The fit looks at 10.8 mm to either side: no press is thicker."""
+INKED = 0.3
+CELLS = tuple((height, tilt) for height in (11.0, 13.0, 15.0, 17.0, 20.0) for tilt in (0.0, 5.0, 10.0))
+REPEATS = 10
+BRISTLES = Path(__file__).resolve().parents[2] / "shared" / "data"
+BRISTLE_SETS = ("bristle_presses_1", "bristle_presses_4")
+Images = NDArray[np.float32]
+Chosen = Sequence[tuple[int, int]]
+"""Strokes, each as (number of its cell, number of the press)."""
+
+
+@dataclass(frozen=True, slots=True)
+class BrushPresses:
+    """All presses of a brush: `ink` (15 cells, repeats, len(y_mm), len(x_mm)), coverage."""
+
+    name: str
+    radius_mm: float
+    length_mm: float
+    grid: Grid
+    ink: Images
+
+    def strokes(self, chosen: Chosen) -> list[Pressed]:
+        """The chosen presses as data of a fit."""
+        return [Pressed(*CELLS[c], self.ink[c, r]) for c, r in chosen]
+
+    def every(self) -> list[Pressed]:
+        """All presses."""
+        return self.strokes([(c, r) for c in range(len(CELLS)) for r in range(self.ink.shape[1])])
+
+    def gap(self, cells: Sequence[int], predict: Callable[[float, float], NDArray[np.floating]]) -> float:
+        """CSIM points by which predictions of these cells fall short of the ceiling: the majority of the other presses
+        of the same cell. A negative gap is a prediction better than that."""
+        repeats = self.ink.shape[1]
+        short: list[float] = []
+        for c in cells:
+            seen = predict(*CELLS[c]) > 0.5
+            truth = self.ink[c] > 0.5
+            votes = truth.sum(axis=0)
+            for one in truth:
+                short.append(_csim(2 * (votes - one) > repeats - 1, one) - _csim(seen, one))
+        return 100.0 * float(np.mean(short))
+
+
+def simulated(spec: BrushSpec, name: str, repeats: int = REPEATS) -> BrushPresses:
+    """Presses of a brush of the loopback rig."""
+    brush = Brush(spec)
+    ink = np.empty((len(CELLS), repeats, SIZE_PX, SIZE_PX), np.float32)
+    for c, (height, tilt) in enumerate(CELLS):
+        for r in range(repeats):
+            ink[c, r] = _on_field(brush.press(height, tilt, ink_load=1.0, press_seed=1000 * c + r))
+    return BrushPresses(name, spec.radius_mm, spec.length_mm, grid(), ink[:, :, ROWS])
+
+
+def bristles(name: str) -> BrushPresses:
+    """Presses of an independent bristle simulation. Raises BenchError where the data set is not at hand."""
+    photos = BRISTLES / name
+    if not (photos / "strokes.csv").exists():
+        raise BenchError(f"the bristle presses ({name}) are not beside this checkout")
+    with tempfile.TemporaryDirectory() as folder:
+        session = Path(folder) / name
+        import_photographs(photos, photos / "strokes.csv", session, ImportOptions(kind="press"), "bench", lambda: 1)
+        captures = read_presses(session, Field())
+    by_cell = [[s.ink for s in captures.strokes if (s.height_mm, s.tilt_deg) == cell] for cell in CELLS]
+    return BrushPresses(name, captures.radius_mm, captures.length_mm, captures.grid, np.array(by_cell, np.float32))
+
+
+def grid() -> Grid:
+    """Pixel centres around the point of touch, cut to the rows that the fit looks at."""
+    centres = (np.arange(SIZE_PX) + 0.5) * PX_MM
+    return Grid(np.asarray(centres - LEFT_MM, np.float64), np.asarray(TOP_MM - centres, np.float64)[ROWS])
+
+
+def _on_field(mark: Footprint) -> Images:
+    """(128, 128) share of each pixel that is inked."""
+    side = round(SIZE_PX * PX_MM * mark.px_per_mm)
+    field = np.zeros((side, side), np.float32)
+    column, row = (round(mm * mark.px_per_mm - at) for mm, at in zip((LEFT_MM, TOP_MM), mark.origin_px, strict=True))
+    ink = (mark.density > INKED)[max(0, -row) : side - row, max(0, -column) : side - column]
+    top, left = max(0, row), max(0, column)
+    field[top : top + ink.shape[0], left : left + ink.shape[1]] = ink
+    return np.asarray(cv2.resize(field, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _csim(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
+    norm = np.sqrt(float(np.count_nonzero(a)) * float(np.count_nonzero(b)))
+    return float(np.count_nonzero(a & b)) / norm if norm > 0.0 else 0.0
