@@ -16,6 +16,7 @@ from bench.peak import measure
 from bench.processes import started
 from model.brush import Brush
 from model.ccdbsm import ccdbsm
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -143,7 +144,7 @@ def test_the_picture_of_footprints_is_drawn(tmp_path: Path, monkeypatch: pytest.
 
 def test_unknown_name_is_one_line_and_exit_code_2() -> None:
     command = [sys.executable, "-m", "bench", "rasta"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr == f"unknown bench 'rasta'; known: {', '.join(bench.__main__.benches())}\n"

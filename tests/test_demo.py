@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from calibrate.validate.report.tables import table_1
 from sessions.journal.journal import replay
 from sessions.journal.lines import read_lines
 from sessions.reader import Recording
+from tests.waiting import wait_until
 
 SMALL = """
 import sys
@@ -49,11 +49,7 @@ def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactl
     out = tmp_path / "demo"
     command = [sys.executable, "-c", SMALL, str(out)]
     first = subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 200
-    while again_steps_done(out) < PRESSED:
-        assert time.monotonic() < deadline
-        assert first.poll() is None
-        time.sleep(0.02)
+    wait_until(lambda: again_steps_done(out) >= PRESSED, f"{PRESSED} steps", process=first)
     os.killpg(first.pid, signal.SIGKILL)
     first.wait()
 

@@ -21,6 +21,7 @@ from drivers.clock import HostClock
 from drivers.sim.brush.flaws import Flaw
 from drivers.sim.config import SimConfig, Table, View
 from drivers.sim.rig import LoopbackRig
+from tests.waiting import PATIENCE_S
 
 OPTIONS = ("--out", "--config", "--protocol")
 SMALL_VIEW = View(width_px=512, height_px=384, px_per_mm=1.56, fps=50.0)
@@ -58,12 +59,12 @@ def serving(config: SimConfig) -> Iterator[LoopbackRig]:
 
     thread = threading.Thread(target=lambda: asyncio.run(serve()), name="loopback rig", daemon=True)
     thread.start()
-    rig, loop, over = ready.result(timeout=30)
+    rig, loop, over = ready.result(timeout=PATIENCE_S)
     try:
         yield rig
     finally:
         loop.call_soon_threadsafe(over.set)
-        thread.join(timeout=30)
+        thread.join(timeout=PATIENCE_S)
         assert not thread.is_alive(), "waited 30 s for the loopback rig to end"
 
 

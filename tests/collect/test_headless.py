@@ -13,16 +13,14 @@ from collect.engine.snapshot import Snapshot
 from collect.headless import eta_text
 from sessions.reader import Recording
 from tests.command import brushloop
+from tests.waiting import PATIENCE_S, wait_until
 
 if TYPE_CHECKING:
     from conftest import Lab
 
 
 def wait_for_presses(lab: Lab, count: int) -> None:
-    deadline = time.monotonic() + 60
-    while len(lab.rig.world.presses) < count:
-        assert time.monotonic() < deadline, f"waited 60 s for {count} presses; {len(lab.rig.world.presses)} were made"
-        time.sleep(0.01)
+    wait_until(lambda: len(lab.rig.world.presses) >= count, f"{count} presses")
 
 
 def test_a_signal_stops_the_arm_and_the_same_command_goes_on(lab: Lab) -> None:
@@ -31,7 +29,7 @@ def test_a_signal_stops_the_arm_and_the_same_command_goes_on(lab: Lab) -> None:
         first = lab.process()
         wait_for_presses(lab, len(lab.rig.world.presses) + 1)
         first.send_signal(number)
-        _, stderr = first.communicate(timeout=60)
+        _, stderr = first.communicate(timeout=PATIENCE_S)
         assert first.returncode == 4, stderr
         assert stderr.splitlines()[-1] == "brushloop: stopped; the same command goes on from here"
         assert "Traceback" not in stderr

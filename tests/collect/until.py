@@ -10,12 +10,10 @@ import pytest
 
 from collect.engine.engine import Engine
 from collect.engine.snapshot import Snapshot
-
-END_S = 100.0
-"""Time for a run to end, on a busy machine: less than the time-out of a test, whose message would not say as much."""
+from tests.waiting import PATIENCE_S
 
 
-def until(engine: Engine, condition: Callable[[Snapshot], bool], timeout_s: float = 60.0) -> Snapshot:
+def until(engine: Engine, condition: Callable[[Snapshot], bool], timeout_s: float = PATIENCE_S) -> Snapshot:
     """The first snapshot that meets the condition; fails where it does not come in time, or the run is over."""
     deadline = time.monotonic() + timeout_s
     while not condition(now := engine.snapshot()):
@@ -27,7 +25,7 @@ def until(engine: Engine, condition: Callable[[Snapshot], bool], timeout_s: floa
     return now
 
 
-def wait_for_end(engine: Engine, timeout_s: float = END_S) -> None:
+def wait_for_end(engine: Engine, timeout_s: float = PATIENCE_S) -> None:
     """Wait until the run is over, and raise what ended it; stops the run and fails where it does not end in time."""
     deadline = time.monotonic() + timeout_s
     while not engine.finished:

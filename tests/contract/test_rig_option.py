@@ -17,12 +17,12 @@ from unittest.mock import Mock
 import pytest
 
 from tests.contract.conftest import pytest_configure
+from tests.waiting import PATIENCE_S, wait_until
 
 ROOT = Path(__file__).parents[2]
 QUESTION = "May the arm move? [y/N]"
 # One test that moves and two that do not.
 CHOSEN = "a_move_arrives or who_answers or agree_on_an_arm"
-WITHIN_S = 60.0
 
 
 @pytest.fixture(scope="module")
@@ -32,11 +32,7 @@ def rig_toml(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     command = [sys.executable, "-m", "brushloop", "sim", "--write-rig", str(path), "--rate", "5"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as sim:
         try:
-            deadline = time.monotonic() + WITHIN_S
-            while not path.exists():
-                assert sim.poll() is None
-                assert time.monotonic() < deadline
-                time.sleep(0.05)
+            wait_until(path.exists, "rig.toml", process=sim)
             yield path
         finally:
             sim.terminate()
@@ -56,7 +52,7 @@ def on_a_terminal(rig_toml: Path, answer: str) -> tuple[int, str]:
         os.close(theirs)
         try:
             output, answered = "", False
-            deadline = time.monotonic() + WITHIN_S
+            deadline = time.monotonic() + PATIENCE_S
             # Linux reports by an error that the other end has gone.
             with contextlib.suppress(OSError):
                 while time.monotonic() < deadline:
@@ -69,7 +65,7 @@ def on_a_terminal(rig_toml: Path, answer: str) -> tuple[int, str]:
                         assert "passed" not in output, "asks before the first test"
                         os.write(ours, f"{answer}\n".encode())
                         answered = True
-            return run.wait(WITHIN_S), output
+            return run.wait(PATIENCE_S), output
         finally:
             run.kill()
             os.close(ours)
@@ -101,7 +97,7 @@ def test_any_other_answer_skips_what_moves_and_runs_the_rest(rig_toml: Path, ans
 
 def test_without_a_terminal_nothing_moves(rig_toml: Path):
     run = subprocess.run(
-        command(rig_toml), cwd=ROOT, input="y\n", capture_output=True, text=True, check=False, timeout=WITHIN_S
+        command(rig_toml), cwd=ROOT, input="y\n", capture_output=True, text=True, check=False, timeout=PATIENCE_S
     )
     assert run.returncode == 0, run.stdout
     assert "2 passed, 1 skipped" in run.stdout
@@ -110,7 +106,7 @@ def test_without_a_terminal_nothing_moves(rig_toml: Path):
 
 def test_what_cannot_be_used_is_one_line(tmp_path: Path):
     path = tmp_path / "rig.toml"
-    run = subprocess.run(command(path), cwd=ROOT, capture_output=True, text=True, check=False, timeout=WITHIN_S)
+    run = subprocess.run(command(path), cwd=ROOT, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
     assert run.returncode == pytest.ExitCode.USAGE_ERROR
     assert run.stderr.count("\n") == 1 + run.stderr.endswith("\n\n"), run.stderr
     assert "no such file" in run.stderr

@@ -2,8 +2,6 @@
 
 import math
 import shutil
-import subprocess
-import sys
 
 import cv2
 import pytest
@@ -13,6 +11,7 @@ from sessions.cli import app
 from sessions.imports.photographs import ImportOptions
 from sessions.reader import Recording
 from sessions.recording.schemas import Source
+from tests.command import brushloop
 
 ROWS = [
     {"file": "a.png", "px_per_mm": "12.5", "height_mm": "13", "tilt_deg": "5"},
@@ -119,8 +118,7 @@ def test_a_refusal_is_one_line_on_stderr_and_exit_code_2(make, tmp_path, photos,
     make.photographs(photos, *ROWS)
     damage(photos)
     before = make.tree(tmp_path)
-    command = [sys.executable, "-m", "brushloop", "sessions", "import", "photos", "--csv", "photos/table.csv"]
-    ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    ran = brushloop("sessions", "import", "photos", "--csv", "photos/table.csv", cwd=tmp_path)
     assert ran.returncode == 2
     assert ran.stdout == ""
     assert "Traceback" not in ran.stderr

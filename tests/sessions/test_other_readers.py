@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.waiting import PATIENCE_S
+
 PACKAGES = ("@mcap/core@2.2.2", "fzstd@0.1.1")
 
 COUNT = """
@@ -58,7 +60,7 @@ def node(tmp_path_factory):
     folder = tmp_path_factory.mktemp("node")
     command = ["npm", "install", "--no-audit", "--no-fund", "--ignore-scripts", "--prefer-offline", *PACKAGES]
     try:
-        ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=60)
+        ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
     except subprocess.TimeoutExpired:
         pytest.skip("npm did not fetch @mcap/core within 60 s")
     if ran.returncode != 0:
@@ -70,7 +72,9 @@ def node(tmp_path_factory):
 def test_the_javascript_reader_counts_the_same(make, store, node):
     make.collect(store)
     final = store.close()
-    ran = subprocess.run(["node", "count.js", final], cwd=node, capture_output=True, text=True, check=False, timeout=60)
+    ran = subprocess.run(
+        ["node", "count.js", final], cwd=node, capture_output=True, text=True, check=False, timeout=PATIENCE_S
+    )
     assert ran.returncode == 0, ran.stderr
     found = json.loads(ran.stdout)
     topics = Counter(topic for topic, *_ in make.messages(final).elements())

@@ -21,6 +21,7 @@ from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 from sessions.repair.verify import verify_session
 from sessions.store import STEP_BYTES, SessionStore
+from tests.waiting import PATIENCE_S
 
 Usage = namedtuple("Usage", "total used free")
 
@@ -184,7 +185,7 @@ def test_while_one_process_has_a_session_no_other_collects_closes_or_repairs_it(
         assert holder.stdout.readline() == "held\n"
         before = make.tree(store.folder)
         other = subprocess.run(
-            [sys.executable, "-c", TOUCH, store.folder], capture_output=True, text=True, check=True, timeout=60
+            [sys.executable, "-c", TOUCH, store.folder], capture_output=True, text=True, check=True, timeout=PATIENCE_S
         )
         assert other.stdout.split() == ["SessionLocked", "2", "SessionLocked", "2"]
         assert make.tree(store.folder) == before

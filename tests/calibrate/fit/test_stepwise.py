@@ -7,6 +7,7 @@ import pytest
 from calibrate.fit.stepwise import next_press
 from calibrate.fit.strokes import Grid
 from model.fitted import FittedPress
+from tests.waiting import PATIENCE_S
 
 GRID = Grid((np.arange(80) + 0.5) * 0.5 - 31.0, 8.0 - (np.arange(32) + 0.5) * 0.5)
 CELLS = [(h, a) for h in (11.0, 13.0, 15.0, 17.0, 20.0) for a in (0.0, 5.0, 10.0)]
@@ -46,4 +47,4 @@ def test_no_candidates_is_an_error() -> None:
 
 def test_a_rig_needs_no_torch_for_it() -> None:
     code = "import sys, calibrate.fit.stepwise; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=PATIENCE_S).returncode == 0

@@ -9,6 +9,8 @@ import shutil
 import subprocess
 from pathlib import Path
 
+from tests.waiting import PATIENCE_S
+
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FRAME = '<iframe width="{width}" height="900" srcdoc="{page}"></iframe>'
 SCRIPT = """<script>onload = () => document.body.insertAdjacentHTML("afterbegin", "<pre>" + JSON.stringify(
@@ -25,7 +27,7 @@ def content_widths_px(page: str, widths_px: tuple[int, ...], folder: Path) -> tu
     flags = ("--headless=new", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--dump-dom")
     profile = f"--user-data-dir={folder / 'profile'}"
     ran = subprocess.run(
-        [BROWSER, *flags, profile, outer.as_uri()], capture_output=True, text=True, timeout=120, check=True
+        [BROWSER, *flags, profile, outer.as_uri()], capture_output=True, text=True, timeout=PATIENCE_S, check=True
     )
     found = re.search(r"<pre>(.*?)</pre>", ran.stdout)
     assert found is not None, ran.stderr[-2000:]

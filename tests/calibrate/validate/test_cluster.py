@@ -20,14 +20,13 @@ from pathlib import Path
 import pytest
 
 from calibrate.validate.pool import ClusterError, Dask
+from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = [
     # Looked for and not imported: every worker collects this file, and one of them runs it.
     pytest.mark.skipif(find_spec("distributed") is None, reason="needs the extra [cluster]"),
-    pytest.mark.timeout(180),
     pytest.mark.xdist_group("cluster"),
 ]
-DEADLINE_S = 60.0
 FILES = ("scores.csv", "summary.csv", "failures.csv")
 
 
@@ -50,10 +49,7 @@ def cluster_of_two(folder: Path) -> Iterator[Cluster]:
     try:
         here = ("--host", "127.0.0.1", "--no-dashboard")
         start("distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", str(scheduler_file), *here)
-        deadline = time.monotonic() + DEADLINE_S
-        while not scheduler_file.is_file() or not scheduler_file.read_text():
-            assert time.monotonic() < deadline, "waited for the scheduler to listen"
-            time.sleep(0.05)
+        wait_until(lambda: scheduler_file.is_file() and scheduler_file.read_text(), "the scheduler to listen")
         address = json.loads(scheduler_file.read_text())["address"]
         words = ("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny", *here)
         yield Cluster(address, [start(*words), start(*words)])
@@ -121,7 +117,12 @@ def test_no_scheduler_there_is_one_clear_line(session: Path, tmp_path: Path) -> 
         "'--scheduler', 'tcp://127.0.0.1:9']; brushloop.main()"
     )
     ran = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False, env=environment, timeout=60
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment,
+        timeout=PATIENCE_S,
     )
     assert ran.returncode == 2, ran.stderr
     assert ran.stderr.count("\n") == 1, ran.stderr
@@ -134,11 +135,13 @@ def test_a_worker_with_other_software_is_refused(cluster: Cluster) -> None:
         "from calibrate.validate.pool import ClusterError, Dask\n"
         f"try:\n    Dask({cluster.address!r})\nexcept ClusterError as error:\n    print(error)\n"
     )
-    deadline = time.monotonic() + DEADLINE_S
+    deadline = time.monotonic() + PATIENCE_S
     said = "has no worker"
     while "has no worker" in said:
         assert time.monotonic() < deadline, said
-        ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+        ran = subprocess.run(
+            [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=PATIENCE_S
+        )
         said = ran.stdout
     assert "has brushloop" in said
     assert "(work of tomorrow) is needed there" in said
@@ -205,7 +208,9 @@ with Threads(1) as pool:
     here = dict(pool.run(prepare_job, iter(jobs)))
 print(len(there), there == here)
 """
-    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=120)
+    ran = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=PATIENCE_S
+    )
     assert ran.stdout == "33 True\n", ran.stderr
     assert cluster.workers[0].wait(10.0) != 0
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+
+from tests.waiting import wait_until
 
 
 def brushloop(*words: str | Path) -> subprocess.CompletedProcess[str]:
@@ -63,9 +64,5 @@ def bench(tmp_path: Path, at_rate: float) -> Iterator[Bench]:
         log = stack.enter_context((tmp_path / "rig.log").open("wb"))
         process = stack.enter_context(subprocess.Popen([*command, "--rate", str(at_rate)], stdout=log, stderr=log))
         stack.callback(process.terminate)
-        deadline = time.monotonic() + 60
-        while b"Ctrl-C ends" not in (tmp_path / "rig.log").read_bytes():
-            assert process.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
+        wait_until(lambda: b"Ctrl-C ends" in (tmp_path / "rig.log").read_bytes(), "the rig", process=process)
         yield Bench(tmp_path, process)

@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +16,7 @@ import pytest
 from calibrate.loop.scores import read_loop
 from sessions.journal.journal import JOURNAL_NAME
 from sessions.reader import Recording
+from tests.waiting import wait_until
 
 if TYPE_CHECKING:
     from tests.collect.chains.conftest import Bench
@@ -52,11 +52,7 @@ def test_the_loop_is_closed_and_goes_on_after_kill_nine(bench: Bench) -> None:
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-    deadline = time.monotonic() + 100
-    while replay_journal(bench).count(b'"event":"done","key"') < 6:
-        assert first.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_until(lambda: replay_journal(bench).count(b'"event":"done","key"') >= 6, "six steps", process=first)
     os.killpg(first.pid, signal.SIGKILL)
     first.wait()
 

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.engine.engine import Engine
-from collect.engine.snapshot import Snapshot
 from collect.errors import CollectAborted
 from sessions.journal.journal import JOURNAL_NAME
 from sessions.journal.lines import read_lines
@@ -17,7 +14,7 @@ from sessions.reader import Recording
 from sessions.recording import container
 from sessions.repair.verify import verify_session
 from tests.collect.durability.conftest import the_session
-from tests.collect.until import wait_for_end
+from tests.collect.until import until, wait_for_end
 
 if TYPE_CHECKING:
     from tests.collect.conftest import Lab
@@ -40,14 +37,6 @@ class WallClock:
 @pytest.fixture
 def wall(monkeypatch: pytest.MonkeyPatch) -> WallClock:
     return WallClock(monkeypatch)
-
-
-def until(engine: Engine, condition: Callable[[Snapshot], bool]) -> None:
-    deadline = time.monotonic() + 60
-    while not condition(engine.snapshot()):
-        assert time.monotonic() < deadline
-        assert not engine.finished, engine.snapshot().error
-        time.sleep(0.002)
 
 
 @pytest.mark.parametrize("jump_s", [-HOUR_S, HOUR_S])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING
 
 from sessions.journal.journal import JOURNAL_NAME, replay
@@ -11,16 +10,14 @@ from sessions.reader import Recording
 from sessions.repair.verify import verify_session
 from tests.collect.durability.conftest import Disk, parked, the_session
 from tests.command import brushloop
+from tests.waiting import PATIENCE_S, wait_until
 
 if TYPE_CHECKING:
     from tests.collect.conftest import Lab
 
 
 def wait_for_a_file(lab: Lab, pattern: str) -> None:
-    deadline = time.monotonic() + 60
-    while not any(lab.sessions.glob(f"*/{pattern}")):
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
+    wait_until(lambda: any(lab.sessions.glob(f"*/{pattern}")), pattern)
 
 
 def run(lab: Lab) -> tuple[int, str]:
@@ -35,7 +32,7 @@ def test_a_disk_that_fills_up_in_mid_step_parks_the_arm_and_with_room_the_same_c
     first = lab.process()
     wait_for_a_file(lab, "*-press-*.mcap.part")
     disk.fill()
-    _, stderr = first.communicate(timeout=60)
+    _, stderr = first.communicate(timeout=PATIENCE_S)
     assert first.returncode == 4, stderr
     assert "Traceback" not in stderr
     assert "No space left on device" in stderr.splitlines()[-1] or "make room" in stderr.splitlines()[-1]

@@ -15,6 +15,7 @@ import pytest
 from drivers.sim.config import Table
 from drivers.sim.fault_client import ask
 from drivers.sim.faults.phases import Phase
+from tests.waiting import wait_until
 
 PAPER_MM = Table().paper_z_mm
 RATE = 4.0
@@ -33,11 +34,7 @@ class OwnRig:
         self.toml, self.control = folder / "rig.toml", folder / "control"
         command = [sys.executable, "-m", "brushloop", "sim", "--write-rig", str(self.toml), "--rate", str(RATE)]
         self.process = subprocess.Popen([*command, "--control", str(self.control)], stdout=subprocess.DEVNULL)
-        deadline = time.monotonic() + 60.0
-        while not self.toml.exists():
-            assert self.process.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
+        wait_until(self.toml.exists, "rig.toml", process=self.process)
 
     def state(self) -> tuple[float, float, str]:
         """(simulated seconds, height of the tip above the paper in mm, phase)."""
@@ -76,10 +73,7 @@ def kill(rig: OwnRig, seed: int, when: Callable[[], None]) -> tuple[str, float]:
 
 def until(rig: OwnRig, met: Callable[[float, str], bool]) -> None:
     """Wait for a height above the paper in mm and a phase."""
-    deadline = time.monotonic() + 60.0
-    while not met(*rig.state()[1:]):
-        assert time.monotonic() < deadline
-        time.sleep(0.003)
+    wait_until(lambda: met(*rig.state()[1:]), "a height and a phase")
 
 
 @pytest.mark.parametrize("phase", [Phase.DESCENDING, Phase.PRESSED])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import tomllib
 from typing import TYPE_CHECKING
 
@@ -14,6 +13,7 @@ from sessions.repair.verify import verify_session
 from tests.collect.conftest import SMALL_VIEW, serving
 from tests.collect.durability.conftest import the_session
 from tests.command import brushloop
+from tests.waiting import PATIENCE_S, wait_until
 
 if TYPE_CHECKING:
     from tests.collect.conftest import Lab
@@ -39,10 +39,7 @@ def test_a_session_that_is_open_elsewhere_is_refused_before_anything_is_powered(
     protocol.write_text(protocol.read_text().replace("dwell_s = 0.0", "dwell_s = 60.0"))
     with serving(SimConfig(rate=60.0, view=SMALL_VIEW)) as rig:
         first = lab.process()
-        deadline = time.monotonic() + 60
-        while not lab.rig.world.presses:
-            assert time.monotonic() < deadline, "waited 60 s for the first press"
-            time.sleep(0.01)
+        wait_until(lambda: lab.rig.world.presses, "the first press")
         for name, value in where(rig).items():
             monkeypatch.setenv(name, value)
         second = brushloop("collect", "--no-tui", *lab.options)  # this process is the second
@@ -50,6 +47,6 @@ def test_a_session_that_is_open_elsewhere_is_refused_before_anything_is_powered(
         assert second.stderr.splitlines()[-1].endswith("another brushloop has this session open")
         assert rig.arcs.mode == "PowerOff"
         assert not rig.world.presses
-    _, stderr = first.communicate(timeout=120)
+    _, stderr = first.communicate(timeout=PATIENCE_S)
     assert first.returncode == 0, stderr
     assert verify_session(the_session(lab)).sound

@@ -19,6 +19,7 @@ import pytest
 from sessions.reader import Recording
 from sessions.repair.verify import verify_session
 from tests.collect.durability.conftest import the_session
+from tests.waiting import PATIENCE_S, wait_until
 
 if TYPE_CHECKING:
     from tests.collect.conftest import Lab
@@ -61,11 +62,12 @@ def in_terminal(lab: Lab, end: int, *options: str) -> subprocess.Popen[str]:
 
 
 def read_until(end: int, condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline
-        if select.select([end], [], [], 0.01)[0]:
+    def met() -> bool:
+        if select.select([end], [], [], 0.0)[0]:
             os.read(end, 65536)
+        return condition()
+
+    wait_until(met, "what the terminal is to show")
 
 
 @pytest.mark.parametrize("option", ["--tui", "--no-tui"])
@@ -74,7 +76,7 @@ def test_a_terminal_that_is_closed_stops_the_arm_and_the_same_command_goes_on(la
         process = in_terminal(lab, theirs, option)
         read_until(ours, lambda: len(lab.rig.world.presses) >= 1)
         os.close(ours)
-        assert process.wait(timeout=30) == 4
+        assert process.wait(timeout=PATIENCE_S) == 4
     still = lab.rig.world.tool()
     time.sleep(0.1)
     assert lab.rig.world.tool() == still
@@ -82,7 +84,7 @@ def test_a_terminal_that_is_closed_stops_the_arm_and_the_same_command_goes_on(la
     assert verify_session(folder).sound
 
     again = lab.process()
-    _, stderr = again.communicate(timeout=60)
+    _, stderr = again.communicate(timeout=PATIENCE_S)
     assert again.returncode == 0, stderr
     assert len({capture.stroke.stroke_id for capture in Recording(folder).captures()}) == 2
     assert verify_session(folder).sound

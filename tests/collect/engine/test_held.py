@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -12,7 +11,7 @@ from collect.engine.open_or_resume import Opening
 from collect.errors import ConfigError
 from drivers.arcs.codes import SafetyMode
 from drivers.errors import RobotNotSafe
-from tests.collect.until import wait_for_end
+from tests.collect.until import until, wait_for_end
 from tests.command import brushloop
 
 if TYPE_CHECKING:
@@ -30,21 +29,14 @@ def slowly(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
 
 
-def asked(engine: Engine, timeout_s: float = 60.0) -> Prompt:
-    deadline = time.monotonic() + timeout_s
-    while (prompt := engine.snapshot().prompt) is None:
-        assert not engine.finished, engine.snapshot()
-        assert time.monotonic() < deadline, engine.snapshot()
-        time.sleep(0.01)
+def asked(engine: Engine) -> Prompt:
+    prompt = until(engine, lambda now: now.prompt is not None).prompt
+    assert prompt is not None
     return prompt
 
 
 def pressing(lab: Lab, engine: Engine) -> None:
-    deadline = time.monotonic() + 60.0
-    while lab.rig.world.tool().z_mm > 117.0:
-        assert not engine.finished, engine.snapshot()
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
+    until(engine, lambda _now: lab.rig.world.tool().z_mm <= 117.0)
 
 
 @pytest.mark.parametrize("mode", [SafetyMode.PROTECTIVE_STOP, SafetyMode.SAFEGUARD_STOP])
@@ -75,11 +67,8 @@ def test_an_answer_before_the_stop_is_released_is_asked_again_and_moves_nothing(
     first = asked(engine)
     where = lab.rig.world.tool()
     assert engine.answer(first.number, "g")
-    deadline = time.monotonic() + 30.0
-    while (second := engine.snapshot().prompt) is None or second.number == first.number:
-        assert not engine.finished, engine.snapshot()
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    second = until(engine, lambda now: now.prompt is not None and now.prompt.number != first.number).prompt
+    assert second is not None
     assert "ProtectiveStop" in second.question
     assert lab.rig.world.tool() == where
     assert engine.answer(second.number, "x")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -17,7 +16,8 @@ from collect.quality.verdict import Verdict
 from drivers.sim.brush.flaws import Flaw
 from sessions.journal.journal import replay
 from sessions.reader import Recording
-from tests.collect.until import wait_for_end
+from tests.collect.until import until, wait_for_end
+from tests.waiting import wait_until
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -36,13 +36,15 @@ def answered(engine: Engine, answer: str, *, over: Callable[[Snapshot], bool]) -
     """Run, answering every question the same way; the questions."""
     engine.start()
     asked: dict[int, str] = {}
-    deadline = time.monotonic() + 60.0
-    while not over(now := engine.snapshot()) and not engine.finished:
-        assert time.monotonic() < deadline, now
-        if now.prompt is not None and now.prompt.number not in asked:
+
+    def answering() -> bool:
+        now = engine.snapshot()
+        if now.prompt is not None and now.prompt.number not in asked and not over(now):
             asked[now.prompt.number] = now.prompt.question
             assert engine.answer(now.prompt.number, answer)
-        time.sleep(0.01)
+        return over(now) or engine.finished
+
+    wait_until(answering, "the end of the questions")
     wait_for_end(engine)
     return list(asked.values())
 
@@ -105,11 +107,8 @@ def test_a_full_sheet_is_changed_on_the_screen_and_the_run_goes_on(sharp_lab: La
     sharp_lab.write_protocol("[13.0, 15.0]", "[0.0]")
     engine = sharp_lab.engine(watched=True)
     engine.start()
-    deadline = time.monotonic() + 60.0
-    while (prompt := engine.snapshot().prompt) is None:
-        assert not engine.finished, engine.snapshot()
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    prompt = until(engine, lambda now: now.prompt is not None).prompt
+    assert prompt is not None
     assert "Sheet 1 is full" in prompt.question
     sharp_lab.rig.world.fresh_sheet()
     assert engine.answer(prompt.number, "g")

@@ -35,6 +35,7 @@ from sessions.recording.schemas import Topic, Wrench
 from sessions.recording.writer import Outgoing
 from sessions.repair.verify import verify_session
 from tests.command import brushloop
+from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -67,7 +68,7 @@ class Viewer:
 
     @classmethod
     def connect(cls, port: int) -> Viewer:
-        viewer = cls(socket.create_connection((HOST, port), timeout=10.0))
+        viewer = cls(socket.create_connection((HOST, port), timeout=PATIENCE_S))
         key = base64.b64encode(os.urandom(16)).decode()
         head = f"GET / HTTP/1.1\r\nHost: {HOST}:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
         head += f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n"
@@ -292,7 +293,7 @@ def test_a_run_with_a_viewer_shows_what_it_records_and_records_the_same(lab: Lab
     thread = threading.Thread(target=look)
     thread.start()
     assert start(opening, on_screen=False, live=live) == 0
-    thread.join(timeout=10.0)
+    thread.join(timeout=PATIENCE_S)
     [folder] = lab.sessions.iterdir()
     assert verify_session(folder).sound
     recorded = set(container.indexed_counts(folder / f"{folder.name}.mcap"))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import pytest
 
 from collect.engine.control import State
@@ -16,6 +14,7 @@ from sessions.reader import Recording
 from sessions.remarks import mark_bad_or_good
 from tests.collect.conftest import Lab
 from tests.collect.until import until, wait_for_end
+from tests.waiting import wait_until
 
 
 def answer(engine: Engine, words: str, key: str) -> None:
@@ -23,10 +22,9 @@ def answer(engine: Engine, words: str, key: str) -> None:
     assert now.prompt is not None
     number = now.prompt.number
     assert engine.answer(number, key)
-    deadline = time.monotonic() + 10.0
-    while (prompt := engine.snapshot().prompt) is not None and prompt.number == number:
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
+    wait_until(
+        lambda: (prompt := engine.snapshot().prompt) is None or prompt.number != number, "the answer to be taken"
+    )
 
 
 def lines(lab: Lab, event: str) -> list[dict[str, object]]:

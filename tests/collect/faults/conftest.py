@@ -21,6 +21,7 @@ from drivers.clock import HostClock
 from drivers.sim.config import SimConfig, View
 from drivers.sim.rig import LoopbackRig
 from drivers.sim.world import SimClock
+from tests.waiting import PATIENCE_S
 
 FAST = 300.0
 CONFIRM_S = 1.2
@@ -100,7 +101,7 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
 
     thread = threading.Thread(target=lambda: asyncio.run(serve()), name="loopback rig", daemon=True)
     thread.start()
-    rig, loop, over = ready.result(timeout=30)
+    rig, loop, over = ready.result(timeout=PATIENCE_S)
     text = rig.toml().replace("latency_ms = 250.0", f"latency_ms = 60.0\ntimeout_s = {CAMERA_TIMEOUT_S}")
     text = re.sub("least_dwell_s = .*", "", text)  # a phase is struck at half real speed
     (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
@@ -109,5 +110,5 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
         patch.setattr(stopping, "CONFIRM_S", CONFIRM_S)
         yield Stage(rig, loop, gears, tmp_path)
     loop.call_soon_threadsafe(over.set)
-    thread.join(timeout=30)
+    thread.join(timeout=PATIENCE_S)
     assert not thread.is_alive(), "waited 30 s for the loopback rig to end"

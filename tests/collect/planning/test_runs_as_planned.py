@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
 
 import pytest
@@ -21,6 +20,7 @@ from drivers.samples import Pose
 from tests.collect.conftest import Lab
 from tests.collect.sent import not_checked, not_sent, noting
 from tests.collect.until import wait_for_end
+from tests.waiting import wait_until
 
 EXTRAS = """
 [ink.wipe]
@@ -88,12 +88,13 @@ def run(lab: Lab, protocol: str, extra: str = EXTRAS) -> None:
     (lab.folder / "protocol.toml").write_text(protocol, encoding="utf-8")
     engine = lab.engine(watched=True)
     engine.start()
-    deadline = time.monotonic() + 60.0
-    while not engine.finished:
-        assert time.monotonic() < deadline, engine.snapshot()
+
+    def answering() -> bool:
         if (prompt := engine.snapshot().prompt) is not None:
             engine.answer(prompt.number, "t")
-        time.sleep(0.01)
+        return engine.finished
+
+    wait_until(answering, "the end of the run")
     wait_for_end(engine)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from sessions.journal.journal import JOURNAL_NAME, replay
 from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 from tests.collect.until import wait_for_end
+from tests.waiting import PATIENCE_S, wait_until
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -133,7 +133,7 @@ def test_a_cell_that_shows_no_stroke_twice_is_not_chosen_again() -> None:
 
 def test_a_rig_pc_chooses_without_torch() -> None:
     code = "import sys, collect.engine.steps.choose, calibrate.fit.stepwise; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=PATIENCE_S).returncode == 0
 
 
 def adaptive_lab(lab: Lab, enough: float) -> Lab:
@@ -189,7 +189,7 @@ def test_killed_again_and_again_it_presses_each_choice_once(lab: Lab) -> None:
         assert now[: len(known)] == known, "an earlier choice changed"
         known = now
     process = lab.process()
-    _, stderr = process.communicate(timeout=120)
+    _, stderr = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, stderr
     *made, last = choices(lab)
     assert made[: len(known)] == known
@@ -211,14 +211,10 @@ def test_killed_again_and_again_it_presses_each_choice_once(lab: Lab) -> None:
 
 def wait_for(lab: Lab, kind: str, process: subprocess.Popen[str]) -> None:
     """Until a step of that kind begins that had not begun when this was called."""
-    deadline = time.monotonic() + 60.0
 
     def begun() -> int:
         lines = [line for path in lab.sessions.glob(f"*/{JOURNAL_NAME}") for line in read_lines(path)]
         return sum(1 for line in lines if line["event"] == "begin" and line["kind"] == kind)
 
     known = begun()
-    while begun() <= known + (kind == "choose"):
-        assert process.poll() is None, "over too early"
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
+    wait_until(lambda: begun() > known + (kind == "choose"), f"a step {kind}", process=process)

@@ -25,6 +25,7 @@ from drivers.clock import HostClock
 from drivers.sim.lab.lab import UnknownLab
 from drivers.sim.lab.seen import Seen, truth
 from drivers.sim.lab.traps import Trap
+from tests.waiting import PATIENCE_S
 
 KIND = {"ink-station": "i", "modbus-pump": "p"}
 
@@ -139,12 +140,12 @@ def in_lab(seed: int, trap: Trap | None = None, **options: Any) -> Iterator[InLa
 
     thread = threading.Thread(target=lambda: asyncio.run(serve()), name="unknown lab", daemon=True)
     thread.start()
-    lab, loop, over = ready.result(timeout=60)
+    lab, loop, over = ready.result(timeout=PATIENCE_S)
     try:
         yield InLab(lab, loop)
     finally:
         loop.call_soon_threadsafe(over.set)
-        thread.join(timeout=30)
+        thread.join(timeout=PATIENCE_S)
         assert not thread.is_alive(), "waited 30 s for the lab to end"
 
 

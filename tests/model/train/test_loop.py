@@ -16,6 +16,7 @@ from model.train.data import Exact, batch_numbers, exact_sets
 from model.train.distributed import Group
 from model.train.errors import BlankOutput, Diverged, TrainingStopped
 from model.train.loop import converged, learning_rate, new_state, train
+from tests.waiting import PATIENCE_S
 
 
 def same(a: State, b: State) -> bool:
@@ -77,7 +78,7 @@ def test_batches_are_drawn_while_earlier_ones_are_in_use(tiny: TrainConfig) -> N
     training = exact_sets(tiny)[0]
     with closing(batches(tiny, Noted(training.target, training.inputs), Group(), 0)) as ahead:
         next(ahead)
-        assert all(drawn.acquire(timeout=10) for _ in range(3))  # the first and two more
+        assert all(drawn.acquire(timeout=PATIENCE_S) for _ in range(3))  # the first and two more
 
 
 def test_asked_to_stop_it_keeps_the_last_step(tiny: TrainConfig, notes) -> None:

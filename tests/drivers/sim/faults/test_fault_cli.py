@@ -5,20 +5,20 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from drivers.sim.fault_client import FaultRefused, ask, request_of
+from tests.waiting import PATIENCE_S, wait_until
 
 NOTHING: dict[str, object] = {"on": None, "count": None, "id": None}
 
 
 def brushloop(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "brushloop", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
 
 
 @pytest.fixture
@@ -28,14 +28,10 @@ def served(tmp_path: Path) -> Iterator[Path]:
     path = tmp_path / "control"
     command = [sys.executable, "-m", "brushloop", "sim", "--faults", str(script), "--control", str(path)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 30.0
-    while not path.exists():
-        assert process.poll() is None, process.stderr.read() if process.stderr else ""
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    wait_until(path.exists, "the control socket", process=process)
     yield path
     process.terminate()
-    _, stderr = process.communicate(timeout=10)
+    _, stderr = process.communicate(timeout=PATIENCE_S)
     assert stderr == ""
     assert not path.exists()
 
