@@ -36,26 +36,46 @@ LONGEST = (
     "tests/collect/tui/test_session.py",
     "tests/collect/quality",
     "tests/calibrate/validate",
+    "tests/calibrate/compare",
+    "tests/calibrate/invert",
+    "tests/calibrate/fit",
     "tests/collect/durability",
     "tests/collect/faults",
     "tests/collect/test_soak.py",
-    "tests/model/train",
+    "tests/model",
+    "tests/contract/test_rig_option.py",
     "tests/sessions/test_kill.py",
     "tests/sessions/test_repair_everywhere.py",
     "tests/test_bench.py",
 )
 """They come first, so that no worker is left alone with one of them at the end."""
 
+TOGETHER = {
+    "tests/calibrate/validate/": "comparing",
+    "tests/calibrate/compare/": "comparing",
+    "tests/calibrate/invert/": "comparing",
+    "tests/calibrate/fit/": "comparing",
+    "tests/calibrate/loop/": "comparing",
+    "tests/calibrate/writing/": "comparing",
+    "tests/model/": "model",
+}
+"""What one worker runs: its first test imports and compiles for ten seconds, which the others then do without."""
 
+
+@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: not item.nodeid.startswith(LONGEST))  # stable: otherwise the order stays
+    for item in items:
+        for folder, group in TOGETHER.items():
+            if item.nodeid.startswith(folder) and item.get_closest_marker("xdist_group") is None:
+                item.add_marker(pytest.mark.xdist_group(group))
 
 
 @pytest.fixture(autouse=True)
 def no_thread_outlives_the_test() -> Iterator[None]:
     before = set(threading.enumerate())
     yield
-    deadline = time.monotonic() + 2.0
+    deadline = time.monotonic() + 30.0  # for a busy machine
     while True:
         left = [t for t in set(threading.enumerate()) - before if t.is_alive() and not t.name.startswith(TOLERATED)]
         if not left or time.monotonic() > deadline:

@@ -18,13 +18,15 @@ from collect.engine.engine import Engine
 from collect.engine.open_or_resume import Opening, find_resumable, open_store
 from drivers.arcs.rpc import RpcConnection
 from drivers.clock import HostClock
+from drivers.force import stream
 from drivers.sim.brush.flaws import Flaw
 from drivers.sim.config import SimConfig, Table, View
 from drivers.sim.rig import LoopbackRig
+from tests.collect.until import wait_for_end
 from tests.waiting import PATIENCE_S
 
 OPTIONS = ("--out", "--config", "--protocol")
-SMALL_VIEW = View(width_px=512, height_px=384, px_per_mm=1.56, fps=50.0)
+SMALL_VIEW = View(width_px=512, height_px=384, px_per_mm=1.56, fps=25.0)
 SMALL_TABLE = Table(
     sheet_mm=(110.0, 80.0),
     board_origin_mm=(-20.0, -20.0),
@@ -42,8 +44,9 @@ RPC_TIMEOUT_S = 10.0
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The simulated cabinet may have to wait for its turn on a busy machine, and has ten times as long to answer."""
+    """The simulated cabinet and the force board may have to wait for their turn on a busy machine."""
     monkeypatch.setitem(RpcConnection.__init__.__kwdefaults__, "timeout_s", RPC_TIMEOUT_S)
+    monkeypatch.setattr(stream, "SILENT_S", PATIENCE_S)
 
 
 @contextmanager
@@ -164,7 +167,7 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Collected:
         lab.write_protocol(tilts="[0.0, 10.0]")
         engine = lab.engine()
         engine.start()
-        engine.join()
+        wait_for_end(engine)
     return Collected(lab, engine)
 
 

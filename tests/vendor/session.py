@@ -114,7 +114,7 @@ def blend(robot: Any) -> None:
     start = state.getTcpPose()
     corner, end = shifted(start, 0.04), [start[0] + 0.04, start[1] + 0.04, *start[2:]]
     motion.stopMove(True, True)
-    SEEN["blend sent"] = [motion.moveLine(pose, 1.0, 0.1, 0.015, 0.0) for pose in (corner, end)]
+    SEEN["blend sent"] = [motion.moveLine(pose, 1.0, 0.02, 0.015, 0.0) for pose in (corner, end)]
     SEEN["blend start"] = motion.startMove()
     nearest, ids, blending = 1.0, set(), False
     while not at_rest():

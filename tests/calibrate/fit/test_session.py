@@ -21,8 +21,6 @@ from drivers.sim.brush.brush import Brush, BrushSpec
 from model.fitted import NAME
 from sessions.imports.photographs import ImportOptions, import_photographs
 
-pytestmark = pytest.mark.xdist_group("fitted")  # one session of photographs
-
 CELLS = [(11.0, 0.0), (11.0, 10.0), (15.0, 5.0), (20.0, 0.0), (20.0, 10.0)]
 VIEW = Field(mm_per_px=0.4)
 

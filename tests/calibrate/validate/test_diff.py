@@ -13,8 +13,6 @@ from brushloop import app
 from calibrate.errors import CalibrationError
 from calibrate.validate.diff import compare
 
-pytestmark = pytest.mark.xdist_group("diff")  # validated once
-
 MODELS = ("--model", "line", "--model", "ellipse", "--no-held-out")
 
 

@@ -17,8 +17,6 @@ from model.train.checkpoint import load_generator, load_weights
 from model.train.data import load_captures
 from model.train.errors import TrainError
 
-pytestmark = pytest.mark.xdist_group("generator")  # trained once
-
 # One word a line, as the file's owner would write it.
 TRAINING = """
 steps = 250

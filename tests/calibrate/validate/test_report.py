@@ -23,8 +23,6 @@ from sessions.reader import Recording
 from sessions.remarks import Remark, add_remark
 from tests.calibrate.validate.browser import BROWSER, content_widths_px
 
-pytestmark = pytest.mark.xdist_group("report")  # validated once
-
 MODELS = ("ccd-bsm", "bezier", "bezier-refitted", "ellipse", "line", "circle", "qbc", "another press")
 
 

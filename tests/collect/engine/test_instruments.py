@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,7 @@ from drivers.ink.port import InkRefused
 from drivers.sim.faults.kinds import ForceFault
 from sessions.journal.journal import replay
 from sessions.recording.schemas import Topic
-from tests.collect.until import wait_for_end
+from tests.collect.until import until, wait_for_end
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -97,14 +96,12 @@ def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_d
         return push_n(depth_mm, tilt_deg)
 
     monkeypatch.setattr(lab.rig.world.reaction, "push_n", silent_once)
-    monkeypatch.setattr("drivers.force.stream.SILENT_S", 30.0)  # the bus is there
     text = (lab.folder / "rig.toml").read_text(encoding="utf-8").replace("stale_ms = 1000.0", "stale_ms = 600.0")
     (lab.folder / "rig.toml").write_text(text, encoding="utf-8")
     slowly(lab)
     engine = lab.engine()
     engine.start()
-    while engine.snapshot().voids == 0 and not engine.finished:
-        time.sleep(0.005)
+    until(engine, lambda now: now.voids > 0)
     board._faults.clear()
     wait_for_end(engine)
 

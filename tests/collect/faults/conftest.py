@@ -89,7 +89,7 @@ class Stage:
 def stage(tmp_path: Path) -> Iterator[Stage]:
     ready: Future[tuple[LoopbackRig, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
     gears = Gears()
-    view = View(width_px=512, height_px=384, px_per_mm=1.56, fps=30.0)
+    view = View(width_px=512, height_px=384, px_per_mm=1.56, fps=20.0)
 
     async def serve() -> None:
         over = asyncio.Event()

@@ -26,8 +26,6 @@ from tests.collect.until import wait_for_end
 if TYPE_CHECKING:
     from conftest import Stage
 
-BOUND_S = 40.0
-
 
 @dataclass
 class Disk:
@@ -65,7 +63,7 @@ def run(stage: Stage) -> tuple[BaseException | None, State]:
     engine = stage.engine()
     engine.start()
     try:
-        wait_for_end(engine, BOUND_S)
+        wait_for_end(engine)
     except Exception as error:
         return error, engine.snapshot().state
     return None, engine.snapshot().state

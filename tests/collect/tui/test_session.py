@@ -23,7 +23,6 @@ from collect.tui.review_screen import ReviewScreen
 from collect.tui.run_screen import RunScreen
 from collect.tui.set_up_screen import SetUpScreen
 from collect.tui.start_screen import StartScreen
-from drivers.force import stream
 from sessions.reader import Recording
 from sessions.remarks import remarks_of
 from sessions.repair.verify import verify_session
@@ -119,9 +118,8 @@ class Day:
 
 
 @pytest.fixture
-def day(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Day]:
+def day(tmp_path: Path) -> Iterator[Day]:
     """A camera sharp enough to judge by, and a force sensor that may have to wait for the rest of a busy machine."""
-    monkeypatch.setattr(stream, "SILENT_S", PATIENCE_S)
     rig_toml = tmp_path / "rig.toml"
     with started("tests.collect.tui.rig_process", str(rig_toml), str(RATE)) as rig:
         text = rig_toml.read_text(encoding="utf-8").replace("latency_ms = 250.0", "latency_ms = 1500.0")
