@@ -13,6 +13,7 @@ import pytest
 
 from drivers.sim.config import SimConfig
 from drivers.sim.rig import LoopbackRig
+from tests.waiting import PATIENCE_S
 
 pytestmark = [
     pytest.mark.xdist_group("vendor"),  # one session for all of them
@@ -41,7 +42,7 @@ async def run_session() -> dict[str, Any]:
 
 async def one_session() -> tuple[int, str, int]:
     """(exit code, negative for a signal; everything it printed; RTDE pings that the server saw)."""
-    async with LoopbackRig(SimConfig(rate=20.0)) as rig:
+    async with LoopbackRig(SimConfig(rate=5.0)) as rig:
         process = await asyncio.create_subprocess_exec(
             sys.executable,
             str(SESSION),
@@ -51,7 +52,7 @@ async def one_session() -> tuple[int, str, int]:
             stderr=asyncio.subprocess.STDOUT,
         )
         try:
-            async with asyncio.timeout(60.0):
+            async with asyncio.timeout(PATIENCE_S):
                 output, _ = await process.communicate()
         except TimeoutError:
             process.kill()
