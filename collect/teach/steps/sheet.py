@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections import defaultdict
 
 import numpy as np
 
+from calibrate.board.artefact import read_lens
+from calibrate.board.detect import find_board
 from calibrate.board.spec import BoardSpec
+from calibrate.errors import CalibrationError
+from collect.teach.arm_reader import ArmReader
+from collect.teach.cameras import still, taught_camera
 from collect.teach.day import Day
 from collect.teach.errors import CannotTeach
 from collect.teach.guide import Target, TargetKind
 from collect.teach.maths.sheet import CORNERS, Point, SheetFit, check_board, corners_of, fit_sheet
+from collect.teach.maths.sheet_seen import OFF_MM, check_seen, seen_margins, touched_margins
 from collect.teach.maths.tip import tip_of
 from collect.teach.store import Notebook, StepName, Taught, now_utc
 
@@ -21,6 +28,7 @@ GOOD_MM = 0.13
 """Standard error of the sheet's origin, in each axis, at which touching ends."""
 MOST_ROUNDS = 5
 WORST_MM = 0.25
+VIEW, SEEN = "sheet-view", "aside.sheet_seen"
 INSET_MM = 2.0
 """Distance of the touch point from the sheet's edges: beside every cell."""
 
@@ -55,9 +63,23 @@ class SheetStep:
                     fit = fitted(day.notebook)
                 await day.say(*in_words(fit))
                 if fit.origin_sigma_mm <= GOOD_MM:
-                    return
-        with day.touched_again_if_refused(BOARD, SHEET):
-            check_known(fitted(day.notebook))
+                    break
+            with day.touched_again_if_refused(BOARD, SHEET):
+                check_known(fitted(day.notebook))
+            if SEEN not in day.notebook.values:
+                await self._seen(day, reader)
+
+    async def _seen(self, day: Day, reader: ArmReader) -> None:
+        """Compare the touched sheet with the one that the camera sees on the board. Raises `CannotTeach`."""
+        how = "Guide the arm so far away that it hides neither board nor sheet from the camera."
+        if await day.touch(reader, Target("clear-view", 1), how, f"{VIEW} 0") is None:
+            found = "not checked against the camera: the arm was in its way"
+        else:
+            await day.working("looking for the sheet's edges on the board")
+            with day.touched_again_if_refused(BOARD, SHEET, VIEW):
+                found = await _compared(day)
+        await day.say(f"The sheet: {found}.", tone="warning" if found.startswith("not") else "finding")
+        day.keep("sheet", SEEN, found, "the edges of the sheet on the board, in one picture")
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """Everything that follows from the touched corners and the tip."""
@@ -65,7 +87,7 @@ class SheetStep:
         touches = len(notebook.touched(BOARD)) + len(notebook.touched(SHEET))
         worst_mm = max(fit.residuals_mm.values())
         by_hand = f"{touches} corners of board and sheet touched by hand"
-        known = f"residuals up to {worst_mm:.2f} mm"
+        known = f"residuals up to {worst_mm:.2f} mm; {notebook.get(SEEN) or 'not checked against the camera'}"
         point = touch_point(fit)
 
         def taught(
@@ -92,12 +114,33 @@ class SheetStep:
 
     def forget(self, notebook: Notebook) -> Notebook:
         """Without the touches of both."""
-        return notebook.without_touches(BOARD, SHEET)
+        kept = {field: taught for field, taught in notebook.values.items() if field != SEEN}
+        return notebook.without_touches(BOARD, SHEET, VIEW).model_copy(update={"values": kept})
 
     def summary(self, notebook: Notebook) -> str:
         """Origin and turn."""
         x, y = notebook.numbers("paper.origin_mm")
         return f"origin ({x:.1f}, {y:.1f}) mm, turned by {notebook.number('paper.yaw_deg'):.2f} deg"
+
+
+async def _compared(day: Day) -> str:
+    """What the camera says of the touched sheet. Raises `CannotTeach` where it sees it elsewhere."""
+    spec, fit = board_of(day.notebook), fitted(day.notebook)
+    touched = touched_margins(fit.board_origin_mm, fit.size_mm, spec)
+    try:
+        async with taught_camera(day.notebook, day.clock) as camera:
+            picture = await still(camera, day.clock)
+        if (file := day.notebook.get("camera.lens_file")) is not None:
+            lens = read_lens(day.rig_path.parent / str(file)).lens()
+            lens.check_size(picture, "camera")
+            picture = lens.undistort(picture)
+        view = await asyncio.to_thread(find_board, picture, spec, "camera")
+        seen = await asyncio.to_thread(seen_margins, picture, view, spec, touched)
+    except CalibrationError as error:
+        return f"not checked against the camera: {error.what}"
+    if seen is None:
+        return "not checked against the camera: it does not see all edges of the sheet"
+    return f"the camera sees its edges within {check_seen(seen, touched):.1f} mm (at most {OFF_MM:g})"
 
 
 def touch_point(fit: SheetFit) -> tuple[float, float]:
