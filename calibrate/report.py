@@ -6,6 +6,7 @@ import base64
 import hashlib
 import io
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar, cast
@@ -22,6 +23,7 @@ from sessions.recording.schemas import Source
 Image = NDArray[np.float32]
 PAPER = "#fbf9f4"
 """Background of picture files."""
+REMARK = re.compile(r"\(([^()]+)\)$")
 
 
 def render(template: str, **values: Any) -> str:
@@ -57,11 +59,21 @@ def write_files(folder: Path, texts: Mapping[str, str]) -> None:
         write_whole(folder / name, text)
 
 
-def source_note(source: Source) -> str:
+def source_label(source: Source, brushes: Iterable[str] = ()) -> str:
+    """The label of tables and figures: the source, and what the names of simulated brushes remark.
+
+    A remark is what a described brush (`brushloop sim --brush FILE`) has in brackets at the end of its name.
+    """
+    found = [REMARK.search(brush) for brush in brushes] if source is Source.LOOPBACK else []
+    return ", ".join((str(source), *dict.fromkeys(f"brush {one[1]}" for one in found if one)))
+
+
+def source_note(source: Source, brush: str = "") -> str:
     """One sentence on where the ink comes from."""
     match source:
         case Source.LOOPBACK:
-            return "loopback rig: simulated brush, ink and camera; not a result on paper"
+            remark = source_label(source, (brush,)).removeprefix(str(source))
+            return f"loopback rig: simulated brush, ink and camera; not a result on paper{remark}"
         case Source.REAL:
             return "real capture: ink on paper, pressed by the arm named below"
         case Source.IMPORT:

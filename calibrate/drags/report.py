@@ -45,7 +45,7 @@ def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
     page = render(
         "drags.html.j2",
         header=validation.header,
-        note=source_note(validation.header.source),
+        note=source_note(validation.header.source, validation.header.brush),
         refused=results.refused,
         provenance=_provenance(validation, command),
         strokes=len(results.strokes),

@@ -100,8 +100,8 @@ def _drag_tables(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:
     from calibrate.report import source_note
 
     yield (
-        f"{source_note(drawn.header.source)}; {artefact.strokes} dragged strokes in {artefact.images} images; "
-        f"condition number {artefact.condition:.3g}"
+        f"{source_note(drawn.header.source, drawn.header.brush)}; "
+        f"{artefact.strokes} dragged strokes in {artefact.images} images; condition number {artefact.condition:.3g}"
     )
     for name, why in drawn.refused:
         yield f"left out: {name}: {why}"
@@ -144,7 +144,7 @@ def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
     from model.fitted import PARAMETERS
 
     artefact = fitted.artefact
-    yield f"{source_note(captures.header.source)}; {len(captures.strokes)} presses fitted"
+    yield f"{source_note(captures.header.source, captures.header.brush)}; {len(captures.strokes)} presses fitted"
     for name, why in captures.refused:
         yield f"left out: {name}: {why}"
     out = Table("parameter", "unit", "published", "fitted", "95 %", title="brush")

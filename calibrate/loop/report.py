@@ -48,7 +48,7 @@ def write_loop(loop: LoopComparison, folder: Path, command: str) -> Path:
         header=header,
         again=loop.again.header,
         source=source,
-        note=source_note(source),
+        note=source_note(source, header.brush),
         model=loop.model,
         in_sample=loop.in_sample,
         goal=f"{GOAL_POINTS:g}",

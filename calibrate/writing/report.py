@@ -40,7 +40,7 @@ def write_written(written: WritingComparison, folder: Path, command: str) -> Pat
     page = render(
         "written.html.j2",
         header=written.header,
-        note=source_note(written.header.source),
+        note=source_note(written.header.source, written.header.brush),
         names=" ".join(one.name for one in written.characters),
         writings=sum(len(one.captured) for one in written.characters),
         model=written.plan.model,

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict
 
 from calibrate.compare.field import Alignment, Tone
 from calibrate.loop.scores import LoopRecord
-from calibrate.report import Sealed, load_sealed
+from calibrate.report import Sealed, load_sealed, source_label
 from calibrate.writing.scores import WrittenRecord
 from sessions.recording.schemas import Source
 
@@ -187,7 +187,7 @@ class Report(Sealed):
     @property
     def label(self) -> str:
         """Label of every table and figure."""
-        return str(self.source)
+        return source_label(self.source, (session.brush for session in self.sessions))
 
 
 def load_report(path: Path) -> Report:

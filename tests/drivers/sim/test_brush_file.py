@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import brushloop
 from bench.brushfit_brushes import FROZEN
 from drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
-from drivers.sim.brush_file import BrushFileError, load_brush
+from drivers.sim.brush_file import PAPER, BrushFileError, load_brush
 from drivers.sim.serve import LabRefused
 
 PRESSED = (
@@ -64,6 +64,17 @@ def test_a_name_that_would_not_fit_in_a_rig_toml_is_refused(tmp_path: Path, name
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BrushFileError, match="no such file"):
         load_brush(tmp_path / "brush.toml")
+
+
+@pytest.mark.parametrize(("depth_mm", "width_mm"), [(11.0, 8.67), (20.0, 15.77)])
+def test_the_paper_s_brush_marks_nearly_as_wide_as_ccd_bsm_says_and_says_for_what_it_was_made(
+    depth_mm: float, width_mm: float
+) -> None:
+    found = load_brush(Path(PAPER))
+    assert "made to agree with the paper's Table 2: no evidence for the model" in found.name
+    mark = Brush(found.spec).press(depth_mm, 5.0, ink_load=1.0, press_seed=1)
+    width = (mark.density > 0.4).sum(axis=0) / mark.px_per_mm
+    assert 0.8 < width.max() / width_mm < 1.2
 
 
 def test_the_rig_is_served_with_the_brush_and_records_its_name(tmp_path: Path) -> None:

@@ -1,0 +1,20 @@
+"""The label that every table and figure carries."""
+
+from __future__ import annotations
+
+from calibrate.report import source_label, source_note
+from sessions.recording.schemas import Source
+
+MADE = "simulated bristle bundle, paper (made to agree with the paper's Table 2: no evidence for the model)"
+
+
+def test_the_remark_of_a_described_brush_is_part_of_the_label() -> None:
+    remark = "brush made to agree with the paper's Table 2: no evidence for the model"
+    assert source_label(Source.LOOPBACK, [MADE, MADE]) == f"loopback rig, {remark}"
+    assert source_note(Source.LOOPBACK, MADE).endswith(f"not a result on paper, {remark}")
+
+
+def test_the_label_of_any_other_brush_is_its_source() -> None:
+    assert source_label(Source.LOOPBACK, ["simulated bristle bundle, seed 1"]) == "loopback rig"
+    assert source_label(Source.REAL, ["Langhao brush (12 mm)"]) == "real capture"
+    assert source_note(Source.REAL, "Langhao brush (12 mm)") == source_note(Source.REAL)
