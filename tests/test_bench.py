@@ -10,7 +10,7 @@ import cv2
 import pytest
 
 import bench.__main__
-from bench import footprints, raster, rpc, table
+from bench import footprints, paper_brush, raster, rpc, table
 from bench.harness import BenchError, Result, interleave, percentile, results_of
 from bench.peak import measure
 from bench.processes import started
@@ -148,3 +148,10 @@ def test_unknown_name_is_one_line_and_exit_code_2() -> None:
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr == f"unknown bench 'rasta'; known: {', '.join(bench.__main__.benches())}\n"
+
+
+def test_no_outline_has_both_the_paper_s_csim_and_its_ssim_with_the_circle() -> None:
+    bound = paper_brush.circle_bound(seed=1)
+    assert 50.0 < bound.value < 55.0
+    assert bound.ratio == pytest.approx(bound.value / 60.23)
+    assert paper_brush.CHECKED not in paper_brush.SEARCHED
