@@ -78,6 +78,8 @@ def source_note(source: Source, brush: str = "") -> str:
             return "real capture: ink on paper, pressed by the arm named below"
         case Source.IMPORT:
             return "imported photographs: not collected by brushloop; scale and commands come from their table"
+        case Source.IMPORT_SIMULATED:
+            return "imported simulation: simulated ink, as declared when it was imported; not a result on paper"
 
 
 def png_uri(data: bytes) -> str:

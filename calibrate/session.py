@@ -19,7 +19,7 @@ from calibrate.errors import CalibrationError
 from calibrate.stroke.params import Params
 from sessions.reader import Recording
 from sessions.recording.messages import decode_gray
-from sessions.recording.schemas import Source, Stroke
+from sessions.recording.schemas import Stroke
 
 FITTED = "k1 fitted on the board"
 
@@ -31,7 +31,7 @@ def calibrate_session(session: Path, lens: Path | None = None) -> Path:
     unknown lens that visibly distorts.
     """
     recording = Recording(session)
-    if recording.header.source == Source.IMPORT:
+    if recording.header.source.imported:
         raise CalibrationError(str(recording.path), "is an import and brings its own scale: go on with `validate`")
     where = str(recording.path)
     spec, known = board_of(recording), known_lens(recording, lens)
@@ -71,7 +71,7 @@ def apply_calibration(path: Path, session: Path, *, force: bool = False) -> Path
     """
     recording, given = Recording(session), load_artefact(path, Calibration)
     folder = recording.path.parent
-    if recording.header.source == Source.IMPORT:
+    if recording.header.source.imported:
         raise CalibrationError(str(recording.path), "is an import and brings its own scale: nothing is applied to it")
     if given.recording_sha256 == recording.sha256:
         return put_to_use(given, folder)

@@ -26,6 +26,7 @@ Origin = Annotated[str, typer.Option(help="Where they come from, kept in the rec
 Brush = Annotated[str, typer.Option(help="What is known of the brush.")]
 Radius = Annotated[float | None, typer.Option(min=0.5, max=50.0, help="R of the brush; 6 where it is not given.")]
 Length = Annotated[float | None, typer.Option(min=5.0, max=500.0, help="L of the brush; 48 where it is not given.")]
+Simulated = Annotated[bool, typer.Option("--simulated", help="The ink was simulated; every report says so.")]
 Kind = Annotated[str, typer.Option(help="press (vertical presses) or drag (strokes that travel).")]
 
 app = typer.Typer(help="Inspect, check, repair, import and export recordings.", no_args_is_help=True)
@@ -157,11 +158,12 @@ def import_(
     brush: Brush = "",
     brush_radius_mm: Radius = None,
     brush_length_mm: Length = None,
+    simulated: Simulated = False,
 ) -> None:
     """Turn a folder of photographs with a parameter table into a session that every later command accepts."""
     from sessions.imports.photographs import ImportOptions, import_photographs
 
-    options = ImportOptions(kind, px_per_mm, licence, origin, brush, brush_radius_mm, brush_length_mm)
+    options = ImportOptions(kind, px_per_mm, licence, origin, brush, brush_radius_mm, brush_length_mm, simulated)
     _import(import_photographs, folder, csv, out, options)
 
 
@@ -175,6 +177,7 @@ def import_sequence(
     licence: Licence = "",
     origin: Origin = "",
     brush: Brush = "",
+    simulated: Simulated = False,
 ) -> None:
     """Import a page that was photographed after every stroke; without --csv the frames are taken by name."""
     from sessions.errors import InputError
@@ -190,7 +193,7 @@ def import_sequence(
         if not (1.0 <= width <= 1e5 and 1.0 <= height <= 1e5):
             raise InputError(folder, f"--page-mm is {page_mm!r}, allowed 1 to 100000 mm")
         page = (width, height)
-    options = ImportOptions("drag", px_per_mm, licence, origin, brush)
+    options = ImportOptions("drag", px_per_mm, licence, origin, brush, simulated=simulated)
     _import(run, folder, csv, out, options, page)
 
 
@@ -206,12 +209,13 @@ def import_scans(
     brush: Brush = "",
     brush_radius_mm: Radius = None,
     brush_length_mm: Length = None,
+    simulated: Simulated = False,
 ) -> None:
     """Import flatbed scans; the scale is their dpi, and a sheet is cut into strokes where the table has boxes."""
     from sessions.imports.photographs import ImportOptions
     from sessions.imports.photographs import import_scans as run
 
-    options = ImportOptions(kind, None, licence, origin, brush, brush_radius_mm, brush_length_mm)
+    options = ImportOptions(kind, None, licence, origin, brush, brush_radius_mm, brush_length_mm, simulated)
     _import(run, folder, csv, out, options, dpi)
 
 

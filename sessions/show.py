@@ -22,7 +22,7 @@ from sessions.journal.journal import JOURNAL_NAME, Replay, is_open, read_header,
 from sessions.names import check_folder
 from sessions.reader import Recording
 from sessions.recording import container
-from sessions.recording.schemas import Header, Source, Stroke, Topic
+from sessions.recording.schemas import Header, Stroke, Topic
 from sessions.remarks import remarks_of
 
 DEVICES = ("robot", "robot_firmware", "camera", "lens", "brush", "ink", "paper")
@@ -253,7 +253,7 @@ def _summary(folder: Path) -> Summary | None:
     if renamed is None and not merged.is_file():
         return None
     recording = Recording(renamed or merged)
-    state_name = "imported" if recording.header.source is Source.IMPORT else "closed"
+    state_name = "imported" if recording.header.source.imported else "closed"
     if renamed is not None:
         return Summary(folder.name, "renamed", recording.header.source, recording.strokes(), renamed.name)
     return Summary(folder.name, state_name, recording.header.source, recording.strokes(), merged.name)

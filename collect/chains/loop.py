@@ -19,7 +19,7 @@ from collect.chains.commands import Say, collected_session, run_command
 from collect.errors import ConfigError
 from collect.rig.config import RigConfig, load_rig
 from sessions.reader import Recording
-from sessions.recording.schemas import BareName, Header, Source
+from sessions.recording.schemas import BareName, Header
 
 SETTINGS, RECOVERED, PROTOCOL, PAGE = "settings.json", "recovered.csv", "protocol-replay.toml", "loop.html"
 FITS = "brushfit"
@@ -71,13 +71,13 @@ def run_loop(request: LoopRequest, say: Say) -> Path:
 
 def _check_rig(path: Path, rig: RigConfig, header: Header) -> None:
     """Refuse another brush, which makes other marks, before anything moves."""
-    if header.source is not Source.IMPORT and header.brush != rig.brush.name:
+    if not header.source.imported and header.brush != rig.brush.name:
         raise ConfigError(path, "brush.name", f"{rig.brush.name!r}: the original was pressed with {header.brush!r}")
 
 
 def _fit(request: LoopRequest, recording: Recording, say: Say) -> Path:
     folder = recording.path.parent
-    if recording.header.source is not Source.IMPORT and not artefacts(folder):
+    if not recording.header.source.imported and not artefacts(folder):
         run_command(say, "calibrate", folder)
     if request.fit is not None:
         return request.fit

@@ -52,6 +52,8 @@ class ImportOptions:
     brush_radius_mm: float | None = None
     """R and L of the bundle, for the models of presses; None for the paper's nominal brush."""
     brush_length_mm: float | None = None
+    simulated: bool = False
+    """Declares that the ink was simulated; every report says so."""
 
 
 def import_photographs(
@@ -190,7 +192,7 @@ def store_rows(
         _check(first, opening)
     header = Header(
         session_id=out.name,
-        source=Source.IMPORT,
+        source=Source.IMPORT_SIMULATED if options.simulated else Source.IMPORT,
         software=software,
         brush=options.brush,
         brush_radius_mm=options.brush_radius_mm,

@@ -43,11 +43,18 @@ class Topic(StrEnum):
 
 
 class Source(StrEnum):
-    """Origin of the ink. Set when recording, from what the devices report, and never from configuration."""
+    """Origin of the ink. Set when recording, from what the devices report, and never from configuration; the person who
+    imports pictures of simulated ink declares them as such."""
 
     LOOPBACK = "loopback rig"
     REAL = "real capture"
     IMPORT = "imported photographs"
+    IMPORT_SIMULATED = "imported simulation"
+
+    @property
+    def imported(self) -> bool:
+        """Whether brushloop did not collect it."""
+        return self in (Source.IMPORT, Source.IMPORT_SIMULATED)
 
 
 MIN_PX_PER_MM, MAX_PX_PER_MM = 0.01, 10_000.0

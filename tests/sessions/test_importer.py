@@ -41,6 +41,14 @@ def test_the_brush_is_as_large_as_was_given(make, photos, out, run):
     assert (header.brush_radius_mm, header.brush_length_mm) == (4.0, 31.0)
 
 
+def test_simulated_ink_is_declared_by_who_imports_it(make, photos, out, run):
+    make.photographs(photos, *ROWS)
+    run(ImportOptions(kind="press", simulated=True))
+    source = Recording(out).header.source
+    assert source is Source.IMPORT_SIMULATED
+    assert source.imported
+
+
 def test_the_origin_is_the_folder_and_its_table_unless_it_is_given(make, photos, out, run):
     make.photographs(photos, *ROWS)
     run(ImportOptions())

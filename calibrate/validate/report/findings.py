@@ -49,6 +49,7 @@ def measured(report: Report) -> str:
         Source.LOOPBACK: "The brush, the ink and the photographs are simulated",
         Source.REAL: "A robot arm pressed them on paper, a camera photographed them",
         Source.IMPORT: "They are photographs from elsewhere",
+        Source.IMPORT_SIMULATED: "They are pictures of simulated ink from elsewhere",
     }[report.source]
     return (
         f"{compared} brush presses{where}, from {many}, were compared with what {_count(report)} stroke models predict "
@@ -76,6 +77,7 @@ def verdict(report: Report) -> Iterator[str]:
         Source.LOOPBACK: "The brush and its ink are simulated, so this tests the method and says nothing about paper.",
         Source.REAL: "The ink is real, pressed by the arm and photographed as the recording says.",
         Source.IMPORT: "The photographs come from elsewhere; their scale and commands were not measured here.",
+        Source.IMPORT_SIMULATED: "The ink was simulated elsewhere, so this says nothing about paper.",
     }[report.source]
 
 
@@ -106,7 +108,7 @@ def findings(report: Report) -> Iterator[str]:
             yield f"{rival.label} {rival.basis}, given only the brush's size, H and α, reaches {_interval(stat)}."
     if published:
         yield from _sizes(report)
-    if held is None and report.source != Source.IMPORT:
+    if held is None and not report.source.imported:
         yield "No model was calibrated to this brush: “brushloop fit” does that; then validate again."
 
 
@@ -187,6 +189,8 @@ def trust(report: Report) -> Iterator[Point]:
             yield Point(True, "Real capture: the recording says so itself, and its hash is below.")
         case Source.IMPORT:
             yield Point(None, "Imported photographs: scale and commands come from their table, not measured.")
+        case Source.IMPORT_SIMULATED:
+            yield Point(None, "Imported simulation: the numbers say nothing about ink on paper.")
     strokes = sum(s.strokes for s in report.sessions)
     lost = len({(r.session_id, r.stroke_id) for r in report.refused if "does not predict it" not in r.why})
     if lost:

@@ -15,12 +15,16 @@ from calibrate.artefact import current, load_artefact
 from calibrate.drags.artefact import DragArtefact
 from calibrate.drags.captures import commanded_path, figures_of, read_drags
 from calibrate.drags.fit import chance, fit_drags
+from calibrate.drags.measure import validate_drags
 from calibrate.drags.predict import predictors
+from calibrate.drags.report import DragValidation, write_drags
 from calibrate.drags.run import FOLDER, LAGGING, STAMPS
 from calibrate.errors import CalibrationError
+from calibrate.stroke.params import Params
 from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from model.drag import DragModel
 from sessions.imports.photographs import ImportOptions, import_photographs
+from sessions.reader import Recording
 from sessions.recording.schemas import Header, Source
 
 STROKES = [
@@ -86,6 +90,19 @@ def test_another_session_is_predicted_stroke_by_stroke(session: Path, tmp_path: 
     assert said["over_all"]["predicted"]["csim"] > said["over_all"]["circle stamps"]["csim"]
     assert len(said["strokes"]) == 6
     assert "captured and predicted ink" in (out / "report.html").read_text()
+
+
+def test_a_report_of_simulated_drags_says_so_everywhere(session: Path, tmp_path: Path) -> None:
+    validation = DragValidation(
+        Header(session_id="s", source=Source.IMPORT_SIMULATED, software="test", protocol=""),
+        session / "drags.mcap",
+        "",
+        validate_drags(Recording(session).captures(), Params()),
+    )
+    page = write_drags(validation, tmp_path, "test").read_text()
+    assert page.count("imported simulation") >= 3
+    assert "imported photographs" not in page
+    assert "imported simulation" in (tmp_path / "measured.csv").read_text()
 
 
 def test_a_known_brush_is_adapted_to_the_first_strokes(session: Path) -> None:
