@@ -188,9 +188,14 @@ def _words(scores: Floats) -> str:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """`python -m bench.realink [--quick | SUBSETS [SIZE...]]`: prints each size as soon as it is measured."""
+    """`python -m bench.realink [--quick | SUBSETS [SIZE...]]`: prints each size as soon as it is measured;
+    `--sessions [SPLITS]` measures only one session against the other."""
     quick = "--quick" in arguments
-    numbers = [int(word) for word in arguments if word != "--quick"]
+    numbers = [int(word) for word in arguments if not word.startswith("--")]
+    if "--sessions" in arguments:
+        splits = numbers[0] if numbers else SESSION_SPLITS
+        _print(measure_sessions(splits, 0, QUICK_STEPS if quick else NETWORK_STEPS))
+        return
     subsets = numbers[0] if numbers else 2 if quick else SUBSETS
     try:
         strokes = load()

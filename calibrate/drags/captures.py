@@ -212,7 +212,7 @@ def _photograph(capture: Capture, x_mm: Floats, y_mm: Floats) -> tuple[NDArray[n
         raise CaptureRefused(stroke.stroke_id, "has no scale or no start (start_x_px, start_y_px)")
     anchor = on_raster(stroke.anchor_px, stroke.px_per_mm)
     raster = rescale(capture.image(), stroke.px_per_mm, capture.where)
-    prepared, flags = prepare_drag(raster, anchor, capture.where, Params())
+    prepared, whole, flags = prepare_drag(raster, anchor, capture.where, Params())
     if prepared.cut:
         raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph")
     half = 0.5 * float(x_mm[1] - x_mm[0])
@@ -220,7 +220,7 @@ def _photograph(capture: Capture, x_mm: Floats, y_mm: Floats) -> tuple[NDArray[n
     top = round(anchor[1] - (y_mm[0] + half) * PX_PER_MM)
     height, width = (round(2 * half * len(axis) * PX_PER_MM) for axis in (y_mm, x_mm))
     pad = max(height, width) + abs(left) + abs(top)
-    mask = np.pad(prepared.mask, pad)[top + pad : top + pad + height, left + pad : left + pad + width]
+    mask = np.pad(whole, pad)[top + pad : top + pad + height, left + pad : left + pad + width]
     return _shrunk(mask, x_mm, y_mm), flags
 
 

@@ -10,6 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from calibrate.stroke.components import components, fill_holes
 from calibrate.stroke.measure import outline
 from calibrate.stroke.params import Gray, Mask, Params
 from calibrate.stroke.preprocess import Prepared, preprocess
@@ -26,11 +27,16 @@ FLAGGED_WEIGHT = 0.3
 
 def prepare_drag(
     raster: Gray, anchor_px: tuple[float, float] | None, where: str, params: Params
-) -> tuple[Prepared, tuple[str, ...]]:
-    """Find a drag on its raster, all parts of it, and its defects. Raises `CaptureRefused` as `prepare` does."""
-    prepared = preprocess(raster, anchor_px, where, replace(params, join_mm=max(params.join_mm, JOIN_MM))).prepared
-    glare = tuple(flag for flag in prepared.flags if flag.startswith("glare"))
-    return prepared, (*defects(prepared.mask), *glare)
+) -> tuple[Prepared, Mask, tuple[str, ...]]:
+    """Find a drag on its raster: its connected part, all parts of it, and its defects.
+
+    Raises `CaptureRefused` as `prepare` does.
+    """
+    steps = preprocess(raster, anchor_px, where, params)
+    wide = replace(params, join_mm=max(params.join_mm, JOIN_MM))
+    whole = fill_holes(components(steps.ink, anchor_px, wide).mask, params)
+    glare = tuple(flag for flag in steps.prepared.flags if flag.startswith("glare"))
+    return steps.prepared, whole, (*defects(whole), *glare)
 
 
 def defects(mask: Mask) -> tuple[str, ...]:

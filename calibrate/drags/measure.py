@@ -83,7 +83,7 @@ def _measure(capture: Capture, params: Params) -> Drag:
         raise CaptureRefused(stroke.stroke_id, "has no scale (px_per_mm)")
     raster = rescale(capture.image(), stroke.px_per_mm, capture.where)
     anchor = on_raster(stroke.anchor_px, stroke.px_per_mm) if stroke.anchor_px is not None else None
-    prepared, flags = prepare_drag(raster, anchor, capture.where, params)
+    prepared, _, flags = prepare_drag(raster, anchor, capture.where, params)
     commanded = dict(stroke.commanded)
     if stroke.height_mm is not None:
         commanded["height_mm"] = stroke.height_mm

@@ -238,10 +238,12 @@ def _drags(results: DragResults) -> Table:
     names = sorted({name for drag in results.strokes for name in drag.commanded})
     # The rest of what was commanded is in the CSV and the report: a terminal is 80 columns wide.
     shown = [n for n in (LENGTH_NAME, *DEPTH_NAMES, "tilt_deg") if n in names]
-    heads = [*(f"asked {_short(n)}" for n in shown), "length mm", "width mm", "at middle", "area mm²", "whole"]
+    heads = [*(f"cmd. {_short(n)}" for n in shown), "length mm", "width mm", "at middle", "area mm²", "whole"]
     # As wide as the longest word of its head: a narrow terminal breaks heads between words, never within one.
     columns = [Column(head, min_width=max(len(word) for word in head.split())) for head in heads]
-    out = Table(Column("stroke", overflow="fold"), *columns, title="commanded beside measured", padding=(0, 0, 0, 1))
+    out = Table(
+        Column("stroke", overflow="fold"), *columns, title="commanded (cmd.) beside measured", padding=(0, 0, 0, 1)
+    )
     for drag in results.strokes:
         m = drag.measured
         sizes = (f"{m.length_mm:.2f}", f"{m.width_mm:.2f}", f"{m.mid_width_mm:.2f}", f"{m.area_mm2:.1f}")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from brushloop import app
@@ -17,7 +19,7 @@ from calibrate.drags.captures import commanded_path, figures_of, read_drags
 from calibrate.drags.fit import chance, fit_drags
 from calibrate.drags.measure import validate_drags
 from calibrate.drags.predict import predictors
-from calibrate.drags.report import DragValidation, write_drags
+from calibrate.drags.report import DragValidation, summary, write_drags
 from calibrate.drags.run import FOLDER, LAGGING, STAMPS
 from calibrate.errors import CalibrationError
 from calibrate.stroke.params import Params
@@ -103,6 +105,11 @@ def test_a_report_of_simulated_drags_says_so_everywhere(session: Path, tmp_path:
     assert page.count("imported simulation") >= 3
     assert "imported photographs" not in page
     assert "imported simulation" in (tmp_path / "measured.csv").read_text()
+    with io.StringIO() as narrow:
+        Console(file=narrow, width=80).print(*summary(validation))
+        heads = narrow.getvalue().split("┡")[0]
+    for word in ("stroke", "cmd.", "length", "depth", "width", "middle", "area", "whole"):
+        assert word in heads, f"the head {word} is broken"
 
 
 def test_a_known_brush_is_adapted_to_the_first_strokes(session: Path) -> None:
