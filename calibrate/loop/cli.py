@@ -27,9 +27,11 @@ def compare(
     from calibrate.files import check_folder
     from calibrate.loop.compare import compare_sessions
     from calibrate.loop.report import PICTURE, summary, write_loop
+    from sessions.progress import shown
 
     check_folder(out)
-    loop = compare_sessions(original, again, fit, Field(mm_per_px=mm_per_px))
+    with shown() as progress:
+        loop = compare_sessions(original, again, fit, Field(mm_per_px=mm_per_px), progress)
     report = write_loop(loop, out, " ".join(["brushloop", *sys.argv[1:]]))
     for line in summary(loop):
         say(line)

@@ -21,6 +21,7 @@ from calibrate.stroke.measure import measure
 from calibrate.stroke.params import Params
 from model.brush import DomainError
 from sessions.errors import SessionDamaged
+from sessions.progress import Progress, counted, unseen
 from sessions.reader import Capture, Recording
 from sessions.recording.schemas import Header, Source
 
@@ -66,7 +67,9 @@ class LoopComparison:
     software: str
 
 
-def compare_sessions(original: Path, again: Path, fit: Path | None, view: Field) -> LoopComparison:
+def compare_sessions(
+    original: Path, again: Path, fit: Path | None, view: Field, progress: Progress = unseen
+) -> LoopComparison:
     """Compare pair by pair. Raises `CalibrationError` where the two do not belong together."""
     first, second = Recording(original), Recording(again)
     loopback = [one.header.source == Source.LOOPBACK for one in (first, second)]
@@ -78,11 +81,17 @@ def compare_sessions(original: Path, again: Path, fit: Path | None, view: Field)
         raise CalibrationError(str(second.path), f"{what}, not {first.header.session_id}")
     model, fitted_to = _model(first.header, fit)
     one, other = _opened(first), _opened(second)
-    paired = pair_up(first.captures(), one.calibration, second.captures(), other.calibration, model, view)
+    captures, repeats = (
+        counted(recording.captures(), f"{recording.header.session_id}: found", recording.strokes(), progress)
+        for recording in (first, second)
+    )
+    paired = pair_up(captures, one.calibration, repeats, other.calibration, model, view)
     if not paired.pairs:
         why = f": {paired.refused[0][0]}: {paired.refused[0][1]}" if paired.refused else ""
         raise CalibrationError(str(second.path), f"not one pair can be compared{why}")
+    progress("compared", 0, 1)
     scores = score_pairs(paired.pairs, paired.originals.values())
+    progress("compared", 1, 1)
     table = table_1(
         scores,
         source=other.header.source,

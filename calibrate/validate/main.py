@@ -30,7 +30,7 @@ from calibrate.validate.report.page import page_of
 from calibrate.validate.report.summary import report_of
 from calibrate.validate.run import Options, Outcome, validate_presses
 from calibrate.validate.sources import URL, LoadedSession, one_source, open_session
-from sessions.progress import Progress
+from sessions.progress import Progress, counted
 
 FOLDER = "validation"
 WORK = "work"
@@ -183,7 +183,8 @@ def _drags(request: Request, sessions: list[LoadedSession], folder: Path, progre
     validated: list[DragValidation] = []
     for one in sessions:
         params = Params(**one.calibration.preprocess) if one.calibration is not None else Params()
-        results = validate_drags(one.recording.captures(), params)
+        captures = counted(one.recording.captures(), f"{one.header.session_id}: measured", one.count, progress)
+        results = validate_drags(captures, params)
         predictions = None
         if request.fit is not None:
             predictions = predict_session(one.recording.path, request.fit, request.calibration, progress)

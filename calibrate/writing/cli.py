@@ -104,6 +104,7 @@ def compare(
     from calibrate.writing.compare import compare_written, read_reference
     from calibrate.writing.plan_files import load_plan
     from calibrate.writing.report import PICTURE, summary, write_written
+    from sessions.progress import shown
 
     check_folder(out)
     references: dict[str, tuple[str, Image]] = {}
@@ -112,7 +113,8 @@ def compare(
         if not name or not equals or not path:
             raise CalibrationError("--reference", f"{given!r}: expected CHARACTER=FILE, as 字=zi.png")
         references[name] = (Path(path).name, read_reference(Path(path)))
-    written = compare_written(session, load_plan(plan), references)
+    with shown() as progress:
+        written = compare_written(session, load_plan(plan), references, progress)
     report = write_written(written, out, " ".join(["brushloop", *sys.argv[1:]]))
     for line in summary(written):
         say(line)
@@ -131,9 +133,11 @@ def learn(
     from calibrate.writing.compare import compare_written
     from calibrate.writing.learn import learned
     from calibrate.writing.plan_files import load_plan, write_record
+    from sessions.progress import shown
 
     check_folder(out)
-    made, lessons = learned(compare_written(session, load_plan(plan), {}), gain)
+    with shown() as progress:
+        made, lessons = learned(compare_written(session, load_plan(plan), {}, progress), gain)
     out.mkdir(parents=True, exist_ok=True)
     protocol = write_record(made, repeats, out)
     for one in lessons:

@@ -23,6 +23,7 @@ from calibrate.stroke.rectify import rectify_by
 from calibrate.writing.plan_files import FigureRecord, PlanRecord, points_digest
 from calibrate.writing.scores import Character, Ink, Table3Row, WrittenScore, score_character, table_3
 from sessions.errors import SessionDamaged
+from sessions.progress import Progress, counted, unseen
 from sessions.reader import Capture, Recording
 from sessions.recording.schemas import Header
 
@@ -47,7 +48,9 @@ class WritingComparison:
     software: str = ""
 
 
-def compare_written(session: Path, plan: PlanRecord, references: dict[str, tuple[str, Image]]) -> WritingComparison:
+def compare_written(
+    session: Path, plan: PlanRecord, references: dict[str, tuple[str, Image]], progress: Progress = unseen
+) -> WritingComparison:
     """Compare a session with its plan. `references` (character -> name, image) replace those of the plan.
 
     Raises `CalibrationError` if the two do not belong together or nothing can be compared.
@@ -61,12 +64,13 @@ def compare_written(session: Path, plan: PlanRecord, references: dict[str, tuple
     _check_points(recording, plan)
     if unknown := sorted(set(references) - {figure.name for figure in plan.figures}):
         raise CalibrationError("--reference", f"{unknown[0]!r} is not in the plan")
-    found, cut, refused = _writings(recording, plan, calibration)
+    found, cut, refused = _writings(recording, plan, calibration, progress)
     characters = [_character(figure, found, cut, references) for figure in plan.figures if figure.name in found]
     if not characters:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
         raise CalibrationError(str(recording.path), f"no character can be compared{why}")
-    scores = [score for one in characters for score in score_character(one)]
+    counting = counted(characters, "characters compared", len(characters), progress)
+    scores = [score for one in counting for score in score_character(one)]
     header = recording.header
     table = table_3(
         scores,
@@ -82,13 +86,14 @@ def compare_written(session: Path, plan: PlanRecord, references: dict[str, tuple
 
 
 def _writings(
-    recording: Recording, plan: PlanRecord, calibration: Calibration
+    recording: Recording, plan: PlanRecord, calibration: Calibration, progress: Progress
 ) -> tuple[dict[str, dict[str, Ink]], set[str], list[tuple[str, str]]]:
     """(character -> stroke -> ink, strokes that are cut, refused)."""
     found: dict[str, dict[str, Ink]] = {}
     cut: set[str] = set()
     refused: list[tuple[str, str]] = []
-    for capture in recording.captures():
+    what = f"{recording.header.session_id}: found"
+    for capture in counted(recording.captures(), what, recording.strokes(), progress):
         stroke_id = capture.stroke.stroke_id
         name = stroke_id.rsplit("-r", 1)[0]
         if capture.stroke.kind != "drag" or plan.figure(name) is None:

@@ -186,15 +186,21 @@ def _finish(config: TrainConfig, folder: Path, state: State, images: Images, cpu
 
 
 class Bar:
-    """A progress bar that shows the latest losses."""
+    """A progress bar that shows the latest losses; where there is no terminal, a line for each tenth of the steps."""
 
     def __init__(self, progress: ProgressBar, steps: int) -> None:
-        self._progress = progress
+        self._progress, self._steps, self._tenths = progress, steps, 0
         self._task: TaskID = progress.add_task("training", total=steps, loss="", validation="")
 
     def stepped(self, step: int, loss: float) -> None:
         """See `Watcher.stepped`."""
         self._progress.update(self._task, completed=step, loss=f"left, MSE {loss:.1e}")
+        if self._progress.console.is_terminal or 10 * step // self._steps <= self._tenths:
+            return
+        self._tenths = 10 * step // self._steps
+        left_s = self._progress.tasks[self._task].time_remaining
+        left = f", about {left_s:.0f} s left" if left_s and step < self._steps else ""
+        self._progress.console.print(f"training: {step} of {self._steps} steps{left}, MSE {loss:.1e}")
 
     def validated(self, validation: Validation) -> None:
         """See `Watcher.validated`."""
