@@ -208,7 +208,7 @@ async def find_framing(address: Address) -> Framing:
     raise first
 
 
-async def answers(host: str, port: int, within_s: float = 1.0) -> bool:
+async def answers(host: str, port: int, within_s: float = 3.0) -> bool:
     """Whether anything listens there."""
     try:
         async with asyncio.timeout(within_s):

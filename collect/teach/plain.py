@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import sys
+import os
+import select
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,27 +15,49 @@ from sessions.terminal import say
 
 BACK, SKIP, JOG, QUIT = "back", "skip", "jog", "quit"
 MARKS = {"open": "  ", "current": "->", "taught": "ok"}
-AXES = {"x", "y", "z"}
+LOOK_S = 0.1
+"""Time between two looks whether a wait for a line was ended."""
 
 
-def _read() -> str | None:
-    """One line from the standard input; None at its end."""
-    line = sys.stdin.readline()
-    return line.rstrip("\r\n") if line else None
+class Lines:
+    """Lines from a file descriptor, read so that a wait for one can be ended: ctrl-c must not hang until Enter."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._held = b""
+        self._ended = threading.Event()
+
+    def read(self) -> str | None:
+        """The next line; None at the end of the input, and after `end`. Blocks."""
+        while b"\n" not in self._held and not self._ended.is_set():
+            if not select.select([self._descriptor], [], [], LOOK_S)[0]:
+                continue
+            if not (part := os.read(self._descriptor, 4096)):
+                break
+            self._held += part
+        if self._ended.is_set() or not self._held:
+            return None
+        line, _, self._held = self._held.partition(b"\n")
+        return line.decode(errors="replace").rstrip("\r")
+
+    def end(self) -> None:
+        """Let a wait end, from another thread."""
+        self._ended.set()
 
 
 class PlainGuide:
     """A person at a terminal. `back` leaves a step, `quit` or the end of the input leaves off."""
 
-    def __init__(self, pictures: Path, read: Callable[[], str | None] = _read) -> None:
-        """Pictures are written into the folder `pictures`, and named."""
+    def __init__(self, pictures: Path, read: Callable[[], str | None] | None = None, descriptor: int = 0) -> None:
+        """Pictures are written into the folder `pictures` and named; lines come from `read`, else from `descriptor`."""
         self._pictures = pictures
-        self._read = read
+        self._lines = Lines(descriptor)
+        self._read = read or self._lines.read
         self._shown = 0
 
     async def overview(self, steps: tuple[StepState, ...]) -> None:
         """Print one line per step."""
-        say("")
+        say("", f"`{BACK}` leaves a step, `{QUIT}` leaves off, ctrl-c stops the arm; all that was taught is kept.")
         for number, step in enumerate(steps, start=1):
             after = f": {step.summary}" if step.summary else f" (about {step.minutes} min)"
             say(f"{MARKS[step.state]} {number}. {step.title}{after}")
@@ -121,7 +145,11 @@ class PlainGuide:
         return answer
 
     async def _raw(self) -> str:
-        line = await asyncio.to_thread(self._read)
+        try:
+            line = await asyncio.to_thread(self._read)
+        except asyncio.CancelledError:
+            self._lines.end()
+            raise
         if line is None or line.strip().lower() == QUIT:
             raise LeftOff
         return line

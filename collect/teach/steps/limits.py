@@ -1,4 +1,4 @@
-"""Step 7: the smallest box around what was taught, and cautious speeds, confirmed one by one."""
+"""Step 8: the smallest box around what was taught, and cautious speeds, confirmed one by one."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ MARGIN_MM = 25.0
 """Room beside what was taught: a brush lifted along a tool axis that leans by 15 deg moves aside by as much."""
 BELOW_MM = 2.0
 """Room below the deepest press and the dip, for a sheet that is found a little lower."""
-DEFAULTS: tuple[tuple[str, float, str], ...] = (
-    ("robot.limits.tilt_deg", 15.0, "deg"),
-    ("robot.limits.speed_mm_s", 150.0, "mm/s"),
-    ("robot.limits.acc_mm_s2", 800.0, "mm/s2"),
-    ("motion.travel_speed_mm_s", 100.0, "mm/s"),
-    ("motion.press_speed_mm_s", 15.0, "mm/s"),
-    ("motion.acc_mm_s2", 500.0, "mm/s2"),
+DEFAULTS: tuple[tuple[str, float, str, float, str], ...] = (
+    ("robot.limits.tilt_deg", 15.0, "deg", 30.0, "Widest lean of the brush"),
+    ("robot.limits.speed_mm_s", 150.0, "mm/s", 500.0, "Fastest speed of the tip, in anything"),
+    ("robot.limits.acc_mm_s2", 800.0, "mm/s2", 5000.0, "Largest acceleration, in anything"),
+    ("motion.travel_speed_mm_s", 100.0, "mm/s", 500.0, "Speed of travel above the sheet"),
+    ("motion.press_speed_mm_s", 15.0, "mm/s", 100.0, "Speed down into a press"),
+    ("motion.acc_mm_s2", 500.0, "mm/s2", 5000.0, "Acceleration of travel and press"),
 )
+"""Field, cautious default, unit, most that `rig.toml` takes, and what it is."""
 
 
 class LimitsStep:
@@ -45,19 +46,26 @@ class LimitsStep:
         found = self.derived(day.notebook)
         rig = rig_of(day.notebook.with_values(found), day.rig_path)
         picture = day.rig_path.with_name(f"{day.rig_path.stem}.limits.png")
+        await day.working("drawing reach, box and places")
         await asyncio.to_thread(draw_rig, rig, picture)
         await day.say(
             f"{picture} shows reach, box, sheet, board, well and park, from above and from the side.",
             picture=await asyncio.to_thread(read_gray, picture),
         )
-        for field, taught in found.items():
-            if field in day.notebook.values and field not in _box_fields():
-                continue
-            if not await day.yes(f"{field} = {taught.value} {taught.unit} ({taught.how}): agreed?", default=True):
+        for axis, field in zip("xyz", _box_fields(), strict=True):
+            taught = found[field]
+            question = f"The box along base {axis}: {taught.value} {taught.unit} ({taught.how}; {field}). Agreed?"
+            if not await day.yes(question, default=True):
                 raise CannotTeach(
                     f"{field} was not agreed.",
                     "Teach the place again that makes the box too large: `brushloop rig teach`.",
                 )
+        for field, cautious, unit, most, what in DEFAULTS:
+            if field not in day.notebook.values:
+                value = await day.guide.number(f"{what} ({field})", unit, 1.0, most, cautious)
+                how = "cautious default, agreed" if value == cautious else "typed"
+                day.keep("limits", field, value, how, unit=unit)
+        rig = rig_of(day.notebook.with_values(self.derived(day.notebook)), day.rig_path)
         try:
             count = await ask_reach(day.rig_path, rig, _to_reach(rig, day.notebook))
         except ConfigError as error:
@@ -82,12 +90,12 @@ class LimitsStep:
             "robot.limits.z_mm": taught(list(z_mm), "mm", floor),
         } | {
             field: notebook.values.get(field) or taught(value, unit, "cautious default")
-            for field, value, unit in DEFAULTS
+            for field, value, unit, _, _ in DEFAULTS
         }
 
     def forget(self, notebook: Notebook) -> Notebook:
         """Without the defaults."""
-        names = {field for field, _, _ in DEFAULTS}
+        names = {field for field, *_ in DEFAULTS}
         kept = {field: taught for field, taught in notebook.values.items() if field not in names}
         return notebook.model_copy(update={"values": kept})
 

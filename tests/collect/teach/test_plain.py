@@ -1,0 +1,36 @@
+"""The first day in lines: a wait for a line ends when the arm is stopped."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from pathlib import Path
+
+import pytest
+
+from collect.teach.plain import PlainGuide
+
+
+async def test_lines_are_read_one_by_one(tmp_path: Path) -> None:
+    read, write = os.pipe()
+    guide = PlainGuide(tmp_path, descriptor=read)
+    os.write(write, b"192.0.2.7\n26\n")
+    assert await guide.text("Address", "") == "192.0.2.7"
+    assert await guide.number("Squares", "", 3, 50, None) == 26.0
+    os.close(write)
+    os.close(read)
+
+
+def test_a_question_that_is_stopped_does_not_wait_for_enter(tmp_path: Path) -> None:
+    read, write = os.pipe()
+
+    async def stopped() -> None:
+        asked = asyncio.create_task(PlainGuide(tmp_path, descriptor=read).text("Address", ""))
+        await asyncio.sleep(0.05)
+        asked.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await asked
+
+    asyncio.run(stopped())  # would wait for the reading thread
+    os.close(write)
+    os.close(read)
