@@ -10,9 +10,9 @@ import cv2
 import pytest
 
 import bench.__main__
-from bench import footprints, paper_brush, raster, rpc, table
+from bench import footprints, growth, paper_brush, raster, rpc, table
 from bench.harness import BenchError, Result, interleave, percentile, results_of
-from bench.peak import measure
+from bench.peak import Used, measure
 from bench.processes import started
 from model.brush import Brush
 from model.ccdbsm import ccdbsm
@@ -62,6 +62,22 @@ def test_the_table_keeps_rows_that_were_not_measured_and_names_missed_goals(tmp_
     assert [table.name_of(line) for line in rows] == ["raster-press", "startup"]
     assert "| `raster-press` | 500,000 images/s | 12.00 | 41.00, 39.50 | cv2 | 40, **missed** | 60 | 0 |" in rows[0]
     assert "| 0.90 |  | import typer |  | 10 | 3 | Python" in rows[1]
+
+
+def test_a_figure_beside_its_goal_or_of_growth_asks_for_a_ratio(tmp_path: Path) -> None:
+    peers = {"overhead: software": "the goal (2 %)", "growth-merge-memory": "1.05 times", "growth-merge-time": "x"}
+    path = tmp_path / "bench.md"
+    table.renew([Result(name, 3.0, "", peer, 0.95, 4, 0) for name, peer in peers.items()], path)
+    goals = [line.split(" | ")[5] for line in path.read_text().splitlines() if line.startswith("| `")]
+    assert goals == ["1, **missed**", "0.9", "1, **missed**"]
+
+
+def test_growth_compares_the_largest_sizes_with_the_smallest() -> None:
+    used = {100: Used(1.0, 2.0, 80.0), 1000: Used(5.0, 6.5, 100.0), 5000: Used(30.0, 30.5, 104.0)}
+    time, memory = growth.results([growth.Point("merge", size, one) for size, one in used.items()], 0)
+    assert (time.name, time.value) == ("growth-merge-time", 6.0)
+    assert time.ratio == pytest.approx(5.0 / 6.0)
+    assert memory.ratio == pytest.approx(1.05 * 100 / 104)
 
 
 def test_peak_memory_is_of_the_command_alone() -> None:
