@@ -22,7 +22,7 @@ from bench.realink_sessions import SESSION_SPLITS, measure_sessions
 from bench.realink_strokes import PX_PER_MM, Strokes, load, region
 from calibrate.drags.fit import INK_ABOVE, chance, fit_drags
 from calibrate.drags.predict import STAMP_ABOVE, STAMP_SPREAD_MM
-from calibrate.drags.residual import Residual, captured_distance
+from calibrate.drags.residual import Residual, captured_distance, threshold
 
 SPLIT_SEED = 0
 TEST = 40
@@ -146,7 +146,8 @@ def predict(
     there = fit.distance([strokes.paths[k] for k in test], x_mm, y_mm, place[test])
     here = fit.distance(paths, x_mm, y_mm, place[chosen])
     missed = Residual.fit(strokes.commands[chosen], here, captured[chosen])
-    return chance(there), chance(missed.add(strokes.commands[test], there)), missed.choice.above
+    above = threshold(strokes.commands[chosen], here, captured[chosen])
+    return chance(there), chance(missed.add(strokes.commands[test], there)), above
 
 
 def circles(strokes: Strokes, chosen: NDArray[np.int64], test: NDArray[np.int64]) -> Scores:

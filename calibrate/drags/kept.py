@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from calibrate.drags.captures import COMMANDS, commanded_path
-from calibrate.drags.residual import ABOVE, RIDGES, SHARES, Choice, Residual, captured_distance
+from calibrate.drags.residual import RIDGE, Residual, captured_distance
 from model.drag import DragModel, distances, trails
 
 Floats = NDArray[np.float64]
@@ -47,8 +47,7 @@ class Kept(BaseModel):
     """Centre of the first row, y upward."""
     columns: Annotated[int, Field(ge=8, le=4000)]
     rows: Annotated[int, Field(ge=8, le=4000)]
-    ridge: Annotated[float, Field(gt=0.0, le=RIDGES[-1])]
-    share: Annotated[float, Field(ge=0.0, le=SHARES[-1])]
+    ridge: Annotated[float, Field(gt=1e-6, le=1e6)]
     ink: Annotated[str, Field(max_length=MOST_BYTES)]
     """Bits of all images, row by row from the top, compressed with zlib, in base64."""
 
@@ -67,7 +66,6 @@ class Kept(BaseModel):
         x_mm: Floats,
         y_mm: Floats,
         model: DragModel,
-        choice: Choice,
     ) -> Kept | None:
         """The strokes as they go into an artefact; None if they do not fit into one, however few are kept."""
         step = max(1, -(-len(commands) // MOST_STROKES))
@@ -85,8 +83,7 @@ class Kept(BaseModel):
                     top_mm=round(float(y_mm[0]), 6),
                     columns=len(x_mm),
                     rows=len(y_mm),
-                    ridge=choice.ridge,
-                    share=choice.share,
+                    ridge=RIDGE,
                     ink=base64.b64encode(packed).decode(),
                 )
             step += 1
@@ -96,9 +93,8 @@ class Kept(BaseModel):
         """The ridges, fitted again, and the model that they correct. Raises ValueError for ink that cannot be read."""
         model = DragModel.of(np.array(self.parameters))
         base = self.base(model, [commanded_path(*row[:4]) for row in self.commands])
-        choice = Choice(self.ridge, self.share, ABOVE[0])
         captured = captured_distance(self._unpacked(), self.mm_per_px)
-        return Residual.fit(np.array(self.commands), base, captured, choice), model
+        return Residual.fit(np.array(self.commands), base, captured, self.ridge), model
 
     def base(self, model: DragModel, paths: list[Floats]) -> Floats:
         """Signed distances of a model's marks on the grid of the kept strokes."""

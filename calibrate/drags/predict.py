@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibrate.drags.artefact import DragArtefact, Stamps
 from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, DragFit, chance, fit_drags
 from calibrate.drags.kept import Kept
-from calibrate.drags.residual import Residual, captured_distance, choose, clipped
+from calibrate.drags.residual import Residual, captured_distance, clipped, threshold
 from calibrate.errors import CalibrationError
 from model.drag import DragModel, distances, trails
 
@@ -71,9 +71,8 @@ def learn(drawn: Drawn, images: Indices) -> Learned:
         ink = drawn.ink[images] > 0.5
         commands = drawn.commands[images]
         base = fit.distance(paths, drawn.x_mm, drawn.y_mm, groups=groups)
-        choice = choose(commands, base, captured_distance(ink, drawn.mm_per_px))
-        above = choice.above
-        kept = Kept.of(commands, ink, drawn.x_mm, drawn.y_mm, fit.model, choice)
+        above = threshold(commands, base, captured_distance(ink, drawn.mm_per_px))
+        kept = Kept.of(commands, ink, drawn.x_mm, drawn.y_mm, fit.model)
         learned = kept.residual() if kept is not None else None
     stamps = _fit(drawn, images, lag=False, spread_mm=STAMP_SPREAD_MM)
     return Learned(fit, Predictor(fit.model, fit.spread_mm, above, kept, learned), _stamps(drawn, images, stamps))

@@ -1,8 +1,7 @@
 """What a drag model misses, learned from its training strokes by kernel ridge regression on clipped signed distances.
 
-Two ridges are mixed: one on the difference between captured and predicted distance, and one straight on the captured
-distance. Their strengths, and the chance from which a pixel is called ink, are chosen by leaving out each training
-stroke in turn, which a ridge gives in closed form. No other stroke takes part in the choice.
+The chance from which a pixel is called ink follows from how well each training stroke is predicted by the others, which
+a ridge gives in closed form: half of the attainable Dice score maximises its expectation.
 """
 
 from __future__ import annotations
@@ -24,86 +23,47 @@ SPREADS = 2.2
 """Width of the kernel in standard deviations of each column of the training commands."""
 TILT_SPREADS = 5.0
 """The same for the last column, the tilt, which matters little on real ink within 5 deg."""
-STRAIGHT_SPREADS, STRAIGHT_RIDGE = 0.5, 0.1
-"""Width, relative to the other ridge's, and strength of the ridge straight on the distance."""
-RIDGES = (1.0, 3.0, 10.0, 1e6)
-"""Strengths to choose from: the last one leaves the model as it is."""
-SHARES = (0.0, 0.25, 0.5)
-"""Shares of the straight ridge to choose from."""
-ABOVE = (0.30, 0.34, 0.38, 0.42, 0.46)
+RIDGE = 1.0
+LEAST_ABOVE, MOST_ABOVE = 0.3, 0.46
 LEAST = 8
-"""Fewer training strokes say too little about neighbours."""
-
-
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """What the left-out training strokes chose."""
-
-    ridge: float = 1.0
-    share: float = 0.0
-    """Share of the straight ridge."""
-    above: float = INK_ABOVE
-    """A pixel counts as ink above this probability."""
+"""Fewer training strokes say too little about the threshold."""
 
 
 @dataclass(frozen=True, slots=True)
 class Residual:
-    """Two fitted ridges over (B, d) commands, on one grid."""
+    """A ridge over (B, d) commands, on one grid."""
 
     commands: Floats
     scales: Floats
-    choice: Choice
-    missed: NDArray[np.float32]
-    """(B, h * w) weights of captured minus predicted distance."""
-    straight: NDArray[np.float32]
-    """(B, h * w) weights of the captured distance less `middle`; empty if its share is 0."""
-    middle: NDArray[np.float32]
+    weights: NDArray[np.float32]
+    """(B, h * w)."""
 
     @staticmethod
-    def fit(commands: Floats, base_mm: Floats, captured_mm: Floats, choice: Choice | None = None) -> Residual:
-        """Fit to (B, d) commands and to the model's and the captured signed distances (B, h, w).
-
-        Without a `choice`, the strengths are chosen by `choose`.
-        """
-        taken = choose(commands, base_mm, captured_mm) if choice is None else choice
-        base, captured = _flat(base_mm), _flat(captured_mm)
+    def fit(commands: Floats, base_mm: Floats, captured_mm: Floats, ridge: float = RIDGE) -> Residual:
+        """Fit to (B, d) commands and to the model's and the captured signed distances (B, h, w)."""
         scales = scales_of(commands)
-        missed = _solved(_gram(commands, scales, taken.ridge), captured - base)
-        middle = captured.mean(axis=0)
-        straight = np.zeros((0, base.shape[1]), np.float32)
-        if taken.share > 0.0:
-            gram = _gram(commands, scales * STRAIGHT_SPREADS, STRAIGHT_RIDGE)
-            straight = _solved(gram, captured - middle)
-        return Residual(commands, scales, taken, missed, straight, middle)
+        return Residual(commands, scales, _solved(_gram(commands, scales, ridge), _flat(captured_mm) - _flat(base_mm)))
 
     def add(self, commands: Floats, base_mm: Floats) -> Floats:
         """The corrected signed distances, (B, h, w), of the model's."""
-        base = _flat(base_mm)
-        found = base + _kernel(commands, self.commands, self.scales) @ self.missed
-        if self.choice.share > 0.0:
-            kernel = _kernel(commands, self.commands, self.scales * STRAIGHT_SPREADS)
-            found = (1.0 - self.choice.share) * found + self.choice.share * (self.middle + kernel @ self.straight)
+        found = _flat(base_mm) + _kernel(commands, self.commands, self.scales) @ self.weights
         return np.asarray(found, np.float64).reshape(base_mm.shape)
 
 
-def choose(
+def threshold(
     commands: Floats, base_mm: Floats, captured_mm: Floats, stride: int = 2, spread_mm: float = SPREAD_MM
-) -> Choice:
-    """The strengths with the best mean CSIM over the training strokes, each predicted from the others."""
+) -> float:
+    """The chance above which a pixel counts as ink: half the mean CSIM of training strokes predicted from the others.
+
+    `INK_ABOVE` for fewer than `LEAST` strokes.
+    """
+    if len(commands) < LEAST:
+        return INK_ABOVE
     every = (slice(None), slice(None, None, stride), slice(None, None, stride))
     base, captured = _flat(base_mm[every]), _flat(captured_mm[every])
-    if len(commands) < LEAST:
-        return Choice(ridge=RIDGES[-1])
-    truth, scales = captured > 0.0, scales_of(commands)
-    centred = captured - captured.mean(axis=0)
-    straight = captured - _left_out(_gram(commands, scales * STRAIGHT_SPREADS, STRAIGHT_RIDGE), centred)
-    found: list[tuple[float, Choice]] = []
-    for ridge in RIDGES:
-        corrected = captured - _left_out(_gram(commands, scales, ridge), captured - base)
-        for share in SHARES:
-            seen = chance((1.0 - share) * corrected + share * straight, spread_mm)
-            found += [(_csim(seen > above, truth), Choice(ridge, share, above)) for above in ABOVE]
-    return max(found, key=lambda one: one[0])[1]
+    corrected = captured - _left_out(_gram(commands, scales_of(commands), RIDGE), captured - base)
+    half = 0.5 * _csim(chance(corrected.astype(np.float64), spread_mm) > INK_ABOVE, captured > 0.0)
+    return min(max(round(half, 3), LEAST_ABOVE), MOST_ABOVE)
 
 
 def scales_of(commands: Floats) -> Floats:

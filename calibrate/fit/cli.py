@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 DRAG_MM_PER_PX = 0.4
 """Scale of the images that drags are fitted to."""
-MOST_RIDGE = 1e5
-"""A ridge this strong corrects nothing."""
 
 
 def fit(
@@ -121,11 +119,7 @@ def _drag_tables(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:
         out.add_row(name, f"{found.value:.3f}", interval)
     yield out
     if artefact.kept is not None:
-        corrected = "nothing" if artefact.kept.ridge > MOST_RIDGE else f"ridge {artefact.kept.ridge:g}"
-        yield (
-            f"Chosen by leaving out one training stroke at a time: {corrected} for what the lag misses, share of the "
-            f"ridge straight on the distance {artefact.kept.share:g}, ink above {artefact.ink_above:g}."
-        )
+        yield f"Ink is where its chance is above {artefact.ink_above:g}, which follows from the training strokes."
     if artefact.held_out:
         out = Table("model", "n", "CSIM", "IoU", title="a fifth left out in turn, where the command put it, percent")
         for name, score in artefact.held_out.items():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibrate.drags.fit import INK_ABOVE, chance, determined, fit_drags
-from calibrate.drags.residual import Choice, Residual, choose
+from calibrate.drags.residual import Residual, threshold
 from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from model.drag import DragModel
 
@@ -48,19 +48,18 @@ def test_what_the_model_lacks_is_learned_from_neighbours() -> None:
     commands = np.column_stack([np.linspace(0.0, 1.0, 20), np.zeros(20)])
     base = np.zeros((20, 4, 4))
     captured = base + np.sin(3.0 * commands[:, 0])[:, None, None]
-    residual = Residual.fit(commands[::2], base[::2], captured[::2], Choice(ridge=0.01))
+    residual = Residual.fit(commands[::2], base[::2], captured[::2], ridge=0.01)
     assert np.abs(residual.add(commands[1:-1:2], base[1:-1:2]) - captured[1:-1:2]).max() < 0.05
 
 
-def test_the_strength_of_the_correction_follows_from_the_training_strokes_alone() -> None:
+def test_of_strokes_that_scatter_less_certain_pixels_count_as_ink() -> None:
     rng = np.random.default_rng(0)
     commands = np.column_stack([np.linspace(0.0, 1.0, 24), np.zeros(24)])
     x = np.linspace(-4.0, 4.0, 33)
     base = np.broadcast_to(3.0 - np.abs(x), (24, 33, 33)).copy()
-    wider = base + np.where(commands[:, 0] > 0.5, 0.9, -0.9)[:, None, None]  # depends on the command
-    scattered = base + rng.normal(0.0, 0.9, 24)[:, None, None]  # does not
-    assert choose(commands, base, wider).ridge < 10.0
-    assert choose(commands, base, scattered).ridge >= 10.0
+    little, much = (base + rng.normal(0.0, sd, 24)[:, None, None] for sd in (0.3, 3.0))
+    assert threshold(commands, base, much) < threshold(commands, base, little)
+    assert threshold(commands[:4], base[:4], much[:4]) == INK_ABOVE
 
 
 def test_a_parameter_that_the_strokes_do_not_determine_is_named() -> None:
