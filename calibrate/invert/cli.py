@@ -37,7 +37,7 @@ def invert(
     from calibrate.errors import CalibrationError
     from calibrate.files import check_target
     from calibrate.invert.files import write_inversion
-    from calibrate.invert.invert import Settings, invert_recording, off_command
+    from calibrate.invert.invert import NO_MODEL_ERROR, Settings, invert_recording, off_command
     from model.inversion.press import Range
     from sessions.progress import shown
 
@@ -73,6 +73,13 @@ def invert(
     for name, mean, sd, inside, n in off_command(made.rows):
         unit = "mm" if name == "H" else "deg"
         say(f"{name}: recovered - commanded {mean:+.3f} {unit}, sd {sd:.3f}; {inside:.0%} of {n} in the interval")
+    say(
+        "alpha is known from how far the mark lies from the zero-touch point, as far as the model places it; "
+        "it cannot be known from the shape of the mark alone."
+    )
+    bare = sum(NO_MODEL_ERROR in row.flags for row in made.rows)
+    if bare:
+        say(f"warning: {bare} without model error in their intervals: too few cells with a known command")
     unknown = sum("alpha_unknown" in row.flags for row in made.rows)
     if unknown:
         say(f"warning: {unknown} without a zero-touch anchor: their alpha is assumed, shape does not tell it")

@@ -8,7 +8,7 @@ describes the brush.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar, cast
 
@@ -19,6 +19,7 @@ from calibrate.calibration import Calibration
 from calibrate.compare.field import SIZE_PX, Field, Image, crop
 from calibrate.compare.images import brush_of, prepare_press
 from calibrate.errors import CalibrationError, CaptureRefused
+from calibrate.invert.model_error import model_sd
 from calibrate.session import calibration_of
 from calibrate.stroke.params import PX_PER_MM, Params
 from calibrate.stroke.preprocess import prepare
@@ -34,6 +35,8 @@ from sessions.reader import Capture, Recording
 from sessions.recording.schemas import Header, Stroke
 
 _T = TypeVar("_T")
+NO_MODEL_ERROR = "no_model_error"
+"""Flag of a press whose deviations say only how well its image identifies it within the model."""
 BATCH = 64
 USELESS = frozenset({Flag.BLANK, Flag.DID_NOT_CONVERGE, Flag.CUT})
 """Flags that exclude a stroke: it is listed with the reason and not pressed again."""
@@ -133,7 +136,27 @@ def invert_recording(
         _invert(made, anchored if known else loose, rest)
     order = {stroke.stroke_id: number for number, stroke in enumerate(strokes)}
     made.rows.sort(key=lambda row: order[row.stroke_id])
+    made.rows[:] = with_model_error(made.rows)
     return made
+
+
+def with_model_error(rows: Sequence[Row]) -> list[Row]:
+    """The rows with model error in their deviations, or flagged where too few commands are known for it."""
+    nan = float("nan")
+    cells = [(row.commanded_height_mm or 0.0, row.commanded_tilt_deg or 0.0) for row in rows]
+    deep = np.array([nan if (h := row.commanded_height_mm) is None else row.height_mm - h for row in rows])
+    tilted = np.array([nan if (a := row.commanded_tilt_deg) is None else row.tilt_deg - a for row in rows])
+    height_sd = np.array([row.height_sd_mm for row in rows])
+    tilt_sd = np.array([nan if row.tilt_sd_deg is None else row.tilt_sd_deg for row in rows])
+    more_mm, more_deg = model_sd(deep, height_sd, cells), model_sd(tilted, tilt_sd, cells)
+    out: list[Row] = []
+    for k, row in enumerate(rows):
+        if np.isnan(more_mm[k]) or (row.tilt_sd_deg is not None and np.isnan(more_deg[k])):
+            out.append(replace(row, flags=tuple(sorted({*row.flags, NO_MODEL_ERROR}))))
+            continue
+        wider = None if row.tilt_sd_deg is None else float(np.hypot(row.tilt_sd_deg, more_deg[k]))
+        out.append(replace(row, height_sd_mm=float(np.hypot(row.height_sd_mm, more_mm[k])), tilt_sd_deg=wider))
+    return out
 
 
 def spread(strokes: Sequence[_T], most: int | None) -> Sequence[_T]:

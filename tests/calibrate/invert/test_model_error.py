@@ -1,0 +1,41 @@
+"""Intervals of recovered presses hold the command although the model is wrong, or say that they may not."""
+
+import numpy as np
+import pytest
+
+from calibrate.invert.invert import NO_MODEL_ERROR, Row, with_model_error
+from calibrate.invert.model_error import model_sd
+
+CELLS = [(h, a) for h in (11.0, 13.0, 15.0, 17.0, 20.0) for a in (0.0, 5.0, 10.0)]
+
+
+def rows(cells: list[tuple[float, float]], error_mm: float, error_deg: float) -> list[Row]:
+    rng = np.random.default_rng(0)
+    return [
+        Row(f"s{k}", h + error_mm * rng.normal(), a + error_deg * rng.normal(), 0.05, 0.2, 0.1, (), h, a)
+        for k, (h, a) in enumerate(cells * 20)
+    ]
+
+
+def inside(made: list[Row]) -> float:
+    return float(
+        np.mean([abs(r.tilt_deg - (r.commanded_tilt_deg or 0.0)) <= 1.96 * (r.tilt_sd_deg or 0.0) for r in made])
+    )
+
+
+def test_a_model_error_is_in_the_interval() -> None:
+    raw = rows(CELLS, 0.3, 2.0)
+    assert inside(raw) < 0.3
+    assert 0.93 <= inside(with_model_error(raw)) <= 0.99
+
+
+def test_the_own_command_does_not_enter_the_interval() -> None:
+    off = np.array([5.0, 0.1, 0.1, 0.1])
+    found = model_sd(off, np.full(4, 0.01), [(11.0, 0.0), (13.0, 0.0), (15.0, 0.0), (17.0, 0.0)])
+    assert found[0] == pytest.approx(0.1 * 4.303 / 1.96, rel=0.02)
+    assert found[1] > 3.0
+
+
+def test_too_few_known_cells_are_flagged() -> None:
+    assert all(NO_MODEL_ERROR in row.flags for row in with_model_error(rows(CELLS[:3], 0.3, 2.0)))
+    assert with_model_error([]) == []
