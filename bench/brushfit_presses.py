@@ -86,7 +86,8 @@ def bristles(name: str) -> BrushPresses:
         raise BenchError(f"the bristle presses ({name}) are not beside this checkout")
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / name
-        import_photographs(photos, photos / "strokes.csv", session, ImportOptions(kind="press"), "bench", lambda: 1)
+        options = ImportOptions(kind="press", simulated=True)
+        import_photographs(photos, photos / "strokes.csv", session, options, "bench", lambda: 1)
         captures = read_presses(session, Field())
     by_cell = [[s.ink for s in captures.strokes if (s.height_mm, s.tilt_deg) == cell] for cell in CELLS]
     return BrushPresses(name, captures.radius_mm, captures.length_mm, captures.grid, np.array(by_cell, np.float32))
