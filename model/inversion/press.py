@@ -32,6 +32,9 @@ class Flag(StrEnum):
     """No zero-touch anchor: shape does not determine alpha, since 1 % error of R or lambda moves it by 4.4 deg."""
     AT_BOUND = "at_bound"
     """H, alpha or place lies at the limit of its range; its interval holds for one side at most."""
+    UPRIGHT = "upright"
+    """alpha is 0, where its range ends because a lean to the other side is another heading. That says nothing against
+    the model: half of all upright presses are recovered so. The interval of alpha holds for one side."""
     DID_NOT_CONVERGE = "did_not_converge"
     CUT = "cut"
     """The mark reaches the edge of the image; ink beyond it is unknown."""
@@ -244,11 +247,13 @@ def _recover(
     values[:, columns] = found.values
     sigma[:, columns] = np.sqrt(np.einsum("bii->bi", spread))
     values[blank] = sigma[blank] = np.nan
-    bound = ((found.values <= limits.low) | (found.values >= limits.high)).any(axis=1)
+    at_limit = (found.values <= limits.low) | (found.values >= limits.high)
+    upright = at_limit & (np.array(forward.names) == "tilt_deg") & (found.values == 0.0)
     held = "tilt_deg" not in forward.names
     raised = {
         Flag.ALPHA_UNKNOWN: np.full(len(target), held or not alpha_known),
-        Flag.AT_BOUND: bound & ~blank,
+        Flag.AT_BOUND: (at_limit & ~upright).any(axis=1) & ~blank,
+        Flag.UPRIGHT: upright.any(axis=1) & ~blank,
         Flag.DID_NOT_CONVERGE: ~found.converged & ~blank,
         Flag.CUT: found.normal.cut > EDGE_INK,
         Flag.BLANK: blank,

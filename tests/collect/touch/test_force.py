@@ -165,3 +165,9 @@ async def test_a_sensor_that_is_too_noisy_says_so(reaction: Reaction) -> None:
     config = ForceTouchConfig(max_samples=2000)
     with pytest.raises(StepError, match="too noisy for this brush"):
         await touch_by_force(Felt(reaction, 120.0, np.random.default_rng(1)), REACH, config)
+
+
+async def test_a_rough_touch_of_few_samples_ends_within_its_standard_error(reaction: Reaction) -> None:
+    config = ForceTouchConfig(sigma_mm=0.3, fast_samples=20, medium_samples=40, slow_samples=100)
+    errors = [(await touched(reaction, seed, config))[0] for seed in range(100)]
+    assert np.std(errors) < 0.3

@@ -179,6 +179,18 @@ def test_flags_say_what_is_wrong() -> None:
     assert low.height_mm[0] == 10.0
 
 
+def test_an_upright_press_at_the_end_of_alphas_range_does_not_speak_against_the_model() -> None:
+    place = anchored(1, 9)[2]
+    height, tilt = np.array([15.0]), np.array([0.0])
+    images = drawn(height, tilt, place, np.zeros(1), anchored=True)
+    beside = place - np.array([[0.3, 0.0]])  # an anchor that is off, as if the brush leaned the other way
+    found = Inverter.of_brush(BASIS, px_mm=PX)(images, beside)
+    other = Inverter.of_brush(BASIS, px_mm=PX)(images, place + np.array([[0.3, 0.0]]))
+    [flags] = found.flags if found.tilt_deg[0] == 0.0 else other.flags
+    assert Flag.UPRIGHT in flags
+    assert Flag.AT_BOUND not in flags
+
+
 def test_without_an_anchor_alpha_can_be_held() -> None:
     height, _, _, images = anchored(1, 10, (5.0, 5.0))
     found = Inverter.of_brush(BASIS, known=Known.NOTHING, px_mm=PX, tilt_deg=0.0).assuming(5.0)(images)
