@@ -165,15 +165,17 @@ class _Log:
     def contact(self, config: ForceTouchConfig) -> Contact:
         """Fit the hinge to the readings of the linear part; iterated, because that part depends on the hinge.
 
-        All readings are taken while too few of those below the contact are left to give it: the descent lay too low.
+        More readings are kept where too few are left to give it: the descent lay too low, or they are noisy still.
         """
         found = self._fit(-math.inf)
         for _ in range(3):
             lowest_z_mm = found.z_mm - config.linear_mm
-            left = {reading.z_mm for reading, _ in self.readings if lowest_z_mm <= reading.z_mm < found.z_mm}
-            if len(left) < (2 if self.spring is None else 1):
+            if not any(lowest_z_mm <= reading.z_mm < found.z_mm for reading, _ in self.readings):
                 break
-            found = self._fit(lowest_z_mm)
+            try:
+                found = self._fit(lowest_z_mm)
+            except StepError:
+                break
         return found
 
     def _fit(self, lowest_z_mm: float) -> Contact:

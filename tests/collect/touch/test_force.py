@@ -167,7 +167,7 @@ async def test_a_sensor_that_is_too_noisy_says_so(reaction: Reaction) -> None:
         await touch_by_force(Felt(reaction, 120.0, np.random.default_rng(1)), REACH, config)
 
 
-async def test_a_rough_touch_of_few_samples_ends_within_its_standard_error(reaction: Reaction) -> None:
-    config = ForceTouchConfig(sigma_mm=0.3, fast_samples=20, medium_samples=40, slow_samples=100)
-    errors = [(await touched(reaction, seed, config))[0] for seed in range(100)]
-    assert np.std(errors) < 0.3
+@pytest.mark.parametrize("seed", range(20))
+async def test_rests_that_are_noisy_still_are_repeated_and_do_not_end_the_touch(reaction: Reaction, seed: int) -> None:
+    few = ForceTouchConfig(sigma_mm=0.3, fast_samples=20, medium_samples=40, slow_samples=100)
+    assert abs((await touched(reaction, seed, few))[0]) < 0.5
