@@ -207,12 +207,14 @@ async def touch_by_force(
     is felt over the whole travel, if something is felt at its start, or if the noise leaves the contact unknown.
     """
     log, lowest_z_mm = _Log(None if spring is None else spring.next()), reach.lowest_z_mm
+    highest_z_mm = reach.start_z_mm
     if near_z_mm is None or spring is None:
         report(f"down to the paper in steps of {config.fast_step_mm:g} mm")
         felt_z_mm = await _fast(probe, reach.start_z_mm, lowest_z_mm, config)
         start_z_mm = felt_z_mm + LATE_STEPS * config.fast_step_mm + CLEAR_STEPS * config.medium_step_mm
         report(f"steps of {config.medium_step_mm:g} mm around {felt_z_mm:.1f} mm")
         await _medium(probe, log, start_z_mm, lowest_z_mm, config)
+        highest_z_mm = start_z_mm + config.fast_step_mm
         near_z_mm = log.contact(config).z_mm
     run, left = ROUGH_RUN, ""
     while True:
@@ -223,6 +225,11 @@ async def touch_by_force(
             log.readings.append((await probe.rest(z_mm, max(4, round(share * config.slow_samples))), run))
         contact = log.contact(config)
         if _known(contact, near_z_mm, config):
+            if contact.z_mm > highest_z_mm:
+                raise StepError(
+                    f"the contact was found at {contact.z_mm:.2f} mm, above {highest_z_mm:.2f} mm where the brush was "
+                    "in the air: the sensor is too noisy for so few samples"
+                )
             return contact
         if log.samples > config.max_samples:
             raise StepError(
