@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Iterator
@@ -26,7 +27,8 @@ class Spool(Generic[_T]):
             self.append(item)
 
     def append(self, item: _T) -> None:
-        """Add an item at the end; not while a walk is under way."""
+        """Add an item at the end."""
+        self._file.seek(0, io.SEEK_END)  # a walk that was broken off leaves the file in its middle
         self._file.write(self._dumps(item).encode() + b"\n")
         self._count += 1
 

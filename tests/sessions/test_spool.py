@@ -21,3 +21,10 @@ def test_two_walks_at_once_do_not_disturb_each_other() -> None:
     assert list(islice(first, 90_000))[-1] == 89_999
     assert list(islice(second, 3)) == [0, 1, 2]
     assert next(first) == 90_000
+
+
+def test_a_walk_that_is_broken_off_does_not_move_where_items_are_added():
+    spool: Spool[int] = Spool(json.dumps, json.loads, range(100_000))
+    assert next(iter(spool)) == 0
+    spool.append(100_000)
+    assert list(spool) == list(range(100_001))

@@ -62,7 +62,7 @@ def quick_camera(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def soaking(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Limits on time in which the host's clock counts, for a busy machine on which simulated time is fast besides.
+    """Limits on time that the host's clock measures: the machine may be busy, and simulated time runs fast.
 
     Pictures are drawn by the processor that also takes them, and six simulated seconds pass in one of the host's.
     """
