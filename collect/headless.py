@@ -11,8 +11,6 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Protocol
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
 from collect.engine.snapshot import EngineView, Snapshot
 from sessions.terminal import plain_console
 
@@ -53,6 +51,8 @@ def run_headless(engine: RunnableEngine) -> None:
 
 
 def _show(engine: RunnableEngine) -> None:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
     shown, silent = 0, False
     columns = (
         TextColumn("{task.description}", markup=False),

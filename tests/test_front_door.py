@@ -43,13 +43,18 @@ COMMANDS = (
     "calibrate nowhere",
     "fit nowhere",
     "validate nowhere",
+    "validate diff nowhere nowhere",
+    "invert nowhere",
+    "loop nowhere --config no.toml",
     "loop compare nowhere nowhere",
+    "write 字 --config no.toml",
+    "sim --write-rig no/rig.toml",
     "sessions verify nowhere",
     "sessions export nowhere out",
     "sessions merge out.mcap nowhere nowhere",
     "sessions import nowhere --csv no.csv",
 )
-SLOW = ("torch", "scipy", "numba", "matplotlib", "skimage", "textual", "jinja2")
+SLOW = ("torch", "scipy", "numba", "matplotlib", "skimage", "textual", "jinja2", "can", "rich.progress")
 """Packages that take from a tenth of a second to seconds to import, which no command needs to begin."""
 
 

@@ -33,15 +33,19 @@ def invert(
 ) -> None:
     """Recover depth and tilt of every captured press; writes a CSV and a protocol that presses them again."""
 
-    from calibrate.compare.field import Field
     from calibrate.errors import CalibrationError
     from calibrate.files import check_target
+    from sessions.reader import Recording
+
+    check_target(out, ".csv")
+    Recording(session)  # a wrong path is refused before the models are loaded, which takes seconds
+
+    from calibrate.compare.field import Field
     from calibrate.invert.files import write_inversion
     from calibrate.invert.invert import NO_MODEL_ERROR, Settings, invert_recording, off_command
     from model.inversion.press import Range
     from sessions.progress import shown
 
-    check_target(out, ".csv")
     try:
         within = Range(height_range, tilt_range)
         if tilt_range[1] > 30 or not tilt_range[0] <= assume_tilt <= tilt_range[1]:

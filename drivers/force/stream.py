@@ -8,13 +8,14 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
-
-import can
+from typing import TYPE_CHECKING, Any
 
 from drivers.clock import Clock
 from drivers.force.rounds import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, RoundAssembler, Wrench
 from drivers.samples import Stamp
+
+if TYPE_CHECKING:
+    import can
 
 RECEIVE_S = 0.05
 RATE_WINDOW = 200
@@ -111,6 +112,8 @@ class RoundStream:
 
     def _run(self) -> None:
         try:
+            import can  # slow to import, and most rigs have no such sensor
+
             bus = self._open()
         except Exception as error:
             # Back ends raise arbitrary exceptions if a library or a package is missing.
@@ -142,6 +145,8 @@ class RoundStream:
                 self._lose("the reader failed", "Connect again.")
 
     def _open(self) -> can.BusABC:
+        import can
+
         settings = self._settings
         # Use these settings only: python-can would also read can.ini, the environment and the home folder.
         # The library warns of frames that arrive in two pieces, which is harmless; a lost frame shows in the counts.
@@ -194,6 +199,8 @@ class RoundStream:
 
 def command(data: bytes) -> can.Message:
     """A command frame to the board."""
+    import can
+
     return can.Message(arbitration_id=COMMAND_ID, is_extended_id=False, data=data)
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import math
 from typing import Any, Literal, Protocol
-
-from scipy.spatial.transform import Rotation
 
 from drivers.arcs.codes import SafetyMode
 from drivers.force.rounds import Wrench
+from drivers.rotation import columns, inverse, of_angles, product
 from drivers.sim.arcs.power import EMERGENCY_STOPS
 from drivers.sim.arcs.rtde_server import RtdeServer
 from drivers.sim.arcs.server import ArcsServer
@@ -237,8 +237,9 @@ def _at_sensor(config: SimConfig, wrench: Wrench) -> Wrench:
 @functools.lru_cache(maxsize=8)
 def _axes_of_sensor(lean_deg: tuple[float, float], turn_deg: float, sign: int) -> list[list[float]]:
     """(3, 3) from the brush's axes to the sensor's, with its sign; solved once, as a round comes 200 times a second."""
-    brush = Rotation.from_euler("xy", lean_deg, degrees=True)
-    return (sign * (Rotation.from_euler("z", turn_deg, degrees=True).inv() * brush).as_matrix()).tolist()
+    brush = of_angles(math.radians(lean_deg[0]), math.radians(lean_deg[1]), 0.0)
+    sensor = of_angles(0.0, 0.0, math.radians(turn_deg))
+    return [[sign * value for value in row] for row in zip(*columns(product(inverse(sensor), brush)), strict=True)]
 
 
 def _ink(world: World, device: Literal["station", "pump"]) -> Instrument:

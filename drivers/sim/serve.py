@@ -6,16 +6,16 @@ import asyncio
 import signal
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers.sim.config import SimConfig
 from drivers.sim.control import live_control
 from drivers.sim.faults.kinds import hang_script, load_faults
-from drivers.sim.lab.lab import UnknownLab
-from drivers.sim.lab.seen import truth_text
-from drivers.sim.lab.traps import Trap
 from drivers.sim.rig import LoopbackRig
 from drivers.sim.rig_toml import LOOPBACK_HEAD
+
+if TYPE_CHECKING:
+    from drivers.sim.lab.traps import Trap
 
 
 def serve(
@@ -70,6 +70,8 @@ def serve_unknown(
 
     Raises `LabRefused` for an unknown trap or a file that cannot be written, and `ControlPathError`.
     """
+    from drivers.sim.lab.traps import Trap
+
     if trap is not None and trap not in [*Trap]:
         raise LabRefused(f"--trap is {trap!r}, allowed: {', '.join(Trap)}")
     if truth is not None and truth.exists() and b'"seed"' not in truth.read_bytes()[:100]:
@@ -86,6 +88,9 @@ async def _serve_unknown(
     truth: Path | None,
     control: Path | None,
 ) -> None:
+    from drivers.sim.lab.lab import UnknownLab
+    from drivers.sim.lab.seen import truth_text
+
     over, lab = _signalled(), UnknownLab(seed, trap, rate=rate)
 
     async def obey(request: Mapping[str, object]) -> dict[str, Any]:

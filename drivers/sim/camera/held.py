@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from drivers.rotation import columns as axes
+from drivers.rotation import of_vector
 from drivers.sim.camera.optics import Optics
 from drivers.sim.config import Table, View
 
@@ -44,8 +46,9 @@ def held_picture(
     # raster pixel centres -> mm from the middle of the board -> image
     s = 1.0 / PX_PER_MM
     to_mm = np.array([[s, 0.0, -0.5 * s * (columns - 1)], [0.0, s, -0.5 * s * (rows - 1)], [0.0, 0.0, 1.0]])
-    rotation = Rotation.from_rotvec(held.turn_deg, degrees=True).as_matrix()
-    plane = np.column_stack([rotation[:, 0], rotation[:, 1], held.centre_mm])
+    rx, ry, rz = (math.radians(turn_deg) for turn_deg in held.turn_deg)
+    right, down, _ = axes(of_vector((rx, ry, rz)))
+    plane = np.column_stack([right, down, held.centre_mm])
     flat = cv2.warpPerspective(
         paper, optics.camera_matrix @ plane @ to_mm, (view.width_px, view.height_px), borderValue=BEHIND
     )
