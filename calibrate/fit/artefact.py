@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from calibrate.artefact import Artefact, FittedValue
 from model.fitted import MODES, NAMES, TERMS, FittedPress
@@ -22,7 +22,8 @@ class FittedStage(BaseModel):
 
     name: str
     condition: float | None
-    refused: bool
+    refused: bool = False
+    """Earlier versions refused a stage with a large condition number; its parameters have no interval there."""
 
 
 class BrushFit(Artefact):
@@ -44,6 +45,8 @@ class BrushFit(Artefact):
     ends_mm: tuple[tuple[float, ...], ...] = ((0.0,) * TERMS,) * 2
     """Missing in files of earlier versions, whose edges also lack the last term."""
     stages: tuple[FittedStage, ...]
+    from_strokes: dict[str, float] = Field(default_factory=dict[str, float])
+    """Share of each parameter's variance among known brushes that the strokes took away; missing in earlier files."""
     proportional_h0_mm: float
     """Absolute zero offset, with every size held proportional to depth; see docs/brushfit.md."""
     proportional_h0_se_mm: float

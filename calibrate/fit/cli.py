@@ -132,7 +132,6 @@ def _drag_tables(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:
 def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
     from rich.table import Table
 
-    from calibrate.fit.fit import WORST_CONDITION
     from calibrate.fit.run import NAMES
     from calibrate.report import source_note
     from model.fitted import PARAMETERS
@@ -141,16 +140,20 @@ def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
     yield f"{source_note(captures.header.source, captures.header.brush)}; {len(captures.strokes)} presses fitted"
     for name, why in captures.refused:
         yield f"left out: {name}: {why}"
-    out = Table("parameter", "unit", "published", "fitted", "95 %", title="brush")
+    out = Table("parameter", "published", "fitted", "95 %", "from strokes", title="brush")
     for name, parameter in zip(NAMES, PARAMETERS, strict=True):
-        found = artefact.parameters[name]
-        interval = "from known brushes" if found.low is None else f"{found.low:.3f} to {found.high:.3f}"
-        out.add_row(name, parameter.unit, f"{parameter.start:.3f}", f"{found.value:.3f}", interval)
+        found, share = artefact.parameters[name], artefact.from_strokes[name]
+        out.add_row(
+            name, f"{parameter.start:.3f}", f"{found.value:.3f}", f"{found.low:.3f} to {found.high:.3f}", f"{share:.0%}"
+        )
     yield out
-    out = Table("stage", "condition", "", title=f"stages, refused beyond {WORST_CONDITION:g}")
+    yield (
+        "The intervals hold within the model. “From strokes” is the share of the variance among known brushes that "
+        "these strokes took away; at 0 % value and interval are those of known brushes."
+    )
+    out = Table("stage", "condition", title="condition numbers")
     for stage in artefact.stages:
-        condition = "infinite" if stage.condition is None else f"{stage.condition:.1f}"
-        out.add_row(stage.name, condition, "refused: the strokes do not determine it" if stage.refused else "fitted")
+        out.add_row(stage.name, "infinite" if stage.condition is None else f"{stage.condition:.1f}")
     yield out
     if not fitted.held_out:
         yield "One cell only: nothing can be held out."

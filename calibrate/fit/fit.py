@@ -31,8 +31,6 @@ STAGES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("lean", ("lean", "heel_tilt")),
 )
 """Each stage frees its parameters in addition to all that were freed before."""
-WORST_CONDITION = 300.0
-"""Condition number of the Jacobian with unit columns above which noisy captures do not separate the parameters."""
 ROUNDS = 40
 STEP = 1e-4
 """Step of a derivative, as a share of the parameter's spread."""
@@ -47,22 +45,37 @@ class Stage:
     name: str
     parameters: tuple[str, ...]
     condition: float
-    """Condition number over all free parameters; inf where a column of the Jacobian is zero."""
-    refused: bool
+    """Condition number of the Jacobian with unit columns over all free parameters; inf where a column is zero."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A brush fitted to presses, with the data for its intervals and for the choice of the next press."""
+    """A brush fitted to presses, with what the strokes tell of its parameters."""
 
     press: FittedPress
     free: tuple[str, ...]
     stages: tuple[Stage, ...]
-    squares: Floats
-    """(strokes, P, P): J'J of each stroke at the end, scaled by the parameters' spreads; P is free parameters."""
-    gradients: Floats
-    """(strokes, P)."""
+    information: Floats
+    """(P, P): sum of J'J over the strokes, scaled by the parameters' spreads; P is free parameters."""
+    prior: Prior
     strokes: int
+
+    @property
+    def errors(self) -> Floats:
+        """Standard deviation of each free parameter after the fit, (P,), in the parameter's unit.
+
+        The posterior is linearised at the fit, with a variance of 1 for a pixel's edge times the number of pixels whose
+        errors are correlated. What the strokes do not determine keeps the deviation of the prior.
+        """
+        at = [NAMES.index(name) for name in self.free]
+        return spreads()[at] * np.sqrt(np.diag(_inverse(self.information + self.prior.precision[np.ix_(at, at)])))
+
+    @property
+    def from_strokes(self) -> Floats:
+        """Share of each free parameter's variance before the fit that the strokes took away, (P,), 0 to 1."""
+        at = [NAMES.index(name) for name in self.free]
+        before = np.diag(_inverse(self.prior.precision[np.ix_(at, at)]))
+        return 1.0 - (self.errors / spreads()[at]) ** 2 / before
 
 
 def fit_presses(
@@ -78,7 +91,7 @@ def fit_presses(
 ) -> Fit:
     """Fit the parameters of the stages, then what they cannot express. The prior is the learned one by default.
 
-    Parameters that the strokes do not determine have the values that the prior expects beside the others.
+    Parameters that the strokes do not determine have the values and the deviations that the prior expects.
     Raises ValueError without a stroke.
     """
     if not strokes:
@@ -90,18 +103,14 @@ def fit_presses(
     if not prior.gradual:
         press = _minimise(press, tuple(name for _, names in stages for name in names), strokes, grid, prior)
     for name, parameters in counted(stages, "stages fitted", len(stages), progress):
-        wanted = (*free, *parameters)
-        # Judged at the end of the stage's fit, as the published start is far from any brush.
-        fitted = _minimise(press, wanted, strokes, grid, prior) if prior.gradual else press
-        condition = condition_number(_squares(fitted, wanted, strokes, grid))
-        refused = not condition <= WORST_CONDITION
-        made.append(Stage(name, parameters, condition, refused))
-        if not refused:
-            press, free = fitted, wanted
-    squares, gradients, _ = _normal(press, free, strokes, grid)
+        free = (*free, *parameters)
+        if prior.gradual:
+            press = _minimise(press, free, strokes, grid, prior)
+        made.append(Stage(name, parameters, condition_number(_squares(press, free, strokes, grid))))
+    information = _normal(press, free, strokes, grid)[0].sum(axis=0)
     if residual:
         press = fit_residual(press, strokes, grid)
-    return Fit(press, free, tuple(made), squares, gradients, len(strokes))
+    return Fit(press, free, tuple(made), information, prior, len(strokes))
 
 
 def refit(fit: Fit, strokes: Sequence[Pressed], grid: Grid) -> Fit:
@@ -110,47 +119,22 @@ def refit(fit: Fit, strokes: Sequence[Pressed], grid: Grid) -> Fit:
         raise ValueError("a fit needs at least one stroke")
     bare = FittedPress(fit.press.radius_mm, fit.press.length_mm, fit.press.values)
     press = _minimise(bare, NAMES, strokes, grid, learned())
-    squares, gradients, _ = _normal(press, fit.free, strokes, grid)
+    information = _normal(press, fit.free, strokes, grid)[0].sum(axis=0)
     press = fit_residual(press, strokes, grid)
-    return replace(fit, press=press, squares=squares, gradients=gradients, strokes=len(strokes))
+    return replace(fit, press=press, information=information, prior=learned(), strokes=len(strokes))
 
 
 def zero_touch(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> tuple[FittedPress, Floats]:
     """Fit only depth and place of the zero touch, all else of the brush held: what changed since `press` was fitted.
 
-    Returns the brush and the standard errors of (h0_mm, origin_mm), by bootstrap over strokes.
+    Returns the brush and the standard deviations of (h0_mm, origin_mm).
     """
     free = ("h0_mm", "origin_mm")
     bare = FittedPress(press.radius_mm, press.length_mm, press.values)
     held = _minimise(bare, free, strokes, grid, wide())
-    squares, gradients, _ = _normal(held, free, strokes, grid)
-    errors = bootstrap(held, free, squares, gradients, wide()).std(axis=0)
-    return replace(held, edges=press.edges, ends=press.ends), errors
-
-
-def bootstrap(
-    press: FittedPress,
-    free: Sequence[str],
-    squares: Floats,
-    gradients: Floats,
-    prior: Prior | None = None,
-    draws: int = 500,
-    seed: int = 0,
-) -> Floats:
-    """(draws, P) values of the free parameters, by bootstrap over strokes.
-
-    Each draw takes one Gauss-Newton step from the fit instead of a whole fit, which keeps 500 of them within a
-    second; with fewer than some 8 strokes the intervals are too short.
-    """
-    at = [NAMES.index(name) for name in free]
-    spread = spreads()[at]
-    pull, stiff = _prior_terms(press, at, learned() if prior is None else prior)
-    count = len(squares)
-    weights = np.random.default_rng(seed).multinomial(count, np.full(count, 1.0 / count), draws).astype(np.float64)
-    square = np.tensordot(weights, squares, 1) + stiff
-    steps = np.asarray(np.linalg.solve(square, -(weights @ gradients + pull)[..., None]), np.float64)[..., 0]
-    low, high = (np.array([getattr(PARAMETERS[k], end) for k in at]) for end in ("low", "high"))
-    return np.clip(press.values[at] + spread * steps, low, high)
+    information = _normal(held, free, strokes, grid)[0].sum(axis=0)
+    found = Fit(held, free, (), information, wide(), len(strokes))
+    return replace(held, edges=press.edges, ends=press.ends), found.errors
 
 
 def condition_number(square: Floats) -> float:
@@ -244,6 +228,10 @@ def _minimise(
             if damping > 1e5:
                 break
     return press
+
+
+def _inverse(square: Floats) -> Floats:
+    return np.asarray(np.linalg.inv(square), np.float64)
 
 
 def _squares(press: FittedPress, free: Sequence[str], strokes: Sequence[Pressed], grid: Grid) -> Floats:

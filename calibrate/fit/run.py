@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
-
 from calibrate.artefact import FittedValue, put_to_use
 from calibrate.compare.field import Field
-from calibrate.errors import CalibrationError
 from calibrate.fit.artefact import FOLDER, BrushFit, FittedStage
 from calibrate.fit.captures import Captures
-from calibrate.fit.fit import STAGES, Fit, bootstrap, fit_presses, zero_touch
+from calibrate.fit.fit import STAGES, Fit, fit_presses, zero_touch
 from calibrate.fit.heldout import HeldOut, by_cell, leave_cell_out
 from calibrate.fit.prior import wide
 from calibrate.fit.strokes import Grid, Pressed
-from model.fitted import NAMES, FittedPress
+from model.fitted import NAMES, PARAMETERS
 from sessions.progress import Progress, unseen
 
 NORMAL_95 = 1.96
@@ -51,24 +48,15 @@ class Fitted:
 
 
 def fit_session(captures: Captures, view: Field, progress: Progress = unseen) -> Fitted:
-    """Fit, leave each cell out in turn, and make the artefact.
-
-    Raises `CalibrationError` where the strokes determine no stage.
-    """
+    """Fit, leave each cell out in turn, and make the artefact."""
     grid, strokes = captures.grid, captures.strokes
     fit = fit_presses(strokes, grid, captures.radius_mm, captures.length_mm, progress=progress)
-    if not fit.free:
-        first = fit.stages[0]
-        raise CalibrationError(
-            captures.header.session_id,
-            f"its strokes do not even tell scale and place (condition number {first.condition:.3g})",
-        )
     held_out = leave_cell_out(fit, strokes, grid, progress) if len(by_cell(strokes)) > 1 else []
-    draws = bootstrap(_bare(fit.press), fit.free, fit.squares, fit.gradients)
-    low, high = np.quantile(draws, [0.025, 0.975], axis=0)
-    parameters = {name: FittedValue(value=v, low=None, high=None) for name, v in zip(NAMES, _floats(fit), strict=True)}
-    for k, name in enumerate(fit.free):
-        parameters[name] = FittedValue(value=parameters[name].value, low=float(low[k]), high=float(high[k]))
+    parameters: dict[str, FittedValue] = {}
+    for name, value, error in zip(NAMES, _floats(fit), fit.errors.tolist(), strict=True):
+        bounds = PARAMETERS[NAMES.index(name)]
+        low, high = _interval(value, error)
+        parameters[name] = FittedValue(value=value, low=max(low, bounds.low), high=min(high, bounds.high))
     h0_mm, h0_se_mm = proportional_zero(strokes, grid, captures.radius_mm, captures.length_mm)
     artefact = BrushFit(
         session_id=captures.header.session_id,
@@ -84,9 +72,9 @@ def fit_session(captures: Captures, view: Field, progress: Progress = unseen) ->
         edges_mm=tuple(tuple(tuple(terms) for terms in side) for side in fit.press.edges.tolist()),
         ends_mm=tuple(tuple(terms) for terms in fit.press.ends.tolist()),
         stages=tuple(
-            FittedStage(name=s.name, condition=s.condition if math.isfinite(s.condition) else None, refused=s.refused)
-            for s in fit.stages
+            FittedStage(name=s.name, condition=s.condition if math.isfinite(s.condition) else None) for s in fit.stages
         ),
+        from_strokes=dict(zip(NAMES, fit.from_strokes.tolist(), strict=True)),
         proportional_h0_mm=h0_mm,
         proportional_h0_se_mm=h0_se_mm,
         csim_percent={row.model: row.csim for row in held_out},
@@ -95,13 +83,10 @@ def fit_session(captures: Captures, view: Field, progress: Progress = unseen) ->
 
 
 def proportional_zero(strokes: list[Pressed], grid: Grid, radius_mm: float, length_mm: float) -> tuple[float, float]:
-    """(h0, its standard error) in mm with every size proportional to depth; (0, 1e9) if one depth leaves it open."""
+    """(h0, its standard deviation) in mm with every size proportional to depth; with one depth only, the prior's."""
     fit = fit_presses(strokes, grid, radius_mm, length_mm, residual=False, stages=STAGES[:PROPORTIONAL], prior=wide())
-    if "h0_mm" not in fit.free:
-        return 0.0, 1e9
-    at = fit.free.index("h0_mm")
-    draws = bootstrap(fit.press, fit.free, fit.squares, fit.gradients, wide())[:, at]
-    return float(fit.press.values[NAMES.index("h0_mm")]), float(draws.std())
+    at = NAMES.index("h0_mm")
+    return float(fit.press.values[at]), float(fit.errors[fit.free.index("h0_mm")])
 
 
 def correction(captures: Captures, artefact: BrushFit, reference: BrushFit | None) -> Correction:
@@ -129,7 +114,3 @@ def _interval(value: float, error: float) -> tuple[float, float]:
 
 def _floats(fit: Fit) -> list[float]:
     return [float(v) for v in fit.press.values]
-
-
-def _bare(press: FittedPress) -> FittedPress:
-    return replace(press, edges=np.zeros_like(press.edges), ends=np.zeros_like(press.ends))

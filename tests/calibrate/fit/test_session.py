@@ -54,7 +54,7 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     ran = CliRunner().invoke(app, ["fit", str(session), "--mm-per-px", "0.4", "--correction"])
     assert ran.exit_code == 0, ran.output
     said = " ".join(ran.output.split())
-    for words in ("leave one cell out", "refitted Bezier", "uncalibrated", "condition", "paper.touch_z_mm: add"):
+    for words in ("leave one cell out", "refitted Bezier", "uncalibrated", "from strokes", "paper.touch_z_mm: add"):
         assert words in said
     path = current(session, FOLDER)
     assert path is not None
@@ -87,5 +87,9 @@ def test_one_press_alone_says_what_it_cannot_tell(session: Path) -> None:
     del captures.strokes[1:]
     fitted = fit_session(captures, VIEW)
     assert fitted.held_out == []
-    assert {"zero offset", "tilt"} <= {stage.name for stage in fitted.artefact.stages if stage.refused}
-    assert fitted.artefact.parameters["h0_mm"].low is None
+    tilt, scale = (fitted.artefact.from_strokes[name] for name in ("width_tilt", "lam"))
+    assert tilt < 0.5 < scale
+    found = fitted.artefact.parameters["width_tilt"]
+    assert found.low is not None
+    assert found.high is not None
+    assert found.low < found.value < found.high
