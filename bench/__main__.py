@@ -11,6 +11,7 @@ import argparse
 import sys
 
 from bench import (
+    adaptive,
     analysis,
     brushfit,
     curves,
@@ -40,6 +41,7 @@ from bench.harness import Bench, BenchError, results_of
 def benches() -> dict[str, Bench]:
     """Every benchmark by name; a new one is added here."""
     return {
+        "adaptive": adaptive.run,
         "analysis": analysis.run,
         "brushfit": brushfit.run,
         "curves": curves.run,
