@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import gc
 import os
 import threading
 import time
@@ -24,6 +25,9 @@ os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")
 settings.register_profile("same", max_examples=40, derandomize=True, deadline=None)
 settings.register_profile("search", max_examples=200, derandomize=False, deadline=None)
 settings.load_profile("same")
+
+# What collecting makes lives as long as the worker: looking through it for garbage takes a second each time.
+gc.disable()
 
 # Our command line does not change between tests: its tree of commands is built once instead of at every command.
 typer.main.get_command = typer.testing._get_command = functools.cache(typer.main.get_command)
@@ -69,6 +73,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for folder, group in TOGETHER.items():
             if item.nodeid.startswith(folder) and item.get_closest_marker("xdist_group") is None:
                 item.add_marker(pytest.mark.xdist_group(group))
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(autouse=True)
