@@ -20,6 +20,7 @@ from bench.harness import BenchError, Result, machine
 from bench.realink_network import train_and_predict
 from bench.realink_sessions import SESSION_SPLITS, measure_sessions
 from bench.realink_strokes import PX_PER_MM, Strokes, load, region
+from calibrate.compare.similarity import binary_scores
 from calibrate.drags.fit import INK_ABOVE, chance, fit_drags
 from calibrate.drags.predict import STAMP_ABOVE, STAMP_SPREAD_MM
 from calibrate.drags.residual import Residual, captured_distance, threshold
@@ -165,22 +166,17 @@ def circles(strokes: Strokes, chosen: NDArray[np.int64], test: NDArray[np.int64]
 
 def score(strokes: Strokes, test: NDArray[np.int64], chances: NDArray[np.floating], above: float = INK_ABOVE) -> Scores:
     """Means over the test strokes of the chances of ink, (n, rows, columns)."""
-    rows: list[tuple[float, float, float, float]] = []
-    for k, seen in zip(test, chances, strict=True):
-        truth, ink = strokes.ink[k], seen > above
-        union = float(np.count_nonzero(ink | truth))
-        padded = np.pad(ink.astype(np.float32), SHIFT_PX)
+    ink, truths = chances > above, strokes.ink[test]
+    csim, iou = binary_scores(ink, truths).mean(axis=0)
+    rows: list[tuple[float, float]] = []
+    for seen, one, truth in zip(chances, ink, truths, strict=True):
+        padded = np.pad(one.astype(np.float32), SHIFT_PX)
         overlap = cv2.matchTemplate(padded, truth.astype(np.float32), cv2.TM_CCORR)
-        norm = max(1.0, float(np.sqrt(np.count_nonzero(ink) * np.count_nonzero(truth))))
-        rows.append(
-            (
-                np.count_nonzero(ink & truth) / norm,
-                np.count_nonzero(ink & truth) / union,
-                float(overlap.max()) / norm,
-                float(seen[truth].sum() / (np.linalg.norm(seen) * np.sqrt(np.count_nonzero(truth)) + 1e-9)),
-            )
-        )
-    return Scores(*(float(v) for v in np.mean(rows, axis=0)))
+        norm = max(1.0, float(np.sqrt(np.count_nonzero(one) * np.count_nonzero(truth))))
+        gray = float(seen[truth].sum() / (np.linalg.norm(seen) * np.sqrt(np.count_nonzero(truth)) + 1e-9))
+        rows.append((float(overlap.max()) / norm, gray))
+    shifted, gray = np.mean(rows, axis=0)
+    return Scores(float(csim), float(iou), float(shifted), float(gray))
 
 
 def _words(scores: Floats) -> str:

@@ -1,9 +1,10 @@
 """One session of a small brush predicted from another: real ink, two sessions of different travel.
 
 In each split a quarter of the target session is scored. The fit within the session and the one of the other session
-have the same number of training strokes. A third contestant is the other session's brush with place and width adapted
-to the first strokes of the target session that are not scored (`brushloop fit --drags --prior --strokes`). Every
-setting was chosen on training strokes of the big brush, or by the fit itself on its own training strokes.
+have the same number of training strokes, and so has the network. Further contestants are the other session's brush with
+place and width adapted to 5 or 10 strokes of the target session, chosen by their commands among those that are not
+scored (`brushloop fit --drags --prior --strokes`). Every setting was chosen on training strokes of the big brush, or by
+the fit itself on its own training strokes.
 """
 
 from __future__ import annotations
@@ -16,14 +17,15 @@ from numpy.typing import NDArray
 from bench.harness import BenchError, Result, machine
 from bench.realink_network import train_and_predict
 from bench.realink_strokes import SMALL_A, SMALL_B, Strokes, drawn, load, region
+from calibrate.compare.similarity import binary_scores
 from calibrate.drags.captures import Drawn
-from calibrate.drags.predict import learn, scores
-from calibrate.drags.run import adapt, adapted
+from calibrate.drags.predict import learn
+from calibrate.drags.run import adapt, adapted, different
 
 SESSION_SPLITS = 5
 STROKES = 90
 SCORED = 0.25
-FIRST = 10
+ADAPTED = (5, 10)
 """Strokes of the target session that a known brush is adapted to."""
 NETWORK_STEPS = 500
 SHORT = {SMALL_A: "a", SMALL_B: "b"}
@@ -56,7 +58,7 @@ def _compare(
     seed: int,
     network_steps: int,
 ) -> dict[str, Floats]:
-    """(splits, 2) mean CSIM and IoU of every contestant; the network is trained once, for the first split."""
+    """(splits, 2) mean CSIM and IoU of every contestant."""
     found: dict[str, list[Floats]] = {}
     for k in range(splits):
         rng = np.random.default_rng([seed, k])
@@ -69,15 +71,15 @@ def _compare(
         known = across.predictor
         seen = {
             "within": within.ink(target, test),
-            "zero-shot": known.ink(target, test),
-            "lag, zero-shot": known.ink(target, test, corrected=False),
-            "adapted": adapted(known, adapt(target, left[:FIRST], known)).ink(target, test),
             "circles": across.stamps.ink(target, test),
+            "network": _network(strokes[source_name], other, strokes[target_name], test, seed + k, network_steps),
         }
-        if k == 0:
-            seen["network"] = _network(strokes[source_name], other, strokes[target_name], test, seed, network_steps)
+        seen["zero-shot"], seen["lag, zero-shot"] = known.ink_both_ways(target, test)
+        for count in ADAPTED:
+            fit = adapt(target, different(target, left, count), known)
+            seen[f"adapted to {count}"] = adapted(known, fit).ink(target, test)
         for name, ink in seen.items():
-            found.setdefault(name, []).append(scores(ink, truth).mean(axis=0))
+            found.setdefault(name, []).append(binary_scores(ink, truth).mean(axis=0))
     return {name: np.array(each) for name, each in found.items()}
 
 
@@ -97,18 +99,15 @@ def _results(found: dict[str, Floats], way: str, splits: int, seed: int, steps: 
         for name, each in found.items()
     )
     conditions = (
-        f"real ink, small brush, {way}, {STROKES} training strokes, adapted to {FIRST}; CSIM / IoU: {words}; network: "
-        f"first split only, at most {steps} steps; {machine()}"
+        f"real ink, small brush, {way}, {STROKES} training strokes, {splits} splits; CSIM / IoU, means: {words}; "
+        f"network: at most {steps} steps; {machine()}"
     )
     results: list[Result] = []
-    for name in ("zero-shot", "adapted"):
+    for name in ("zero-shot", *(f"adapted to {count}" for count in ADAPTED)):
+        label = f"realink.{way}.{name.replace(' ', '-')}"
         for column, what in enumerate(("csim", "iou")):
-            ours = found[name][:, column]
+            ours = float(found[name][:, column].mean())
             for peer, against in (("a fit within the session", "within"), ("a network of FRIDA's shape", "network")):
-                other = found[against][:, column]
-                ratio = float(ours[: len(other)].mean() / other.mean())
-                label = f"realink.{way}.{name}.{what}" + (".first" if against == "network" else "")
-                results.append(
-                    Result(label, float(ours[: len(other)].mean()), "of 1", peer, ratio, len(other), seed, conditions)
-                )
+                ratio = ours / float(found[against][:, column].mean())
+                results.append(Result(f"{label}.{what}", ours, "of 1", peer, ratio, splits, seed, conditions))
     return results

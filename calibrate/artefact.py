@@ -53,6 +53,18 @@ class Artefact(BaseModel):
         return path
 
 
+class SessionFit(Artefact):
+    """Base class of what is fitted to the strokes of one session."""
+
+    schema_version: int = 1
+    session_id: str
+    source: str
+    recording_sha256: str
+    calibration: str
+    """Digest of the calibration that the captures were rectified with; empty for an import."""
+    software: str
+
+
 class FittedValue(BaseModel):
     """A fitted parameter; the interval is missing where the data do not determine the parameter."""
 

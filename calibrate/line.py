@@ -27,15 +27,19 @@ class Line:
         return self.slope - reach, self.slope + reach
 
 
-def fit_line(x: Sequence[float], y: Sequence[float]) -> Line | None:
-    """y = slope x + intercept; None with fewer than 3 points or no spread in x or y."""
+def fit_line(x: Sequence[float], y: Sequence[float], weights: Sequence[float] | None = None) -> Line | None:
+    """y = slope x + intercept; None with fewer than 3 points or no spread in x or y.
+
+    Points may have positive `weights`, inversely proportional to their variances.
+    """
     n = len(x)
     if n < 3 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
         return None
-    xs, ys = np.asarray(x), np.asarray(y)
-    sxx = float(((xs - xs.mean()) ** 2).sum())
-    slope = float(((xs - xs.mean()) * (ys - ys.mean())).sum()) / sxx
-    intercept = float(ys.mean()) - slope * float(xs.mean())
-    residual = ys - slope * xs - intercept
-    slope_se = float(np.sqrt((residual**2).sum() / max(n - 2, 1) / sxx))
-    return Line(slope, intercept, slope_se, float(np.corrcoef(xs, ys)[0, 1]), n)
+    share = np.ones(n) if weights is None else np.asarray(weights, np.float64)
+    x_mean, y_mean = float(np.average(x, weights=share)), float(np.average(y, weights=share))
+    xs, ys = np.asarray(x) - x_mean, np.asarray(y) - y_mean
+    sxx, sxy, syy = (float((share * a * b).sum()) for a, b in ((xs, xs), (xs, ys), (ys, ys)))
+    slope = sxy / sxx
+    residual = ys - slope * xs
+    slope_se = float(np.sqrt((share * residual**2).sum() / max(n - 2, 1) / sxx))
+    return Line(slope, y_mean - slope * x_mean, slope_se, sxy / float(np.sqrt(sxx * syy)), n)

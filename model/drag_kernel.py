@@ -88,11 +88,12 @@ def signed(nodes, starts, groups, x, y, out):
 
 
 @_compile
-def normal_equations(nodes, starts, groups, slopes, x, y, target, weights, spread, square, gradient):
+def normal_equations(nodes, starts, groups, slopes, x, y, target, added, weights, spread, square, gradient):
     """Add J'J and J'r of ink minus target over every pixel; returns half the sum of squares. Image i counts
     `weights[i]` times.
 
-    `slopes` (nodes, 3, P) are the nodes' derivatives. The position t of the nearest disc is held constant.
+    `slopes` (nodes, 3, P) are the nodes' derivatives. The position t of the nearest disc is held constant, and so is
+    what is `added` to the signed distances, one array for each image or a single one for all of them.
     """
     count = slopes.shape[2]
     j = np.empty(count)
@@ -101,7 +102,7 @@ def normal_equations(nodes, starts, groups, slopes, x, y, target, weights, sprea
         for r in range(len(y)):
             for c in range(len(x)):
                 value, k, t, ux, uy = _nearest_of(nodes, starts, groups[i], groups[i + 1], x[c], y[r])
-                u = value / spread
+                u = (value + added[min(i, len(added) - 1), r, c]) / spread
                 seen = 1.0 / (1.0 + math.exp(-min(max(u, -40.0), 40.0)))
                 miss = seen - target[i, r, c]
                 cost += 0.5 * weights[i] * miss * miss

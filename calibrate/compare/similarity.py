@@ -54,6 +54,15 @@ def csim(a: Image, b: Image) -> float:
     return float(x @ y) / norm
 
 
+def binary_scores(seen: NDArray[np.bool_], truth: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(n, 2) CSIM and IoU of n pairs of (h, w) images of ink or paper; 0 where either is blank."""
+    seen, truth = seen.reshape(len(seen), -1), truth.reshape(len(truth), -1)
+    both = np.count_nonzero(seen & truth, axis=1).astype(np.float64)
+    one, other = np.count_nonzero(seen, axis=1), np.count_nonzero(truth, axis=1)
+    norm, union = np.sqrt(one * other.astype(np.float64)), one + other - both
+    return np.column_stack([both / np.maximum(norm, 1.0), both / np.maximum(union, 1.0)])
+
+
 def ssim(a: Image, b: Image) -> float:
     """Mean structural similarity of two (h, w) images with values in [0, 1], with `SSIM_SETTINGS`."""
     import skimage.metrics

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from calibrate.artefact import Artefact, FittedValue
+from calibrate.artefact import FittedValue, SessionFit
 from calibrate.drags.fit import INK_ABOVE
 from calibrate.drags.kept import Kept
 from model.drag import DragModel
@@ -34,18 +34,12 @@ class Stamps(BaseModel):
     ink_above: Annotated[float, Field(gt=0.0, lt=1.0)]
 
 
-class DragArtefact(Artefact):
+class DragArtefact(SessionFit):
     """The fitted drag model on disk. Equal inputs give an equal file."""
 
     versions: ClassVar[tuple[int, ...]] = (1, SCHEMA_VERSION)
 
     schema_version: int = SCHEMA_VERSION
-    session_id: str
-    source: str
-    recording_sha256: str
-    calibration: str
-    """Digest of the calibration that the captures were rectified with; empty for an import."""
-    software: str
     images: int
     strokes: int
     mm_per_px: float

@@ -13,7 +13,7 @@ import numpy as np
 from calibrate.stroke.components import components, fill_holes
 from calibrate.stroke.measure import outline
 from calibrate.stroke.params import Gray, Mask, Params
-from calibrate.stroke.preprocess import Prepared, preprocess
+from calibrate.stroke.preprocess import Prepared, preprocess, touches_edge
 
 JOIN_MM = 6.0
 """Parts this close to the stroke belong to it."""
@@ -28,7 +28,7 @@ FLAGGED_WEIGHT = 0.3
 def prepare_drag(
     raster: Gray, anchor_px: tuple[float, float] | None, where: str, params: Params
 ) -> tuple[Prepared, Mask, tuple[str, ...]]:
-    """Find a drag on its raster: its connected part, all parts of it, and its defects.
+    """Find a drag on its raster: its connected part, all parts of it, and its defects. It is cut if any part is.
 
     Raises `CaptureRefused` as `prepare` does.
     """
@@ -36,7 +36,7 @@ def prepare_drag(
     wide = replace(params, join_mm=max(params.join_mm, JOIN_MM))
     whole = fill_holes(components(steps.ink, anchor_px, wide).mask, params)
     glare = tuple(flag for flag in steps.prepared.flags if flag.startswith("glare"))
-    return steps.prepared, whole, (*defects(whole), *glare)
+    return replace(steps.prepared, cut=touches_edge(whole)), whole, (*defects(whole), *glare)
 
 
 def defects(mask: Mask) -> tuple[str, ...]:

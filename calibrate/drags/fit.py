@@ -83,12 +83,14 @@ def fit_drags(
     groups: Indices | None = None,
     weights: Floats | None = None,
     only: Mapping[str, float] | None = None,
+    added_mm: Floats | None = None,
 ) -> DragFit:
     """Fit by Levenberg-Marquardt to (B, len(y_mm), len(x_mm)) ink; `place` is (B, q).
 
     Paths `groups[i]` to `groups[i + 1]` are the strokes of image i; without `groups` each image shows one stroke.
     Without `lag` the disc stays at the tip, except for drift; its width still settles along the path. `weights` are one
-    for each image. `only` names the parameters that are fitted, and how far each may be from `start`.
+    for each image. `only` names the parameters that are fitted, and how far each may be from `start`. `added_mm`
+    (B, len(y_mm), len(x_mm)) is added to the signed distances: what the model is known to miss.
     Raises ValueError if the sizes of paths, ink and place do not match.
     """
     from model import drag_kernel
@@ -105,6 +107,7 @@ def fit_drags(
     first = np.concatenate([begin.vector(), np.zeros(2 * columns.shape[1])])
     prior = np.array([(only or {}).get(name, sd) for name, sd in zip(DragModel.names(), PRIOR, strict=True)])
     scale = np.concatenate([prior, np.full(2 * columns.shape[1], PLACE_PRIOR_MM)])
+    added = np.zeros((1, *images.shape[1:])) if added_mm is None else np.ascontiguousarray(added_mm, np.float64)
     counted = np.ones(shown) if weights is None else np.asarray(weights, np.float64)
     free = np.ones(len(first), np.bool_)
     if only is not None:
@@ -118,7 +121,7 @@ def fit_drags(
         square, gradient = np.zeros((len(vector), len(vector))), np.zeros(len(vector))
         cost = float(
             kernel.normal_equations(
-                nodes, starts, each, slopes, x_mm, y_mm, images, counted, spread_mm, square, gradient
+                nodes, starts, each, slopes, x_mm, y_mm, images, added, counted, spread_mm, square, gradient
             )
         )
         off = (vector - first) / scale
@@ -145,7 +148,7 @@ def fit_drags(
                 break
     spread = np.sqrt(np.diag(square))
     condition = float(np.linalg.cond(square / np.outer(spread, spread)))
-    squares, gradients = _by_image(paths, each, images, counted, x_mm, y_mm, vector, scale, columns, spread_mm)
+    squares, gradients = _by_image(paths, each, images, added, counted, x_mm, y_mm, vector, scale, columns, spread_mm)
     names = tuple(name for name, is_free in zip(DragModel.names(), free, strict=False) if is_free)
     return DragFit(
         DragModel.of(vector[:14]),
@@ -199,6 +202,7 @@ def _by_image(
     paths: Sequence[Floats],
     each: Indices,
     images: NDArray[np.float32],
+    added: Floats,
     weights: Floats,
     x_mm: Floats,
     y_mm: Floats,
@@ -223,6 +227,7 @@ def _by_image(
             x_mm,
             y_mm,
             images[i : i + 1],
+            added[i : i + 1] if len(added) > 1 else added,
             weights[i : i + 1],
             spread_mm,
             squares[i],

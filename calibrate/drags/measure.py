@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.drags.defects import prepare_drag
+from calibrate.drags.defects import FLAGGED_WEIGHT, prepare_drag
 from calibrate.errors import CaptureRefused
 from calibrate.line import Line, fit_line
 from calibrate.stroke.measure import Measured, measure
@@ -44,6 +44,11 @@ class Drag:
     """(160, 160) gray photograph with the stroke's outline drawn in."""
 
     @property
+    def weight(self) -> float:
+        """Weight in a fit: a stroke with a defect counts less."""
+        return FLAGGED_WEIGHT if self.flags else 1.0
+
+    @property
     def depth_mm(self) -> float | None:
         """The commanded depth, under whichever name the source gives it."""
         return next((self.commanded[name] for name in DEPTH_NAMES if name in self.commanded), None)
@@ -60,7 +65,10 @@ class DragResults:
 
 
 def validate_drags(captures: Iterator[Capture], params: Params) -> DragResults:
-    """Measure every stroke, then fit width on depth and length on commanded length over those that are whole."""
+    """Measure every stroke, then fit width on depth and length on commanded length over those that are not cut.
+
+    Strokes with a defect count less, as in a fit.
+    """
     results = DragResults()
     for capture in captures:
         try:
@@ -68,11 +76,13 @@ def validate_drags(captures: Iterator[Capture], params: Params) -> DragResults:
         except (CaptureRefused, SessionDamaged) as error:
             results.refused.append((capture.stroke.stroke_id, error.what))
     whole = [drag for drag in results.strokes if not drag.cut]
-    deep = [(drag.depth_mm, drag.measured.mid_width_mm) for drag in whole if drag.depth_mm is not None]
-    results.width_on_depth = fit_line([d for d, _ in deep], [w for _, w in deep])
+    deep = [(drag.depth_mm, drag.measured.mid_width_mm, drag.weight) for drag in whole if drag.depth_mm is not None]
+    results.width_on_depth = fit_line([d for d, _, _ in deep], [w for _, w, _ in deep], [w for _, _, w in deep])
     long = [drag for drag in whole if LENGTH_NAME in drag.commanded]
     results.length_on_commanded = fit_line(
-        [drag.commanded[LENGTH_NAME] for drag in long], [drag.measured.length_mm for drag in long]
+        [drag.commanded[LENGTH_NAME] for drag in long],
+        [drag.measured.length_mm for drag in long],
+        [drag.weight for drag in long],
     )
     return results
 

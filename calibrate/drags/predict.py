@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.compare.similarity import binary_scores
 from calibrate.drags.artefact import DragArtefact, Stamps
 from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, DragFit, chance, fit_drags
 from calibrate.drags.kept import Kept
@@ -40,17 +41,35 @@ class Predictor:
     learned: tuple[Residual, DragModel] | None = None
     """The ridges over `kept`, and the model that they correct."""
 
-    def ink(self, drawn: Drawn, images: Indices, *, corrected: bool = True) -> NDArray[np.bool_]:
-        """The ink that these images should show, (n, len(y_mm), len(x_mm)); `corrected` by the ridges if there are."""
+    def ink(self, drawn: Drawn, images: Indices) -> NDArray[np.bool_]:
+        """The ink that these images should show, (n, len(y_mm), len(x_mm))."""
+        return self.ink_both_ways(drawn, images)[0]
+
+    def ink_both_ways(self, drawn: Drawn, images: Indices) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """The ink that these images should show, and the same without the correction, (n, len(y_mm), len(x_mm))."""
+        away = self.distance(drawn, images)
+        alone = self.is_ink(away)
+        change = self.correction(drawn, images)
+        return (alone if change is None else self.is_ink(clipped(away) + change)), alone
+
+    def distance(self, drawn: Drawn, images: Indices) -> Floats:
+        """Signed distances of the model's marks, (n, len(y_mm), len(x_mm)) mm, positive in ink."""
         paths, groups = chosen(drawn, images)
         nodes, starts = trails(paths, self.model.vector())
-        away = distances(nodes, starts, drawn.x_mm, drawn.y_mm, groups)
-        if corrected and self.kept is not None and self.learned is not None and drawn.commands is not None:
-            residual, model = self.learned
-            base = self.kept.base(model, paths)
-            change = residual.add(drawn.commands[images], base) - clipped(base)
-            away = clipped(away) + self.kept.placed(change, drawn.x_mm, drawn.y_mm)
-        return chance(away, self.spread_mm) > self.above
+        return distances(nodes, starts, drawn.x_mm, drawn.y_mm, groups)
+
+    def correction(self, drawn: Drawn, images: Indices) -> Floats | None:
+        """What the ridge adds to these distances once they are clipped; None without a ridge, or for figures."""
+        if self.kept is None or self.learned is None or drawn.commands is None:
+            return None
+        residual, model = self.learned
+        base = self.kept.base(model, chosen(drawn, images)[0])
+        change = residual.add(drawn.commands[images], base) - clipped(base)
+        return self.kept.placed(change, drawn.x_mm, drawn.y_mm)
+
+    def is_ink(self, away_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Whether a signed distance is called ink."""
+        return chance(np.asarray(away_mm, np.float64), self.spread_mm) > self.above
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,18 +122,15 @@ def chosen(drawn: Drawn, images: Indices) -> tuple[list[Floats], Indices]:
     return [path for one in each for path in one], np.cumsum([0, *(len(one) for one in each)])
 
 
+def coarse_step(drawn: Drawn) -> int:
+    """How many pixels make about `FIT_MM`."""
+    return max(1, round(FIT_MM / drawn.mm_per_px))
+
+
 def coarse(drawn: Drawn, images: Indices) -> tuple[NDArray[np.float32], Floats, Floats]:
     """Ink, x and y of these images at about `FIT_MM` a pixel."""
-    step = max(1, round(FIT_MM / drawn.mm_per_px))
+    step = coarse_step(drawn)
     return drawn.ink[images][:, ::step, ::step], drawn.x_mm[::step], drawn.y_mm[::step]
-
-
-def scores(seen: NDArray[np.bool_], truth: NDArray[np.bool_]) -> Floats:
-    """(n, 2) CSIM and IoU of ink as 0 or 1, without a search for a shift; 0 where nothing is predicted."""
-    both = np.count_nonzero(seen & truth, axis=(1, 2)).astype(np.float64)
-    one, other = np.count_nonzero(seen, axis=(1, 2)), np.count_nonzero(truth, axis=(1, 2))
-    norm, union = np.sqrt(one * other.astype(np.float64)), one + other - both
-    return np.column_stack([both / np.maximum(norm, 1.0), both / np.maximum(union, 1.0)])
 
 
 def _fit(drawn: Drawn, images: Indices, *, lag: bool, spread_mm: float) -> DragFit:
@@ -127,4 +143,5 @@ def _fit(drawn: Drawn, images: Indices, *, lag: bool, spread_mm: float) -> DragF
 def _stamps(drawn: Drawn, images: Indices, fit: DragFit) -> Predictor:
     truth = drawn.ink[images] > 0.5
     each = [Predictor(fit.model, fit.spread_mm, above) for above in STAMP_ABOVE]
-    return max(each, key=lambda one: float(scores(one.ink(drawn, images), truth)[:, 0].mean()))
+    away = each[0].distance(drawn, images)
+    return max(each, key=lambda one: float(binary_scores(one.is_ink(away), truth)[:, 0].mean()))

@@ -6,7 +6,6 @@ Scores are CSIM and IoU of ink as 0 or 1 at the commanded place; no shift is sea
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.artefact import load_artefact
+from calibrate.compare.similarity import binary_scores
 from calibrate.drags.artefact import DragArtefact
 from calibrate.drags.captures import Drawn, read_drags
-from calibrate.drags.predict import Predictor, predictors, scores
+from calibrate.drags.predict import Predictor, predictors
 from sessions.progress import Progress, unseen
 
 Floats = NDArray[np.float64]
@@ -115,13 +115,12 @@ def predict_session(
     ours, stamps = predictors(artefact, str(fit))
     drawn = read_drags(session, artefact.mm_per_px, calibration, progress)
     truth = drawn.ink > 0.5
-    seen = _in_pieces(drawn, lambda images: ours.ink(drawn, images))
-    rows = {OURS: scores(seen, truth)}
+    seen, alone = _in_pieces(drawn, ours)
+    rows = {OURS: binary_scores(seen, truth)}
     if ours.kept is not None and drawn.commands is not None:
-        rows[LAG] = scores(_in_pieces(drawn, lambda images: ours.ink(drawn, images, corrected=False)), truth)
+        rows[LAG] = binary_scores(alone, truth)
     if stamps is not None:
-        circles: Predictor = stamps
-        rows[STAMPS] = scores(_in_pieces(drawn, lambda images: circles.ink(drawn, images)), truth)
+        rows[STAMPS] = binary_scores(_in_pieces(drawn, stamps)[0], truth)
     ceiling = _ceiling(drawn, truth)
     known = set(artefact.fitted_strokes) if artefact.recording_sha256 == drawn.recording_sha256 else set[str]()
     strokes = [
@@ -137,9 +136,10 @@ def predict_session(
     return Predictions(artefact, tuple(strokes), drawn, seen)
 
 
-def _in_pieces(drawn: Drawn, ink: Callable[[NDArray[np.int64]], NDArray[np.bool_]]) -> NDArray[np.bool_]:
+def _in_pieces(drawn: Drawn, predictor: Predictor) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     count = len(drawn.ink)
-    return np.concatenate([ink(np.arange(k, min(k + PIECE, count))) for k in range(0, count, PIECE)])
+    pieces = [predictor.ink_both_ways(drawn, np.arange(k, min(k + PIECE, count))) for k in range(0, count, PIECE)]
+    return np.concatenate([seen for seen, _ in pieces]), np.concatenate([alone for _, alone in pieces])
 
 
 def _ceiling(drawn: Drawn, truth: NDArray[np.bool_]) -> dict[int, tuple[float, float]]:
@@ -153,6 +153,6 @@ def _ceiling(drawn: Drawn, truth: NDArray[np.bool_]) -> dict[int, tuple[float, f
     for group in alike.values():
         for k in group if len(group) > 1 else ():
             others = truth[[j for j in group if j != k]].mean(axis=0) >= 0.5
-            [(csim, iou)] = scores(others[None], truth[k : k + 1]).tolist()
+            [(csim, iou)] = binary_scores(others[None], truth[k : k + 1]).tolist()
             found[k] = (csim, iou)
     return found

@@ -71,15 +71,7 @@ def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
 def drags_csv(results: DragResults, source: str) -> str:
     """CSV of commanded and measured values, one row per stroke."""
     names = sorted({name for drag in results.strokes for name in drag.commanded})
-    sizes = [
-        "measured_length_mm",
-        "measured_width_mm",
-        "measured_mid_width_mm",
-        "measured_area_mm2",
-        "cut",
-        "flags",
-        "source",
-    ]
+    sizes = ["measured_length_mm", "measured_width_mm", "measured_mid_width_mm", "measured_area_mm2"]
     head = ["stroke_id", *(f"commanded_{name}" for name in names), *sizes, "cut", "flags", "source"]
     rows: list[list[object]] = []
     for drag in results.strokes:

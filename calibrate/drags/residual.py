@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.compare.similarity import binary_scores
 from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, chance
 
 Floats = NDArray[np.float64]
@@ -62,7 +63,8 @@ def threshold(
     every = (slice(None), slice(None, None, stride), slice(None, None, stride))
     base, captured = _flat(base_mm[every]), _flat(captured_mm[every])
     corrected = captured - _left_out(_gram(commands, scales_of(commands), RIDGE), captured - base)
-    half = 0.5 * _csim(chance(corrected.astype(np.float64), spread_mm) > INK_ABOVE, captured > 0.0)
+    found = binary_scores(chance(corrected.astype(np.float64), spread_mm) > INK_ABOVE, captured > 0.0)
+    half = 0.5 * float(found[:, 0].mean())
     return min(max(round(half, 3), LEAST_ABOVE), MOST_ABOVE)
 
 
@@ -105,12 +107,6 @@ def _left_out(gram: Floats, target: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _solved(gram: Floats, target: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.linalg.solve(gram, target), np.float32)
-
-
-def _csim(seen: NDArray[np.bool_], truth: NDArray[np.bool_]) -> float:
-    both = (seen & truth).sum(axis=1, dtype=np.float64)
-    norm = np.sqrt(seen.sum(axis=1, dtype=np.float64) * truth.sum(axis=1, dtype=np.float64))
-    return float((both / np.maximum(norm, 1e-9)).mean())
 
 
 def _kernel(a: Floats, b: Floats, scales: Floats) -> Floats:

@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.artefact import FittedValue, put_to_use
+from calibrate.compare.similarity import binary_scores
 from calibrate.drags.artefact import DragArtefact, DragScore
 from calibrate.drags.captures import Drawn
 from calibrate.drags.fit import DragFit, bootstrap, determined, fit_drags
-from calibrate.drags.predict import Predictor, chosen, coarse, learn, predictors, scores, stamps_of
+from calibrate.drags.predict import Predictor, chosen, coarse, coarse_step, learn, predictors, stamps_of
 from calibrate.errors import CalibrationError
+from calibrate.spread import farthest_first
 from model.drag import DragModel
 from sessions.progress import Progress, counted, unseen
 
@@ -33,6 +35,7 @@ STROKE_MM2 = 0.14
 """Weight of a square millimetre of wrong ink in such a fit: one stroke then tells its place to about 1 mm, which is how
 far strokes of one session scatter."""
 Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +55,9 @@ def fit_drawn(drawn: Drawn, progress: Progress = unseen) -> FittedDrags:
         raise CalibrationError(
             drawn.header.session_id, f"{len(drawn.ink)} images of dragged strokes, at least {LEAST} are needed"
         )
-    learned = learn(drawn, np.arange(len(drawn.ink)))
-    artefact = _artefact(drawn, learned.fit, len(drawn.ink), _values(learned.fit)).model_copy(
+    every = np.arange(len(drawn.ink))
+    learned = learn(drawn, every)
+    artefact = _artefact(drawn, learned.fit, every, _values(learned.fit)).model_copy(
         update={
             "ink_above": learned.predictor.above,
             "stamps": stamps_of(learned.stamps),
@@ -65,7 +69,7 @@ def fit_drawn(drawn: Drawn, progress: Progress = unseen) -> FittedDrags:
 
 
 def refit_drawn(drawn: Drawn, prior: DragArtefact, where: str, strokes: int) -> FittedDrags:
-    """Adapt a known brush to the first `strokes` images of a session, by the parameters `SESSION_MM`.
+    """Adapt a known brush to `strokes` images of a session, as different as possible, by the parameters `SESSION_MM`.
 
     Raises `CalibrationError` if the session has fewer images, or if its scale is not that of `prior`.
     """
@@ -73,12 +77,12 @@ def refit_drawn(drawn: Drawn, prior: DragArtefact, where: str, strokes: int) -> 
         raise CalibrationError("--strokes", f"{strokes}: allowed 1 to {len(drawn.ink)}, the usable strokes")
     if abs(drawn.mm_per_px - prior.mm_per_px) > 1e-6:
         raise CalibrationError(where, f"mm_per_px is {prior.mm_per_px:g}, here {drawn.mm_per_px:g}")
-    first = np.arange(strokes)
+    images = np.sort(different(drawn, np.arange(len(drawn.ink)), strokes))
     ours, stamps = predictors(prior, where)
-    fit = adapt(drawn, first, ours)
-    moved = None if stamps is None else stamps_of(adapted(stamps, adapt(drawn, first, stamps)))
+    fit = adapt(drawn, images, ours)
+    moved = None if stamps is None else stamps_of(adapted(stamps, adapt(drawn, images, stamps)))
     values = {name: value for name, value in _values(fit).items() if name in SESSION_MM}
-    artefact = _artefact(drawn, fit, strokes, prior.parameters | values).model_copy(
+    artefact = _artefact(drawn, fit, images, prior.parameters | values).model_copy(
         update={
             "ink_above": prior.ink_above,
             "stamps": moved,
@@ -91,11 +95,26 @@ def refit_drawn(drawn: Drawn, prior: DragArtefact, where: str, strokes: int) -> 
     return FittedDrags(fit, artefact)
 
 
-def adapt(drawn: Drawn, images: NDArray[np.int64], known: Predictor) -> DragFit:
-    """Fit place and width of a known brush to these images."""
+def different(drawn: Drawn, among: Indices, count: int) -> Indices:
+    """`count` images among these whose commands are as different as possible, the most ordinary one first.
+
+    Strokes of one kind would pass off what the model misses of that kind as a change of the brush's place. Figures have
+    no commands: of them, the first are taken. Raises ValueError if there are fewer images.
+    """
+    if drawn.commands is None:
+        return among[:count]
+    commands = drawn.commands[among]
+    spread = commands.std(axis=0)
+    places = (commands - commands.mean(axis=0)) / np.where(spread > 1e-9, spread, np.inf)
+    return among[farthest_first(places, int(np.linalg.norm(places, axis=1).argmin()), count)]
+
+
+def adapt(drawn: Drawn, images: Indices, known: Predictor) -> DragFit:
+    """Fit place and width of a known brush to these images, on top of what it is known to miss."""
     paths, groups = chosen(drawn, images)
     ink, x_mm, y_mm = coarse(drawn, images)
     weights = drawn.weights[images] * STROKE_MM2 * float(x_mm[1] - x_mm[0]) ** 2
+    missed, step = known.correction(drawn, images), coarse_step(drawn)
     return fit_drags(
         paths,
         ink,
@@ -106,6 +125,7 @@ def adapt(drawn: Drawn, images: NDArray[np.int64], known: Predictor) -> DragFit:
         groups=groups,
         weights=weights,
         only=SESSION_MM,
+        added_mm=None if missed is None else missed[:, ::step, ::step],
     )
 
 
@@ -120,7 +140,7 @@ def save(fitted: FittedDrags, session: Path) -> Path:
 
 
 def _values(fit: DragFit) -> dict[str, FittedValue]:
-    """All parameters; those that the strokes do not determine have no interval."""
+    """All parameters; those that the strokes do not determine have no interval, nor does any parameter of one image."""
     low, high = np.quantile(bootstrap(fit), [0.025, 0.975], axis=0)
     known = determined(fit)
     values = {
@@ -128,26 +148,27 @@ def _values(fit: DragFit) -> dict[str, FittedValue]:
         for name, value in zip(DragModel.names(), fit.model.vector(), strict=True)
     }
     for name, a, b, is_known in zip(fit.free, low, high, known, strict=True):
-        if is_known:
+        if is_known and a < b:
             values[name] = FittedValue(value=values[name].value, low=float(a), high=float(b))
     return values
 
 
-def _artefact(drawn: Drawn, fit: DragFit, images: int, values: dict[str, FittedValue]) -> DragArtefact:
+def _artefact(drawn: Drawn, fit: DragFit, images: Indices, values: dict[str, FittedValue]) -> DragArtefact:
+    taken: list[int] = images.tolist()
     return DragArtefact(
         session_id=drawn.header.session_id,
         source=drawn.header.source,
         recording_sha256=drawn.recording_sha256,
         calibration=drawn.calibration.digest if drawn.calibration else "",
         software=f"brushloop {version('brushloop')}",
-        images=images,
-        strokes=int(drawn.groups[images]),
+        images=len(taken),
+        strokes=int(np.diff(drawn.groups)[images].sum()),
         mm_per_px=round(drawn.mm_per_px, 9),
         spread_mm=fit.spread_mm,
         parameters=values,
         condition=fit.condition,
         held_out={},
-        fitted_strokes=tuple(drawn.stroke_ids[:images]),
+        fitted_strokes=tuple(drawn.stroke_ids[k] for k in taken),
     )
 
 
@@ -157,11 +178,11 @@ def _held_out(drawn: Drawn, progress: Progress) -> dict[str, DragScore]:
     for k in counted(range(FOLDS), "fifths left out in turn", FOLDS, progress):
         left, others = np.sort(order[k::FOLDS]), np.sort(np.setdiff1d(order, order[k::FOLDS]))
         learned, truth = learn(drawn, others), drawn.ink[left] > 0.5
+        seen, alone = learned.predictor.ink_both_ways(drawn, left)
         if learned.predictor.kept is not None:
-            found.setdefault(PREDICTED, []).append(scores(learned.predictor.ink(drawn, left), truth))
-        lag = learned.predictor.ink(drawn, left, corrected=False)
-        found.setdefault(LAGGING, []).append(scores(lag, truth))
-        found.setdefault(STAMPS, []).append(scores(learned.stamps.ink(drawn, left), truth))
+            found.setdefault(PREDICTED, []).append(binary_scores(seen, truth))
+        found.setdefault(LAGGING, []).append(binary_scores(alone, truth))
+        found.setdefault(STAMPS, []).append(binary_scores(learned.stamps.ink(drawn, left), truth))
     means = {name: (100.0 * np.concatenate(each).mean(axis=0)).tolist() for name, each in found.items()}
     return {
         name: DragScore(csim_percent=csim, iou_percent=iou, images=len(drawn.ink))

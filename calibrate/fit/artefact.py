@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from calibrate.artefact import Artefact, FittedValue
+from calibrate.artefact import FittedValue, SessionFit
 from model.fitted import MODES, NAMES, TERMS, FittedPress
 
 SCHEMA_VERSION = 1
@@ -26,16 +26,10 @@ class FittedStage(BaseModel):
     """Earlier versions refused a stage with a large condition number; its parameters have no interval there."""
 
 
-class BrushFit(Artefact):
+class BrushFit(SessionFit):
     """A fitted brush, with its strokes and software. Equal inputs give an equal file."""
 
     schema_version: int = SCHEMA_VERSION
-    session_id: str
-    source: str
-    recording_sha256: str
-    calibration: str
-    """Digest of the calibration that the captures were rectified with; empty for an import."""
-    software: str
     radius_mm: float
     length_mm: float
     strokes: int

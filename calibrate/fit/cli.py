@@ -37,7 +37,9 @@ def fit(
     prior: Annotated[
         Path | None, typer.Option(help="With --drags: a dragfit of this brush, whose place and width are adapted.")
     ] = None,
-    strokes: Annotated[int | None, typer.Option(min=1, help="With --prior: only the first so many strokes.")] = None,
+    strokes: Annotated[
+        int | None, typer.Option(min=1, help="With --prior: only so many strokes, as different as possible.")
+    ] = None,
 ) -> None:
     """Fit the stroke model to a session's presses; writes an immutable brushfit/<hash>.json."""
     if (prior is not None and not drags) or (strokes is not None and prior is None):

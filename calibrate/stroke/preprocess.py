@@ -103,7 +103,7 @@ def preprocess(
     mask = fill_holes(chosen.mask, params)
     soft = _soft_ink(reflectance, chosen.mask)
     flags = _flags(raster[window], mask[window], chosen)
-    prepared = Prepared(mask, soft, anchor_px, level.threshold, _touches_edge(mask[window]), flags)
+    prepared = Prepared(mask, soft, anchor_px, level.threshold, touches_edge(mask[window]), flags)
     return Steps(window, reflectance, level, ink, chosen, prepared)
 
 
@@ -140,7 +140,7 @@ def _flags(raster: Gray, mask: Mask, chosen: Chosen) -> tuple[str, ...]:
     saturated = float(np.count_nonzero(raster >= SATURATED)) / raster.size
     if saturated > MOST_SATURATED:
         flags.append(f"saturated: {100 * saturated:.0f} % of the pixels are white, the light cannot be judged")
-    if _touches_edge(mask):
+    if touches_edge(mask):
         flags.append("cut: the stroke reaches the edge of its photograph or cell")
     others = [area for area in chosen.others_mm2 if area >= OTHER_MM2]
     if others:
@@ -164,6 +164,6 @@ def _cell_window(raster: Gray, cell_px: tuple[int, int, int, int] | None, where:
     return rows, columns
 
 
-def _touches_edge(mask: Mask) -> bool:
+def touches_edge(mask: Mask) -> bool:
     """Whether ink lies in the outermost rows or columns."""
     return bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from skimage.metrics import structural_similarity
 
-from calibrate.compare.similarity import csim, ssim
+from calibrate.compare.similarity import binary_scores, csim, ssim
 
 images = hnp.arrays(np.float64, (16, 16), elements=st.floats(0, 1))
 
@@ -26,6 +26,14 @@ def image(*ink: tuple[int, int]) -> np.ndarray:
 def test_the_same_ink_is_1_and_disjoint_ink_is_0() -> None:
     assert csim(image((1, 1), (2, 2)), image((1, 1), (2, 2))) == pytest.approx(1.0)
     assert csim(image((1, 1)), image((2, 2))) == 0.0
+
+
+def test_many_pairs_at_once_are_scored_as_one_by_one() -> None:
+    seen, truth = np.stack([image((1, 1), (2, 2)), image()]) > 0, np.stack([image((1, 1), (3, 3), (4, 4))] * 2) > 0
+    [[cosine, share], blank] = binary_scores(seen, truth).tolist()
+    assert cosine == pytest.approx(csim(seen[0], truth[0]))
+    assert share == pytest.approx(1 / 4)
+    assert blank == [0.0, 0.0]
 
 
 def test_half_the_ink_in_common_is_one_half() -> None:

@@ -112,7 +112,7 @@ def test_a_report_of_simulated_drags_says_so_everywhere(session: Path, tmp_path:
         assert word in heads, f"the head {word} is broken"
 
 
-def test_a_known_brush_is_adapted_to_the_first_strokes(session: Path) -> None:
+def test_a_known_brush_is_adapted_to_few_strokes(session: Path) -> None:
     run = CliRunner()
     assert run.invoke(app, ["fit", str(session), "--drags", "--mm-per-px", "1.0"]).exit_code == 0
     prior = current(session, FOLDER)
@@ -124,6 +124,10 @@ def test_a_known_brush_is_adapted_to_the_first_strokes(session: Path) -> None:
     assert (adapted.prior, adapted.images) == (before.digest, 2)
     assert adapted.parameters["leash_mm"] == before.parameters["leash_mm"]
     assert adapted.kept == before.kept
+    alone = run.invoke(app, ["fit", str(session), "--drags", "--prior", str(prior), "--strokes", "1"])
+    assert "drift_x_mm" in alone.output
+    one = load_artefact(current(session, FOLDER) or prior, DragArtefact)
+    assert one.parameters["drift_x_mm"].low is None  # a single stroke has no interval, not one of width zero
     many = run.invoke(app, ["fit", str(session), "--drags", "--prior", str(prior), "--strokes", "7"])
     assert "allowed 1 to 6" in str(many.exception)
 
