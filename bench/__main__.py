@@ -1,6 +1,7 @@
-"""`python -m bench [NAME] [-n N] [--json] [--table]`: run one benchmark, or all, and print a line for each figure.
+"""`python -m bench [NAME] [-n N] [--json] [--table]`: run one benchmark, or many, and print a line for each figure.
 
-With --table, docs/bench.md gets the figures as well.
+Without NAME, those of speed and memory (some 12 minutes), or with --accuracy those that train, fit and press (hours).
+`growth` is run by name only. With --table, docs/bench.md gets the figures as well.
 
 Exit codes: 0 measured, 1 a benchmark could not be measured, 2 unknown name.
 """
@@ -9,12 +10,14 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
 
 from bench import (
     adaptive,
     analysis,
     brushfit,
     curves,
+    export,
     generator,
     growth,
     inversion,
@@ -33,6 +36,7 @@ from bench import (
     tables,
     tui,
     validate,
+    whole,
     written,
 )
 from bench.harness import Bench, BenchError, results_of
@@ -45,6 +49,8 @@ def benches() -> dict[str, Bench]:
         "analysis": analysis.run,
         "brushfit": brushfit.run,
         "curves": curves.run,
+        "drawing": generator.run_drawing,
+        "export": export.run,
         "generator": generator.run,
         "generator-qbc": generator.run_qbc,
         "growth": growth.run,
@@ -71,7 +77,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     known = benches()
     parser = argparse.ArgumentParser(prog="python -m bench", description="Measure this project beside its peers.")
-    parser.add_argument("name", nargs="?", metavar="NAME", help=f"one of {', '.join(known)}; all when left out")
+    parser.add_argument("name", nargs="?", metavar="NAME", help=f"one of {', '.join(known)}")
+    parser.add_argument("--accuracy", action="store_true", help=f"without NAME: {', '.join(whole.ACCURACY)}; hours")
     parser.add_argument("--json", action="store_true", help="one JSON object per line")
     parser.add_argument("--table", action="store_true", help=f"renew the figures' rows in {table.OUT.name}")
     parser.add_argument("-n", "--largest", type=int, dest="n", help="rounds, or strokes, or the largest of `growth`")
@@ -79,21 +86,35 @@ def main(arguments: list[str] | None = None) -> int:
     if options.name is not None and options.name not in known:
         print(f"unknown bench {options.name!r}; known: {', '.join(known)}", file=sys.stderr)
         return 2
-    code = 0
-    for name in known if options.name is None else [options.name]:
-        try:
-            results = results_of(known[name](n=options.n))
-        except BenchError as error:
-            print(f"{name}: {error}", file=sys.stderr)
-            code = 1
-            continue
-        if options.table:
-            table.renew(results)
-        for before, result in zip([None, *results], results, strict=False):
-            if not options.json and result.conditions and (before is None or before.conditions != result.conditions):
-                print(f"# {result.conditions}")
-            print(result.to_json() if options.json else result.to_line(), flush=True)
-    return code
+    if options.name is None:
+        if options.n is not None:
+            print("-n: goes with a NAME", file=sys.stderr)
+            return 2
+        return _several(whole.ACCURACY if options.accuracy else whole.SPEED, as_json=options.json, kept=options.table)
+    try:
+        results = results_of(known[options.name](n=options.n))
+    except BenchError as error:
+        print(f"{options.name}: {error}", file=sys.stderr)
+        return 1
+    if options.table:
+        table.renew(results)
+    for before, result in zip([None, *results], results, strict=False):
+        if not options.json and result.conditions and (before is None or before.conditions != result.conditions):
+            print(f"# {result.conditions}")
+        print(result.to_json() if options.json else result.to_line(), flush=True)
+    return 0
+
+
+def _several(plan: Mapping[str, int], *, as_json: bool, kept: bool) -> int:
+    """Run the benches of a plan; progress, and what was missed, go to stderr. Returns the exit code."""
+    words = [word for word, wanted in (("--json", as_json), ("--table", kept)) if wanted]
+    failed = whole.run_all(plan, words, lambda line: print(line, file=sys.stderr, flush=True))
+    if kept:
+        for line in table.missed():
+            print(f"goal missed: {line}", file=sys.stderr)
+    if failed:
+        print(f"not measured: {', '.join(failed)}; their rows in {table.OUT.name} are as before", file=sys.stderr)
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ PEER_RATE = 1e-3
 _TRIAL_STEPS = 15
 _ROUNDS = 20
 _DRAWN = 200
+DRAWING_STEPS = 200
 DRAWING_SHARE = 0.07
 """The share that drawing had of the training on one core before presses were drawn without an outline."""
 _SHARE = 0.95  # of the budget: steps are counted out beforehand, and their cost wavers
@@ -41,6 +42,32 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
 def run_qbc(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """The same network on QBC strokes, 8 inputs (the paper's ablation), beside the peer; see `_compare`."""
     return _compare("qbc", "generator-qbc", n, seed, with_basis=False)
+
+
+def run_drawing(*, n: int | None = None, seed: int = 0) -> Result:
+    """The share of the training's CPU time in which its batches are drawn, over `n` steps (200) on one thread."""
+    steps = DRAWING_STEPS if n is None else n
+    if steps < 1:
+        raise ValueError(f"n = {n}: at least one step is needed")
+    quiet = {"picture_every": 10**9, "checkpoint_every": 10**9, "validate_every": 10**9}
+    config = preset("press", seed=seed).model_copy(update=quiet | {"steps": steps})
+    with _one_thread():
+        training, validation = exact_sets(config)
+        few = (training, Exact(validation.target, validation.inputs[:1]))
+        state = new_state(config)
+        began = time.process_time()
+        train(config, state, few, _Quiet())
+        whole_s = time.process_time() - began
+        drawing_s = _drawing_s(config, training, steps)
+    conditions = f"{steps} steps of {config.batch} images, {whole_s:.1f} CPU-s; {machine()}"
+    return _drawn("generator", drawing_s / whole_s, seed, conditions)
+
+
+def _drawn(name: str, share: float, seed: int, conditions: str) -> Result:
+    peer = f"{DRAWING_SHARE:g} of it"
+    return Result(
+        f"{name}-drawing", share, "of the training's CPU time", peer, DRAWING_SHARE / share, 1, seed, conditions
+    )
 
 
 def _compare(target: str, name: str, n: int | None, seed: int, *, with_basis: bool) -> Sequence[Result]:
@@ -95,18 +122,7 @@ def _compare(target: str, name: str, n: int | None, seed: int, *, with_basis: bo
         for what, value, kind, ratio in rows
     ]
     results[-1] = replace(results[-1], **turns.ratios())
-    share = drawing_s / ours_s
-    drawn = Result(
-        f"{name}-drawing",
-        share,
-        "of the training's CPU time",
-        f"{DRAWING_SHARE:g} of it",
-        DRAWING_SHARE / share,
-        1,
-        seed,
-        conditions,
-    )
-    return [*results, drawn, *fitted]
+    return [*results, _drawn(name, drawing_s / ours_s, seed, conditions), *fitted]
 
 
 def _drawing_s(config: TrainConfig, training: Exact, steps: int) -> float:

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 
 from bench.harness import BenchError
 
@@ -31,17 +32,17 @@ class Used:
     peak_mb: float
 
 
-def measure(*command: str) -> Used:
-    """Run a command to its end. Raises BenchError with its last words if it fails."""
+def measure(*command: str, code: int = 0, cwd: Path | None = None) -> Used:
+    """Run a command to its end. Raises BenchError with its last words if its exit code is not `code`."""
     read, write = os.pipe()
     starter = [sys.executable, "-I", "-S", "-c", _STARTER, str(write), *command]
-    ran = subprocess.run(starter, capture_output=True, text=True, check=False, pass_fds=(write,))
+    ran = subprocess.run(starter, capture_output=True, text=True, check=False, pass_fds=(write,), cwd=cwd)
     os.close(write)
     with os.fdopen(read) as pipe:
         answer = pipe.read()
     if not answer:
         raise BenchError(f"{command[0]} could not be started: {ran.stderr[-300:]}")
-    wall_s, cpu_s, peak_kib, code = json.loads(answer)
-    if code:
-        raise BenchError(f"`{' '.join(command)}` ended with {code}: {(ran.stderr or ran.stdout)[-300:]}")
+    wall_s, cpu_s, peak_kib, ended = json.loads(answer)
+    if ended != code:
+        raise BenchError(f"`{' '.join(command)}` ended with {ended}: {(ran.stderr or ran.stdout)[-300:]}")
     return Used(wall_s, cpu_s, peak_kib * 1024 / 1e6)

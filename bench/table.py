@@ -13,15 +13,18 @@ GOALS = {
     "raster-press-bulk": 40.0,
     "raster-press-memset": 0.45,
     "raster-press-bulk-memset": 0.45,
-    "raster-compiled-bulk": 25.0,
+    "recorder write rate": 0.8,
+    "recorder write rate per CPU second": 0.8,
 }
 """The ratio that was asked for, by figure."""
 TIME_GOAL = 0.9
 """For `growth-...-time`: a further stroke may take a tenth longer at the largest sizes than at the smallest."""
 _HEAD = """# Figures of the benches
-Written by `make bench`, which runs every bench, or by `python -m bench NAME --table`, which renews the rows of one. A
-ratio compares with the peer or limit named beside it, in the same run; above 1 is better for us. Figures of strokes and
-photographs are of the loopback rig, which is simulated.
+Written by `make bench` (speed and memory, some 12 minutes), `python -m bench --accuracy --table` (hours),
+`python -m bench.growth 5000`, or `python -m bench NAME --table`, which renews the rows of one bench.
+
+A ratio compares with the peer or limit named beside it, in the same run; above 1 is better for us. Figures of strokes
+and photographs are of the loopback rig, which is simulated.
 
 | figure | value | ratio | quickest tenth, median | peer or limit | goal | n | seed | machine |
 |---|---|---|---|---|---|---|---|---|
@@ -34,6 +37,11 @@ def renew(results: Sequence[Result], path: Path = OUT) -> None:
     rows = {name_of(line): line for line in kept if line.startswith("| `")}
     rows |= {result.name: row(result) for result in results}
     path.write_text(_HEAD + "".join(f"{rows[name]}\n" for name in sorted(rows)))
+
+
+def missed(path: Path = OUT) -> list[str]:
+    """The figures whose goal is missed."""
+    return [name_of(line) for line in path.read_text().splitlines() if line.startswith("| `") and "**missed**" in line]
 
 
 def name_of(line: str) -> str:
@@ -58,4 +66,4 @@ def _goal(result: Result) -> float | None:
         return GOALS[result.name]
     if result.name.startswith("growth-"):
         return TIME_GOAL if result.name.endswith("-time") else 1.0
-    return 1.0 if "goal" in result.peer else None
+    return 1.0 if "goal" in result.peer or result.name.endswith("-memory") else None

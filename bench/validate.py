@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.harness import BenchError, Result, interleave, machine
+from bench.peak import measure
 from bench.press_sessions import STILL, Presses, pressed, session
 from calibrate.compare.field import BEST_SHIFT_PX, KEYS, SIZE_PX, Alignment, Field
 from calibrate.compare.images import Pixels, pack, simulated_pixels, unpack
@@ -37,6 +38,8 @@ from model.registry import stroke_models
 from sessions.reader import Recording
 
 STROKES = 60
+FEW = 4
+"""Memory is compared with that of so many times fewer strokes."""
 SAME = 1e-6
 START_S = 60.0
 
@@ -54,7 +57,24 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
         under = Path(folder)
         place = session(under, "presses", Presses(strokes, seed, view=STILL))
         jobs = [PrepareJob(capture, None, Field()) for capture in Recording(place).captures()]
-        return [*scoring(seed), *threads(jobs, seed), *cluster(under, jobs, seed)]
+        few = session(under, "few", Presses(max(1, strokes // FEW), seed, view=STILL))
+        return [*scoring(seed), *threads(jobs, seed), *cluster(under, jobs, seed), memory(few, place, seed)]
+
+
+def memory(few: Path, many: Path, seed: int) -> Result:
+    """Peak memory of the whole command, beside that on a few strokes."""
+    out, strokes = many.parent / "report", Recording(many).strokes()
+    level, used = (
+        measure(
+            sys.executable, "-m", "brushloop", "validate", str(place), "--no-held-out", "--out", f"{out}-{place.name}"
+        )
+        for place in (few, many)
+    )
+    where = (
+        f"loopback rig, {strokes} stills of {STILL.width_px} x {STILL.height_px} px, {used.wall_s:.1f} s; {machine()}"
+    )
+    peer, ratio = f"1.05 times the peak at {Recording(few).strokes()}", 1.05 * level.peak_mb / used.peak_mb
+    return Result("validate-memory", used.peak_mb, "MB", peer, ratio, strokes, seed, where)
 
 
 def scoring(seed: int, repeats: int = 12, rounds: int = 3) -> list[Result]:

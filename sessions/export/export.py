@@ -7,33 +7,21 @@ written to. The images are the photographs as they were recorded, byte for byte,
 from __future__ import annotations
 
 import json
-import zipfile
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from sessions.cells import CsvWriter
 from sessions.disk import check_room, staged_folder, sync, write_durably
 from sessions.errors import InputError, disk_error
+from sessions.export.npz import SAMPLE_COLUMNS, write_npz
 from sessions.export.parquet import write_parquet
 from sessions.export.rows import Cropper, Export, ForceRow, PoseRow, Row
 from sessions.progress import Progress, unseen
 from sessions.reader import Recording
-from sessions.recording.messages import decode_gray
 from sessions.spool import Spool
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-SAMPLE_COLUMNS = ("episode_index", "frame_index", "t_ns", "log_ns", "sequence")
 POSE_COLUMNS = (*SAMPLE_COLUMNS, "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
 FORCE_COLUMNS = (*SAMPLE_COLUMNS, "fx_n", "fy_n", "fz_n", "mx_nm", "my_nm", "mz_nm")
-
-DECODED_AHEAD = 2
-"""Images that wait while one is packed."""
 
 
 def export(
@@ -112,69 +100,3 @@ def _write_samples(path: Path, columns: tuple[str, ...], rows: Iterable[list[flo
         lines.writerow(columns)
         lines.writerows(rows)
         sync(file)
-
-
-def write_npz(export: Export, folder: Path) -> None:
-    """Write `strokes.npz` (loads without pickle) and `header.json`.
-
-    One array per column of the table of strokes, (n,), NaN where a value is missing; `image_0000`, ... (h, w) uint8
-    gray; `pose_<column>` (m,), `pose_position_mm` (m, 3) and `pose_quaternion` (m, 4). With a force sensor also
-    `force_<column>` (k,) and `force_wrench` (k, 6), with a cropper `mask_0000`, and `frame_0000` if asked.
-    """
-    import numpy as np
-
-    rows: list[Row] = []
-    with (folder / "strokes.npz").open("xb") as file:
-        # Level 6 would take ten times as long for photographs, and save a twentieth of their size.
-        with (
-            zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
-            ThreadPoolExecutor(2) as threads,
-        ):
-            reading = threads.submit(lambda: list(export.poses()))
-            for row, images in _decoded(threads, export.captures()):
-                for name, image in images.items():
-                    _add(archive, f"{name}_{len(rows):04d}", image)
-                rows.append(row)
-            for name in dict.fromkeys(name for row in rows for name in row):
-                values = [row.get(name) for row in rows]
-                text = name in export.text_columns
-                _add(archive, name, np.array(values) if text else np.array(values, np.float64))
-            poses = reading.result()
-            for name in SAMPLE_COLUMNS:
-                _add(archive, f"pose_{name}", np.array([getattr(pose, name) for pose in poses], np.int64))
-            positions = np.array([pose.position_mm for pose in poses], np.float64).reshape(-1, 3)
-            _add(archive, "pose_position_mm", positions)
-            quaternions = np.array([pose.quaternion for pose in poses], np.float64).reshape(-1, 4)
-            _add(archive, "pose_quaternion", quaternions)
-            if export.has_force:
-                forces = list(export.forces())
-                for name in SAMPLE_COLUMNS:
-                    _add(archive, f"force_{name}", np.array([getattr(one, name) for one in forces], np.int64))
-                _add(archive, "force_wrench", np.array([one.wrench for one in forces], np.float64).reshape(-1, 6))
-        sync(file)
-    write_durably(folder / "header.json", export.header_json())
-
-
-def _decoded(
-    threads: Executor, captures: Iterable[tuple[Row, dict[str, bytes]]]
-) -> Iterator[tuple[Row, dict[str, NDArray[np.uint8]]]]:
-    """Rows with their pictures; the next ones are decoded while one is packed."""
-
-    def decode(row: Row, pictures: dict[str, bytes]) -> dict[str, NDArray[np.uint8]]:
-        return {name: decode_gray(data, f"stroke {row['stroke_id']}") for name, data in pictures.items()}
-
-    ahead: deque[tuple[Row, Future[dict[str, NDArray[np.uint8]]]]] = deque()
-    for row, pictures in captures:
-        ahead.append((row, threads.submit(decode, row, pictures)))
-        if len(ahead) > DECODED_AHEAD:
-            row, images = ahead.popleft()
-            yield row, images.result()
-    for row, images in ahead:
-        yield row, images.result()
-
-
-def _add(archive: zipfile.ZipFile, name: str, array: NDArray[np.generic]) -> None:
-    import numpy as np
-
-    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-        np.lib.format.write_array(member, array, allow_pickle=False)
