@@ -124,6 +124,11 @@ class Progress:
         """The lowest index above all steps of the protocol; the steps of repeated strokes begin there."""
         return self._first_free_index
 
+    def more_than(self, stroke_id: str) -> bool:
+        """Whether a stroke other than this one is still to be made."""
+        with self._lock:
+            return any(p.stroke_id != stroke_id and p.stroke_id not in self._tally.over for p in self._plan)
+
     def made_again(self, stroke_id: str) -> Planned:
         """Return the stroke that replaces `stroke_id`."""
         with self._lock:

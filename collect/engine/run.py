@@ -49,7 +49,7 @@ class Run:
                 break
             for stroke_id, _ in (await self._result(step))["again"]:
                 await self._walk(takes(self.context.progress.made_again(str(stroke_id))))
-        await self._once_arm_is_free(self._recover)  # the last capture has set out for a dip that does not come
+        await self._once_arm_is_free(self._recover)  # a capture may have set out for a dip that does not come
 
     async def _walk(self, protocol: Protocol) -> None:
         step = next(protocol)

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Any, BinaryIO, Literal
 
 from sessions.disk import sync, write_durably
 from sessions.export.npz_file import NpzFile, Packed, npy_header, packed_image
@@ -59,7 +59,8 @@ class Numbers:
     """A column of numbers, of 8 bytes each, `width` in a row."""
 
     def __init__(self, kind: Literal["d", "q"], width: int | None = None) -> None:
-        self._waiting, self._width = array(kind), width
+        self._waiting: array[Any] = array(kind)
+        self._width = width
         self._file: BinaryIO | None = None
         self._values = 0
 

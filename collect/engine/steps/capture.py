@@ -115,9 +115,9 @@ def _camera_delay(context: StepContext) -> Result:
 async def capture(context: StepContext) -> Result:
     """The CAPTURE step: `kept` if the stroke counts, `retake` if it must be pressed again on another cell.
 
-    Once the frame is there, the arm goes where the next dip begins while the frame is recorded and judged. The brush is
-    empty and stays so until the decision is in the journal: only the next step may dip it. Raises `BadPicture` if the
-    photograph, not the stroke, is at fault.
+    Once the frame is there, the arm goes where the next dip begins, if another stroke is planned, while the frame is
+    recorded and judged. The brush is empty and stays so until the decision is in the journal: only the next step may
+    dip it. Raises `BadPicture` if the photograph, not the stroke, is at fault.
     """
     run, stroke_id = context.run, str(context.step.params["stroke_id"])
     if int(context.number("sheet")) != run.store.state.sheet:
@@ -125,8 +125,11 @@ async def capture(context: StepContext) -> Result:
     cell = run.sheet.cell(int(context.number("cell")))
     frame = await _fresh_frame(context)
     waited = _wait_check(context)
-    moving = context.guard.guarded(run.procedures.set_out())
-    image, verdict = await meanwhile(moving, _looked_at(context, frame, cell, waited))
+    looking = _looked_at(context, frame, cell, waited)
+    if run.progress.more_than(stroke_id):
+        image, verdict = await meanwhile(context.guard.guarded(run.procedures.set_out()), looking)
+    else:
+        image, verdict = await looking  # a dip for a retake goes to the well by itself
     kept, retake = await decide(context, verdict, image, cell)
     if not kept:
         run.progress.looked_at(kept=False)

@@ -12,6 +12,7 @@ from collect.engine.engine import Engine
 from collect.engine.steps import capture as capturing
 from collect.engine.steps.context import meanwhile
 from collect.errors import BadPicture, CollectAborted
+from collect.motion.procedures import Procedures
 from sessions.journal.lines import read_lines
 from tests.collect.until import until, wait_for_end
 
@@ -38,7 +39,7 @@ def test_a_capture_is_judged_on_the_way_to_the_well_and_decided_before_the_dip(
 
     async def once_under_way(*arguments: Any) -> Any:
         async with asyncio.timeout(10.0):
-            while away_from_park_mm(engine) < 20.0:
+            while engine.snapshot().strokes_done == 0 and away_from_park_mm(engine) < 20.0:
                 await asyncio.sleep(0.001)
         return await look(*arguments)
 
@@ -50,6 +51,24 @@ def test_a_capture_is_judged_on_the_way_to_the_well_and_decided_before_the_dip(
     recorded = events(lab)
     after_captures = [recorded[at + 1] for at, one in enumerate(recorded[:-1]) if one == ("begin", "capture")]
     assert after_captures == [("done", "capture")] * 2
+
+
+def test_every_stroke_has_one_dip_and_the_arm_does_not_set_out_after_the_last(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    went: list[str] = []
+    for name in ("set_out", "dip", "press", "capture"):
+        method = getattr(Procedures, name)
+
+        async def noted(*arguments: Any, _name: str = name, _method: Any = method, **options: Any) -> Any:
+            went.append(_name)
+            return await _method(*arguments, **options)
+
+        monkeypatch.setattr(Procedures, name, noted)
+    engine = lab.engine()
+    engine.start()
+    wait_for_end(engine)
+    assert went[went.index("dip") :] == ["dip", "press", "capture", "set_out", "dip", "press", "capture"]
 
 
 def test_a_stop_while_a_capture_is_judged_costs_a_photograph_and_no_press(
