@@ -15,7 +15,7 @@ from calibrate.board.pix2len import Plane
 from calibrate.stroke.params import PX_PER_MM, Gray, Params
 from calibrate.stroke.rectify import rectify
 from collect.quality import measure
-from collect.quality.ink import Ink, Point, Rect, around, mm2, take, tell_apart
+from collect.quality.ink import Ink, Point, Rect, around, mm2, on_sheet, take, tell_apart
 from collect.quality.measure import Mark, measure_mark
 from collect.quality.verdict import Check, Failure, Verdict
 from collect.rig.config_quality import QualityConfig
@@ -50,9 +50,9 @@ def check_capture(
     """Judge one press of commanded depth `height_mm` from the (h, w) photograph taken after it.
 
     `previous` is the last valid photograph before the press, from the same camera pose: it separates new ink from old,
-    and reveals a press that landed far off. `sheet_mm` (width, height) excludes the table beyond the sheet. `anchor_mm`
-    is the zero-touch point if it is not the cell's own. Checks that an earlier failure makes meaningless are left out
-    of the verdict.
+    and reveals a press that landed far off. `sheet_mm` (width, height) excludes the sheet's edge and the table
+    beyond it. `anchor_mm` is the zero-touch point if it is not the cell's own. Checks that an earlier failure makes
+    meaningless are left out of the verdict.
     """
     frame = check_frame(image, plane, limits)
     if not frame.passed:
@@ -63,7 +63,7 @@ def check_capture(
     checks = [
         *frame.checks,
         cut(ink, plane, image.shape, anchor, limits),
-        glare(image, plane, press.around(LIGHT_MM), cell.rect_mm, limits),
+        glare(image, plane, press.around(LIGHT_MM), press.cell_mm, limits),
     ]
     if all(check.passed for check in checks):
         checks += _ink_checks(press, ink)
@@ -94,9 +94,14 @@ def check_drawing(
     return Verdict((*frame.checks, crossing(float(edge.sum()) / PX_PER_MM), blank(mm2(inked), height_mm, limits)))
 
 
-def cell_is_blank(image: Gray, plane: Plane, cell: Cell, *, limits: QualityConfig) -> Check:
-    """Check in an (h, w) photograph that the cell is blank; `NEIGHBOUR` if it holds ink or is not wholly seen."""
-    patch = take(image, plane.image_to_paper, cell.rect_mm, Params())
+def cell_is_blank(
+    image: Gray, plane: Plane, cell: Cell, *, limits: QualityConfig, sheet_mm: tuple[float, float] | None = None
+) -> Check:
+    """Check in an (h, w) photograph that the cell is blank; `NEIGHBOUR` if it holds ink or is not wholly seen.
+
+    `sheet_mm` (width, height) excludes the sheet's edge and what lies beyond it.
+    """
+    patch = take(image, plane.image_to_paper, on_sheet(cell.rect_mm, sheet_mm), Params())
     hidden_mm2 = mm2(~patch.in_view)
     if hidden_mm2 > 0.0:
         return unseen(cell.index, hidden_mm2, limits)
@@ -116,6 +121,11 @@ class _Press:
     sheet_mm: tuple[float, float] | None
     limits: QualityConfig
 
+    @property
+    def cell_mm(self) -> Rect:
+        """The cell, without what lies at the sheet's edge."""
+        return on_sheet(self.cell.rect_mm, self.sheet_mm)
+
     def around(self, margin_mm: float) -> Rect:
         """The cell with a margin, clipped to the sheet."""
         return around(self.cell.rect_mm, margin_mm, self.sheet_mm)
@@ -125,7 +135,7 @@ class _Press:
         window, to_paper = self.around(margin_mm), self.plane.image_to_paper
         now = take(self.image, to_paper, window, Params())
         before = None if self.previous is None else take(self.previous, to_paper, window, Params())
-        return tell_apart(now, before, self.cell.rect_mm, self.anchor_mm, self.limits.ink_gate)
+        return tell_apart(now, before, self.cell_mm, self.anchor_mm, self.limits.ink_gate)
 
     def away_mm(self) -> float | None:
         """Distance from the anchor to new ink outside the cell, if there is as much of it as a press leaves."""

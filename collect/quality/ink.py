@@ -17,6 +17,9 @@ from calibrate.stroke.rectify import rectify
 Rect = tuple[float, float, float, float]
 """x, y, width, height in the paper frame, mm."""
 Point = tuple[float, float]
+EDGE_MM = 1.5
+"""Margin inside the sheet's edge that is not judged: origin and size of a sheet are known to tenths of a millimetre, so
+what is seen there may be the board or the table beneath."""
 GRAIN_MM = 0.15
 """Scale of the smoothing before ink is looked for: noise and paper fibres are finer."""
 
@@ -68,15 +71,20 @@ def take(image: Gray, image_to_paper: Floats, window_mm: Rect, params: Params) -
     return Patch(window_mm, raster, dark, in_view, pixel_mm)
 
 
+def on_sheet(rect_mm: Rect, sheet_mm: tuple[float, float] | None) -> Rect:
+    """The part of a rectangle that is surely paper: farther than `EDGE_MM` from the edges of the sheet."""
+    if sheet_mm is None:
+        return rect_mm
+    left, bottom = max(rect_mm[0], EDGE_MM), max(rect_mm[1], EDGE_MM)
+    right = min(rect_mm[0] + rect_mm[2], sheet_mm[0] - EDGE_MM)
+    top = min(rect_mm[1] + rect_mm[3], sheet_mm[1] - EDGE_MM)
+    return left, bottom, right - left, top - bottom
+
+
 def around(rect_mm: Rect, margin_mm: float, sheet_mm: tuple[float, float] | None) -> Rect:
     """A rectangle with a margin, clipped to the sheet: the table beyond it is not paper."""
-    left, bottom = rect_mm[0] - margin_mm, rect_mm[1] - margin_mm
-    right, top = rect_mm[0] + rect_mm[2] + margin_mm, rect_mm[1] + rect_mm[3] + margin_mm
-    if sheet_mm is not None:
-        left, bottom = max(left, min(0.0, rect_mm[0])), max(bottom, min(0.0, rect_mm[1]))
-        right = min(right, max(sheet_mm[0], rect_mm[0] + rect_mm[2]))
-        top = min(top, max(sheet_mm[1], rect_mm[1] + rect_mm[3]))
-    return left, bottom, right - left, top - bottom
+    x, y, width, height = rect_mm
+    return on_sheet((x - margin_mm, y - margin_mm, width + 2.0 * margin_mm, height + 2.0 * margin_mm), sheet_mm)
 
 
 def corners(rect_mm: Rect) -> Floats:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +25,8 @@ LATE_MS = 2500.0
 RATE_S = 2.0
 """How long frames are counted."""
 LOCKED = "camera.locked."
+TILE_PX, NUMBER_PX = (480, 360), 64
+"""Width and height of one picture beside others, and the side of the square with its number."""
 
 
 def devices(folder: Path = Path("/dev")) -> list[str]:
@@ -57,6 +60,24 @@ async def taught_camera(notebook: Notebook, clock: Clock) -> AsyncGenerator[Open
     locked = LockedConfig.model_validate(named)
     async with opened(str(notebook.get("camera.source")), clock, Locked(**locked.model_dump())) as camera:
         yield camera
+
+
+def side_by_side(pictures: Sequence[Gray]) -> Gray:
+    """Pictures of any sizes in one, two in a row, numbered from 1 in their upper left corners."""
+    tiles = list[Gray]()
+    for number, picture in enumerate(pictures, 1):
+        height, width = picture.shape
+        scale = min(TILE_PX[0] / width, TILE_PX[1] / height)
+        small = cv2.resize(picture, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
+        tile = np.zeros(TILE_PX[::-1], np.uint8)
+        tile[: small.shape[0], : small.shape[1]] = small
+        tile[:NUMBER_PX, :NUMBER_PX] = 0
+        cv2.putText(tile, str(number), (10, NUMBER_PX - 12), cv2.FONT_HERSHEY_SIMPLEX, 1.8, (255,), 5, cv2.LINE_AA)
+        tiles.append(tile)
+    if len(tiles) % 2 and len(tiles) > 1:
+        tiles.append(np.zeros(TILE_PX[::-1], np.uint8))
+    rows = [np.hstack(tiles[first : first + 2]) for first in range(0, len(tiles), 2)]
+    return np.vstack(rows)
 
 
 async def frame_rate_hz(camera: OpenCvCamera) -> float:

@@ -40,6 +40,8 @@ class Target:
     """Which corner: `lower left`, `lower right`, `upper right` or `upper left`, as the print names it."""
     may_jog: bool = False
     """Whether the tip may also be brought there by keys: the arm was armed."""
+    may_skip: bool = False
+    """Whether the step can go on without it, or can say what to do where it is out of reach."""
 
 
 class Brought(StrEnum):
@@ -49,7 +51,7 @@ class Brought(StrEnum):
     BACK = "back"
     """Leave this step; what it had measured so far is forgotten."""
     SKIP = "skip"
-    """Go on without it, where the step can."""
+    """Go on without it; only where the target may be skipped."""
     JOG = "jog"
     """Bring it there by keys; only where the target may be jogged to."""
 

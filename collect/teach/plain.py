@@ -104,20 +104,20 @@ class PlainGuide:
 
     async def bring(self, target: Target, how: str) -> Brought:
         """Print the request and wait for Enter."""
-        jog = f"{JOG}: by keys; " if target.may_jog else ""
-        say(how, f"  Enter: it is there; {jog}{SKIP}; {BACK}")
+        words = (*((JOG,) if target.may_jog else ()), *((SKIP,) if target.may_skip else ()), BACK)
+        say(how, f"  Enter: it is there; {'; '.join(words)}")
         while True:
             match (await self._raw()).strip().lower():
                 case "":
                     return Brought.DONE
-                case "skip":
+                case "skip" if target.may_skip:
                     return Brought.SKIP
                 case "back":
                     return Brought.BACK
                 case "jog" if target.may_jog:
                     return Brought.JOG
                 case other:
-                    say(f"  {other!r} is none of Enter, {f'{JOG}, ' if target.may_jog else ''}{SKIP}, {BACK}")
+                    say(f"  {other!r} is none of Enter, {', '.join(words)}")
 
     async def jog(self, view: JogView) -> JogStep | Brought:
         """Read a step such as `z -0.1`."""

@@ -88,6 +88,7 @@ class StepsScreen(Screen[None]):
     def action_picture(self) -> None:
         """Show the picture instead of the findings, on a narrow screen."""
         self.toggle_class("-picture")
+        self.call_after_refresh(self._found_pane.scroll_end, animate=False)  # what was hidden could not be scrolled
 
     def stop_sent(self) -> None:
         """Show at once that a stop key was pressed."""

@@ -58,6 +58,11 @@ class Question:
         """Whether it may be brought there by keys."""
         return self.target is not None and self.target.may_jog
 
+    @property
+    def may_skip(self) -> bool:
+        """Whether the step can go on without it."""
+        return self.target is not None and self.target.may_skip
+
 
 @dataclass(frozen=True, slots=True)
 class TeachView:

@@ -32,12 +32,13 @@ JOG_KEYS = {
 }
 TYPING_STOP = "ctrl-c: software stop; red button: emergency stop"
 JOG: Key = ("j", "jog")
+SKIP: Key = ("k", "skip")
 BASE_KEYS: tuple[Key, ...] = (("q", "leave"), ("tab", "picture"), ("?", "help"))
 KEYS: dict[str, tuple[Key, ...]] = {
     "choose": (("s", "STOP"), ("enter", "default"), ("esc", "back"), *BASE_KEYS),
     "number": (("ctrl-c", "STOP"), ("enter", "take"), ("esc", "back"), ("ctrl-q", "leave: all is kept")),
     "text": (("ctrl-c", "STOP"), ("enter", "take"), ("esc", "back"), ("ctrl-q", "leave: all is kept")),
-    "bring": (("s", "STOP"), ("enter", "it is there"), ("k", "skip"), ("esc", "back"), *BASE_KEYS),
+    "bring": (("s", "STOP"), ("enter", "there"), ("esc", "back"), *BASE_KEYS),
     "jog": (
         ("s", "STOP"),
         ("arrows", "x y"),
@@ -178,7 +179,9 @@ class TeachScreen(StepsScreen):
             self._guide.answer(question.number, str(event.character))
 
     def _brought(self, question: Question, event: events.Key) -> None:
-        answers = {"enter": Brought.DONE, "k": Brought.SKIP} | ({"j": Brought.JOG} if question.may_jog else {})
+        answers = {"enter": Brought.DONE}
+        answers |= {"j": Brought.JOG} if question.may_jog else {}
+        answers |= {"k": Brought.SKIP} if question.may_skip else {}
         if event.key in answers:
             self._guide.answer(question.number, answers[event.key])
 
@@ -229,7 +232,8 @@ def _finding(shown: Shown) -> Content:
 
 def _keys_of(question: Question) -> tuple[Key, ...]:
     keys = KEYS[question.kind]
-    return (*keys[:2], JOG, *keys[2:]) if question.may_jog else keys
+    more = (*((JOG,) if question.may_jog else ()), *((SKIP,) if question.may_skip else ()))
+    return (*keys[:2], *more, *keys[2:])
 
 
 def _busy_text(now: TeachView, now_s: float, columns: int) -> str:

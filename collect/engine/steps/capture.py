@@ -79,7 +79,8 @@ def _inked_cells(run: RunContext, image: Gray, begun: int | None) -> list[str]:
     plane = run.image_plane(image)
     used = run.used_cells() - {begun}  # this attempt's own cell is not pressed yet
     free = [run.sheet.cell(index) for index in range(run.sheet.capacity) if index not in used]
-    checks = [cell_is_blank(image, plane, cell, limits=run.rig.config.quality) for cell in free]
+    limits, sheet_mm = run.rig.config.quality, run.rig.config.paper.size_mm
+    checks = [cell_is_blank(image, plane, cell, limits=limits, sheet_mm=sheet_mm) for cell in free]
     return [check.reason for check in checks if not check.passed]
 
 

@@ -85,6 +85,16 @@ def check_board(board: Mapping[str, Sequence[Point]], spec: BoardSpec) -> None:
         )
 
 
+def expected_mm(touched: Mapping[str, Sequence[Point]], name: str, spec: BoardSpec) -> tuple[float, float]:
+    """Where a corner of the board must lie, (x, y) in the base frame, by two or three others that were touched."""
+    printed, known = corners_of(*size_mm(spec)), [CORNERS.index(corner) for corner in touched]
+    places = np.array([np.mean(points, axis=0)[:2] for points in touched.values()])
+    angle = _turn(printed[known], places)
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    x, y = turn @ (printed[CORNERS.index(name)] - printed[known].mean(axis=0)) + places.mean(axis=0)
+    return float(x), float(y)
+
+
 def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence[Point]], spec: BoardSpec) -> SheetFit:
     """Least squares over all touches of four board corners and four sheet corners, by name; base frame, in mm.
 

@@ -22,6 +22,8 @@ that turns along with the lean makes all of them one: the same side of the flang
 OUTLIER_SHARE = 4.0
 """A touch whose residual exceeds the others' standard deviation by this factor is named as a slip."""
 LEAST_OUTLIER_MM = 1.0
+ELSEWHERE_MM = 10.0
+"""A touch that lies farther than this from where the others agree was not made at the pin."""
 HAND_MM = 0.15
 """No hand touches better, in one axis: a few touches that agree by chance do not prove otherwise."""
 
@@ -53,13 +55,14 @@ class TipFit:
         """Half width of the 95 % interval of the worst component, by Student's t."""
         return float(stdtrit(self.freedom, 0.975)) * max(self.sigma_mm)
 
-    def slip(self) -> int | None:
-        """Number of the touch that does not fit the others; None if all do."""
+    def slip(self) -> tuple[int, float] | None:
+        """Number of the touch that does not fit the others, and its residual in mm; None if all do."""
         worst = int(np.argmax(self.residuals_mm))
         others = [r for k, r in enumerate(self.residuals_mm) if k != worst]
         typical_mm = math.sqrt(sum(r * r for r in others) / len(others))
         limit_mm = max(LEAST_OUTLIER_MM, OUTLIER_SHARE * typical_mm)
-        return worst if self.residuals_mm[worst] > limit_mm and len(others) >= LEAST_TOUCHES else None
+        off_mm = self.residuals_mm[worst]
+        return (worst, off_mm) if off_mm > limit_mm and len(others) >= LEAST_TOUCHES else None
 
 
 def find_tip(flanges: Sequence[Pose]) -> TipFit:
@@ -93,6 +96,25 @@ def find_tip(flanges: Sequence[Pose]) -> TipFit:
         freedom,
         condition,
     )
+
+
+def elsewhere(flanges: Sequence[Pose]) -> tuple[int, float] | None:
+    """Number of the one touch that was made elsewhere, and its distance in mm from the point of the others.
+
+    Such a touch spoils the residuals of all, so each touch is compared with a fit of the others alone. None if there
+    is none, or for fewer than five touches.
+    """
+    worst, farthest_mm = None, ELSEWHERE_MM
+    for k in range(len(flanges)):
+        others = [pose for n, pose in enumerate(flanges) if n != k]
+        try:
+            fit = find_tip(others)
+        except CannotTeach:
+            continue
+        off_mm = math.dist(tip_of(flanges[k], fit.offset_mm), fit.pin_mm)
+        if off_mm > max(farthest_mm, 2.0 * OUTLIER_SHARE * max(fit.residuals_mm)):
+            worst, farthest_mm = (k, off_mm), off_mm
+    return worst
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,16 @@ from calibrate.board.spec import BoardSpec, describe
 from calibrate.errors import CalibrationError
 from calibrate.files import read_gray
 from collect.operator import Choice
-from collect.teach.cameras import Gray, devices, frame_rate_hz, locked_settings, opened, still, taught_camera
+from collect.teach.cameras import (
+    Gray,
+    devices,
+    frame_rate_hz,
+    locked_settings,
+    opened,
+    side_by_side,
+    still,
+    taught_camera,
+)
 from collect.teach.day import Day
 from collect.teach.errors import CannotTeach
 from collect.teach.guide import Brought, Target, WentBack
@@ -94,14 +103,16 @@ class CameraStep:
         question = "Address of the camera's stream, as http://192.0.2.8/stream.mjpg (several: with spaces between them)"
         typed = (await day.guide.text(question, "")).split()
         seen = {source: await self._looked_at(day, source) for source in dict.fromkeys([*typed, *found])}
-        usable = {source: corners for source, corners in seen.items() if corners is not None}
+        usable = {source: look for source, look in seen.items() if look is not None}
         if not usable:
             raise CannotTeach("no camera gives a picture.", "Check power, cable and address; then try again.")
-        source = max(usable, key=lambda one: usable[one] or 0)
+        source = max(usable, key=lambda one: usable[one][0])
         if len(usable) > 1:
             keys = {str(number): one for number, one in enumerate(usable, 1)}
             choices = tuple(Choice(key, one) for key, one in keys.items())
             best = next(key for key, one in keys.items() if one == source)
+            pictures = side_by_side([picture for _, picture in usable.values()])
+            await day.say(f"{len(usable)} cameras give a picture, numbered as below.", picture=pictures)
             source = keys[await day.guide.choose("Which of them looks at the sheet?", choices, best)]
         settings = await locked_settings(source)
         day.keep("camera", "camera.kind", "opencv", "the only kind")
@@ -118,8 +129,8 @@ class CameraStep:
         # Last, so that a session that is cut before begins again with the source.
         day.keep("camera", "camera.source", source, "typed or found, and its picture was seen")
 
-    async def _looked_at(self, day: Day, source: str) -> int | None:
-        """Show a picture of a camera; return how many corners of the board it shows, None where it gives none."""
+    async def _looked_at(self, day: Day, source: str) -> tuple[int, Gray] | None:
+        """Show a picture of a camera; return how many corners of the board it shows, and the picture if there is one."""
         await day.working(f"waiting for a picture of {source}")
         try:
             async with opened(source, day.clock) as camera:
@@ -134,7 +145,7 @@ class CameraStep:
         except CalibrationError as error:
             corners, what = 0, error.what
         await day.say(f"{source}: {width} x {height} px; {what}", picture=picture)
-        return corners
+        return corners, picture
 
     async def _print(self, day: Day) -> None:
         await day.say("The board: a print of `brushloop camera board`. Its name stands along its lower edge.")
@@ -207,7 +218,7 @@ class CameraStep:
 
     async def _held(self, day: Day, path: Path, where: str, take: Take, views: list[BoardView]) -> bool:
         """Take one photograph of the held board; False where the person skips it."""
-        target = Target("hold-board", int(path.stem))
+        target = Target("hold-board", int(path.stem), may_skip=True)
         how = f"Cover the sheet, and hold the board before the camera, {where}, all of it sharp; keep still."
         brought = await day.guide.bring(target, how)
         if brought is Brought.BACK:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections import defaultdict
 
 import numpy as np
@@ -16,7 +17,7 @@ from collect.teach.cameras import still, taught_camera
 from collect.teach.day import Day
 from collect.teach.errors import CannotTeach
 from collect.teach.guide import Target, TargetKind
-from collect.teach.maths.sheet import CORNERS, Point, SheetFit, check_board, corners_of, fit_sheet
+from collect.teach.maths.sheet import CORNERS, Point, SheetFit, check_board, corners_of, expected_mm, fit_sheet
 from collect.teach.maths.sheet_seen import OFF_MM, check_seen, seen_margins, touched_margins
 from collect.teach.maths.tip import tip_of
 from collect.teach.store import Notebook, StepName, Taught, now_utc
@@ -28,6 +29,8 @@ GOOD_MM = 0.13
 """Standard error of the sheet's origin, in each axis, at which touching ends."""
 MOST_ROUNDS = 5
 WORST_MM = 0.25
+EASY_MM = (250.0, 700.0)
+"""Distances from the foot of the arm at which it holds a brush upright without being folded up or stretched out."""
 VIEW, SEEN = "sheet-view", "aside.sheet_seen"
 INSET_MM = 2.0
 """Distance of the touch point from the sheet's edges: beside every cell."""
@@ -55,7 +58,9 @@ class SheetStep:
                         continue  # the sheet's own corners give its origin, and need more touches
                     for corner in CORNERS:
                         how = f"Bring the tip to the {corner} corner of {thing}" + (" once more." if number else ".")
-                        await day.touch(reader, Target(kind, number, corner), how, f"{kind} {number} {corner}")
+                        await day.touch(
+                            reader, Target(kind, number, corner, may_skip=True), how, f"{kind} {number} {corner}"
+                        )
                     if kind == BOARD:
                         with day.touched_again_if_refused(BOARD):
                             check_board(all_corners(day.notebook, BOARD, "board"), board_of(day.notebook))
@@ -72,7 +77,7 @@ class SheetStep:
     async def _seen(self, day: Day, reader: ArmReader) -> None:
         """Compare the touched sheet with the one that the camera sees on the board. Raises `CannotTeach`."""
         how = "Guide the arm so far away that it hides neither board nor sheet from the camera."
-        if await day.touch(reader, Target("clear-view", 1), how, f"{VIEW} 0") is None:
+        if await day.touch(reader, Target("clear-view", 1, may_skip=True), how, f"{VIEW} 0") is None:
             found = "not checked against the camera: the arm was in its way"
         else:
             await day.working("looking for the sheet's edges on the board")
@@ -177,12 +182,28 @@ def all_corners(notebook: Notebook, kind: str, thing: str) -> dict[str, list[Poi
     found = corners(notebook, kind)
     missing = [f"{thing} {name}" for name in CORNERS if name not in found]
     if missing:
+        how_far = _how_far(found, notebook) if kind == BOARD else "nearer to it"
         raise CannotTeach(
             f"not touched: {', '.join(missing)}.",
             "All four corners of both are needed. What the arm does not reach by hand is out of its reach: move the "
-            "board with the sheet nearer to it, and touch all corners again.",
+            f"board with the sheet {how_far}, and touch all corners again.",
         )
     return found
+
+
+def _how_far(found: dict[str, list[Point]], notebook: Notebook) -> str:
+    """In words, how far the board has to be moved; where two corners were touched, the others follow from its print."""
+    if len(found) < 2:
+        return "nearer to it"
+    spec = board_of(notebook)
+    away_mm = [math.hypot(*expected_mm(found, name, spec)) for name in CORNERS if name not in found]
+    if max(away_mm) > EASY_MM[1]:
+        return (
+            f"by {max(away_mm) - EASY_MM[1]:.0f} mm nearer to its foot, from which that corner is {max(away_mm):.0f} mm"
+        )
+    if min(away_mm) < EASY_MM[0]:
+        return f"by {EASY_MM[0] - min(away_mm):.0f} mm away from its foot, to which that corner is too near"
+    return "nearer to it, or turn its wrist the other way round"
 
 
 def fitted(notebook: Notebook) -> SheetFit:

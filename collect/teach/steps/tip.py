@@ -6,7 +6,7 @@ from collect.teach.arm_reader import ArmReader
 from collect.teach.day import Day
 from collect.teach.errors import CannotTeach
 from collect.teach.guide import Target
-from collect.teach.maths.tip import LEAST_TOUCHES, find_axis, find_tip
+from collect.teach.maths.tip import LEAST_TOUCHES, elsewhere, find_axis, find_tip
 from collect.teach.store import Notebook, StepName, Taught, now_utc
 
 MOST_TOUCHES = 24
@@ -43,7 +43,7 @@ class TipStep:
                     f"Upright {index + 1} of {UPRIGHTS}: the brush upright along the set square"
                     f"{', the wrist turned otherwise than before' if index else ''}, anywhere over the table."
                 )
-                await day.touch(reader, Target("upright", index), how, f"upright {index}")
+                await day.touch(reader, Target("upright", index, may_skip=True), how, f"upright {index}")
 
     async def _pin(self, day: Day, reader: ArmReader) -> None:
         if await self._known(day):
@@ -55,7 +55,7 @@ class TipStep:
                 f"Touch {index + 1}: bring the tip to the pin, the brush leaning by 30 deg or more "
                 f"{SIDES[index % 4]}; lean it without turning the wrist along."
             )
-            await day.touch(reader, Target("pin", index), how, f"pin {index}")
+            await day.touch(reader, Target("pin", index, may_skip=True), how, f"pin {index}")
             if await self._known(day):
                 return
         with day.touched_again_if_refused("pin"):
@@ -75,12 +75,10 @@ class TipStep:
         except CannotTeach as error:
             await day.say(str(error), tone="warning")
             return False
-        slip = fit.slip()
+        slip, off_mm = elsewhere(list(touches.values())) or fit.slip() or (None, 0.0)
         if slip is not None:
             name = list(touches)[slip]
-            await day.say(
-                f"Touch {int(name) + 1} lies {fit.residuals_mm[slip]:.1f} mm off: it is left out.", tone="warning"
-            )
+            await day.say(f"Touch {int(name) + 1} lies {off_mm:.1f} mm off: it is left out.", tone="warning")
             kept = {key: t for key, t in day.notebook.touches.items() if key != f"pin {name}"}
             day.save(day.notebook.model_copy(update={"touches": kept}))
             return False

@@ -77,6 +77,7 @@ class _Line:
             raise ConnectionResetError("the client has gone")
         self._last_s = max(self._last_s + NEXT_S, self._exposed_s + late_s)
         self._loop.call_at(self._last_s, self._write, data)
+        await self._writer.drain()  # of earlier pictures: without it, a slow client would be ever farther behind
 
     def _write(self, data: bytes) -> None:
         if not self._writer.is_closing():

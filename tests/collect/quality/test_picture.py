@@ -157,6 +157,17 @@ def test_a_cell_that_is_not_wholly_seen_is_not_called_blank() -> None:
     assert cell_is_blank(paper(), plane(), CELL, limits=LIMITS).passed
 
 
+def test_the_edge_of_a_sheet_is_no_ink_in_the_cells_along_it() -> None:
+    cell, sheet_mm = Cell(0, 20.0, 36.0, 40.0, 24.0), (80.0, 60.0)
+    seen = paper()
+    seen[: round(0.8 * PX)] = 20  # the dark table, where the sheet was thought to reach
+    assert not cell_is_blank(seen, plane(), cell, limits=LIMITS).passed
+    assert cell_is_blank(seen, plane(), cell, limits=LIMITS, sheet_mm=sheet_mm).passed
+    pressed = stroke(seen.copy(), 50.0, 48.0)
+    first = check_capture(pressed, plane(), cell, height_mm=10.0, limits=LIMITS, sheet_mm=sheet_mm)
+    assert next(check for check in first.checks if check.name is Failure.NEIGHBOUR).passed
+
+
 def test_limits_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(ValidationError, match="dark_level"):
         QualityConfig(dark_level=200.0, bright_level=150.0)

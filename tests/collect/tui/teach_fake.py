@@ -68,7 +68,7 @@ class Asking:
             case "bring":
                 await guide.show(Shown(("the board as the camera sees it",), board()))
                 how = "Guide the tip to the pin by hand, the brush leaning toward the window, then press Enter."
-                return await guide.bring(Target("pin", 2, may_jog=True), how)
+                return await guide.bring(Target("pin", 2, may_jog=True, may_skip=True), how)
             case "jog":
                 while not isinstance(answer := await guide.jog(JOG), Brought):
                     self.answers.append(answer)

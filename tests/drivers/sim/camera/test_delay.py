@@ -27,8 +27,17 @@ class Loop:
 
 
 class Open:
+    """A connection; its client has taken everything once `taken` is set."""
+
+    def __init__(self) -> None:
+        self.taken = asyncio.Event()
+        self.taken.set()
+
     def is_closing(self) -> bool:
         return False
+
+    async def drain(self) -> None:
+        await self.taken.wait()
 
 
 async def test_the_time_to_draw_a_picture_is_a_part_of_its_delay_and_no_picture_overtakes_another() -> None:
@@ -41,3 +50,15 @@ async def test_the_time_to_draw_a_picture_is_a_part_of_its_delay_and_no_picture_
         await line.send(b"picture")
     assert loop.due_s == pytest.approx([100.3, 100.35, 100.35, 102.35], abs=1e-3)
     assert loop.due_s == sorted(set(loop.due_s))
+
+
+async def test_a_client_that_reads_too_slowly_is_sent_no_further_picture_until_it_has_taken_the_earlier_ones() -> None:
+    client = Open()
+    client.taken.clear()
+    line = _Line(View(delay_s=0.3), cast("asyncio.StreamWriter", client))
+    line.exposed()
+    sending = asyncio.create_task(line.send(b"picture"))
+    await asyncio.sleep(0)
+    assert not sending.done()
+    client.taken.set()
+    await sending
