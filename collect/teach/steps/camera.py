@@ -130,7 +130,7 @@ class CameraStep:
         day.keep("camera", "camera.source", source, "typed or found, and its picture was seen")
 
     async def _looked_at(self, day: Day, source: str) -> tuple[int, Gray] | None:
-        """Show a picture of a camera; return how many corners of the board it shows, and the picture if there is one."""
+        """Show a picture of a camera; return how many corners of the board it shows, and the picture, if any."""
         await day.working(f"waiting for a picture of {source}")
         try:
             async with opened(source, day.clock) as camera:
