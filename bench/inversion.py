@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from bench.harness import Result, machine
+from bench.inversion_commands import intervals
 from model.brush import Brush
 from model.ccdbsm import ccdbsm
 from model.inversion.noise import Noise
@@ -47,7 +48,8 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     |recovered - true|; the peer of a figure is what was asked for. Times are thread CPU seconds with everything from
     the images to the intervals, in batches of 50; `-one` one image a call; `-autograd` the same fit through
     `coverage_at` and `torch.func.jvp`. `-coverage` is how often the true value lies in the 95 % interval; for a few
-    draws it says nothing.
+    draws it says nothing. `inversion-commands-` are shares of intervals that hold the command on brushes that the model
+    family does not contain (`bench.inversion_commands`); `n` does not change these.
     """
     count = DRAWS if n is None else n
     if count < 1:
@@ -55,7 +57,7 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return [*_anchored(count, seed), *_shape_only(count, seed)]
+        return [*_anchored(count, seed), *_shape_only(count, seed), *intervals(seed)]
     finally:
         torch.set_num_threads(threads)
 

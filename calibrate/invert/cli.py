@@ -42,7 +42,7 @@ def invert(
 
     from calibrate.compare.field import Field
     from calibrate.invert.files import write_inversion
-    from calibrate.invert.invert import NO_MODEL_ERROR, Settings, invert_recording, off_command
+    from calibrate.invert.invert import NO_MODEL_ERROR, NOT_INFORMATIVE, Settings, invert_recording, off_command
     from model.inversion.press import Range
     from sessions.progress import shown
 
@@ -84,6 +84,10 @@ def invert(
     bare = sum(NO_MODEL_ERROR in row.flags for row in made.rows)
     if bare:
         say(f"warning: {bare} without model error in their intervals: too few cells with a known command")
+    for name, flag in NOT_INFORMATIVE.items():
+        vague = sum(flag in row.flags for row in made.rows)
+        if vague:
+            say(f"warning: {vague} not informative on {name}: the interval covers most of what the session commanded")
     unknown = sum("alpha_unknown" in row.flags for row in made.rows)
     if unknown:
         say(f"warning: {unknown} without a zero-touch anchor: their alpha is assumed, shape does not tell it")

@@ -19,7 +19,7 @@ from calibrate.calibration import Calibration
 from calibrate.compare.field import SIZE_PX, Field, Image, crop
 from calibrate.compare.images import brush_of, prepare_press
 from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.invert.model_error import model_sd
+from calibrate.invert.model_error import NORMAL_95, model_sd
 from calibrate.session import calibration_of
 from calibrate.stroke.params import PX_PER_MM, Params
 from calibrate.stroke.preprocess import prepare
@@ -37,6 +37,10 @@ from sessions.recording.schemas import Header, Stroke
 _T = TypeVar("_T")
 NO_MODEL_ERROR = "no_model_error"
 """Flag of a press whose deviations say only how well its image identifies it within the model."""
+NOT_INFORMATIVE = {"H": "height_not_informative", "alpha": "tilt_not_informative"}
+"""Flags of a value whose 95 % interval covers most of the range that was commanded in the session."""
+MOST = 0.8
+"""How much of that range."""
 BATCH = 64
 USELESS = frozenset({Flag.BLANK, Flag.DID_NOT_CONVERGE, Flag.CUT})
 """Flags that exclude a stroke: it is listed with the reason and not pressed again."""
@@ -141,22 +145,40 @@ def invert_recording(
 
 
 def with_model_error(rows: Sequence[Row]) -> list[Row]:
-    """The rows with model error in their deviations, or flagged where too few commands are known for it."""
+    """The rows with model error in their deviations, flagged where it is unknown and where an interval says little."""
     nan = float("nan")
     cells = [(row.commanded_height_mm or 0.0, row.commanded_tilt_deg or 0.0) for row in rows]
     deep = np.array([nan if (h := row.commanded_height_mm) is None else row.height_mm - h for row in rows])
     tilted = np.array([nan if (a := row.commanded_tilt_deg) is None else row.tilt_deg - a for row in rows])
     height_sd = np.array([row.height_sd_mm for row in rows])
     tilt_sd = np.array([nan if row.tilt_sd_deg is None else row.tilt_sd_deg for row in rows])
+    known = [
+        cell for cell, one, other in zip(cells, deep, tilted, strict=True) if np.isfinite(one) and np.isfinite(other)
+    ]
     more_mm, more_deg = model_sd(deep, height_sd, cells), model_sd(tilted, tilt_sd, cells)
     out: list[Row] = []
     for k, row in enumerate(rows):
+        flags = set(row.flags)
         if np.isnan(more_mm[k]) or (row.tilt_sd_deg is not None and np.isnan(more_deg[k])):
-            out.append(replace(row, flags=tuple(sorted({*row.flags, NO_MODEL_ERROR}))))
-            continue
-        wider = None if row.tilt_sd_deg is None else float(np.hypot(row.tilt_sd_deg, more_deg[k]))
-        out.append(replace(row, height_sd_mm=float(np.hypot(row.height_sd_mm, more_mm[k])), tilt_sd_deg=wider))
+            flags.add(NO_MODEL_ERROR)
+        else:
+            wider = None if row.tilt_sd_deg is None else float(np.hypot(row.tilt_sd_deg, more_deg[k]))
+            row = replace(row, height_sd_mm=float(np.hypot(row.height_sd_mm, more_mm[k])), tilt_sd_deg=wider)
+        for name, (value, sd, among) in {
+            "H": (row.height_mm, row.height_sd_mm, [cell[0] for cell in known]),
+            "alpha": (row.tilt_deg, row.tilt_sd_deg, [cell[1] for cell in known]),
+        }.items():
+            if sd is not None and covers_most(value, sd, among):
+                flags.add(NOT_INFORMATIVE[name])
+        out.append(replace(row, flags=tuple(sorted(flags))))
     return out
+
+
+def covers_most(value: float, sd: float, commanded: Sequence[float]) -> bool:
+    """Whether a 95 % interval, cut to the range of the commanded values, covers most of that range."""
+    low, high = min(commanded, default=0.0), max(commanded, default=0.0)
+    covered = min(value + NORMAL_95 * sd, high) - max(value - NORMAL_95 * sd, low)
+    return high > low and covered > MOST * (high - low)
 
 
 def spread(strokes: Sequence[_T], most: int | None) -> Sequence[_T]:
@@ -258,5 +280,5 @@ def off_command(rows: list[Row]) -> Iterator[tuple[str, float, float, float, int
         known = [(value - asked, sd) for value, sd, asked in found if asked is not None]
         if known:
             off, sd = (np.array(part, np.float64) for part in zip(*known, strict=True))
-            inside = np.abs(off) <= 1.96 * sd
+            inside = np.abs(off) <= NORMAL_95 * sd
             yield name, float(off.mean()), float(off.std()), float(inside.mean()), len(known)

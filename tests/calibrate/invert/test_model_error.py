@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibrate.invert.invert import NO_MODEL_ERROR, Row, with_model_error
+from calibrate.invert.invert import NO_MODEL_ERROR, NOT_INFORMATIVE, Row, covers_most, with_model_error
 from calibrate.invert.model_error import model_sd
 
 CELLS = [(h, a) for h in (11.0, 13.0, 15.0, 17.0, 20.0) for a in (0.0, 5.0, 10.0)]
@@ -39,3 +39,15 @@ def test_the_own_command_does_not_enter_the_interval() -> None:
 def test_too_few_known_cells_are_flagged() -> None:
     assert all(NO_MODEL_ERROR in row.flags for row in with_model_error(rows(CELLS[:3], 0.3, 2.0)))
     assert with_model_error([]) == []
+
+
+def test_an_interval_over_most_of_the_commanded_range_is_flagged_and_still_given() -> None:
+    vague, sharp = (with_model_error(rows(CELLS, 0.3, error_deg)) for error_deg in (4.0, 0.5))
+    assert any(NOT_INFORMATIVE["alpha"] in row.flags and (row.tilt_sd_deg or 0.0) > 3.0 for row in vague)
+    assert not any(set(row.flags) & set(NOT_INFORMATIVE.values()) for row in sharp)
+
+
+@pytest.mark.parametrize(("value", "sd", "vague"), [(5.0, 2.5, True), (5.0, 1.5, False), (0.0, 2.5, False)])
+def test_an_interval_is_cut_to_what_was_commanded(value: float, sd: float, vague: bool) -> None:
+    assert covers_most(value, sd, [0.0, 5.0, 10.0]) is vague
+    assert not covers_most(value, sd, [5.0, 5.0]), "one tilt only: there is no range to compare with"
