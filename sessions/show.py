@@ -199,7 +199,7 @@ def _protocol(header: Header) -> dict[str, Any]:
     except ValueError:
         return {}
     protocol: dict[str, Any] = dict(found) if isinstance(found, dict) else {}  # pyright: ignore[reportUnknownArgumentType]
-    # An adaptive protocol presses only part of the grid that it chooses from.
+    # `few-strokes`, and `adaptive` of earlier versions, press only part of the grid that they name.
     is_grid = protocol.get("kind", "grid") == "grid" and protocol.keys() >= {"heights_mm", "tilts_deg", "repeats"}
     return protocol if is_grid else {}
 

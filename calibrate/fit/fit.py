@@ -113,15 +113,12 @@ def fit_presses(
     return Fit(press, free, tuple(made), information, prior, len(strokes))
 
 
-def refit(fit: Fit, strokes: Sequence[Pressed], grid: Grid) -> Fit:
-    """Fit other strokes of the same brush, starting from the fit. Raises ValueError as `fit_presses`."""
+def refit(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> FittedPress:
+    """Fit other strokes of the same brush, starting from `press`. Raises ValueError as `fit_presses`."""
     if not strokes:
         raise ValueError("a fit needs at least one stroke")
-    bare = FittedPress(fit.press.radius_mm, fit.press.length_mm, fit.press.values)
-    press = _minimise(bare, NAMES, strokes, grid, learned())
-    information = _normal(press, fit.free, strokes, grid)[0].sum(axis=0)
-    press = fit_residual(press, strokes, grid)
-    return replace(fit, press=press, information=information, prior=learned(), strokes=len(strokes))
+    bare = FittedPress(press.radius_mm, press.length_mm, press.values)
+    return fit_residual(_minimise(bare, NAMES, strokes, grid, learned()), strokes, grid)
 
 
 def zero_touch(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> tuple[FittedPress, Floats]:

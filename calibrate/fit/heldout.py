@@ -62,7 +62,7 @@ def leave_cell_out(fit: Fit, strokes: Sequence[Pressed], grid: Grid, progress: P
     for cell, held in counted(cells.items(), "cells left out in turn", len(cells), progress):
         others = [stroke for key, group in cells.items() if key != cell for stroke in group]
         images = {
-            FITTED: predictor(refit(fit, others, grid).press, grid)(*cell),
+            FITTED: predictor(refit(fit.press, others, grid), grid)(*cell),
             UNCALIBRATED: image_of(published.outline(*cell), grid),
         }
         with contextlib.suppress(ValueError):  # the other cells span no plane

@@ -16,7 +16,7 @@ from calibrate.compare.field import SIZE_PX, Field
 from calibrate.compare.images import Pixels, brush_of, loop_pixels, unpack
 from calibrate.fit.artefact import BrushFit
 from calibrate.fit.captures import MARGIN_MM, grid_of
-from calibrate.fit.fit import Fit, refit
+from calibrate.fit.fit import refit
 from calibrate.fit.heldout import BEZIER_SIZES, RefittedBezier, refit_bezier
 from calibrate.fit.strokes import Grid, Pressed
 from calibrate.validate.jobs import Row, pixels_of
@@ -43,8 +43,8 @@ class RefitJob:
     """H, alpha and `Press.pixels`, whose last image is the coverage."""
     radius_mm: float
     length_mm: float
-    start: tuple[tuple[float, ...], tuple[str, ...]] | None
-    """Values, and names of the free parameters, from the session's fit; None fits no CCD-BSM."""
+    start: tuple[float, ...] | None
+    """Parameters of the session's fit; None fits no CCD-BSM."""
     view: Field
 
     @property
@@ -58,10 +58,9 @@ class RefitJob:
         return digest.hexdigest()
 
 
-def start_of(fit: BrushFit) -> tuple[tuple[float, ...], tuple[str, ...]]:
-    """Initial values of a refit, and its free parameters: those that the whole session determines."""
-    values = tuple(fit.parameters[name].value for name in NAMES)
-    return values, tuple(name for name in NAMES if fit.parameters[name].low is not None)
+def start_of(fit: BrushFit) -> tuple[float, ...]:
+    """Initial values of a refit: those of the whole session."""
+    return tuple(fit.parameters[name].value for name in NAMES)
 
 
 def folds(cells: Sequence[Cell], most: int = MAX_FOLDS) -> list[list[Cell]]:
@@ -76,11 +75,8 @@ def refit_job(job: RefitJob) -> dict[str, Any]:
     strokes, grid = cropped(job)
     out: dict[str, Any] = {"fitted": None}
     if job.start is not None:
-        values, free = job.start
-        empty = np.zeros((0, len(free)))
-        whole = Fit(FittedPress(job.radius_mm, job.length_mm, np.array(values)), free, (), empty, empty, len(strokes))
-        press = refit(whole, strokes, grid).press
-        out["fitted"] = press_body(press)
+        whole = FittedPress(job.radius_mm, job.length_mm, np.array(job.start))
+        out["fitted"] = press_body(refit(whole, strokes, grid))
     return out | {"bezier": bezier_body(strokes, grid)}
 
 

@@ -16,7 +16,7 @@ from sessions.reader import Recording
 Say = Callable[[str], None]
 GIVEN_UP = 3
 """Exit code of a collection that finished but left strokes out."""
-PRESSES = frozenset({"grid", "adaptive", "list"})
+PRESSES = frozenset({"grid", "few-strokes", "list"})
 """Protocols whose recording is calibrated and validated alone; after others, the next step is not one command."""
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from collect.engine.force_guard import ForceGuard
 from collect.engine.live import LiveView
 from collect.engine.recorder import Recorder
-from collect.engine.steps import capture, choose, dip, press, review, touch
+from collect.engine.steps import capture, dip, press, review, touch
 from collect.engine.steps.context import RunContext, StepContext, uninterrupted
 from collect.engine.telemetry import Telemetry
 from collect.errors import describe
@@ -114,8 +114,6 @@ class Performer:
                 return await press.draw(context)
             case StepKind.CAPTURE:
                 return await capture.capture(context)
-            case StepKind.CHOOSE:
-                return await choose.choose(context)
             case StepKind.REVIEW:
                 return await review.review(context)
 

@@ -13,7 +13,6 @@ from collect.engine.last_capture import LastCapture
 from collect.engine.snapshot import SET_UP, CellCount, Snapshot
 from collect.engine.tally import Place, Tally
 from collect.operator import Prompt
-from collect.protocols.adaptive import with_choice
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.plan import AGAIN, Planned, with_review
 from collect.protocols.steps import MARKING, Result, Step, StepKind
@@ -231,15 +230,10 @@ class Progress:
 
     def _count(self, kind: str, result: Result) -> None:
         self._tally.finished(kind, result)
-        # Until a choice is made, the plan of an adaptive protocol is the worst case; a stroke that is marked bad in
-        # review is replaced by its repeat.
-        if kind == StepKind.CHOOSE:
-            self._plan = with_choice(self._plan, result)
-        elif kind == StepKind.REVIEW:
+        # A stroke that is marked bad in review is replaced by its repeat.
+        if kind == StepKind.REVIEW:
             self._plan = with_review(self._plan, result)
-        else:
-            return
-        self._by_index = {p.index: p for p in self._plan}
+            self._by_index = {p.index: p for p in self._plan}
 
     def _current(self) -> Planned | None:
         """The stroke in progress."""

@@ -64,7 +64,7 @@ def distinct_steps(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Step
 
 def _check_brush(path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
     brush = rig.brush
-    field = {"grid": "heights_mm", "adaptive": "heights_mm", "write": "figures"}.get(protocol.kind, "presses")
+    field = {"grid": "heights_mm", "few-strokes": "heights_mm", "write": "figures"}.get(protocol.kind, "presses")
     for depth_mm, tilt_deg, name in _depths(protocol):
         if depth_mm > brush.max_depth_mm:
             raise ConfigError(

@@ -14,7 +14,6 @@ from collect.errors import StepError
 from collect.motion.moves import park_moves
 from collect.planning.estimate import OMITTED, InkNeed, ink_need, reach_of, step_s
 from collect.planning.walk import StepMoves, Walked, sheet_of, walk
-from collect.protocols.adaptive import AdaptiveConfig
 from collect.protocols.config import ProtocolConfig
 from collect.protocols.presses import ReplayConfig
 from collect.protocols.steps import MARKING, StepKind
@@ -134,11 +133,6 @@ def _warnings(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list
     warnings: list[str] = []
     if isinstance(protocol, ReplayConfig) and protocol.ignored_columns:
         warnings.append(f"{protocol.file}: columns that are not used: {', '.join(protocol.ignored_columns)}")
-    if isinstance(protocol, AdaptiveConfig):
-        warnings.append(
-            f"the presses are chosen while they are made: this is the worst case, {protocol.most} presses; it stops "
-            f"after {protocol.least_presses} at the earliest"
-        )
     if (added := _armed(config, protocol)) is not None:
         warnings.append(added)
     over_mm, worst = max(_overhangs(config, protocol, sheet), default=(0.0, ""))

@@ -58,7 +58,7 @@ def moves_of(
             return _touches(config, plane, step, dips)
         case StepKind.DIP:
             return StepMoves([*inking_moves(config, dips)], dips=1)
-        case StepKind.CHOOSE | StepKind.REVIEW:
+        case StepKind.REVIEW:
             return StepMoves()
         case StepKind.BOARD:
             return StepMoves([*photograph_moves(config)], captures=1)

@@ -15,16 +15,15 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from collect.errors import ConfigError
-from collect.protocols.adaptive import AdaptiveConfig
 from collect.protocols.base import MAX_STROKES, ProtocolBase
 from collect.protocols.calibration import CalibrationConfig
-from collect.protocols.presses import GridConfig, ListConfig, ReplayConfig
+from collect.protocols.presses import FewStrokesConfig, GridConfig, ListConfig, ReplayConfig
 from collect.protocols.write import MAX_POINTS, PointRow, WriteConfig
 from collect.rig.config_file import read_text, read_toml, refusal
 from sessions.cells import as_text
 
 MAX_PROTOCOL_BYTES = 4 * 1024 * 1024
-ProtocolConfig = GridConfig | AdaptiveConfig | ListConfig | ReplayConfig | WriteConfig | CalibrationConfig
+ProtocolConfig = GridConfig | FewStrokesConfig | ListConfig | ReplayConfig | WriteConfig | CalibrationConfig
 TaggedProtocol = Annotated[ProtocolConfig, Field(discriminator="kind")]
 _PROTOCOL: TypeAdapter[ProtocolConfig] = TypeAdapter(TaggedProtocol)
 _KINDS: dict[str, type[ProtocolBase]] = {
@@ -38,6 +37,10 @@ def load_protocol(path: Path) -> ProtocolConfig:
     for name in ("presses", "points", "ignored_columns"):
         if name in values and "file" in values:
             raise ConfigError(path, name, "a file is named too: one of the two")
+    if values.get("kind") == "adaptive":
+        raise ConfigError(
+            path, "kind", "'adaptive' is no longer a protocol: use 'few-strokes' with heights_mm and tilts_deg"
+        )
     kind = _KINDS.get(str(values.get("kind")))
     if kind is WriteConfig:
         _fill_strokes(path, values)

@@ -115,11 +115,8 @@ def stroke_steps(plan: Iterable[Planned], *, board_every: int | None) -> Protoco
         yield from takes(stroke)
 
 
-def takes(stroke: Planned, *, measured: bool = False) -> Generator[Step, Result, None]:
-    """Steps of one stroke: dip, press or draw, capture; repeated while the capture asks for a retake.
-
-    `measured`: the capture's result also holds the ink.
-    """
+def takes(stroke: Planned) -> Generator[Step, Result, None]:
+    """Steps of one stroke: dip, press or draw, capture; repeated while the capture asks for a retake."""
     for take in itertools.count(1):
         # Only later takes are numbered, so that the keys of first takes match those of older sessions.
         taken: Params = {} if take == 1 else {"take": take}
@@ -130,8 +127,6 @@ def takes(stroke: Planned, *, measured: bool = False) -> Generator[Step, Result,
         marked = yield Step(kind, stroke.index, _mark_params(stroke) | taken)
         # A capture belongs to one cell: a capture of another cell is another step.
         place = _capture_params(stroke, int(marked["sheet"]), int(marked["cell"]))
-        if measured:
-            place["measured"] = True
         seen = yield Step(StepKind.CAPTURE, stroke.index, place | taken)
         if not seen.get("retake"):
             break

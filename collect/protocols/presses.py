@@ -1,4 +1,4 @@
-"""`grid`, `list` and `replay`: presses that are known before the first one is made."""
+"""`grid`, `few-strokes`, `list` and `replay`: presses that are known before the first one is made."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
+from calibrate.fit.design import spread_out
 from collect.protocols.base import (
     MAX_STROKES,
     DeepMm,
@@ -67,6 +68,36 @@ class GridConfig(ProtocolBase):
                 [Planned(f"H{h:g}-a{a:g}-r{repeat:02d}", h, a, repeat, dwell_s=self.dwell_s) for h, a in cells]
             )
         return numbered(rounds, self.seed, layout)
+
+
+class FewStrokesConfig(ProtocolBase):
+    """A few presses of a grid that tell most about a brush: each (H, alpha) as far as possible from those before it."""
+
+    depths_field: ClassVar[str] = "heights_mm"
+
+    kind: Literal["few-strokes"]
+    heights_mm: Annotated[list[DeepMm], Field(min_length=1, max_length=100)]
+    """Depths H below the touch height."""
+    tilts_deg: Annotated[list[TiltDeg], Field(min_length=1, max_length=100)]
+    """Tilts alpha from the paper's normal."""
+    strokes: Annotated[int, Field(ge=1, le=MAX_STROKES)] = 9
+    """Number of presses. After every (H, alpha) once, the same order begins again."""
+    dwell_s: DwellS = 0.2
+    """Time at full depth."""
+
+    @model_validator(mode="after")
+    def _distinct(self) -> FewStrokesConfig:
+        check_axes(self.heights_mm, self.tilts_deg)
+        return self
+
+    def planned(self, layout: Layout | None = None) -> list[Planned]:
+        """The presses in the order of the design, which does not depend on the sheet."""
+        order = spread_out(self.heights_mm, self.tilts_deg)
+        return [
+            Planned(f"H{h:g}-a{a:g}-r{repeat + 1:02d}", h, a, repeat + 1, number, dwell_s=self.dwell_s)
+            for number in range(self.strokes)
+            for repeat, (h, a) in [(number // len(order), order[number % len(order)])]
+        ]
 
 
 class PressRow(Config):

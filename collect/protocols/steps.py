@@ -28,8 +28,6 @@ class StepKind(StrEnum):
     TOUCH = "touch"
     """Bring the tip down on a given point of the sheet and measure its height."""
     CAPTURE = "capture"
-    CHOOSE = "choose"
-    """Fit the brush to the captures so far, and choose the next press or to stop; nothing moves."""
     REVIEW = "review"
     """Read which captures a person has marked bad; nothing moves."""
     SELF_CHECK = "self_check"

@@ -9,7 +9,6 @@ from calibrate.board.view import see_board
 from calibrate.errors import CalibrationError
 from calibrate.stroke.params import Gray
 from collect.engine.last_capture import LastCapture, pictures_of, published_mark
-from collect.engine.steps.choose import measured
 from collect.engine.steps.context import RunContext, StepContext, meanwhile, uninterrupted
 from collect.engine.steps.retake import decide
 from collect.errors import BadPicture, NeedsOperator, StepError
@@ -145,7 +144,6 @@ async def capture(context: StepContext) -> Result:
         "retake": retake,
         **_camera_delay(context),
         "verdict": "" if verdict is None or verdict.cause is None else str(verdict.cause.name),
-        **(await measured(context, image, cell) if context.step.params.get("measured") else {}),
     }
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import pytest
 
 from collect.engine.perform import Performer
-from collect.engine.steps import choose as choosing
 from collect.engine.steps.context import StepContext
 from collect.motion.moves import inking_moves
 from collect.planning.limit_check import all_poses, check_protocol
@@ -41,7 +40,7 @@ TWO_PRESSES = "presses = [{height_mm = 9.0, tilt_deg = 5.0}, {height_mm = 11.0}]
 KINDS = {
     "grid": 'kind = "grid"\nheights_mm = [9.0]\ntilts_deg = [5.0]\nrepeats = 2\nboard_every = 1\n',
     "replay": 'kind = "replay"\nof = "s"\npresses = [{stroke_id = "b", height_mm = 9.0, tilt_deg = 1.0}]\n',
-    "adaptive": 'kind = "adaptive"\nheights_mm = [9.0]\ntilts_deg = [5.0]\nleast_presses = 3\nenough_points = 50.0\n',
+    "few-strokes": 'kind = "few-strokes"\nheights_mm = [9.0, 11.0]\ntilts_deg = [5.0]\nstrokes = 1\n',
     "write": f'kind = "write"\ncell_mm = [60.0, 60.0]\n{FIGURE}',
     "calibration": 'kind = "calibration"\ntouches_mm = [[20.0, 20.0], [200.0, 20.0]]\n',
 }
@@ -113,20 +112,12 @@ def hold_against_the_plan(lab: Lab, made: list[Made]) -> None:
         assert {rounded(pose) for pose, _ in planned.poses} <= checked, one.step
 
 
-async def chosen(context: StepContext) -> Result:
-    """One press, without the seconds that a fit takes."""
-    return {"number": context.step.index, "stop": context.step.index > 0, "height_mm": 9.0, "tilt_deg": 5.0}
-
-
 def rounded(pose: Pose) -> tuple[float, ...]:
     return tuple(round(v, 6) for v in (*pose.position_mm, *pose.quaternion))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_a_run_sends_the_plan_has_checked(
-    lab: Lab, made: list[Made], monkeypatch: pytest.MonkeyPatch, kind: str
-) -> None:
-    monkeypatch.setattr(choosing, "choose", chosen)
+def test_what_a_run_sends_the_plan_has_checked(lab: Lab, made: list[Made], kind: str) -> None:
     run(lab, KINDS[kind])
     hold_against_the_plan(lab, made)
     assert {one.step.kind for one in made} >= {StepKind.ZERO_TOUCH, StepKind.BOARD}

@@ -128,8 +128,8 @@ def test_what_is_wrong_in_the_file_is_not_blamed_on_the_environment(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", r"kind: is missing: one of 'grid', 'adaptive', 'list', 'replay', 'write', 'calibration'$"),
-        (PROTOCOL.replace('"grid"', '"gird"'), r"kind: 'gird' is not one of 'grid', 'adaptive', "),
+        ("", r"kind: is missing: one of 'grid', 'few-strokes', 'list', 'replay', 'write', 'calibration'$"),
+        (PROTOCOL.replace('"grid"', '"gird"'), r"kind: 'gird' is not one of 'grid', 'few-strokes', "),
         (PROTOCOL.replace("heights_mm", "height_mm"), r"height_mm: unknown field; did you mean heights_mm, which is m"),
         (PROTOCOL.replace("repeats = 2", "repeats = 0"), r"repeats: .*1"),
         (PROTOCOL.replace("[11.0, 20.0]", "[]"), r"heights_mm: .*at least 1"),
