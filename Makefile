@@ -40,8 +40,8 @@ lint: $(STAMP)-dev
 types: $(STAMP)-dev
 	$(BIN)/pyright
 
-bench: $(STAMP)-dev  ## every bench, one line a figure, kept as a table in docs/bench.md
-	$(BIN)/python -m bench --table
+bench: $(STAMP)-dev  ## speed and memory beside named peers, some 12 minutes, kept as a table in docs/bench.md
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m bench --table
 
 docs: $(STAMP)-dev  ## the documentation as a site, in build/site/index.html; warnings are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet

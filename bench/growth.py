@@ -1,8 +1,11 @@
 """Time and peak memory of commands by number of strokes, with stills of the size and noise of the rig's camera.
 
 Each command is a process of its own, started by a small one, so that its peak is its own. A few dozen stills are drawn;
-the others are links to them. `python -m bench.growth 20000` measures up to 20,000 strokes, renews the rows in
-docs/bench.md and draws docs/growth.svg; `python -m bench growth --largest 5000` only measures.
+the others are links to them. A brush is fitted to these few, and `validate` compares it with all.
+
+`python -m bench.growth 20000` measures up to 20,000 strokes, renews the rows in docs/bench.md and draws
+docs/growth.svg; `python -m bench growth --largest 5000` only measures. With `--small`, pictures are of 480 x 300 px
+without noise: for the number of strokes alone, in a twentieth of the time and of the disk.
 """
 
 from __future__ import annotations
@@ -20,7 +23,9 @@ from typing import Any
 from bench import table
 from bench.harness import BenchError, Result, machine
 from bench.peak import Used, measure
-from bench.press_sessions import STILL, Presses, photographs, session, write_table
+from bench.press_sessions import CLOSE, STILL, Presses, View, photographs, session, write_table
+from calibrate.artefact import current
+from calibrate.fit.artefact import FOLDER as FITS
 
 SIZES = (100, 300, 1000, 5000, 20_000)
 LARGEST = 300
@@ -51,15 +56,20 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     return results(list(measured(LARGEST if n is None else n, seed)), seed)
 
 
-def measured(largest: int, seed: int) -> Iterator[Point]:
+def measured(largest: int, seed: int, view: View = STILL) -> Iterator[Point]:
     """Every command at each size, with at most one session of the largest size and a copy of it on the disk."""
     if largest < SIZES[0] + 1:
         raise ValueError(f"n = {largest}: more than {SIZES[0]} strokes are needed")
-    presses = Presses(largest, seed, view=STILL)
+    presses = Presses(largest, seed, view=view)
     with tempfile.TemporaryDirectory() as folder:
         under = Path(folder)
         photos = photographs(under / "photos", presses)
         another = session(under, "another", replace(presses, strokes=presses.distinct))
+        brushloop = (sys.executable, "-m", "brushloop")
+        measure(*brushloop, "fit", str(another))
+        fitted = current(another, FITS)
+        if fitted is None:
+            raise BenchError("the brush was not fitted")
         for strokes in (*(size for size in SIZES if size < largest), largest):
             write_table(photos, replace(presses, strokes=strokes))
             place, out = under / f"of-{strokes}", under / "out"
@@ -78,18 +88,20 @@ def measured(largest: int, seed: int) -> Iterator[Point]:
                 "verify": ("sessions", "verify", place),
                 "merge": ("sessions", "merge", out / "merged.mcap", place, another),
                 **{f"export-{kind}": ("sessions", "export", place, out / kind, "--format", kind) for kind in EXPORTS},
-                "validate": ("validate", place, "--out", out / "report"),
+                "validate": ("validate", place, "--fit", fitted, "--out", out / "report"),
             }
             for name, words in commands.items():
                 out.mkdir()
-                yield Point(name, strokes, measure(sys.executable, "-m", "brushloop", *map(str, words)))
+                yield Point(name, strokes, measure(*brushloop, *map(str, words)))
                 shutil.rmtree(out)
             shutil.rmtree(place)
 
 
-def results(points: Sequence[Point], seed: int) -> list[Result]:
+def results(points: Sequence[Point], seed: int, view: View = STILL) -> list[Result]:
     """Two figures of each command."""
     made: list[Result] = []
+    name = "growth" if view is STILL else "growth-small"
+    size = f"stills of {view.width_px} x {view.height_px} px{' with noise' if view.noise else ''}"
     for command, mine in by_command(points).items():
         (a, b), (y, z) = mine[:2], mine[-2:]
         level = next((point for point in mine[:-1] if point.strokes == LEVEL_FROM), mine[0])
@@ -98,13 +110,12 @@ def results(points: Sequence[Point], seed: int) -> list[Result]:
             f"{point.used.peak_mb:.0f} MB"
             for point in mine
         )
-        size = f"{STILL.width_px} x {STILL.height_px} px"
-        where = f"loopback rig, stills of {size} with noise; {command}: {each}; {machine()}"
+        where = f"loopback rig, {size}; {command}: {each}; {machine()}"
         first_ms, last_ms = each_ms(a, b), each_ms(y, z)
         peak_mb, level_mb = z.used.peak_mb, level.used.peak_mb
         made += [
             Result(
-                f"growth-{command}-time",
+                f"{name}-{command}-time",
                 last_ms,
                 f"CPU-ms a stroke from {y.strokes:,} to {z.strokes:,}",
                 f"from {a.strokes:,} to {b.strokes:,} strokes",
@@ -114,7 +125,7 @@ def results(points: Sequence[Point], seed: int) -> list[Result]:
                 where,
             ),
             Result(
-                f"growth-{command}-memory",
+                f"{name}-{command}-memory",
                 peak_mb,
                 f"MB at {z.strokes:,} strokes",
                 f"{MOST_GROWTH:g} times the peak at {level.strokes:,}",
@@ -138,8 +149,8 @@ def each_ms(few: Point, many: Point) -> float:
     return 1e3 * (many.used.cpu_s - few.used.cpu_s) / (many.strokes - few.strokes)
 
 
-def draw(points: Sequence[Point], path: Path) -> None:
-    """CPU time and peak memory by number of strokes, both axes logarithmic."""
+def draw(points: Sequence[Point], path: Path, title: str) -> None:
+    """CPU time and peak memory by number of strokes, which is on a logarithmic axis."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -154,6 +165,7 @@ def draw(points: Sequence[Point], path: Path) -> None:
     for axis in (left, right):
         axis.grid(alpha=0.3)
     right.legend(fontsize=8)
+    figure.suptitle(title, fontsize=9)
     with mpl.rc_context({"svg.hashsalt": "growth", "svg.fonttype": "none"}):
         figure.savefig(path, metadata={"Date": None})
 
@@ -163,16 +175,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m bench.growth", description="Time and memory by number of strokes.")
     parser.add_argument("largest", nargs="?", type=int, default=SIZES[-2])
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--small", action="store_true", help="pictures of 480 x 300 px without noise")
     options = parser.parse_args()
     points: list[Point] = []
-    for point in measured(options.largest, options.seed):
+    view = CLOSE if options.small else STILL
+    for point in measured(options.largest, options.seed, view):
         points.append(point)
         used = point.used
         words = f"{point.command}: {point.strokes:,} strokes, {used.wall_s:.1f} s, {used.cpu_s:.1f} CPU-s"
         sys.stdout.write(f"# {words}, {used.peak_mb:.0f} MB\n")
         sys.stdout.flush()
-    draw(points, PICTURE)
-    found = results(points, options.seed)
+    command = f"python -m bench.growth {options.largest}{' --small' if options.small else ''} --seed {options.seed}"
+    title = f"simulated presses, pictures of {view.width_px} x {view.height_px} px; {command}"
+    draw(points, PICTURE.with_stem("growth-small") if options.small else PICTURE, title)
+    found = results(points, options.seed, view)
     table.renew(found)
     sys.stdout.writelines(f"{result.to_line()}\n" for result in found)
 

@@ -29,8 +29,10 @@ def calibrate(
     from calibrate.artefact import load_artefact
     from calibrate.calibration import Calibration
     from calibrate.session import calibrate_session
+    from sessions.progress import shown
 
-    path = calibrate_session(session, lens)
+    with shown() as progress:
+        path = calibrate_session(session, lens, progress)
     made = load_artefact(path, Calibration)
     for flag in made.flags:
         say(f"warning: {flag}")

@@ -17,14 +17,16 @@ from calibrate.board.view import calibration_plane, paper_mm
 from calibrate.calibration import Calibration, Foreign
 from calibrate.errors import CalibrationError
 from calibrate.stroke.params import Params
+from sessions.progress import Progress, unseen
 from sessions.reader import Recording
 from sessions.recording.messages import decode_gray
 from sessions.recording.schemas import Stroke
 
 FITTED = "k1 fitted on the board"
+STEPS = "steps done: read the session, fit the plane, check the file"
 
 
-def calibrate_session(session: Path, lens: Path | None = None) -> Path:
+def calibrate_session(session: Path, lens: Path | None = None, progress: Progress = unseen) -> Path:
     """Calibrate a session, save the result beside the recording and use it from now on; returns its path.
 
     Without a lens file, the lens that the session was collected with is used. Raises `CalibrationError`, also for an
@@ -35,11 +37,14 @@ def calibrate_session(session: Path, lens: Path | None = None) -> Path:
         raise CalibrationError(str(recording.path), "is an import and brings its own scale: go on with `validate`")
     where = str(recording.path)
     spec, known = board_of(recording), known_lens(recording, lens)
+    progress(STEPS, 0, 3)
     stills = list(recording.stills_of("board"))
+    progress(STEPS, 1, 3)
     if not stills:
         raise CalibrationError(where, NO_BOARD)
     image, given = decode_gray(stills[-1], where), known.lens() if known else None
     plane = calibration_plane(image, spec, given, where, sheet_of(recording))
+    progress(STEPS, 2, 3)
     low, high = plane.interval_mm_per_px
     calibration = Calibration(
         session_id=recording.header.session_id,
@@ -60,6 +65,7 @@ def calibrate_session(session: Path, lens: Path | None = None) -> Path:
         flags=plane.flags,
         still_sha256=hashlib.sha256(stills[-1]).hexdigest(),
     )
+    progress(STEPS, 3, 3)
     return put_to_use(calibration, recording.path.parent)
 
 

@@ -10,7 +10,7 @@ import cv2
 import pytest
 
 import bench.__main__
-from bench import footprints, growth, paper_brush, raster, rpc, table
+from bench import footprints, growth, paper_brush, raster, rpc, table, whole
 from bench.harness import BenchError, Result, interleave, percentile, results_of
 from bench.peak import Used, measure
 from bench.processes import started
@@ -156,6 +156,38 @@ def test_the_picture_of_footprints_is_drawn(tmp_path: Path, monkeypatch: pytest.
     red = ((image[:, :, 2] > 180) & (image[:, :, 1] < 90)).mean()
     assert 0.01 < dark < 0.5
     assert 0.001 < red < 0.1
+
+
+def test_every_bench_belongs_to_one_run_and_growth_is_run_by_name() -> None:
+    planned = [*whole.SPEED, *whole.ACCURACY, "growth"]
+    assert sorted(planned) == sorted(bench.__main__.benches())
+    assert sum(whole.SPEED.values()) <= 15 * 60
+
+
+def test_a_bench_that_fails_or_hangs_costs_its_own_figures_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: list[str] = []
+
+    def run(command: list[str], *, timeout: float, **_options: object) -> subprocess.CompletedProcess[str]:
+        ran.append(command[3])
+        if command[3] == "b":
+            raise subprocess.TimeoutExpired(command, timeout)
+        return subprocess.CompletedProcess(command, 1 if command[3] == "c" else 0)
+
+    monkeypatch.setattr(whole.subprocess, "run", run)
+    said: list[str] = []
+    assert whole.run_all({"a": 60, "b": 30, "c": 10, "d": 100}, ["--table"], said.append) == ["b", "c"]
+    assert ran == ["a", "b", "c", "d"]
+    assert said[:2] == [
+        "[1 of 4] a: about 60 s (30 % of all), about 3 min left",
+        "[2 of 4] b: about 30 s (15 % of all), about 2 min left",
+    ]
+    assert "b: not measured: it was ended after 360 s" in said
+    assert "c: not measured: it ended with 1" in said
+
+
+def test_a_number_of_rounds_goes_with_one_bench(capsys: pytest.CaptureFixture[str]) -> None:
+    assert bench.__main__.main(["-n", "3"]) == 2
+    assert capsys.readouterr().err == "-n: goes with a NAME\n"
 
 
 def test_unknown_name_is_one_line_and_exit_code_2() -> None:

@@ -74,16 +74,19 @@ def intrinsics(
     from calibrate.board.spec import describe
     from calibrate.errors import CalibrationError
     from calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
+    from sessions.progress import counted, shown
 
     made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
     seen, unusable, digests = list[BoardView](), dict[str, str](), dict[str, str]()
-    for name, path in named(photographs).items():
-        image = read_gray(path)
-        digests[name] = hashlib.sha256(read_bounded(path, MAX_PHOTOGRAPH_BYTES)).hexdigest()
-        try:
-            seen.append(find_board(image, made, name))
-        except CalibrationError as error:
-            unusable[name] = error.what
+    given = named(photographs)
+    with shown() as progress:
+        for name, path in counted(given.items(), "photographs searched for the board", len(given), progress):
+            image = read_gray(path)
+            digests[name] = hashlib.sha256(read_bounded(path, MAX_PHOTOGRAPH_BYTES)).hexdigest()
+            try:
+                seen.append(find_board(image, made, name))
+            except CalibrationError as error:
+                unusable[name] = error.what
     fitted = fit_lens(seen, limit_px, unusable, one_camera=one_camera)
     file = lens_file(fitted, describe(made), digests, limit_px, f"brushloop {version('brushloop')}")
     for name, residual in file.residuals_px.items():
@@ -144,11 +147,13 @@ def drift(
     """Show pix2len at each view of the board in a session, and its trend. Exit code 5 on warnings."""
     from calibrate.board.drift import board_over_session
     from calibrate.board.session import board_of, known_lens
+    from sessions.progress import shown
     from sessions.reader import Recording
 
     recording = Recording(session)
     known = known_lens(recording, lens)
-    found = board_over_session(recording, board_of(recording), known.lens() if known else None)
+    with shown() as progress:
+        found = board_over_session(recording, board_of(recording), known.lens() if known else None, progress)
     for seen in found.seen:
         low, high = (seen.mm_per_px * (1.0 + side * seen.reach) for side in (-1.0, 1.0))
         after_s = (seen.t_ns - found.seen[0].t_ns) / 1e9

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from calibrate.board.spec import BoardSpec
 from calibrate.board.view import see_board_and_lens
 from calibrate.errors import CalibrationError
 from calibrate.line import Line, fit_line
+from sessions.progress import Progress, counted, unseen
 from sessions.reader import Recording
 
 MOVED_PX = 1.0
@@ -52,16 +53,19 @@ class Drift:
     warnings: tuple[str, ...]
 
 
-def board_over_session(recording: Recording, spec: BoardSpec, lens: Lens | None = None) -> Drift:
+def board_over_session(
+    recording: Recording, spec: BoardSpec, lens: Lens | None = None, progress: Progress = unseen
+) -> Drift:
     """Measure the board in every still of a `board` step. Raises `CalibrationError` where there is none."""
     stills = list(board_stills(recording))
     if not stills:
         raise CalibrationError(str(recording.path), NO_BOARD)
-    return drift(stills, spec, lens, sheet_of(recording))
+    looked_at = counted(stills, "photographs of the board measured", len(stills), progress)
+    return drift(looked_at, spec, lens, sheet_of(recording))
 
 
 def drift(
-    stills: Sequence[tuple[int, Gray]],
+    stills: Iterable[tuple[int, Gray]],
     spec: BoardSpec,
     lens: Lens | None = None,
     sheet_mm: tuple[float, float] | None = None,
@@ -71,12 +75,12 @@ def drift(
     Raises `CalibrationError` if the board is seen in none.
     """
     seen: list[BoardAt] = []
-    unseen: list[tuple[int, str]] = []
+    missing: list[tuple[int, str]] = []
     for t_ns, image in stills:
         try:
             plane = see_board_and_lens(image, spec, lens, f"the board at {t_ns} ns", sheet_mm)
         except CalibrationError as error:
-            unseen.append((t_ns, error.what))
+            missing.append((t_ns, error.what))
             continue
         middle = np.array([spec.squares]) * spec.square_mm / 2.0 + np.array([spec.origin_mm])
         first = seen[0].plane if seen else plane
@@ -84,10 +88,12 @@ def drift(
         seen.append(BoardAt(t_ns, plane, plane.scale_at(here), float(np.linalg.norm(here - then))))
     if not seen:
         problem = (
-            f"is not seen in any of {len(unseen)} photographs: {unseen[0][1]}" if unseen else "was never photographed"
+            f"is not seen in any of {len(missing)} photographs: {missing[0][1]}"
+            if missing
+            else "was never photographed"
         )
         raise CalibrationError("the board", problem)
-    return Drift(tuple(seen), tuple(unseen), _trend(seen), _warnings(seen, unseen))
+    return Drift(tuple(seen), tuple(missing), _trend(seen), _warnings(seen, missing))
 
 
 def _trend(seen: Sequence[BoardAt]) -> Line | None:
@@ -98,8 +104,8 @@ def _trend(seen: Sequence[BoardAt]) -> Line | None:
     return fit_line(hours, [s.mm_per_px / first.mm_per_px - 1.0 for s in seen])
 
 
-def _warnings(seen: Sequence[BoardAt], unseen: Sequence[tuple[int, str]]) -> tuple[str, ...]:
-    warnings = [f"the board is not seen at {t_ns} ns: {why}" for t_ns, why in unseen]
+def _warnings(seen: Sequence[BoardAt], missing: Sequence[tuple[int, str]]) -> tuple[str, ...]:
+    warnings = [f"the board is not seen at {t_ns} ns: {why}" for t_ns, why in missing]
     warnings += [f"at {s.t_ns} ns: {flag}" for s in seen for flag in s.plane.flags]
     first = seen[0]
     for s in seen[1:]:

@@ -277,12 +277,12 @@ def test_drift_distinguishes_a_camera_that_stays_from_one_that_was_touched(
     still = photographed(tmp_path / "still", SPEC, [board(seed=k) for k in range(3)])
     ran = run("drift", still)
     assert ran.exit_code == 0, ran.output
-    assert [line.split(" s:")[0].strip() for line in ran.output.splitlines()[:3]] == ["0", "60", "120"]
+    assert [line.split(" s:")[0].strip() for line in ran.stdout.splitlines()[:3]] == ["0", "60", "120"]
     assert "trend " in ran.output
     touched = photographed(tmp_path / "touched", SPEC, [board(), board(4.0, seed=1), half_hidden(0.5), BLANK])
     ran = run("drift", touched)
     assert ran.exit_code == 5
-    warnings = [line for line in ran.output.splitlines() if line.startswith("warning: ")]
+    warnings = [line for line in ran.stdout.splitlines() if line.startswith("warning: ")]
     assert "is blank" in warnings[0]
     assert "the board is partly hidden" in warnings[1]
     assert "the board moved by 3.9 px" in warnings[2]
@@ -308,6 +308,16 @@ def test_drift_refuses_a_session_in_which_no_board_is_seen(
 def test_drift_refuses_what_is_no_session_with_boards(photographed: Photographed, tmp_path: Path) -> None:
     assert "no such session" in str(run("drift", tmp_path / "nosuch").exception)
     refused(run("drift", photographed(tmp_path / "none", SPEC, [])), "holds no view of the board")
+
+
+def test_long_work_says_how_far_it_is(
+    photographed: Photographed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sessions.progress.QUIET_S", 0.0)
+    paths = [saved(tmp_path / f"{number}.png", BLANK) for number in range(2)]
+    assert "photographs searched for the board: 1 of 2, about" in run("intrinsics", *paths, *BOARD).output
+    session = photographed(tmp_path / "s", SPEC, [BLANK, BLANK])
+    assert "photographs of the board measured: 1 of 2, about" in run("drift", session).output
 
 
 def test_intrinsics_names_every_useless_photograph_and_writes_nothing(tmp_path: Path) -> None:

@@ -140,7 +140,10 @@ def test_a_session_that_was_collected_with_a_lens_needs_no_other(
     photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path
 ) -> None:
     session = collected(photographed, tmp_path / "own", shot, read_lens(lens))
-    holds(load_artefact(calibrate_session(session), Calibration), shot)
+    steps: list[int] = []
+    made = calibrate_session(session, progress=lambda _what, done, _of: steps.append(done))
+    assert steps == [0, 1, 2, 3]
+    holds(load_artefact(made, Calibration), shot)
     wrong = kept_lens(tmp_path / "wrong", 0.08)
     with pytest.raises(CalibrationError, match=r"bent by .* of another camera, or of another focus"):
         calibrate_session(session, wrong)
