@@ -32,7 +32,7 @@ class OptionRefused(Exception):
 
 
 class FrontDoor(TyperGroup):
-    """Names the number given and both ends of its range; typer itself names one end, also for `nan`."""
+    """Reports the given number and both ends of its range; typer itself names only one end, and allows `nan`."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command. Raises `OptionRefused`."""
@@ -110,12 +110,12 @@ def sim(
     seed: Annotated[int, typer.Option(min=0, help="Seed of brush, presses and noise.")] = 1,
     arcs_port: Annotated[int, typer.Option(min=0, max=65535, help="Controller port; 0: any.")] = 0,
     camera_port: Annotated[int, typer.Option(min=0, max=65535, help="Camera port; 0: any.")] = 0,
-    fps: Annotated[float, typer.Option(min=1, max=60, help="Camera's pictures per real second.")] = 8.0,
+    fps: Annotated[float, typer.Option(min=1, max=60, help="Camera pictures per real second.")] = 8.0,
     idle_exit: Annotated[float, typer.Option(min=0, help="End after so many seconds without clients; 0: never.")] = 0.0,
     brush: Annotated[
-        Path | None, typer.Option(help="A described brush, brush.toml; `paper` for the paper's. By default any brush.")
+        Path | None, typer.Option(help="Brush described in a brush.toml, or `paper`; default: the rig's own.")
     ] = None,
-    faults: Annotated[Path | None, typer.Option(help="A script of faults, faults.toml.")] = None,
+    faults: Annotated[Path | None, typer.Option(help="Script of faults, faults.toml.")] = None,
     control: Annotated[Path | None, typer.Option(help="Make a control socket here, for `fault` and `hand`.")] = None,
     unknown: Annotated[
         int | None, typer.Option(min=0, help="Serve a lab that nobody has measured, drawn from this seed.")
@@ -125,8 +125,8 @@ def sim(
 ) -> None:
     """Serve the loopback rig: an ARCS controller and an MJPEG camera over one simulated world, on 127.0.0.1 only.
 
-    Ctrl-C ends it; SIGUSR1 puts a fresh sheet in. An unknown lab has a loopback address of its own, and no rig.toml:
-    that is what `brushloop rig new` finds out there.
+    Ctrl-C ends it; SIGUSR1 puts a fresh sheet in. An unknown lab has a loopback address of its own and no rig.toml,
+    which `brushloop rig new` has to find out.
     """
     from drivers.sim.brush.brush import BrushSpec
     from drivers.sim.brush_file import NamedBrush, load_brush
@@ -135,11 +135,11 @@ def sim(
 
     if unknown is not None:
         if write_rig is not None or brush is not None or faults is not None or arcs_port or camera_port:
-            raise LabRefused("--unknown: goes with --trap, --truth, --control, --rate and --idle-exit alone")
+            raise LabRefused("--unknown: can only be combined with --trap, --truth, --control, --rate and --idle-exit")
         serve_unknown(unknown, trap, rate, idle_exit, say, truth=truth, control=control)
         return
     if trap is not None or truth is not None:
-        raise LabRefused("--trap and --truth: go with --unknown SEED")
+        raise LabRefused("--trap and --truth: need --unknown SEED")
     pressed = NamedBrush(BrushSpec(seed=seed), "") if brush is None else load_brush(brush)
     config = SimConfig(
         seed=seed,
@@ -160,11 +160,11 @@ def fault(
     kind: Annotated[str | None, typer.Argument(help="How it breaks: mute, late, black, bus-off, ...")] = None,
     after_s: Annotated[float | None, typer.Option(help="Not before this simulated time.")] = None,
     on: Annotated[str | None, typer.Option(help="Only on this method of the robot, such as moveLine.")] = None,
-    nth: Annotated[int | None, typer.Option(help="From the n-th request, push or frame on.")] = None,
+    nth: Annotated[int | None, typer.Option(help="Begin at the n-th request, push or frame.")] = None,
     phase: Annotated[str | None, typer.Option(help="Begin while the arm does this, such as descending.")] = None,
-    press: Annotated[int | None, typer.Option(help="Begin while so many presses lie on the paper.")] = None,
-    count: Annotated[int | None, typer.Option(help="Occur so many times.")] = None,
-    for_s: Annotated[float | None, typer.Option(help="Last for so many real seconds.")] = None,
+    press: Annotated[int | None, typer.Option(help="Begin while this many presses are on the paper.")] = None,
+    count: Annotated[int | None, typer.Option(help="Occur this many times.")] = None,
+    for_s: Annotated[float | None, typer.Option(help="Last for this many real seconds.")] = None,
     late_s: Annotated[float | None, typer.Option(help="Delay of a late reply, in real seconds.")] = None,
     ident: Annotated[int | None, typer.Option("--id", help="Fault to clear; all of them by default.")] = None,
 ) -> None:
@@ -183,10 +183,10 @@ def hand(
     control: Annotated[Path, typer.Argument(help="Control socket of a lab: `brushloop sim --unknown`.")],
     act: Annotated[str, typer.Argument(help="bring, measure, mend or plug.")],
     to: Annotated[str | None, typer.Argument(help="What: pin, board-corner, well, park, hold-board, ...")] = None,
-    index: Annotated[int, typer.Option(min=0, max=999, help="Which one, from 0: the direction at the pin, ...")] = 0,
+    index: Annotated[int, typer.Option(min=0, max=999, help="Which one, from 0, such as a direction at the pin.")] = 0,
     corner: Annotated[str | None, typer.Option(help="Such as 'lower left' or 'upper right'.")] = None,
 ) -> None:
-    """Be the person in an unknown lab: guide the arm by hand, hold the printed board, mend what is wrong."""
+    """Act as the person in an unknown lab: guide the arm by hand, hold the printed board, correct mistakes."""
     from drivers.sim.fault_client import ask
 
     wanted = {"act": act, "to": to, "index": index or None, "corner": corner}
@@ -206,7 +206,7 @@ def demo(
         str | None, typer.Option(help="The rig's brush, as for `brushloop sim`: a brush.toml, or `paper`.")
     ] = None,
 ) -> None:
-    """Press, calibrate, press again and validate on the loopback rig. Run again, it goes on where it stopped."""
+    """Press, calibrate, press again and validate on the loopback rig. Run it again to continue where it stopped."""
     from collect.chains.demo import FULL, QUICK, Demo
 
     if code := Demo(out, FULL if full else QUICK, repeats, rate, seed, brush).run():

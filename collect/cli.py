@@ -21,7 +21,7 @@ app = typer.Typer(invoke_without_command=True, pretty_exceptions_enable=False)
 
 Rig = Annotated[Path, typer.Option(help="The rig: addresses, frames, limits.")]
 Arm = Annotated[bool, typer.Option("--arm", help="Let real hardware move.")]
-Tui = Annotated[bool | None, typer.Option("--tui/--no-tui", help="Screen; by default where there is a terminal.")]
+Tui = Annotated[bool | None, typer.Option("--tui/--no-tui", help="Show the screen; default: if there is a terminal.")]
 NewSheet = Annotated[int | None, typer.Option(min=1, help="Sheet N of the new session is in, as for collect.")]
 
 
@@ -29,9 +29,9 @@ NewSheet = Annotated[int | None, typer.Option(min=1, help="Sheet N of the new se
 def collect(
     ctx: typer.Context,
     config: Annotated[Path | None, typer.Option(help="The rig: addresses, frames, limits; required.")] = None,
-    protocol: Annotated[Path | None, typer.Option(help="What to do; required.")] = None,
+    protocol: Annotated[Path | None, typer.Option(help="The protocol.toml to carry out; required.")] = None,
     out: Annotated[Path, typer.Option(help="Folder that holds sessions.")] = Path("sessions"),
-    new: Annotated[bool, typer.Option("--new", help="Start a new session though one is open.")] = False,
+    new: Annotated[bool, typer.Option("--new", help="Start a new session although one is open.")] = False,
     sheet: Annotated[
         int | None,
         typer.Option(min=1, help="Sheet N of the session is in: confirms a fresh one. Repeating it is safe."),
@@ -39,7 +39,7 @@ def collect(
     arm: Arm = False,
     dry_run: Annotated[
         float | None,
-        typer.Option(help="Only move, lifted by so many mm: nothing is pressed, dipped or kept."),
+        typer.Option(help="Only move, lifted by this many mm: nothing is pressed, dipped or kept."),
     ] = None,
     tui: Tui = None,
     set_up: Annotated[
@@ -47,10 +47,10 @@ def collect(
     ] = False,
     preview: Annotated[
         Literal["cells", "auto", "off"],
-        typer.Option(help="Camera on the screen: half-cells; auto: pixels where the terminal has them."),
+        typer.Option(help="Camera on the screen, in half-cells; auto: in pixels if the terminal supports them."),
     ] = "cells",
-    live: Annotated[bool, typer.Option("--live", help="Let a Foxglove viewer on this machine look on.")] = False,
-    live_port: Annotated[int, typer.Option(min=0, max=65535, help="Port that it listens on; 0: any.")] = 8765,
+    live: Annotated[bool, typer.Option("--live", help="Let a Foxglove viewer on this machine watch the run.")] = False,
+    live_port: Annotated[int, typer.Option(min=0, max=65535, help="Port of --live; 0: any.")] = 8765,
 ) -> None:
     """Collect strokes. Ctrl-C stops the arm; run the same command again to resume."""
     if ctx.invoked_subcommand is not None:
@@ -76,7 +76,7 @@ def collect(
         preview=preview,
     )
     if given_up:
-        say(f"finished; {given_up} strokes came out badly every time and were left out", err=True)
+        say(f"finished; {given_up} strokes failed every time and were left out", err=True)
         raise typer.Exit(3)
 
 
@@ -96,13 +96,13 @@ def browse() -> None:
 @app.command()
 def plan(
     config: Rig,
-    protocol: Annotated[Path, typer.Option(help="What would be done.")],
+    protocol: Annotated[Path, typer.Option(help="The protocol to plan.")],
     picture: Annotated[
         Path | None, typer.Option(help="Draw the sheets into this file: .png, .svg, .pdf or .jpg.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
     arm: Annotated[
-        bool, typer.Option("--arm", help="As it is run with --arm: with the self-check; moves nothing.")
+        bool, typer.Option("--arm", help="Plan for a run with --arm, which includes the self-check; moves nothing.")
     ] = False,
     ask: Annotated[
         bool, typer.Option("--ask", help="Ask the arm's controller whether it reaches every pose; moves nothing.")
@@ -149,7 +149,7 @@ def doctor(
     config: Rig,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object per device.")] = False,
     report: Annotated[
-        Path | None, typer.Option(help="Write an archive for a report of a defect, without secrets: FILE.zip.")
+        Path | None, typer.Option(help="Write an archive for a bug report, without secrets: FILE.zip.")
     ] = None,
 ) -> None:
     """Ask every configured device for its identity and its faults. Powers nothing and moves nothing."""
@@ -204,7 +204,7 @@ def loop(
     out: Annotated[Path | None, typer.Option(help="Folder for what the loop makes; <session>/loop by default.")] = None,
     fit: Annotated[Path | None, typer.Option(help="Brush fit; the one in use, or made, by default.")] = None,
     presses: Annotated[
-        int | None, typer.Option(min=1, help="Only so many presses, spread evenly over the session.")
+        int | None, typer.Option(min=1, help="Only this many presses, spread evenly over the session.")
     ] = None,
     repeats: Annotated[int, typer.Option(min=1, max=100, help="How often each is pressed again.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the order.")] = 1,
@@ -232,7 +232,7 @@ def write(
     out: Annotated[Path, typer.Option(help="Folder for the plan and the report.")] = Path("written"),
     sessions: Annotated[Path, typer.Option(help="Folder that holds sessions.")] = Path("sessions"),
     count: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written.")] = 10,
-    learn: Annotated[int, typer.Option(min=0, max=20, help="Rounds of correcting the plan by its own ink first.")] = 0,
+    learn: Annotated[int, typer.Option(min=0, max=20, help="Rounds that first correct the plan by its own ink.")] = 0,
     learn_count: Annotated[int, typer.Option(min=1, max=100, help="How often each is written in such a round.")] = 2,
     data: Annotated[Path | None, typer.Option(help="hanzi-writer folder or makemeahanzi graphics.txt.")] = None,
     reference: Annotated[list[str] | None, typer.Option(help="字=picture.png: compare with this picture.")] = None,

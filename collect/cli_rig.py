@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collect.tui.teach_guide import ScreenGuide
 
 app = typer.Typer(
-    help="Teach a rig on its first day, look at its rig.toml, check it.",
+    help="Teach a rig on its first day; show and check its rig.toml.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -114,9 +114,9 @@ def show(
 
 @app.command()
 def check(rig: RigFile, as_json: Json = False) -> None:
-    """Say what in a rig.toml is plausible, what contradicts what, and what was not measured. Asks no device.
+    """Report which values of a rig.toml are plausible, contradict each other, or were not measured. Asks no device.
 
-    Ends with code 5 if anything contradicts something.
+    Ends with code 5 if values contradict each other.
     """
     import json
 

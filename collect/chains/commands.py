@@ -17,7 +17,7 @@ Say = Callable[[str], None]
 GIVEN_UP = 3
 """Exit code of a collection that finished but left strokes out."""
 PRESSES = frozenset({"grid", "few-strokes", "list"})
-"""Protocols whose recording is calibrated and validated alone; after others, the next step is not one command."""
+"""Protocols whose recording can be calibrated and validated by itself; after others, no single next command exists."""
 
 
 class CommandFailed(Exception):
@@ -74,7 +74,7 @@ def collected_session(say: Say, config: Path, protocol: Path, root: Path, option
         run_command(say, "collect", *files, *options, accepts=(0, GIVEN_UP))
         session = finished_session(root, protocol)
     if session is None:
-        raise ConfigError(root, "", f"holds no finished session of {protocol}, though collection ended")
+        raise ConfigError(root, "", f"holds no finished session of {protocol}, although collection ended")
     if not artefacts(session):
         run_command(say, "calibrate", session)
     return session

@@ -59,7 +59,7 @@ COMMAND_S, FIT_CELL_S, VALIDATE_CELL_S = 2.0, 0.4, 0.4
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One step of the demo; `run` does what of it is not done yet."""
+    """One step of the demo; `run` does the part that is not done yet."""
 
     title: str
     about_s: float
@@ -188,7 +188,7 @@ class Demo:
         run_command(say, "validate", self._finished(), "--generator", SHIPPED_GENERATOR)
 
     def _blank_sheet(self, protocol: Path) -> None:
-        """Have the rig ready for the session of this protocol, with a blank sheet unless that has begun."""
+        """Make the rig ready for the session of this protocol, with a blank sheet unless the session has begun."""
         if protocol.exists() and finished_session(self._sessions, protocol) is not None:
             return
         self._rig.ready()

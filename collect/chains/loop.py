@@ -70,7 +70,7 @@ def run_loop(request: LoopRequest, say: Say) -> Path:
 
 
 def _check_rig(path: Path, rig: RigConfig, header: Header) -> None:
-    """Refuse another brush, which makes other marks, before anything moves."""
+    """Refuse a rig with another brush, whose marks would differ, before anything moves."""
     if not header.source.imported and header.brush != rig.brush.name:
         raise ConfigError(path, "brush.name", f"{rig.brush.name!r}: the original was pressed with {header.brush!r}")
 
@@ -115,7 +115,7 @@ def check_recovered(path: Path) -> None:
 
 
 class Settings(BaseModel):
-    """What the presses of a loop depend on, kept in its folder, since a resumed loop must have the same ones."""
+    """What the presses of a loop depend on; kept in its folder, because a resumed loop must use the same settings."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -28,7 +28,7 @@ class WritingRequest:
     """Folder that holds sessions."""
     count: int = 10
     learn: int = 0
-    """Rounds before the writings that count; each writes a few copies and corrects the plan by them."""
+    """Rounds before the final writings; each writes a few copies and corrects the plan by them."""
     learn_count: int = 2
     """How often each character is written in such a round."""
     sheet: int | None = None

@@ -54,7 +54,7 @@ def check_transition(old: State, new: State) -> None:
 
 
 class RunControl:
-    """State of a run and what the keys asked for, under one lock. Talks to no device."""
+    """State of a run and the requests from keys, under one lock. Talks to no device."""
 
     def __init__(self, doing: Callable[[str], None]) -> None:
         """`doing` is called with what the run is doing, in words."""

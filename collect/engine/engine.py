@@ -37,16 +37,16 @@ from drivers.errors import DeviceError, NotConnected, Stale
 from sessions.store import SessionStore
 
 PARKED_MM = 2.0
-"""Distance from the park position that counts as parked."""
+"""Distance from the park position, in mm, within which the arm counts as parked."""
 SILENT_S = 1.0
 """Time without a pose after which the snapshot says so: the arm or the connection to it has failed."""
 UNCHECKED = (
-    "no self-check: it is switched off in rig.toml, or this session was begun without it. Nothing checks whether arm, "
+    "no self-check: it is switched off in rig.toml, or this session began without it. Nothing checks whether arm, "
     "camera and configuration agree"
 )
 
-ARM = Choice("a", "arm it: I look at the cell, my hand is at the emergency stop")
-LEAVE = Choice("x", "leave it")
+ARM = Choice("a", "arm it: I am looking at the robot cell, my hand is at the emergency stop")
+LEAVE = Choice("x", "do not arm it")
 
 OpenStore = Callable[[Rig], SessionStore]
 """Makes or resumes the session, once the devices have been identified and before anything is powered."""
@@ -72,7 +72,7 @@ class Engine:
         preview: bool = False,
     ) -> None:
         """`watched`: a screen can answer questions. `armed`: the operator allows real hardware to move. `live` was
-        started already. `guided`: a person accepts each set-up step. `preview`: snapshots hold a camera picture."""
+        already started. `guided`: a person accepts each set-up step. `preview`: snapshots hold a camera picture."""
         self._rig_config = rig
         self._protocol_config = protocol
         self._open_store = open_store

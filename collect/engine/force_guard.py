@@ -13,7 +13,7 @@ from collect.rig.devices import Rig
 from drivers.samples import ForceSample
 
 CHECK_S = 0.02
-"""Time between checks that the sensor is not silent: silence must not be taken for zero force."""
+"""Time between checks for a silent sensor: silence must not be mistaken for zero force."""
 
 _R = TypeVar("_R")
 

@@ -91,7 +91,7 @@ class Performer:
             raise
         if step.kind == StepKind.DIP and run.requests.take(OperatorRequest.SKIP):
             result = {**result, **progress.skipped(step)}
-            progress.log(f"{result['stroke_id']}: is left out, as the operator asked")
+            progress.log(f"{result['stroke_id']}: is left out, as the operator requested")
         await uninterrupted(store.done, attempt, result)
         progress.finished(step, result)
         return result

@@ -11,7 +11,7 @@ from drivers.errors import ArmMoved, DeviceError, DeviceTimeout, MotionError, Ro
 from drivers.ink.port import InkRefused
 
 MAX_FAILURES = 3
-"""The third failure of one step is no coincidence: a person decides."""
+"""Failures of one step after which a person decides: so many are no coincidence."""
 
 STOP = Choice("x", "stop the run")
 GO_ON = "g"
@@ -65,18 +65,18 @@ def question(error: StepError | DeviceError, sheet: int) -> Prompt:
             text = f"Sheet {sheet + 1} is full. Put a fresh one in, then go on."
             go_on = f"sheet {sheet + 2} is in, and blank"
         case InkRefused():
-            go_on = "there is ink, dip again"
+            go_on = "there is ink: dip again"
         case ForceTooHigh():
-            go_on = "nothing is under the brush, lift it and go on"
+            go_on = "nothing is under the brush: lift it and go on"
         case ArmMoved():
-            go_on = "nobody else has the arm, lift it and go on"
+            go_on = "nobody else uses the arm: lift it and go on"
         case SettingsChanged():
-            go_on = "nobody else has the arm: set it anew, lift it and go on"
+            go_on = "nobody else uses the arm: restore the settings, lift it and go on"
         case JogGivenUp(height=height):
             text += f". {height[0].upper()}{height[1:]} can be kept: H is then counted from there."
             return Prompt(text, (Choice(KEEP, "keep that height, go on"), Choice("a", "jog again"), STOP), STOP.key)
         case MotionError():
-            go_on = "the arm is released and clear, lift it and go on"
+            go_on = "the arm is released and nothing is in its way: lift it and go on"
         case _:
-            go_on = "the cause is removed, try again"
+            go_on = "the cause is removed: try again"
     return Prompt(text, (Choice(GO_ON, go_on), STOP), STOP.key)

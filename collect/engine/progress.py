@@ -166,7 +166,7 @@ class Progress:
             self._messages.append(f"warning: {text}" if warning else text)
 
     def ended(self, why: str) -> None:
-        """Note that the run ended before it was done."""
+        """Note that the run ended early, and why."""
         with self._lock:
             self._error = why
             self._over_ns = self._clock.now_ns()

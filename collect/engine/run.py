@@ -24,7 +24,7 @@ from sessions.errors import SessionError
 
 ITS_OWN_TROUBLE = (MotionError, RpcError, ForceTooHigh)
 """After these errors the arm does not move before a person has looked."""
-KEEP_SHEET = Choice("o", "keep the old one in")
+KEEP_SHEET = Choice("o", "keep the old sheet")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class Run:
                 break
             for stroke_id, _ in (await self._result(step))["again"]:
                 await self._walk(takes(self.context.progress.made_again(str(stroke_id))))
-        await self._once_arm_is_free(self._recover)  # a capture may have set out for a dip that does not come
+        await self._once_arm_is_free(self._recover)  # the arm may have left for a dip that does not follow
 
     async def _walk(self, protocol: Protocol) -> None:
         step = next(protocol)
@@ -95,7 +95,7 @@ class Run:
                 failures += 1
                 action = decide(step, error, failures)
                 if self.guided and step.kind in SET_UP and self.context.asker.watched:
-                    action = Action.ASK  # the person who sets up can remove the cause
+                    action = Action.ASK  # the person at the set-up can remove the cause
                 self.context.progress.log(f"{step.kind}: {error} -> {action}", warning=True)
                 if action is Action.ABORT or (action is Action.ASK and not self.context.asker.watched):
                     await self._lift(error)
@@ -158,7 +158,7 @@ class Run:
             await self.performer.perform(touch)
         except StepError as error:
             self.context.progress.log(
-                f"zero touch by jog: {error} The paper stays where it was found before.", warning=True
+                f"zero touch by jog: {error} The previous height of the paper is kept.", warning=True
             )
         await self._once_arm_is_free(self._recover)
 
@@ -196,8 +196,8 @@ class Run:
         return await self.context.asker.ask(prompt)
 
     async def _lift(self, error: StepError | DeviceError | SessionError) -> None:
-        """Lift the brush off the paper after `error`, unless the arm is at fault or the brush met something hard, which
-        a person must look at first."""
+        """Lift the brush off the paper after `error`. Where the arm is at fault, or the brush met something hard, leave
+        it: a person must look first."""
         if isinstance(error, ITS_OWN_TROUBLE) or getattr(error, "device", "") == "robot":
             return
         try:

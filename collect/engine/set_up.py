@@ -40,7 +40,7 @@ def question(kind: StepKind, result: Result, config: RigConfig) -> Prompt:
     facts = facts_of(kind, result, config)
     good = all(fact.good is not False for fact in facts)
     text = f"{TITLES[kind]}: " + ("all within limits." if good else "not all is within limits.")
-    choices = [Choice(GO_ON, "good, go on" if good else "go on all the same"), AGAIN]
+    choices = [Choice(GO_ON, "good, go on" if good else "go on anyway"), AGAIN]
     if kind is StepKind.ZERO_TOUCH:
         choices += [BY_JOG, *([BY_FORCE] if config.force is not None else [])]
     return Prompt(text, (*choices, STOP), STOP.key)
@@ -81,7 +81,7 @@ def _board(result: Result, config: RigConfig) -> tuple[Fact, ...]:
     if "camera_delay_ms" in result:
         for name, value_ms, limit_ms in (
             ("delay of the camera", float(result["camera_delay_ms"]), config.camera.max_delay_ms),
-            ("it varies by", float(result["camera_jitter_ms"]), config.camera.max_jitter_ms),
+            ("variation of the delay", float(result["camera_jitter_ms"]), config.camera.max_jitter_ms),
         ):
             facts.append(Fact(name, f"{value_ms:.0f} ms", f"at most {limit_ms:g}", value_ms <= limit_ms))
     for check in result.get("checks", ()):
@@ -97,12 +97,12 @@ def _board(result: Result, config: RigConfig) -> tuple[Fact, ...]:
 
 def _touch(result: Result, config: RigConfig) -> tuple[Fact, ...]:
     touch, method = config.touch, str(result["method"])
-    named = {"taught": "taught height, visited", "kept": "none: the height from before is kept"}
+    named = {"taught": "taught height, visited", "kept": "none: the previous height is kept"}
     facts = [Fact("method", named.get(method, method))]
     for number, point in enumerate(result["points"], 1):
         where = f"point {number} ({point['x_mm']:.0f}, {point['y_mm']:.0f})"
         if method in named:
-            facts.append(Fact(where, f"{'rests' if method == 'taught' else 'lies'} at {point['z_mm']:.2f} mm"))
+            facts.append(Fact(where, f"{'rests' if method == 'taught' else 'is'} at {point['z_mm']:.2f} mm"))
             continue
         span_mm, limit_mm = float(point["span_mm"]), touch.repeatability_mm
         facts.append(Fact(where, f"{point['z_mm']:.3f} mm", "", None))

@@ -36,7 +36,7 @@ class CellCount:
 
     @property
     def over(self) -> bool:
-        """Whether every planned stroke was made or given up."""
+        """Whether every planned stroke was pressed or given up."""
         return self.done + self.left_out >= self.planned
 
 
@@ -137,7 +137,7 @@ class Snapshot:
     """Attempts that were cut short."""
     elapsed_s: float
     eta_s: float | None
-    """Seconds to go; None until a stroke has been timed."""
+    """Remaining time in seconds; None until a stroke has been timed."""
     tip_mm: tuple[float, float, float] | None
     """Position of the brush tip; None while the arm sends no fresh pose."""
     messages: tuple[str, ...]

@@ -185,7 +185,7 @@ class StrokeMoves:
 
     @property
     def parts(self) -> list[Part]:
-        """All of it, in order."""
+        """All moves in order."""
         return [*self.down, self.way, *self.up]
 
 

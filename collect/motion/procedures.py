@@ -81,11 +81,11 @@ class Procedures:
         return rests_mm
 
     async def set_out(self) -> None:
-        """Go where the next dip or wash begins, at travel height."""
+        """Go to where the next dip or wash begins, at travel height."""
         await self.go(inking_moves(self._config, self._dips)[0])
 
     async def dip(self) -> None:
-        """Dip into the well and wipe; wash first if a wash is due. An arm that has set out does not do so again."""
+        """Dip into the well and wipe; wash first if a wash is due. After `set_out` the arm is there already."""
         first, *moves = inking_moves(self._config, self._dips)
         if math.dist((await self._rig.robot.where()).position_mm, first.target.position_mm) > THERE_MM:
             moves.insert(0, first)
@@ -103,7 +103,7 @@ class Procedures:
         seen = await self._rig.robot.sequence(lines, acc_mm_s2=self._config.motion.acc_mm_s2)
         depth_mm = max((-self.plane.above_mm(self._config.paper, pose) for pose in seen), default=0.0)
         if abs(depth_mm - height_mm) > DEPTH_TOLERANCE_MM:
-            raise StepVoid(f"was seen {depth_mm:.3f} mm deep, {height_mm:g} mm were asked for")
+            raise StepVoid(f"the depth was {depth_mm:.3f} mm, {height_mm:g} mm was commanded")
         return depth_mm
 
     async def capture(self) -> Frame:

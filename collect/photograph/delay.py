@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 GOOD_SHARE, GOOD_S = 0.1, 0.03
 """The delay is known well enough within a tenth of its value, or within 30 ms."""
 MOST_GAP_S = 1.0
-"""A longer silence of camera or arm hides when something happened."""
+"""After a longer silence of camera or arm, the time of an event is unknown."""
 SLACK_S = 0.05
 """How far a busy computer may shift the times of single poses and frames."""
 
@@ -113,7 +113,7 @@ def look(seen: Sequence[FrameChange], placed: Sequence[ArmPlace]) -> Look | None
     points = np.linspace(0.02, 0.98, 97)
     there_s = np.interp(points, np.maximum.accumulate(way[: turn + 1]), t_s[: turn + 1])
     back_s = np.interp(points, np.maximum.accumulate(way[turn:][::-1]), t_s[turn:][::-1])
-    # The farther out a point, the less time the arm is beyond it: take the point where that is how long it was seen.
+    # The farther out a point, the shorter the time beyond it: take the point at which that equals the time it was seen.
     misfit_s = np.abs((back_s - there_s) - (left_s - entered_s))
     at = int(np.argmin(misfit_s))
     if float(misfit_s[at]) > coarse_in + coarse_out + SLACK_S:

@@ -20,7 +20,7 @@ Thumbnail = NDArray[np.float32]
 WIDTH_PX = 160
 """Width of a thumbnail. A pixel averages some 2 mm of a sheet: noise is gone, and an arm is tens of pixels wide."""
 CHANGED_LEVELS = 25.0
-"""Difference in gray levels, corrected for the light, from which a pixel counts as changed."""
+"""Difference in gray levels, corrected for the light, from which on a pixel counts as changed."""
 
 
 def thumbnail(image: NDArray[np.uint8]) -> Thumbnail:
@@ -41,7 +41,7 @@ def changed_share(now: Thumbnail, before: Thumbnail) -> float:
 ARM_SHARE = 0.02
 """An arm over the sheet hides a far larger share of the picture than a stroke, or a drawn figure, covers with ink."""
 STILL_SHARE = 0.005
-"""Two frames that differ by less show no motion; a clock that a camera writes into its picture changes less."""
+"""Two frames that differ by less show no motion; even a clock that a camera draws into its picture changes less."""
 
 
 @dataclass(frozen=True, slots=True)

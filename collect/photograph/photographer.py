@@ -217,13 +217,13 @@ class Photographer:
     def _uneven(self, what: str = "frames come too unevenly to measure it") -> CameraLate:
         return CameraLate(
             f"the camera's delay is not steady: {what}; camera.max_jitter_ms = {self._config.max_jitter_ms:g}. "
-            "Use a cable instead of Wi-Fi, fewer frames or pixels, and give the computer less to do."
+            "Use a cable instead of Wi-Fi, fewer frames or pixels, and a less busy computer."
         )
 
     def _not_shown(self) -> CameraLate:
         return CameraLate(
             f"the camera did not show within {self._patience_s:g} s that the arm went over the sheet and away again: "
-            "it looks elsewhere, stands still, or its delay is far longer than camera.max_delay_ms = "
+            "it looks elsewhere, its picture is frozen, or its delay is far longer than camera.max_delay_ms = "
             f"{self._config.max_delay_ms:g}. Point it at the sheet, and see that nothing else moves in its view."
         )
 

@@ -19,10 +19,10 @@ Measured on the loopback rig; for a real controller it is not known."""
 FRAME_S = 0.1
 """Period of 10 frames a second: a photograph is the second frame that begins after the arm rests."""
 IN_PLACE_MM = 1.0
-"""For a shorter line, ARCS takes the speed as that of the rotation: mm/s as thousandths of rad/s."""
+"""For a line shorter than this, ARCS reads the speed as that of the rotation: mm/s as thousandths of rad/s."""
 OMITTED = (
-    "connecting, power on, doses of ink, a touch that is measured instead of visited, quality checks, writing to disk, "
-    "sheet changes, pauses, and presses made again"
+    "connecting, power on, doses of ink, touches that measure the height, quality checks, writing to disk, "
+    "sheet changes, pauses, and repeated presses"
 )
 
 
@@ -69,7 +69,7 @@ def step_s(config: RigConfig, here: Pose, moves: StepMoves) -> tuple[float, Pose
                 took_s = way_s(here, part, acc_mm_s2, limits)
                 here = part.poses[-1]
             case Room():
-                # One descent: how often a measured touch comes down is not known beforehand.
+                # One descent: the number of descents of a measured touch is not known beforehand.
                 took_s = move_s(here, part.poses[0], part.speed_mm_s, acc_mm_s2, limits)
                 here = part.poses[0]
         total_s += took_s + SETTLE_S
@@ -105,7 +105,7 @@ def ink_need(config: RigConfig, dips: int) -> InkNeed:
     load_ml = HELD_SHARE * bundle_ml(config.brush)
     return InkNeed(
         dips * load_ml,
-        f"at most: every dip a full load of {load_ml:.2f} ml, {HELD_SHARE:.0%} of the bundle's volume (assumed)",
+        f"at most: every dip takes {load_ml:.2f} ml, {HELD_SHARE:.0%} of the bundle's volume (assumed)",
     )
 
 

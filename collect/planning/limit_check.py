@@ -77,7 +77,7 @@ def _check_brush(path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
             raise ConfigError(
                 path,
                 field,
-                f"{name}{depth_mm:g} mm at {tilt_deg:g} deg is more than the bundle is long ({most_mm:.1f} mm)",
+                f"{name}{depth_mm:g} mm at {tilt_deg:g} deg is more than the bundle allows ({most_mm:.1f} mm)",
             )
 
 
@@ -104,7 +104,7 @@ def _check_cells(rig_path: Path, path: Path, rig: RigConfig, protocol: ProtocolC
         try:
             triangle_in(sheet.cell(0), rig.self_check)
         except StepError as error:
-            what = f"{error}; `enabled = false` switches the self-check off, which --arm switches on"
+            what = f"{error}; --arm switches the self-check on, `enabled = false` switches it off"
             raise ConfigError(rig_path, "self_check.legs_mm", what) from None
     x_mm, y_mm = rig.paper.touch_point_mm
     for cell in map(sheet.cell, range(sheet.capacity)):
@@ -159,7 +159,9 @@ def _check(rig_path: Path, rig: RigConfig, poses: Iterable[tuple[Pose, float, st
         try:
             limits.check("robot", pose, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
         except LimitExceeded as error:
-            raise ConfigError(rig_path, "robot.limits", f"a planned pose leaves them: {error.what} ({where})") from None
+            raise ConfigError(
+                rig_path, "robot.limits", f"a planned pose is outside the limits: {error.what} ({where})"
+            ) from None
 
 
 def all_poses(

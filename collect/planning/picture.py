@@ -70,7 +70,7 @@ def _place(axes: Axes, config: RigConfig, plan: Plan, sheet: Sheet) -> None:
     shown = ((0.0, 0.0), config.paper.size_mm, config.ink.well_mm, park, board.origin_mm, far)
     for limit, along in zip((axes.set_xlim, axes.set_ylim), zip(*shown, strict=True), strict=True):
         limit(min(along) - 15.0, max(along) + 15.0)
-    finish(axes, "the place from above, paper frame")
+    finish(axes, "rig and sheet from above, paper frame")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5, frameon=False)
 
 

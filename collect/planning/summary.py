@@ -1,4 +1,4 @@
-"""A whole plan: what is done where and in what order, its ink and time; and its tables."""
+"""A whole plan: every step in order with its place, ink and time; and the tables that show it."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Plan:
 
 
 def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
-    """Walk the protocol and add up what it takes. `check_protocol` must have passed."""
+    """Walk the protocol and add up strokes, sheets, ink and time. `check_protocol` must have passed."""
     sheet = sheet_of(config, protocol)
     placed: list[PlacedStroke] = []
     changes: list[str] = []
@@ -145,7 +145,7 @@ def _warnings(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list
 
 
 def _armed(config: RigConfig, protocol: ProtocolConfig) -> str | None:
-    """Warning of what the self-check, which `--arm` switches on, adds to this plan; None if it adds nothing."""
+    """Warning about what the self-check, which `--arm` switches on, adds to this plan; None if it adds nothing."""
     if config.self_check.enabled is not None or not protocol.planned():
         return None
     armed = config.checking_itself(True)

@@ -27,20 +27,20 @@ class ProtocolBase(Config):
     """Fields and methods of every kind. A kind adds its own fields, `kind` among them, and `planned`."""
 
     depths_field: ClassVar[str] = "presses"
-    """The field that the error names if a depth is more than the brush bears."""
+    """The field that the error names if a depth is more than the brush can take."""
     row: ClassVar[type[BaseModel] | None] = None
     """Model of a row of the CSV that `file` names; the rows become `presses`."""
     ignores_columns: ClassVar[bool] = False
     """Whether other columns of that CSV are noted in `ignored_columns` instead of refused."""
 
     board_every: Annotated[int, Field(ge=1, le=MAX_STROKES)] | None = None
-    """Look at the board again after this many strokes, to see whether camera or sheet moved; left out, only at the
-    start."""
+    """Photograph the board again after this many strokes, to see whether camera or sheet moved; if left out, only at
+    the start."""
     wait_after_dip_s: Annotated[float, Field(ge=0.0, le=600.0)] | None = Field(
         default=None, exclude_if=lambda wait_s: wait_s is None
     )
-    """Wait over the cell until this much time has passed since the brush left the ink. Left out, it presses at once and
-    the field is not written, so that protocols written before it existed stay the same."""
+    """Wait over the cell until this much time has passed since the brush left the ink. If left out, it presses at
+    once and the field is not written, so that protocols written before it existed stay the same."""
 
     @property
     def own_cell_mm(self) -> tuple[float, float] | None:
@@ -77,7 +77,7 @@ def check_distinct(field: str, values: Iterable[object]) -> None:
     seen: set[object] = set()
     for value in values:
         if value in seen:
-            raise ValueError(f"{field}: {value!r} is there twice")
+            raise ValueError(f"{field}: {value!r} occurs twice")
         seen.add(value)
 
 

@@ -21,7 +21,7 @@ class CalibrationConfig(ProtocolBase):
     rounds: Annotated[int, Field(ge=1, le=100)] = 1
     """How often all of them are touched: the spread of a point over the rounds shows how well a touch repeats."""
     board_views: Annotated[int, Field(ge=1, le=1000)] = 1
-    """How often the board is looked at in each round."""
+    """How often the board is photographed in each round."""
 
     @model_validator(mode="after")
     def _apart(self) -> CalibrationConfig:
@@ -30,7 +30,7 @@ class CalibrationConfig(ProtocolBase):
         if self.wait_after_dip_s is not None:
             raise ValueError("wait_after_dip_s: this protocol has no dips")
         if len(set(self.touches_mm)) != len(self.touches_mm):
-            raise ValueError("touches_mm has the same point twice: use rounds")
+            raise ValueError("touches_mm contains the same point twice: use rounds")
         check_count((len(self.touches_mm) + self.board_views) * self.rounds)
         return self
 

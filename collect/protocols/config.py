@@ -36,7 +36,7 @@ def load_protocol(path: Path) -> ProtocolConfig:
     values = read_toml(path, MAX_PROTOCOL_BYTES)
     for name in ("presses", "points", "ignored_columns"):
         if name in values and "file" in values:
-            raise ConfigError(path, name, "a file is named too: one of the two")
+            raise ConfigError(path, name, "a file is named too: give only one of the two")
     if values.get("kind") == "adaptive":
         raise ConfigError(
             path, "kind", "'adaptive' is no longer a protocol: use 'few-strokes' with heights_mm and tilts_deg"
@@ -66,7 +66,7 @@ def _fill_strokes(path: Path, values: dict[str, Any]) -> None:
                 continue
             field = f"figures.{i}.strokes.{k}.file"
             if "points" in stroke:
-                raise ConfigError(path, field, "points are given too: one of the two")
+                raise ConfigError(path, field, "points are given too: give only one of the two")
             rows, _ = read_rows(path, field, stroke["file"], PointRow, left)
             stroke["points"] = [row.point for row in rows]
             left -= len(rows)
@@ -156,11 +156,11 @@ def _header(path: Path, cells: list[str], row: type[BaseModel], *, ignore_others
         raise ConfigError(path, "line 1", f"{len(columns)} columns, at most {MAX_COLUMNS}")
     for column in columns:
         if not column or len(column) > 60 or not column.isprintable():
-            raise ConfigError(path, "line 1", f"{column!r:.80} is no name of a column")
+            raise ConfigError(path, "line 1", f"{column!r:.80} is not a valid column name")
         if columns.count(column) > 1:
-            raise ConfigError(path, "line 1", f"the column {column} is there twice")
+            raise ConfigError(path, "line 1", f"the column {column} occurs twice")
         if column not in known and not ignore_others:
-            raise ConfigError(path, "line 1", f"{column}: no such column; there are {', '.join(known)}")
+            raise ConfigError(path, "line 1", f"unknown column {column}; known are {', '.join(known)}")
     for column, info in row.model_fields.items():
         if info.is_required() and column not in columns:
             raise ConfigError(path, "line 1", f"the column {column} is missing")

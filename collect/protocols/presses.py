@@ -124,7 +124,7 @@ class ListConfig(ProtocolBase):
     repeats: Repeats = 1
     """Rounds: each holds every press once."""
     seed: Seed | None = None
-    """Shuffles each round; left out, the order is that of the list."""
+    """Shuffles each round; if left out, the order is that of the list."""
     dwell_s: DwellS = 0.2
     """Time at full depth of presses that have no `dwell_s` of their own."""
 
@@ -194,7 +194,7 @@ class ReplayConfig(ProtocolBase):
     repeats: Repeats = 1
     """How often each is pressed again; each round holds every stroke once."""
     seed: Seed | None = None
-    """Shuffles each round; left out, the order is that of the list."""
+    """Shuffles each round; if left out, the order is that of the list."""
     dwell_s: DwellS = 0.2
     """Time at full depth."""
 

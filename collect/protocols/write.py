@@ -47,9 +47,9 @@ class DrawnStroke(Config):
     def _drawn(self) -> DrawnStroke:
         for number, (a, b) in enumerate(zip(self.points, self.points[1:], strict=False), 2):
             if math.dist(a[:3], b[:3]) < LEAST_APART_MM:
-                raise ValueError(f"point {number} lies less than {LEAST_APART_MM:g} mm from the one before")
+                raise ValueError(f"point {number} is less than {LEAST_APART_MM:g} mm from the previous point")
         if max(point[2] for point in self.points) <= 0.0:
-            raise ValueError("no point lies below the touch height: nothing would be drawn")
+            raise ValueError("no point is below the touch height: nothing would be drawn")
         return self
 
     @property
@@ -68,7 +68,7 @@ class Figure(Config):
 
 
 class WriteConfig(ProtocolBase):
-    """Draw trajectories: x, y, depth, tilt and heading, in the frame of the figure's own paper cell."""
+    """Trajectories to draw: x, y, depth, tilt and heading, in the frame of the figure's own paper cell."""
 
     depths_field: ClassVar[str] = "figures"
 
@@ -80,7 +80,7 @@ class WriteConfig(ProtocolBase):
     repeats: Repeats = 1
     """Rounds: each holds every figure once."""
     seed: Seed | None = None
-    """Shuffles each round; left out, the order is that of the list."""
+    """Shuffles each round; if left out, the order is that of the list."""
     speed_mm_s: Annotated[float, Field(ge=1.0, le=100.0)] = 20.0
     """Speed of the tip along the trajectory."""
     blend_mm: Annotated[float, Field(ge=1.0, le=20.0)] = 1.0

@@ -28,7 +28,7 @@ FAR_MM = 45.0
 LIGHT_MM = 22.0
 """Margin around the cell that shows enough paper to tell glare from the light."""
 CROSSING_MM = 4.0
-"""Length of ink across the edge of a cell: more than the end of one stroke that went too far."""
+"""Length of ink across the edge of a cell, in mm; the end of one stroke that goes too far covers less."""
 
 
 def check_frame(image: Gray, plane: Plane, limits: QualityConfig) -> Verdict:
@@ -204,14 +204,14 @@ def cut(ink: Ink, plane: Plane, shape: tuple[int, ...], anchor_mm: Point, limits
 
 
 def glare(image: Gray, plane: Plane, window: Rect, cell_mm: Rect, limits: QualityConfig) -> Check:
-    """No reflection in the cell; `window` holds enough of the paper around it to know the light."""
+    """No reflection in the cell; `window` includes enough paper around it to measure the light."""
     spots = measure.glare(rectify(image, plane.image_to_paper, window), limits.glare_share)
     scale = measure.BRIGHT_PX_PER_MM
     left, top = cell_mm[0] - window[0], window[1] + window[3] - cell_mm[1] - cell_mm[3]
     rows = slice(round(top * scale), round((top + cell_mm[3]) * scale))
     columns = slice(round(left * scale), round((left + cell_mm[2]) * scale))
     area_mm2 = float(spots[rows, columns].sum()) / scale**2
-    reason = f"{area_mm2:.0f} mm^2 of glare in the cell. Move the lamp, or wait until the ink has lost its shine."
+    reason = f"{area_mm2:.0f} mm^2 of glare in the cell. Move the lamp, or wait until the ink no longer shines."
     return _below(Failure.GLARE, area_mm2, "mm^2", limits.glare_mm2, reason)
 
 
@@ -233,7 +233,7 @@ def neighbour(ink: Ink, limits: QualityConfig) -> Check:
     """The cell holds no ink but the press's own."""
     area_mm2 = ink.before_mm2 + ink.beside_mm2
     source = (
-        "a stroke from next door reaches in. Leave this cell out and make the cells larger"
+        "a stroke of the next cell reaches into it. Leave this cell out and make the cells larger"
         if ink.before_mm2 > ink.beside_mm2
         else "something dripped or lies apart from the stroke. Wipe the brush on the rim after a dip"
     )
@@ -294,4 +294,4 @@ def bent(mark: Mark, limits: QualityConfig) -> Check:
 
 MARK_CHECKS = (misplaced, faint, split, bent)
 """Checks of a mark that is not dry."""
-_WHERE = "Check the sheet's origin, that the sheet has not slipped, and that the brush sits firm."
+_WHERE = "Check the sheet's origin, that the sheet has not slipped, and that the brush is tight."

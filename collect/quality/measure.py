@@ -18,7 +18,7 @@ FINE_PX, WIDE_PX = 1.0, 2.0
 EDGE_SHARE = 0.02
 """Share of the frame's pixels, the steepest ones, that are taken for edges."""
 LEAST_EDGE = 3.0
-"""Gray levels per pixel below which nothing is an edge."""
+"""Gray levels per pixel below which a slope is not an edge."""
 FEWEST_EDGES = 50
 SLOPE_PX2 = 1.0 / 3.0
 """Variance of the blur that a difference over two pixels adds."""
@@ -32,7 +32,7 @@ SATURATED = 252
 
 
 def paper_level(image: Gray) -> float:
-    """Gray level of what is bright in the frame: its paper."""
+    """Gray level of the bright part of the frame, its paper."""
     small = image[::4, ::4]
     otsu, _ = cv2.threshold(np.ascontiguousarray(small), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     bright = small[small > otsu]
@@ -110,7 +110,7 @@ CLEFT_MM = 0.5
 RIM_MM = 0.5
 """The edge of a stroke is never as dark as its middle."""
 RIM_PX = 2.3
-"""Pixels of the photograph over which an edge is blurred: in a coarse one they are wider than `RIM_MM`."""
+"""Pixels of the photograph over which an edge is blurred; in a coarse photograph they are wider than `RIM_MM`."""
 HEAD_SHARE = 0.4
 """Share of the length, from the head, that shows where the stroke begins and in what direction."""
 TIP_SHARE = 0.1
@@ -201,7 +201,7 @@ def _unevenness(own: Mask, dark: Soft, tone: float, rim_mm: float) -> float:
     cleft = cv2.dilate(cv2.morphologyEx(hollow, cv2.MORPH_OPEN, _disc(CLEFT_MM)), _disc(2 * rim_mm))
     core = (cv2.erode(outline, _disc(2 * rim_mm)) > 0) & (cleft == 0)
     if np.count_nonzero(core) < LEAST_CORE_MM2 * PX_PER_MM**2:
-        # Hardly more than rim or cleft: a few hairs, or crumbs.
+        # Little more than rim or cleft: a few hairs, or specks.
         core = outline > 0
     values = darkness[core]
     return float(values.std() / max(float(values.mean()), 1e-3))

@@ -1,4 +1,4 @@
-"""One page about a `rig.toml`: what is plausible, what contradicts what, what nothing has measured. Asks no device."""
+"""One page about a `rig.toml`: values that are plausible, contradict each other or are unmeasured. Asks no device."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def _camera(camera: CameraConfig) -> Iterator[Check]:
         remedy = "Switch automatic exposure, white balance and focus off there."
         yield unmeasured("camera settings", "set by the stream's server", remedy)
     elif names:
-        remedy = "What is not locked may drift during a session: brushloop rig teach camera."
+        remedy = "Settings that are not locked may drift during a session: brushloop rig teach camera."
         yield unmeasured("camera settings", f"not locked: {', '.join(names)}", remedy)
     if camera.optics is None:
         remedy = "brushloop camera intrinsics makes camera.lens_file."
@@ -87,7 +87,7 @@ def _ink(config: RigConfig) -> Iterator[Check]:
     if ink.wipe is not None:
         yield plausible.travel_over_rim(motion.safe_z_mm, ink.wipe.z_mm)
     else:
-        yield unmeasured("rim of the well", "no [ink.wipe]", "Nothing says how high the rim is: travel must clear it.")
+        yield unmeasured("rim of the well", "no [ink.wipe]", "The height of the rim is unknown: travel must clear it.")
 
 
 def _places(config: RigConfig) -> Iterator[Check]:
@@ -114,7 +114,7 @@ def _motion(config: RigConfig) -> Iterator[Check]:
 
 def _force(config: RigConfig) -> Iterator[Check]:
     if config.force is None:
-        yield unmeasured("force", "no sensor", "Nothing stops a press that meets something hard but the arm itself.")
+        yield unmeasured("force", "no sensor", "Only the arm itself stops a press that meets something hard.")
         return
     yield plausible.force_ceiling(config.force.max_n)
     if config.touch.method == "force":
@@ -122,7 +122,7 @@ def _force(config: RigConfig) -> Iterator[Check]:
 
 
 def check_page(checks: list[Check]) -> Text:
-    """A line for each check, its verdict a word as well as a colour, and a line below it where something is to do."""
+    """A line for each check, its verdict a word and a colour, and below it what to do, if anything."""
     page, width = Text(), max(len(check.name) for check in checks)
     for check in checks:
         page.append(f"{check.verdict:<12}", COLOURS[check.verdict])

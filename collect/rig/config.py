@@ -95,7 +95,7 @@ class PaperConfig(Config):
 
 
 class WipeConfig(Config):
-    """Wiping off a drop at the rim of the well, after each dip."""
+    """Wipes a drop off at the rim of the well after each dip."""
 
     rim_mm: tuple[Finite, Finite]
     """Where the wipe from the middle of the well across its rim ends; in the paper frame, off the sheet."""

@@ -48,7 +48,7 @@ class RobotConfig(Config):
     """Flange to brush tip, along the flange's axes."""
     tcp_rotation_deg: Annotated[tuple[Turn, Turn, Turn], Field(exclude_if=lambda turn: not any(turn))] = (0.0, 0.0, 0.0)
     """Turn from the flange's axes to the brush's: about x, then y, then z of the flange. The brush is along its z.
-    Not written where it is zero, so that a session from before there was this field can be resumed."""
+    It is not written if it is zero, so that sessions older than this field can be resumed."""
     framing: Literal["sof", "bare"] = "sof"
     """`sof` as in the maker's client, `bare` as in the maker's documentation."""
     rtde_port: int | None = Field(None, ge=1, le=65535)
@@ -73,7 +73,7 @@ class RobotConfig(Config):
 
 
 class LockedConfig(Config):
-    """Camera settings that must not drift, in the device's own units; one that is left out is not changed."""
+    """Camera settings that must not drift, in the device's own units; a setting that is left out is not changed."""
 
     width: Annotated[int, Field(ge=16, le=65535)] | None = None
     height: Annotated[int, Field(ge=16, le=65535)] | None = None
@@ -121,7 +121,7 @@ class InkStationConfig(Config):
     """Size of one dose, repeated until the level is reached."""
     max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
     light: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
-    """Set at the start of a run; left out, the light stays as it is."""
+    """Set at the start of a run; if left out, the light stays as it is."""
 
 
 class ModbusPumpConfig(Config):
@@ -136,7 +136,7 @@ class ModbusPumpConfig(Config):
     unit: Annotated[int, Field(ge=1, le=247)] = 1
     baud: Annotated[int, Field(ge=1200, le=115200)] = 9600
     dose_ml: Annotated[float, Field(gt=0.0, le=2.0)] = 0.3
-    """Given before every `every_dips`-th dip."""
+    """Dose before every `every_dips`-th dip."""
     every_dips: Annotated[int, Field(ge=1, le=1000)] = 5
     max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
 

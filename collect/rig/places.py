@@ -20,13 +20,13 @@ class Place:
     kind: Kind
     name: str
     at_mm: tuple[float, float, float]
-    """In the base frame; z is the lowest that the tip goes there."""
+    """In the base frame; z is the lowest height of the tip there."""
     paper_mm: tuple[float, float]
     """The same point in the paper frame, seen from above."""
     top_mm: float
     """Height in the base frame from which the tip comes down to it."""
     reach_left_mm: float
-    """How far the wrist is from the end of the arm's reach, at the lower or the upper end; negative is out of reach."""
+    """Distance of the wrist from the limit of the arm's reach, at the worse height; negative is out of reach."""
 
 
 def places_of(config: RigConfig) -> tuple[Place, ...]:

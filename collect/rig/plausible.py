@@ -1,6 +1,6 @@
-"""Whether one value of a rig is plausible: each function takes values as they stand in `rig.toml` and gives one line.
+"""Checks whether single values of a rig are plausible: each function takes values of `rig.toml` and gives one line.
 
-`brushloop rig check` asks all of them of a file, `brushloop rig new` asks each as soon as its value is taught.
+`brushloop rig check` runs all of them on a file, `brushloop rig new` runs each as soon as its value is taught.
 """
 
 from __future__ import annotations
@@ -78,13 +78,13 @@ def brush_square(rotation_deg: tuple[float, float, float]) -> Check:
 
 
 def brush_shorter_than_tool(offset_mm: tuple[float, float, float], length_mm: float) -> Check:
-    """The hair of the brush is a part of the tool."""
+    """Length of the hair, which is a part of the tool."""
     remedy = "The hair is longer than the whole tool: measure brush.length_mm, or teach the tip."
     return within("hair of the brush", length_mm, 5.0, round(math.hypot(*offset_mm), 1), "mm", remedy)
 
 
 def deepest_press(max_depth_mm: float, length_mm: float) -> Check:
-    """A bundle that is pressed flat no longer bends but breaks."""
+    """The deepest press: beyond it the bundle is pressed flat, and its hairs break."""
     remedy = "Give brush.max_depth_mm a smaller value: the ferrule would come near the paper."
     return within("deepest press", max_depth_mm, 0.5, round(0.6 * length_mm, 1), "mm", remedy)
 
@@ -144,7 +144,7 @@ def touch_height(points: int, method: str) -> Check:
 LEAST_REACH_MM = 10.0
 """The dimensions of an arm differ from the nominal ones by a millimetre or so; a stretched arm is also weak."""
 LOOSE_MM = 250.0
-"""Room beyond the outermost place from which the box no longer protects anything."""
+"""Room beyond the outermost place, in mm, from which on the box no longer protects anything."""
 PARK_CLEAR_MM = 40.0
 """Half the width of a holder and a part of the wrist, which must be out of the picture."""
 

@@ -23,7 +23,7 @@ SIDEWAYS_MM = 121.5
 """Distance of the plane in which upper arm and forearm move from the axis of the base."""
 WRIST_MM, FLANGE_MM = 102.5, 94.0
 ELBOW_DEG = 175.0
-"""The elbow bends this far to either side."""
+"""Largest angle by which the elbow bends to either side."""
 STRETCHED_MM = UPPER_ARM_MM + FOREARM_MM
 FOLDED_MM = math.sqrt(
     UPPER_ARM_MM**2 + FOREARM_MM**2 - 2.0 * UPPER_ARM_MM * FOREARM_MM * math.cos(math.radians(180.0 - ELBOW_DEG))

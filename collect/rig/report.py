@@ -1,4 +1,4 @@
-"""`doctor --report`: one archive for a report of a defect. It holds what devices answered, and nothing that is secret.
+"""`doctor --report`: one archive for a bug report. It holds the answers of the devices, and nothing that is secret.
 
 | file | holds |
 |---|---|
@@ -47,11 +47,11 @@ def check_report(path: Path) -> None:
     if not path.parent.is_dir():
         raise ConfigError("--report", "", f"{path}: there is no folder {path.parent}")
     if path.exists():
-        raise ConfigError("--report", "", f"{path} exists, and nothing is overwritten: choose another name")
+        raise ConfigError("--report", "", f"{path} exists and is not overwritten: choose another name")
 
 
 async def write_report(path: Path, config: RigConfig, findings: list[Finding]) -> None:
-    """Ask the controller word by word and write the archive; `check_report` must have passed.
+    """Record a transcript of the controller and write the archive; `check_report` must have passed.
 
     Raises OSError if it cannot be written.
     """
@@ -67,7 +67,7 @@ async def write_report(path: Path, config: RigConfig, findings: list[Finding]) -
 
 
 def write_archive(path: Path, files: dict[str, str]) -> None:
-    """Write these files, and the one that says what they are. Raises OSError."""
+    """Write these files, and a README that describes them. Raises OSError."""
     with path.open("xb") as out, zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, text in {"README.txt": ABOUT, **files}.items():
             archive.writestr(name, text)
@@ -109,7 +109,7 @@ def about_this_machine() -> dict[str, Any]:
 
 
 def _versions() -> dict[str, str]:
-    """Of brushloop and of every library that it names."""
+    """Versions of brushloop and of its libraries."""
     named = ["brushloop", *(importlib.metadata.requires("brushloop") or ())]
     found: dict[str, str] = {}
     for requirement in named:

@@ -44,7 +44,7 @@ class Scrubber:
         self._names = sorted(((k, v) for k, v in names.items() if len(k) >= SHORTEST), key=lambda pair: -len(pair[0]))
 
     def text(self, text: str) -> str:
-        """The text without them."""
+        """The text with all of these replaced."""
         for name, stands_for in self._names:
             text = re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", stands_for, text)
         for pattern, stands_for in PATTERNS:
@@ -65,7 +65,7 @@ class Scrubber:
 
 
 def scrubber_of(config: RigConfig) -> Scrubber:
-    """One that knows the names in `rig.toml`."""
+    """A scrubber that knows the names in `rig.toml`."""
     force, device = config.force, config.ink.device
     names = {config.robot.host: "<host>", config.camera.source: "<camera>"}
     names |= {force.host or "": "<host>"} if force is not None else {}

@@ -23,13 +23,13 @@ SPRING_CHANGES = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Spring:
-    """The brush's stiffness near to the paper, and its standard error."""
+    """The brush's stiffness close to the paper, and its standard error."""
 
     n_mm: float
     sigma_n_mm: float
 
     def next(self) -> Spring:
-        """What it says about the stiffness in the next touch."""
+        """The knowledge about the stiffness with which the next touch begins."""
         return Spring(self.n_mm, math.hypot(self.sigma_n_mm, SPRING_CHANGES * self.n_mm))
 
 
@@ -42,7 +42,7 @@ class Contact:
     """Standard error from the noise of the samples alone, without the error of taking the brush for a hinge."""
     spring: Spring
     misfit: float
-    """Chi-square per degree of freedom: about 1 if the brush is a linear spring this near to the paper."""
+    """Chi-square per degree of freedom: about 1 if the brush is a linear spring this close to the paper."""
     samples: int
 
 
@@ -58,7 +58,7 @@ def find_contact(
 
     All arrays are (m,): height, mean force, number of samples in the mean, and descent (0, 1, ...) that it belongs to.
     Each descent has its own offset, so that a slow drift of the sensor is not taken for force. `sample_sd_n` is the
-    standard deviation of one sample. `spring` is what is known of the stiffness from elsewhere; it counts as one more
+    standard deviation of one sample. `spring` is what earlier touches found; it counts as one more
     observation. The join is solved exactly between neighbouring heights (D. J. Hudson, Fitting
     segmented curves whose join points have to be estimated, J. Am. Stat. Assoc. 61, 1966).
     Raises `StepError` where the force does not rise over at least two heights, or one if the stiffness is known.
@@ -233,7 +233,7 @@ async def touch_by_force(
             return contact
         if log.samples > config.max_samples:
             raise StepError(
-                f"the contact is known to {contact.sigma_mm:.3f} mm only after {log.samples} samples of the force, "
+                f"the contact is known to only {contact.sigma_mm:.3f} mm after {log.samples} samples of the force, "
                 f"{config.sigma_mm:g} mm are asked for: the sensor is too noisy for this brush"
             )
         near_z_mm = contact.z_mm
@@ -244,8 +244,8 @@ async def touch_by_force(
 def _known(contact: Contact, tried_z_mm: float, config: ForceTouchConfig) -> bool:
     """Whether the contact is known well enough, after a descent around `tried_z_mm`.
 
-    Its standard error is computed from the stiffness. Where that is known badly, or where the descent lay beside the
-    contact, the error can be much larger than it seems.
+    Its standard error is computed from the stiffness. If the stiffness is uncertain, or if the descent lay beside the
+    contact, the true error can be much larger.
     """
     sure = contact.spring.sigma_n_mm <= SPRING_SHARE * contact.spring.n_mm
     return sure and abs(contact.z_mm - tried_z_mm) <= BESIDE_MM and contact.sigma_mm <= config.sigma_mm

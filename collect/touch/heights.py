@@ -13,7 +13,7 @@ from collect.rig.config_touch import Method, TouchConfig
 from collect.rig.paper import PaperPlane, fit_plane
 
 SPAN_SIGMAS = 5.0
-"""Three touches at one height span more than this many of their standard errors once in a thousand times."""
+"""Three touches at one height span more than this many of their standard errors only once in a thousand times."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -154,7 +154,7 @@ async def touch_by_jog(
         if step_mm is None:
             return Touch(*at_mm, rests_mm)
         if all(abs(abs(step_mm) - size) > ROUNDING_MM for size in config.steps_mm):
-            raise StepError(f"a jog of {step_mm:g} mm is none of {', '.join(f'{s:g}' for s in config.steps_mm)} mm")
+            raise StepError(f"a jog of {step_mm:g} mm is not one of {', '.join(f'{s:g}' for s in config.steps_mm)} mm")
         z_mm = min(max(z_mm + step_mm, reach.lowest_z_mm), reach.start_z_mm)
 
 
@@ -168,7 +168,7 @@ def asked(asker: Asker, config: JogTouchConfig, height: str = "the height") -> N
     choices = (
         *(Choice(key, f"{'down' if step < 0 else 'up'} {abs(step):g} mm") for key, step in keys.items()),
         Choice("t", "the tip just touches"),
-        Choice("x", f"give up: {height} stays as it was"),
+        Choice("x", f"give up: {height} stays unchanged"),
     )
 
     async def next_jog(at: Jogged) -> float | None:

@@ -147,8 +147,8 @@ def _find(rig: Rig, before: Frame, after: Frame, config: SelfCheckConfig) -> Flo
     if marks and marks[0].ink_mm2 > MOST_MARK_MM2:
         large = marks[0]
         raise StepError(
-            f"self-check: {large.ink_mm2:.0f} mm2 at ({large.x_mm:.0f}, {large.y_mm:.0f}) mm became dark, which no "
-            "mark does: is the arm, or its shadow, in the picture? See motion.park_mm"
+            f"self-check: {large.ink_mm2:.0f} mm2 at ({large.x_mm:.0f}, {large.y_mm:.0f}) mm became dark, more than "
+            "a mark: is the arm, or its shadow, in the picture? See motion.park_mm"
         )
     if len(marks) != 3:
         listed = "; ".join(f"{m.ink_mm2:.1f} mm2 at ({m.x_mm:.0f}, {m.y_mm:.0f})" for m in marks[:6])

@@ -84,7 +84,7 @@ class OperatorApp(PlainApp):
 
     @property
     def at_work(self) -> bool:
-        """Whether a run is on."""
+        """Whether a run is in progress."""
         return self._now is not None and self._now.state not in FINAL
 
     async def on_event(self, event: events.Event) -> None:
@@ -120,7 +120,7 @@ class OperatorApp(PlainApp):
         )
 
     def action_stop(self) -> None:
-        """Stop the arm at once and show that, even if another screen lies over the run."""
+        """Stop the arm at once and show that, even if another screen covers the run."""
         if self.engine is not None:
             self.engine.stop()
             if self._main is not None and self._main.is_mounted:
@@ -134,13 +134,13 @@ class OperatorApp(PlainApp):
             (self.engine.resume if self._now.state in CAN_RESUME else self.engine.pause)()
 
     def action_request(self, name: str) -> None:
-        """Send the engine a request, or take it back."""
+        """Send the engine a request, or withdraw it."""
         if self.engine is not None and self._now_s() >= self._deaf_until_s:
             self.engine.request(OperatorRequest[name])
             self._poll()
 
     def action_mark_last(self) -> None:
-        """Mark the newest capture bad, or good after all; at once on disk."""
+        """Mark the newest capture bad, or good again; the mark is on disk at once."""
         last = None if self._now is None else self._now.last
         if self._now is None or last is None or not last.kept or self.screen is not self._main:
             return
@@ -149,7 +149,7 @@ class OperatorApp(PlainApp):
         except SessionError as error:
             self.notify(plain(str(error)), severity="error")
             return
-        mark = "marked bad: pressed again once the plan is through" if bad else "good after all"
+        mark = "marked bad: pressed again after the planned strokes" if bad else "marked good again"
         self.notify(f"{last.stroke_id}: {mark}")
 
     def action_help(self) -> None:
@@ -170,7 +170,7 @@ class OperatorApp(PlainApp):
         if now is None:
             self.exit()
         elif now.state is State.STOPPING:
-            self.notify("The arm is being stopped. The red button, if it moves on.", severity="warning")
+            self.notify("The arm is being stopped. Press the red button if it keeps moving.", severity="warning")
         elif now.rest_unknown:
             self.push_screen(Confirm(*NOT_AT_REST), self._leave_answered)
         elif now.state not in FINAL:
@@ -246,7 +246,7 @@ class OperatorApp(PlainApp):
         elif self.screen is self._main:
             self.switch_screen(screen)  # pyright: ignore[reportUnknownMemberType]
         else:
-            return  # something lies over it: try again at the next poll
+            return  # another screen covers it: try again at the next poll
         self._main = screen
 
     def _poll(self) -> None:

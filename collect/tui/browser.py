@@ -43,7 +43,7 @@ class SessionBrowser:
         self._engine_for = engine_for
 
     def choose(self, config: str, protocol: str) -> None:
-        """Work with another rig and another protocol."""
+        """Use another rig and another protocol."""
         self.paths = replace(self.paths, config=Path(config), protocol=Path(protocol))
 
     def recent(self) -> list[Summary]:
@@ -55,7 +55,7 @@ class SessionBrowser:
         return sorted(summaries(self.paths.root), key=lambda row: row.session_id, reverse=True)[:RECENT]
 
     def standing(self, session_id: str) -> Details:
-        """What is finished, void and next in a session. Raises `SessionError`."""
+        """What of a session is finished, what is void and what comes next. Raises `SessionError`."""
         from sessions.show import details
 
         return details(self.paths.root / session_id)
@@ -81,7 +81,7 @@ class SessionBrowser:
         return f"{len(plan.placed)} strokes on {sheets}, about {plan.seconds / 60:.0f} min"
 
     def engine(self, session_id: str | None, *, preview: bool) -> RunnableEngine:
-        """An engine that resumes that open session, with the set-up wizard; with None, of a new one on a fresh sheet.
+        """An engine that resumes that open session, with the set-up wizard; with None, one for a new session.
 
         Connects nothing yet. Raises `ConfigError`, also where these files belong to another open session.
         """

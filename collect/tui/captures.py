@@ -51,11 +51,11 @@ class ReviewCapture:
     waited_s: float | None = None
     """From dip to touch; None if the session did not record it."""
     unlike: str = ""
-    """How `waited_s` differs from that of the session's other strokes; empty if it does not."""
+    """How `waited_s` differs from that of the session's other strokes; empty if it does not differ."""
 
     @property
     def counts(self) -> bool:
-        """Whether it counts: kept by the run, and not marked bad since."""
+        """Whether it counts: kept by the run, and not marked bad afterwards."""
         return self.kept and not (self.remark is not None and self.remark.bad)
 
 
@@ -67,7 +67,7 @@ class CapturePictures:
     """(h, w) gray: the field around its zero-touch point, or the whole photograph where the board is not seen."""
     binary: NDArray[np.bool_] | None
     log_ns: int
-    """When the still came to the host: the time to jump to in a viewer."""
+    """When the still arrived at the host: the time to jump to in a viewer."""
 
 
 class Review:

@@ -57,7 +57,7 @@ class FinishScreen(ModalScreen[None]):
         self._busy = False
 
     def compose(self) -> ComposeResult:
-        """Lay out the verdict, what comes next, what a command said."""
+        """Lay out the verdict, the next commands and the output of a command."""
         with VerticalScroll() as page:
             page.border_title = "Finish"
             yield self._verdict

@@ -46,17 +46,17 @@ RUN_KEYS = (
     RunKey("q", "leave", "Finish the step, park the arm, then leave", "quit", "Leave"),
     RunKey("?", "help", "This page", "help"),
     RunKey("tab", "pane", "On a narrow screen: overview, last capture, camera"),
-    RunKey("v", "review", "Look through the captures: mark, note, how alike they are", "review", "Review"),
-    RunKey("r", "retake", "Press the stroke in hand again, once photographed", "request('RETAKE')", "Retake"),
-    RunKey("k", "skip", "Leave the stroke in hand out", "request('SKIP')", "Skip"),
+    RunKey("v", "review", "Look through the captures, mark and compare them", "review", "Review"),
+    RunKey("r", "retake", "Press the current stroke again, once photographed", "request('RETAKE')", "Retake"),
+    RunKey("k", "skip", "Skip the current stroke", "request('SKIP')", "Skip"),
     RunKey("n", "new sheet", "Put a new sheet in, before the next stroke", "request('NEW_SHEET')", "New sheet"),
     RunKey("j", "jog", "Find the paper again by jog, before the next stroke", "request('JOG')", "Jog"),
-    RunKey("b", "bad", "The last capture is bad: pressed again at the end", "mark_last", "Last capture bad"),
-    RunKey("ctrl-p", "commands", "All commands by name, light and dark among them"),
+    RunKey("b", "bad", "Mark the last capture bad: pressed again at the end", "mark_last", "Last capture bad"),
+    RunKey("ctrl-p", "commands", "All commands by name; light and dark colours"),
 )
-"""The most needed first: a narrow screen shows only as many as fit."""
+"""Most important first: a narrow screen shows only as many as fit."""
 RUN_BINDINGS: tuple[Binding, ...] = (
-    # With a run on, ctrl+c is a stop key and does not come this far.
+    # During a run, ctrl+c is a stop key and does not reach this binding.
     Binding("ctrl+c", "quit", "Leave", show=False, priority=True),
     Binding("p", "pause", "Pause or go on"),
     *(Binding("question_mark" if k.key == "?" else k.key, k.action, k.title or k.label) for k in RUN_KEYS if k.action),
@@ -79,10 +79,10 @@ def keys_in(state: State, bar: tuple[Key, ...]) -> tuple[Key, ...]:
 
 SIGNS = f"""\
 {SOFTWARE_STOP}
-r, k, n, j and b: the same key again takes it back.
+r, k, n, j and b: press the key again to take it back.
 
 Grid     ✓ complete   ▶ now   › next   ! had bad takes   × left out
-Sheet    · blank   ● counts   ! does not count   × burnt   △ self-check
+Sheet    · blank   ● counts   ! does not count   × cut short   △ self-check
 
 The same command resumes a session, after a crash or a lost terminal too:
 no stroke twice, no cell of a sheet twice."""

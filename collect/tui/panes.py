@@ -79,14 +79,14 @@ def _counts(now: Snapshot) -> tuple[str, str]:
     parts = [f"voids {now.voids}"]
     if now.given_up:
         parts.append(f"left out {now.given_up}")
-    parts.append("ink not gauged" if now.ink_level is None else f"ink {now.ink_level:.0%} of the well")
+    parts.append("ink level unknown" if now.ink_level is None else f"ink {now.ink_level:.0%} of the well")
     return "   ".join(parts), "bold $text-warning" if now.voids or now.given_up else ""
 
 
 def target_text(now: Snapshot) -> str:
     """Where the arm was sent, and how far it still has to go."""
     if now.target_mm is None:
-        return "not sent anywhere yet"
+        return "no target yet"
     if now.tip_mm is None:
         return tip_text(now.target_mm)
     return f"{tip_text(now.target_mm)}   {math.dist(now.target_mm, now.tip_mm):.2f} mm to go"

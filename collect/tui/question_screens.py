@@ -25,25 +25,25 @@ from collect.tui.widgets import Line
 
 LEAVE_LINE = "q  leave: park the arm, answer nothing"
 STOP_LINE = "s  stop the arm now: software stop; red button: emergency stop"
-LEAVE_KEYS = "y  leave it so      n  stay"
+LEAVE_KEYS = "y  leave it as it is      n  stay"
 AT_WORK = (
     "The arm is at work. Finish this step, park the arm, and leave?",
     "y  park and leave      n  go on      s  stop now",
 )
 NOT_PARKED = (
     "The arm is not parked: it rests where it was stopped, perhaps with the brush down. "
-    "The next run begins by lifting it. Leave it so?",
+    "The next run begins by lifting it. Leave it as it is?",
     LEAVE_KEYS,
 )
 NOT_AT_REST = (
     "The arm was not seen at rest: it may still be moving. Use the emergency stop, the red button. "
-    "Leave this screen all the same?",
+    "Leave this screen anyway?",
     LEAVE_KEYS,
 )
 
 
 class AskScreen(ModalScreen[None]):
-    """One prompt of the engine, until it is answered here or its time is over."""
+    """Shows one prompt of the engine until it is answered or its time is up."""
 
     DEFAULT_CSS = """
     AskScreen { align: center middle; }
@@ -89,7 +89,7 @@ class AskScreen(ModalScreen[None]):
         answer_by_key(self.prompt, self._engine, event)
 
     def show_time_left(self) -> None:
-        """Show how long the default still waits, or that nothing happens without an answer."""
+        """Show the time until the default is taken, or that nothing happens without an answer."""
         prompt = self.prompt
         if prompt.timeout_s is None:
             self._left.show("Waits until it is answered; the arm does not move meanwhile.")
@@ -106,7 +106,7 @@ def answer_by_key(prompt: Prompt, engine: EngineView, event: events.Key) -> None
 
 
 def choices_content(prompt: Prompt) -> Content:
-    """A line for each answer, with a mark at the one that is taken when the time is over."""
+    """A line for each answer, with a mark at the one that is taken when the time is up."""
     lines: list[Content] = []
     for choice in prompt.choices:
         timed = prompt.timeout_s is not None and choice.key == prompt.default

@@ -71,7 +71,7 @@ class ReviewScreen(Screen[None]):
         at_work: Callable[[], bool] = lambda: False,
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """`at_work` says whether a run is on: then no text can be typed, as `s` stops the arm."""
+        """`at_work` says whether a run is in progress: then no text can be typed, because `s` stops the arm."""
         super().__init__()
         self._review = review
         self._at_work = at_work
@@ -114,7 +114,7 @@ class ReviewScreen(Screen[None]):
         self._load(self._capture)
 
     def _show_keys(self) -> None:
-        """Show the keys; while a run is on, how to stop it, and neither note nor finish."""
+        """Show the keys; during a run, show how to stop it, and hide note and finish."""
         at_work = self._at_work()
         self._keys.show(KEYS_AT_WORK if at_work else KEYS)
         self._stop_note.show(f"The arm is at work. {SOFTWARE_STOP}" if at_work else "")
@@ -129,7 +129,7 @@ class ReviewScreen(Screen[None]):
             app_of(self).pop_screen()
 
     def action_mark(self) -> None:
-        """Mark the capture bad, or good after all."""
+        """Mark the capture bad, or good again."""
         if self._capture is not None and not self._capture.kept:
             self.notify(f"{self._capture.stroke_id}: the run did not count it; there is nothing to mark.")
         elif self._capture is not None:
@@ -137,14 +137,14 @@ class ReviewScreen(Screen[None]):
             bad = self._capture.counts
             self._remark(bad=bad, note=note)
             if bad and self._review.open:
-                self.notify(f"{self._capture.stroke_id}: pressed again once the plan is through")
+                self.notify(f"{self._capture.stroke_id}: pressed again after the planned strokes")
 
     def action_note(self) -> None:
         """Let the operator type a note."""
         if self._capture is None:
             return
         if self._at_work():
-            self.notify("Notes wait until the run is over: while the arm is at work, s stops it.", severity="warning")
+            self.notify("Notes can be written after the run: while the arm is at work, s stops it.", severity="warning")
             return
         self._note.value = self._capture.remark.note if self._capture.remark is not None else ""
         self.add_class("-noting")
@@ -165,7 +165,7 @@ class ReviewScreen(Screen[None]):
     def action_finish(self) -> None:
         """Show whether the recording is sound, and what comes next."""
         if self._at_work():
-            self.notify("The run is on; finish once it is over.", severity="warning")
+            self.notify("The run is in progress; finish once it is over.", severity="warning")
             return
         app_of(self).push_screen(FinishScreen(self._review.folder, is_open=self._review.open))
 

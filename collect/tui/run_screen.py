@@ -22,7 +22,7 @@ from collect.tui.text import SHORT_STOP, SOFTWARE_STOP, one_line, plain, plot
 from collect.tui.widgets import KeyBar, Line, entitle
 
 OVER = "Over: q leaves"
-GOES_ON = "The same command goes on from here; this screen does not."
+GOES_ON = "Run the same command again to continue."
 STOP_SENT = "STOP SENT"
 WARNING = "warning: "
 TALL_ROWS = 36
@@ -31,7 +31,7 @@ TRACE_ROWS = 4
 
 
 class RunScreen(Screen[None]):
-    """Draws snapshots; keeps nothing but what is on the screen."""
+    """Draws snapshots; keeps only what is on the screen."""
 
     AUTO_FOCUS = "#log-pane"
     DEFAULT_CSS = """
@@ -163,10 +163,10 @@ class RunScreen(Screen[None]):
         self._state.set_class(True, "-stopping")
 
     def show(self, now: Snapshot) -> None:
-        """Draw what differs from the snapshot before.
+        """Draw what differs from the previous snapshot.
 
-        What changes all the time takes turns (figures 5 times a second, camera 5, trace 2.5), because textual goes
-        through every widget between two that it draws at once. A new state or step is shown at once.
+        Parts that change all the time take turns (figures 5 times a second, camera 5, trace 2.5), because textual
+        visits every widget between two that it draws at the same time. A new state or step is shown at once.
         """
         self._turn = 0 if self._doing != (now.state, now.step) else self._turn + 1
         self._doing = now.state, now.step
@@ -215,12 +215,12 @@ def _message_content(line: str) -> Content:
 
 
 def _note_content(now: Snapshot) -> Content:
-    """Requests that still wait, and what the stop key is; once the run is over, how to leave."""
+    """Pending requests and the stop key; once the run is over, how to leave."""
     if now.state in FINAL:
         following = SOFTWARE_STOP if now.state is State.DONE or now.rest_unknown else GOES_ON
         return Content.assemble((f" {OVER} ", "bold reverse"), f"  {following}")
     if now.state is State.STOPPING:
-        return Content.styled(" not seen at rest yet: the red button, if it moves on ", "bold reverse")
+        return Content.styled(" not seen at rest yet: press the red button if it moves ", "bold reverse")
     if now.requests:
         asked = ", ".join(request.short for request in now.requests)
         return Content.assemble((f" asked: {asked} ", "bold reverse"), f" {SHORT_STOP}")

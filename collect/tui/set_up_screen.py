@@ -23,7 +23,7 @@ SIGNS = {
     Standing.DOUBTFUL: ("!", "bold $text-warning"),
 }
 SHARP_PX = 2.0
-"""Blur in the full frame that a lens in focus stays below: a hint while turning it; the step's own check decides."""
+"""Blur in the full frame below which the lens is in focus: a hint for turning it; the step's own check decides."""
 FORCE_SCALE_N = 0.1
 """Force at which the bar is full: a soft brush pushes with a few tens of mN."""
 BAR_COLUMNS = 30
@@ -91,12 +91,12 @@ def _live_content(now: Snapshot) -> Content:
     if now.picture is not None:
         blur_px = now.picture.blur_px
         if blur_px is None:
-            blur = "no edge in view to measure it by"
+            blur = "no edge in view to measure"
         else:
             blur = f"blur {blur_px:.1f} px  {'✓ sharp' if blur_px < SHARP_PX else '! turn the lens'}"
     force = f"{force_bar(now.force_n, FORCE_SCALE_N, BAR_COLUMNS)} {spark(now.trace_n, 20)}"
     if now.force_n is not None and not _zeroed(now.set_up):
-        force = f"{now.force_n:.3f} N, weight of the holder included: set to zero with zero touch"
+        force = f"{now.force_n:.3f} N with the weight of the holder; zero touch sets it to zero"
     tip = no_pose_text(now) or tip_text(now.tip_mm)
     rows = (("Tip", tip), ("Target", target_text(now)), ("Force", force), ("Focus", blur))
     return Content("\n").join(Content.assemble((name.ljust(8), "dim"), text) for name, text in rows)

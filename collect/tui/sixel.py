@@ -24,7 +24,7 @@ VT340_CELL_PX = (10, 20)
 
 
 STEADY = 0.8
-"""A level is kept while the picture is within this many levels of it: most of a camera's changes are its noise."""
+"""A level is kept while the picture stays within this many levels of it: most changes of a camera are noise."""
 
 
 def fitted(

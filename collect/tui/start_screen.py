@@ -38,7 +38,7 @@ TYPING_KEYS = (("enter", "use these files"), ("tab", "the other file"), ("escape
 UNASKED = Content.styled("Rig health: d asks every device; powers nothing, moves nothing", "dim")
 WELCOME = (
     "No session yet.\n\nn starts one: the set-up looks through the camera, finds the paper, and asks "
-    "you about each measurement; then the strokes follow.\n\nd asks every device of the rig whether it is well. "
+    "you about each measurement; then the strokes follow.\n\nd asks every device of the rig for its state. "
     "Nothing moves from this screen."
 )
 SIGNS = {
@@ -135,7 +135,7 @@ class StartScreen(Screen[None]):
         self._trouble.show(plain(text))
 
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
-        """Show how the session under the cursor stands."""
+        """Show the state of the session under the cursor."""
         self._show_standing(str(event.option.id))
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
@@ -149,7 +149,7 @@ class StartScreen(Screen[None]):
             self._look(row.session_id)
 
     def on_input_submitted(self, _event: Input.Submitted) -> None:
-        """Go back to the list with the files that were typed, and clear what was shown of the previous ones."""
+        """Go back to the list with the typed files, and clear what was shown about the previous ones."""
         self._choose()
         self._health.show(UNASKED)
         self.show_trouble("")

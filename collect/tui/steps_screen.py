@@ -1,4 +1,4 @@
-"""The layout that set-up and first day share: steps at the left, findings, a picture, live figures, the question."""
+"""The common layout of set-up and first day: steps at the left, findings, a picture, live figures, the question."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class StepsScreen(Screen[None]):
     BINDINGS: ClassVar[list[BindingType]] = [Binding("tab", "picture", "Picture", priority=True)]
 
     def __init__(self, picture: AnyPicture | None, keys: Iterable[Key]) -> None:
-        """`picture` is None where no terminal could show one."""
+        """`picture` is None where there is never a picture."""
         super().__init__()
         self._title, self._steps, self._found = Line("title"), Line("steps"), Line("found-text")
         self._live, self._asked, self._note = Line("live"), Line("question-text"), Line("note")
@@ -72,7 +72,7 @@ class StepsScreen(Screen[None]):
         yield self._keys
 
     def below_the_question(self) -> Iterable[Widget]:
-        """Widgets that stand with the question."""
+        """Widgets that are shown with the question."""
         return ()
 
     def on_resize(self, event: events.Resize) -> None:

@@ -28,7 +28,7 @@ class Line(Static):
     """Literal text, never read as markup, drawn again only when it changed."""
 
     def __init__(self, place: str, classes: str | None = None, *, sized: bool = False) -> None:
-        """`sized`: its place does not depend on its text, so that new text moves nothing."""
+        """`sized`: its size does not depend on its text, so that new text moves nothing."""
         super().__init__(id=place, classes=classes, markup=False)
         self._shown: Content | None = None
         self._sized = sized

@@ -16,7 +16,7 @@ from collect.rig.config_devices import InkStationConfig, ModbusPumpConfig
 from drivers.samples import PoseSample
 
 LEVEL_RISES = 0.005
-"""A dose that raises the level of the well by less has not arrived."""
+"""A dose that raises the level of the well by less than this has not arrived."""
 STALE_INK_S = 5.0
 """After a longer wait (a pause, a question, a photograph) the brush dips again before it presses."""
 

@@ -11,7 +11,7 @@ from collect.operator import Choice, OperatorRequest, Prompt
 from collect.quality.verdict import Verdict
 from collect.rig.paper import Cell
 
-KEEP, AGAIN, SKIP = Choice("g", "good all the same: it counts"), Choice("r", "press it again"), Choice("k", "skip it")
+KEEP, AGAIN, SKIP = Choice("g", "good anyway: it counts"), Choice("r", "press it again"), Choice("k", "skip it")
 PICTURE_MARGIN_PX = 40
 """Margin around the cell in the picture that goes with a question."""
 
@@ -20,10 +20,10 @@ async def decide(context: StepContext, verdict: Verdict | None, image: Gray, cel
     """Return (kept, retake) of the stroke in `image`, by the operator's request if there is one, else the verdict."""
     run, stroke_id = context.run, str(context.step.params["stroke_id"])
     if run.requests.take(OperatorRequest.RETAKE):
-        run.progress.log(f"{stroke_id}: is pressed again, as the operator asked")
+        run.progress.log(f"{stroke_id}: is pressed again, as the operator requested")
         return False, True
     if run.requests.take(OperatorRequest.SKIP):
-        run.progress.log(f"{stroke_id}: is left out, as the operator asked")
+        run.progress.log(f"{stroke_id}: is left out, as the operator requested")
         return False, False
     if verdict is None or verdict.passed:
         return True, False

@@ -28,5 +28,5 @@ async def review(context: StepContext) -> Result:
     first = run.progress.first_free_index + sum(map(len, lines))
     again = [[name, first + n] for n, name in enumerate(marked_bad(run))]
     for name, _ in again:
-        run.progress.log(f"{name}: was marked bad in review, is pressed again")
+        run.progress.log(f"{name} was marked bad in the review and is pressed again")
     return {"again": again}

@@ -62,8 +62,8 @@ def _moved_mm(found: PlaneResult, before: PaperPlane) -> float:
 
 async def _accepted(context: StepContext, moved_mm: float) -> None:
     """Ask a person before strokes are pressed from a new height. Raises `StepError` if the answer is no."""
-    text = f"The paper was found {moved_mm:+.2f} mm from where it was. Strokes from here on are pressed from there."
-    choices = (Choice("g", "good, go on from the new height"), Choice("k", "keep the height as it was"))
+    text = f"The paper was found {moved_mm:+.2f} mm from where it was. From now on, H is counted from there."
+    choices = (Choice("g", "good, use the new height"), Choice("k", "keep the old height"))
     if await context.run.asker.ask(Prompt(text, choices, "k")) != "g":
         raise StepError("the new height was not accepted.")
 

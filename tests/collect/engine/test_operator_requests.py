@@ -179,7 +179,7 @@ def test_who_gives_the_jog_of_the_set_up_up_keeps_the_taught_height_and_the_run_
         answer(engine, "Camera, board, scale", "g")
     now = until(engine, lambda now: now.prompt is not None and "Touch 1 of 3." in now.prompt.question)
     assert now.prompt is not None
-    assert now.prompt.choices[-1].label == "give up: the taught height, 120.03 mm, stays as it was"
+    assert now.prompt.choices[-1].label == "give up: the taught height, 120.03 mm, stays unchanged"
     answer(engine, "Touch 1 of 3.", "x")
     answer(engine, "The taught height, 120.03 mm, can be kept", "a")
     answer(engine, "Touch 1 of 3.", "x")

@@ -79,14 +79,14 @@ async def test_every_press_stays_long_enough_to_be_seen(
 
 @pytest.mark.parametrize("off_mm", [0.15, -0.15])
 async def test_a_press_that_was_not_seen_at_its_depth_is_void(rig_file: Path, off_mm: float):
-    with pytest.raises(StepVoid, match=f"was seen {13.0 - off_mm:.3f} mm deep, 13 mm were asked for"):
+    with pytest.raises(StepVoid, match=f"the depth was {13.0 - off_mm:.3f} mm, 13 mm was commanded"):
         await pressed(rig_file, MadeUpRobot(off_mm))
     assert await pressed(rig_file, MadeUpRobot(0.5 * off_mm)) == pytest.approx(13.0 - 0.5 * off_mm)
 
 
 @pytest.mark.parametrize("seen", [slice(0, 1), slice(4, None), slice(0)])
 async def test_a_depth_that_nobody_saw_is_not_believed(rig_file: Path, seen: slice):
-    with pytest.raises(StepVoid, match="13 mm were asked for"):
+    with pytest.raises(StepVoid, match="13 mm was commanded"):
         await pressed(rig_file, MadeUpRobot(seen=seen))
 
 

@@ -47,16 +47,16 @@ def test_the_examples_are_valid(path: Path) -> None:
         (LIST, "height_mm,dwell_s\n11,61\n", r"line 2: dwell_s: must be a number, at least 0 and at most 60"),
         (LIST, "height_mm,tilt_deg\n,5\n", r"line 2: height_mm: is empty"),
         (LIST, "height_mm,tilt_deg\n11\n", r"line 2: 1 cells under 2 columns"),
-        (LIST, "height_mm,tilt\n11,5\n", r"p.csv: line 1: tilt: no such column; there are height_mm, tilt_deg"),
+        (LIST, "height_mm,tilt\n11,5\n", r"p.csv: line 1: unknown column tilt; known are height_mm, tilt_deg"),
         (LIST, "tilt_deg\n5\n", r"line 1: the column height_mm is missing"),
-        (LIST, "height_mm,height_mm\n5,5\n", r"line 1: the column height_mm is there twice"),
+        (LIST, "height_mm,height_mm\n5,5\n", r"line 1: the column height_mm occurs twice"),
         (LIST, "height_mm\n", r"p.csv: has no rows"),
         (LIST, "", r"p.csv: line 1: the column height_mm is missing"),
         (LIST, b"height_mm\n\xff\n", r"p.csv: is not UTF-8 at byte 10"),
         (LIST, 'height_mm\n"11', r"p.csv: line 2: is not CSV"),
         (LIST, "height_mm,stroke_id\n11,a/b\n", r"line 2: stroke_id: a name has no .*slashes"),
         (LIST, "height_mm,stroke_id\n11,\x1b[2J\n", r"line 2: stroke_id: .*control"),
-        (LIST, "height_mm,stroke_id\n11,a\n12,a\n", r"presses: 'a' is there twice"),
+        (LIST, "height_mm,stroke_id\n11,a\n12,a\n", r"presses: 'a' occurs twice"),
         (LIST, None, r"p.csv: no such file"),
         (LIST.replace("p.csv", "../p.csv"), None, r"protocol.toml: file: must be the plain name of a file next to it"),
         (LIST.replace("p.csv", "/etc/passwd"), None, r"file: must be the plain name"),
@@ -70,13 +70,13 @@ def test_the_examples_are_valid(path: Path) -> None:
         (REPLAY.replace("old", "a b"), "stroke_id,height_mm,tilt_deg\na,11,0\n", r"of = 'a b'"),
         (WRITE + 'file = "p.csv"\n' + POINTS, None, r"figures.0.strokes.0.file: points are given too"),
         (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,height_mm\n1,1,3\n70,1,3\n", r"the point \[70, 1\] lies outside"),
-        (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,height_mm\n1,1,3\n1.5,1,3\n", r"point 2 lies less than 1 mm from"),
+        (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,height_mm\n1,1,3\n1.5,1,3\n", r"point 2 is less than 1 mm from"),
         (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,height_mm\n1,1,3\n", r"figures.0.strokes.0.points: .*at least 2"),
         (WRITE + POINTS.replace("5.0,", "-1.0,"), None, r"nothing would be drawn"),
         (WRITE + POINTS.replace("20.0", "nan"), None, r"figures.0.strokes.0.points.1.0: "),
         (WRITE.replace('"a"', '"a b"') + POINTS, None, r"figure 'a b': .*spaces"),
         ('kind = "write"\ncell_mm = [60.0, 60.0]\nfigures = 3\n', None, r"figures: "),
-        (CALIBRATION + "touches_mm = [[1.0, 1.0], [1.0, 1.0]]\n", None, r"touches_mm has the same point twice"),
+        (CALIBRATION + "touches_mm = [[1.0, 1.0], [1.0, 1.0]]\n", None, r"touches_mm contains the same point twice"),
         (CALIBRATION + "board_every = 3\n", None, r"use board_views"),
         (CALIBRATION + "wait_after_dip_s = 3.0\n", None, r"wait_after_dip_s: this protocol has no dips"),
         (LIST + "wait_after_dip_s = 601\n", "height_mm\n11\n", r"wait_after_dip_s: .*600 \(given: 601\)$"),
@@ -140,7 +140,7 @@ def test_what_is_no_file_is_not_read(tmp_path: Path) -> None:
 
 
 def test_names_of_a_list_may_not_meet_those_of_its_own_repeats(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"'a-r02' is there twice"):
+    with pytest.raises(ConfigError, match=r"'a-r02' occurs twice"):
         load(tmp_path, LIST + "repeats = 2\n", "height_mm,stroke_id\n11,a\n12,a-r02\n")
 
 

@@ -163,7 +163,7 @@ def test_a_press_deeper_than_the_brush_survives_is_refused_before_anything_is_co
 
 
 def test_a_pose_outside_the_box_is_refused_before_anything_is_connected(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"robot.limits: a planned pose leaves them: x = .* is outside"):
+    with pytest.raises(ConfigError, match=r"robot.limits: a planned pose is outside the limits: x = .* is outside"):
         plan(tmp_path, old="x_mm = [200.0, 640.0]", new="x_mm = [240.0, 400.0]")
 
 

@@ -105,7 +105,7 @@ def test_nothing_is_overwritten(rig: Path, tmp_path: Path) -> None:
     report.write_bytes(b"mine")
     ran = brushloop("doctor", "--config", rig, "--report", report)
     assert ran.returncode == 2
-    assert "nothing is overwritten" in ran.stderr
+    assert "is not overwritten" in ran.stderr
     assert report.read_bytes() == b"mine"
 
 

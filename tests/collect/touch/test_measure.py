@@ -204,7 +204,7 @@ async def test_a_jog_of_a_size_that_is_not_configured_is_refused(make_bench: Mak
     async def far(_at: Jogged) -> float | None:
         return -5.0
 
-    with pytest.raises(StepError, match=r"none of 0\.02"):
+    with pytest.raises(StepError, match=r"not one of 0\.02"):
         await measure_plane(bench.rig, bench.effector, TouchConfig(method="jog"), next_jog=far)
     assert bench.lifted
 

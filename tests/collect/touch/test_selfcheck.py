@@ -253,5 +253,5 @@ async def test_an_arm_in_the_picture_is_no_mark(make_bench: MakeBench) -> None:
         return cv2.circle(image.copy(), (250, 550), 90, 70, -1) if next(shots) else image  # pyright: ignore[reportReturnType]
 
     bench.photograph = with_arm  # pyright: ignore[reportAttributeAccessIssue]
-    with pytest.raises(StepError, match=r"mm2 at \(.*\) mm became dark, which no mark does: is the arm"):
+    with pytest.raises(StepError, match=r"mm2 at \(.*\) mm became dark, more than a mark: is the arm"):
         await checked(bench, places)

@@ -119,7 +119,7 @@ def full_picture(**changes: Any) -> Snapshot:
 
 SPLIT = Prompt(
     "H15-a5-r01: The tip is split by 0.42 mm. Comb the brush.",
-    (Choice("g", "good all the same: it counts"), Choice("r", "press it again"), Choice("k", "skip it")),
+    (Choice("g", "good anyway: it counts"), Choice("r", "press it again"), Choice("k", "skip it")),
     "k",
     timeout_s=120.0,
     image=capture(kept=False).photo,
@@ -159,7 +159,7 @@ JOGGED = Prompt(
         Choice("9", "up 0.1 mm"),
         Choice("0", "up 1 mm"),
         Choice("t", "the tip just touches"),
-        Choice("x", "give up: the height stays as it was"),
+        Choice("x", "give up: the height stays unchanged"),
     ),
     "x",
     number=4,
@@ -167,7 +167,7 @@ JOGGED = Prompt(
 TOUCHED = Prompt(
     "Zero touch and plane: not all is within limits.",
     (
-        Choice("g", "go on all the same"),
+        Choice("g", "go on anyway"),
         Choice("a", "measure again"),
         Choice("b", "measure by jog"),
         Choice("f", "measure by force"),

@@ -24,8 +24,8 @@ def run(*arguments: str) -> str:
     ("arguments", "words"),
     [
         (("--unknown", "3", "--trap", "loud"), r"--trap is 'loud', allowed: swapped-corner, .*cable-pulled"),
-        (("--unknown", "3", "--write-rig", "rig.toml"), "--unknown: goes with --trap"),
-        (("--trap", "force-sign"), "--trap and --truth: go with --unknown SEED"),
+        (("--unknown", "3", "--write-rig", "rig.toml"), "--unknown: can only be combined with --trap"),
+        (("--trap", "force-sign"), "--trap and --truth: need --unknown SEED"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(arguments: tuple[str, ...], words: str):
