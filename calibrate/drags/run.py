@@ -1,7 +1,7 @@
 """Fit dragged strokes of a session: parameters with intervals, held-out scores, and the artefact.
 
-A brush known from another session is adapted by its place and its width alone: these change whenever a brush is
-mounted and its zero set.
+A brush known from another session is adapted by its place and its width, which change whenever a brush is mounted and
+its zero set, and within narrow bounds by its leash and by what grows with depth, as another session may go deeper.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from calibrate.artefact import FittedValue, put_to_use
 from calibrate.compare.similarity import binary_scores
 from calibrate.drags.artefact import DragArtefact, DragScore
-from calibrate.drags.captures import Drawn
+from calibrate.drags.captures import COMMANDS, Drawn
 from calibrate.drags.fit import DragFit, bootstrap, determined, fit_drags
 from calibrate.drags.predict import Predictor, chosen, coarse, coarse_step, learn, predictors, stamps_of
 from calibrate.errors import CalibrationError
@@ -31,9 +31,13 @@ LEAST = 3
 PREDICTED, LAGGING, STAMPS = "bristle lag, corrected", "bristle lag", "circle stamps"
 SESSION_MM = {"drift_x_mm": 1.0, "drift_y_mm": 1.0, "half_mm": 0.4}
 """How far place and half width change from one session to another of the same brush (standard deviation)."""
+LEASH_MM = 2.0
+GROWTH_MM = {"half_per_mm": 0.5, "leash_per_mm": 2.0, "drift_x_per_mm": 0.5, "drift_y_per_mm": 0.5}
+"""The same for the leash, and for what grows with depth, at the deepest stroke that the brush was fitted to."""
 STROKE_MM2 = 0.14
 """Weight of a square millimetre of wrong ink in such a fit: one stroke then tells its place to about 1 mm, which is how
 far strokes of one session scatter."""
+DEPTH = COMMANDS.index("depth_mm")
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
@@ -69,7 +73,7 @@ def fit_drawn(drawn: Drawn, progress: Progress = unseen) -> FittedDrags:
 
 
 def refit_drawn(drawn: Drawn, prior: DragArtefact, where: str, strokes: int) -> FittedDrags:
-    """Adapt a known brush to `strokes` images of a session, as different as possible, by the parameters `SESSION_MM`.
+    """Adapt a known brush to `strokes` images of a session, as different as possible (`session_change`).
 
     Raises `CalibrationError` if the session has fewer images, or if its scale is not that of `prior`.
     """
@@ -81,7 +85,7 @@ def refit_drawn(drawn: Drawn, prior: DragArtefact, where: str, strokes: int) -> 
     ours, stamps = predictors(prior, where)
     fit = adapt(drawn, images, ours)
     moved = None if stamps is None else stamps_of(adapted(stamps, adapt(drawn, images, stamps)))
-    values = {name: value for name, value in _values(fit).items() if name in SESSION_MM}
+    values = {name: value for name, value in _values(fit).items() if name in fit.free}
     artefact = _artefact(drawn, fit, images, prior.parameters | values).model_copy(
         update={
             "ink_above": prior.ink_above,
@@ -89,7 +93,7 @@ def refit_drawn(drawn: Drawn, prior: DragArtefact, where: str, strokes: int) -> 
             "kept": prior.kept,
             "prior": prior.digest,
             "prior_session": f"{prior.session_id}, {prior.source}",
-            "refitted": tuple(SESSION_MM),
+            "refitted": fit.free,
         }
     )
     return FittedDrags(fit, artefact)
@@ -110,7 +114,7 @@ def different(drawn: Drawn, among: Indices, count: int) -> Indices:
 
 
 def adapt(drawn: Drawn, images: Indices, known: Predictor) -> DragFit:
-    """Fit place and width of a known brush to these images, on top of what it is known to miss."""
+    """Fit what changes with a session to these images, on top of what the known brush is known to miss."""
     paths, groups = chosen(drawn, images)
     ink, x_mm, y_mm = coarse(drawn, images)
     weights = drawn.weights[images] * STROKE_MM2 * float(x_mm[1] - x_mm[0]) ** 2
@@ -124,9 +128,20 @@ def adapt(drawn: Drawn, images: Indices, known: Predictor) -> DragFit:
         spread_mm=known.spread_mm,
         groups=groups,
         weights=weights,
-        only=SESSION_MM,
+        only=session_change(known),
         added_mm=None if missed is None else missed[:, ::step, ::step],
     )
+
+
+def session_change(known: Predictor) -> dict[str, float]:
+    """How far each parameter may change with a session (standard deviation).
+
+    What grows with depth is free only where the depth of the strokes is known that the brush was fitted to.
+    """
+    deepest = max(row[DEPTH] for row in known.kept.commands) if known.kept is not None else 0.0
+    if deepest <= 0.0:
+        return SESSION_MM
+    return SESSION_MM | {"leash_mm": LEASH_MM} | {name: mm / deepest for name, mm in GROWTH_MM.items()}
 
 
 def adapted(known: Predictor, fit: DragFit) -> Predictor:

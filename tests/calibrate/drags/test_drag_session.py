@@ -122,7 +122,8 @@ def test_a_known_brush_is_adapted_to_few_strokes(session: Path) -> None:
     adapted = load_artefact(current(session, FOLDER) or prior, DragArtefact)
     before = load_artefact(prior, DragArtefact)
     assert (adapted.prior, adapted.images) == (before.digest, 2)
-    assert adapted.parameters["leash_mm"] == before.parameters["leash_mm"]
+    assert adapted.parameters["settle_mm"] == before.parameters["settle_mm"]
+    assert adapted.refitted[:2] == ("half_mm", "half_per_mm")
     assert adapted.kept == before.kept
     alone = run.invoke(app, ["fit", str(session), "--drags", "--prior", str(prior), "--strokes", "1"])
     assert "drift_x_mm" in alone.output

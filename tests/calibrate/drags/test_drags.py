@@ -3,10 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calibrate.drags.captures import Drawn, commanded_path
 from calibrate.drags.fit import INK_ABOVE, chance, determined, fit_drags
 from calibrate.drags.residual import Residual, threshold
+from calibrate.drags.run import different
 from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from model.drag import DragModel
+from sessions.recording.schemas import Header, Source
 
 X_MM, Y_MM = np.arange(-10.0, 50.0, 1.0), np.arange(-18.0, 18.0, 1.0)
 TRUTH = DragModel(half_mm=1.5, half_per_mm=0.4, leash_mm=3.0, leash_per_mm=0.5, drift_y_mm=0.5, settle_mm=2.0)
@@ -82,6 +85,19 @@ def test_a_known_brush_is_adapted_by_its_place_alone() -> None:
     assert fit.free == ("drift_x_mm", "drift_y_mm")
 
 
+def test_what_a_model_is_known_to_miss_is_not_taken_for_a_change_of_place() -> None:
+    """All strokes of one kind: what the lag misses of them lies across their bend, like a change of place."""
+    paths = arcs(2, 5)
+    true = np.array([TRUTH.distance(path, X_MM, Y_MM) for path in paths])
+    wrong = replace(TRUTH, drift_y_mm=-0.7)
+    missed = true - np.array([wrong.distance(path, X_MM, Y_MM) for path in paths])
+    only = {"drift_y_mm": 1.0}
+    plain = fit_drags(paths, chance(true), X_MM, Y_MM, start=wrong, only=only)
+    knowing = fit_drags(paths, chance(true), X_MM, Y_MM, start=wrong, only=only, added_mm=missed)
+    assert plain.model.drift_y_mm == pytest.approx(TRUTH.drift_y_mm, abs=0.1)
+    assert knowing.model.drift_y_mm == pytest.approx(wrong.drift_y_mm, abs=0.1)
+
+
 def test_a_stroke_that_counts_less_moves_the_fit_less() -> None:
     paths = arcs(4, 6)
     images = drawn(TRUTH, paths)
@@ -122,3 +138,24 @@ def test_what_does_not_belong_together_is_refused() -> None:
         fit_drags(paths, np.zeros((3, len(Y_MM), len(X_MM))), X_MM, Y_MM)
     with pytest.raises(ValueError, match="not alike"):
         fit_drags(paths, drawn(replace(TRUTH), paths), X_MM, Y_MM, np.zeros((3, 1)))
+
+
+def test_a_brush_is_adapted_to_strokes_that_differ_most() -> None:
+    commands = np.array([[20.0, 5.0, 2.0, 2.0, 0.0]] * 6 + [[40.0, -5.0, 4.0, 4.0, 0.0], [20.0, -5.0, 4.0, 4.0, 0.0]])
+    session = Drawn(
+        header=Header(session_id="s", source=Source.IMPORT, software="test", protocol=""),
+        recording_sha256="",
+        calibration=None,
+        x_mm=X_MM,
+        y_mm=Y_MM,
+        paths=[commanded_path(*row[:4]) for row in commands],
+        groups=np.arange(9),
+        ink=np.zeros((8, 2, 2), np.float32),
+        stroke_ids=[str(k) for k in range(8)],
+        refused=[],
+        commands=commands,
+        flags=[()] * 8,
+        ends="depth_ends_mm",
+    )
+    assert sorted(different(session, np.arange(8), 3)) == [0, 6, 7]
+    assert different(replace(session, commands=None), np.arange(8), 3).tolist() == [0, 1, 2]
