@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 SAMPLE_STEP = 7
 """Pixels are sampled at this step in both directions; a prime, so that no pattern hides between them."""
 BLACK_BELOW = 25
+LIGHT_SHARE = 0.005
+"""A frame in which fewer of the sampled pixels than this are lighter than `BLACK_BELOW` is black."""
 SATURATED_SHARE = 0.5
 TORN_BAND_SHARE = 0.02
 """Share of the rows, at the bottom, that are uniform if the decoder ran out of data."""
@@ -90,7 +92,7 @@ class FrameHealth:
         import numpy as np
 
         sample = image[::SAMPLE_STEP, ::SAMPLE_STEP]
-        if float(np.quantile(sample, 0.995)) < BLACK_BELOW:
+        if np.count_nonzero(sample >= BLACK_BELOW) < LIGHT_SHARE * sample.size:
             return Fault.BLACK
         if float(np.mean(sample >= 255)) > SATURATED_SHARE:
             return Fault.SATURATED

@@ -139,6 +139,8 @@ class World:
         self.push_n = (0.0, 0.0, 0.0)
         """Force of a person's finger on the tip, in the base frame."""
         self.motion = ArmQueue(brush_pose(*config.home_mm), self._travelled, tool_of(config))
+        self._felt: tuple[object, Wrench] | None = None
+        """The last wrench and what it follows from; it stays the same while the arm rests."""
 
     def flaw_next(self, flaw: Flaw, severity: float = 1.0) -> None:
         """Give a flaw to the next press that lifts off; raises ValueError unless severity is in 0 .. 1."""
@@ -157,9 +159,13 @@ class World:
 
     def wrench(self) -> Wrench:
         """Current wrench on the force sensor, in the tool's frame."""
-        tip = self.tool()
-        x_mm, y_mm, depth_mm = self._on_sheet(tip)
-        return self.reaction.wrench(tip, 0.0 if self._in_well(x_mm, y_mm) else depth_mm, self._normal, self.push_n)
+        tip, table, push_n = self.tool(), self.config.table, self.push_n
+        follows_from = tip, table, push_n
+        if self._felt is None or self._felt[0] != follows_from:
+            x_mm, y_mm, depth_mm = self._on_sheet(tip)
+            free = self._in_well(x_mm, y_mm)
+            self._felt = follows_from, self.reaction.wrench(tip, 0.0 if free else depth_mm, self._normal, push_n)
+        return self._felt[1]
 
     def to_paper(self, x_mm: float, y_mm: float) -> tuple[float, float]:
         """Convert x and y from the base frame to the paper frame."""

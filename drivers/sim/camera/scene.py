@@ -53,6 +53,8 @@ class Scene:
         """By noise field: the frame without the tool. Valid for the sheet as it is lit now."""
         self._lit: NDArray[np.float32] | None = None
         self._lit_version: tuple[int, Held | None] = (-1, None)
+        self._disc_of: tuple[Pose | None, tuple[int, int] | None] = None, None
+        """The tool as it was last seen, and the place of its disc."""
         self._count = 0
         self.held: Held | None = None
         """The board that a person holds before the camera; it hides everything else."""
@@ -79,7 +81,9 @@ class Scene:
             self._without_tool.clear()
         field = self._count % NOISE_FIELDS
         self._count += 1
-        disc_px = None if held else self._tool_disc(tool)
+        if self._disc_of[0] != tool:
+            self._disc_of = tool, self._tool_disc(tool)
+        disc_px = None if held else self._disc_of[1]
         at_px, frame = self._finished.get(field, (None, None))
         if frame is None or at_px != disc_px:
             frame = self._sheet_alone(field, self._lit)
