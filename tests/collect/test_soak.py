@@ -66,10 +66,10 @@ class Toll:
         )
 
 
-def test_a_session_that_is_killed_six_times_ends_whole(lab: Lab) -> None:
+def test_a_session_that_is_killed_three_times_ends_whole(lab: Lab) -> None:
     toll = Toll(seed=1)
-    while toll.kills.total() < 6:
-        session(lab, toll, kills=6 - toll.kills.total())
+    while toll.kills.total() < 3:
+        session(lab, toll, kills=3 - toll.kills.total())
     sys.stdout.write(f"{toll}\n")
 
 

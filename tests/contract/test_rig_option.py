@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import pty
 import re
@@ -12,10 +13,11 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from unittest.mock import Mock
+from unittest.mock import AsyncMock, Mock
 
 import pytest
 
+from tests.contract import asking
 from tests.contract.conftest import pytest_configure
 from tests.waiting import PATIENCE_S, wait_until
 
@@ -86,8 +88,29 @@ def test_it_says_what_it_will_do_and_after_a_yes_it_moves(rig_toml: Path):
         assert re.search(expected, output), expected
 
 
-# In the soak: another answer takes the same way, and each costs a pytest of its own.
-@pytest.mark.parametrize("answer", ["", pytest.param("n", marks=pytest.mark.soak)])
+def answered(monkeypatch: pytest.MonkeyPatch, answer: str) -> str | None:
+    """What a person's answer comes to, of an arm that nobody has to connect to."""
+    terminal = Mock(spec=io.StringIO, **{"isatty.return_value": True, "readline.return_value": f"{answer}\n"})
+    monkeypatch.setattr(sys, "stdin", terminal)
+    monkeypatch.setattr(asking, "_look", AsyncMock(return_value=(None, None, None)))
+    monkeypatch.setattr(asking, "_announcement", Mock(return_value=""))
+    monkeypatch.setattr(asking, "sole_driver", lambda _host, _port: contextlib.nullcontext())
+    return asking.permission_refused(Mock(), Mock(), 1)
+
+
+@pytest.mark.parametrize("answer", ["y", "YES", " yes "])
+def test_a_yes_lets_it_move(monkeypatch: pytest.MonkeyPatch, answer: str):
+    assert answered(monkeypatch, answer) is None
+
+
+@pytest.mark.parametrize("answer", ["", "n", "yesterday"])
+def test_any_other_answer_refuses(monkeypatch: pytest.MonkeyPatch, answer: str):
+    assert f"was {answer or 'no'!r}" in str(answered(monkeypatch, answer))
+
+
+# A pytest of its own for each; `test_any_other_answer_refuses` has the same answers in this process.
+@pytest.mark.soak
+@pytest.mark.parametrize("answer", ["", "n"])
 def test_any_other_answer_skips_what_moves_and_runs_the_rest(rig_toml: Path, answer: str):
     code, output = on_a_terminal(rig_toml, answer)
     assert code == 0, output

@@ -123,7 +123,7 @@ def test_a_capture_without_any_scale_is_refused() -> None:
 
 
 def test_a_name_that_no_protocol_can_hold_is_not_written(tmp_path: Path) -> None:
-    made = invert_recording(session(tmp_path), Settings(within=Range((5.0, 25.0))), None)
+    made = invert_recording(session(tmp_path), Settings(within=Range((5.0, 25.0))), None, presses=1)
     with pytest.raises(CalibrationError, match="give a plain name"):
         write_inversion(made, tmp_path / PROTOCOL)
 

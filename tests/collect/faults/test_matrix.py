@@ -301,7 +301,9 @@ def assert_the_session_is_whole(stage: Stage, name: str, phase: str) -> None:
     store.release()
 
 
-@pytest.mark.parametrize(("name", "phase"), [("drop", "descent"), ("protective stop", "lift")])
+@pytest.mark.parametrize(
+    ("name", "phase"), [("drop", "descent"), pytest.param("protective stop", "lift", marks=pytest.mark.soak)]
+)
 def test_once_the_cause_is_mended_the_same_command_goes_on(stage: Stage, name: str, phase: str) -> None:
     engine = stage.engine()
     arm_the_fault(stage, engine, name, phase)

@@ -91,7 +91,7 @@ def test_a_disk_that_does_not_keep_up_ends_the_run_and_says_so(
     assert_stopped_clear_of_the_paper(stage)
 
 
-@pytest.mark.parametrize("full_after", [0, 3, 60])
+@pytest.mark.parametrize("full_after", [0, 3, pytest.param(60, marks=pytest.mark.soak)])
 def test_a_disk_that_fills_up_ends_the_run_and_with_room_the_same_command_goes_on(
     stage: Stage, disk: Disk, full_after: int
 ) -> None:

@@ -47,11 +47,13 @@ class Operator:
         return self.app.engine.snapshot()
 
     async def until(self, condition: Callable[[], bool], what: str, timeout_s: float = PATIENCE_S) -> None:
-        deadline = time.monotonic() + timeout_s
+        deadline, looked_s = time.monotonic() + timeout_s, time.thread_time()
         while not condition():
             assert time.monotonic() < deadline, f"{what}; the screen shows:\n{shown(self.app)}"
             await self._answer_what_this_test_is_not_about()
-            await asyncio.sleep(0.2)  # reading the screen takes longer than showing it
+            # Reading the screen takes longer than showing it: it has a tenth of the time at most.
+            await asyncio.sleep(max(0.1, 10.0 * (time.thread_time() - looked_s)))
+            looked_s = time.thread_time()
 
     async def _answer_what_this_test_is_not_about(self) -> None:
         """The loopback brush runs dry by itself now and then; on a busy machine a frame may be late."""
