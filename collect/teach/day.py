@@ -22,7 +22,7 @@ ARM = Choice("a", "let it move: I look at the cell, my hand is at the emergency 
 STAY = Choice("x", "leave it where it is")
 YES, NO = Choice("y", "yes"), Choice("n", "no")
 JOGGED: frozenset[TargetKind] = frozenset(
-    {"pin", "board-corner", "sheet-corner", "well", "well-rim", "wash-pot", "park"}
+    {"pin", "board-corner", "sheet-corner", "well", "well-rim", "wash-pot", "wash-rim", "park"}
 )
 """Places to which the last millimetres may be jogged."""
 

@@ -22,6 +22,7 @@ TargetKind = Literal[
     "well",
     "well-rim",
     "wash-pot",
+    "wash-rim",
     "park",
     "hold-board",
     "push-sensor",

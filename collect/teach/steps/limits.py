@@ -112,7 +112,9 @@ def _box_fields() -> tuple[str, ...]:
 def _within(notebook: Notebook) -> list[Point]:
     """Everything that the tip must reach, in the base frame."""
     places, safe_mm = tips(notebook), notebook.number("motion.safe_z_mm")
-    reached = [point for name, point in places.items() if name.split(" ")[0] in ("well-rim", "well", "wash-pot")]
+    reached = [
+        point for name, point in places.items() if name.split(" ")[0] in ("well-rim", "well", "wash-pot", "wash-rim")
+    ]
     park_x, park_y, park_z = notebook.numbers("motion.park_mm")
     corners = sheet_corners(notebook)
     deepest_mm = min(sheet_heights(notebook)) - notebook.number("brush.max_depth_mm") - BELOW_MM

@@ -45,15 +45,10 @@ class PlacesStep:
             how = "Bring the tip into the middle of the well, as deep as a dip should go: a few mm above its bottom."
             await day.touch(reader, Target("well"), how, "well 0")
             with day.touched_again_if_refused("well-rim", "well"):
-                found = _check_well(day.notebook)
+                found = check_pot(day.notebook, "well-rim 0", "well 0", "well")
             await day.say(found)
             await self._wipe(day, reader)
-            if "wash-pot 0" not in day.notebook.touches and "aside.wash" not in day.notebook.values:
-                wash = await day.yes("Is there a pot of water to wash the brush in?", default=False)
-                if wash:
-                    how = "Bring the tip into the middle of the pot of water, as deep as a wash should go."
-                    await day.touch(reader, Target("wash-pot"), how, "wash-pot 0")
-                day.keep("places", "aside.wash", wash, "answered")
+            await self._wash(day, reader)
             if not (clear := _clear_view(day.rig_path)).exists() or "clear-view 0" not in day.notebook.touches:
                 how = "Guide the arm so far away that neither it nor its shadow is in the camera's picture."
                 await day.touch(reader, Target("clear-view"), how, "clear-view 0")
@@ -81,6 +76,21 @@ class PlacesStep:
                 raise
         day.keep("places", "aside.wipe", wipe, "answered")
 
+    async def _wash(self, day: Day, reader: ArmReader) -> None:
+        """Have rim and middle of a pot of water touched, if there is one."""
+        if "aside.wash" in day.notebook.values:
+            return
+        wash = "wash-rim 0" in day.notebook.touches or await day.yes(
+            "Is there a pot of water to wash the brush in?", default=False
+        )
+        if wash:
+            await day.touch(reader, Target("wash-rim"), "Bring the tip to the rim of the pot of water.", "wash-rim 0")
+            how = "Bring the tip into the middle of the pot of water, as deep as a wash should go."
+            await day.touch(reader, Target("wash-pot"), how, "wash-pot 0")
+            with day.touched_again_if_refused("wash-rim", "wash-pot"):
+                check_pot(day.notebook, "wash-rim 0", "wash-pot 0", "pot of water")
+        day.keep("places", "aside.wash", wash, "answered")
+
     async def _seen(self, day: Day) -> Thumbnail:
         async with taught_camera(day.notebook, day.clock) as camera:
             return thumbnail(await still(camera, day.clock))
@@ -105,7 +115,8 @@ class PlacesStep:
         x, y, dip_z_mm = places["well 0"]
         rim_x, rim_y, _ = places["well-rim 0"]
         rim_z_mm = max(z for name, (_, _, z) in places.items() if name.startswith("well-rim "))
-        safe_mm = max(max(sheet_heights(notebook)) + TRAVEL_MM, rim_z_mm + RIM_CLEAR_MM)
+        highest_rim_mm = max(z for name, (_, _, z) in places.items() if name.split(" ")[0] in ("well-rim", "wash-rim"))
+        safe_mm = max(max(sheet_heights(notebook)) + TRAVEL_MM, highest_rim_mm + RIM_CLEAR_MM)
         by_hand = "the tip was brought there by hand"
 
         def taught(value: Value, how: str = by_hand, known: str = "one touch by hand, within a mm") -> Taught:
@@ -119,7 +130,7 @@ class PlacesStep:
             "aside.rim_z_mm": taught(rim_z_mm),
             "motion.safe_z_mm": taught(
                 safe_mm,
-                f"the higher of sheet + {TRAVEL_MM:g} mm and rim of the well + {RIM_CLEAR_MM:g} mm",
+                f"the higher of sheet + {TRAVEL_MM:g} mm and highest rim + {RIM_CLEAR_MM:g} mm",
                 "a stated clearance",
             ),
             "motion.park_mm": taught(
@@ -142,7 +153,7 @@ class PlacesStep:
         """Without what was touched here."""
         gone = {"aside.wipe", "ink.wipe.rim_mm", "ink.wipe.z_mm", "aside.wash", "ink.wash.pot_mm", "ink.wash.dip_z_mm"}
         kept = {field: taught for field, taught in notebook.values.items() if field not in gone}
-        cleared = notebook.without_touches("well-rim", "well", "wash-pot", "park", "clear-view")
+        cleared = notebook.without_touches("well-rim", "well", "wash-rim", "wash-pot", "park", "clear-view")
         return cleared.model_copy(update={"values": kept})
 
     def summary(self, notebook: Notebook) -> str:
@@ -177,18 +188,18 @@ def sheet_corners(notebook: Notebook) -> list[Point]:
     return [(*to_base(paper, x, y), z) for (x, y), z in zip(corners_of(*paper.size_mm).tolist(), heights, strict=True)]
 
 
-def _check_well(notebook: Notebook) -> str:
-    """Describe the well. Raises `CannotTeach` if rim and dip contradict each other."""
-    (rim_x, rim_y, rim_z), (x, y, z) = tips(notebook)["well-rim 0"], tips(notebook)["well 0"]
+def check_pot(notebook: Notebook, rim: str, middle: str, what: str) -> str:
+    """Describe a well or pot by its two touches. Raises `CannotTeach` if rim and dip contradict each other."""
+    (rim_x, rim_y, rim_z), (x, y, z) = tips(notebook)[rim], tips(notebook)[middle]
     radius_mm = math.dist((rim_x, rim_y), (x, y))
     if not LEAST_RADIUS_MM <= radius_mm <= MOST_RADIUS_MM:
         raise CannotTeach(
-            f"the dip is {radius_mm:.0f} mm from the rim, seen from above, which no well is.",
-            "Teach the well again: its rim, then its middle.",
+            f"the dip is {radius_mm:.0f} mm from the rim of the {what}, seen from above, which no {what} is wide.",
+            f"Teach the {what} again: its rim, then its middle.",
         )
     if z >= rim_z:
-        raise CannotTeach("the dip is no deeper than the rim of the well.", "Bring the tip into the ink.")
-    return f"well of radius {radius_mm:.0f} mm, its rim {rim_z - z:.1f} mm above the bottom of a dip"
+        raise CannotTeach(f"the dip is no deeper than the rim of the {what}.", "Bring the tip below the rim.")
+    return f"{what} of radius {radius_mm:.0f} mm, its rim {rim_z - z:.1f} mm above the bottom of a dip"
 
 
 def wipe_of(notebook: Notebook) -> tuple[tuple[float, float], float]:

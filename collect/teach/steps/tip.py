@@ -14,8 +14,10 @@ GOOD_MM = 0.18
 """Root mean square error of the tip at which touching ends."""
 WORST_MM = 0.35
 """Above this after the last touch, the tip is not accepted."""
-LEAST_UPRIGHTS, UPRIGHTS = 3, 5
-"""Times that the brush is held against a set square, each with another turn of the wrist."""
+LEAST_UPRIGHTS, UPRIGHTS = 3, 12
+"""Times that the brush is held against a set square, each with another turn of the wrist. Nothing but a few degrees of
+set bends an upright brush along the heading: an error of 0.12 deg across it turns every mark by 5 deg, which is judged
+bent. Twelve times, each to 0.15 deg, leave 0.04 deg."""
 LEAST_LEAN = 3.0
 """A lean of the brush against the flange counts from this many standard errors."""
 SIDES = ("away from you", "to the right", "toward you", "to the left")
@@ -26,7 +28,7 @@ class TipStep:
 
     name: StepName = "tip"
     title = "Tip of the brush"
-    minutes = 8
+    minutes = 9
     needs: tuple[StepName, ...] = ("arm",)
 
     async def teach(self, day: Day) -> None:
@@ -43,7 +45,8 @@ class TipStep:
                     f"Upright {index + 1} of {UPRIGHTS}: the brush upright along the set square"
                     f"{', the wrist turned otherwise than before' if index else ''}, anywhere over the table."
                 )
-                await day.touch(reader, Target("upright", index, may_skip=True), how, f"upright {index}")
+                if await day.touch(reader, Target("upright", index, may_skip=True), how, f"upright {index}") is None:
+                    break
 
     async def _pin(self, day: Day, reader: ArmReader) -> None:
         if await self._known(day):

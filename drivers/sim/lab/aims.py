@@ -17,7 +17,7 @@ from drivers.sim.camera.optics import Floats
 from drivers.sim.lab.facts import PIN_TILT_DEG, Facts
 from drivers.sim.lab.places import Place, azimuth_deg, board_size_mm, corner, held, in_base, over_sheet
 
-TOUCHED = ("pin", "board-corner", "sheet-corner", "well-rim")
+TOUCHED = ("pin", "board-corner", "sheet-corner", "well-rim", "wash-rim")
 """Things that the tip touches; to the others it is brought as near as the eye can tell."""
 BY_EYE_MM = 1.0
 SEEN_SIGMAS = 2.5
@@ -112,8 +112,8 @@ class Aims:
                 return corner(table, to.removesuffix("-corner"), self._meant(facts, name))
             case "well":
                 return in_base(table, *table.well_mm, DIP_ABOVE_BOTTOM_MM)
-            case "well-rim":
-                x, y = table.well_mm
+            case "well-rim" | "wash-rim":
+                x, y = table.well_mm if to == "well-rim" else facts.wash_mm
                 return in_base(table, x, y + table.well_radius_mm, table.well_depth_mm)
             case "wash-pot":
                 return in_base(table, *facts.wash_mm, DIP_ABOVE_BOTTOM_MM)

@@ -34,7 +34,18 @@ from drivers.sim.lab.places import shifted, withdrawn
 from drivers.sim.world import World
 
 THINGS = (
-    *("pin", "upright", "board-corner", "sheet-corner", "well", "well-rim", "wash-pot", "park", "clear-view"),
+    *(
+        "pin",
+        "upright",
+        "board-corner",
+        "sheet-corner",
+        "well",
+        "well-rim",
+        "wash-pot",
+        "wash-rim",
+        "park",
+        "clear-view",
+    ),
     *("hold-board", "push-sensor"),
 )
 SPEED_RAD_S, ACC_RAD_S2 = 0.35, 1.0

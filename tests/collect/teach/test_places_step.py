@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from collect.teach.errors import CannotTeach
-from collect.teach.steps.places import PlacesStep, check_wipe
+from collect.teach.steps.places import PlacesStep, check_pot, check_wipe
 from collect.teach.store import Notebook, Taught, now_utc, touch_of
 from drivers.geometry import brush_pose
 
@@ -49,6 +49,23 @@ def test_without_a_second_touch_of_the_rim_there_is_no_wipe() -> None:
     touches = {name: touch for name, touch in notebook.touches.items() if name != "well-rim 1"}
     found = PlacesStep().derived(notebook.model_copy(update={"touches": touches}))
     assert not any(field.startswith("ink.wipe") for field in found)
+
+
+def test_the_arm_travels_above_the_rim_of_the_pot_of_water_too() -> None:
+    notebook, safe_mm = taught((316.0, 40.0, 133.0)), []
+    for rim_z_mm in (150.0, 210.0):
+        for name, place in {"wash-rim 0": (120.0, 216.0, rim_z_mm), "wash-pot 0": (120.0, 200.0, 125.0)}.items():
+            notebook = notebook.with_touch(name, touch_of(brush_pose(*place)))
+        assert check_pot(notebook, "wash-rim 0", "wash-pot 0", "pot of water").startswith(
+            "pot of water of radius 16 mm"
+        )
+        found = PlacesStep().derived(notebook)
+        assert found["ink.wash.dip_z_mm"].value == pytest.approx(125.0)
+        safe_mm.append(found["motion.safe_z_mm"].value)
+    assert safe_mm == pytest.approx([180.0, 230.0]), "60 mm above the sheet, 20 mm above the highest rim"
+    drowned = notebook.with_touch("wash-pot 0", touch_of(brush_pose(120.0, 200.0, 220.0)))
+    with pytest.raises(CannotTeach, match="no deeper than the rim of the pot of water"):
+        check_pot(drowned, "wash-rim 0", "wash-pot 0", "pot of water")
 
 
 @pytest.mark.parametrize(
