@@ -22,8 +22,9 @@ SPEED = {
     "raster": 60,
     "drawing": 60,
     "preprocess": 20,
-    "rpc": 60,
+    "rpc": 120,
     "validate": 100,
+    "kept": 40,
 }
 """What `make bench` measures, and about how many seconds each bench takes on two quiet cores."""
 ACCURACY = {

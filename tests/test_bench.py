@@ -10,7 +10,7 @@ import cv2
 import pytest
 
 import bench.__main__
-from bench import footprints, growth, paper_brush, raster, rpc, table, whole
+from bench import footprints, growth, kept, paper_brush, raster, rpc, table, whole
 from bench.harness import BenchError, Result, interleave, percentile, results_of
 from bench.peak import Used, measure
 from bench.processes import started
@@ -183,6 +183,11 @@ def test_a_bench_that_fails_or_hangs_costs_its_own_figures_only(monkeypatch: pyt
     ]
     assert "b: not measured: it was ended after 360 s" in said
     assert "c: not measured: it ended with 1" in said
+
+
+def test_what_a_stroke_takes_needs_more_than_a_few_strokes() -> None:
+    with pytest.raises(ValueError, match="at least 40"):
+        kept.run(n=39)
 
 
 def test_a_number_of_rounds_goes_with_one_bench(capsys: pytest.CaptureFixture[str]) -> None:
