@@ -39,6 +39,7 @@ ACCURACY = {
     "generator": 1000,
     "generator-qbc": 1000,
     "written": 1300,
+    "adaptive": 600,
     "brushfit": 1800,
 }
 """What takes longer, because it trains, fits or presses: how good the results are, rather than how quick."""
