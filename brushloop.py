@@ -21,6 +21,7 @@ import collect.cli
 import collect.cli_rig
 import model.train.cli
 import sessions.cli
+import twin.cli
 from calibrate.path_or_command import PathOrCommand
 from sessions.terminal import plain, say
 
@@ -81,6 +82,7 @@ app.add_typer(calibrate.cli.app, name="calibrate")
 app.add_typer(calibrate.board.cli.app, name="camera")
 app.add_typer(calibrate.validate.cli.app, name="validate")
 app.command("fit")(calibrate.fit.cli.fit)
+app.command("twin")(twin.cli.twin)
 app.command("invert")(calibrate.invert.cli.invert)
 loop = typer.Typer(
     cls=PathOrCommand,
@@ -148,7 +150,7 @@ def sim(
         camera_port=camera_port,
         brush=pressed.spec,
         brush_name=pressed.name,
-        view=View(fps=fps),
+        view=View(fps=fps) if pressed.noise_gray is None else View(fps=fps, noise=pressed.noise_gray),
     )
     serve(config, write_rig, idle_exit, say, faults=faults, control=control)
 

@@ -69,10 +69,10 @@ def leave_cell_out(fit: Fit, strokes: Sequence[Pressed], grid: Grid, progress: P
             images[BEZIER] = image_of(refit_bezier(others, grid).outline(*cell), grid)
         for k, stroke in enumerate(held):
             for name, image in images.items():
-                scores.setdefault(name, []).append(_score(image, stroke.ink))
+                scores.setdefault(name, []).append(score(image, stroke.ink))
             if len(held) >= 3:
                 template = np.mean([other.ink > 0.5 for m, other in enumerate(held) if m != k], axis=0)
-                scores.setdefault(CEILING, []).append(_score(template, stroke.ink))
+                scores.setdefault(CEILING, []).append(score(template, stroke.ink))
     order = [name for name in (CEILING, FITTED, BEZIER, UNCALIBRATED) if name in scores]
     rows: list[HeldOut] = []
     for name in order:
@@ -121,7 +121,8 @@ def refit_bezier(strokes: Sequence[Pressed], grid: Grid) -> RefittedBezier:
     return RefittedBezier(fit_plane(height, tilt, dict(zip(BEZIER_SIZES, np.array(rows).T, strict=True))))
 
 
-def _score(predicted: Images, ink: Images) -> tuple[float, float]:
+def score(predicted: Images, ink: Images) -> tuple[float, float]:
+    """(CSIM, SSIM) of two images of one size as binary images; zero for a blank one."""
     seen, truth = (np.asarray(image > 0.5, np.float32) for image in (predicted, ink))
     if not seen.any() or not truth.any():
         return 0.0, 0.0

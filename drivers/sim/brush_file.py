@@ -4,6 +4,8 @@
 name = "our goat-hair brush no. 3, simulated"   # in every recording and report made with it
 [brush]
 stiffness_n_mm2 = 150.0                         # the fields of `BrushSpec`; the default of each that is left out
+[camera]
+noise = 1.4                                     # gray levels; may be left out
 ```
 """
 
@@ -18,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from drivers.sim.brush.spec import BrushSpec
 from drivers.sim.described import SimFileError, load_described
 
+MAX_NOISE_GRAY = 30.0
 PAPER = "paper"
 """Name under which the brush of `PAPER_FILE` is chosen."""
 PAPER_FILE = Path(__file__).with_name("brush") / "paper_brush.toml"
@@ -34,6 +37,14 @@ class NamedBrush:
 
     spec: BrushSpec
     name: str
+    noise_gray: float | None = None
+    """Standard deviation of the camera's noise that was measured with it; None for the rig's default."""
+
+
+class _Camera(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    noise: Annotated[float, Field(ge=0.0, le=MAX_NOISE_GRAY)]
 
 
 class _File(BaseModel):
@@ -41,9 +52,10 @@ class _File(BaseModel):
 
     name: Annotated[str, Field(min_length=1, max_length=120, pattern=r'^[^\x00-\x1f\x7f"\\]+$')]
     brush: BrushSpec
+    camera: _Camera | None = None
 
 
 def load_brush(path: Path) -> NamedBrush:
     """Read the file, or the shipped brush if `path` is just `paper`. Raises `BrushFileError`."""
     found = load_described(PAPER_FILE if str(path) == PAPER else path, _File, BrushFileError)
-    return NamedBrush(found.brush, found.name)
+    return NamedBrush(found.brush, found.name, None if found.camera is None else found.camera.noise)

@@ -15,7 +15,16 @@ from drivers.sim.brush.flaws import Flaw, Trouble, draw_trouble
 from drivers.sim.brush.footprint import Tuft, blank_footprint, draw_wander, grow_bristles, print_footprint
 from drivers.sim.brush.paper import Footprint
 from drivers.sim.brush.spec import BrushSpec, within
-from drivers.sim.brush.spine import Bundle, SpineShape, Vector, press_spine, pull_spine, rest_spine
+from drivers.sim.brush.spine import (
+    LOAD_STEP_MM,
+    Bundle,
+    SpineShape,
+    Vector,
+    lower_spine,
+    press_spine,
+    pull_spine,
+    rest_spine,
+)
 
 __all__ = ["Brush", "BrushSpec", "Flaw", "Footprint", "Waypoint"]
 
@@ -25,6 +34,9 @@ LEAST_DEPTH_MM = 1e-6
 MAX_TILT_DEG = 30.0
 MAX_DEPTH = 0.9
 """Deepest press as a fraction of the ferrule's height at zero touch; beyond it the ferrule hits the paper."""
+
+Descent = tuple[SpineShape, ...]
+"""The spine after each load step on the way down; the last is final."""
 
 REMEMBERED_SPINES = 64
 REMEMBERED_STANCES = 8
@@ -68,6 +80,30 @@ class Brush:
             trouble = draw_trouble(flaw, severity, self.spec.bristles, self.spec.length_mm, rng)
         spine = _spine(self.spec, float(depth_mm), float(tilt_deg))
         return print_footprint(spine, self._tuft(press_seed, trouble), ink_load, px_per_mm, self._paper(press_seed))
+
+    def descents(self, depths_mm: Sequence[float], tilt_deg: float) -> dict[float, Descent]:
+        """The way down to each of the depths, from one descent to the deepest: quicker than one for each.
+
+        The load steps end at multiples of half a mm and at each depth; `press` divides each way into equal steps, so
+        that the shapes differ slightly where a depth is not such a multiple. Raises ValueError as `press` does.
+        """
+        for depth in depths_mm:
+            within("depth_mm", depth, LEAST_DEPTH_MM, self.deepest_mm(tilt_deg))
+        grid = LOAD_STEP_MM * np.arange(1, math.ceil(max(depths_mm) / LOAD_STEP_MM))
+        lowered = np.union1d(grid, np.asarray(depths_mm, np.float64))
+        path = lower_spine(self._bundle, lowered, math.radians(tilt_deg))
+        steps = list(zip(lowered, np.isin(lowered, grid), path, strict=True))
+        return {
+            depth: tuple(shape for at, on_grid, shape in steps if at == depth or (on_grid and at < depth))
+            for depth in depths_mm
+        }
+
+    def print_descent(self, descent: Descent, *, ink_load: float, press_seed: int, px_per_mm: float) -> Footprint:
+        """The mark that a way down leaves, as `press` would print it. Raises ValueError as `press` does."""
+        within("ink_load", ink_load, 0.0, 1.0)
+        within("px_per_mm", px_per_mm, 2.0, 40.0)
+        within("press_seed", press_seed, 0, 2**63 - 1)
+        return print_footprint(descent, self._tuft(press_seed, None), ink_load, px_per_mm, self._paper(press_seed))
 
     @property
     def set_lean_deg(self) -> float:
@@ -135,7 +171,7 @@ class Brush:
 
 
 @lru_cache(maxsize=REMEMBERED_SPINES)
-def _spine(spec: BrushSpec, depth_mm: float, tilt_deg: float) -> tuple[SpineShape, ...]:
+def _spine(spec: BrushSpec, depth_mm: float, tilt_deg: float) -> Descent:
     """The way down; it depends on brush, depth and tilt only, and a protocol repeats its cells."""
     return press_spine(_bundle(spec), depth_mm, math.radians(tilt_deg))
 

@@ -2,7 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
+
+ALLOWED: Mapping[str, tuple[float, float]] = MappingProxyType(
+    {
+        "radius_mm": (1.0, 20.0),
+        "length_mm": (3.0, 120.0),
+        "stiffness_n_mm2": (10.0, 1000.0),
+        "stiffness_power": (2.0, 4.0),
+        "squash_n_per_mm2": (0.001, 0.5),
+        "suction_n_per_mm2": (0.0, 0.01),
+        "friction": (0.0, 0.8),
+        "set_deg": (1.0, 30.0),
+        "belly_share": (0.1, 0.7),
+        "taper_power": (0.5, 3.0),
+        "splay_power": (1.0, 4.0),
+        "splay_reach_mm": (1.0, 12.0),
+        "film_mm": (0.12, 2.0),
+        "uneven_mm": (0.0, 12.0),
+        "wick_mm": (0.04, 1.0),
+        "need_per_mm2": (0.5, 15.0),
+        "bow_mm": (0.0, 3.0),
+        "spread_wander": (0.0, 0.3),
+        "reach_wander_mm": (0.0, 3.0),
+        "bow_wander_mm": (0.0, 3.0),
+        "strand_mm": (0.0, 1.0),
+        "bristles": (50, 5000),
+        "seed": (0, 2**63 - 1),
+    }
+)
+"""Range of each constant of a `BrushSpec`; a bundle is also at least three times as long as it is thick."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,29 +88,9 @@ class BrushSpec:
     """Seed of the individual: its bristles and how they clump."""
 
     def __post_init__(self) -> None:
-        within("radius_mm", self.radius_mm, 1.0, 20.0)
+        for name, (low, high) in ALLOWED.items():
+            within(name, getattr(self, name), low, high)
         within("length_mm", self.length_mm, 3.0 * self.radius_mm, 120.0)
-        within("stiffness_n_mm2", self.stiffness_n_mm2, 10.0, 1000.0)
-        within("stiffness_power", self.stiffness_power, 2.0, 4.0)
-        within("squash_n_per_mm2", self.squash_n_per_mm2, 0.001, 0.5)
-        within("suction_n_per_mm2", self.suction_n_per_mm2, 0.0, 0.01)
-        within("friction", self.friction, 0.0, 0.8)
-        within("set_deg", self.set_deg, 1.0, 30.0)
-        within("belly_share", self.belly_share, 0.1, 0.7)
-        within("taper_power", self.taper_power, 0.5, 3.0)
-        within("splay_power", self.splay_power, 1.0, 4.0)
-        within("splay_reach_mm", self.splay_reach_mm, 1.0, 12.0)
-        within("film_mm", self.film_mm, 0.12, 2.0)
-        within("uneven_mm", self.uneven_mm, 0.0, 12.0)
-        within("wick_mm", self.wick_mm, 0.04, 1.0)
-        within("need_per_mm2", self.need_per_mm2, 0.5, 15.0)
-        within("bow_mm", self.bow_mm, 0.0, 3.0)
-        within("spread_wander", self.spread_wander, 0.0, 0.3)
-        within("reach_wander_mm", self.reach_wander_mm, 0.0, 3.0)
-        within("bow_wander_mm", self.bow_wander_mm, 0.0, 3.0)
-        within("strand_mm", self.strand_mm, 0.0, 1.0)
-        within("bristles", self.bristles, 50, 5000)
-        within("seed", self.seed, 0, 2**63 - 1)
 
 
 def within(name: str, value: float, low: float, high: float) -> None:

@@ -9,6 +9,7 @@ ACM TOG 39(4), 2020), by damped Newton.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -78,11 +79,16 @@ def press_spine(bundle: Bundle, depth_mm: float, tilt_rad: float) -> tuple[Spine
     At zero touch the tip of the unloaded bundle is at x = z = 0; the bundle tilts about it, then the ferrule
     moves down.
     """
+    steps = max(1, int(np.ceil(depth_mm / LOAD_STEP_MM)))
+    return lower_spine(bundle, np.linspace(0.0, depth_mm, steps + 1)[1:], tilt_rad)
+
+
+def lower_spine(bundle: Bundle, lowered_mm: Iterable[float], tilt_rad: float) -> tuple[SpineShape, ...]:
+    """The spine at each of the rising depths `lowered_mm`, which are the load steps of one descent."""
     start = _unloaded(bundle, tilt_rad)
     phi, last_x, last_normal = tilt_rad + np.cumsum(bundle.rest_bend_rad), start.last_x, start.last_normal
     path: list[SpineShape] = []
-    steps = max(1, int(np.ceil(depth_mm / LOAD_STEP_MM)))
-    for lowered in np.linspace(0.0, depth_mm, steps + 1)[1:]:
+    for lowered in lowered_mm:
         step = start.moved(0.0, float(lowered), last_x, last_normal)
         phi = step.solve(phi)
         path.append(step.shape(phi))

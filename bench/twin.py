@@ -1,0 +1,66 @@
+"""How well twins predict cells that they have not seen, and how well they repeat themselves.
+
+Brushes: the five frozen ones of the loopback rig, which the twin's own simulator pressed, and two of an independent
+bristle simulation. Nothing is a result on paper.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+
+from bench.brushfit_brushes import FROZEN
+from bench.brushfit_presses import BRISTLE_SETS, CELLS, BrushPresses, bristles, simulated
+from bench.harness import BenchError, Result
+from calibrate.fit.heldout import BEZIER, CEILING
+from sessions.progress import shown
+from twin.run import fit_presses, workers
+from twin.score import TWIN
+
+REPEATS = 3
+"""Presses of each cell: 45 in all."""
+GAP_POINTS, REPEAT_POINTS = 1.5, 1.0
+
+
+def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
+    """Fit a twin to 45 presses of each of the first `n` brushes (all seven by default) and score it.
+
+    value = CSIM points below the ceiling, or between the agreement of two captures and of two presses of the twin.
+    """
+    results: list[Result] = []
+    for brush in _brushes(n):
+        results += _scored(brush, seed)
+    return results
+
+
+def _brushes(n: int | None) -> Iterator[BrushPresses]:
+    count = len(FROZEN) + len(BRISTLE_SETS) if n is None else n
+    for k, spec in enumerate(FROZEN[:count], 1):
+        yield simulated(spec, f"frozen-{k}", REPEATS)
+    for name in BRISTLE_SETS[: max(0, count - len(FROZEN))]:
+        try:
+            yield bristles(name)
+        except BenchError as error:
+            sys.stderr.write(f"twin: {error}\n")
+
+
+def _scored(brush: BrushPresses, seed: int) -> Iterator[Result]:
+    strokes = brush.strokes([(c, r) for c in range(len(CELLS)) for r in range(min(REPEATS, brush.ink.shape[1]))])
+    with workers() as pool, shown() as progress:
+        twin = fit_presses(strokes, brush.grid, brush.radius_mm, brush.length_mm, pool, progress)
+    csim = {row.model: row.csim for row in twin.held_out}
+    gap = csim[CEILING] - csim[TWIN]
+    where = f"simulated; ceiling {csim[CEILING]:.2f}, twin {csim[TWIN]:.2f}, refitted Bezier {csim[BEZIER]:.2f} %"
+    independent = brush.name in BRISTLE_SETS
+    goal = csim[CEILING] - csim[BEZIER] if independent else GAP_POINTS
+    peer = "the refitted Bezier's gap" if independent else f"goal {GAP_POINTS:g} at most"
+    yield Result(
+        f"twin.gap.{brush.name}", gap, "CSIM points", peer, goal / max(gap, 0.01), len(strokes), seed, where
+    )
+    if twin.spread is not None:
+        off = abs(twin.spread.captured_percent - twin.spread.twin_percent)
+        words = f"simulated; two presses of a cell: {twin.spread.captured_percent:.2f} % as captured"
+        yield Result(
+            f"twin.repeats.{brush.name}", off, "CSIM points", f"goal {REPEAT_POINTS:g} at most",
+            REPEAT_POINTS / max(off, 0.01), len(strokes), seed, f"{words}, twin {twin.spread.twin_percent:.2f} %",
+        )  # fmt: skip

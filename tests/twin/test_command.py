@@ -1,0 +1,102 @@
+"""`brushloop twin`, on an imported session of shallow presses, with a short search."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import brushloop
+from calibrate.errors import CalibrationError
+from drivers.sim.brush.brush import Brush, BrushSpec
+from drivers.sim.brush_file import load_brush
+from sessions.imports.photographs import ImportOptions, import_photographs
+from tests.twin.serial import Serial
+from twin.file import notes_path
+from twin.score import PARTS
+from twin.shape import Found, Round
+
+CELLS = [(height, tilt) for height in (3.0, 4.0, 5.0) for tilt in (0.0, 5.0)]
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photos")
+    lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
+    for k, (height, tilt) in enumerate(CELLS):
+        mark = Brush(BrushSpec()).press(height, tilt, ink_load=1.0, press_seed=k)
+        page = np.full((200, 320), 235, np.uint8)
+        rows, columns = mark.density.shape
+        left, top = 250 - round(mark.origin_px[0]), 100 - round(mark.origin_px[1])
+        page[top : top + rows, left : left + columns] -= np.rint(200 * np.clip(mark.density, 0, 1)).astype(np.uint8)
+        cv2.imwrite(str(folder / f"{k}.png"), page)
+        lines.append(f"{k}.png,{height},{tilt},10.0,250.0,100.0")
+    table = folder / "strokes.csv"
+    table.write_text("\n".join(lines) + "\n")
+    out = tmp_path_factory.mktemp("sessions") / "presses"
+    import_photographs(folder, table, out, ImportOptions(kind="press"), "test", lambda: 1)
+    return out
+
+
+@contextmanager
+def _in_this_process() -> Generator[Executor]:
+    yield Serial()
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, last = Round(1.0, 1), Round(0.5, 1)
+    for name, value in {"COARSE": (first,), "FINE": last, "ROUNDS": (first, last), "workers": _in_this_process}.items():
+        monkeypatch.setattr(f"twin.run.{name}", value)
+    monkeypatch.setattr("twin.shape.INDIVIDUALS", 2)
+    monkeypatch.setattr("twin.score.VOTES", 1)
+
+
+def made(session: Path, out: Path) -> str:
+    ran = CliRunner().invoke(brushloop.app, ["twin", str(session), "--out", str(out)], catch_exceptions=False)
+    assert ran.exit_code == 0, ran.output
+    return " ".join(ran.output.split())
+
+
+@pytest.mark.usefixtures("short")
+def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
+    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, searched = tmp_path / "twin.toml", list[float]()
+
+    def counted(_target: object, found: Found, one: Round, *_: object) -> Found:
+        searched.append(one.blur_mm)
+        return found  # how a search finds its way is tested beside it
+
+    monkeypatch.setattr("twin.run.search", counted)
+    with monkeypatch.context() as broken:
+        broken.setattr("twin.run.covariance", _power_cut)
+        with pytest.raises(PowerCut):
+            made(session, out)
+    assert notes_path(out).exists()
+    assert not out.exists()
+    assert searched == [1.0, 0.5]
+
+    said = made(session, out)
+    assert searched == [1.0, 0.5] * (1 + PARTS)  # those of all cells were not repeated
+    unknown = "No cell has three captures", "The camera's noise was not measured"
+    for words in ("friction", "a third of the cells left out in turn", *unknown):
+        assert words in said
+    assert not notes_path(out).exists()
+    assert load_brush(out).name == "simulated bristle bundle (twin of presses, simulated)"
+    with pytest.raises(CalibrationError, match="exists: give --out FILE or --replace"):
+        made(session, out)
+
+
+class PowerCut(BaseException):
+    pass
+
+
+def _power_cut(*_: object) -> None:
+    raise PowerCut

@@ -1,0 +1,1 @@
+"""A twin of a brush: the simulator's brush, ink and camera noise, fitted to captured presses (`brushloop twin`)."""

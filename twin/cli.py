@@ -1,0 +1,108 @@
+"""`brushloop twin`: a simulated brush that presses like a captured one. Heavy imports wait until the command runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from calibrate.compare import MM_PER_PX
+from sessions.terminal import say
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from calibrate.fit.captures import Captures
+    from twin.run import Twin
+    from twin.shape import Found
+
+
+def twin(
+    session: Annotated[Path, typer.Argument(help="A session of presses: its folder or its .mcap file.")],
+    out: Annotated[Path | None, typer.Option(help="File to write; twin.toml in the session's folder.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
+) -> None:
+    """Fit the simulator's brush, ink and camera noise to a session's presses; writes twin.toml.
+
+    `brushloop sim --brush twin.toml` is then a rig that presses like that brush. A run that was broken off goes on
+    where it was when the same command is given again.
+    """
+    from importlib.metadata import version
+
+    from calibrate.compare.field import Field
+    from calibrate.errors import CalibrationError
+    from calibrate.files import check_target, write_whole
+    from calibrate.fit.captures import read_presses
+    from sessions.progress import shown
+    from sessions.reader import Recording
+    from twin.camera import noise_gray
+    from twin.file import Notes, notes_path, resumed, save_notes, twin_toml
+    from twin.run import fit_twin, workers
+
+    recording = Recording(session)
+    target = out or recording.path.parent / "twin.toml"
+    check_target(target, ".toml")
+    if target.exists() and not replace:
+        raise CalibrationError(str(target), "exists: give --out FILE or --replace")
+    notes_file = notes_path(target)
+    with shown() as progress:
+        captures = read_presses(session, Field(), calibration, progress)
+        used = captures.calibration.digest if captures.calibration else ""
+        fresh = Notes(
+            recording_sha256=captures.recording_sha256,
+            calibration=used,
+            mm_per_px=MM_PER_PX,
+            software=f"brushloop {version('brushloop')}",
+        )
+        kept = [resumed(notes_file, fresh)]
+
+        def keep(name: str, found: Found) -> None:
+            kept[0] = kept[0].with_step(name, found)
+            save_notes(notes_file, kept[0])
+
+        with workers() as pool:
+            try:
+                fitted = fit_twin(captures, pool, progress, kept[0].found(), keep)
+            except ValueError as error:
+                raise CalibrationError(str(recording.path), str(error)) from None
+    noise = noise_gray(recording)
+    write_whole(target, twin_toml(fitted, captures.header.session_id, noise))
+    notes_file.unlink(missing_ok=True)
+    say(*_tables(captures, fitted, noise), f"Twin: {target}")
+
+
+def _tables(captures: Captures, fitted: Twin, noise: float | None) -> Iterator[object]:
+    from rich.table import Table
+
+    from calibrate.report import source_note
+
+    yield f"{source_note(captures.header.source, captures.header.brush)}; twin of {len(captures.strokes)} presses"
+    for name, why in captures.refused:
+        yield f"left out: {name}: {why}"
+    out = Table("constant", "unit", "default", "twin", "95 %", title="simulated brush")
+    for one in fitted.estimates:
+        interval = f"{one.low:.3g} to {one.high:.3g}" if one.determined else "not determined"
+        out.add_row(one.constant.name, one.constant.unit, f"{one.constant.default:.4g}", f"{one.value:.4g}", interval)
+    yield out
+    yield (
+        f"The captured brush touched {fitted.offset.depth_mm:+.2f} mm deeper than commanded, and "
+        f"({fitted.offset.x_mm:+.2f}, {fitted.offset.y_mm:+.2f}) mm beside the point of touch; the twin does not."
+    )
+    if noise is None:
+        yield "The camera's noise was not measured: no two stills show the same view."
+    else:
+        yield f"camera noise: {noise:.2f} gray levels"
+    if fitted.held_out:
+        out = Table("model", "n", "CSIM", "SSIM", title="a third of the cells left out in turn, mm, binary, percent")
+        for row in fitted.held_out:
+            out.add_row(row.model, str(row.n), f"{row.csim:.2f}", f"{row.ssim:.2f}")
+        yield out
+    if fitted.spread is None:
+        yield "No cell has three captures: how presses differ is left as in the default brush."
+    else:
+        yield (
+            f"Two presses of a cell agree to CSIM {fitted.spread.captured_percent:.2f} % as captured, and to "
+            f"{fitted.spread.twin_percent:.2f} % from the twin."
+        )

@@ -1,0 +1,204 @@
+"""Fits a twin to the presses of a session: shape, intervals, spread, camera noise, and scores on cells left out."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibrate.fit.captures import Captures
+from calibrate.fit.heldout import HeldOut, by_cell
+from calibrate.fit.strokes import Grid, Pressed
+from drivers.sim.brush.spec import BrushSpec
+from sessions.progress import Progress, unseen
+from twin.constants import SHAPE, SPREAD, Constant, Offset, brush_at, offset_at, with_values
+from twin.drawing import Cell
+from twin.score import Scores, parts_of, predicted
+from twin.shape import COARSE, FINE, Found, Round, Target, choose_individual, covariance, search, start
+from twin.spread import FEWEST, Repeats, Spread, fit_spread
+
+MOST_WORKERS = 8
+TOLD_SD = 0.7
+"""Standard error, in scales, from which the presses count as not determining a constant: the prior's own is 1."""
+NORMAL_95 = 1.96
+ROUNDS: tuple[Round, ...] = (*COARSE, FINE)
+Keep = Callable[[str, Found], None]
+"""Called with the name of a finished step and where the search stands."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A constant of the twin with its 95 % interval."""
+
+    constant: Constant
+    value: float
+    low: float
+    high: float
+    determined: bool
+    """False where the presses do not determine it, and the value is near the default."""
+
+
+@dataclass(frozen=True, slots=True)
+class Twin:
+    """A fitted twin, and all that is reported about it."""
+
+    spec: BrushSpec
+    offset: Offset
+    estimates: tuple[Estimate, ...]
+    spread: Spread | None
+    """None where no cell has enough captures; the spread is then the default brush's."""
+    held_out: tuple[HeldOut, ...]
+    """Empty where the cells cannot be divided."""
+
+
+@contextmanager
+def workers(most: int = MOST_WORKERS) -> Generator[Executor]:
+    """Processes that draw presses, one for each core."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads of matrix products would compete with the processes
+    count = min(os.cpu_count() or 1, most)
+    with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
+        yield pool
+
+
+def fit_twin(
+    captures: Captures,
+    pool: Executor,
+    progress: Progress = unseen,
+    before: dict[str, Found] | None = None,
+    keep: Keep = lambda _name, _found: None,
+) -> Twin:
+    """Fit the twin of a session's brush; see `fit_presses`."""
+    brush = captures.radius_mm, captures.length_mm
+    return fit_presses(captures.strokes, captures.grid, *brush, pool, progress, before, keep)
+
+
+def fit_presses(
+    strokes: Sequence[Pressed],
+    grid: Grid,
+    radius_mm: float,
+    length_mm: float,
+    pool: Executor,
+    progress: Progress = unseen,
+    before: dict[str, Found] | None = None,
+    keep: Keep = lambda _name, _found: None,
+) -> Twin:
+    """Fit the twin of a brush of this size to its presses.
+
+    `before` holds the finished steps of a run that was broken off; `keep` is given each new one.
+    Raises ValueError for a press that is deeper than a brush of this size allows.
+    """
+    cells = by_cell(strokes)
+    target = target_of(cells, radius_mm, length_mm, grid)
+    parts = parts_of(target.cells)
+    ticks = _Ticks(progress, (1 + len(parts)) * sum(one.steps for one in ROUNDS))
+    run = _Run(pool, ticks, before or {}, keep)
+    found = run.shape("all cells", target)
+    errors = np.sqrt(np.diagonal(covariance(target, found, pool)))
+    spec, offset = brush_at(found.point, replace(target.base, seed=found.seed)), offset_at(found.point)
+    repeats = repeats_of(cells)
+    spread = fit_spread(spec, offset, repeats, grid) if repeats.cells else None
+    estimates = [_estimate(*one) for one in zip(SHAPE, found.point, errors, strict=False)]
+    if spread is not None:
+        spec = with_values(spec, SPREAD, spread.point)
+        estimates += [_estimate(*one) for one in zip(SPREAD, spread.point, spread.error, strict=True)]
+    scores = Scores()
+    for number, part in enumerate(parts, 1):
+        kept = [k for k in range(len(cells)) if k not in part]
+        there = run.shape(f"part {number} left out", target.only(kept))
+        score_part(scores, cells, [target.cells[k] for k in part], there, target, spread)
+    ticks.end()
+    return Twin(spec, offset, tuple(estimates), spread, tuple(scores.rows()))
+
+
+def score_part(
+    scores: Scores, cells: dict[Cell, list[Pressed]], held: list[Cell], there: Found, target: Target,
+    spread: Spread | None,
+) -> None:  # fmt: skip
+    """Score the cells `held` by the twin found without them."""
+    spec = brush_at(there.point, replace(target.base, seed=there.seed))
+    if spread is not None:
+        spec = with_values(spec, SPREAD, spread.point)
+    images = predicted(spec, offset_at(there.point), held, target.grid)
+    others = [one for cell, group in cells.items() if cell not in held for one in group]
+    scores.add({cell: cells[cell] for cell in held}, others, images, target.grid)
+
+
+def target_of(cells: dict[Cell, list[Pressed]], radius_mm: float, length_mm: float, grid: Grid) -> Target:
+    """The mean capture of each cell."""
+    means = [np.mean([one.ink for one in group], axis=0) for group in cells.values()]
+    base = BrushSpec(radius_mm=radius_mm, length_mm=length_mm, seed=0)
+    return Target(base, tuple(cells), grid, np.asarray(means, np.float32))
+
+
+def repeats_of(cells: dict[Cell, list[Pressed]]) -> Repeats:
+    """The captures of the cells that have at least `FEWEST`."""
+    several = {cell: group for cell, group in cells.items() if len(group) >= FEWEST}
+    return Repeats(tuple(several), tuple(np.array([one.ink for one in group]) for group in several.values()))
+
+
+class _Ticks:
+    """Progress over all passes; a pass that ends early counts as if it had taken all its steps."""
+
+    def __init__(self, progress: Progress, total: int) -> None:
+        self._progress = progress
+        self._total = total
+        self._done = 0
+        self._due = 0
+        progress("twin: steps of the search", 0, total)
+
+    def tick(self) -> None:
+        self._done = min(self._done + 1, self._total)
+        self._progress("twin: steps of the search", self._done, self._total)
+
+    def passed(self, steps: int) -> None:
+        """A pass of so many steps has ended."""
+        self._due += steps
+        self._done = max(self._done, self._due) - 1
+        self.tick()
+
+    def end(self) -> None:
+        self.passed(self._total - self._due)
+
+
+class _Run:
+    """The searches of one twin, of which those that are known from before are not repeated."""
+
+    def __init__(self, pool: Executor, ticks: _Ticks, before: dict[str, Found], keep: Keep) -> None:
+        self._pool = pool
+        self._ticks = ticks
+        self._before = before
+        self._keep = keep
+
+    def shape(self, what: str, target: Target) -> Found:
+        found = self._individual(f"{what}, first individual", target, start())
+        for one in COARSE:
+            found = self._step(f"{what}, blur {one.blur_mm:g} mm", one, target, found)
+        found = self._individual(f"{what}, individual", target, found)
+        return self._step(f"{what}, blur {FINE.blur_mm:g} mm", FINE, target, found)
+
+    def _individual(self, name: str, target: Target, found: Found) -> Found:
+        return self._known(name, lambda: choose_individual(target, found, self._pool))
+
+    def _step(self, name: str, one: Round, target: Target, found: Found) -> Found:
+        ended = self._known(name, lambda: search(target, found, one, self._pool, self._ticks.tick))
+        self._ticks.passed(one.steps)
+        return ended
+
+    def _known(self, name: str, work: Callable[[], Found]) -> Found:
+        if name in self._before:
+            return self._before[name]
+        found = work()
+        self._keep(name, found)
+        return found
+
+
+def _estimate(constant: Constant, scales: float, error: float) -> Estimate:
+    ends = (constant.value(scales + way * NORMAL_95 * error) for way in (-1.0, 1.0))
+    low, high = constant.bounds
+    inside = low + 0.01 < scales < high - 0.01
+    return Estimate(constant, constant.value(scales), *ends, determined=bool(error < TOLD_SD and inside))

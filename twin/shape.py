@@ -1,0 +1,154 @@
+"""Fits the mean press of each cell: mechanics, ink and place, by least squares on blurred images.
+
+The images are blurred less from round to round: a wide blur gives the search a slope from far away, a narrow one the
+detail. The minimiser is SciPy's trust-region least squares with bounds; its derivatives are differences between brushes
+that press with the same seeds. A prior of one scale on each constant keeps what the presses do not determine at its
+default.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from functools import partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.fit.strokes import Grid
+from drivers.sim.brush.spec import BrushSpec
+from twin.constants import SHAPE, Vector, brush_at, offset_at, search_bounds
+from twin.drawing import Cell, Images, draw, still
+
+IMAGE_SD = 0.12
+"""Deviation of a blurred pixel that weighs as much as a constant one scale from its default: the deviations of
+neighbouring pixels are not independent, and a brush differs from this one in more than its constants."""
+STEP = 0.3
+"""Scales by which a constant is changed for its derivative."""
+EVERY = 2
+"""Blurred images are compared at each second row and column."""
+NEAR_BOUND = 1e-3
+INDIVIDUALS = 32
+"""Seeds of the individual (its hairs and how they clump) that are tried."""
+FINEST_MM = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """One pass of the search: the blur, and the most steps."""
+
+    blur_mm: float
+    steps: int
+
+
+COARSE = (Round(1.2, 6), Round(0.5, 6))
+FINE = Round(FINEST_MM, 4)
+"""The pass after the individual has been chosen."""
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """What a twin is fitted to."""
+
+    base: BrushSpec
+    """Radius and length of the brush; everything else at its default."""
+    cells: tuple[Cell, ...]
+    grid: Grid
+    mean: Images
+    """(cells, len(y_mm), len(x_mm)) mean ink of each cell's captures."""
+
+    def only(self, kept: Sequence[int]) -> Target:
+        """The same with some of the cells."""
+        return replace(self, cells=tuple(self.cells[k] for k in kept), mean=self.mean[list(kept)])
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Where a search stands: the point, and the seed of the individual."""
+
+    point: Vector
+    seed: int
+
+
+Map = Callable[[Callable[[Vector], Vector], Iterable[Vector]], Iterable[Vector]]
+"""The built-in `map`, or an executor's."""
+
+
+def start() -> Found:
+    """The default brush."""
+    return Found(np.zeros(len(SHAPE) + 3), 0)
+
+
+def off(target: Target, seed: int, blur_mm: float, point: Vector) -> Vector:
+    """Differences of blurred pixels between brush and captures, in `IMAGE_SD`, then the prior's."""
+    base = replace(target.base, seed=seed)
+    drawn = draw(still(brush_at(point, base)), offset_at(point), target.cells, target.grid)[:, 0]
+    apart = blurred(drawn - target.mean, blur_mm, target.grid)
+    return np.concatenate([apart.ravel() / IMAGE_SD, point])
+
+
+def blurred(images: Images, blur_mm: float, grid: Grid) -> NDArray[np.float64]:
+    """Each second row and column of images (n, rows, columns) after a Gaussian blur."""
+    sigma = blur_mm / grid.px_mm
+    soft = [cv2.GaussianBlur(image, (0, 0), sigma)[::EVERY, ::EVERY] for image in images]
+    return np.asarray(soft, np.float64)
+
+
+def search(target: Target, found: Found, one: Round, workers: Executor, tick: Callable[[], None]) -> Found:
+    """One pass from where the search stands; `tick` is called after each step's derivatives."""
+    from scipy.optimize import least_squares  # slow to import
+
+    low, high = search_bounds()
+    evaluate = partial(off, target, found.seed, one.blur_mm)
+
+    def slopes(point: Vector) -> NDArray[np.float64]:
+        tick()
+        return derivatives(evaluate, point, high, STEP, workers.map)
+
+    began = np.clip(found.point, low + NEAR_BOUND, high - NEAR_BOUND)
+    best = least_squares(
+        evaluate, began, jac=slopes, bounds=(low, high), max_nfev=one.steps, xtol=1e-3, ftol=1e-3, gtol=None
+    )
+    return Found(np.asarray(best.x, np.float64), found.seed)
+
+
+def derivatives(
+    evaluate: Callable[[Vector], Vector], point: Vector, high: Vector, step: float, each: Map = map
+) -> NDArray[np.float64]:
+    """(residuals, constants) by differences of one step, downward where the upper bound is nearer than that."""
+    steps = np.where(point + step < high, step, -step)
+    here, *there = each(evaluate, [point, *(point + np.diag(steps))])
+    return np.column_stack([(one - here) / by for one, by in zip(there, steps, strict=True)])
+
+
+def choose_individual(target: Target, found: Found, workers: Executor) -> Found:
+    """The seed whose hairs, with the constants found, come nearest to the captures."""
+    seeds = range(INDIVIDUALS)
+    tried = [partial(off, target, seed, FINEST_MM) for seed in seeds]
+    squares = [float(one @ one) for one in workers.map(_call, tried, [found.point] * len(tried), chunksize=4)]
+    return Found(found.point, seeds[int(np.argmin(squares))])
+
+
+def _call(evaluate: Callable[[Vector], Vector], point: Vector) -> Vector:
+    return evaluate(point)
+
+
+def covariance(target: Target, found: Found, workers: Executor) -> NDArray[np.float64]:
+    """Covariance (constants, constants) of the point in scales, with whole cells as what varies.
+
+    The sandwich of a least-squares fit: what each cell asks to be changed, the model's own errors included, spreads
+    over the cells. The prior counts as one more observation of each constant.
+    """
+    _, high = search_bounds()
+    evaluate = partial(off, target, found.seed, FINEST_MM)
+    jacobian = derivatives(evaluate, found.point, high, STEP, workers.map)
+    residual = evaluate(found.point)
+    count, constants = len(target.cells), len(found.point)
+    of_cells = jacobian[:-constants].reshape(count, -1, constants)
+    pulls = np.einsum("cij,ci->cj", of_cells, residual[:-constants].reshape(count, -1))
+    pulls -= pulls.mean(axis=0)
+    spread = pulls.T @ pulls * count / max(count - 1, 1)
+    inverse = np.linalg.inv(jacobian.T @ jacobian)
+    return np.asarray(inverse @ (spread + np.eye(constants)) @ inverse, np.float64)

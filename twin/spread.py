@@ -1,0 +1,115 @@
+"""Fits how presses of one cell differ: spread, reach and bow of the tip, and stray of the hairs.
+
+Four statistics of repeats, four constants. Simulated presses have the same seeds for every brush tried.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from calibrate.compare.similarity import csim
+from calibrate.fit.strokes import Grid
+from drivers.sim.brush.spec import BrushSpec
+from twin.constants import SPREAD, Offset, Vector, with_values
+from twin.drawing import Cell, Images, draw
+from twin.shape import derivatives
+
+REPEATS = 6
+"""Simulated presses of a cell."""
+FIRST_SEED = 500
+TIP_SHARE = 1.0 / 3.0
+"""Share of the mark, from its tip, whose middle tells the bow."""
+PRIOR_SD = 2.0
+STEP = 0.3
+STEPS = 6
+FEWEST = 3
+"""Captures of a cell from which its spread is measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class Repeats:
+    """Captures of the cells that have several; (n, len(y_mm), len(x_mm)) each."""
+
+    cells: tuple[Cell, ...]
+    ink: tuple[Images, ...]
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom of a deviation pooled over the cells."""
+        return sum(len(one) - 1 for one in self.ink)
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """The four constants in scales from their defaults, their standard errors, and the agreement of repeats."""
+
+    point: tuple[float, ...]
+    error: tuple[float, ...]
+    captured_percent: float
+    """Mean CSIM of two captures of a cell."""
+    twin_percent: float
+    """The same of the twin."""
+
+
+def fit_spread(spec: BrushSpec, offset: Offset, repeats: Repeats, grid: Grid) -> Spread:
+    """Match the statistics of the captures. Raises ValueError without a cell that has `FEWEST` captures."""
+    from scipy.optimize import least_squares  # slow to import
+
+    if not repeats.cells:
+        raise ValueError(f"no cell has {FEWEST} captures")
+    seen = statistics(repeats.ink, grid)
+    # twice the relative standard error of a deviation with so many degrees of freedom: the simulated one has its own
+    sd = 2.0 / math.sqrt(2.0 * repeats.freedom)
+
+    def off(point: Vector) -> Vector:
+        drawn = statistics(_drawn(with_values(spec, SPREAD, point), offset, repeats, grid), grid)
+        return np.concatenate([(drawn - seen) / sd, point / PRIOR_SD])
+
+    low, high = np.array([one.bounds for one in SPREAD]).T
+    best = least_squares(
+        off,
+        np.zeros(len(SPREAD)),
+        jac=lambda point: derivatives(off, point, high, STEP),
+        bounds=(low, high),
+        max_nfev=STEPS,
+    )
+    twin = _drawn(with_values(spec, SPREAD, best.x), offset, repeats, grid)
+    jacobian = np.asarray(best.jac, np.float64)
+    error = np.sqrt(np.diagonal(np.linalg.inv(jacobian.T @ jacobian)))
+    return Spread(tuple(map(float, best.x)), tuple(map(float, error)), agreement(repeats.ink), agreement(twin))
+
+
+def statistics(ink: Sequence[Images], grid: Grid) -> Vector:
+    """Logarithms of: deviation of log area, of the tip's place and of its bow in mm, and 1 - CSIM of two repeats."""
+    measured = [np.array([_measure(image, grid) for image in cell]) for cell in ink]
+    freedom = sum(len(one) - 1 for one in measured)
+    squares = sum(((one - one.mean(axis=0)) ** 2).sum(axis=0) for one in measured)
+    deviations = np.sqrt(np.asarray(squares) / max(freedom, 1))
+    return np.log(np.append(deviations, 1.0 - agreement(ink) / 100.0) + 1e-6)
+
+
+def agreement(ink: Sequence[Images]) -> float:
+    """Mean CSIM in percent of two repeats of a cell, as binary images."""
+    binary = [(cell > 0.5).astype(np.float32) for cell in ink]
+    pairs = [csim(a, b) for cell in binary for a, b in combinations(cell, 2)]
+    return 100.0 * float(np.mean(pairs))
+
+
+def _measure(image: Images, grid: Grid) -> tuple[float, float, float]:
+    ink = image > 0.5
+    columns = np.flatnonzero(ink.any(axis=0))
+    if not columns.size:
+        return 0.0, 0.0, 0.0
+    first, last = int(columns[0]), int(columns[-1])
+    tip = ink[:, first : first + max(1, round(TIP_SHARE * (last - first + 1)))]
+    middle = float((tip.sum(axis=1) * grid.y_mm).sum() / tip.sum())
+    return math.log(float(ink.sum())), float(grid.x_mm[first]), middle
+
+
+def _drawn(spec: BrushSpec, offset: Offset, repeats: Repeats, grid: Grid) -> list[Images]:
+    return list(draw(spec, offset, repeats.cells, grid, REPEATS, FIRST_SEED))
