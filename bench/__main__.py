@@ -44,6 +44,7 @@ def benches() -> dict[str, Bench]:
         "structure": _late("structure"),
         "tables": _late("tables"),
         "tui": _late("tui"),
+        "twin": _late("twin"),
         "validate": _late("validate"),
         "written": _late("written"),
     }

@@ -27,7 +27,7 @@ from bench.harness import BenchError, Result
 from bench.processes import started
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("collect", "calibrate", "drivers", "sessions", "model")
+PACKAGES = ("collect", "calibrate", "drivers", "sessions", "model", "twin")
 LONG, SHORT = 300, 40
 IMAGE_PX = 64 * 64
 """An array of two dimensions and as many values is taken for an image."""

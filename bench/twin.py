@@ -54,9 +54,7 @@ def _scored(brush: BrushPresses, seed: int) -> Iterator[Result]:
     independent = brush.name in BRISTLE_SETS
     goal = csim[CEILING] - csim[BEZIER] if independent else GAP_POINTS
     peer = "the refitted Bezier's gap" if independent else f"goal {GAP_POINTS:g} at most"
-    yield Result(
-        f"twin.gap.{brush.name}", gap, "CSIM points", peer, goal / max(gap, 0.01), len(strokes), seed, where
-    )
+    yield Result(f"twin.gap.{brush.name}", gap, "CSIM points", peer, goal / max(gap, 0.01), len(strokes), seed, where)
     if twin.spread is not None:
         off = abs(twin.spread.captured_percent - twin.spread.twin_percent)
         words = f"simulated; two presses of a cell: {twin.spread.captured_percent:.2f} % as captured"

@@ -41,6 +41,7 @@ ACCURACY = {
     "written": 1300,
     "adaptive": 600,
     "brushfit": 1800,
+    "twin": 2400,
 }
 """What takes longer, because it trains, fits or presses: how good the results are, rather than how quick."""
 MOST_TIMES, MORE_S = 6, 180

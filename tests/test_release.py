@@ -68,3 +68,23 @@ def test_a_shell_is_given_what_completes_a_command(
     if not command.is_file():
         pytest.skip("brushloop is not installed beside this Python")
     assert completed in run(command, cwd=tmp_path, _BRUSHLOOP_COMPLETE=f"complete_{shell}", **typed)
+
+
+LABS_TEST = """
+import tomllib
+
+def test_the_rig_is_served(brushloop_rig):
+    assert tomllib.loads(brushloop_rig.read_text())["name"] == "loopback rig"
+
+def test_the_twin_presses(brushloop_twin):
+    assert tomllib.loads(brushloop_twin.read_text())["brush"]["name"] == "our brush, simulated"
+"""
+
+
+@pytest.mark.soak  # builds and installs
+def test_a_labs_own_tests_get_a_rig_and_its_twin(brushloop: Path, tmp_path: Path) -> None:
+    (tmp_path / "twin.toml").write_text('name = "our brush, simulated"\n[brush]\nfriction = 0.3\n')
+    (tmp_path / "pytest.ini").write_text("[pytest]\nbrushloop_twin = twin.toml\n")
+    (tmp_path / "test_ours.py").write_text(LABS_TEST)
+    said = run(brushloop.with_name("python"), "-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=tmp_path)
+    assert "2 passed" in said
