@@ -43,6 +43,11 @@ def say(*parts: object, err: bool = False) -> None:
             plain_console(stderr=err).print(part)
 
 
+def narrow() -> bool:
+    """Whether the terminal has fewer than 80 columns; tables then leave out what can be spared."""
+    return plain_console().width < 80
+
+
 def plain_console(*, stderr: bool = False) -> Console:
     """Make a rich console for tables and progress bars: no markup, and no control character but the console's own.
 

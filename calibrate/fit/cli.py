@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calibrate.compare import MM_PER_PX
-from sessions.terminal import say
+from sessions.terminal import narrow, say
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -97,8 +97,9 @@ def _drag_tables(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:
     from rich.table import Table
 
     from calibrate.drags.report import ends_sentence
-    from calibrate.report import source_note
+    from calibrate.report import source_label, source_note
 
+    label = source_label(drawn.header.source, [drawn.header.brush])
     yield (
         f"{source_note(drawn.header.source, drawn.header.brush)}; "
         f"{artefact.strokes} dragged strokes in {artefact.images} images; condition number {artefact.condition:.3g}"
@@ -113,7 +114,7 @@ def _drag_tables(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:
     if artefact.prior:
         adapted = ", ".join(artefact.refitted)
         yield f"The brush of {artefact.prior_session} (fit {artefact.prior}), of which are adapted: {adapted}."
-    out = Table("parameter", "fitted", "95 %", title="drag model, mm")
+    out = Table("parameter", "fitted", "95 %", title=f"drag model, mm ({label})")
     for name, found in artefact.parameters.items():
         interval = "not determined" if found.low is None else f"{found.low:.3f} to {found.high:.3f}"
         if artefact.prior and name not in artefact.refitted:
@@ -123,7 +124,8 @@ def _drag_tables(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:
     if artefact.kept is not None:
         yield f"Ink is where its chance is above {artefact.ink_above:g}, which follows from the training strokes."
     if artefact.held_out:
-        out = Table("model", "n", "CSIM", "IoU", title="a fifth left out in turn, where the command put it, percent")
+        title = f"a fifth left out in turn, where the command put it, percent ({label})"
+        out = Table("model", "n", "CSIM", "IoU", title=title)
         for name, score in artefact.held_out.items():
             out.add_row(name, str(score.images), f"{score.csim_percent:.2f}", f"{score.iou_percent:.2f}")
         yield out
@@ -135,19 +137,20 @@ def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
     from rich.table import Table
 
     from calibrate.fit.run import NAMES
-    from calibrate.report import source_note
+    from calibrate.report import source_label, source_note
     from model.fitted import PARAMETERS
 
     artefact = fitted.artefact
     yield f"{source_note(captures.header.source, captures.header.brush)}; {len(captures.strokes)} presses fitted"
     for name, why in captures.refused:
         yield f"left out: {name}: {why}"
-    out = Table("parameter", "published", "fitted", "95 %", "from strokes", title="brush")
+    label = source_label(captures.header.source, [captures.header.brush])
+    published = [] if narrow() else ["published"]
+    out = Table("parameter", *published, "fitted", "95 %", "from strokes", title=f"brush ({label})")
     for name, parameter in zip(NAMES, PARAMETERS, strict=True):
         found, share = artefact.parameters[name], artefact.from_strokes[name]
-        out.add_row(
-            name, f"{parameter.start:.3f}", f"{found.value:.3f}", f"{found.low:.3f} to {found.high:.3f}", f"{share:.0%}"
-        )
+        start = [f"{parameter.start:.3f}"] if published else []
+        out.add_row(name, *start, f"{found.value:.3f}", f"{found.low:.3f} to {found.high:.3f}", f"{share:.0%}")
     yield out
     yield (
         "The intervals hold within the model. “From strokes” is the share of the variance among known brushes that "
@@ -160,7 +163,7 @@ def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
     if not fitted.held_out:
         yield "One cell only: nothing can be held out."
         return
-    out = Table("model", "n", "CSIM", "SSIM", title="leave one cell out, mm, binary, percent")
+    out = Table("model", "n", "CSIM", "SSIM", title=f"leave one cell out, mm, binary, percent ({label})")
     for row in fitted.held_out:
         out.add_row(row.model, str(row.n), f"{row.csim:.2f}", f"{row.ssim:.2f}")
     yield out

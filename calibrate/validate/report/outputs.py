@@ -6,7 +6,7 @@ import hashlib
 import importlib
 import io
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from calibrate.validate.report import findings, tables
 from calibrate.validate.report.data import Report, Stat
 from calibrate.validate.run import REPEATED, Outcome
 from sessions.cells import CsvWriter
+from sessions.terminal import narrow
 
 COLUMNS = ("session_id", "stroke_id", "height_mm", "tilt_deg", "model", "alignment", "tone", "csim", "ssim", "source")
 GROUP = 2000
@@ -184,26 +185,12 @@ def summary(report: Report) -> Iterator[Table | str]:
 def _scores(report: Report, alignment: Alignment) -> Table:
     # The paper's numbers are shown only in the table made in the same way, as far as the paper describes it.
     with_paper = alignment is Alignment.SIZE_NORMALISED
-    columns = [
-        "model",
-        "n",
-        "CSIM max",
-        "min",
-        "avg",
-        "SSIM max",
-        "min",
-        "avg",
-        *(["paper's avg"] if with_paper else []),
-    ]
     title = f"{alignment}, binary, ink = 1, percent ({report.label})"
-    out = Table(*columns, title=title)
+    out = Table("model", *_heads(with_paper=with_paper), title=title)
     others = tables.robot_writing(report, alignment, Tone.BINARY)
     for row in (*tables.table_2(report, alignment, Tone.BINARY), *others):
-        if row.ours is None:
-            continue
-        paper = f"{row.paper[2]:.2f} / {row.paper[5]:.2f}" if row.paper is not None else ""
-        cells = [row.label + SHORT.get(row.basis, ""), str(row.n), *(f"{v:.2f}" for v in row.ours)]
-        out.add_row(*cells, *([paper] if with_paper else []))
+        if row.ours is not None:
+            out.add_row(row.label + SHORT.get(row.basis, ""), *_cells(row, row.ours, with_paper=with_paper))
     return out
 
 
@@ -212,22 +199,21 @@ def _character(report: Report, one: tables.CharacterTables) -> Iterator[Table]:
     for alignment, rows in ((Alignment.SIZE_NORMALISED, one.paper_like), (Alignment.MM, one.strict)):
         for polarity, group in itertools.groupby(rows, key=lambda row: row.basis.partition(";")[0]):
             with_paper = alignment is Alignment.SIZE_NORMALISED
-            columns = [
-                "n",
-                "CSIM\nmax",
-                "min",
-                "avg",
-                "SSIM\nmax",
-                "min",
-                "avg",
-                *(["paper's avg"] if with_paper else []),
-            ]
             title = f"Table 3: {one.character}, {alignment}, binary, {polarity}, percent ({report.label})"
-            paper_column = ["paper's avg"] if with_paper else []
-            out = Table(Column("", min_width=len("simulated")), *columns, *paper_column, title=title)
+            out = Table(Column("", min_width=len("simulated")), *_heads(with_paper=with_paper), title=title)
             for row in group:
                 assert row.ours is not None, "rows of Table 3 are rows of ours"
-                paper = f"{row.paper[2]:.2f} / {row.paper[5]:.2f}" if row.paper is not None else ""
-                cells = [row.label, str(row.n), *(f"{value:.2f}" for value in row.ours)]
-                out.add_row(*cells, *([paper] if with_paper else []))
+                out.add_row(row.label, *_cells(row, row.ours, with_paper=with_paper))
             yield out
+
+
+def _heads(*, with_paper: bool) -> list[str]:
+    """Heads of the columns of scores; a narrow terminal has room for averages only."""
+    scores = ["CSIM\navg", "SSIM\navg"] if narrow() else ["CSIM\nmax", "min", "avg", "SSIM\nmax", "min", "avg"]
+    return ["n", *scores, *(["paper's avg"] if with_paper else [])]
+
+
+def _cells(row: tables.PaperRow, ours: Sequence[float], *, with_paper: bool) -> list[str]:
+    scores = [ours[2], ours[5]] if narrow() else ours
+    paper = f"{row.paper[2]:.2f} / {row.paper[5]:.2f}" if row.paper is not None else ""
+    return [str(row.n), *(f"{score:.2f}" for score in scores), *([paper] if with_paper else [])]

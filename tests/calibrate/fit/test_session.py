@@ -18,7 +18,7 @@ from calibrate.fit.captures import read_presses
 from calibrate.fit.run import correction, fit_session
 from calibrate.validate.report.data import load_report
 from drivers.sim.brush.brush import Brush, BrushSpec
-from model.fitted import NAME
+from model.fitted import NAME, NAMES
 from sessions.imports.photographs import ImportOptions, import_photographs
 
 CELLS = [(11.0, 0.0), (11.0, 10.0), (15.0, 5.0), (20.0, 0.0), (20.0, 10.0)]
@@ -51,9 +51,12 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> None:
-    ran = CliRunner().invoke(app, ["fit", str(session), "--mm-per-px", "0.4", "--correction"])
+    narrow = CliRunner(env={"COLUMNS": "60"})
+    ran = narrow.invoke(app, ["fit", str(session), "--mm-per-px", "0.4", "--correction"])
     assert ran.exit_code == 0, ran.output
     said = " ".join(ran.output.split())
+    for head in (*NAMES, "95 %", "from strokes", "brush (imported"):
+        assert head in said, "a column head or a name is cut in 60 columns"
     for words in ("leave one cell out", "refitted Bezier", "uncalibrated", "from strokes", "paper.touch_z_mm: add"):
         assert words in said
     path = current(session, FOLDER)
@@ -61,10 +64,10 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     fit = load_artefact(path, BrushFit)
     assert fit.strokes == 5
     assert fit.csim_percent["fitted"] > fit.csim_percent["uncalibrated"] + 3.0
-    ran = CliRunner().invoke(
-        app, ["validate", str(session), "--mm-per-px", "0.4", "--model", "ccd-bsm", "--model", NAME]
-    )
+    ran = narrow.invoke(app, ["validate", str(session), "--mm-per-px", "0.4", "--model", "ccd-bsm", "--model", NAME])
     assert ran.exit_code == 0, ran.output
+    assert "paper's avg" in ran.output
+    assert "…" not in ran.output
     report = load_report(session / "validation" / "report.json")
     [rival] = [one for one in report.rivals if one.name == NAME]
     assert rival.basis == "fitted, in sample"
