@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 from sessions.cli import app
 from sessions.errors import InputError
 from sessions.remarks import mark_bad_or_good
+from sessions.repair.verify import verify_session
 from sessions.show import GridCell, Sheet, details
 from sessions.show_text import ranges
 from sessions.store import SessionStore
@@ -107,3 +108,17 @@ def test_files_are_counted_and_listed_only_where_that_is_asked_for(collected):
 def test_what_is_not_there_is_refused(tmp_path):
     with pytest.raises(InputError, match="no such session"):
         details(tmp_path / "gone")
+
+
+def test_a_recording_of_the_earlier_protocol_adaptive_is_shown_closed_and_verified(make, tmp_path):
+    protocol = '{"kind":"adaptive","heights_mm":[13.0,15.0],"tilts_deg":[5.0],"repeats":10,"enough_points":1.0}'
+    header = make.header.model_copy(update={"protocol": protocol})
+    store = SessionStore.create(tmp_path / header.session_id, header, make.snapshots, make.clock())
+    chosen = {"number": 0, "points": 9.0, "ink_sha256": "0" * 64, "stop": False, "height_mm": 13.0, "tilt_deg": 5.0}
+    store.done(store.begin("choose 0", "choose", cell=None, notes={"params": {}}), chosen)
+    press(make, store, "001-H13-a5", 13.0, 0)
+    shown = details(store.folder)
+    assert (shown.strokes, shown.planned, shown.finished["choose"]) == (1, None, 1)
+    final = store.close()
+    assert details(final).grid == [GridCell(13.0, 5.0, 1, None)]
+    assert verify_session(store.folder).sound
