@@ -6,11 +6,8 @@ Nothing here imports torch, which preparing and scoring do not need.
 from __future__ import annotations
 
 import hashlib
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from functools import lru_cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -25,7 +22,7 @@ from calibrate.stroke.measure import Measured, measure
 from calibrate.stroke.params import Params
 from calibrate.validate.store import VERSION, Store
 from sessions.errors import SessionDamaged
-from sessions.reader import Capture, Place, Recording, capture_at
+from sessions.reader import Capture, Place, capture_at
 
 if TYPE_CHECKING:
     from calibrate.validate.pool import Scheduler
@@ -108,22 +105,10 @@ def prepare_job(job: PrepareJob) -> Press:
     return Press(stroke.stroke_id, height, tilt, again, pixels, measured, prepared.cut, prepared.flags, "")
 
 
-@lru_cache(maxsize=8)
-def opened(session: str, sha256: str) -> Path:
-    """The recording as a file of this machine, checked once; a URL is copied. Raises what reading it raises."""
-    from calibrate.validate.sources import URL, fetched
-
-    if URL.match(session):
-        address = session.partition("#")[0]
-        return fetched(f"{address}#sha256={sha256}", Path(tempfile.gettempdir()) / "brushloop-recordings")
-    recording = Recording(Path(session))
-    if recording.sha256 != sha256:
-        raise SessionDamaged(recording.path, "is another recording there: its SHA-256 differs")
-    return recording.path
-
-
 def read_job(job: ReadJob) -> Press | None:
     """Read a capture and prepare it; None where it does not follow the stroke before, as our recordings have it."""
+    from calibrate.validate.sources import opened  # what prepares alone needs no URLs
+
     try:
         capture = capture_at(opened(job.session, job.sha256), job.place)
     except SessionDamaged:

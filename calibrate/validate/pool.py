@@ -132,7 +132,7 @@ class Dask(AbstractContextManager["Dask"]):
 
     def opens(self, session: str, sha256: str) -> bool:
         """Whether every worker has the recording there; if not, photographs are sent and `notes` says why."""
-        from calibrate.validate.jobs import opened
+        from calibrate.validate.sources import opened
 
         found: dict[str, Any] = self._client.run(opened, session, sha256, on_error="return")
         for worker, answer in found.items():

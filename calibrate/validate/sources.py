@@ -11,8 +11,10 @@ import importlib
 import os
 import re
 import sys
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -139,6 +141,18 @@ def fetched(url: str, folder: Path) -> Path:
     except (OSError, ValueError, NotImplementedError, *_backend_errors()) as error:
         raise CalibrationError(address, f"cannot be read: {_line(error)}") from None
     return target
+
+
+@lru_cache(maxsize=8)
+def opened(session: str, sha256: str) -> Path:
+    """The recording as a file of this machine, checked once; a URL is copied. Raises what reading it raises."""
+    if URL.match(session):
+        address = session.partition("#")[0]
+        return fetched(f"{address}#sha256={sha256}", Path(tempfile.gettempdir()) / "brushloop-recordings")
+    recording = Recording(Path(session))
+    if recording.sha256 != sha256:
+        raise SessionDamaged(recording.path, "is another recording there: its SHA-256 differs")
+    return recording.path
 
 
 def _backend_errors() -> tuple[type[Exception], ...]:

@@ -21,7 +21,7 @@ from collect.errors import ConfigError
 from collect.headless import REFRESH_S, RunnableEngine
 from collect.operator import OperatorRequest
 from collect.tui.browser import SessionBrowser
-from collect.tui.keys import CAN_PAUSE, CAN_RESUME, RUN_BINDINGS, RUN_KEYS, HelpScreen, is_stop_key
+from collect.tui.keys import CAN_PAUSE, CAN_RESUME, RUN_BINDINGS, RUN_KEYS, help_text, is_stop_key
 from collect.tui.pictures import Pictures
 from collect.tui.question_screens import AT_WORK, NOT_AT_REST, NOT_PARKED, AskScreen, Confirm
 from collect.tui.run_screen import RunScreen
@@ -29,6 +29,7 @@ from collect.tui.set_up_screen import SetUpScreen
 from collect.tui.start_screen import StartScreen
 from collect.tui.terminal import PlainApp, TerminalDriver
 from collect.tui.text import plain
+from collect.tui.widgets import HelpScreen
 from sessions.errors import SessionError
 from sessions.remarks import mark_bad_or_good
 
@@ -155,7 +156,7 @@ class OperatorApp(PlainApp):
     def action_help(self) -> None:
         """Show every key."""
         if not isinstance(self.screen, HelpScreen):
-            self.push_screen(HelpScreen())
+            self.push_screen(HelpScreen(help_text()))
 
     def action_review(self) -> None:
         """Look through the captures of the run that is shown."""

@@ -1,4 +1,4 @@
-"""The keys of a run: the stop keys, the other keys, which of them do something in a state, and the help page.
+"""The keys of a run: the stop keys, the other keys, which of them do something in a state, and the text of the help.
 
 `OperatorApp` passes each key to `is_stop_key` before any screen or field sees it.
 """
@@ -6,14 +6,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from textual import events
-from textual.app import ComposeResult
-from textual.binding import Binding, BindingType
-from textual.containers import VerticalScroll
-from textual.screen import ModalScreen
-from textual.widgets import Static
+from textual.binding import Binding
 
 from collect.engine.control import FINAL, State
 from collect.tui.text import SOFTWARE_STOP
@@ -88,25 +83,7 @@ The same command resumes a session, after a crash or a lost terminal too:
 no stroke twice, no cell of a sheet twice."""
 
 
-class HelpScreen(ModalScreen[None]):
-    """Every key and sign on one page; any of its own keys closes it."""
-
-    DEFAULT_CSS = """
-    HelpScreen { align: center middle; }
-    HelpScreen VerticalScroll {
-        width: 80; max-width: 100%; height: auto; max-height: 100%; padding: 0 1;
-        border: heavy $accent; background: $surface;
-    }
-    """
-    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,q,question_mark,enter", "close", "Close")]
-
-    def compose(self) -> ComposeResult:
-        """Lay out the page."""
-        with VerticalScroll() as page:
-            page.border_title = "Help, escape closes"
-            lines = [f"{'s, ctrl-c' if key.key == 's' else key.key:<11} {key.what}" for key in RUN_KEYS]
-            yield Static("\n".join([*lines, "", SIGNS]), markup=False)
-
-    def action_close(self) -> None:
-        """Close the page."""
-        self.dismiss(None)
+def help_text() -> str:
+    """Every key and sign of a run."""
+    lines = [f"{'s, ctrl-c' if key.key == 's' else key.key:<11} {key.what}" for key in RUN_KEYS]
+    return "\n".join([*lines, "", SIGNS])

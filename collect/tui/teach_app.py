@@ -7,11 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from textual import events
-from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import VerticalScroll
-from textual.screen import ModalScreen
-from textual.widgets import Static
 
 from collect.errors import CollectAborted, describe
 from collect.headless import REFRESH_S, stop_signals
@@ -21,6 +17,7 @@ from collect.tui.teach_guide import ScreenGuide, Teaching
 from collect.tui.teach_screen import GO_ON, LEAVE, TeachScreen
 from collect.tui.terminal import PlainApp, TerminalDriver
 from collect.tui.text import SOFTWARE_STOP
+from collect.tui.widgets import HelpScreen
 
 Work = Callable[[ScreenGuide], Coroutine[Any, Any, Path | None]]
 AT_WORK = ("Something is at work: stop it and leave?", "y  stop and leave      n  go on      s  stop now")
@@ -43,25 +40,6 @@ known so far: 25 mm around all that was touched and where your hand left
 the arm, 5 mm below. The arm makes it at 20 mm/s.
 
 {SOFTWARE_STOP}"""
-
-
-class TeachHelp(ModalScreen[None]):
-    """Every key on one page; any of its own keys closes it."""
-
-    DEFAULT_CSS = """
-    TeachHelp { align: center middle; }
-    TeachHelp VerticalScroll {
-        width: 78; max-width: 100%; height: auto; max-height: 100%; padding: 0 1;
-        border: heavy $accent; background: $surface;
-    }
-    """
-    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,q,question_mark,enter", "dismiss(None)", "Close")]
-
-    def compose(self) -> ComposeResult:
-        """Lay out the page."""
-        with VerticalScroll() as page:
-            page.border_title = "Help, escape closes"
-            yield Static(HELP, markup=False)
 
 
 class TeachApp(PlainApp):
@@ -138,8 +116,8 @@ class TeachApp(PlainApp):
 
     def action_help(self) -> None:
         """Show every key."""
-        if not isinstance(self.screen, TeachHelp):
-            self.push_screen(TeachHelp())
+        if not isinstance(self.screen, HelpScreen):
+            self.push_screen(HelpScreen(HELP))
 
     def leave_soon(self) -> None:
         """End the app, from any thread: a signal came."""

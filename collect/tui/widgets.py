@@ -1,14 +1,17 @@
-"""Widgets that several screens use: text that is drawn only when it changed, a list, and the line of keys."""
+"""Parts that several screens use: text that is drawn only when it changed, a list, the line of keys, the help page."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import ClassVar, cast
 
 from rich.cells import cell_len
-from textual.app import App, RenderResult
+from textual.app import App, ComposeResult, RenderResult
+from textual.binding import Binding, BindingType
+from textual.containers import VerticalScroll
 from textual.content import Content
 from textual.dom import DOMNode
+from textual.screen import ModalScreen
 from textual.widget import Widget
 from textual.widgets import OptionList, Static
 from textual.widgets.option_list import Option
@@ -98,3 +101,26 @@ class KeyBar(Widget):
             parts.append(Content.assemble((key, "bold $text-accent"), f" {label}"))
             used += width + GAP
         return Content(" " * GAP).join(parts)
+
+
+class HelpScreen(ModalScreen[None]):
+    """Every key on one page; any of its own keys closes it."""
+
+    DEFAULT_CSS = """
+    HelpScreen { align: center middle; }
+    HelpScreen VerticalScroll {
+        width: 80; max-width: 100%; height: auto; max-height: 100%; padding: 0 1;
+        border: heavy $accent; background: $surface;
+    }
+    """
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,q,question_mark,enter", "dismiss(None)", "Close")]
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self._text = text
+
+    def compose(self) -> ComposeResult:
+        """Lay out the page."""
+        with VerticalScroll() as page:
+            page.border_title = "Help, escape closes"
+            yield Static(self._text, markup=False)

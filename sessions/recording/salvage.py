@@ -12,10 +12,10 @@ import struct
 import zlib
 from array import array
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import zstandard
 from mcap.data_stream import ReadDataStream
@@ -36,50 +36,12 @@ from sessions.recording.container import (
     indexed,
 )
 from sessions.recording.mcap_file import HEADER_METADATA, header_crc, read_note
+from sessions.recording.parts import Part, Parts
 
 _STROKE_NAME = re.compile(rb'"stroke_id":"([^"\\]{1,100})","kind"')
 """Beginning of a stroke's message."""
 _PIECE_BYTES = 256
 _MESSAGE_INDEX = struct.Struct("<HI")
-
-
-@dataclass(frozen=True, slots=True)
-class Part:
-    """One chunk of a file, readable or not."""
-
-    offset: int
-    counts: Counter[str] | None
-    """Number of messages by topic; None if unknown."""
-    sound: bool
-    """Whether it can be read and matches its CRC."""
-
-
-class Parts(Sequence[Part]):
-    """The chunks of a file, 16 bytes for each; nearly all of them hold the same numbers of messages."""
-
-    def __init__(self) -> None:
-        self._offsets = array("Q")
-        self._kinds: list[Part] = []
-        """A part of this kind, for each."""
-        self._known: dict[tuple[bool, frozenset[tuple[str, int]] | None], Part] = {}
-
-    def append(self, part: Part) -> None:
-        """Add a chunk."""
-        kind = part.sound, None if part.counts is None else frozenset(part.counts.items())
-        self._offsets.append(part.offset)
-        self._kinds.append(self._known.setdefault(kind, part))
-
-    def __len__(self) -> int:
-        return len(self._offsets)
-
-    @overload
-    def __getitem__(self, at: int) -> Part: ...
-    @overload
-    def __getitem__(self, at: slice) -> list[Part]: ...
-    def __getitem__(self, at: int | slice) -> Part | list[Part]:
-        if isinstance(at, slice):
-            return [self[k] for k in range(len(self))[at]]
-        return replace(self._kinds[at], offset=self._offsets[at])
 
 
 @dataclass(slots=True)

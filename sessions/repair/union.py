@@ -17,7 +17,8 @@ from pydantic import ValidationError
 from sessions.journal.codec import Line
 from sessions.recording.container import Record
 from sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE
-from sessions.recording.salvage import Part, Scan, read_part, salvaged
+from sessions.recording.parts import Part
+from sessions.recording.salvage import Scan, read_part, salvaged
 from sessions.recording.schemas import StepEvent, Topic
 
 Place = tuple[str, int]

@@ -154,9 +154,9 @@ def test_workers_open_the_recording_themselves_or_are_sent_the_photographs(
 from dataclasses import replace
 from pathlib import Path
 from calibrate.compare.field import Field
-from calibrate.validate.jobs import opened, pixels_of, prepared_rows
+from calibrate.validate.jobs import pixels_of, prepared_rows
 from calibrate.validate.pool import Dask, Threads
-from calibrate.validate.sources import open_session
+from calibrate.validate.sources import open_session, opened
 from calibrate.validate.store import Store
 
 def prepared(scheduler, session, name):

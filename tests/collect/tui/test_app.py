@@ -16,11 +16,11 @@ from textual.widgets import Static
 from collect.engine.control import FINAL, State
 from collect.operator import OperatorRequest
 from collect.tui.app import OperatorApp
-from collect.tui.keys import RUN_KEYS, HelpScreen
+from collect.tui.keys import RUN_KEYS
 from collect.tui.question_screens import Confirm
 from collect.tui.run_screen import GOES_ON, OVER, STOP_SENT
 from collect.tui.text import SOFTWARE_STOP
-from collect.tui.widgets import Line
+from collect.tui.widgets import HelpScreen, Line
 from tests.collect.tui.fake import (
     DONE,
     ERROR,
