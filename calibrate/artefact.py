@@ -73,7 +73,7 @@ class FittedValue(BaseModel):
     value: float
     low: float | None
     high: float | None
-    """95 % interval, by bootstrap over strokes."""
+    """Ends of the 95 % interval."""
 
 
 A = TypeVar("A", bound=Artefact)
