@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import realink
+from bench import realink, realink_sessions
 from bench.realink import circles, predict, score, split
 from bench.realink_strokes import BIG, DATA, PX_PER_MM, load
 from calibrate.drags.captures import commanded_path
@@ -53,3 +53,25 @@ def test_the_test_strokes_are_fixed_and_never_trained_on() -> None:
     assert len(test) == 40
     assert not set(train.tolist()) & set(test.tolist())
     assert split(187)[1].tolist() == test.tolist()
+
+
+def test_each_way_between_two_sessions_is_compared_with_a_fit_of_its_own_and_with_the_network(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    each = {
+        "within": 0.8,
+        "network": 0.5,
+        "zero-shot": 0.7,
+        "adapted to 5": 0.75,
+        "adapted to 10": 0.78,
+        "circles": 0.6,
+    }
+    found = {name: np.array([[csim - 0.01, 0.5], [csim + 0.01, 0.5]]) for name, csim in each.items()}
+    monkeypatch.setattr(realink_sessions, "load", lambda name: name)
+    monkeypatch.setattr(realink_sessions, "drawn", lambda strokes, name: strokes)
+    monkeypatch.setattr(realink_sessions, "_compare", lambda *_: found)
+    results = {(r.name, r.peer): r for r in realink_sessions.measure_sessions(2, seed=0)}
+    ours = results["realink.b-to-a.adapted-to-10.csim", "a fit within the session"]
+    assert (ours.value, ours.ratio, ours.n) == pytest.approx((0.78, 0.78 / 0.8, 2))
+    assert "within 0.800 / 0.500 (sd 0.010)" in ours.conditions
+    assert results["realink.a-to-b.zero-shot.csim", "a network of FRIDA's shape"].ratio == pytest.approx(0.7 / 0.5)
