@@ -24,6 +24,8 @@ from collect.errors import CollectAborted
 from collect.start import engine_for
 from collect.tui.app import OperatorApp
 from collect.tui.browser import Paths, SessionBrowser
+from collect.tui.capture_screen import CaptureScreen
+from collect.tui.end_screen import EndScreen
 from collect.tui.finish_screen import FinishScreen
 from collect.tui.question_screens import AskScreen
 from collect.tui.review_screen import ReviewScreen
@@ -170,8 +172,15 @@ async def _tour(app: OperatorApp, rig: LoopbackRig, out: Path) -> None:
         await pilot.press("escape")
         await pilot.resize_terminal(*SIZE)
         await tour.until(lambda: app.engine is not None and app.engine.snapshot().state is State.DONE)
+        await tour.until(lambda: isinstance(app.screen, EndScreen))
+        await app.workers.wait_for_complete()
+        await tour.take("end")
+        await pilot.press("escape")
         await tour.take("done")
-        await pilot.press("v")
+        await pilot.press("enter")
+        await tour.until(lambda: isinstance(app.screen, CaptureScreen))
+        await tour.take("capture")
+        await pilot.press("escape", "v")
         await tour.until(lambda: isinstance(app.screen, ReviewScreen))
         await pilot.press("down")
         await pilot.pause(1.0)

@@ -46,9 +46,9 @@ def collect(
         bool, typer.Option("--set-up", help="On the screen: accept what each set-up step measured, or measure again.")
     ] = False,
     preview: Annotated[
-        Literal["cells", "auto", "off"],
-        typer.Option(help="Camera on the screen, in half-cells; auto: in pixels if the terminal supports them."),
-    ] = "cells",
+        Literal["auto", "cells", "off"],
+        typer.Option(help="Pictures: pixels if the terminal supports them, else braille cells; off: no camera."),
+    ] = "auto",
     live: Annotated[bool, typer.Option("--live", help="Let a Foxglove viewer on this machine watch the run.")] = False,
     live_port: Annotated[int, typer.Option(min=0, max=65535, help="Port of --live; 0: any.")] = 8765,
 ) -> None:

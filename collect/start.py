@@ -5,21 +5,30 @@ from __future__ import annotations
 import contextlib
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 from collect.chains.commands import ending
 from collect.engine.dry_run import DryRunEngine
 from collect.engine.engine import Engine
 from collect.engine.live import LiveView
-from collect.engine.open_or_resume import Opening, check_writable, find_resumable, open_store
-from collect.headless import run_headless
+from collect.engine.open_or_resume import Opening, check_writable, find_resumable, open_store, resuming
+from collect.headless import RunnableEngine, run_headless
 from collect.planning.limit_check import check_protocol
 from drivers.clock import HostClock
 from sessions.terminal import plain
 
 if TYPE_CHECKING:
     from collect.tui.pictures import Preview
+
+
+class Settings(TypedDict):
+    """Options of an engine that stay the same when the session is resumed on the screen."""
+
+    live: LiveView | None
+    guided: bool
+    preview: bool
 
 
 def engine_for(
@@ -52,19 +61,23 @@ def engine_for(
 
 
 def start(
-    opening: Opening, *, on_screen: bool, live: LiveView | None = None, guided: bool = False, preview: Preview = "cells"
+    opening: Opening, *, on_screen: bool, live: LiveView | None = None, guided: bool = False, preview: Preview = "auto"
 ) -> int:
     """Run to the end and print where the recording lies and what comes next; return how many strokes were left out.
 
     Raises the error that ended the run.
     """
-    engine = engine_for(opening, watched=on_screen, live=live, guided=guided, preview=on_screen and preview != "off")
+    settings: Settings = {"live": live, "guided": guided, "preview": on_screen and preview != "off"}
+    engine = engine_for(opening, watched=on_screen, **settings)
+
+    def again(session_id: str) -> Engine:
+        return engine_for(resuming(opening, session_id), watched=True, **settings)
+
     with contextlib.ExitStack() as stack:
         if live is not None:
             live.start()
             stack.callback(live.close)
-        _run(engine, preview, on_screen=on_screen)
-    now = engine.snapshot()
+        now = _run(engine, preview, again, on_screen=on_screen).snapshot()
     _say(ending(Path(now.folder), opening.protocol.kind))
     return now.given_up
 
@@ -73,17 +86,25 @@ def dry_run(config: Path, protocol: Path, height_mm: float, *, armed: bool, on_s
     """Move through the protocol in the air; the recording is thrown away, so that no cell counts as used."""
     with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:
         opening = Opening.load(Path(folder), config, protocol, armed=armed, dry_run_mm=height_mm)
-        _run(engine_for(opening, watched=on_screen, preview=on_screen, make=DryRunEngine), "cells", on_screen=on_screen)
+        _run(
+            engine_for(opening, watched=on_screen, preview=on_screen, make=DryRunEngine),
+            "auto",
+            None,
+            on_screen=on_screen,
+        )
     _say("dry run done; nothing was kept\n")
 
 
-def _run(engine: Engine, preview: Preview, *, on_screen: bool) -> None:
+def _run(
+    engine: RunnableEngine, preview: Preview, again: Callable[[str], Engine] | None, *, on_screen: bool
+) -> RunnableEngine:
+    """Run to the end; return the engine that ran last, as the operator may resume after a stop."""
     if on_screen:
         from collect.tui.runner import run_screen
 
-        run_screen(engine, preview)
-    else:
-        run_headless(engine)
+        return run_screen(engine, preview, again)
+    run_headless(engine)
+    return engine
 
 
 def _say(text: str) -> None:

@@ -129,6 +129,7 @@ class Engine:
             parked=self._parked(),
             rest_unknown=self._rest_unknown,
             trace_n=self._telemetry.trace_n(),
+            force_ceiling_n=None if self._rig_config.force is None else self._rig_config.force.max_n,
             picture=self._telemetry.picture,
             requests=self._requests.open,
             set_up=self._set_up(),

@@ -49,22 +49,34 @@ class LastCapture:
     @property
     def likeness(self) -> float | None:
         """CSIM of `binary` and `model`, 0 to 1; None if either shows no ink."""
-        if self.binary is None or self.model is None or not (self.binary.any() and self.model.any()):
-            return None
-        return csim(self.binary.astype(float), self.model.astype(float))
+        return likeness(self.binary, self.model)
+
+
+def likeness(captured: NDArray[np.bool_] | None, predicted: NDArray[np.bool_] | None) -> float | None:
+    """CSIM of two images of ink, 0 to 1; None if either is missing or shows no ink."""
+    if captured is None or predicted is None or not (captured.any() and predicted.any()):
+        return None
+    return csim(captured.astype(float), predicted.astype(float))
 
 
 def published_mark(
     height_mm: float, tilt_deg: float, *, radius_mm: float, length_mm: float
 ) -> NDArray[np.bool_] | None:
     """Mark of CCD-BSM as published, (128, 128) on the default field; None if the model gives none. Takes a few ms."""
-    press, (left, top) = FittedPress(radius_mm, length_mm), FIELD.anchor_mm
+    return mark_of(FittedPress(radius_mm, length_mm), height_mm, tilt_deg)
+
+
+def mark_of(press: FittedPress, height_mm: float, tilt_deg: float) -> NDArray[np.bool_] | None:
+    """Mark of a brush, (128, 128) on the default field; None if the model gives none there. Takes a few ms."""
+    left, top = FIELD.anchor_mm
     centres = (np.arange(FINE * SIZE_PX) + 0.5) * (FIELD.mm_per_px / FINE)
     try:
-        half_mm = press.half_width(height_mm, tilt_deg, np.asarray(centres - left, np.float64))
+        upper, lower = press.edges_at(height_mm, tilt_deg, np.asarray(centres - left, np.float64))
     except ValueError:
         return None
-    fine = np.abs(top - centres)[:, None] <= half_mm[None]
+    up_mm = (top - centres)[:, None]
+    edge_mm = np.asarray(np.where(up_mm > 0.0, upper, lower), np.float64)
+    fine = np.abs(up_mm) <= edge_mm
     return np.asarray(fine.reshape(SIZE_PX, FINE, SIZE_PX, FINE).mean(axis=(1, 3)) > 0.5)
 
 

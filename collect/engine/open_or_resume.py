@@ -133,6 +133,19 @@ def find_resumable(opening: Opening) -> Path | None:
     return None
 
 
+def resuming(opening: Opening, session_id: str) -> Opening:
+    """Return `opening` to go on with that open session, and with no other.
+
+    Raises `ConfigError` where these files begin or go on with another session.
+    """
+    opening = replace(opening, new=False)
+    found = find_resumable(opening)
+    if found is None or found.name != session_id:
+        instead = "no open session" if found is None else f"session {found.name}, which is open as well"
+        raise ConfigError(opening.rig_path, "", f"goes on with {instead}, not with {session_id}")
+    return opening
+
+
 def _changed(folder: Path, found: Sequence[Difference], given: dict[str, Path], texts: dict[str, str]) -> ConfigError:
     """The refusal to resume a session with another configuration: each difference on a line, then what to do.
 

@@ -148,6 +148,8 @@ class Snapshot:
     """Strokes that were left out, because every take was bad or the operator asked for it."""
     force_n: float | None = None
     """Force less the sensor's bias; None without a sensor or a fresh sample."""
+    force_ceiling_n: float | None = None
+    """Force above which the arm is stopped while the brush is down; None without a sensor."""
     ink_level: float | None = None
     """Level of the well before the last dip, 0 to 1; None if nothing measures it."""
     prompt: Prompt | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -21,13 +22,13 @@ from collect.errors import ConfigError
 from collect.headless import REFRESH_S, RunnableEngine
 from collect.operator import OperatorRequest
 from collect.tui.browser import SessionBrowser
-from collect.tui.keys import CAN_PAUSE, CAN_RESUME, RUN_BINDINGS, RUN_KEYS, help_text, is_stop_key
+from collect.tui.keys import CAN_GO_ON, CAN_PAUSE, CAN_RESUME, RUN_BINDINGS, RUN_KEYS, help_text, is_stop_key
 from collect.tui.pictures import Pictures
-from collect.tui.question_screens import AT_WORK, NOT_AT_REST, NOT_PARKED, AskScreen, Confirm
+from collect.tui.question_screens import AT_WORK, NOT_AT_REST, NOT_PARKED, RESUME, RESUME_UNSEEN, AskScreen, Confirm
 from collect.tui.run_screen import RunScreen
 from collect.tui.set_up_screen import SetUpScreen
 from collect.tui.start_screen import StartScreen
-from collect.tui.terminal import PlainApp, TerminalDriver
+from collect.tui.terminal import PlainApp
 from collect.tui.text import plain
 from collect.tui.widgets import HelpScreen
 from sessions.errors import SessionError
@@ -50,13 +51,20 @@ class OperatorApp(PlainApp):
         engine: RunnableEngine | None = None,
         *,
         browser: SessionBrowser | None = None,
+        again: Callable[[str], RunnableEngine] | None = None,
         pictures: Pictures | None = None,
+        theme_file: Path | None = None,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """With an engine, show that run; with a browser, the start screen first. `now_s` is the clock of questions."""
-        super().__init__(driver_class=TerminalDriver)
+        """With an engine, show that run; with a browser, the start screen first.
+
+        `again` makes the engine that resumes a session after a stop. `theme_file` keeps the colours for
+        the next start. `now_s` is the clock of questions and ages.
+        """
+        super().__init__(theme_file)
         self.engine = engine
         self._browser = browser
+        self._again = again
         self._pictures = pictures or Pictures()
         self._now_s = now_s
         self._now: Snapshot | None = None if engine is None else engine.snapshot()
@@ -68,7 +76,16 @@ class OperatorApp(PlainApp):
     def on_mount(self) -> None:
         """Show the first screen; then poll the engine at 10 Hz."""
         if self._browser is not None:
-            self.push_screen(StartScreen(self._browser, self._begin, self._review_named))
+            self._again = partial(self._browser.engine, preview=self._pictures.camera_shown)
+            begin = partial(partial, self._browser.engine, preview=self._pictures.camera_shown)
+            self.push_screen(
+                StartScreen(
+                    self._browser,
+                    lambda session_id: self._begin(begin(session_id)),
+                    self._review_named,
+                    now_s=self._now_s,
+                )
+            )
         if self.engine is not None:
             self._show_run()
         self.call_after_refresh(self._poll)
@@ -103,22 +120,19 @@ class OperatorApp(PlainApp):
             return self._now is not None and self._now.state in CAN_PAUSE | CAN_RESUME
         if action in ("request", "mark_last"):
             return self.at_work
+        if action == "enter":
+            return self._can_go_on or (self._now is not None and self._now.last is not None)
         if action == "review":
             return self._now is not None and bool(self._now.folder)
         return super().check_action(action, parameters)
 
     def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
-        """List the keys of a run by name, then light and dark colours."""
+        """List the keys of a run by name, then the colours."""
         for key in RUN_KEYS:
             if key.title and self.check_action(key.action.partition("(")[0], ()):
                 run = partial(self.call_later, self.run_action, key.action)
                 yield SystemCommand(key.title, key.what, run)
-        dark = self.theme != "textual-light"
-        yield SystemCommand(
-            "Light colours" if dark else "Dark colours",
-            "For a bright room, or a dark one",
-            lambda: setattr(self, "theme", "textual-light" if dark else "textual-dark"),
-        )
+        yield from super().get_system_commands(screen)
 
     def action_stop(self) -> None:
         """Stop the arm at once and show that, even if another screen covers the run."""
@@ -163,6 +177,33 @@ class OperatorApp(PlainApp):
         if self._now is not None and self._now.folder and self.screen is self._main:
             self._review(Path(self._now.folder))
 
+    @property
+    def _can_go_on(self) -> bool:
+        now = self._now
+        return self._again is not None and now is not None and now.state in CAN_GO_ON and bool(now.folder)
+
+    def action_enter(self) -> None:
+        """Resume the session of a run that ended before its time, asking first; else show the last capture large."""
+        if self._now is None or self.screen is not self._main:
+            return
+        if self._can_go_on:
+            question = RESUME_UNSEEN if self._now.rest_unknown else RESUME
+            self.push_screen(Confirm(*question), self._go_on_answered)
+        else:
+            self.action_enlarge()
+
+    def action_enlarge(self) -> None:
+        """Show the last capture large."""
+        if self._now is not None and self._now.last is not None and self.screen is self._main:
+            from collect.tui.capture_screen import CaptureScreen
+            from collect.tui.large import of_last
+
+            self.push_screen(CaptureScreen(of_last(self._now.last), self._pictures, at_work=self.at_work))
+
+    def _go_on_answered(self, yes: bool | None) -> None:
+        if yes and self._can_go_on and self._now is not None and self._again is not None:
+            self._begin(partial(self._again, Path(self._now.folder).name))
+
     async def action_quit(self) -> None:
         """Leave; ask first if the arm is not parked."""
         if isinstance(self.screen, Confirm):
@@ -205,16 +246,18 @@ class OperatorApp(PlainApp):
         self._leave_when_over = False
 
     @work(exclusive=True, group="begin")
-    async def _begin(self, session_id: str | None) -> None:
-        """Read and check the files off the screen's loop, then start the run."""
-        assert self._browser is not None
+    async def _begin(self, make: Callable[[], RunnableEngine]) -> None:
+        """Wait for the end of the run before; read and check the files off the screen's loop; start the run."""
         try:
-            engine = await asyncio.to_thread(self._browser.engine, session_id, preview=self._pictures.camera_shown)
+            engine = await asyncio.to_thread(_after, self.engine, make)
         except (ConfigError, SessionError, OSError) as error:
             if isinstance(self.screen, StartScreen):
                 self.screen.show_trouble(str(error))
+            else:
+                self.notify(plain(str(error)), severity="error", timeout=20)
             return
         self.engine = engine
+        self._leave_when_over = False
         engine.start()
         self._now = engine.snapshot()
         self._show_run()
@@ -241,7 +284,7 @@ class OperatorApp(PlainApp):
         wizard = bool(self._now.set_up) and self._now.state not in FINAL
         if self._main is not None and isinstance(self._main, SetUpScreen) == wizard:
             return
-        screen = SetUpScreen(self.engine, self._pictures) if wizard else RunScreen(self._pictures)
+        screen = SetUpScreen(self.engine, self._pictures) if wizard else self._run_screen()
         if self._main is None:
             self.push_screen(screen)
         elif self.screen is self._main:
@@ -249,6 +292,9 @@ class OperatorApp(PlainApp):
         else:
             return  # another screen covers it: try again at the next poll
         self._main = screen
+
+    def _run_screen(self) -> RunScreen:
+        return RunScreen(self._pictures, resumable=self._again is not None, now_s=self._now_s)
 
     def _poll(self) -> None:
         if not self.is_running:
@@ -266,11 +312,28 @@ class OperatorApp(PlainApp):
             self.refresh_bindings()
             if self._now.state in FINAL | {State.STOPPING} and isinstance(self.screen, Confirm):
                 self.pop_screen()  # what it asks about is over
+            if self._now.state is State.DONE and self._again is not None:
+                self._show_end(self._now)
         if self._leave_when_over and self._now.state in FINAL:
             if self._now.rest_unknown:
                 self._leave_when_over = False  # the operator has to read that first
             else:
                 self._away()
+
+    def _show_end(self, now: Snapshot) -> None:
+        """Show the card of a finished session, unless the operator is looking at something else."""
+        if now.folder and self.screen is self._main and not self._leave_when_over:
+            from collect.tui.end_screen import EndScreen
+
+            self.push_screen(EndScreen(now, self._pictures), self._end_answered)
+
+    def _end_answered(self, answer: str | None) -> None:
+        if answer == "review":
+            self.call_after_refresh(self.action_review)
+        elif answer == "finish" and self._now is not None:
+            from collect.tui.finish_screen import FinishScreen
+
+            self.push_screen(FinishScreen(Path(self._now.folder), is_open=False))
 
     def _ask(self, now: Snapshot) -> None:
         prompt = None if isinstance(self._main, SetUpScreen) else now.prompt
@@ -284,3 +347,11 @@ class OperatorApp(PlainApp):
             self._deaf_until_s = self._now_s() + BOUNCE_S
         if prompt is not None and self.engine is not None and not isinstance(self.screen, Confirm | AskScreen):
             self.push_screen(AskScreen(prompt, self.engine, self._pictures, self._now_s))
+
+
+def _after(before: RunnableEngine | None, make: Callable[[], RunnableEngine]) -> RunnableEngine:
+    """Make an engine once the one before has let go of session and devices; how that one ended was shown."""
+    if before is not None:
+        with contextlib.suppress(Exception):
+            before.join()
+    return make()

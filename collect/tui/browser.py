@@ -85,12 +85,10 @@ class SessionBrowser:
 
         Connects nothing yet. Raises `ConfigError`, also where these files belong to another open session.
         """
-        from collect.engine.open_or_resume import Opening, find_resumable
-        from collect.errors import ConfigError
+        from collect.engine.open_or_resume import Opening, resuming
 
         paths, new = self.paths, session_id is None
         opening = Opening.load(paths.root, paths.config, paths.protocol, new=new, sheet=1 if new else None)
-        resumable = None if new else find_resumable(opening)
-        if resumable is not None and resumable.name != session_id:
-            raise ConfigError(paths.config, "", f"goes on with session {resumable.name}, which is open as well")
+        if session_id is not None:
+            opening = resuming(opening, session_id)
         return self._engine_for(opening, watched=True, guided=True, preview=preview)

@@ -8,15 +8,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from calibrate.artefact import current, load_artefact
 from calibrate.board.pix2len import Plane
 from calibrate.board.session import board_of
 from calibrate.board.spec import BoardSpec
 from calibrate.board.view import see_board
 from calibrate.compare.similarity import csim
 from calibrate.errors import CalibrationError
+from calibrate.fit.artefact import FOLDER as FITS
+from calibrate.fit.artefact import BrushFit
 from calibrate.session import lens_in_use
-from collect.engine.last_capture import pictures_of
+from collect.engine.last_capture import likeness, mark_of, pictures_of
 from collect.rig.paper import Cell
+from collect.tui.large import LargeCapture
 from sessions.errors import InputError, SessionDamaged
 from sessions.history import unlike, waits_of
 from sessions.journal.codec import Line
@@ -24,7 +28,7 @@ from sessions.journal.journal import JOURNAL_NAME, is_open, replay
 from sessions.names import check_folder
 from sessions.recording import container
 from sessions.recording.messages import decode_gray, decode_still
-from sessions.recording.schemas import Stroke, Topic
+from sessions.recording.schemas import Check, Quality, Stroke, Topic
 from sessions.remarks import Remark, remarks_of
 
 if TYPE_CHECKING:
@@ -32,6 +36,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from calibrate.board.lens import Lens
+
+NO_FIT = "no fit yet: run `brushloop fit`"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +74,8 @@ class CapturePictures:
     binary: NDArray[np.bool_] | None
     log_ns: int
     """When the still arrived at the host: the time to jump to in a viewer."""
+    checks: tuple[Check, ...] = ()
+    """Checks of its quality as the run recorded them."""
 
 
 class Review:
@@ -131,33 +139,53 @@ class Review:
             return None
         return statistics.fmean(csim(a, b) for a, b in itertools.combinations(binaries, 2)), len(binaries)
 
+    def large(self, capture: ReviewCapture) -> LargeCapture:
+        """One capture with the prediction of the session's fitted brush, where it has one.
+
+        Call it off a screen's loop. Raises `SessionDamaged` as `pictures` does.
+        """
+        pictures, predicted, model = self.pictures(capture), None, NO_FIT
+        try:
+            if (found := current(self.folder, FITS)) is not None:
+                fit = load_artefact(found, BrushFit)
+                predicted = mark_of(fit.press(), capture.height_mm, capture.tilt_deg)
+                model = f"CCD-BSM fitted to {fit.strokes} strokes of {fit.session_id}"
+        except CalibrationError as error:
+            model = str(error)
+        title = f"{capture.stroke_id}   H {capture.height_mm:g} mm  α {capture.tilt_deg:g}°"
+        alike = likeness(pictures.binary, predicted)
+        return LargeCapture(title, pictures.photo, pictures.binary, predicted, model, alike, pictures.checks)
+
     def _make_pictures(self, capture: ReviewCapture) -> CapturePictures:
         path = self.folder / capture.file
         path = path if path.is_file() else self.folder / f"{self.folder.name}.mcap"
         image, log_ns, stroke = None, 0, None
-        for _schema, channel, message in container.messages(path, [Topic.STILL, Topic.STROKE]):
+        checks: tuple[Check, ...] = ()
+        for _schema, channel, message in container.messages(path, [Topic.STILL, Topic.STROKE, Topic.QUALITY]):
             if message.sequence != capture.still:
                 continue
             if channel.topic == Topic.STILL:
                 image, log_ns = decode_gray(decode_still(message.data), f"still {capture.still}"), message.log_time
+            elif channel.topic == Topic.QUALITY:
+                checks = Quality.model_validate_json(message.data).checks
             else:
                 stroke = Stroke.model_validate_json(message.data)
         if image is None:
             raise SessionDamaged(path, f"holds no still {capture.still}")
         cell = self._cell(stroke)
         if cell is None or self._board is None:
-            return CapturePictures(image, None, log_ns)
+            return CapturePictures(image, None, log_ns, checks)
         if self._lens is not None:
             if image.shape[::-1] != self._lens.size_px:
-                return CapturePictures(image, None, log_ns)  # the lens was calibrated for another size
+                return CapturePictures(image, None, log_ns, checks)  # the lens was calibrated for another size
             image = self._lens.undistort(image)
         try:
             self._plane = see_board(image, self._board)
         except CalibrationError:
             if self._plane is None:
-                return CapturePictures(image, None, log_ns)
+                return CapturePictures(image, None, log_ns, checks)
         photo, binary = pictures_of(image, self._plane, cell)
-        return CapturePictures(photo, binary, log_ns)
+        return CapturePictures(photo, binary, log_ns, checks)
 
     def _cell(self, stroke: Stroke | None) -> Cell | None:
         """Where the stroke lies; None for a take that does not count, which has no stroke record and is shown whole."""

@@ -41,13 +41,14 @@ RUN_KEYS = (
     RunKey("q", "leave", "Finish the step, park the arm, then leave", "quit", "Leave"),
     RunKey("?", "help", "This page", "help"),
     RunKey("tab", "pane", "On a narrow screen: overview, last capture, camera"),
+    RunKey("enter", "large", "The last capture large; after a stop: resume the session", "enter", "Large, or resume"),
     RunKey("v", "review", "Look through the captures, mark and compare them", "review", "Review"),
     RunKey("r", "retake", "Press the current stroke again, once photographed", "request('RETAKE')", "Retake"),
     RunKey("k", "skip", "Skip the current stroke", "request('SKIP')", "Skip"),
     RunKey("n", "new sheet", "Put a new sheet in, before the next stroke", "request('NEW_SHEET')", "New sheet"),
     RunKey("j", "jog", "Find the paper again by jog, before the next stroke", "request('JOG')", "Jog"),
     RunKey("b", "bad", "Mark the last capture bad: pressed again at the end", "mark_last", "Last capture bad"),
-    RunKey("ctrl-p", "commands", "All commands by name; light and dark colours"),
+    RunKey("ctrl-p", "commands", "All commands by name; dark, light, safe colours"),
 )
 """Most important first: a narrow screen shows only as many as fit."""
 RUN_BINDINGS: tuple[Binding, ...] = (
@@ -56,18 +57,21 @@ RUN_BINDINGS: tuple[Binding, ...] = (
     Binding("p", "pause", "Pause or go on"),
     *(Binding("question_mark" if k.key == "?" else k.key, k.action, k.title or k.label) for k in RUN_KEYS if k.action),
 )
+CAN_GO_ON = frozenset({State.STOPPED, State.FAILED})
+"""States in which a run has ended before its session was finished."""
 CAN_PAUSE = frozenset({State.IDLE, State.RECOVERING, State.RUNNING})
 CAN_RESUME = frozenset({State.PAUSING, State.PAUSED})
-RUN_BAR: tuple[Key, ...] = tuple((k.key, k.label) for k in RUN_KEYS)
-LABELS = dict(RUN_BAR)
+LABELS = {k.key: k.label for k in RUN_KEYS}
+RUN_BAR: tuple[Key, ...] = tuple(LABELS.items())
 OVER_BAR: tuple[Key, ...] = tuple((key, LABELS[key]) for key in ("q", "v", "?", "tab", "ctrl-p"))
+GO_ON_BAR: tuple[Key, ...] = (("enter", "resume"), *OVER_BAR)
 SET_UP_BAR: tuple[Key, ...] = (*((key, LABELS[key]) for key in ("s", "space", "q", "?", "ctrl-p")), ("tab", "camera"))
 
 
-def keys_in(state: State, bar: tuple[Key, ...]) -> tuple[Key, ...]:
+def keys_in(state: State, bar: tuple[Key, ...], *, resumable: bool = False) -> tuple[Key, ...]:
     """The keys of `bar` that do something in this state, each with what it does then."""
     if state in FINAL:
-        return OVER_BAR
+        return GO_ON_BAR if resumable and state in CAN_GO_ON else OVER_BAR
     space = "resume" if state in CAN_RESUME else "pause" if state in CAN_PAUSE else ""
     return tuple((key, space if key == "space" else label) for key, label in bar if key != "space" or space)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from rich.cells import cell_len
@@ -15,9 +16,11 @@ from collect.engine.control import FINAL
 from collect.engine.snapshot import CellCount, Mark, SheetMap, Snapshot
 from collect.headless import eta_text, minutes_text, no_pose_text
 from collect.quality.verdict import Check
+from collect.tui.force_text import scale_n, spark
+from collect.tui.large import limit_sign, number_text
 from collect.tui.pictures import Pictures, binary_picture
-from collect.tui.text import bar_text, one_line, spark, tip_text
-from collect.tui.widgets import Line
+from collect.tui.text import age_text, bar_text, one_line, tip_text
+from collect.tui.widgets import Line, entitle
 
 if TYPE_CHECKING:
     from collect.engine.last_capture import LastCapture
@@ -43,7 +46,7 @@ SHEET_SIGNS: dict[Mark | None, tuple[str, str]] = {
     Mark.VOID: ("×", "bold $text-error"),
     Mark.CHECK: ("△", "dim"),
 }
-A_LINE, CHECK_WIDTH = 3, 16
+A_LINE, CHECK_WIDTH = 2, 24
 """Quality checks on a line, and columns of each: as many as fit beside the grid on 120 columns."""
 
 
@@ -95,8 +98,11 @@ def target_text(now: Snapshot) -> str:
 def _force(now: Snapshot, room: int) -> str:
     if now.force_n is None:
         return "not measured now" if now.state in FINAL else "no force sensor, or silent"
-    force = f"{now.force_n:6.3f} N  "
-    return force + spark(now.trace_n, max(0, min(room - len(force), LONGEST_TRACE)))
+    ceiling = "" if now.force_ceiling_n is None else f" of {now.force_ceiling_n:g} N at most"
+    force = f"{now.force_n:6.3f} N{ceiling}  "
+    scale = f"0 to {scale_n(now.trace_n[-LONGEST_TRACE:]):g} N "
+    width = max(0, min(room - len(force) - len(scale), LONGEST_TRACE))
+    return force + (scale + spark(now.trace_n, width) if width else "")
 
 
 class Grid(Widget):
@@ -203,12 +209,18 @@ class CapturePane(Vertical):
     CapturePane #photo, CapturePane #binary { margin-right: 1; }
     """
 
-    def __init__(self, pictures: Pictures) -> None:
+    def __init__(self, pictures: Pictures, now_s: Callable[[], float]) -> None:
         super().__init__(id="capture-pane", classes="pane")
-        self.border_title = "Last capture: photograph, binarised, CCD-BSM"
+        self.border_title = "Last capture"
+        self._now_s = now_s
+        self._since_s = 0.0
         self._words = Line("capture-words")
         self._photo, self._binary, self._model = (pictures.make(name) for name in ("photo", "binary", "model"))
         self._shown: LastCapture | None = None
+
+    async def on_click(self) -> None:
+        """Show this capture large."""
+        await self.run_action("app.enlarge")
 
     def compose(self) -> ComposeResult:
         """Lay out the words above, the pictures below."""
@@ -223,6 +235,9 @@ class CapturePane(Vertical):
         if last is None:
             self._words.show(Content.styled("nothing captured by this process yet", "dim"))
             return
+        if last is not self._shown:
+            self._since_s = self._now_s()
+        entitle(self, f"Capture, {age_text(self._now_s() - self._since_s)}: photograph, binarised, CCD-BSM")
         if last is self._shown:
             return
         self._shown = last
@@ -241,7 +256,7 @@ def _capture_words(last: LastCapture) -> Content:
     else:
         if last.verdict.reason:
             lines.append(Content.styled(last.verdict.reason, "$text-warning"))
-        checks = [_check(check) for check in last.verdict.checks]
+        checks = [_check(check) for check in sorted(last.verdict.checks, key=lambda check: check.passed)]
         lines += [Content("  ").join(checks[k : k + A_LINE]) for k in range(0, len(checks), A_LINE)]
     if last.model is not None:
         csim = "" if last.likeness is None else f": CSIM {100.0 * last.likeness:.1f} % in mm"
@@ -251,6 +266,7 @@ def _capture_words(last: LastCapture) -> Content:
 
 def _check(check: Check) -> Content:
     sign, style = ("✓", "") if check.passed else ("!", "bold $text-warning")
-    score = f"{check.score:.2f}" if abs(check.score) < 10.0 else f"{check.score:.0f}"
+    limit = f" {limit_sign(check)} {number_text(check.threshold)}"
     # In columns, because a line break could separate the sign from its check.
-    return Content.styled(f"{sign} {check.name} {score}".ljust(CHECK_WIDTH), style)
+    text = f"{sign} {check.name} {number_text(check.score)}"
+    return Content.assemble((text, style), (limit.ljust(CHECK_WIDTH - len(text)), "dim"))

@@ -1,12 +1,9 @@
-"""Gray pictures in a terminal: half-cells that work anywhere, or pixels (sixels, kitty's protocol) where it has them.
-
-A half-cell is `▀` with its own two grays: over SSH and tmux as good as any other text.
-"""
+"""Pictures in a terminal: braille cells that work anywhere, or pixels (sixels, kitty's protocol) where it has them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 from rich.segment import ControlType, Segment
@@ -17,21 +14,21 @@ from textual.geometry import Region, Size
 from textual.strip import Strip
 from textual.widget import Widget
 
-from collect.tui.sixel import fitted, lines_of, runs, sixels, terminal_cell_px
+from collect.tui.dots import Cells
+from collect.tui.graphics import PixelKind, pixels_of_terminal
+from collect.tui.levels import Coloured
+from collect.tui.sixel import SIXEL_GRAYS, VT340_CELL_PX, lines_of, sixels, terminal_cell_px
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-HALF = "▀"
-LEVELS = 32
-"""Grays of a picture in half-cells: fewer styles make longer runs, less to send over a slow line."""
 Preview = Literal["auto", "cells", "off"]
-"""How the camera is shown: in pixels where the terminal has them, in half-cells, or not at all."""
+"""How pictures are shown: in pixels where the terminal has them, in cells, or without those of the camera."""
 
 
 class CellPicture(Widget):
-    """A picture in half-cells, as large as its place allows, its shape kept."""
+    """A picture in braille cells, as large as its place allows, its shape kept."""
 
     DEFAULT_CSS = """
     CellPicture { width: 1fr; height: 1fr; }
@@ -39,33 +36,34 @@ class CellPicture(Widget):
 
     def __init__(self, id: str | None = None) -> None:  # noqa: A002 - textual's name
         super().__init__(id=id)
-        self._image: NDArray[np.uint8] | None = None
-        self._lines: NDArray[np.int64] | None = None
+        self._image: NDArray[np.uint8] | Coloured | None = None
+        self._cells = Cells(None, Size())
         self._made_for: Size | None = None
 
-    def show(self, image: NDArray[np.uint8] | None) -> None:
+    def show(self, image: NDArray[np.uint8] | Coloured | None) -> None:
         """Draw the lines of this picture that changed; nothing where it is the same object."""
         if image is self._image:
             return
-        self._image, before = image, self._lines
-        self._fit(before)
-        if before is None or self._lines is None or before.shape != self._lines.shape:
+        self._image, before = image, self._cells.codes
+        self._fit(self._cells)
+        codes = self._cells.codes
+        if before is None or codes is None or before.shape != codes.shape or isinstance(image, Coloured):
             self.refresh()
             return
-        for y in (before != self._lines).any(axis=1).nonzero()[0].tolist():
+        for y in (before != codes).any(axis=1).nonzero()[0].tolist():
             self.refresh(Region(0, y, self.size.width, 1))
 
     def render_line(self, y: int) -> Strip:
-        """Draw one line of half-cells."""
+        """Draw one line of cells."""
         if self._made_for != self.size:
             self._fit(None)
         width, ground = self.size.width, self.rich_style
-        if self._lines is None or y >= len(self._lines):
+        if self._cells.codes is None or y >= len(self._cells.codes):
             return Strip.blank(width, ground)
-        return _strip(self._lines[y]).extend_cell_length(width, ground)
+        return self._cells.strip(y).extend_cell_length(width, ground)
 
-    def _fit(self, before: NDArray[np.int64] | None) -> None:
-        self._lines, self._made_for = half_cells(self._image, self.size, before), self.size
+    def _fit(self, before: Cells | None) -> None:
+        self._cells, self._made_for = Cells(self._image, self.size, before), self.size
 
 
 class SixelPicture(Container):
@@ -87,7 +85,7 @@ class SixelPicture(Container):
         """Lay out the pixels."""
         yield self._pixels
 
-    def show(self, image: NDArray[np.uint8] | None) -> None:
+    def show(self, image: NDArray[np.uint8] | Coloured | None) -> None:
         """Draw this picture, unless it is the same object."""
         self._pixels.show(image)
 
@@ -105,11 +103,11 @@ class Pixels(Widget):
 
     def __init__(self) -> None:
         super().__init__()
-        self._image: NDArray[np.uint8] | None = None
+        self._image: NDArray[np.uint8] | Coloured | None = None
         self._lines: list[NDArray[np.int64]] = []
         self._made_for: Size | None = None
 
-    def show(self, image: NDArray[np.uint8] | None) -> None:
+    def show(self, image: NDArray[np.uint8] | Coloured | None) -> None:
         """Draw the lines of this picture that changed; nothing where it is the same object."""
         if image is self._image:
             return
@@ -129,13 +127,14 @@ class Pixels(Widget):
         # While something lies over the screen, textual dims what is below; pixels cannot be dimmed.
         if y >= len(self._lines) or not self.screen.is_active:
             return Strip.blank(width, ground)
-        pixels = f"\x1b[{width}D\x1b7{sixels(self._lines[y])}\x1b8\x1b[{width}C"
+        drawn = sixels(self._lines[y], self._image.colours if isinstance(self._image, Coloured) else SIXEL_GRAYS)
+        pixels = f"\x1b[{width}D\x1b7{drawn}\x1b8\x1b[{width}C"
         control = Segment(pixels, Style.null(), ((ControlType.CURSOR_FORWARD, 0),))
         return Strip([Segment(" " * width, ground), control], width)
 
     def _fit(self) -> None:
         self._made_for = self.size
-        self._lines = lines_of(self._image, self.size, terminal_cell_px())
+        self._lines = lines_of(self._image, self.size, terminal_cell_px() or VT340_CELL_PX)
 
 
 class ImagePicture(Container):
@@ -149,13 +148,13 @@ class ImagePicture(Container):
     def __init__(self, widget: type[Any], id: str | None = None) -> None:  # noqa: A002 - textual's name
         super().__init__(id=id)
         self._inner: Any = widget()
-        self._image: NDArray[np.uint8] | None = None
+        self._image: NDArray[np.uint8] | Coloured | None = None
 
     def compose(self) -> ComposeResult:
         """Lay out textual-image's own widget."""
         yield self._inner
 
-    def show(self, image: NDArray[np.uint8] | None) -> None:
+    def show(self, image: NDArray[np.uint8] | Coloured | None) -> None:
         """Draw this picture, unless it is the same object."""
         if image is self._image:
             return
@@ -163,8 +162,11 @@ class ImagePicture(Container):
         if image is None:
             self._inner.image = None
             return
+        import numpy as np
         from PIL import Image
 
+        if isinstance(image, Coloured):
+            image = np.array(image.colours, np.uint8)[image.pixels]
         self._inner.image = Image.fromarray(image)
 
 
@@ -176,24 +178,25 @@ class Pictures:
 
     def __init__(self, preview: Preview = "cells") -> None:
         self.camera_shown = preview != "off"
-        self._make = _best_kind() if preview == "auto" else CellPicture
+        self._make = _best_kind(pixels_of_terminal()) if preview == "auto" else CellPicture
 
     def make(self, id: str) -> AnyPicture:  # noqa: A002 - textual's name
         """Make a widget."""
         return self._make(id)
 
 
-def _best_kind() -> Callable[[str], CellPicture | SixelPicture | ImagePicture]:
-    """Ask the terminal which kind it shows; half-cells if textual-image is not installed."""
-    try:
-        from textual_image.renderable import Image, SixelImage, TGPImage
-        from textual_image.widget import TGPImage as Widget
-    except (ImportError, OSError, ValueError):
-        # The extra is missing, or textual-image does not understand the terminal's answer.
-        return CellPicture
-    if Image is SixelImage:
+def _best_kind(pixels: PixelKind) -> Callable[[str], AnyPicture]:
+    """The widget for the pixels that the terminal has; kitty's protocol needs the package textual-image."""
+    if pixels == "sixel":
         return SixelPicture
-    return partial(ImagePicture, Widget) if Image is TGPImage else CellPicture
+    if pixels == "kitty":
+        try:
+            from textual_image.widget import TGPImage
+        except (ImportError, OSError, ValueError):
+            # The extra is missing, or textual-image does not understand the terminal's answer.
+            return CellPicture
+        return partial(ImagePicture, TGPImage)
+    return CellPicture
 
 
 def binary_picture(binary: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -201,30 +204,3 @@ def binary_picture(binary: NDArray[np.bool_]) -> NDArray[np.uint8]:
     import numpy as np
 
     return np.where(binary, 0, 255).astype(np.uint8)
-
-
-def half_cells(
-    image: NDArray[np.uint8] | None, size: Size, before: NDArray[np.int64] | None = None
-) -> NDArray[np.int64] | None:
-    """The picture fitted into `size` cells: (lines, columns) of pairs of grays, upper * LEVELS + lower; None for none.
-
-    `before` are the pairs of the picture before, of which those stay that are still right; see `fitted`.
-    """
-    if image is None or not image.size or size.width < 1 or size.height < 1:
-        return None
-    import numpy as np
-
-    grays = None if before is None else np.stack(divmod(before, LEVELS), axis=1).reshape(-1, before.shape[1])
-    # A cell is about twice as high as wide: a half-cell is a square.
-    levels = fitted(image, size.width, 2 * size.height, LEVELS, step=2, before=grays)
-    return levels[::2] * LEVELS + levels[1::2]
-
-
-def _strip(pairs: NDArray[np.int64]) -> Strip:
-    return Strip([Segment(HALF * count, _style(pair)) for pair, count in runs(pairs)], len(pairs))
-
-
-@lru_cache(maxsize=LEVELS * LEVELS)
-def _style(pair: int) -> Style:
-    top, bottom = (round(level * 255 / (LEVELS - 1)) for level in divmod(pair, LEVELS))
-    return Style.parse(f"rgb({top},{top},{top}) on rgb({bottom},{bottom},{bottom})")

@@ -40,6 +40,17 @@ NOT_AT_REST = (
     "Leave this screen anyway?",
     LEAVE_KEYS,
 )
+RESUME_KEYS = "y  the arm is at rest and its cell is clear: resume      n  back"
+RESUME = (
+    "Resume this session? The arm first lifts the brush slowly and parks; the paper is found again, "
+    "and the plan goes on. No stroke is made twice.",
+    RESUME_KEYS,
+)
+RESUME_UNSEEN = (
+    "The arm was not seen at rest when the run ended. Look at it: resume only if it stands still. "
+    "It then lifts the brush slowly, and parks.",
+    RESUME_KEYS,
+)
 
 
 class AskScreen(ModalScreen[None]):

@@ -16,6 +16,7 @@ from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Input, OptionList
 
+from collect.tui.capture_screen import CaptureScreen
 from collect.tui.captures import CapturePictures, Review, ReviewCapture
 from collect.tui.finish_screen import FinishScreen
 from collect.tui.keys import LABELS
@@ -27,6 +28,7 @@ from sessions.remarks import Remark, add_remark
 
 KEYS = (
     ("escape", "back"),
+    ("enter", "large"),
     ("b", "bad / good"),
     ("o", "note"),
     ("t", "copy MCAP time"),
@@ -74,6 +76,7 @@ class ReviewScreen(Screen[None]):
         """`at_work` says whether a run is in progress: then no text can be typed, because `s` stops the arm."""
         super().__init__()
         self._review = review
+        self._made_by = pictures
         self._at_work = at_work
         self._now_ns = now_ns
         self._rows: tuple[ReviewCapture, ...] = ()
@@ -112,6 +115,21 @@ class ReviewScreen(Screen[None]):
         self._pictures = None
         self._show_words()
         self._load(self._capture)
+
+    def on_option_list_option_selected(self, _event: OptionList.OptionSelected) -> None:
+        """Show the capture under the cursor large."""
+        if self._capture is not None:
+            self._enlarge(self._capture)
+
+    @work(exclusive=True, group="large")
+    async def _enlarge(self, capture: ReviewCapture) -> None:
+        try:
+            large = await asyncio.to_thread(self._review.large, capture)
+        except SessionError as error:
+            self.notify(plain(str(error)), severity="error")
+            return
+        if self.is_active:
+            app_of(self).push_screen(CaptureScreen(large, self._made_by, at_work=self._at_work()))
 
     def _show_keys(self) -> None:
         """Show the keys; during a run, show how to stop it, and hide note and finish."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from typing import ClassVar
 
 from textual import events
@@ -14,15 +16,17 @@ from textual.screen import Screen
 from collect.engine.control import FINAL, State
 from collect.engine.snapshot import Snapshot
 from collect.headless import no_pose_text
+from collect.tui.force_text import plot, plot_title
 from collect.tui.keys import RUN_BAR, keys_in
 from collect.tui.panes import LEGEND, CapturePane, Grid, figures_content, sheet_content, sheet_title
 from collect.tui.pictures import Pictures
 from collect.tui.steps_screen import NARROW_COLUMNS
-from collect.tui.text import SHORT_STOP, SOFTWARE_STOP, one_line, plain, plot
+from collect.tui.text import SHORT_STOP, SOFTWARE_STOP, one_line, plain
 from collect.tui.widgets import KeyBar, Line, entitle
 
 OVER = "Over: q leaves"
-GOES_ON = "Run the same command again to continue."
+GOES_ON = "Press enter to resume, or run the same command later."
+COMMAND_GOES_ON = "Run the same command again to continue."
 STOP_SENT = "STOP SENT"
 WARNING = "warning: "
 TALL_ROWS = 36
@@ -87,8 +91,12 @@ class RunScreen(Screen[None]):
     """
     BINDINGS: ClassVar[list[BindingType]] = [Binding("tab", "next_pane", "Next pane")]
 
-    def __init__(self, pictures: Pictures) -> None:
+    def __init__(
+        self, pictures: Pictures, *, resumable: bool = False, now_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        """`resumable`: whether this screen can go on with a run that was stopped. `now_s` is the clock of ages."""
         super().__init__()
+        self._resumable = resumable
         # Kept, not queried: a snapshot may come before the parts are mounted or after they are gone.
         self._session, self._source = Line("session"), Line("source")
         self._state, self._figures = Line("state", sized=True), Line("figures", sized=True)
@@ -97,7 +105,7 @@ class RunScreen(Screen[None]):
         self._sheet = Line("sheet-pane", classes="pane")
         self._trace = Line("trace-pane", classes="pane", sized=True)
         self._log, self._log_pane = Line("log"), VerticalScroll(id="log-pane", classes="pane")
-        self._capture = CapturePane(pictures)
+        self._capture = CapturePane(pictures, now_s)
         self._camera, self._with_camera = pictures.make("camera-pane"), pictures.camera_shown
         self._note, self._keys = Line("note", sized=True), KeyBar(RUN_BAR)
         self._messages: tuple[str, ...] = ()
@@ -109,7 +117,6 @@ class RunScreen(Screen[None]):
         self._legend = Line("legend")
         self._legend.show(Content.styled(LEGEND, "dim"))
         self._log_pane.border_title = "Log"
-        self._trace.border_title = "Force, peaks by tenth of a second"
         self._camera.add_class("pane")
         self._camera.border_title = "Camera"
 
@@ -184,15 +191,17 @@ class RunScreen(Screen[None]):
         self._sheet.show(sheet_content(now.sheet))
         entitle(self._sheet, sheet_title(now.sheet))
         if self._trace.display and trace_turn:
-            self._trace.show(plot(now.trace_n, self._trace.content_size.width, TRACE_ROWS))
+            self._trace.show(plot(now.trace_n, self._trace.content_size.width, TRACE_ROWS, now.force_ceiling_n))
+            entitle(self._trace, plot_title(now.force_ceiling_n))
         if now.messages != self._messages:
             self._messages = now.messages
             self._log.show(Content("\n").join(_message_content(line) for line in now.messages))
         self._capture.show(now.last)
         if now.picture is not None and self._camera.display and not figures_turn:
             self._camera.show(now.picture.image)
-        self._note.show(_note_content(now))
-        self._keys.show(keys_in(now.state, RUN_BAR))
+        resumable = self._resumable and bool(now.folder)
+        self._note.show(_note_content(now, resumable=resumable))
+        self._keys.show(keys_in(now.state, RUN_BAR, resumable=resumable))
 
     def _show_state(self, now: Snapshot) -> None:
         state = now.state
@@ -214,10 +223,11 @@ def _message_content(line: str) -> Content:
     return Content.styled(text, "bold $text-warning") if text.startswith(WARNING) else Content(text)
 
 
-def _note_content(now: Snapshot) -> Content:
+def _note_content(now: Snapshot, *, resumable: bool) -> Content:
     """Pending requests and the stop key; once the run is over, how to leave."""
     if now.state in FINAL:
-        following = SOFTWARE_STOP if now.state is State.DONE or now.rest_unknown else GOES_ON
+        on = GOES_ON if resumable else COMMAND_GOES_ON
+        following = SOFTWARE_STOP if now.state is State.DONE or now.rest_unknown else on
         return Content.assemble((f" {OVER} ", "bold reverse"), f"  {following}")
     if now.state is State.STOPPING:
         return Content.styled(" not seen at rest yet: press the red button if it moves ", "bold reverse")

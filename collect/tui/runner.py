@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 
 from collect.errors import CollectAborted
@@ -11,24 +12,32 @@ from collect.headless import RunnableEngine, stop_signals
 from collect.tui.app import OperatorApp
 from collect.tui.browser import SessionBrowser
 from collect.tui.pictures import Pictures, Preview
+from collect.tui.themes import chosen_file
 
 
 class ScreenCrashed(Exception):
     """The screen crashed and has printed the error; the arm was stopped."""
 
 
-def run_screen(engine: RunnableEngine, preview: Preview = "cells") -> None:
-    """Run under the screen until the operator leaves; raises what ended the run."""
-    app = OperatorApp(engine, pictures=Pictures(preview))
+def run_screen(
+    engine: RunnableEngine, preview: Preview = "auto", again: Callable[[str], RunnableEngine] | None = None
+) -> RunnableEngine:
+    """Run under the screen until the operator leaves; raises what ended the run.
+
+    `again` makes the engine that resumes a session after a stop. Returns the engine that ran last.
+    """
+    app = OperatorApp(engine, again=again, pictures=Pictures(preview), theme_file=chosen_file())
     with _signals(app):
         engine.start()
         _run(app)
-        engine.join()
+        assert app.engine is not None
+        app.engine.join()
+        return app.engine
 
 
 def run_browser(browser: SessionBrowser) -> None:
     """Show the start screen, and run what is started from it; raises what ended the last run."""
-    app = OperatorApp(browser=browser, pictures=Pictures())
+    app = OperatorApp(browser=browser, pictures=Pictures("auto"), theme_file=chosen_file())
     with _signals(app):
         _run(app)
         if app.engine is not None:

@@ -9,12 +9,13 @@ from collect.engine.snapshot import EngineView, Fact, SetUpStep, Snapshot, Stand
 from collect.headless import no_pose_text
 from collect.operator import Prompt
 from collect.protocols.steps import StepKind
+from collect.tui.force_text import LEAST_SCALE_N, force_bar, spark
 from collect.tui.keys import SET_UP_BAR, keys_in
 from collect.tui.panes import target_text
 from collect.tui.pictures import Pictures
 from collect.tui.question_screens import answer_by_key, choices_content
 from collect.tui.steps_screen import StepsScreen
-from collect.tui.text import SOFTWARE_STOP, force_bar, one_line, plain, spark, tip_text
+from collect.tui.text import SOFTWARE_STOP, one_line, plain, tip_text
 
 SIGNS = {
     Standing.TO_COME: ("·", "dim"),
@@ -24,8 +25,6 @@ SIGNS = {
 }
 SHARP_PX = 2.0
 """Blur in the full frame below which the lens is in focus: a hint for turning it; the step's own check decides."""
-FORCE_SCALE_N = 0.1
-"""Force at which the bar is full: a soft brush pushes with a few tens of mN."""
 BAR_COLUMNS = 30
 
 
@@ -94,7 +93,7 @@ def _live_content(now: Snapshot) -> Content:
             blur = "no edge in view to measure"
         else:
             blur = f"blur {blur_px:.1f} px  {'✓ sharp' if blur_px < SHARP_PX else '! turn the lens'}"
-    force = f"{force_bar(now.force_n, FORCE_SCALE_N, BAR_COLUMNS)} {spark(now.trace_n, 20)}"
+    force = f"{force_bar(now.force_n, LEAST_SCALE_N, BAR_COLUMNS)} {spark(now.trace_n, 20)}"
     if now.force_n is not None and not _zeroed(now.set_up):
         force = f"{now.force_n:.3f} N with the weight of the holder; zero touch sets it to zero"
     tip = no_pose_text(now) or tip_text(now.tip_mm)

@@ -1,4 +1,4 @@
-"""Gray pictures reduced to few levels, as runs, and as sixels: escape sequences that draw pixels on some terminals."""
+"""Pictures of few colours as sixels: escape sequences that draw pixels on some terminals."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ import fcntl
 import struct
 import sys
 import termios
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from textual.geometry import Size
+
+from collect.tui.levels import RGB, Coloured, fitted, grays, runs, sampled
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,64 +26,32 @@ NOTHING = -1
 VT340_CELL_PX = (10, 20)
 
 
-STEADY = 0.8
-"""A level is kept while the picture stays within this many levels of it: most changes of a camera are noise."""
-
-
-def fitted(
-    image: NDArray[np.uint8],
-    width: int,
-    height: int,
-    levels: int,
-    step: int = 1,
-    before: NDArray[np.int64] | None = None,
-) -> NDArray[np.int64]:
-    """Scale the (h, w) gray picture into `width` x `height`, its shape kept, in grays 0 to `levels` - 1.
-
-    The rows of the result are a multiple of `step`, and at least one. Levels of the picture `before` that are still
-    right within `STEADY` stay.
-    """
-    import cv2
-    import numpy as np
-
-    scale = min(width / image.shape[1], height / image.shape[0])
-    columns, rows = max(1, int(image.shape[1] * scale)), max(1, int(image.shape[0] * scale / step)) * step
-    small = np.asarray(cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA), np.int64) * (levels - 1)
-    made = (small + 127) // 255
-    if before is None or before.shape != made.shape:
-        return made
-    return np.where(np.abs(small - 255 * before) < 255 * STEADY, before, made)
-
-
-def runs(values: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """(value, count) of each run of equal values."""
-    import numpy as np
-
-    starts = np.flatnonzero(np.concatenate(([True], values[1:] != values[:-1])))
-    counts = np.diff(np.append(starts, len(values)))
-    return list(zip(values[starts].tolist(), counts.tolist(), strict=True))
-
-
 def lines_of(
-    image: NDArray[np.uint8] | None, size: Size, cell_px: tuple[int, int] = VT340_CELL_PX
+    image: NDArray[np.uint8] | Coloured | None, size: Size, cell_px: tuple[int, int] = VT340_CELL_PX
 ) -> list[NDArray[np.int64]]:
-    """Gray levels of a picture cut into lines of the terminal, one array as high as a cell for each line it reaches.
+    """Numbers of the picture's colours cut into lines of the terminal, one array as high as a cell for each line.
 
     `NOTHING` fills the last line below the picture.
     """
-    if image is None or not image.size or not size.area:
+    pixels = image.pixels if isinstance(image, Coloured) else image
+    if pixels is None or not pixels.size or not size.area:
         return []
     import numpy as np
 
-    levels = fitted(image, size.width * cell_px[0], size.height * cell_px[1], SIXEL_LEVELS)
+    width, height = size.width * cell_px[0], size.height * cell_px[1]
+    coloured = isinstance(image, Coloured)
+    levels = sampled(pixels, width, height) if coloured else fitted(pixels, width, height, SIXEL_LEVELS)
     rows, columns = levels.shape
     ground = np.full((-(-rows // cell_px[1]) * cell_px[1], columns), NOTHING)
     ground[:rows] = levels
     return [ground[y : y + cell_px[1]] for y in range(0, len(ground), cell_px[1])]
 
 
-def sixels(levels: NDArray[np.int64]) -> str:
-    """The escape sequence that draws (h, w) gray levels and leaves pixels that are `NOTHING` as they were.
+SIXEL_GRAYS = grays(SIXEL_LEVELS)
+
+
+def sixels(levels: NDArray[np.int64], colours: Sequence[RGB] = SIXEL_GRAYS) -> str:
+    """The escape sequence that draws (h, w) numbers of colours and leaves pixels that are `NOTHING` as they were.
 
     DEC STD 070, chapter 9: six rows a band, one pass a colour, runs as `!count`.
     """
@@ -88,8 +59,9 @@ def sixels(levels: NDArray[np.int64]) -> str:
 
     height, width = levels.shape
     used = [int(level) for level in np.unique(levels) if level != NOTHING]
-    percent = {level: round(100 * level / (SIXEL_LEVELS - 1)) for level in used}
-    out = ["\x1bP0;1;0q", f'"1;1;{width};{height}', *(f"#{k};2;{p};{p};{p}" for k, p in percent.items())]
+    out = ["\x1bP0;1;0q", f'"1;1;{width};{height}']
+    for number in used:
+        out.append(f"#{number};2;" + ";".join(str(round(100 * part / 255)) for part in colours[number]))
     for top in range(0, height, BAND_PX):
         band = levels[top : top + BAND_PX]
         weights = 1 << np.arange(len(band))
@@ -101,13 +73,13 @@ def sixels(levels: NDArray[np.int64]) -> str:
     return "".join([*out, "\x1b\\"])
 
 
-def terminal_cell_px() -> tuple[int, int]:
-    """Width and height of a cell of this terminal; a VT340's if the terminal does not report them."""
+def terminal_cell_px() -> tuple[int, int] | None:
+    """Width and height of a cell of this terminal; None if the terminal does not report them."""
     answer = bytes(8)
     if sys.__stderr__ is not None:
         with contextlib.suppress(OSError, ValueError):
             answer = fcntl.ioctl(sys.__stderr__.fileno(), termios.TIOCGWINSZ, answer)
     rows, columns, width_px, height_px = struct.unpack("HHHH", answer)
     if not (rows and columns and width_px and height_px):
-        return VT340_CELL_PX
+        return None
     return max(1, width_px // columns), max(1, height_px // rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar
 
@@ -15,9 +16,9 @@ from textual.screen import Screen
 from textual.widgets import Input, OptionList
 
 from collect.errors import ConfigError
-from collect.tui.browser import SessionBrowser
+from collect.tui.browser import Paths, SessionBrowser
 from collect.tui.question_screens import Confirm
-from collect.tui.text import one_line, plain
+from collect.tui.text import age_text, one_line, plain
 from collect.tui.widgets import KeyBar, Line, Rows, app_of
 from sessions.errors import SessionError
 
@@ -36,11 +37,8 @@ KEYS = (
 )
 TYPING_KEYS = (("enter", "use these files"), ("tab", "the other file"), ("escape", "keep the old files"))
 UNASKED = Content.styled("Rig health: d asks every device; powers nothing, moves nothing", "dim")
-WELCOME = (
-    "No session yet.\n\nn starts one: the set-up looks through the camera, finds the paper, and asks "
-    "you about each measurement; then the strokes follow.\n\nd asks every device of the rig for its state. "
-    "Nothing moves from this screen."
-)
+AGE_S = 5.0
+"""Interval at which the age of the rig's health is updated."""
 SIGNS = {
     "open": ("▶", "bold $text-warning"),
     "damaged": ("!", "bold $text-error"),
@@ -57,11 +55,12 @@ class StartScreen(Screen[None]):
     StartScreen #start-title { height: 1; padding: 0 1; background: $panel; text-style: bold; }
     StartScreen #start-body { height: 1fr; }
     StartScreen #sessions { width: 42%; height: 100%; border: none; padding: 0; }
+    StartScreen.-empty #sessions { display: none; }
     StartScreen #standing { width: 1fr; height: 100%; padding: 0 1; border-left: solid $foreground 40%; }
     StartScreen #files { height: 1; }
     StartScreen #files Line { width: auto; padding: 0 1; }
     StartScreen #files Input { width: 1fr; height: 1; border: none; padding: 0; }
-    StartScreen #health { height: auto; max-height: 8; padding: 0 1; border-top: solid $foreground 40%; }
+    StartScreen #health { height: auto; max-height: 10; padding: 0 1; border-top: solid $foreground 40%; }
     StartScreen #trouble { height: auto; max-height: 10; padding: 0 1; color: $text-error; text-style: bold; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -72,13 +71,20 @@ class StartScreen(Screen[None]):
     ]
 
     def __init__(
-        self, browser: SessionBrowser, begin: Callable[[str | None], object], look: Callable[[str], None]
+        self,
+        browser: SessionBrowser,
+        begin: Callable[[str | None], object],
+        look: Callable[[str], None],
+        now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """`begin` resumes the named session, or begins a new one (None); `look` opens one for review."""
         super().__init__()
         self._browser = browser
         self._begin = begin
         self._look = look
+        self._now_s = now_s
+        self._findings: list[Finding] = []
+        self._asked_s: float | None = None
         self._rows: list[Summary] = []
         self._title, self._standing = Line("start-title"), Line("standing-text")
         self._health, self._trouble = Line("health-text"), Line("trouble")
@@ -111,6 +117,7 @@ class StartScreen(Screen[None]):
         self.query_one("#protocol-label", Line).show("protocol")
         self._health.show(UNASKED)
         self.reread()
+        self.set_interval(AGE_S, self._show_health)
 
     def on_screen_resume(self) -> None:
         """List the sessions again, as a run has changed them."""
@@ -125,10 +132,11 @@ class StartScreen(Screen[None]):
             self.show_trouble(str(error))
             return
         self._options.fill([(row.session_id, _row_content(row)) for row in self._rows])
+        self.set_class(not self._rows, "-empty")
         if self._rows:
             self._options.highlighted = 0
         else:
-            self._standing.show(WELCOME)
+            self._show_first_steps()
 
     def show_trouble(self, text: str) -> None:
         """Show what went wrong; an empty text clears it."""
@@ -151,8 +159,10 @@ class StartScreen(Screen[None]):
     def on_input_submitted(self, _event: Input.Submitted) -> None:
         """Go back to the list with the typed files, and clear what was shown about the previous ones."""
         self._choose()
+        self._asked_s = None
         self._health.show(UNASKED)
         self.show_trouble("")
+        self._show_first_steps()
         self._to_list()
 
     def action_list(self) -> None:
@@ -197,7 +207,19 @@ class StartScreen(Screen[None]):
         except (ConfigError, OSError) as error:
             self._health.show(Content.styled(f"Rig health: {plain(str(error))}", "$text-error"))
             return
-        self._health.show(_health_content(findings))
+        self._findings, self._asked_s = findings, self._now_s()
+        self._show_health()
+        self._show_first_steps()
+
+    def _show_health(self) -> None:
+        if self._asked_s is not None:
+            age = Content.styled(f"Rig health, {age_text(self._now_s() - self._asked_s)}; d asks again", "dim")
+            self._health.show(Content("\n").join((age, _health_content(self._findings))))
+
+    def _show_first_steps(self) -> None:
+        if not self._rows:
+            well = self._asked_s is not None and all(finding.well for finding in self._findings)
+            self._standing.show(first_steps_content(self._browser.paths, well=well))
 
     def _choose(self) -> None:
         self._browser.choose(self._config.value, self._protocol.value)
@@ -207,6 +229,37 @@ class StartScreen(Screen[None]):
             self._standing.show(_standing_content(self._browser.standing(session_id)))
         except SessionError as error:
             self._standing.show(Content.styled(plain(str(error)), "$text-error"))
+
+
+def first_steps_content(paths: Paths, *, well: bool) -> Content:
+    """What to do before the first session, each step with a sign once it is done."""
+    steps = (
+        (
+            paths.config.is_file(),
+            f"The rig: {plain(str(paths.config))}",
+            "An arm: `brushloop rig new` writes it, step by step.\n"
+            "No arm: `brushloop sim --write-rig rig.toml --rate 20`, in another terminal.",
+        ),
+        (
+            paths.protocol.is_file(),
+            f"What to press: {plain(str(paths.protocol))}",
+            "Copy examples/protocol-quick.toml, or press e and type another path.",
+        ),
+        (well, "Health: d asks every device", "Nothing is powered, and nothing moves from this screen."),
+        (
+            False,
+            "The first session: n",
+            "It asks for a blank sheet; the set-up looks through the camera, finds the paper, and asks you "
+            "about each measurement. Then the strokes follow.",
+        ),
+    )
+    parts = [Content.styled("No session yet. First steps:", "bold")]
+    for number, (done, title, what) in enumerate(steps, 1):
+        sign = ("✓", "$text-success") if done else ("·", "dim")
+        parts.append(Content.assemble("\n", sign, f" {number}  ", (title, "bold")))
+        if not done:
+            parts.append(Content.styled(what, "dim"))
+    return Content("\n").join(parts)
 
 
 def _row_content(row: Summary) -> Content:

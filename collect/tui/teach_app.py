@@ -15,8 +15,9 @@ from collect.tui.pictures import Pictures
 from collect.tui.question_screens import Confirm
 from collect.tui.teach_guide import ScreenGuide, Teaching
 from collect.tui.teach_screen import GO_ON, LEAVE, TeachScreen
-from collect.tui.terminal import PlainApp, TerminalDriver
+from collect.tui.terminal import PlainApp
 from collect.tui.text import SOFTWARE_STOP
+from collect.tui.themes import chosen_file
 from collect.tui.widgets import HelpScreen
 
 Work = Callable[[ScreenGuide], Coroutine[Any, Any, Path | None]]
@@ -54,8 +55,8 @@ class TeachApp(PlainApp):
         Binding("g", "go_on", "Go on", show=False),
     ]
 
-    def __init__(self, work: Work, name: str, pictures: Pictures | None = None) -> None:
-        super().__init__(driver_class=TerminalDriver)
+    def __init__(self, work: Work, name: str, pictures: Pictures | None = None, theme_file: Path | None = None) -> None:
+        super().__init__(theme_file)
         self._work = work
         self._name = name
         self._pictures = pictures or Pictures()
@@ -142,7 +143,7 @@ def run_teaching(work: Work, name: str, pictures: Pictures | None = None) -> Pat
 
     However the screen ends, nobody watches the arm from here on: whatever moves it is stopped.
     """
-    app = TeachApp(work, name, pictures)
+    app = TeachApp(work, name, pictures, chosen_file())
 
     def on_signal(_: int) -> None:
         app.teaching.stop()

@@ -8,15 +8,19 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from functools import partial
+from pathlib import Path
 from typing import TextIO
 
 from rich.segment import Segment
-from textual.app import App
+from textual.app import App, SystemCommand
 from textual.color import Color
 from textual.drivers.linux_driver import LinuxDriver
 from textual.filter import LineFilter
+from textual.screen import Screen
 
+from collect.tui.themes import THEMES, TITLES, chosen, keep
 from sessions.terminal import inert
 
 
@@ -43,7 +47,25 @@ class TerminalDriver(LinuxDriver):
 
 
 class PlainApp(App[None]):
-    """An app that shows text of any origin without letting it control the terminal."""
+    """An app that shows text of any origin without letting it control the terminal, in the colours that were chosen."""
+
+    def __init__(self, theme_file: Path | None = None) -> None:
+        """`theme_file` keeps the choice of colours; None where it is not kept."""
+        super().__init__(driver_class=TerminalDriver)
+        self._theme_file = theme_file
+        for theme in THEMES:
+            self.register_theme(theme)
+        self.theme = chosen(theme_file)
+
+    def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
+        """List the themes that are not shown now."""
+        for name, (title, what) in TITLES.items():
+            if name != self.theme:
+                yield SystemCommand(title, what, partial(self._choose_theme, name))
+
+    def _choose_theme(self, name: str) -> None:
+        self.theme = name
+        keep(self._theme_file, name)
 
     def get_line_filters(self) -> Sequence[LineFilter]:
         """Add `PlainLines` after textual's own filters."""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import ClassVar, cast
 
 from rich.cells import cell_len
+from textual import events
 from textual.app import App, ComposeResult, RenderResult
 from textual.binding import Binding, BindingType
 from textual.containers import VerticalScroll
@@ -18,6 +19,8 @@ from textual.widgets.option_list import Option
 
 Key = tuple[str, str]
 """The key and what it does."""
+KEY_NAMES = {"?": "question_mark", "→": "right", "ctrl-p": "ctrl+p", "esc": "escape"}
+"""Textual's names of keys that are shown by another."""
 GAP = 2
 CURSOR, ELSEWHERE = "›", " "
 
@@ -83,6 +86,8 @@ class KeyBar(Widget):
     def __init__(self, keys: Sequence[Key] = ()) -> None:
         super().__init__()
         self._keys = tuple(keys)
+        self._places: list[tuple[str, int, int]] = []
+        """Each key that is drawn, with its first column and the one after its last."""
 
     def show(self, keys: Sequence[Key]) -> None:
         """Replace the keys, if they differ."""
@@ -90,15 +95,24 @@ class KeyBar(Widget):
             self._keys = tuple(keys)
             self.refresh()
 
+    def on_click(self, event: events.Click) -> None:
+        """Do what the key under the pointer does."""
+        # One column of padding.
+        key = next((key for key, start, end in self._places if start <= event.x - 1 < end), None)
+        if key is not None:
+            app_of(self).simulate_key(KEY_NAMES.get(key, key))
+
     def render(self) -> RenderResult:
         """Draw `s STOP  space pause  q leave ...` as far as it fits."""
         parts: list[Content] = []
+        self._places = []
         used = 0
         for key, label in self._keys:
             width = cell_len(key) + 1 + cell_len(label)
             if used + width > self.size.width:
                 break
             parts.append(Content.assemble((key, "bold $text-accent"), f" {label}"))
+            self._places.append((key, used, used + width))
             used += width + GAP
         return Content(" " * GAP).join(parts)
 

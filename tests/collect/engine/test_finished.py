@@ -30,7 +30,7 @@ def test_it_is_printed_after_the_screen_too(
 ) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
     monkeypatch.setattr(
-        "collect.tui.runner.run_screen", lambda engine, _preview: (engine.start(), wait_for_end(engine))
+        "collect.tui.runner.run_screen", lambda engine, *_options: (engine.start(), wait_for_end(engine), engine)[-1]
     )
     opening = Opening.load(lab.sessions, lab.folder / "rig.toml", lab.folder / "protocol.toml")
     assert start(opening, on_screen=True, preview="off") == 0

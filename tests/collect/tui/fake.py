@@ -105,6 +105,7 @@ def full_picture(**changes: Any) -> Snapshot:
         "grid": marked_grid(),
         "target_mm": (123.4, -45.25, 7.0),
         "force_n": 0.041,
+        "force_ceiling_n": 5.0,
         "ink_level": 0.63,
         "given_up": 1,
         "trace_n": tuple(0.03 * max(0.0, math.sin(n / 9)) for n in range(120)),

@@ -12,6 +12,11 @@ CHAR_PX = 12.2
 """Width of a cell in that picture."""
 
 
+def has_picture(text: str) -> bool:
+    """Whether a picture is among it: braille with dots."""
+    return any("\u2801" <= sign <= "\u28ff" for sign in text)
+
+
 def shown(app: App[None]) -> str:
     """The lines of the screen, without blanks at their ends."""
     width, height = app.size

@@ -14,12 +14,14 @@ from textual.widget import Widget
 from textual.widgets import Static
 
 from collect.engine.control import FINAL, State
+from collect.errors import ConfigError
 from collect.operator import OperatorRequest
 from collect.tui.app import OperatorApp
 from collect.tui.keys import RUN_KEYS
 from collect.tui.question_screens import Confirm
-from collect.tui.run_screen import GOES_ON, OVER, STOP_SENT
+from collect.tui.run_screen import COMMAND_GOES_ON, GOES_ON, OVER, STOP_SENT
 from collect.tui.text import SOFTWARE_STOP
+from collect.tui.themes import LIGHT
 from collect.tui.widgets import HelpScreen, Line
 from tests.collect.tui.fake import (
     DONE,
@@ -34,7 +36,7 @@ from tests.collect.tui.fake import (
     grid_of,
     picture,
 )
-from tests.collect.tui.screen_text import shown
+from tests.collect.tui.screen_text import has_picture, shown
 from tests.waiting import PATIENCE_S
 
 AT_WORK = sorted(set(State) - FINAL)
@@ -200,7 +202,7 @@ async def test_while_the_arm_is_being_stopped_q_asks_nothing_and_the_red_button_
     engine = FakeEngine(picture(state=State.STOPPING))
     app = OperatorApp(engine)
     async with app.run_test(size=(80, 24)) as pilot:
-        assert "not seen at rest yet: the red button" in await look(app, pilot)
+        assert "not seen at rest yet: press the red button" in await look(app, pilot)
         await pilot.press("q")
         assert not isinstance(app.screen, Confirm)
         assert engine.calls == []
@@ -286,7 +288,7 @@ async def test_the_palette_knows_the_commands(monkeypatch: pytest.MonkeyPatch) -
         await pilot.pause(0.3)
         await pilot.press("enter")
         await pilot.pause(0.3)
-        assert app.theme == "textual-light"
+        assert app.theme == LIGHT
 
 
 async def test_what_comes_from_outside_is_shown_as_it_is() -> None:
@@ -308,10 +310,52 @@ async def test_what_is_over_offers_no_resume_and_says_what_goes_on(state: State)
         assert "space resume" in await look(app, pilot)
         engine.now = replace(PAUSED, state=state, error="stopped by the operator")
         text = await look(app, pilot)
-        assert GOES_ON in text
+        assert COMMAND_GOES_ON in text
         assert not [word for word in ("space", "s STOP", "r retake", SOFTWARE_STOP) if word in text]
         await pilot.press("space", "p", "r", "n", "j")
         assert engine.calls == []
+
+
+@pytest.mark.parametrize("unseen", [False, True])
+async def test_enter_resumes_a_stopped_session_once_the_operator_has_looked_at_the_arm(unseen: bool) -> None:
+    stopped = FakeEngine(picture(state=State.STOPPED, folder="sessions/2026-11-21-grid-01", rest_unknown=unseen))
+    stopped.stop()
+    resumed = FakeEngine(picture())
+    asked: list[str] = []
+
+    def again(session_id: str) -> FakeEngine:
+        asked.append(session_id)
+        return resumed
+
+    app = OperatorApp(stopped, again=again)
+    async with app.run_test(size=(80, 24)) as pilot:
+        text = await look(app, pilot)
+        assert "enter resume" in text
+        assert (GOES_ON in text) is not unseen
+        await pilot.press("enter")
+        assert ("not seen at rest" in await look(app, pilot)) is unseen
+        await pilot.press("n", "enter", "y")
+        await app.workers.wait_for_complete()
+        assert asked == ["2026-11-21-grid-01"]
+        assert stopped.calls == ["stop", "join"]
+        assert resumed.calls == ["start"]
+        assert "RUNNING" in await look(app, pilot)
+
+
+async def test_a_session_that_cannot_be_resumed_says_why() -> None:
+    def again(_session_id: str) -> FakeEngine:
+        raise ConfigError("rig.toml", "", "goes on with no open session")
+
+    stopped = FakeEngine(picture(state=State.STOPPED, folder="sessions/2026-11-21-grid-01"))
+    stopped.stop()
+    app = OperatorApp(stopped, again=again)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await look(app, pilot)
+        await pilot.press("enter", "y")
+        while not app._notifications:
+            await look(app, pilot)
+        assert [note.message for note in app._notifications] == ["rig.toml: goes on with no open session"]
+        assert app.engine is stopped
 
 
 async def test_the_keys_of_the_set_up_are_those_that_work_now() -> None:
@@ -365,7 +409,7 @@ async def test_80_columns_by_24_rows_show_all_that_matters() -> None:
         text = await look(app, pilot)
     for part in ("2026-11-21-grid-01", "source: loopback rig", "FAILED", "13/30", "elapsed 3:05", "voids 1", "20 mm"):
         assert part in text
-    for part in ("123.40", "10°", OVER, GOES_ON, "q leave"):
+    for part in ("123.40", "10°", OVER, COMMAND_GOES_ON, "q leave"):
         assert part in text
     words = " ".join(text.replace("┃", " ").split())
     assert " ".join(ERROR.split()) in words
@@ -379,7 +423,7 @@ async def test_a_run_resized_in_its_middle_shows_the_same() -> None:
             text = await look(app, pilot)
             for part in ("RUNNING", "13/30", "q leave", "s STOP", "Sheet 1: 25 free", SOFTWARE_STOP):
                 assert part in text, size
-            assert ("Last capture" in text) == (size[0] >= 110)
+            assert ("Capture, " in text) == (size[0] >= 110)
 
 
 async def test_tab_turns_to_the_capture_and_the_camera_where_there_is_no_room_for_all() -> None:
@@ -390,7 +434,7 @@ async def test_tab_turns_to_the_capture_and_the_camera_where_there_is_no_room_fo
         text = await look(app, pilot)
         assert "H15-a5-r01" in text
         assert "CCD-BSM as published for this H and α, right: CSIM" in text
-        assert "▀" in text
+        assert has_picture(text)
         await pilot.press("tab")
         assert "Camera" in await look(app, pilot)
         await pilot.press("tab")
@@ -451,7 +495,7 @@ async def test_an_error_of_the_engine_is_a_crash_not_a_blank() -> None:
 
 async def test_what_did_not_change_is_not_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
     engine = FakeEngine(full_picture())
-    app = OperatorApp(engine)
+    app = OperatorApp(engine, now_s=lambda: 1010.0)
     async with app.run_test(size=(120, 40)) as pilot:
         for _ in range(3):
             await look(app, pilot)

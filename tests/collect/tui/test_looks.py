@@ -11,8 +11,20 @@ from textual.pilot import Pilot
 from collect.engine.control import State
 from collect.tui.app import OperatorApp
 from collect.tui.finish_screen import FinishScreen
+from collect.tui.themes import LIGHT, SAFE
 from sessions.repair.verify import Verdict
-from tests.collect.tui.fake import DONE, FAILED, JOGGED, PAUSED, SET_UP, SPLIT, TOUCHED, FakeEngine, full_picture
+from tests.collect.tui.fake import (
+    DONE,
+    FAILED,
+    JOGGED,
+    PAUSED,
+    SET_UP,
+    SPLIT,
+    TOUCHED,
+    FakeEngine,
+    capture,
+    full_picture,
+)
 from tests.collect.tui.fake_browser import FakeBrowser, a_review
 from tests.collect.tui.teach_fake import Asking, app_of
 
@@ -63,21 +75,23 @@ def test_run(snap_compare: Callable[..., bool], name: str, size: str) -> None:
 
 @pytest.mark.parametrize("name", ["paused", "failed", "done"])
 def test_run_small(snap_compare: Callable[..., bool], name: str) -> None:
-    assert snap_compare(OperatorApp(FakeEngine(NOW[name])), terminal_size=(80, 24), run_before=pressing())
+    assert snap_compare(
+        OperatorApp(FakeEngine(NOW[name]), now_s=lambda: 1010.0), terminal_size=(80, 24), run_before=pressing()
+    )
 
 
 @pytest.mark.parametrize(
     ("name", "keys"), [("capture", ["tab"]), ("camera", ["tab", "tab"]), ("help", ["?"]), ("leave", ["q"])]
 )
 def test_over_the_run(snap_compare: Callable[..., bool], name: str, keys: list[str]) -> None:
-    app = OperatorApp(FakeEngine(full_picture()))
+    app = OperatorApp(FakeEngine(full_picture()), now_s=lambda: 1010.0)
     assert snap_compare(app, terminal_size=(80, 24), run_before=pressing(*keys))
 
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("name", ["start", "review"])
 def test_without_a_run(snap_compare: Callable[..., bool], tmp_path: Path, name: str, size: str) -> None:
-    app = OperatorApp(browser=FakeBrowser())
+    app = OperatorApp(browser=FakeBrowser(), now_s=lambda: 1010.0)
     if name == "review":
 
         async def review(pilot: Pilot[None]) -> None:
@@ -96,7 +110,7 @@ def test_without_a_run(snap_compare: Callable[..., bool], tmp_path: Path, name: 
 def test_the_end_of_a_session(snap_compare: Callable[..., bool], monkeypatch: pytest.MonkeyPatch, size: str) -> None:
     sound = Verdict("2026-11-21-grid-01", "closed", files=44, strokes=12, messages=22528)
     monkeypatch.setattr("collect.tui.finish_screen.verify", lambda _folder: sound)
-    app = OperatorApp(browser=FakeBrowser())
+    app = OperatorApp(browser=FakeBrowser(), now_s=lambda: 1010.0)
 
     async def finish(pilot: Pilot[None]) -> None:
         await settled(pilot)
@@ -108,7 +122,7 @@ def test_the_end_of_a_session(snap_compare: Callable[..., bool], monkeypatch: py
 
 @pytest.mark.parametrize(("name", "keys"), [("help", ["?"]), ("leave", ["q"])])
 def test_over_a_larger_run(snap_compare: Callable[..., bool], name: str, keys: list[str]) -> None:
-    app = OperatorApp(FakeEngine(full_picture()))
+    app = OperatorApp(FakeEngine(full_picture()), now_s=lambda: 1010.0)
     assert snap_compare(app, terminal_size=SIZES["120x40"], run_before=pressing(*keys))
 
 
@@ -127,13 +141,26 @@ def test_first_day(snap_compare: Callable[..., bool], kind: str, size: str) -> N
     app.teaching._thread.join()
 
 
-def test_light(snap_compare: Callable[..., bool]) -> None:
-    app = OperatorApp(FakeEngine(full_picture()))
-    app.theme = "textual-light"
+@pytest.mark.parametrize("size", SIZES)
+def test_a_capture_large(snap_compare: Callable[..., bool], size: str) -> None:
+    app = OperatorApp(FakeEngine(full_picture(last=capture(kept=False))), now_s=lambda: 1010.0)
+    assert snap_compare(app, terminal_size=SIZES[size], run_before=pressing("enter"))
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_first_start(snap_compare: Callable[..., bool], size: str) -> None:
+    app = OperatorApp(browser=FakeBrowser(rows=()), now_s=lambda: 1010.0)
+    assert snap_compare(app, terminal_size=SIZES[size], run_before=pressing("d"))
+
+
+@pytest.mark.parametrize("theme", [LIGHT, SAFE])
+def test_other_colours(snap_compare: Callable[..., bool], theme: str) -> None:
+    app = OperatorApp(FakeEngine(full_picture()), now_s=lambda: 1010.0)
+    app.theme = theme
     assert snap_compare(app, terminal_size=(120, 40), run_before=pressing())
 
 
 def test_no_colour(snap_compare: Callable[..., bool], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NO_COLOR", "1")
-    app = OperatorApp(FakeEngine(full_picture()))
+    app = OperatorApp(FakeEngine(full_picture()), now_s=lambda: 1010.0)
     assert snap_compare(app, terminal_size=(120, 40), run_before=pressing())

@@ -17,6 +17,7 @@ from collect.engine.snapshot import Snapshot
 from collect.start import engine_for
 from collect.tui.app import OperatorApp
 from collect.tui.browser import Paths, SessionBrowser
+from collect.tui.end_screen import EndScreen
 from collect.tui.finish_screen import FinishScreen
 from collect.tui.question_screens import AskScreen
 from collect.tui.review_screen import ReviewScreen
@@ -26,7 +27,7 @@ from collect.tui.start_screen import StartScreen
 from sessions.reader import Recording
 from sessions.remarks import remarks_of
 from sessions.repair.verify import verify_session
-from tests.collect.tui.screen_text import shown
+from tests.collect.tui.screen_text import has_picture, shown
 from tests.collect.until import wait_for_end
 from tests.waiting import PATIENCE_S
 
@@ -156,7 +157,8 @@ async def test_a_day_at_the_rig(day: Day) -> None:
         await operator.accept("Self-check")
 
         # a stroke comes out badly: the question has its picture, and the answer presses it again
-        await operator.reads(SPLIT, "r  press it again", "▀")
+        await operator.reads(SPLIT, "r  press it again")
+        await operator.until(lambda: has_picture(shown(app)), "waited for its picture")
         bad = operator.now()
         await operator.press("r")
         await operator.on(RunScreen)
@@ -198,7 +200,8 @@ async def test_a_day_at_the_rig(day: Day) -> None:
         await operator.on(SetUpScreen)
         await operator.accept("Zero touch and plane")
         await operator.in_state(State.DONE)
-        await operator.reads("DONE", f"{STROKES}/{STROKES}")
+        await operator.on(EndScreen)
+        await operator.reads(f"{STROKES} of {STROKES}", "no cell was pressed twice", "brushloop calibrate")
 
         # review: one is marked bad with a note, and the recording is verified
         await operator.press("v")

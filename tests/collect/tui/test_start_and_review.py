@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import subprocess
 import sys
 from collections.abc import Callable
@@ -18,16 +17,20 @@ from textual.pilot import Pilot
 
 from collect.errors import ConfigError
 from collect.tui.app import OperatorApp
+from collect.tui.capture_screen import CaptureScreen
+from collect.tui.dots import Cells
 from collect.tui.finish_screen import FinishScreen, run_command, verdict_content
-from collect.tui.pictures import HALF, CellPicture, ImagePicture, Pictures, half_cells
+from collect.tui.force_text import force_bar, plot, plot_title, scale_n, spark
+from collect.tui.graphics import kind_of
+from collect.tui.levels import Coloured
+from collect.tui.pictures import CellPicture, ImagePicture, Pictures, SixelPicture, _best_kind
 from collect.tui.question_screens import Confirm
 from collect.tui.start_screen import StartScreen
-from collect.tui.text import force_bar, plot, spark
 from sessions.remarks import remarks_of
 from sessions.repair.verify import Finding, Verdict
 from tests.collect.tui.fake import FakeEngine, picture
 from tests.collect.tui.fake_browser import FakeBrowser, a_review
-from tests.collect.tui.screen_text import shown
+from tests.collect.tui.screen_text import has_picture, shown
 from tests.collect.tui.test_app import look
 
 
@@ -64,10 +67,38 @@ async def test_the_first_day_says_what_to_do() -> None:
     app = OperatorApp(browser=FakeBrowser(rows=()))
     async with app.run_test(size=(80, 24)) as pilot:
         text = await ready(app, pilot)
-        assert "No session yet" in text
-        assert "q leave" in text
+        for part in ("No session yet", "brushloop rig new", "protocol-quick.toml", "d asks every device", "q leave"):
+            assert part in text
         await pilot.press("s", "q")
     assert app.return_code == 0
+
+
+async def test_health_says_its_age() -> None:
+    now_s = [100.0]
+    app = OperatorApp(browser=FakeBrowser(), now_s=lambda: now_s[0])
+    async with app.run_test(size=(80, 24)) as pilot:
+        await ready(app, pilot)
+        await pilot.press("d")
+        assert "Rig health, just now" in await ready(app, pilot)
+        now_s[0] += 185.0
+        assert isinstance(app.screen, StartScreen)
+        app.screen._show_health()
+        assert "Rig health, 3 min ago" in await ready(app, pilot)
+
+
+async def test_a_capture_of_the_review_is_shown_large(tmp_path: Path) -> None:
+    app = OperatorApp(browser=FakeBrowser())
+    async with app.run_test(size=(120, 40)) as pilot:
+        await ready(app, pilot)
+        app.push_screen(a_review(tmp_path))
+        await ready(app, pilot)
+        await pilot.press("enter")
+        text = await ready(app, pilot)
+        assert isinstance(app.screen, CaptureScreen)
+        for part in ("H13-a0-r01", "2 binarised", "no fit yet: run `brushloop fit`"):
+            assert part in text
+        assert "difference" not in text
+        assert "s STOP" not in text
 
 
 async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_first() -> None:
@@ -136,9 +167,9 @@ async def test_marks_and_notes_are_kept_beside_the_recording(tmp_path: Path) -> 
             "still 4  at 1795273966.402 s",
             "Waited    1.2 s from dip to touch",
             "H13-a0-r03 dip?",
-            HALF,
         ):
             assert part in text
+        assert has_picture(text)
         await pilot.press("b")
         await ready(app, pilot)
         await pilot.press("o", *"so so", "enter")
@@ -208,16 +239,16 @@ def test_a_command_shows_its_progress_and_keeps_it_where_it_fails(monkeypatch: p
     assert lines == ["3 of 30", "3 of 30"]
 
 
+def test_pixels_are_drawn_where_the_terminal_says_that_it_can() -> None:
+    assert kind_of(b"s\x1b[?62;4;22c") == "sixel"
+    assert kind_of(b"\x1b[?64;22;40c") == kind_of(b"") == "none"
+    assert isinstance(_best_kind("sixel")("x"), SixelPicture)
+    assert isinstance(Pictures("auto").make("x"), CellPicture), "no terminal"
+
+
 def test_pictures_work_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    imports = builtins.__import__
-
-    def missing(name: str, *rest: Any) -> Any:
-        if name.startswith("textual_image"):
-            raise ImportError(name)
-        return imports(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", missing)
-    assert isinstance(Pictures("auto").make("x"), CellPicture)
+    monkeypatch.setitem(sys.modules, "textual_image.widget", None)
+    assert isinstance(_best_kind("kitty")("x"), CellPicture)
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:textual_image")
@@ -235,11 +266,27 @@ async def test_pictures_by_the_extra_are_shown_and_changed() -> None:
 
 def test_a_picture_fits_its_place_and_keeps_its_shape() -> None:
     image = np.tile(np.arange(64, dtype=np.uint8) * 4, (32, 1))
-    pairs = half_cells(image, Size(40, 30))
-    assert pairs is not None
-    assert pairs.shape == (10, 40)
-    assert half_cells(None, Size(40, 30)) is None
-    assert half_cells(image, Size(0, 0)) is None
+    codes = Cells(image, Size(40, 30)).codes
+    assert codes is not None
+    assert codes.shape == (10, 40)
+    assert Cells(None, Size(40, 30)).codes is None
+    assert Cells(image, Size(0, 0)).codes is None
+
+
+def test_a_pixel_is_a_dot_of_its_own_colour_on_the_colour_of_most() -> None:
+    paper = np.full((4, 4), 255, np.uint8)
+    paper[0, 0] = paper[3, 3] = 0
+    [line] = [Cells(paper, Size(2, 1)).strip(0)]
+    assert line.text == "⠁⢀"
+    numbers = np.zeros((4, 4), np.uint8)
+    numbers[:, 2] = 1
+    numbers[1, 3] = 2
+    strip = Cells(Coloured(numbers, ((255, 255, 255), (0, 0, 0), (0, 114, 178))), Size(2, 1)).strip(0)
+    assert strip.text[0] == "⠀"
+    assert {str(part.style) for part in strip} == {
+        "rgb(255,255,255) on rgb(255,255,255)",
+        "rgb(255,255,255) on rgb(0,0,0)",
+    }
 
 
 def test_the_noise_of_a_camera_is_not_drawn_and_a_change_is() -> None:
@@ -248,16 +295,22 @@ def test_the_noise_of_a_camera_is_not_drawn_and_a_change_is() -> None:
     def frame(gray: float) -> NDArray[np.uint8]:
         return np.clip(rng.normal(gray, 3.0, (160, 320)), 0, 255).astype(np.uint8)
 
-    dark = half_cells(frame(100.0), Size(64, 16))
-    assert dark is not None
-    assert (half_cells(frame(100.0), Size(64, 16), dark) == dark).mean() > 0.95
-    assert (half_cells(frame(115.0), Size(64, 16), dark) != dark).mean() > 0.95
+    dark = Cells(frame(100.0), Size(64, 16))
+    again, brighter = Cells(frame(100.0), Size(64, 16), dark), Cells(frame(115.0), Size(64, 16), dark)
+    assert dark.codes is not None
+    assert again.codes is not None
+    assert brighter.codes is not None
+    assert (again.codes == dark.codes).mean() > 0.95
+    assert (brighter.codes != dark.codes).mean() > 0.95
 
 
 def test_a_force_is_drawn_to_scale_and_noise_does_not_fill_its_place() -> None:
     assert spark([0.0, 0.5, 1.0], 4) == "  ▄█"
     assert spark([0.001, 0.0], 2) == "▁ "
-    assert plot([0.0, 1.0], 2, 2).plain == " █\n █"
+    assert [scale_n([force_n]) for force_n in (0.0, 0.04, 0.11, 0.9, 3.0)] == [0.1, 0.1, 0.2, 1.0, 5.0]
+    assert plot([0.0, 1.0], 10, 2).plain == "    1 N┤ █\n    0 N┤ █"
+    assert plot([0.0, 1.0], 10, 2, ceiling_n=0.6).plain == "    1 N┤╌█\n    0 N┤ █"
+    assert "5 N" in plot_title(5.0)
     assert force_bar(0.05, 0.1, 10) == "█████░░░░░   0.050 N"
     assert force_bar(9.0, 0.1, 4) == "████   9.000 N"
     assert force_bar(None, 0.1, 4) == "no force sensor"

@@ -1,0 +1,127 @@
+"""What the large view of a capture shows: its pictures, what was predicted for it, and its checks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from collect.tui.levels import Coloured, grays
+from collect.tui.pictures import binary_picture
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from collect.engine.last_capture import LastCapture
+
+WHITE, BOTH, CAPTURED, PREDICTED = (255, 255, 255), (165, 165, 165), (213, 94, 0), (0, 114, 178)
+"""Colours of a difference, as in the reports: after Okabe and Ito, which colour-blind readers can distinguish."""
+PHOTO_GRAYS = 12
+OVERLAY_PX = 384
+LINE_PX = 3
+
+
+class AnyCheck(Protocol):
+    """A check of a capture, from the running engine or from a recording."""
+
+    @property
+    def name(self) -> str:
+        """What is checked."""
+        ...
+
+    @property
+    def score(self) -> float | None:
+        """The measured value; None if it could not be measured."""
+        ...
+
+    @property
+    def threshold(self) -> float | None:
+        """Its limit."""
+        ...
+
+    @property
+    def passed(self) -> bool:
+        """Whether it is within the limit."""
+        ...
+
+    @property
+    def reason(self) -> str:
+        """What is wrong and what to do; empty where it passed."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LargeCapture:
+    """One capture, for the large view."""
+
+    title: str
+    photo: NDArray[np.uint8] | None
+    binary: NDArray[np.bool_] | None
+    predicted: NDArray[np.bool_] | None
+    """Mark that a model predicts on the field of `binary`; None without one."""
+    model: str
+    """Which model that is, or why there is none."""
+    csim: float | None
+    checks: tuple[AnyCheck, ...]
+
+    def pictures(self) -> dict[str, NDArray[np.uint8] | Coloured]:
+        """The pictures there are, by name, in the order in which they are shown."""
+        found: dict[str, NDArray[np.uint8] | Coloured] = {}
+        if self.photo is not None:
+            found["photograph"] = self.photo
+        if self.binary is not None:
+            found["binarised"] = binary_picture(self.binary)
+            if self.predicted is not None:
+                if self.photo is not None:
+                    found["overlay"] = over_photograph(self.photo, self.predicted)
+                found["difference"] = difference(self.binary, self.predicted)
+        return found
+
+
+def of_last(last: LastCapture) -> LargeCapture:
+    """The newest capture of a run, with CCD-BSM as published."""
+    title = f"{last.stroke_id}   H {last.height_mm:g} mm  α {last.tilt_deg:g}°"
+    model = "CCD-BSM as published" if last.model is not None else "no prediction for this stroke"
+    checks = () if last.verdict is None else last.verdict.checks
+    return LargeCapture(title, last.photo, last.binary, last.model, model, last.likeness, checks)
+
+
+def over_photograph(photo: NDArray[np.uint8], predicted: NDArray[np.bool_]) -> Coloured:
+    """The edge of the predicted mark on the photograph of the same field."""
+    import cv2
+    import numpy as np
+
+    small = cv2.resize(photo, (OVERLAY_PX, OVERLAY_PX), interpolation=cv2.INTER_AREA)
+    levels = (np.asarray(small, np.int64) * (PHOTO_GRAYS - 1) + 127) // 255
+    mask = cv2.resize(predicted.astype(np.uint8), (OVERLAY_PX, OVERLAY_PX), interpolation=cv2.INTER_LINEAR)
+    edges, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    pixels = cv2.drawContours(levels.astype(np.uint8), edges, -1, PHOTO_GRAYS, LINE_PX)
+    return Coloured(np.asarray(pixels, np.uint8), (*grays(PHOTO_GRAYS), PREDICTED))
+
+
+def difference(captured: NDArray[np.bool_], predicted: NDArray[np.bool_]) -> Coloured:
+    """Where both have ink, only the capture has it, and only the prediction has it."""
+    import numpy as np
+
+    pixels = np.where(captured, np.where(predicted, 1, 2), np.where(predicted, 3, 0))
+    return Coloured(pixels.astype(np.uint8), (WHITE, BOTH, CAPTURED, PREDICTED))
+
+
+def number_text(value: float | None) -> str:
+    """A value of a check, as short as it can be read."""
+    if value is None:
+        return "not measured"
+    return f"{value:.2f}" if abs(value) < 10.0 else f"{value:.0f}"
+
+
+def limit_sign(check: AnyCheck) -> str:
+    """`≤` where the value must not exceed the limit, else `≥`; empty without both."""
+    if check.score is None or check.threshold is None:
+        return ""
+    return "≤" if (check.score <= check.threshold) == check.passed else "≥"
+
+
+def limit_text(check: AnyCheck) -> str:
+    """`≤ 0.25 mm`, or nothing for a check without a limit."""
+    sign = limit_sign(check)
+    return f"{sign} {number_text(check.threshold)} {getattr(check, 'unit', '')}".rstrip() if sign else ""
