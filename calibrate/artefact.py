@@ -85,7 +85,7 @@ def load_artefact(path: Path, kind: type[A]) -> A:
     version = _version(data)
     if isinstance(version, int) and version not in kind.versions:
         known = ", ".join(map(str, kind.versions))
-        raise CalibrationError(str(path), f"schema_version: {version} is not one that is read here ({known}): update")
+        raise CalibrationError(str(path), f"schema_version: {version} is not known here ({known}): update brushloop")
     try:
         made = kind.model_validate_json(data)
     except ValidationError as error:
@@ -130,7 +130,7 @@ def current(session: Path, folder: str = FOLDER) -> Path | None:
             raise CalibrationError(str(pointer), f"names {name}, which is not there: {_choose(session, folder)}")
         return path
     if len(found) > 1:
-        taken = f"{len(found)} artefacts, and no file `{POINTER}` says which is in use: {found[-1].name} is taken"
+        taken = f"{len(found)} artefacts, and no file `{POINTER}` that says which is in use: {found[-1].name} is used"
         _log.warning("%s: holds %s, as it was written last; %s", session / folder, taken, _choose(session, folder))
     return found[-1] if found else None
 

@@ -46,7 +46,7 @@ def calibrate(
 
 app = typer.Typer(
     cls=PathOrCommand,
-    help="Fit scale and paper plane of a SESSION (`brushloop calibrate SESSION`), or look at what comes before.",
+    help="Fit scale and paper plane of a SESSION (`brushloop calibrate SESSION`), or examine artefacts and captures.",
 )
 app.command("session")(calibrate)
 
@@ -77,8 +77,10 @@ def diff(
 @app.command("apply")
 def apply_to(
     calibration: Annotated[Path, typer.Argument(help="A calibration/<hash>.json.")],
-    session: Annotated[Path, typer.Argument(help="The session that it is to be used for.")],
-    force: Annotated[bool, typer.Option(help="Also another session's; every result is then labelled.")] = False,
+    session: Annotated[Path, typer.Argument(help="The session that shall use it.")],
+    force: Annotated[
+        bool, typer.Option(help="Allow another session's calibration; every result is then labelled.")
+    ] = False,
 ) -> None:
     """Use a calibration for a session from now on; another session's needs --force."""
     from calibrate.artefact import load_artefact
@@ -94,9 +96,9 @@ def apply_to(
 @app.command()
 def preprocess(
     capture: Annotated[Path, typer.Argument(help="A session (folder or .mcap), or a photograph.")],
-    stroke: Annotated[str, typer.Option(help="Stroke of the session, the first by default.")] = "",
+    stroke: Annotated[str, typer.Option(help="Name of a stroke; default: the first.")] = "",
     px_per_mm: Annotated[float | None, typer.Option(help="Scale of a photograph.")] = None,
-    before: Annotated[Path | None, typer.Option(help="Photograph of the page before the stroke came.")] = None,
+    before: Annotated[Path | None, typer.Option(help="Photograph of the page before the stroke.")] = None,
     lens: Annotated[Path | None, typer.Option(help="Lens file; the session's own by default.")] = None,
     out: Annotated[Path, typer.Option(help="The picture; the numbers go beside it as .json.")] = Path("stages.png"),
 ) -> None:
@@ -137,7 +139,7 @@ def export(
     from sessions.progress import shown
 
     if not crops and (frames or calibration is not None):
-        raise CalibrationError("--frames" if frames else "--calibration", "goes with --crops only")
+        raise CalibrationError("--frames" if frames else "--calibration", "needs --crops")
 
     def make_cropper(recording: Recording) -> Cropper:
         from calibrate.crops import cropper_of

@@ -35,10 +35,10 @@ def read_any(path: Path) -> tuple[Path, Artefact]:
     try:
         values: Any = json.loads(read_bounded(path))
     except (ValueError, RecursionError):
-        raise CalibrationError(str(path), "is no artefact: not JSON") from None
+        raise CalibrationError(str(path), "is not an artefact: not JSON") from None
     kind = next((kind for name, kind in KINDS.items() if isinstance(values, dict) and name in values), None)
     if kind is None:
-        raise CalibrationError(str(path), "is no artefact of this software")
+        raise CalibrationError(str(path), "is not an artefact of this software")
     return path, load_artefact(path, kind)
 
 

@@ -29,7 +29,7 @@ def check_target(path: Path, ending: str, *inputs: Path | None) -> None:
         raise CalibrationError(str(path), "is a folder")
     check_folder(path.parent)
     if any(one is not None and one.exists() and path.exists() and path.samefile(one) for one in inputs):
-        raise CalibrationError(str(path), "is what is read; it is not overwritten")
+        raise CalibrationError(str(path), "is the input; it is not overwritten")
 
 
 def check_folder(folder: Path) -> None:
@@ -61,7 +61,7 @@ def read_bounded(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
     """
     try:
         if not path.is_file() and path.exists():
-            raise CalibrationError(str(path), "is no file")
+            raise CalibrationError(str(path), "is not a file")
         with path.open("rb") as file:
             data = file.read(most_bytes + 1)
     except OSError as error:

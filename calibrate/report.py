@@ -208,7 +208,7 @@ def load_sealed(path: Path, kind: type[S], most_bytes: int) -> S:
     except (ValueError, RecursionError):  # no JSON, or text that is no Unicode: reported below
         fields = {}
     if "format" not in fields or "digest" not in fields:
-        raise CalibrationError(str(path), f"is no report with a digest: write it with `{kind.MADE_BY}`")
+        raise CalibrationError(str(path), f"is not a report with a digest: write it with `{kind.MADE_BY}`")
     if fields["format"] != kind.FORMAT:
         raise CalibrationError(str(path), f"format is {str(fields['format'])[:40]!r}, expected {kind.FORMAT!r}")
     try:
@@ -216,7 +216,7 @@ def load_sealed(path: Path, kind: type[S], most_bytes: int) -> S:
     except ValidationError as error:
         raise invalid(str(path), error) from None
     if fields["digest"] != digest:
-        raise CalibrationError(str(path), "was edited: its digest is not that of its contents")
+        raise CalibrationError(str(path), "was edited: its digest does not match its contents")
     return record
 
 

@@ -34,7 +34,7 @@ def calibrate_session(session: Path, lens: Path | None = None, progress: Progres
     """
     recording = Recording(session)
     if recording.header.source.imported:
-        raise CalibrationError(str(recording.path), "is an import and brings its own scale: go on with `validate`")
+        raise CalibrationError(str(recording.path), "is an import and has its own scale: continue with `validate`")
     where = str(recording.path)
     spec, known = board_of(recording), known_lens(recording, lens)
     progress(STEPS, 0, 3)
@@ -78,7 +78,7 @@ def apply_calibration(path: Path, session: Path, *, force: bool = False) -> Path
     recording, given = Recording(session), load_artefact(path, Calibration)
     folder = recording.path.parent
     if recording.header.source.imported:
-        raise CalibrationError(str(recording.path), "is an import and brings its own scale: nothing is applied to it")
+        raise CalibrationError(str(recording.path), "is an import and has its own scale: no calibration can be applied")
     if given.recording_sha256 == recording.sha256:
         return put_to_use(given, folder)
     if force:

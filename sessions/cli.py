@@ -23,9 +23,9 @@ Session = Annotated[Path, typer.Argument(help="A session's folder, or its .mcap 
 Out = Annotated[Path | None, typer.Option(help="New session folder; sessions/<folder's name> by default.")]
 Licence = Annotated[str, typer.Option(help="Licence of the photographs, kept in the recording.")]
 Origin = Annotated[str, typer.Option(help="Where they come from, kept in the recording.")]
-Brush = Annotated[str, typer.Option(help="What is known of the brush.")]
-Radius = Annotated[float | None, typer.Option(min=0.5, max=50.0, help="R of the brush; 6 where it is not given.")]
-Length = Annotated[float | None, typer.Option(min=5.0, max=500.0, help="L of the brush; 48 where it is not given.")]
+Brush = Annotated[str, typer.Option(help="Description of the brush.")]
+Radius = Annotated[float | None, typer.Option(min=0.5, max=50.0, help="R of the brush; default: 6.")]
+Length = Annotated[float | None, typer.Option(min=5.0, max=500.0, help="L of the brush; default: 48.")]
 Simulated = Annotated[bool, typer.Option("--simulated", help="The ink was simulated; every report says so.")]
 Kind = Annotated[str, typer.Option(help="press (vertical presses) or drag (strokes that travel).")]
 
@@ -112,7 +112,7 @@ def repair(session: Session) -> None:
         what = "nothing was lost" if report.did else "was sound; nothing was changed"
         say(f"{report.session}: {what}, {report.strokes} strokes")
         return
-    say(f"{report.session}: {report.strokes} strokes were given back whole, the rest is named above")
+    say(f"{report.session}: {report.strokes} strokes were recovered completely, the rest is named above")
     raise typer.Exit(LOSSY)
 
 
@@ -170,7 +170,7 @@ def import_(
 @app.command("import-sequence")
 def import_sequence(
     folder: Annotated[Path, typer.Argument(help="Folder of frames of one page.")],
-    csv: Annotated[Path | None, typer.Option(help="Table with `before`, `after` and what was commanded.")] = None,
+    csv: Annotated[Path | None, typer.Option(help="Table with `before`, `after` and the commanded values.")] = None,
     page_mm: Annotated[str, typer.Option(help="Width x height of what a frame shows, as 203.2x279.4.")] = "",
     px_per_mm: Annotated[float | None, typer.Option(help="Scale, instead of --page-mm.")] = None,
     out: Out = None,
@@ -200,8 +200,10 @@ def import_sequence(
 @app.command("import-scans")
 def import_scans(
     folder: Annotated[Path, typer.Argument(help="Folder of scans.")],
-    csv: Annotated[Path, typer.Option(help="Table as for `import`; with boxes and names where a scan holds many.")],
-    dpi: Annotated[float | None, typer.Option(help="Of the scanner; what the files say by default.")] = None,
+    csv: Annotated[
+        Path, typer.Option(help="Table as for `import`, with boxes and names if a scan holds several strokes.")
+    ],
+    dpi: Annotated[float | None, typer.Option(help="Resolution of the scanner; default: that in the files.")] = None,
     kind: Kind = "drag",
     out: Out = None,
     licence: Licence = "",

@@ -62,7 +62,7 @@ def _tables(value: Any) -> list[Any]:
 
 def _short(value: Any) -> str:
     if value is ABSENT:
-        return "not there"
+        return "missing"
     if value is None:
         return "left out"
     if items := _tables(value):

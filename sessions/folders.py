@@ -13,7 +13,7 @@ from sessions.names import SEGMENT_NAME, check_folder
 def check_name(folder: Path) -> None:
     """Raise `InputError`, with advice, for a folder that was renamed or holds links, and for an unfinished file."""
     if folder.suffix == ".part" and folder.is_file():
-        what = "was never finished, a step or a merge was cut: it is kept as evidence and is no recording"
+        what = "was never finished, because a step or a merge was cut: it is kept as evidence and is not a recording"
         raise InputError(folder, f"{what}. Give the session's folder, {folder.parent}")
     if folder.is_dir():
         check_folder(folder)
@@ -45,8 +45,8 @@ def not_a_session(folder: Path) -> InputError:
         return InputError(folder, f"has lost its recording {name}: `brushloop sessions repair {folder}` makes it again")
     inside = sorted(path for path in folder.iterdir() if (path / JOURNAL_NAME).is_file() or any(path.glob("*.mcap")))
     if inside:
-        return InputError(folder, f"is no session, but holds {len(inside)} of them: give one, as {inside[0]}")
-    return InputError(folder, f"is no session: neither {JOURNAL_NAME} nor a recording {name} is in it")
+        return InputError(folder, f"is not a session but holds {len(inside)} of them: give one, such as {inside[0]}")
+    return InputError(folder, f"is not a session: it holds neither {JOURNAL_NAME} nor a recording {name}")
 
 
 def _is_open(folder: Path) -> bool:

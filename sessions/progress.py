@@ -1,4 +1,4 @@
-"""How far long work is and how long it will take: a bar on a terminal, elsewhere a few plain lines; all on stderr."""
+"""Progress of long work and the time left: a bar on a terminal, elsewhere a few plain lines; all on stderr."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
 Progress = Callable[[str, int, int], None]
-"""Called with what is being done, the number done and the total."""
+"""Called with a description of the work, the number done and the total."""
 T = TypeVar("T")
 QUIET_S = 2.0
-"""Off a terminal, work shorter than this says nothing."""
+"""Without a terminal, shorter work prints nothing."""
 
 
 def unseen(_what: str, _done: int, _total: int) -> None:
-    """Progress that nobody watches."""
+    """Ignore progress."""
 
 
 def counted(items: Iterable[T], what: str, total: int, progress: Progress) -> Iterator[T]:

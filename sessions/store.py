@@ -198,7 +198,7 @@ class SessionStore:
         for path in sorted(self.folder.glob("*.mcap*")):
             serial = SEGMENT_NAME.fullmatch(path.name)
             if serial and int(serial[1]) >= self.state.begun:
-                raise SessionDamaged(self.folder / JOURNAL_NAME, f"says nothing of {path.name}: lines are missing")
+                raise SessionDamaged(self.folder / JOURNAL_NAME, f"does not mention {path.name}: lines are missing")
 
 
 def lock(folder: Path) -> FileLock:

@@ -22,7 +22,9 @@ class Kind(StrEnum):
     AFFINE = "affine"
 
 
-app = typer.Typer(help="The camera: print a board, calibrate lens and plane, register the robot.", no_args_is_help=True)
+app = typer.Typer(
+    help="Calibrate the camera: board, lens, plane of the paper, registration of the robot.", no_args_is_help=True
+)
 
 Corners = Annotated[str, typer.Option("--checkerboard", help="Inner corners of a checkerboard, as 9x6.")]
 Squares = Annotated[str, typer.Option("--charuco", help="Squares of a ChArUco board, as 26x20.")]
@@ -60,7 +62,7 @@ def intrinsics(
     dictionary: Dictionary = "DICT_5X5_1000",
     limit_px: Annotated[float, typer.Option(min=0.01, max=10.0, help="Residual above which it warns.")] = 0.5,
     one_camera: Annotated[
-        bool, typer.Option("--one-camera", help="Go on though the photographs look like two cameras'.")
+        bool, typer.Option("--one-camera", help="Continue although the photographs look like those of two cameras.")
     ] = False,
     out: Annotated[Path, typer.Option(help="Folder for the lens file.")] = Path("camera"),
 ) -> None:
@@ -188,7 +190,7 @@ def register(
     ] = None,
     lens: LensOption = None,
     model: Annotated[
-        Kind, typer.Option(help="rigid; similarity: scale too; affine: x and y on their own.")
+        Kind, typer.Option(help="rigid; similarity: also the scale; affine: x and y independently.")
     ] = Kind.RIGID,
     out: Annotated[Path, typer.Option(help="Folder for the registration file.")] = Path("camera"),
 ) -> None:
@@ -206,7 +208,7 @@ def register(
     from calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
 
     if write is not None and model is not Kind.RIGID:
-        raise CalibrationError("--write", "needs --model rigid: rig.toml knows a place and a turn, and no scale")
+        raise CalibrationError("--write", "needs --model rigid: rig.toml holds a place and a rotation but no scale")
     rig_path = config or write
     rig = read_rig(rig_path) if rig_path else None
     target = read_rig(write) if write else None
@@ -239,11 +241,11 @@ def register(
         str(file.save(out)),
     )
     if model is not Kind.RIGID:
-        say("no lines for rig.toml, which knows a place and a turn, and no scale: use --model rigid")
+        say("no lines for rig.toml, which holds a place and a rotation but no scale: use --model rigid")
         return
     lines = PaperLines(fitted.origin_mm, fitted.yaw_deg)
     if target is not None:
-        say(f"{target.path}: written; as it was before: {target.write(lines)}")
+        say(f"{target.path}: written; the old file is kept as {target.write(lines)}")
     else:
         say("for [paper] of rig.toml:")
     say(*lines.toml.splitlines())
@@ -256,7 +258,9 @@ def _board(checkerboard: str, charuco: str, square_mm: float, marker_mm: float, 
     from calibrate.errors import CalibrationError, invalid
 
     if bool(checkerboard) == bool(charuco):
-        raise CalibrationError("board", "give one of --checkerboard (inner corners) and --charuco (squares), as 9x6")
+        raise CalibrationError(
+            "board", "give one of --checkerboard (inner corners) and --charuco (squares), such as 9x6"
+        )
     try:
         if checkerboard:
             return Checkerboard(inner_corners=_pair(checkerboard), square_mm=square_mm)
@@ -276,5 +280,5 @@ def _pair(text: str) -> tuple[int, int]:
 
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(part.isdigit() and len(part) < 4 for part in parts):
-        raise CalibrationError("board", f"{text!r} is no size like 9x6")
+        raise CalibrationError("board", f"{text!r} is not a size such as 9x6")
     return int(parts[0]), int(parts[1])

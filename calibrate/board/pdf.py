@@ -29,7 +29,7 @@ def write_pdf(board: Board, path: Path, page: str = "a4") -> Path:
     if not path.parent.is_dir():
         raise CalibrationError(str(path), f"there is no folder {path.parent}")
     if path.exists() and not (path.is_file() and path.read_bytes().startswith(b"%PDF")):
-        raise CalibrationError(str(path), "is there already and is no PDF; it is not overwritten")
+        raise CalibrationError(str(path), "exists and is not a PDF; it is not overwritten")
     page_mm = _page(board, page)
     content = _content(board, page_mm)
     path.write_bytes(_document(page_mm, content))

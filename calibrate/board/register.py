@@ -104,7 +104,7 @@ def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats, model: Mod
     matrix = _fit(robot_mm[kept], seen_mm[kept], model)
     residuals = seen_mm - _apply(matrix, robot_mm)
     if _rms(residuals[kept]) > WORST_RMS_MM:
-        problem = f"{_rms(residuals[kept]):.1f} mm off on average, at most {WORST_RMS_MM:g}: are their names mixed up?"
+        problem = f"{_rms(residuals[kept]):.1f} mm off on average, allowed {WORST_RMS_MM:g}: are their names mixed up?"
         raise CalibrationError(where, problem)
     left_out = residuals.copy()
     for index in np.flatnonzero(kept):
@@ -214,7 +214,7 @@ def read_points(table: Path) -> Points:
     try:
         rows = list(csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True))
     except (UnicodeDecodeError, csv.Error) as error:
-        raise CalibrationError(str(table), f"is no CSV table in UTF-8: {error}") from None
+        raise CalibrationError(str(table), f"is not a CSV table in UTF-8: {error}") from None
     missing = [name for name in COLUMNS if not rows or name not in rows[0]]
     if missing:
         raise CalibrationError(str(table), f"needs rows with the columns {', '.join(COLUMNS)}; missing: {missing[0]}")

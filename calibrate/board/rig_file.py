@@ -71,7 +71,7 @@ class RigFile:
                 raise self._refused(f"paper.{name}", "is not found on a line of its own under [paper]", lines)
         made = "".join(rows)
         if _tables(made, self.path) != _changed(_tables(self.text, self.path), lines):
-            raise self._refused("paper", "cannot be changed without changing something else", lines)
+            raise self._refused("paper", "cannot be changed without changing other values", lines)
         return made
 
     def write(self, lines: PaperLines) -> Path:
@@ -85,7 +85,7 @@ class RigFile:
 
     def _refused(self, field: str, what: str, lines: PaperLines) -> CalibrationError:
         put = ", ".join(lines.toml.splitlines())
-        return CalibrationError(str(self.path), f"{field}: {what}; nothing is written. Put in by hand: {put}")
+        return CalibrationError(str(self.path), f"{field}: {what}; nothing is written. Enter by hand: {put}")
 
 
 def read_rig(path: Path) -> RigFile:

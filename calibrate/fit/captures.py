@@ -70,7 +70,7 @@ def read_presses(
             refused.append((stroke.stroke_id, error.what))
             continue
         if stroke.height_mm is None or stroke.tilt_deg is None:
-            refused.append((stroke.stroke_id, "tells no depth or tilt"))
+            refused.append((stroke.stroke_id, "has no depth or tilt"))
         elif prepared.cut:
             refused.append((stroke.stroke_id, "is cut by the edge of its photograph or cell"))
         else:

@@ -38,12 +38,12 @@ def fit(
         Path | None, typer.Option(help="With --drags: a dragfit of this brush, whose place and width are adapted.")
     ] = None,
     strokes: Annotated[
-        int | None, typer.Option(min=1, help="With --prior: only so many strokes, as different as possible.")
+        int | None, typer.Option(min=1, help="With --prior: only this many strokes, as different as possible.")
     ] = None,
 ) -> None:
     """Fit the stroke model to a session's presses; writes an immutable brushfit/<hash>.json."""
     if (prior is not None and not drags) or (strokes is not None and prior is None):
-        raise typer.BadParameter("--prior goes with --drags, and --strokes with --prior")
+        raise typer.BadParameter("--prior needs --drags, and --strokes needs --prior")
     if drags:
         if correction or reference is not None:
             raise typer.BadParameter("--correction and --reference are for presses, not for --drags")
@@ -113,7 +113,7 @@ def _drag_tables(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:
         yield ends_sentence(drawn.ends)
     if artefact.prior:
         adapted = ", ".join(artefact.refitted)
-        yield f"The brush of {artefact.prior_session} (fit {artefact.prior}), of which are adapted: {adapted}."
+        yield f"The brush of {artefact.prior_session} (fit {artefact.prior}), with these parameters adapted: {adapted}."
     out = Table("parameter", "fitted", "95 %", title=f"drag model, mm ({label})")
     for name, found in artefact.parameters.items():
         interval = "not determined" if found.low is None else f"{found.low:.3f} to {found.high:.3f}"
@@ -122,7 +122,7 @@ def _drag_tables(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:
         out.add_row(name, f"{found.value:.3f}", interval)
     yield out
     if artefact.kept is not None:
-        yield f"Ink is where its chance is above {artefact.ink_above:g}, which follows from the training strokes."
+        yield f"A pixel is ink above a probability of {artefact.ink_above:g}, chosen by the training strokes."
     if artefact.held_out:
         title = f"a fifth left out in turn, where the command put it, percent ({label})"
         out = Table("model", "n", "CSIM", "IoU", title=title)
@@ -130,7 +130,7 @@ def _drag_tables(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:
             out.add_row(name, str(score.images), f"{score.csim_percent:.2f}", f"{score.iou_percent:.2f}")
         yield out
     elif not artefact.prior:
-        yield "Fewer than five images: none can be left out."
+        yield "Fewer than five images: too few to leave some out."
 
 
 def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
@@ -161,7 +161,7 @@ def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
         out.add_row(stage.name, "infinite" if stage.condition is None else f"{stage.condition:.1f}")
     yield out
     if not fitted.held_out:
-        yield "One cell only: nothing can be held out."
+        yield "Only one cell: nothing can be held out."
         return
     out = Table("model", "n", "CSIM", "SSIM", title=f"leave one cell out, mm, binary, percent ({label})")
     for row in fitted.held_out:
@@ -172,15 +172,15 @@ def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
 def _correction(found: Correction) -> Iterator[str]:
     low, high = found.lift_interval_mm
     if found.reference:
-        yield f"Zero touch against the fit of {found.reference}, everything else of the brush held:"
+        yield f"Zero touch relative to the fit of {found.reference}, all other parameters of the brush fixed:"
     else:
         yield (
-            "Zero touch, absolutely: where the sizes of the marks, taken as proportional to depth, come to nothing. "
-            "Ink that spreads, or a brush that does not open evenly, is taken for an offset: with an earlier fit of "
-            "the same brush (--reference) it is not."
+            "Absolute zero touch: where the sizes of the marks, assumed proportional to depth, become zero. "
+            "Ink that spreads, or a brush that does not open evenly, looks like an offset; with an earlier fit of "
+            "the same brush (--reference) it does not."
         )
     yield f"  paper.touch_z_mm: add {found.lift_mm:+.2f} mm (95 % {low:+.2f} to {high:+.2f})"
     low, high = found.along_interval_mm
-    yield f"  along the heading: the ink lies off by {found.along_mm:+.2f} mm (95 % {low:+.2f} to {high:+.2f})"
+    yield f"  along the heading: the ink is off by {found.along_mm:+.2f} mm (95 % {low:+.2f} to {high:+.2f})"
     if found.lift_interval_mm[0] <= 0.0 <= found.lift_interval_mm[1]:
-        yield "  The interval holds 0: leave rig.toml as it is."
+        yield "  The interval includes 0: leave rig.toml as it is."

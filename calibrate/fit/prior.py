@@ -1,4 +1,4 @@
-"""What is known of a brush before its first stroke: mean and covariance of the parameters over known brushes.
+"""The prior knowledge of a brush: mean and covariance of the parameters over known brushes.
 
 `prior.json` holds the parameters of brushes of several families of shape, each fitted to many strokes
 (`python -m bench.brushfit_prior` makes it). Each family counts with the square root of its number of brushes, so that
@@ -68,7 +68,7 @@ def spreads() -> Floats:
 
 
 def wide() -> Prior:
-    """Nothing known but the plausible spread of each parameter about its published value."""
+    """A prior that holds only the plausible spread of each parameter about its published value."""
     return Prior(np.zeros(len(NAMES)), np.eye(len(NAMES)), gradual=True)
 
 

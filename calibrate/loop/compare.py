@@ -77,7 +77,7 @@ def compare_sessions(
         raise CalibrationError(str(second.path), f"is {second.header.source}, the original {first.header.source}")
     repeated = _replayed(second.header)
     if repeated != first.header.session_id:
-        what = "is no replay" if repeated is None else f"repeats {repeated}"
+        what = "is not a replay" if repeated is None else f"repeats {repeated}"
         raise CalibrationError(str(second.path), f"{what}, not {first.header.session_id}")
     model, fitted_to = _model(first.header, fit)
     one, other = _opened(first), _opened(second)
@@ -125,13 +125,13 @@ def pair_up(
     found = Pairs()
     for press, _ in _presses(original, original_calibration, view, found.refused):
         if press.stroke_id in found.originals:
-            found.refused.append((press.stroke_id, "its name stands for two strokes: the first is used"))
+            found.refused.append((press.stroke_id, "two strokes have this name: the first is used"))
         else:
             found.originals[press.stroke_id] = press
     repeated: set[str] = set()
     for press, of in _presses(again, again_calibration, view, found.refused):
         if of is None or of not in found.originals:
-            why = "repeats no stroke" if of is None else f"repeats {of}, which is not there or cannot be used"
+            why = "repeats no stroke" if of is None else f"repeats {of}, which does not exist or cannot be used"
             found.refused.append((press.stroke_id, why))
             continue
         try:

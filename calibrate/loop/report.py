@@ -78,8 +78,8 @@ def answer(loop: LoopComparison) -> str:
     where = f"{least.measure.upper()}, {least.alignment}, {least.tone}"
     if not failed:
         return (
-            f"The re-pressed strokes are as similar to their originals as the brush's own presses are to each other, "
-            f"or less than {GOAL_POINTS:g} point below, in all {len(loop.verdicts)} comparisons "
+            f"In all {len(loop.verdicts)} comparisons the re-pressed strokes are as similar to their originals as the "
+            f"brush's own presses are to each other, or less than {GOAL_POINTS:g} point below "
             f"(least: {least.difference:+.2f} points, {where})."
         )
     return (
@@ -92,7 +92,7 @@ def answer(loop: LoopComparison) -> str:
 def summary(loop: LoopComparison) -> Iterator[str]:
     """Lines for the terminal."""
     source = loop.again.header.source
-    yield f"{len(loop.paired.pairs)} presses made again, {len(loop.paired.refused)} not compared ({source})"
+    yield f"{len(loop.paired.pairs)} presses repeated, {len(loop.paired.refused)} not compared ({source})"
     for alignment, tone in KEYS:
         rows = [row for row in loop.table if (row.alignment, row.tone) == (alignment, tone)]
         parts = "; ".join(f"{row.what} {row.csim[2]:.2f} / {row.ssim[2]:.2f}" for row in rows)

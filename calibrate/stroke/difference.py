@@ -73,7 +73,7 @@ def new_stroke(
     if before.shape != after.shape:
         raise CaptureRefused(
             where,
-            f"is {after.shape[1]} x {after.shape[0]} px, what is before it {before.shape[1]} x {before.shape[0]} px",
+            f"is {after.shape[1]} x {after.shape[0]} px, the one before it {before.shape[1]} x {before.shape[0]} px",
         )
     shift = _shift(before, after)
     moved = cast("Gray", _moved(after, (-shift[0], -shift[1]))) if max(map(abs, shift)) > 0.02 else after
@@ -214,7 +214,7 @@ def _flags(mask: Mask, clean: Mask, shift: tuple[float, float], px_per_mm: float
     around = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     touching_mm = float(np.count_nonzero(around & ~clean)) / px_per_mm
     if touching_mm > 1.0:
-        flags.append(f"crosses: {touching_mm:.1f} mm of its edge lie on older ink, what is below cannot be seen")
+        flags.append(f"crosses: {touching_mm:.1f} mm of its edge lie on older ink, where new ink cannot be seen")
     if max(map(abs, shift)) > 1.0:
         flags.append(f"moved: the page lay {np.hypot(*shift):.1f} px from where it was")
     if mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any():

@@ -33,18 +33,22 @@ def validate(
     gate: Annotated[
         list[str] | None, typer.Option(help="Like 'csim_avg>=0.90', quoted; exit code 5 if missed.")
     ] = None,
-    ablations: Annotated[bool, typer.Option("--ablations", help="Lambdas, and similarity by number of fits.")] = False,
+    ablations: Annotated[
+        bool, typer.Option("--ablations", help="Other lambdas, and similarity by number of fitted presses.")
+    ] = False,
     curves: Annotated[list[str] | None, typer.Option(help="NAME=FOLDER of a training, for figures 9 and 12.")] = None,
     held_out: Annotated[bool, typer.Option(help="Fit to other cells, each cell left out in turn.")] = True,
-    tune: Annotated[int, typer.Option(min=0, help="Steps to tune each generator on other cells; 0: not.")] = 0,
+    tune: Annotated[int, typer.Option(min=0, help="Steps to tune each generator on other cells; 0: none.")] = 0,
     loop: Annotated[
         list[Path] | None, typer.Option(help="loop.json of re-pressed strokes; <session>/loop by default.")
     ] = None,
     written: Annotated[
-        list[Path] | None, typer.Option(help="written.json of characters; that beside the sessions by default.")
+        list[Path] | None, typer.Option(help="written.json of characters; default: the one beside the sessions.")
     ] = None,
     beside: Annotated[bool, typer.Option(help="Include loop and characters found beside the session.")] = True,
-    parquet: Annotated[bool | None, typer.Option(help="scores.parquet; by default where pyarrow is there.")] = None,
+    parquet: Annotated[
+        bool | None, typer.Option(help="Write scores.parquet; default: if pyarrow is installed.")
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
     scheduler: Annotated[str, typer.Option(help="An existing Dask cluster, as tcp://host:8786.")] = "",
     workers: Annotated[int | None, typer.Option(min=1, max=1024, help="Threads; all cores by default.")] = None,
@@ -120,9 +124,11 @@ def diff(
 @app.command()
 def captures(
     session: Annotated[list[str], typer.Argument(help="Sessions of presses.")],
-    generator: Annotated[Path, typer.Option(help="The generator.safetensors that is to be tuned.")],
+    generator: Annotated[Path, typer.Option(help="The generator.safetensors to tune.")],
     out: Annotated[Path, typer.Option(help="The file for `brushloop train tune`.")] = Path("captures.safetensors"),
-    leave_out: Annotated[list[str] | None, typer.Option(help="A cell to keep for judging, H/alpha as 13/5.")] = None,
+    leave_out: Annotated[
+        list[str] | None, typer.Option(help="A cell to keep for evaluation, as H/alpha: 13/5.")
+    ] = None,
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
 ) -> None:
     """Write captured presses in the format that `brushloop train tune` reads."""
@@ -145,7 +151,7 @@ def captures(
     for name, why in aligned.left_out:
         say(f"left out: {name}: {why}")
     if cells:
-        say(f"left out, as asked: {len(aligned.cells) - count} presses of {len(cells)} cells")
+        say(f"left out, as requested: {len(aligned.cells) - count} presses of {len(cells)} cells")
     say(f"{count} presses ({aligned.source}): {out}")
 
 

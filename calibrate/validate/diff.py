@@ -65,7 +65,7 @@ def compare(before: Path, after: Path) -> Difference:
     one, other = report_path(before), report_path(after)
     a, b = load_report(one), load_report(other)
     if a.source != b.source:
-        raise CalibrationError(str(other), f"is of {b.source}, {one} of {a.source}: they are not compared")
+        raise CalibrationError(str(other), f"is of {b.source}, {one} of {a.source}: they cannot be compared")
     by_stroke = bool({s.recording_sha256 for s in a.sessions} & {s.recording_sha256 for s in b.sessions})
     old, new = read_scores(one, a, by_stroke=by_stroke), read_scores(other, b, by_stroke=by_stroke)
     tests: list[tuple[Series, Paired, float, float]] = []
@@ -94,7 +94,7 @@ def report_path(given: Path) -> Path:
     If there is none, raises `CalibrationError` that names the command to run.
     """
     if not given.exists():
-        raise CalibrationError(str(given), "is not there: give a report.json, or a session that was validated")
+        raise CalibrationError(str(given), "does not exist: give a report.json, or a session that was validated")
     if given.is_file() and given.suffix == ".json":
         return given
     # Search only a recording's own folder: a report next to a session's folder may be about several sessions.
@@ -139,7 +139,7 @@ def sentences(found: Difference) -> Iterator[str]:
         f"{len(found.changes)} series ({found.before.label})."
     )
     if found.paired_by == "cell":
-        yield "Two sessions differ in more than what was meant to change: brush, ink, paper, zero touch."
+        yield "Two sessions also differ in things that were not meant to change: brush, ink, paper, zero touch."
     if found.only_before:
         yield f"Only before: {', '.join(found.only_before)}."
     if found.only_after:

@@ -70,7 +70,7 @@ def find_extras(sessions: Sequence[LoadedSession], request: ExtrasRequest) -> Ex
             picture = path.parent / PICTURE
             written[found.digest] = found, figure_13(picture, found) if picture.exists() else ""
         if not written[found.digest][1]:
-            notes.append(f"{picture} is not there: the report has no Figure 13 of {found.session}")
+            notes.append(f"{picture} does not exist: the report has no Figure 13 of {found.session}")
     records, figures = tuple(one for one, _ in written.values()), tuple(uri for _, uri in written.values())
     return Extras(tuple(loops.values()), records, figures, tuple(notes))
 
@@ -121,7 +121,7 @@ def _foreign(path: Path, record: WrittenRecord, sessions: Sequence[LoadedSession
         return f"it is of {record.source}, not {source}"
     named = record.session not in ("", ".", "..") and Path(record.session).name == record.session
     if not named or not any((folder.parent / record.session).is_dir() for folder in folders):
-        return f"its session {record.session} does not lie beside"
+        return f"its session {record.session} is not beside it"
     brushes = {one.header.brush for one in sessions}
     return "" if brushes == {record.brush} else f"it was written with another brush, {record.brush or 'not named'}"
 
@@ -150,7 +150,7 @@ def _check_source(path: Path, named: str, rows: Sequence[str], sessions: Sequenc
     for one in (named, *rows):
         if one != source:
             recording = sessions[0].recording.path.name
-            raise CalibrationError(str(path), f"is of {one}, {recording} of {source}: they do not go into one report")
+            raise CalibrationError(str(path), f"is of {one}, {recording} of {source}: one report cannot hold both")
 
 
 @contextmanager
@@ -160,5 +160,5 @@ def _naming_no_beside(*, requested: bool) -> Generator[None]:
         yield
     except CalibrationError as error:
         if not requested:
-            error.add_note("(found beside the session; --no-beside goes without)")
+            error.add_note("(found beside the session; --no-beside ignores it)")
         raise

@@ -68,7 +68,7 @@ def parse_gate(text: str) -> Gate:
     try:
         limit = float(found["limit"])
     except ValueError:
-        raise _bad(text, f"{found['limit']!r} is no number") from None
+        raise _bad(text, f"{found['limit']!r} is not a number") from None
     if not 0.0 <= limit <= 1.0:
         raise _bad(text, f"{limit:g} is outside 0 to 1")
     return Gate(text.strip(), model, alignment, tone, found["measure"], found["statistic"], found["op"], limit)

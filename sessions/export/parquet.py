@@ -1,7 +1,7 @@
 """Parquet files that Hugging Face `datasets` loads: strokes with images, and poses as a time series.
 
     README.md                                  data set card: a configuration for each table
-    strokes/train-00000-of-00001.parquet       one row a stroke; `image` is a struct {bytes, path}, feature `Image`
+    strokes/train-00000-of-00001.parquet       one row per stroke; `image` is a struct {bytes, path}, feature `Image`
     poses/train-00000-of-00001.parquet         one row a pose, columns named as LeRobot names them; if there are any
     forces/train-00000-of-00001.parquet        one row a sample of the force sensor; if there are any
     header.json
@@ -159,18 +159,18 @@ def _card(export: Export, counts: dict[str, int]) -> bytes:
         f"(SHA-256 `{export.recording.sha256}`).\n",
         f"Brush: {_text(header.brush)}. Ink: {_text(header.ink)}. Paper: {_text(header.paper)}. "
         f"Robot: {_text(header.robot)}. Licence: {_text(header.licence)}.\n",
-        "`strokes`: one row a stroke; `height_mm` is the commanded depth H, `tilt_deg` the tilt alpha. "
+        "`strokes`: one row per stroke; `height_mm` is the commanded depth H, `tilt_deg` the tilt alpha. "
         + (
             "`image` is a crop seen straight from above, `px_per_mm_x` pixels per mm, gray and not corrected for the\n"
             "light; `mask` is 255 where the stroke's ink is. Ink of neighbouring strokes may show in `image`.\n"
             if export.cropper
             else "`image` is the photograph as it was recorded.\n"
         ),
-        f"`poses`: one row a pose of the brush tip in the robot's base frame; `observation.state` is "
+        f"`poses`: one row per pose of the brush tip in the robot's base frame; `observation.state` is "
         f"{', '.join(STATE_NAMES)}."
         if "poses" in counts
         else "No poses were recorded.",
-        f"`forces`: one row a sample of the force sensor, in its own frame; `observation.force` is "
+        f"`forces`: one row per sample of the force sensor, in its own frame; `observation.force` is "
         f"{', '.join(FORCE_NAMES)}."
         if "forces" in counts
         else "No forces were recorded.",

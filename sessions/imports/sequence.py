@@ -66,7 +66,7 @@ def _by_table(table: Path) -> tuple[list[str], str]:
     try:
         lines = [[cell.strip() for cell in line] for line in csv.reader(io.StringIO(read_text(table)), strict=True)]
     except csv.Error as error:
-        raise InputError(table, f"is no table: {error}") from None
+        raise InputError(table, f"is not a table: {error}") from None
     head = lines[0] if lines else []
     for column in ("before", "after"):
         if head.count(column) != 1:

@@ -141,7 +141,7 @@ def _columns(
     stored = [name for name in names if name in SPECIAL] + [commanded[name][0] for name in names if name in commanded]
     for name in stored:
         if stored.count(name) > 1:
-            raise InputError(table, f"column `{name}` is there twice, perhaps in two units")
+            raise InputError(table, f"column `{name}` occurs twice, perhaps in two units")
     return _Columns(table, folder.resolve(), kind, px_per_mm, names, commanded)
 
 
@@ -213,7 +213,7 @@ def _range(column: str, kind: str) -> tuple[float, float]:
 def _name(columns: _Columns, line: int, name: str) -> str:
     if not name or not name.isprintable() or len(name) > MAX_NAME_CHARS:
         allowed = f"allowed are 1 to {MAX_NAME_CHARS} printable characters"
-        raise InputError(columns.table, f"line {line}, column `name`: {name[:80]!r} is no name; {allowed}")
+        raise InputError(columns.table, f"line {line}, column `name`: {name[:80]!r} is not a valid name; {allowed}")
     return name
 
 

@@ -162,7 +162,7 @@ def _link(reading: Reading, entries: list[Entry], data: bytes) -> None:
             if not by_seq:
                 before.append(entry)
             else:
-                reading.fault(entry.number, "has no chain: it was put in by something else")
+                reading.fault(entry.number, "has no chain: another program inserted it")
         elif entry.chain.session != session:
             reading.fault(entry.number, f"is of another session, {entry.chain.session[:100]!r}")
         else:
@@ -212,7 +212,7 @@ def _misplaced(reading: Reading, held: list[Entry]) -> None:
         index = before[index]
     for index, entry in enumerate(held):
         if index not in in_order and entry.chain is not None:
-            reading.fault(entry.number, f"is out of its place: it was written as line {entry.chain.seq}")
+            reading.fault(entry.number, f"is out of place: it was written as line {entry.chain.seq}")
 
 
 def _missing(reading: Reading, held: list[Entry], before: int) -> None:

@@ -121,7 +121,7 @@ def repair_file(path: Path) -> Report:
         raise SessionDamaged(path, "has lost its header; it cannot be repaired")
     header = parse_header(path, metadata)
     if metadata.get("crc", "") not in ("", header_crc(metadata)):
-        report.lost.append("the certainty of its header: it does not match its CRC, and is kept as it reads")
+        report.lost.append("the certainty of its header: it does not match its CRC, and is kept as it was read")
     strokes = with_their_stills(found)
     notes = {name: values for name, values in found.notes.items() if name != HEADER_METADATA}
     files = {attachment.name: attachment.data for attachment in found.attachments}

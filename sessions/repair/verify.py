@@ -167,7 +167,7 @@ def _journal(verdict: Verdict, evidence: Evidence) -> None:
     for line in evidence.rebuilt:
         match line["event"]:
             case "begin":
-                verdict.findings.append(Finding(JOURNAL_NAME, f"says nothing of {line['file']}"))
+                verdict.findings.append(Finding(JOURNAL_NAME, f"does not mention {line['file']}"))
             case "done":
                 verdict.notes.append(f"{line['file']}: {step_words(line)} is finished, but not journalled as done")
             case "closed":
@@ -243,7 +243,7 @@ def file_problems(path: Path, progress: Progress = unseen) -> tuple[Scan, list[s
             elif channel.topic == Topic.STROKE:
                 stroke = Stroke.model_validate_json(message.data)
                 if hash(stroke.stroke_id) in strokes:
-                    problems.append(f"stroke {stroke.stroke_id} is there twice")
+                    problems.append(f"stroke {stroke.stroke_id} occurs twice")
                 strokes.add(hash(stroke.stroke_id))
                 if stroke.still not in stills:
                     problems.append(f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there")

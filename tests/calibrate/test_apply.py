@@ -146,10 +146,10 @@ def test_a_camera_of_another_size_cannot_be_forced(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("no json", "is no artefact: not JSON"),
-        ("[" * 100_000, "is no artefact: not JSON"),
-        ("[]", "is no artefact of this software"),
-        ('{"kind": "song"}', "is no artefact of this software"),
+        ("no json", "is not an artefact: not JSON"),
+        ("[" * 100_000, "is not an artefact: not JSON"),
+        ("[]", "is not an artefact of this software"),
+        ('{"kind": "song"}', "is not an artefact of this software"),
         ('{"image_to_paper": 1}', "session_id: Field required"),
     ],
     ids=["words", "deep", "list", "another", "half"],
@@ -172,7 +172,7 @@ def test_files_of_version_1_are_read_and_later_ones_are_not(pair: tuple[Path, Pa
     assert load_artefact(_named(tmp_path, text), Calibration) == old
     assert old.lens is None
     later = _named(tmp_path, json.dumps(values | {"schema_version": 3, "tilt": 1}))
-    with pytest.raises(CalibrationError, match=r"schema_version: 3 is not one that is read here \(1, 2\)"):
+    with pytest.raises(CalibrationError, match=r"schema_version: 3 is not known here \(1, 2\)"):
         load_artefact(later, Calibration)
 
 

@@ -92,7 +92,7 @@ def test_a_session_without_a_pointer_uses_the_artefact_written_last_and_says_so(
     os.utime(only, (1, 1))
     assert current(tmp_path) == last
     [message] = caplog.messages
-    assert f"holds 2 artefacts, and no file `current` says which is in use: {last.name} is taken" in message
+    assert f"holds 2 artefacts, and no file `current` that says which is in use: {last.name} is used" in message
     assert f"choose with `brushloop calibrate apply {folder}/<hash>.json {tmp_path}`" in message
 
 

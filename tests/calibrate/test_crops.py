@@ -136,7 +136,7 @@ def test_a_session_without_any_crop_and_options_without_crops_are_refused(tmp_pa
     ran = run("sessions", "export", session, tmp_path / "o", "--crops")
     assert "holds no stroke that can be cropped: 0 is blank" in str(ran.exception)
     ran = run("sessions", "export", session, tmp_path / "o", "--frames")
-    assert str(ran.exception) == "--frames: goes with --crops only"
+    assert str(ran.exception) == "--frames: needs --crops"
     assert not (tmp_path / "o").exists()
 
 

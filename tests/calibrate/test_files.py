@@ -17,7 +17,7 @@ def test_a_target_has_the_ending_of_what_is_written_and_is_not_what_is_read(tmp_
     photograph.write_bytes(b"ink")
     check_target(tmp_path / "new.PNG", ".png", photograph, None)
     check_target(photograph, ".png")
-    for path, why in ((tmp_path / "s.mcap", r"must end in \.png"), (photograph, "is what is read")):
+    for path, why in ((tmp_path / "s.mcap", r"must end in \.png"), (photograph, "is the input")):
         with pytest.raises(CalibrationError, match=why):
             check_target(path, ".png", photograph)
     (tmp_path / "folder.png").mkdir()

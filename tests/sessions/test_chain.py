@@ -70,12 +70,12 @@ def test_a_torn_last_line_is_no_damage_and_its_note_is_chained(make, folder):
         (lambda a: [*a[:4], *a[7:]], ["line 5 comes after 3 lines that are missing"]),
         (lambda a: a[1:], ["line 1 comes after a line that is missing"]),
         (lambda a: [*a[:5], a[4], *a[5:]], ["line 6 stands twice: it is line 5"]),
-        (lambda a: [*a[:4], a[5], a[4], *a[6:]], ["line 6 is out of its place: it was written as line 5"]),
+        (lambda a: [*a[:4], a[5], a[4], *a[6:]], ["line 6 is out of place: it was written as line 5"]),
         (
             lambda a: [*a[:3], a[9], *a[4:9], a[3], *a[10:]],
             [
-                "line 4 is out of its place: it was written as line 10",
-                "line 10 is out of its place: it was written as line 4",
+                "line 4 is out of place: it was written as line 10",
+                "line 10 is out of place: it was written as line 4",
             ],
         ),
     ],

@@ -44,8 +44,8 @@ def lines(*rows):
             lines("file,px_per_mm,height_mm,tilt_deg,l_furlong", "a.png,1,1,1,1"),
             "must end in one of: mm, cm, m, in, deg",
         ),
-        (lines("file,px_per_mm,height_mm,tilt_deg,l_mm,l_cm", "a.png,1,1,1,1,1"), "column `l_mm` is there twice"),
-        (lines("file,px_per_mm,height_mm,tilt_deg,file", "a.png,1,1,1,b.png"), "column `file` is there twice"),
+        (lines("file,px_per_mm,height_mm,tilt_deg,l_mm,l_cm", "a.png,1,1,1,1,1"), "column `l_mm` occurs twice"),
+        (lines("file,px_per_mm,height_mm,tilt_deg,file", "a.png,1,1,1,b.png"), "column `file` occurs twice"),
         (lines("file,px_per_mm,height_mm,tilt_deg,", "a.png,1,1,1,"), "column `` has no known unit"),
         (lines('"fi\nle",px_per_mm', "a.png,1"), "line 1 holds control characters"),
         (

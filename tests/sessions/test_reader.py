@@ -100,7 +100,7 @@ def test_what_is_no_mcap_file_is_refused(path, content):
 def test_a_path_that_is_not_there_and_an_empty_folder_are_refused(tmp_path):
     with pytest.raises(InputError, match="no such session"):
         Recording(tmp_path / "gone")
-    with pytest.raises(InputError, match=r"is no session: neither journal\.jsonl nor a recording .*\.mcap is in it"):
+    with pytest.raises(InputError, match=r"is not a session: it holds neither journal\.jsonl nor a recording .*\.mcap"):
         Recording(tmp_path)
 
 

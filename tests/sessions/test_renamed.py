@@ -103,7 +103,8 @@ def test_an_unfinished_file_is_named_as_one(make, store, look):
     with pytest.raises(InputError) as refused:
         look(part)
     assert str(refused.value) == (
-        f"{part}: was never finished, a step or a merge was cut: it is kept as evidence and is no recording. "
+        f"{part}: was never finished, because a step or a merge was cut: it is kept as evidence and is not a "
+        "recording. "
         f"Give the session's folder, {store.folder}"
     )
     assert refused.value.exit_code == 2
@@ -113,9 +114,9 @@ def test_an_unfinished_file_is_named_as_one(make, store, look):
 @pytest.mark.parametrize("look", LOOKS)
 def test_a_folder_that_is_no_session_is_named_as_what_it_is(make, store, tmp_path, look):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"is no session: neither journal\.jsonl nor a recording empty\.mcap is in it"):
+    with pytest.raises(InputError, match=r"it holds neither journal\.jsonl nor a recording empty\.mcap"):
         look(tmp_path / "empty")
-    with pytest.raises(InputError, match=rf"is no session, but holds 1 of them: give one, as {store.folder}"):
+    with pytest.raises(InputError, match=rf"is not a session but holds 1 of them: give one, such as {store.folder}"):
         look(tmp_path)
 
 

@@ -147,7 +147,7 @@ def test_a_journal_without_its_last_lines_is_refused_until_repaired(make, folder
     journal = folder / JOURNAL_NAME
     lines = journal.read_bytes().splitlines(keepends=True)
     journal.write_bytes(b"".join(lines[:5]))
-    with pytest.raises(SessionDamaged, match=r"says nothing of 0002-press-H13-a05-\.mcap: lines are missing"):
+    with pytest.raises(SessionDamaged, match=r"does not mention 0002-press-H13-a05-\.mcap: lines are missing"):
         go_on(folder)
     assert repair(folder).lossless
     assert make.stroke_names(go_on(folder).close()) == ["H13-a05-r00", "H13-a05-r01"]

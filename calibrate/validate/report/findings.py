@@ -119,7 +119,7 @@ def _pressed_again(report: Report) -> Iterator[str]:
             continue
         others = "" if other is None else f", other presses of the same H and α {other.csim[2]:.1f} %"
         yield (
-            f"Pressed again from their photographs alone ({loop.again}), {again.n} strokes are like their "
+            f"Pressed again from their photographs alone ({loop.again}), {again.n} strokes match their "
             f"originals with a CSIM of {again.csim[2]:.1f} %{others}."
         )
 
@@ -130,7 +130,7 @@ def _characters(report: Report) -> Iterator[str]:
             key = (row.pair, row.alignment, row.tone, row.polarity)
             if key == (REFERENCE, Alignment.MM, Tone.BINARY, Polarity.INK):
                 yield (
-                    f"{row.character}, written {row.n} times by the arm, is like its reference ({row.reference}) with "
+                    f"{row.character}, written {row.n} times by the arm, matches its reference ({row.reference}) with "
                     f"a CSIM of {row.csim[2]:.1f} %."
                 )
 
@@ -144,7 +144,7 @@ def _sizes(report: Report) -> Iterator[str]:
     if not known:
         return
     length, width = (sum(ratio[k] for ratio in known) / len(known) for k in (0, 1))
-    yield f"The marks are {length:.2f} times as long and {width:.2f} times as wide as CCD-BSM says for such a brush."
+    yield f"The marks are {length:.2f} times as long and {width:.2f} times as wide as CCD-BSM predicts."
 
 
 def order(report: Report) -> str:
@@ -176,7 +176,7 @@ def order(report: Report) -> str:
     return (
         f"By average CSIM in the size-normalised alignment: {words}. The paper's order differs: here "
         f"{', '.join(swapped)}. Uncalibrated models carry the proportions of the paper's brush; where this brush's "
-        "marks have others, the closer outline wins by size alone, and the order says little about the models." + near
+        "marks have others, a model can win by its size alone, and the order says little about the models." + near
     )
 
 
@@ -184,7 +184,9 @@ def trust(report: Report) -> Iterator[Point]:
     """Points to check before trusting the numbers."""
     match report.source:
         case Source.LOOPBACK:
-            yield Point(None, "Loopback rig: the numbers test the software and the method. They say nothing about ink.")
+            yield Point(
+                None, "Loopback rig: the numbers test the software and the method. They say nothing about ink on paper."
+            )
         case Source.REAL:
             yield Point(True, "Real capture: the recording says so itself, and its hash is below.")
         case Source.IMPORT:
@@ -211,7 +213,9 @@ def trust(report: Report) -> Iterator[Point]:
         yield Point(width <= WIDE_SCALE, words)
     repeats = [s.n for s in report.stats if s.cell is not None and s.model == CEILING]
     if not repeats:
-        yield Point(False, "No cell was pressed twice: how repeatable the brush is stays unknown, there is no ceiling.")
+        yield Point(
+            False, "No cell was pressed twice: the repeatability of the brush is unknown, and there is no ceiling."
+        )
     elif min(repeats) < FEW_REPEATS:
         words = f"Some cells were pressed only {min(repeats)} times: the ceiling is rough. The paper has ten."
         yield Point(None, words)
@@ -241,15 +245,18 @@ def _collection(one: Session) -> Iterator[Point]:
         yield Point(False, words)
     if collected.pressed_again:
         takes = f"{len(collected.pressed_again)} of {collected.photographed} takes"
-        yield Point(None, f"{one.session_id}: {takes} did not count and were pressed again: what is left was selected.")
+        yield Point(
+            None,
+            f"{one.session_id}: {takes} did not count and were pressed again: the remaining strokes are a selection.",
+        )
     if collected.moved_mm > MOVED_MM:
-        words = f"the paper was found {collected.moved_mm:.2f} mm apart ({', '.join(collected.touches[:MAX_NAMED])})"
-        yield Point(False, f"{one.session_id}: {words}: presses of one H are not of one depth.")
+        words = f"two zero touches differ by {collected.moved_mm:.2f} mm ({', '.join(collected.touches[:MAX_NAMED])})"
+        yield Point(False, f"{one.session_id}: {words}: presses of one H do not have the same depth.")
 
 
 def _verdict(loop: LoopRecord) -> Iterator[Point]:
     if not loop.verdicts:
-        yield Point(None, f"{loop.again}: no original cell was pressed twice, so nothing says how alike is alike.")
+        yield Point(None, f"{loop.again}: no original cell was pressed twice, so the repeatability is unknown.")
         return
     least = min(loop.verdicts, key=lambda verdict: verdict.difference)
     failed = sum(not verdict.holds for verdict in loop.verdicts)
@@ -257,8 +264,8 @@ def _verdict(loop: LoopRecord) -> Iterator[Point]:
     sure = "" if all(verdict.certain for verdict in loop.verdicts) else ", not certain in all"
     yield Point(
         not failed,
-        f"Strokes pressed again ({loop.again}) are {how} {loop.goal_points:g} point less like their originals than "
-        f"other presses of the same cell (least: {least.difference:+.2f} points{sure}).",
+        f"Strokes pressed again ({loop.again}) are {how} {loop.goal_points:g} point less similar to their originals "
+        f"than other presses of the same cell (least: {least.difference:+.2f} points{sure}).",
     )
 
 

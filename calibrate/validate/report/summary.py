@@ -37,8 +37,8 @@ JUDGED: Key = (Alignment.MM, Tone.BINARY)
 PRESSES = {
     CEILING: (
         "another press",
-        "A capture predicted by other captures of its cell, averaged: what a perfect model of this brush could reach, "
-        "about.",
+        "A capture predicted by other captures of its cell, averaged: about what a perfect model of this brush could "
+        "reach.",
     ),
     REPEATED: ("robot writing", "A stroke pressed again with what was recovered from it, against the original."),
 }

@@ -22,8 +22,8 @@ MISSING = {
 WRITTEN_ROWS = {
     SIMULATED: ("simulated", "each writing against the model's image of its plan"),
     REFERENCE: ("robot writing", "each writing against the reference"),
-    ANOTHER: ("another writing", "each writing against the others: how alike arm and brush write twice"),
-    PLANNED: ("the plan", "simulated image against the reference: what the plan gives at best"),
+    ANOTHER: ("another writing", "each writing against the others: how repeatable arm and brush are"),
+    PLANNED: ("the plan", "simulated image against the reference: the best that the plan could give"),
 }
 """Label and description of the row of Table 3 for each comparison."""
 
@@ -77,7 +77,7 @@ def _loop_row(loop: LoopRecord, report: Report, alignment: Alignment, tone: Tone
         return []
     basis = f"{loop.original} pressed again as {loop.again}, recovered by {loop.model}"
     if loop.mm_per_px != report.mm_per_px and alignment is Alignment.MM:
-        basis += f"; at {loop.mm_per_px:g} mm a pixel"
+        basis += f"; at {loop.mm_per_px:g} mm per pixel"
     printed = TABLE_1[REPEATED]
     ours, paper = (*row.csim, *row.ssim), (*printed.csim, *printed.ssim)
     return [PaperRow(printed.label, basis, row.n, ours, paper, ceiling=False)]

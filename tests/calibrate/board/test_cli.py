@@ -173,7 +173,7 @@ def test_what_is_no_photograph_is_refused(tmp_path: Path, data: bytes | None, me
 
 
 def test_a_folder_or_a_lens_of_another_camera_is_refused(tmp_path: Path) -> None:
-    refused(run("check", tmp_path, *BOARD), "is no file")
+    refused(run("check", tmp_path, *BOARD), "is not a file")
     photograph = saved(tmp_path / "p.png", board())
     other = a_lens(tmp_path, (640, 480))
     refused(

@@ -67,7 +67,7 @@ def test_only_a_pdf_is_ever_overwritten(tmp_path: Path) -> None:
     for path, why in (
         (tmp_path / "s.mcap", "must end in .pdf"),
         (tmp_path / "no" / "board.pdf", "there is no folder"),
-        (recording, "is no PDF; it is not overwritten"),
+        (recording, "is not a PDF; it is not overwritten"),
     ):
         with pytest.raises(CalibrationError, match=why):
             write_pdf(BOARD, path)

@@ -142,15 +142,15 @@ def test_only_the_values_change_in_the_text(tmp_path: Path, text: str, expected:
         (f"paper = {{origin_mm = [1, 2], yaw_deg = 0}}\n{BOARD}", "paper: is not a table of its own"),
         (SOUND.replace("yaw_deg = 0\n", ""), "paper.yaw_deg: is not found on a line of its own"),
         (SOUND.replace("[1, 2]", "[1,\n2]"), "paper.origin_mm: is not found on a line of its own"),
-        (f'{SOUND}name = """\nyaw_deg = 5\n"""\n', "cannot be changed without changing something else"),
-        (f'name = """\n[paper]\norigin_mm = [1, 2]\nyaw_deg = 5\n"""\n{SOUND}', "without changing something else"),
+        (f'{SOUND}name = """\nyaw_deg = 5\n"""\n', "cannot be changed without changing other values"),
+        (f'name = """\n[paper]\norigin_mm = [1, 2]\nyaw_deg = 5\n"""\n{SOUND}', "without changing other values"),
     ],
     ids=["none", "inline", "no yaw", "two lines", "yaw in a text", "table in a text"],
 )
 def test_what_cannot_be_found_for_sure_is_not_touched(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "rig.toml"
     path.write_text(text)
-    with pytest.raises(CalibrationError, match=r"nothing is written\. Put in by hand: origin_mm = ") as refused:
+    with pytest.raises(CalibrationError, match=r"nothing is written\. Enter by hand: origin_mm = ") as refused:
         read_rig(path).write(LINES)
     assert message in str(refused.value)
     assert "\n" not in str(refused.value)

@@ -108,8 +108,8 @@ def test_what_repeats_nothing_is_named() -> None:
     made = paired([*ORIGINALS, ORIGINALS[0]], again)
     assert len(made.pairs) == 1
     assert dict(made.refused) == {
-        "a-r01": "its name stands for two strokes: the first is used",
-        "x~1": "repeats x, which is not there or cannot be used",
+        "a-r01": "two strokes have this name: the first is used",
+        "x~1": "repeats x, which does not exist or cannot be used",
         "y": "repeats no stroke",
         "a-r02": "was not pressed again",
         "b-r01": "was not pressed again",

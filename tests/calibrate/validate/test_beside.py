@@ -102,7 +102,7 @@ def test_a_loop_in_the_session_is_found_and_is_the_third_row_of_table_1(
     put(place / "loop", loop.to_json())
     said = invoke(place)
     assert "robot writing" in said
-    assert "6 strokes are like their originals with a CSIM of 94.2 %, other presses of the same H and α 95.2 %" in said
+    assert "6 strokes match their originals with a CSIM of 94.2 %, other presses of the same H and α 95.2 %" in said
 
     folder = place / "validation"
     report = load_report(folder / "report.json")
@@ -119,7 +119,7 @@ def test_a_loop_in_the_session_is_found_and_is_the_third_row_of_table_1(
     page = (folder / "report.html").read_text()
     assert f"{place.name} pressed again as {place.name}-replay" in page
     assert loop.digest in page
-    assert "at most 1 point less like their originals" in " ".join(page.split())
+    assert "at most 1 point less similar to their originals" in " ".join(page.split())
 
     assert "robot writing" not in invoke(place, "--no-beside")
     assert load_report(folder / "report.json").loops == ()
@@ -168,10 +168,10 @@ def test_without_a_loop_or_characters_the_page_names_the_commands(place: Path) -
 @pytest.mark.parametrize(
     ("changes", "edit", "words"),
     [
-        ({}, ("imported photographs", "real capture"), "was edited: its digest is not that of its contents"),
+        ({}, ("imported photographs", "real capture"), "was edited: its digest does not match its contents"),
         ({}, ('"n": 6', '"n": 5'), "was edited"),
         ({}, ('"n": 6', '"n": -1'), "table_1.0.n: Input should be greater than or equal to 1"),
-        ({}, ('"digest"', '"digested"'), "is no report with a digest: write it with `brushloop loop compare`"),
+        ({}, ('"digest"', '"digested"'), "is not a report with a digest: write it with `brushloop loop compare`"),
         ({}, ("brushloop-loop-1", "brushloop-loop-9"), "format is 'brushloop-loop-9', expected 'brushloop-loop-1'"),
         ({"source": Source.LOOPBACK}, None, "is of loopback rig, presses.mcap of imported photographs"),
         ({"source": Source.REAL}, None, "is of real capture, presses.mcap of imported photographs"),
@@ -191,7 +191,7 @@ def test_a_loop_that_is_edited_or_of_something_else_is_refused_by_name(
     path = put(place / "loop", text if edit is None else text.replace(*edit))
     said = refused(place)
     assert said.startswith(f"{path}: {words}")
-    assert said.endswith("(found beside the session; --no-beside goes without)")
+    assert said.endswith("(found beside the session; --no-beside ignores it)")
     assert not (place / "validation").exists()
     assert refused(place, "--loop", path) == said.partition(" (found")[0]
 
@@ -212,7 +212,7 @@ def test_table_3_has_the_papers_rows_beside_and_figure_13(lab: Path, place: Path
     characters(lab / "elsewhere")
     said = invoke(place, "--written", lab / "elsewhere")
     assert "Table 3: 字" in said
-    assert "字, written 2 times by the arm, is like its reference (a font) with a CSIM of 85.0 %" in said
+    assert "字, written 2 times by the arm, matches its reference (a font) with a CSIM of 85.0 %" in said
     folder = place / "validation"
     report = load_report(folder / "report.json")
     [one] = tables.table_3(report)
@@ -248,11 +248,11 @@ def test_characters_of_this_lab_are_found_and_others_are_left_out_with_the_reaso
     said = invoke(place)
     assert "Table 3" not in said
     characters(lab / "written")
-    assert "its session write-01 does not lie beside" in invoke(place)
+    assert "its session write-01 is not beside it" in invoke(place)
     (lab / "sessions" / "write-01").mkdir()
     for name in (str(lab), "../sessions", ".", ""):
         characters(lab / "written", named={"session": name})
-        assert "does not lie beside" in invoke(place)
+        assert "is not beside it" in invoke(place)
     characters(lab / "written")
     assert "Table 3: 字" in invoke(place)
     characters(lab / "written", brush="goat hair")
@@ -271,7 +271,7 @@ def test_an_edited_table_3_or_another_picture_is_refused(lab: Path, place: Path)
     path = characters(lab / "w")
     text = path.read_text()
     path.write_text(text.replace('"字"', '"子"'))
-    assert refused(place, "--written", path) == f"{path}: was edited: its digest is not that of its contents"
+    assert refused(place, "--written", path) == f"{path}: was edited: its digest does not match its contents"
     path.write_text(text)
     figure = lab / "w" / "figure-13.png"
     for data, words in (
@@ -287,7 +287,7 @@ def test_an_edited_table_3_or_another_picture_is_refused(lab: Path, place: Path)
         assert words in said
     figure.unlink()
     # A terminal breaks a long path anywhere.
-    assert f"{figure} is not there".replace(" ", "") in invoke(place, "--written", path).replace(" ", "")
+    assert f"{figure} does not exist".replace(" ", "") in invoke(place, "--written", path).replace(" ", "")
     # Rows of another source, sealed anew by somebody's script.
     rows = (*table_of(source=Source.IMPORT), *table_of())
     path.write_text(written_record(rows).to_json())
@@ -316,8 +316,8 @@ def test_strokes_that_travel_have_no_such_tables(
     drags = tmp_path / "drags"
     import_photographs(photos, photos / "strokes.csv", drags, ImportOptions(kind="drag"), "test", lambda: 1)
     loop = put(tmp_path / "l", a_loop().to_json())
-    assert refused(drags, "--loop", loop) == "--loop: goes into a report of presses; these strokes travel"
-    assert refused(drags, "--written", loop) == "--written: goes into a report of presses; these strokes travel"
+    assert refused(drags, "--loop", loop) == "--loop: is for a report of presses; these strokes travel"
+    assert refused(drags, "--written", loop) == "--written: is for a report of presses; these strokes travel"
     assert not (drags / "validation").exists()
 
 

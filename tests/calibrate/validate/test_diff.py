@@ -73,7 +73,7 @@ def test_a_session_that_was_never_validated_is_refused_with_the_command_that_doe
         assert ran.exception.exit_code == 2
         message = f"{given}: was not validated: run `brushloop validate {given}` first, or give a report.json"
         assert str(ran.exception) == message
-    with pytest.raises(CalibrationError, match=r"nowhere: is not there: give a report\.json"):
+    with pytest.raises(CalibrationError, match=r"nowhere: does not exist: give a report\.json"):
         compare(tmp_path / "nowhere", before)
 
 

@@ -115,7 +115,7 @@ def test_captures_go_through_the_file_into_a_tuning(
     captures = tmp_path / "captures.safetensors"
     said = invoke("validate", "captures", session, "--generator", generator, "--out", captures, "--leave-out", "15/5")
     assert "left out: blank" in said
-    assert "left out, as asked: 2 presses of 1 cells" in said
+    assert "left out, as requested: 2 presses of 1 cells" in said
     assert "8 presses (imported photographs)" in said
 
     config, _, _ = load_weights(generator)

@@ -164,7 +164,7 @@ def test_a_gate_that_holds_passes_and_one_that_is_missed_exits_5(session: Path, 
         ("csim>=0.9", "expected"),
         ("csim_mean>=0.9", "'mean' is not one of"),
         ("csim_avg>=90", "90 is outside 0 to 1"),
-        ("csim_avg>=x", "no number"),
+        ("csim_avg>=x", "not a number"),
         ("a:b:csim_avg>=0.9", "names two models"),
     ],
 )
@@ -228,7 +228,8 @@ def test_what_was_left_out_selected_or_pressed_on_other_paper_stands_above_the_r
     assert "8 planned, 8 photographed" in said()
     assert "2 of 8 planned strokes were left out while it was collected: a, b." in said(left_out=("a", "b"))
     assert "1 of 8 takes did not count and were pressed again" in said(pressed_again=("a",))
-    assert "found 2.00 mm apart (taught 1 mm, jog 3 mm)" in said(moved_mm=2.0, touches=("taught 1 mm", "jog 3 mm"))
+    touches = ("taught 1 mm", "jog 3 mm")
+    assert "two zero touches differ by 2.00 mm (taught 1 mm, jog 3 mm)" in said(moved_mm=2.0, touches=touches)
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")

@@ -144,7 +144,7 @@ def test_table_3_has_a_row_for_each_comparison_and_survives_the_disk(tmp_path: P
     with pytest.raises(CalibrationError, match=r"written\.json: was edited"):
         read_written(path)
     path.write_text("{}")
-    with pytest.raises(CalibrationError, match="is no report with a digest: write it with `brushloop write compare`"):
+    with pytest.raises(CalibrationError, match="not a report with a digest: write it with `brushloop write compare`"):
         read_written(path)
 
 

@@ -130,7 +130,7 @@ def test_an_old_file_that_names_others_must_lie_beside_them(lab: Path) -> None:
 def test_a_field_that_the_older_brushloop_did_not_know_is_reported_as_that(lab: Path) -> None:
     edit("sessions/grid-01/rig.effective.json", '"retakes": 2,', "")
     assert refused()[1:] == [
-        "rig.toml: quality.retakes: not there -> 2",
+        "rig.toml: quality.retakes: missing -> 2",
         "Go on with the old one: with the brushloop that began it, whose files had other fields; "
         "or start a new session with --new.",
     ]
