@@ -24,6 +24,10 @@ END_ROWS = 16
 BURST_SHARE = 0.5
 """Frames that arrive within less than this share of the usual period are a backlog."""
 PERIODS_KEPT = 31
+PERIODS_LEARNED = 3
+"""Number of gaps from which the usual period is taken."""
+STEADY_AFTER = 8
+"""Number of frames at the usual period after which it is no longer taken for misjudged."""
 
 
 class Fault(StrEnum):
@@ -59,6 +63,10 @@ class FrameHealth:
         self._periods: deque[int] = deque(maxlen=PERIODS_KEPT)
         self._backlog = 0
         """Number of coming frames that may have waited in a buffer."""
+        self._steady = 0
+        """Number of frames that came at the usual period."""
+        self._stalled = False
+        self._learning_again = False
         self.counts: Counter[Fault] = Counter()
         self.repeated = False
         """Whether the last frame equals the one before it: nothing new, though not yet a fault."""
@@ -123,16 +131,23 @@ class FrameHealth:
         """True for a frame that had waited in a buffer: its arrival says nothing about its exposure."""
         gap_ns = arrival_ns - self._last_ns if self._last_ns is not None else 0
         self._last_ns = arrival_ns
-        if len(self._periods) < 3:
+        if len(self._periods) < PERIODS_LEARNED:
             self._periods.append(gap_ns)
-            return False
+            return self._learning_again
         usual_ns = max(sorted(self._periods)[len(self._periods) // 2], 1)
         stalled = gap_ns > max(3 * usual_ns, self._latency_ns)
+        again, self._stalled = stalled and self._stalled, stalled
+        if again and self._steady < STEADY_AFTER:
+            # A backlog comes in a burst, so two pauses in a row are the period; the gaps of a first burst were not.
+            self._periods.clear()
+            self._steady, self._learning_again = 0, True
+            return True
         if stalled:
             # No more frames can have waited than came in the gap, so a camera with a misjudged period recovers.
             self._backlog = 1 + gap_ns // usual_ns
         if self._backlog == 0:
             self._periods.append(gap_ns)
+            self._steady, self._learning_again = self._steady + 1, False
             return False
         if stalled or gap_ns < BURST_SHARE * usual_ns:
             self._backlog -= 1

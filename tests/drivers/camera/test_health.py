@@ -80,6 +80,17 @@ def test_a_camera_that_was_slow_at_first_is_not_late_for_ever_after_a_pause() ->
     assert [judged.judge(page(), t) for t in resumed] == [Fault.LATE] * 5 + [None] * 7
 
 
+def test_a_camera_whose_first_frames_come_in_a_burst_is_late_for_a_few_frames_only() -> None:
+    judged = health(latency_ns=60_000_000)
+    burst = [k * 5_000_000 for k in range(5)]
+    steady = [burst[-1] + (k + 1) * 80_000_000 for k in range(40)]
+    for t in burst:
+        judged.judge(page(), t)
+    found = [judged.judge(page(), t) for t in steady]
+    assert found[0] is Fault.LATE
+    assert found[5:] == [None] * 35
+
+
 def test_a_backlog_after_a_pause_is_late_until_frames_come_at_their_own_pace() -> None:
     judged = health()
     arrivals = [k * PERIOD for k in range(6)]
