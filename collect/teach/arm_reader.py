@@ -40,10 +40,10 @@ READ_ONLY = frozenset(
         "RobotAlgorithm.inverseKinematics",
     }
 )
-"""Everything that is ever asked from here."""
+"""All methods that are called before there is a `rig.toml`."""
 FRAMINGS: tuple[Framing, ...] = ("sof", "bare")
 STILL_MM, STILL_DEG = 0.02, 0.01
-"""An arm that a hand holds still moves by less between two readings."""
+"""An arm that is held still by hand moves by less than this between two readings."""
 STILL_S, PATIENCE_S = 0.1, 20.0
 
 
@@ -88,7 +88,7 @@ class Cabinet:
 
     @property
     def simulated(self) -> bool:
-        """Whether it says that it is the loopback controller."""
+        """Whether it identifies itself as the loopback controller."""
         return self.box == LOOPBACK_CONTROL_BOX
 
 
@@ -142,7 +142,7 @@ class ArmReader:
         return Pose(float(x), float(y), float(z), qx, qy, qz, qw)
 
     async def cabinet(self, framing: Framing) -> Cabinet:
-        """Everything that it says of itself. Raises `DeviceError`."""
+        """Everything that the cabinet reports about itself. Raises `DeviceError`."""
         version = await self._connection.call("SystemInfo.getInterfaceVersionCode")
         tool = await self.tool()
         payload = await self.ask("RobotConfig.getPayload")

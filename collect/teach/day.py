@@ -41,7 +41,7 @@ class Day:
         self.notebook: Notebook = self._file.load()
 
     def save(self, notebook: Notebook) -> None:
-        """Take this as what is known."""
+        """Replace what is known so far."""
         if not self._held:
             self._file.save(notebook)
         self.notebook = notebook
@@ -79,7 +79,7 @@ class Day:
         await self.guide.show(Shown(lines, picture, tone))
 
     async def working(self, what: str) -> None:
-        """Say what is at work until the next finding or question."""
+        """Show what is being done until the next finding or question."""
         await self.say(what, tone="progress")
 
     async def yes(self, question: str, *, default: bool) -> bool:

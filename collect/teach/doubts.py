@@ -8,7 +8,7 @@ from collect.rig.plausible import Check, unmeasured
 from collect.teach.store import STEPS, Notebook
 
 UNKNOWN = "not "
-"""How the words begin that say that a value was taken over unmeasured."""
+"""Beginning of the text for a value that was taken over without a measurement."""
 
 
 def gaps(notebook: Notebook) -> Iterator[Check]:

@@ -19,9 +19,9 @@ Floats = NDArray[np.float64]
 Point = tuple[float, float, float]
 CORNERS = ("lower left", "lower right", "upper right", "upper left")
 HAND_MM = 0.15
-"""No hand touches better, in one axis."""
+"""Smallest plausible error of a touch by hand, in one axis."""
 WORST_CORNER_MM = 3.0
-"""A corner that lies farther off than this was not just touched badly."""
+"""A corner that is off by more than this was not merely touched inaccurately."""
 WORST_SCALE = 0.004
 """Relative error of the board's size from which the print is doubted: 1 mm over a page."""
 ASKEW_DEG = 0.5
@@ -39,7 +39,7 @@ class SheetFit:
     plane: PlaneFit
     """Through all touched corners."""
     residuals_mm: dict[str, float]
-    """Of each touch, along the sheet."""
+    """Residual of each touch, along the sheet."""
     origin_sigma_mm: float
     """Standard error of the origin in each axis, at worst."""
     yaw_sigma_deg: float

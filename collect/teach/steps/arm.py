@@ -13,7 +13,7 @@ from drivers.arcs.robot import AUBOPE_PORT
 
 RTDE_PORT = 30010
 LONGEST_TOOL_MM = 600.0
-"""No brush is held farther from the flange."""
+"""Longest plausible distance from the flange to the tip of a brush."""
 SHORTEST_TOOL_MM = 10.0
 
 
