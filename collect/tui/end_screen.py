@@ -102,15 +102,14 @@ class EndScreen(ModalScreen[str]):
 def counts_content(now: Snapshot) -> Content:
     """Strokes, time, retakes, what was cut short."""
     retakes = sum(cell.bad for cell in now.grid)
-    each_s = now.elapsed_s / max(now.strokes_done, 1)
     rows = [
         ("Strokes", f"{now.strokes_done} of {now.strokes_planned}"),
-        ("Time", f"{minutes_text(now.elapsed_s)}, {each_s:.0f} s a stroke"),
+        ("Time", f"{minutes_text(now.elapsed_s)} since the start, or since the last resume"),
         ("Retakes", f"{retakes}" + (f", {now.given_up} strokes left out" if now.given_up else "")),
         ("Source", one_line(now.source)),
     ]
     if now.voids:
-        rows.insert(3, ("Cut short", f"{now.voids} attempts, made again"))
+        rows.insert(3, ("Cut short", f"{now.voids}, made again"))
     return Content("\n").join(_row(name, text) for name, text in rows)
 
 

@@ -40,7 +40,7 @@ NOT_AT_REST = (
     "Leave this screen anyway?",
     LEAVE_KEYS,
 )
-RESUME_KEYS = "y  the arm is at rest and its cell is clear: resume      n  back"
+RESUME_KEYS = "y  at rest, and the cell is clear: resume      n  back"
 RESUME = (
     "Resume this session? The arm first lifts the brush slowly and parks; the paper is found again, "
     "and the plan goes on. No stroke is made twice.",

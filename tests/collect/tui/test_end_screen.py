@@ -34,7 +34,7 @@ async def test_a_finished_session_is_shown_on_a_card(tmp_path: Path, monkeypatch
         for part in (
             "grid-01 is complete",
             "30 of 30",
-            "60:00, 120 s a stroke",
+            "60:00 since the start",
             "mean CSIM 0.914 of 9 presses in 1 cell",
         ):
             assert part in text
