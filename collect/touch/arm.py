@@ -96,8 +96,9 @@ class TouchArm:
         await self.lift()
 
 
-SILENT_S = 1.0
-"""A sensor that sends nothing for this long has stopped."""
+SILENT_S = 5.0
+"""A sensor that sends nothing for this long has stopped. The arm rests meanwhile, so a busy computer is given time;
+while the arm moves, `force.stale_ms` is the limit."""
 
 
 class ForceTap:

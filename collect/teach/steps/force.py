@@ -23,7 +23,7 @@ CHANNEL = "can0"
 """Of a gateway, where none was typed."""
 REST_S = 1.0
 """How long the sensor is listened to with nothing touching."""
-WAIT_S = 3.0
+WAIT_S = 8.0
 """How long a push is waited for after the person has said that it was done."""
 LEAST_PUSH_N, MOST_PUSH_N = 0.3, 60.0
 """A finger pushes with more than the first and less than the second: otherwise the scale is wrong."""

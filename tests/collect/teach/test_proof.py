@@ -1,10 +1,22 @@
-"""The proof's recording: kept beside `rig.toml`, each in a folder of its own."""
+"""The proof: what lets the arm move, how fast, and where its recording is kept."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
-from collect.teach.steps.proof import folder_beside
+import pytest
+
+from collect.operator import Choice
+from collect.rig.config import load_rig
+from collect.teach.day import Day
+from collect.teach.errors import CannotTeach
+from collect.teach.guide import Shown, WentBack
+from collect.teach.steps import proof
+from collect.teach.steps.proof import ProofStep, folder_beside, slowly
+from drivers.clock import HostClock
+from drivers.sim.config import SimConfig
+from drivers.sim.rig_toml import Addresses, rig_toml
 
 
 def test_each_proof_is_recorded_in_a_new_folder_beside_the_rig(tmp_path: Path) -> None:
@@ -13,3 +25,47 @@ def test_each_proof_is_recorded_in_a_new_folder_beside_the_rig(tmp_path: Path) -
     assert [first.name, second.name] == ["lab.proof-1", "lab.proof-2"]
     assert first.is_dir()
     assert second.is_dir()
+
+
+class Refusing:
+    """A person who leaves the arm where it is."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    async def show(self, what: Shown) -> None:
+        pass
+
+    async def choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
+        self.asked.append(question)
+        return default
+
+
+@pytest.mark.parametrize(("armed", "ended"), [(False, CannotTeach), (True, WentBack)])
+async def test_the_proof_runs_nothing_without_the_command_line_and_the_operators_key(
+    armed: bool, ended: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def no_run(*_: object, **__: object) -> Path:
+        raise AssertionError("the arm would have moved")
+
+    async def answered(*_: object) -> None:
+        pass
+
+    monkeypatch.setattr(ProofStep, "_run", no_run)
+    monkeypatch.setattr(ProofStep, "_doctor", answered)
+    monkeypatch.setattr(proof, "rig_of", lambda *_: SimpleNamespace(brush=SimpleNamespace(max_depth_mm=22.0)))
+    person = Refusing()
+    with pytest.raises(ended):
+        await ProofStep().teach(Day(person, tmp_path / "rig.toml", HostClock(), armed=armed))  # type: ignore[arg-type]
+    assert len(person.asked) == armed
+    assert all("The arm moves by itself, slower than 50 mm/s" in question for question in person.asked)
+
+
+def test_every_move_of_the_proof_is_slower_than_50_mm_s(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0")))
+    rig = load_rig(path)
+    slow = slowly(rig)
+    assert rig.motion.travel_speed_mm_s > 50.0, "otherwise faster"
+    assert max(slow.motion.travel_speed_mm_s, slow.motion.press_speed_mm_s) < 50.0
+    assert slow.robot.limits.speed_mm_s <= 50.0, "the driver refuses more"
