@@ -191,7 +191,8 @@ class World:
     def _dip(self, pose: Pose) -> None:
         table = self.config.table
         x_mm, y_mm = self.to_paper(pose.x_mm, pose.y_mm)
-        if self._in_well(x_mm, y_mm) and pose.z_mm < table.paper_z_mm + self.well.level_mm:
+        bottom_mm = table.surface_z_mm(*table.well_mm)
+        if self._in_well(x_mm, y_mm) and pose.z_mm < bottom_mm + self.well.level_mm:
             self.ink_load = self.well.dip(self.ink_load)
 
     def _leave_mark(self, deepest: Pose) -> None:

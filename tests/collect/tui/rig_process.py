@@ -17,7 +17,7 @@ from drivers.sim.config import SimConfig, View
 from drivers.sim.rig import LoopbackRig
 
 MOST_PRESSES = 100
-VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125, fps=10.0)
+VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125, fps=5.0)
 """Half as sharp as the camera is by default: sharp enough to judge by."""
 
 

@@ -94,3 +94,12 @@ def test_a_lean_across_the_set_turns_the_bend_by_45_deg_where_both_carry_the_tip
     wrist_deg = bent_toward(upright, 0.0, 90.0, set_deg)
     assert bent_toward(upright, set_deg, wrist_deg + 90.0, set_deg) == pytest.approx(wrist_deg + 45.0)
     assert bent_toward(upright, 20.0 * set_deg, wrist_deg + 90.0, set_deg) == pytest.approx(wrist_deg + 90.0, abs=3.0)
+
+
+def test_the_well_stands_on_the_leaning_table_and_its_ink_with_it() -> None:
+    table = Table(slope_deg=(0.0, -1.0))
+    bottom_mm = table.surface_z_mm(*table.well_mm)
+    assert bottom_mm > table.paper_z_mm + 4.0
+    heights_mm = (bottom_mm + 60.0, bottom_mm + table.ink_level_mm - 2.0, bottom_mm + 60.0)
+    world = world_after(table, *(over(table, *table.well_mm, z_mm) for z_mm in heights_mm))
+    assert world.ink_load == 1.0
