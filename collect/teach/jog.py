@@ -6,7 +6,7 @@ import contextlib
 import math
 from collections.abc import AsyncGenerator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from scipy.spatial.transform import Rotation
 
@@ -23,7 +23,11 @@ from drivers.protocols import Robot
 from drivers.samples import Pose
 
 if TYPE_CHECKING:
-    from collect.teach.day import Day
+    from contextlib import AbstractAsyncContextManager
+
+    from collect.teach.arm_reader import ArmReader
+    from collect.teach.guide import Guide
+    from drivers.clock import Clock
 
 STEPS_MM = (0.1, 0.5, 2.0, 5.0)
 SPEED_MM_S, ACC_MM_S2 = 20.0, 200.0
@@ -36,7 +40,38 @@ Tool = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Flange to tip: the offset in mm, and the turn about x, y and z of the flange in deg."""
 
 
-async def jogged(day: Day, what: str) -> Brought:
+class JogDay(Protocol):
+    """What a jog needs of the first day that it is part of."""
+
+    @property
+    def guide(self) -> Guide:
+        """The person."""
+        ...
+
+    @property
+    def notebook(self) -> Notebook:
+        """What is known so far."""
+        ...
+
+    @property
+    def clock(self) -> Clock:
+        """The driver's clock."""
+        ...
+
+    async def may_move(self, what: str) -> None:
+        """Ask for the key that lets the arm move. Raises `CannotTeach` unless both it and `--arm` are given."""
+        ...
+
+    async def working(self, what: str) -> None:
+        """Show what is being done."""
+        ...
+
+    def arm(self) -> AbstractAsyncContextManager[ArmReader]:
+        """The arm, to be read only."""
+        ...
+
+
+async def jogged(day: JogDay, what: str) -> Brought:
     """Let the person jog until the tip is there: DONE, or BACK where the person leaves the jog.
 
     Asks for the key that lets the arm move. Raises `CannotTeach` without `--arm`, `ConfigError`, and `DeviceError`
@@ -75,7 +110,7 @@ async def _step(robot: Robot, step: JogStep) -> str:
 
 
 @contextlib.asynccontextmanager
-async def _enabled(day: Day) -> AsyncGenerator[Robot]:
+async def _enabled(day: JogDay) -> AsyncGenerator[Robot]:
     """The arm, powered, with its limits around what is known; stopped and left where it is at the end."""
     book = day.notebook
     host, port = str(book.get("robot.host")), int(book.number("robot.port"))
