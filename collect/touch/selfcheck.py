@@ -153,8 +153,8 @@ def _find(rig: Rig, before: Frame, after: Frame, config: SelfCheckConfig) -> Flo
     if len(marks) != 3:
         listed = "; ".join(f"{m.ink_mm2:.1f} mm2 at ({m.x_mm:.0f}, {m.y_mm:.0f})" for m in marks[:6])
         raise StepError(
-            f"self-check: 3 marks were pressed, {len(marks)} new ones are seen ({listed or 'none'}). "
-            "Is there ink on the brush, and does the camera see where the arm presses?"
+            f"self-check: 3 marks were pressed, new marks seen: {len(marks)} ({listed or 'none'}). "
+            "Was the sheet blank where they were pressed, is there ink on the brush, and does the camera see the place?"
         )
     return np.array([(m.x_mm, m.y_mm) for m in marks], np.float64)
 

@@ -39,7 +39,7 @@ class ProofStep:
 
     name: StepName = "proof"
     title = "Proof"
-    minutes = 12
+    minutes = 20
     needs: tuple[StepName, ...] = ("arm", "camera", "tip", "sheet", "places", "brush", "force", "limits")
 
     async def teach(self, day: Day) -> None:
@@ -139,7 +139,7 @@ class ProofStep:
                 "Use a cable instead of Wi-Fi, MJPEG instead of H.264, fewer pixels, or no buffer in between.",
                 tone="warning",
             )
-        await day.say("READY")
+        await day.say("Lay a fresh sheet before the first session: this one has the marks of the proof.", "READY")
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """No derived values: all values of this step were measured."""

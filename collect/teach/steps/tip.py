@@ -14,6 +14,8 @@ GOOD_MM = 0.18
 """Root mean square error of the tip at which touching ends."""
 WORST_MM = 0.35
 """Above this after the last touch, the tip is not accepted."""
+UNKNOWN_MM = 20.0
+"""Error above which no place of the tip is shown."""
 LEAST_UPRIGHTS, UPRIGHTS = 3, 12
 """Times that the brush is held against a set square, each with another turn of the wrist. Nothing but a few degrees of
 set bends an upright brush along the heading: an error of 0.12 deg across it turns every mark by 5 deg, which is judged
@@ -86,6 +88,10 @@ class TipStep:
             day.save(day.notebook.model_copy(update={"touches": kept}))
             return False
         x, y, z = fit.offset_mm
+        if fit.error_mm > UNKNOWN_MM:
+            more = f"{len(touches)} touches do not tell yet where the tip is; if Enter was pressed too early, the next"
+            await day.say(f"{more} touches will show which one lies off.", tone="warning")
+            return False
         await day.say(
             f"{len(touches)} touches: the tip is at ({x:.2f}, {y:.2f}, {z:.2f}) mm from the flange, known to "
             f"{fit.error_mm:.3f} mm (goal {GOOD_MM:g}); the touches scatter by {max(fit.residuals_mm):.2f} mm at most."

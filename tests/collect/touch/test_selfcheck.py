@@ -151,7 +151,7 @@ async def test_a_dry_brush_leaves_no_marks(make_bench: MakeBench) -> None:
         return
 
     bench.effector.dip = no_ink  # pyright: ignore[reportAttributeAccessIssue]
-    with pytest.raises(StepError, match="3 marks were pressed, 0 new ones are seen"):
+    with pytest.raises(StepError, match="3 marks were pressed, new marks seen: 0"):
         await checked(bench)
 
 
