@@ -23,8 +23,8 @@ from twin.shape import COARSE, FINE, Found, Round, Target, choose_individual, co
 from twin.spread import FEWEST, Repeats, Spread, fit_spread
 
 MOST_WORKERS = 8
-TOLD_SD = 0.7
-"""Standard error, in scales, from which the presses count as not determining a constant: the prior's own is 1."""
+MOST_SD = 0.7
+"""Standard error, in scales, above which the presses count as not determining a constant."""
 NORMAL_95 = 1.96
 ROUNDS: tuple[Round, ...] = (*COARSE, FINE)
 Keep = Callable[[str, Found], None]
@@ -201,4 +201,4 @@ def _estimate(constant: Constant, scales: float, error: float) -> Estimate:
     ends = (constant.value(scales + way * NORMAL_95 * error) for way in (-1.0, 1.0))
     low, high = constant.bounds
     inside = low + 0.01 < scales < high - 0.01
-    return Estimate(constant, constant.value(scales), *ends, determined=bool(error < TOLD_SD and inside))
+    return Estimate(constant, constant.value(scales), *ends, determined=bool(error < MOST_SD and inside))

@@ -2,8 +2,7 @@
 
 The images are blurred less from round to round: a wide blur gives the search a slope from far away, a narrow one the
 detail. The minimiser is SciPy's trust-region least squares with bounds; its derivatives are differences between brushes
-that press with the same seeds. A prior of one scale on each constant keeps what the presses do not determine at its
-default.
+that press with the same seeds. A wide prior on each constant keeps what the presses do not determine near its default.
 """
 
 from __future__ import annotations
@@ -25,6 +24,8 @@ from twin.drawing import Cell, Images, draw, still
 IMAGE_SD = 0.12
 """Deviation of a blurred pixel that weighs as much as a constant one scale from its default: the deviations of
 neighbouring pixels are not independent, and a brush differs from this one in more than its constants."""
+PRIOR_SD = 2.5
+"""Standard deviation of the prior, in scales: brushes of another make lie farther off than brushes of one kind."""
 STEP = 0.3
 """Scales by which a constant is changed for its derivative."""
 EVERY = 2
@@ -86,7 +87,7 @@ def off(target: Target, seed: int, blur_mm: float, point: Vector) -> Vector:
     base = replace(target.base, seed=seed)
     drawn = draw(still(brush_at(point, base)), offset_at(point), target.cells, target.grid)[:, 0]
     apart = blurred(drawn - target.mean, blur_mm, target.grid)
-    return np.concatenate([apart.ravel() / IMAGE_SD, point])
+    return np.concatenate([apart.ravel() / IMAGE_SD, point / PRIOR_SD])
 
 
 def blurred(images: Images, blur_mm: float, grid: Grid) -> NDArray[np.float64]:
@@ -151,4 +152,4 @@ def covariance(target: Target, found: Found, workers: Executor) -> NDArray[np.fl
     pulls -= pulls.mean(axis=0)
     spread = pulls.T @ pulls * count / max(count - 1, 1)
     inverse = np.linalg.inv(jacobian.T @ jacobian)
-    return np.asarray(inverse @ (spread + np.eye(constants)) @ inverse, np.float64)
+    return np.asarray(inverse @ (spread + np.eye(constants) / PRIOR_SD**2) @ inverse, np.float64)
