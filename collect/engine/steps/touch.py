@@ -43,7 +43,7 @@ async def zero_touch(context: StepContext) -> Result:
     if found.method == "kept":
         run.progress.log(f"zero touch was given up: {_height(run)} is kept", warning=True)
     elif found.method != "taught":
-        run.progress.log(f"zero touch by {found.method}: {_compared(moved_mm, run.procedures.plane)}")
+        run.progress.log(f"zero touch by {found.method}: {_compared(moved_mm, found.plane, run.procedures.plane)}")
     if context.step.params.get("between_strokes"):
         await _accepted(context, moved_mm)
     run.procedures.plane = found.plane
@@ -60,8 +60,8 @@ def _moved_mm(found: PlaneResult, before: PaperPlane) -> float:
     return max(away, key=abs)
 
 
-def _compared(moved_mm: float, before: PaperPlane) -> str:
-    if before.slope_deg == 0.0:  # rig.toml has one height for the whole sheet
+def _compared(moved_mm: float, now: PaperPlane, before: PaperPlane) -> str:
+    if before.slope_deg == 0.0 < now.slope_deg:  # rig.toml has one height for the whole sheet
         return f"the paper differs by up to {moved_mm:+.2f} mm from a level sheet at the height known before"
     return f"the paper lies {moved_mm:+.2f} mm from where it was before"
 
