@@ -42,7 +42,9 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     rows += [(kind, one.wall_s, "s", "npz", npz.wall_s / one.wall_s) for kind, one in used.items() if kind != "npz"]
     limit = f"{MOST_GROWTH:g} times the peak at {strokes // FEW}"
     rows += [("npz-memory", npz.peak_mb, "MB", limit, MOST_GROWTH * level.peak_mb / npz.peak_mb)]
-    return [Result(f"export.{name}", *values, 1, seed, where) for name, *values in rows]
+    return [
+        Result(f"export.{name}", value, unit, peer, ratio, 1, seed, where) for name, value, unit, peer, ratio in rows
+    ]
 
 
 def _exported(place: Path, out: Path, kind: str) -> Used:
