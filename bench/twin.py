@@ -14,7 +14,7 @@ from bench.brushfit_presses import BRISTLE_SETS, CELLS, BrushPresses, bristles, 
 from bench.harness import BenchError, Result
 from calibrate.fit.heldout import BEZIER, CEILING
 from sessions.progress import shown
-from twin.run import fit_presses, workers
+from twin.run import fit_twin, workers
 from twin.score import TWIN
 
 REPEATS = 3
@@ -47,7 +47,7 @@ def _brushes(n: int | None) -> Iterator[BrushPresses]:
 def _scored(brush: BrushPresses, seed: int) -> Iterator[Result]:
     strokes = brush.strokes([(c, r) for c in range(len(CELLS)) for r in range(min(REPEATS, brush.ink.shape[1]))])
     with workers() as pool, shown() as progress:
-        twin = fit_presses(strokes, brush.grid, brush.radius_mm, brush.length_mm, pool, progress)
+        twin = fit_twin(strokes, brush.grid, brush.radius_mm, brush.length_mm, pool, progress)
     csim = {row.model: row.csim for row in twin.held_out}
     gap = csim[CEILING] - csim[TWIN]
     where = f"simulated; ceiling {csim[CEILING]:.2f}, twin {csim[TWIN]:.2f}, refitted Bezier {csim[BEZIER]:.2f} %"

@@ -64,7 +64,8 @@ def twin(
 
         with workers() as pool:
             try:
-                fitted = fit_twin(captures, pool, progress, kept[0].found(), keep)
+                brush = captures.radius_mm, captures.length_mm
+                fitted = fit_twin(captures.strokes, captures.grid, *brush, pool, progress, kept[0].found(), keep)
             except ValueError as error:
                 raise CalibrationError(str(recording.path), str(error)) from None
     noise = noise_gray(recording)

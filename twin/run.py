@@ -2,31 +2,39 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibrate.fit.captures import Captures
-from calibrate.fit.heldout import HeldOut, by_cell
+from calibrate.fit.heldout import (
+    BEZIER,
+    CEILING,
+    FEWEST_REPEATS,
+    HeldOut,
+    Images,
+    Scores,
+    by_cell,
+    image_of,
+    refit_bezier,
+)
 from calibrate.fit.strokes import Grid, Pressed
 from drivers.sim.brush.spec import BrushSpec
 from sessions.progress import Progress, unseen
 from twin.constants import SHAPE, SPREAD, Constant, Offset, brush_at, offset_at, with_values
 from twin.drawing import Cell
-from twin.score import Scores, parts_of, predicted
+from twin.score import TWIN, parts_of, predicted
 from twin.shape import COARSE, FINE, Found, Round, Target, choose_individual, covariance, search, start
-from twin.spread import FEWEST, Repeats, Spread, fit_spread
+from twin.spread import Repeats, Spread, fit_spread
 
 MOST_WORKERS = 8
 MOST_SD = 0.7
 """Standard error, in scales, above which the presses count as not determining a constant."""
 NORMAL_95 = 1.96
-ROUNDS: tuple[Round, ...] = (*COARSE, FINE)
 Keep = Callable[[str, Found], None]
 """Called with the name of a finished step and where the search stands."""
 
@@ -56,7 +64,7 @@ class Twin:
     """Empty where the cells cannot be divided."""
 
 
-@contextmanager
+@contextlib.contextmanager
 def workers(most: int = MOST_WORKERS) -> Generator[Executor]:
     """Processes that draw presses, one for each core."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads of matrix products would compete with the processes
@@ -66,18 +74,6 @@ def workers(most: int = MOST_WORKERS) -> Generator[Executor]:
 
 
 def fit_twin(
-    captures: Captures,
-    pool: Executor,
-    progress: Progress = unseen,
-    before: dict[str, Found] | None = None,
-    keep: Keep = lambda _name, _found: None,
-) -> Twin:
-    """Fit the twin of a session's brush; see `fit_presses`."""
-    brush = captures.radius_mm, captures.length_mm
-    return fit_presses(captures.strokes, captures.grid, *brush, pool, progress, before, keep)
-
-
-def fit_presses(
     strokes: Sequence[Pressed],
     grid: Grid,
     radius_mm: float,
@@ -95,37 +91,50 @@ def fit_presses(
     cells = by_cell(strokes)
     target = target_of(cells, radius_mm, length_mm, grid)
     parts = parts_of(target.cells)
-    ticks = _Ticks(progress, (1 + len(parts)) * sum(one.steps for one in ROUNDS))
+    ticks = _Ticks(progress, (1 + len(parts)) * sum(one.steps for one in (*COARSE, FINE)))
     run = _Run(pool, ticks, before or {}, keep)
     found = run.shape("all cells", target)
     errors = np.sqrt(np.diagonal(covariance(target, found, pool)))
-    spec, offset = brush_at(found.point, replace(target.base, seed=found.seed)), offset_at(found.point)
+    spec, offset = _brush(found, target), offset_at(found.point)
     repeats = repeats_of(cells)
     spread = fit_spread(spec, offset, repeats, grid) if repeats.cells else None
     estimates = [_estimate(*one) for one in zip(SHAPE, found.point, errors, strict=False)]
     if spread is not None:
-        spec = with_values(spec, SPREAD, spread.point)
+        spec = _brush(found, target, spread)
         estimates += [_estimate(*one) for one in zip(SPREAD, spread.point, spread.error, strict=True)]
     scores = Scores()
     for number, part in enumerate(parts, 1):
         kept = [k for k in range(len(cells)) if k not in part]
         there = run.shape(f"part {number} left out", target.only(kept))
-        score_part(scores, cells, [target.cells[k] for k in part], there, target, spread)
+        _score_part(scores, cells, [target.cells[k] for k in part], there, target, spread)
     ticks.end()
-    return Twin(spec, offset, tuple(estimates), spread, tuple(scores.rows()))
+    return Twin(spec, offset, tuple(estimates), spread, tuple(scores.rows((CEILING, TWIN, BEZIER))))
 
 
-def score_part(
-    scores: Scores, cells: dict[Cell, list[Pressed]], held: list[Cell], there: Found, target: Target,
+def _score_part(
+    scores: Scores,
+    cells: dict[Cell, list[Pressed]],
+    held: list[Cell],
+    there: Found,
+    target: Target,
     spread: Spread | None,
-) -> None:  # fmt: skip
-    """Score the cells `held` by the twin found without them."""
-    spec = brush_at(there.point, replace(target.base, seed=there.seed))
-    if spread is not None:
-        spec = with_values(spec, SPREAD, spread.point)
-    images = predicted(spec, offset_at(there.point), held, target.grid)
+) -> None:
+    """Score the cells `held` by the twin found without them, and by a Bezier refitted to the others."""
+    drawn = predicted(_brush(there, target, spread), offset_at(there.point), held, target.grid)
     others = [one for cell, group in cells.items() if cell not in held for one in group]
-    scores.add({cell: cells[cell] for cell in held}, others, images, target.grid)
+    bezier = None
+    with contextlib.suppress(ValueError):  # the other cells span no plane
+        bezier = refit_bezier(others, target.grid)
+    for cell in held:
+        images: dict[str, Images] = {TWIN: drawn[cell]}
+        if bezier is not None:
+            images[BEZIER] = image_of(bezier.outline(*cell), target.grid)
+        scores.add(cells[cell], images)
+
+
+def _brush(found: Found, target: Target, spread: Spread | None = None) -> BrushSpec:
+    spec = brush_at(found.point, replace(target.base, seed=found.seed))
+    return spec if spread is None else with_values(spec, SPREAD, spread.point)
 
 
 def target_of(cells: dict[Cell, list[Pressed]], radius_mm: float, length_mm: float, grid: Grid) -> Target:
@@ -136,8 +145,8 @@ def target_of(cells: dict[Cell, list[Pressed]], radius_mm: float, length_mm: flo
 
 
 def repeats_of(cells: dict[Cell, list[Pressed]]) -> Repeats:
-    """The captures of the cells that have at least `FEWEST`."""
-    several = {cell: group for cell, group in cells.items() if len(group) >= FEWEST}
+    """The captures of the cells that have at least `FEWEST_REPEATS`."""
+    several = {cell: group for cell, group in cells.items() if len(group) >= FEWEST_REPEATS}
     return Repeats(tuple(several), tuple(np.array([one.ink for one in group]) for group in several.values()))
 
 
@@ -152,14 +161,16 @@ class _Ticks:
         progress("twin: steps of the search", 0, total)
 
     def tick(self) -> None:
-        self._done = min(self._done + 1, self._total)
-        self._progress("twin: steps of the search", self._done, self._total)
+        self._show(min(self._done + 1, self._total))
 
     def passed(self, steps: int) -> None:
         """A pass of so many steps has ended."""
         self._due += steps
-        self._done = max(self._done, self._due) - 1
-        self.tick()
+        self._show(max(self._done, self._due))
+
+    def _show(self, done: int) -> None:
+        self._done = done
+        self._progress("twin: steps of the search", done, self._total)
 
     def end(self) -> None:
         self.passed(self._total - self._due)

@@ -126,14 +126,9 @@ def derivatives(
 
 def choose_individual(target: Target, found: Found, workers: Executor) -> Found:
     """The seed whose hairs, with the constants found, come nearest to the captures."""
-    seeds = range(INDIVIDUALS)
-    tried = [partial(off, target, seed, FINEST_MM) for seed in seeds]
-    squares = [float(one @ one) for one in workers.map(_call, tried, [found.point] * len(tried), chunksize=4)]
-    return Found(found.point, seeds[int(np.argmin(squares))])
-
-
-def _call(evaluate: Callable[[Vector], Vector], point: Vector) -> Vector:
-    return evaluate(point)
+    residuals = partial(off, target, blur_mm=FINEST_MM, point=found.point)
+    squares = [float(one @ one) for one in workers.map(residuals, range(INDIVIDUALS), chunksize=4)]
+    return Found(found.point, int(np.argmin(squares)))
 
 
 def covariance(target: Target, found: Found, workers: Executor) -> NDArray[np.float64]:

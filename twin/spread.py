@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from calibrate.compare.similarity import csim
+from calibrate.fit.heldout import FEWEST_REPEATS
 from calibrate.fit.strokes import Grid
 from drivers.sim.brush.spec import BrushSpec
 from twin.constants import SPREAD, Offset, Vector, with_values
@@ -27,8 +28,6 @@ TIP_SHARE = 1.0 / 3.0
 PRIOR_SD = 2.0
 STEP = 0.3
 STEPS = 6
-FEWEST = 3
-"""Captures of a cell from which its spread is measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +56,11 @@ class Spread:
 
 
 def fit_spread(spec: BrushSpec, offset: Offset, repeats: Repeats, grid: Grid) -> Spread:
-    """Match the statistics of the captures. Raises ValueError without a cell that has `FEWEST` captures."""
+    """Match the statistics of the captures. Raises ValueError without a cell that has `FEWEST_REPEATS` captures."""
     from scipy.optimize import least_squares  # slow to import
 
     if not repeats.cells:
-        raise ValueError(f"no cell has {FEWEST} captures")
+        raise ValueError(f"no cell has {FEWEST_REPEATS} captures")
     seen = statistics(repeats.ink, grid)
     # twice the relative standard error of a deviation with so many degrees of freedom: the simulated one has its own
     sd = 2.0 / math.sqrt(2.0 * repeats.freedom)

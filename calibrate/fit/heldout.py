@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,8 @@ from model.plane import Plane, fit_plane
 from sessions.progress import Progress, counted, unseen
 
 BEZIER_SIZES = ("left_mm", "right_mm", "belly_mm", "shoulder")
+FEWEST_REPEATS = 3
+"""Strokes of a cell from which one is compared with the others."""
 Cell = tuple[float, float]
 CEILING, FITTED, BEZIER, UNCALIBRATED = "same-cell template", "fitted", "refitted Bezier", "uncalibrated"
 Images = NDArray[np.floating]
@@ -58,7 +60,7 @@ def leave_cell_out(fit: Fit, strokes: Sequence[Pressed], grid: Grid, progress: P
     if len(cells) < 2:
         raise ValueError("leaving a cell out needs at least two cells")
     published = FittedPress(fit.press.radius_mm, fit.press.length_mm)
-    scores: dict[str, list[tuple[float, float]]] = {}
+    scores = Scores()
     for cell, held in counted(cells.items(), "cells left out in turn", len(cells), progress):
         others = [stroke for key, group in cells.items() if key != cell for stroke in group]
         images = {
@@ -67,18 +69,33 @@ def leave_cell_out(fit: Fit, strokes: Sequence[Pressed], grid: Grid, progress: P
         }
         with contextlib.suppress(ValueError):  # the other cells span no plane
             images[BEZIER] = image_of(refit_bezier(others, grid).outline(*cell), grid)
+        scores.add(held, images)
+    return scores.rows((CEILING, FITTED, BEZIER, UNCALIBRATED))
+
+
+class Scores:
+    """Collects scores of held-out strokes by model, and of the template of their own cell."""
+
+    def __init__(self) -> None:
+        self._found: dict[str, list[tuple[float, float]]] = {}
+
+    def add(self, held: Sequence[Pressed], images: Mapping[str, Images]) -> None:
+        """Score the strokes of one cell by what each model predicts there, and by the others of the cell."""
         for k, stroke in enumerate(held):
             for name, image in images.items():
-                scores.setdefault(name, []).append(score(image, stroke.ink))
-            if len(held) >= 3:
+                self._found.setdefault(name, []).append(_score(image, stroke.ink))
+            if len(held) >= FEWEST_REPEATS:
                 template = np.mean([other.ink > 0.5 for m, other in enumerate(held) if m != k], axis=0)
-                scores.setdefault(CEILING, []).append(score(template, stroke.ink))
-    order = [name for name in (CEILING, FITTED, BEZIER, UNCALIBRATED) if name in scores]
-    rows: list[HeldOut] = []
-    for name in order:
-        mean = 100.0 * np.mean(scores[name], axis=0)
-        rows.append(HeldOut(name, float(mean[0]), float(mean[1]), len(scores[name])))
-    return rows
+                self._found.setdefault(CEILING, []).append(_score(template, stroke.ink))
+
+    def rows(self, order: Sequence[str]) -> list[HeldOut]:
+        """Means in percent in this order; a model without a score is left out."""
+        rows: list[HeldOut] = []
+        for name in order:
+            if name in self._found:
+                mean = 100.0 * np.mean(self._found[name], axis=0)
+                rows.append(HeldOut(name, float(mean[0]), float(mean[1]), len(self._found[name])))
+        return rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +138,7 @@ def refit_bezier(strokes: Sequence[Pressed], grid: Grid) -> RefittedBezier:
     return RefittedBezier(fit_plane(height, tilt, dict(zip(BEZIER_SIZES, np.array(rows).T, strict=True))))
 
 
-def score(predicted: Images, ink: Images) -> tuple[float, float]:
-    """(CSIM, SSIM) of two images of one size as binary images; zero for a blank one."""
+def _score(predicted: Images, ink: Images) -> tuple[float, float]:
     seen, truth = (np.asarray(image > 0.5, np.float32) for image in (predicted, ink))
     if not seen.any() or not truth.any():
         return 0.0, 0.0

@@ -100,9 +100,7 @@ class Brush:
 
     def print_descent(self, descent: Descent, *, ink_load: float, press_seed: int, px_per_mm: float) -> Footprint:
         """The mark that a way down leaves, as `press` would print it. Raises ValueError as `press` does."""
-        within("ink_load", ink_load, 0.0, 1.0)
-        within("px_per_mm", px_per_mm, 2.0, 40.0)
-        within("press_seed", press_seed, 0, 2**63 - 1)
+        _check_print(ink_load, press_seed, px_per_mm)
         return print_footprint(descent, self._tuft(press_seed, None), ink_load, px_per_mm, self._paper(press_seed))
 
     @property
@@ -156,9 +154,7 @@ class Brush:
 
     def _check(self, depth_mm: float, tilt_deg: float, ink_load: float, press_seed: int, px_per_mm: float) -> None:
         within("tilt_deg", tilt_deg, 0.0, MAX_TILT_DEG)
-        within("ink_load", ink_load, 0.0, 1.0)
-        within("px_per_mm", px_per_mm, 2.0, 40.0)
-        within("press_seed", press_seed, 0, 2**63 - 1)
+        _check_print(ink_load, press_seed, px_per_mm)
         within("depth_mm", depth_mm, -math.inf, self.deepest_mm(tilt_deg))
 
     # two random streams, so that the paper does not change with the number of bristles
@@ -168,6 +164,12 @@ class Brush:
 
     def _paper(self, press_seed: int) -> np.random.Generator:
         return np.random.default_rng([self.spec.seed, press_seed, 1])
+
+
+def _check_print(ink_load: float, press_seed: int, px_per_mm: float) -> None:
+    within("ink_load", ink_load, 0.0, 1.0)
+    within("px_per_mm", px_per_mm, 2.0, 40.0)
+    within("press_seed", press_seed, 0, 2**63 - 1)
 
 
 @lru_cache(maxsize=REMEMBERED_SPINES)
