@@ -20,7 +20,7 @@ from calibrate.fit.artefact import BrushFit
 from calibrate.session import lens_in_use
 from collect.engine.last_capture import likeness, mark_of, pictures_of
 from collect.rig.paper import Cell
-from collect.tui.large import LargeCapture
+from collect.tui.large import LargeCapture, title_of
 from sessions.errors import InputError, SessionDamaged
 from sessions.history import unlike, waits_of
 from sessions.journal.codec import Line
@@ -152,7 +152,7 @@ class Review:
                 model = f"CCD-BSM fitted to {fit.strokes} strokes of {fit.session_id}"
         except CalibrationError as error:
             model = str(error)
-        title = f"{capture.stroke_id}   H {capture.height_mm:g} mm  α {capture.tilt_deg:g}°"
+        title = title_of(capture.stroke_id, capture.height_mm, capture.tilt_deg)
         alike = likeness(pictures.binary, predicted)
         return LargeCapture(title, pictures.photo, pictures.binary, predicted, model, alike, pictures.checks)
 

@@ -80,10 +80,15 @@ class LargeCapture:
 
 def of_last(last: LastCapture) -> LargeCapture:
     """The newest capture of a run, with CCD-BSM as published."""
-    title = f"{last.stroke_id}   H {last.height_mm:g} mm  α {last.tilt_deg:g}°"
+    title = title_of(last.stroke_id, last.height_mm, last.tilt_deg)
     model = "CCD-BSM as published" if last.model is not None else "no prediction for this stroke"
     checks = () if last.verdict is None else last.verdict.checks
     return LargeCapture(title, last.photo, last.binary, last.model, model, last.likeness, checks)
+
+
+def title_of(stroke_id: str, height_mm: float, tilt_deg: float) -> str:
+    """The stroke and its command."""
+    return f"{stroke_id}   H {height_mm:g} mm  α {tilt_deg:g}°"
 
 
 def over_photograph(photo: NDArray[np.uint8], predicted: NDArray[np.bool_]) -> Coloured:

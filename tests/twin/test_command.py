@@ -7,8 +7,6 @@ from concurrent.futures import Executor
 from contextlib import contextmanager
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -16,7 +14,7 @@ import brushloop
 from calibrate.errors import CalibrationError
 from drivers.sim.brush.brush import Brush, BrushSpec
 from drivers.sim.brush_file import load_brush
-from sessions.imports.photographs import ImportOptions, import_photographs
+from tests.photographed import imported, photograph
 from tests.twin.serial import Serial
 from twin.file import notes_path
 from twin.score import PARTS
@@ -31,17 +29,9 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
     for k, (height, tilt) in enumerate(CELLS):
         mark = Brush(BrushSpec()).press(height, tilt, ink_load=1.0, press_seed=k)
-        page = np.full((200, 320), 235, np.uint8)
-        rows, columns = mark.density.shape
-        left, top = 250 - round(mark.origin_px[0]), 100 - round(mark.origin_px[1])
-        page[top : top + rows, left : left + columns] -= np.rint(200 * np.clip(mark.density, 0, 1)).astype(np.uint8)
-        cv2.imwrite(str(folder / f"{k}.png"), page)
+        photograph(folder / f"{k}.png", mark, (200, 320), (250, 100))
         lines.append(f"{k}.png,{height},{tilt},10.0,250.0,100.0")
-    table = folder / "strokes.csv"
-    table.write_text("\n".join(lines) + "\n")
-    out = tmp_path_factory.mktemp("sessions") / "presses"
-    import_photographs(folder, table, out, ImportOptions(kind="press"), "test", lambda: 1)
-    return out
+    return imported(folder, lines, tmp_path_factory.mktemp("sessions") / "presses", "press")
 
 
 @contextmanager

@@ -6,7 +6,6 @@ import io
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from rich.console import Console
@@ -25,9 +24,9 @@ from calibrate.errors import CalibrationError
 from calibrate.stroke.params import Params
 from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from model.drag import DragModel
-from sessions.imports.photographs import ImportOptions, import_photographs
 from sessions.reader import Recording
 from sessions.recording.schemas import Header, Source
+from tests.photographed import imported, photograph
 
 STROKES = [
     (30.0, 0.0, 4.0),
@@ -47,17 +46,9 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for k, (length, bend, depth) in enumerate(STROKES):
         path = commanded_path(length, bend, depth, depth)
         mark = brush.drag([Waypoint(*row[:3]) for row in path.tolist()], 0.0, 0.0, ink_load=1.0, press_seed=k)
-        page = np.full((700, 900), 235, np.uint8)
-        rows, columns = mark.density.shape
-        left, top = 300 - round(mark.origin_px[0]), 350 - round(mark.origin_px[1])
-        page[top : top + rows, left : left + columns] -= np.rint(200 * np.clip(mark.density, 0, 1)).astype(np.uint8)
-        cv2.imwrite(str(folder / f"{k}.png"), page)
+        photograph(folder / f"{k}.png", mark, (700, 900), (300, 350))
         lines.append(f"{k}.png,{length},{bend},{depth},10.0,300,350")
-    table = folder / "strokes.csv"
-    table.write_text("\n".join(lines) + "\n")
-    out = tmp_path_factory.mktemp("sessions") / "drags"
-    import_photographs(folder, table, out, ImportOptions(kind="drag"), "test", lambda: 1)
-    return out
+    return imported(folder, lines, tmp_path_factory.mktemp("sessions") / "drags", "drag")
 
 
 def test_dragged_strokes_are_fitted_and_written(session: Path) -> None:

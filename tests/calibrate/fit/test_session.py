@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -19,21 +17,10 @@ from calibrate.fit.run import correction, fit_session
 from calibrate.validate.report.data import load_report
 from drivers.sim.brush.brush import Brush, BrushSpec
 from model.fitted import NAME, NAMES
-from sessions.imports.photographs import ImportOptions, import_photographs
+from tests.photographed import imported, photograph
 
 CELLS = [(11.0, 0.0), (11.0, 10.0), (15.0, 5.0), (20.0, 0.0), (20.0, 10.0)]
 VIEW = Field(mm_per_px=0.4)
-
-
-def photograph(path: Path, height_mm: float, tilt_deg: float, seed: int) -> tuple[float, float]:
-    """A press on white paper at 10 px/mm; returns where the tip touched, in pixels."""
-    mark = Brush(BrushSpec()).press(height_mm, tilt_deg, ink_load=1.0, press_seed=seed)
-    page = np.full((300, 480), 235, np.uint8)
-    rows, columns = mark.density.shape
-    left, top = 380 - round(mark.origin_px[0]), 150 - round(mark.origin_px[1])
-    page[top : top + rows, left : left + columns] = 235 - np.rint(200 * np.clip(mark.density, 0, 1)).astype(np.uint8)
-    cv2.imwrite(str(path), page)
-    return 380.0, 150.0
 
 
 @pytest.fixture(scope="module")
@@ -41,13 +28,10 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("photos")
     lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
     for k, (height, tilt) in enumerate(CELLS):
-        x, y = photograph(folder / f"{k}.png", height, tilt, k)
-        lines.append(f"{k}.png,{height},{tilt},10.0,{x},{y}")
-    table = folder / "strokes.csv"
-    table.write_text("\n".join(lines) + "\n")
-    out = tmp_path_factory.mktemp("sessions") / "presses"
-    import_photographs(folder, table, out, ImportOptions(kind="press"), "test", lambda: 1)
-    return out
+        mark = Brush(BrushSpec()).press(height, tilt, ink_load=1.0, press_seed=k)
+        photograph(folder / f"{k}.png", mark, (300, 480), (380, 150))
+        lines.append(f"{k}.png,{height},{tilt},10.0,380.0,150.0")
+    return imported(folder, lines, tmp_path_factory.mktemp("sessions") / "presses", "press")
 
 
 def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> None:

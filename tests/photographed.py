@@ -1,0 +1,34 @@
+"""Marks of the simulated brush as photographs on white paper, and a session that is imported from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from drivers.sim.brush.paper import Footprint
+from sessions.imports.photographs import ImportOptions, import_photographs
+
+PAPER_GRAY, INK_GRAY = 235, 200
+"""Gray of the paper, and how much of it full ink takes away."""
+
+
+def photograph(path: Path, mark: Footprint, size_px: tuple[int, int], touch_px: tuple[int, int]) -> None:
+    """Write the mark on a page of (height, width) pixels; `touch_px` (x, y) is where the tip touched."""
+    page = np.full(size_px, PAPER_GRAY, np.uint8)
+    rows, columns = mark.density.shape
+    left, top = touch_px[0] - round(mark.origin_px[0]), touch_px[1] - round(mark.origin_px[1])
+    ink = np.rint(INK_GRAY * np.clip(mark.density, 0, 1)).astype(np.uint8)
+    page[top : top + rows, left : left + columns] -= ink
+    cv2.imwrite(str(path), page)
+
+
+def imported(photos: Path, lines: Sequence[str], out: Path, kind: Literal["press", "drag"]) -> Path:
+    """The session of these photographs; `lines` are those of their table, its head first."""
+    table = photos / "strokes.csv"
+    table.write_text("\n".join(lines) + "\n")
+    import_photographs(photos, table, out, ImportOptions(kind=kind), "test", lambda: 1)
+    return out
