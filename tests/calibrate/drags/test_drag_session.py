@@ -51,27 +51,38 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return imported(folder, lines, tmp_path_factory.mktemp("sessions") / "drags", "drag")
 
 
-def test_dragged_strokes_are_fitted_and_written(session: Path) -> None:
+def fit_command(session: Path) -> tuple[Path, str]:
+    """The artefact that `brushloop fit --drags` writes, and what it prints."""
     ran = CliRunner().invoke(app, ["fit", str(session), "--drags", "--mm-per-px", "1.0"])
     assert ran.exit_code == 0, ran.output
-    for words in ("bristle lag", "circle stamps", "leash_mm", "condition"):
-        assert words in ran.output
     path = current(session, FOLDER)
     assert path is not None
+    return path, ran.output
+
+
+@pytest.fixture(scope="module")
+def fitted(session: Path) -> tuple[Path, str]:
+    """Fitted once, for whoever only reads it."""
+    return fit_command(session)
+
+
+def test_dragged_strokes_are_fitted_and_written(fitted: tuple[Path, str]) -> None:
+    path, output = fitted
+    for words in ("bristle lag", "circle stamps", "leash_mm", "condition"):
+        assert words in output
     fit = load_artefact(path, DragArtefact)
     assert (fit.images, fit.strokes) == (6, 6)
     assert fit.held_out[LAGGING].csim_percent > fit.held_out[STAMPS].csim_percent + 2.0
     assert fit.model().leash_mm + 6.0 * fit.model().leash_per_mm > 1.0
     assert fit.parameters["half_mm"].low is not None
     assert fit.parameters["settle_mm"].low is None  # each depth is constant along its path
-    assert "not determined" in ran.output
-    assert "no depth at the ends" in " ".join(ran.output.split())
+    assert "not determined" in output
+    assert "no depth at the ends" in " ".join(output.split())
 
 
-def test_another_session_is_predicted_stroke_by_stroke(session: Path, tmp_path: Path) -> None:
+def test_another_session_is_predicted_stroke_by_stroke(session: Path, fitted: tuple[Path, str], tmp_path: Path) -> None:
     """Here the session itself, so that the report has to say "in sample"."""
-    assert CliRunner().invoke(app, ["fit", str(session), "--drags", "--mm-per-px", "1.0"]).exit_code == 0
-    fit = current(session, FOLDER)
+    fit, _ = fitted
     out = tmp_path / "report"
     ran = CliRunner().invoke(app, ["validate", str(session), "--fit", str(fit), "--out", str(out)])
     assert ran.exit_code == 0, ran.output
@@ -103,11 +114,8 @@ def test_a_report_of_simulated_drags_says_so_everywhere(session: Path, tmp_path:
         assert word in heads, f"the head {word} is broken"
 
 
-def test_a_known_brush_is_adapted_to_few_strokes(session: Path) -> None:
-    run = CliRunner()
-    assert run.invoke(app, ["fit", str(session), "--drags", "--mm-per-px", "1.0"]).exit_code == 0
-    prior = current(session, FOLDER)
-    assert prior is not None
+def test_a_known_brush_is_adapted_to_few_strokes(session: Path, fitted: tuple[Path, str]) -> None:
+    run, (prior, _) = CliRunner(), fitted
     ran = run.invoke(app, ["fit", str(session), "--drags", "--prior", str(prior), "--strokes", "2"])
     assert ran.exit_code == 0, ran.output
     adapted = load_artefact(current(session, FOLDER) or prior, DragArtefact)
@@ -124,12 +132,8 @@ def test_a_known_brush_is_adapted_to_few_strokes(session: Path) -> None:
     assert "allowed 1 to 6" in str(many.exception)
 
 
-def test_hostile_ink_in_an_artefact_is_refused(session: Path) -> None:
-    run = CliRunner().invoke(app, ["fit", str(session), "--drags", "--mm-per-px", "1.0"])
-    assert run.exit_code == 0
-    path = current(session, FOLDER)
-    assert path is not None
-    fit = load_artefact(path, DragArtefact)
+def test_hostile_ink_in_an_artefact_is_refused(fitted: tuple[Path, str]) -> None:
+    fit = load_artefact(fitted[0], DragArtefact)
     assert fit.kept is not None
     for ink in ("not base64!", fit.kept.ink[:40], ""):
         bad = fit.model_copy(update={"kept": fit.kept.model_copy(update={"ink": ink})})
@@ -137,13 +141,11 @@ def test_hostile_ink_in_an_artefact_is_refused(session: Path) -> None:
             predictors(bad, "fit.json")
 
 
-def test_equal_inputs_give_an_equal_file_and_an_edited_one_is_refused(session: Path, tmp_path: Path) -> None:
-    names: set[str] = set()
-    for _ in range(2):
-        assert CliRunner().invoke(app, ["fit", str(session), "--drags", "--mm-per-px", "1.0"]).exit_code == 0
-        names.add((session / FOLDER / "current").read_text())
-    assert len(names) == 1
-    path = session / FOLDER / names.pop().strip()
+def test_equal_inputs_give_an_equal_file_and_an_edited_one_is_refused(
+    session: Path, fitted: tuple[Path, str], tmp_path: Path
+) -> None:
+    path, _ = fit_command(session)
+    assert path == fitted[0]
     edited = tmp_path / path.name
     edited.write_text(path.read_text().replace('"leash_mm"', '"leash_m"'))
     with pytest.raises(CalibrationError, match="leash_mm"):
