@@ -101,7 +101,7 @@ def recover(brush: BrushPresses, prior: Prior, seed: int) -> Recovery:
         (height, tilt), (height_sd, tilt_sd) = found.values[k, :2].tolist(), found.sigma[k, :2].tolist()
         flags = tuple(sorted(found.flags[k]))
         alone.append(Row(f"{c}-{r}", height, tilt, height_sd, tilt_sd, float(found.rms[k]), flags, *CELLS[c]))
-    return Recovery(brush.name, alone, with_model_error(alone), refused)
+    return Recovery(brush.name, alone, with_model_error(alone, {CELLS[c] for c in DESIGN[:FITTED_CELLS]}), refused)
 
 
 def held(rows: Sequence[Row], letter: str) -> float:

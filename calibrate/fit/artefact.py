@@ -33,6 +33,8 @@ class BrushFit(SessionFit):
     radius_mm: float
     length_mm: float
     strokes: int
+    cells: tuple[tuple[float, float], ...] = ()
+    """Depth in mm and tilt in deg of the strokes, each cell once; missing in files of earlier versions."""
     mm_per_px: float
     parameters: dict[str, FittedValue]
     edges_mm: tuple[tuple[tuple[float, ...], ...], ...]

@@ -67,6 +67,7 @@ def fit_session(captures: Captures, view: Field, progress: Progress = unseen) ->
         radius_mm=captures.radius_mm,
         length_mm=captures.length_mm,
         strokes=len(strokes),
+        cells=tuple(by_cell(strokes)),
         mm_per_px=view.mm_per_px,
         parameters=parameters,
         edges_mm=tuple(tuple(tuple(terms) for terms in side) for side in fit.press.edges.tolist()),

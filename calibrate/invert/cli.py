@@ -54,14 +54,15 @@ def invert(
             )
     except ValueError as error:
         raise CalibrationError("--height-range, --tilt-range, --assume-tilt", str(error)) from None
-    fitted = None
+    fitted, cells = None, frozenset[tuple[float, float]]()
     if fit is not None:
         from calibrate.artefact import load_artefact
         from calibrate.fit.artefact import BrushFit
         from model.fitted import NAMES
         from model.fitted_shape import fitted_model
 
-        press = load_artefact(fit, BrushFit).press()
+        artefact = load_artefact(fit, BrushFit)
+        press, cells = artefact.press(), frozenset(artefact.cells)
         fitted = fitted_model(press)
         model = fitted.name
         # A fitted brush marks nothing above its zero offset.
@@ -69,7 +70,7 @@ def invert(
         if least >= within.height_mm[1]:
             raise CalibrationError("--height-range", f"ends before the fitted brush marks, at {least:.2f} mm")
         within = Range((least, within.height_mm[1]), within.tilt_deg)
-    settings = Settings(model, fitted, lam, within, anchor_sd, assume_tilt, Field(mm_per_px=mm_per_px))
+    settings = Settings(model, fitted, cells, lam, within, anchor_sd, assume_tilt, Field(mm_per_px=mm_per_px))
     with shown() as progress:
         made = invert_recording(session, settings, calibration, presses, progress)
     protocol = write_inversion(made, out, repeats, seed)

@@ -7,7 +7,7 @@ describes the brush.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar, cast
@@ -19,7 +19,7 @@ from calibrate.calibration import Calibration
 from calibrate.compare.field import SIZE_PX, Field, Image, crop
 from calibrate.compare.images import brush_of, prepare_press
 from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.invert.model_error import NORMAL_95, model_sd
+from calibrate.invert.model_error import NORMAL_95, Cell, model_sd
 from calibrate.session import calibration_of
 from calibrate.stroke.params import PX_PER_MM, Params
 from calibrate.stroke.preprocess import prepare
@@ -53,6 +53,8 @@ class Settings:
     model: str = "ccd-bsm"
     fitted: StrokeModel | None = None
     """A calibrated brush, which replaces `model`."""
+    fitted_cells: frozenset[Cell] = frozenset()
+    """The cells that it was fitted to, where they are known."""
     lam: float | None = None
     """lambda of CCD-BSM; None is pi, the default of the paper."""
     within: Range = field(default_factory=Range)
@@ -140,12 +142,15 @@ def invert_recording(
         _invert(made, anchored if known else loose, rest)
     order = {stroke.stroke_id: number for number, stroke in enumerate(strokes)}
     made.rows.sort(key=lambda row: order[row.stroke_id])
-    made.rows[:] = with_model_error(made.rows)
+    made.rows[:] = with_model_error(made.rows, settings.fitted_cells)
     return made
 
 
-def with_model_error(rows: Sequence[Row]) -> list[Row]:
-    """The rows with model error in their deviations, flagged where it is unknown and where an interval says little."""
+def with_model_error(rows: Sequence[Row], fitted: Collection[Cell] = ()) -> list[Row]:
+    """The rows with model error in their deviations, flagged where it is unknown and where an interval says little.
+
+    `fitted` are the cells that the model was fitted to.
+    """
     nan = float("nan")
     cells = [(row.commanded_height_mm or 0.0, row.commanded_tilt_deg or 0.0) for row in rows]
     deep = np.array([nan if (h := row.commanded_height_mm) is None else row.height_mm - h for row in rows])
@@ -155,7 +160,7 @@ def with_model_error(rows: Sequence[Row]) -> list[Row]:
     known = [
         cell for cell, one, other in zip(cells, deep, tilted, strict=True) if np.isfinite(one) and np.isfinite(other)
     ]
-    more_mm, more_deg = model_sd(deep, height_sd, cells), model_sd(tilted, tilt_sd, cells)
+    more_mm, more_deg = model_sd(deep, height_sd, cells, fitted), model_sd(tilted, tilt_sd, cells, fitted)
     out: list[Row] = []
     for k, row in enumerate(rows):
         flags = set(row.flags)

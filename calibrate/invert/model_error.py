@@ -1,38 +1,68 @@
 """Model error of recovered presses, from how far those of other cells lie from their commands.
 
 The interval of one image says how well that image identifies a press within the model. How far the model and the
-brush's own variation move a recovered value is seen only where the command is known: the mean square of recovered -
-commanded, less what the images' own intervals explain. Each press takes it from the other cells of its session, so that
-its own command does not enter its interval.
+brush's own variation move a recovered value is seen only where the command is known: a variance that is common to the
+presses, beside what each image's own interval explains. Each press takes it from the other cells of its session, so
+that its own command does not enter its interval. A brush predicts the cells that it was fitted to better than others,
+so a press of another cell takes it from such cells only, where there are enough.
+
+R. C. Paule and J. Mandel, "Consensus values and weighting factors", Journal of Research of the National Bureau of
+Standards 87 (1982), give the variance: with it, the mean of squared errors over their expected squares is 1.
 """
 
 from __future__ import annotations
+
+from collections.abc import Collection
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 Floats = NDArray[np.float64]
+Cell = tuple[float, float]
+"""Depth in mm and tilt in deg."""
 LEAST_CELLS = 3
 """With fewer other cells, the model error is unknown."""
 NORMAL_95 = 1.96
+ROUNDS = 100
 
 
-def model_sd(off: Floats, sd: Floats, cells: list[tuple[float, float]]) -> Floats:
+def model_sd(off: Floats, sd: Floats, cells: list[Cell], fitted: Collection[Cell] = ()) -> Floats:
     """Standard deviation of the model error of N presses, (N,); NaN where too few other cells are known.
 
-    `off` (N,) is recovered - commanded, NaN where no command is known, and `sd` (N,) that of the image alone. It is
-    enlarged so that 1.96 of it hold 95 % with so few cells, by Student's t.
+    `off` (N,) is recovered - commanded, NaN where no command is known, and `sd` (N,) that of the image alone. `fitted`
+    are the cells that the brush was fitted to. The deviation is enlarged so that 1.96 of it hold 95 % with so few
+    cells, by Student's t with a degree of freedom for each cell.
     """
     out = np.full(len(off), np.nan)
+    known = np.isfinite(off) & np.isfinite(sd)
     for cell in set(cells):
-        others = [k for k, other in enumerate(cells) if other != cell and np.isfinite(off[k]) and np.isfinite(sd[k])]
-        count = len({cells[k] for k in others})
+        others = [k for k, other in enumerate(cells) if other != cell and known[k]]
+        unseen = [k for k in others if cells[k] not in fitted]
+        if cell not in fitted and _count(cells, unseen) >= LEAST_CELLS:
+            others = unseen
+        count = _count(cells, others)
         if count >= LEAST_CELLS:
-            excess = max(0.0, float(np.mean(off[others] ** 2 - sd[others] ** 2)))
-            out[[k for k, other in enumerate(cells) if other == cell]] = np.sqrt(excess) * _few(count)
+            found = np.sqrt(common_variance(off[others], sd[others])) * float(stdtrit(count, 0.975)) / NORMAL_95
+            out[[k for k, other in enumerate(cells) if other == cell]] = found
     return out
 
 
-def _few(cells: int) -> float:
-    return float(stdtrit(cells - 1, 0.975)) / NORMAL_95
+def common_variance(off: Floats, sd: Floats) -> float:
+    """The variance v for which the mean of off^2 / (sd^2 + v) is 1; 0 where the deviations `sd` alone explain `off`.
+
+    A press that its image hardly determines counts little, however large its deviation.
+    """
+    variance = 0.0
+    square = np.maximum(sd**2, 1e-12)
+    for _ in range(ROUNDS):  # Newton's method, which approaches the root of a convex function from below
+        weight = 1.0 / (square + variance)
+        excess = float(np.mean(off**2 * weight)) - 1.0
+        if excess < 1e-9:
+            break
+        variance += excess / float(np.mean((off * weight) ** 2))
+    return variance
+
+
+def _count(cells: list[Cell], presses: list[int]) -> int:
+    return len({cells[k] for k in presses})

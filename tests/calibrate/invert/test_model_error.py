@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibrate.invert.invert import NO_MODEL_ERROR, NOT_INFORMATIVE, Row, covers_most, with_model_error
-from calibrate.invert.model_error import model_sd
+from calibrate.invert.model_error import common_variance, model_sd
 
 CELLS = [(h, a) for h in (11.0, 13.0, 15.0, 17.0, 20.0) for a in (0.0, 5.0, 10.0)]
 
@@ -32,8 +32,24 @@ def test_a_model_error_is_in_the_interval() -> None:
 def test_the_own_command_does_not_enter_the_interval() -> None:
     off = np.array([5.0, 0.1, 0.1, 0.1])
     found = model_sd(off, np.full(4, 0.01), [(11.0, 0.0), (13.0, 0.0), (15.0, 0.0), (17.0, 0.0)])
-    assert found[0] == pytest.approx(0.1 * 4.303 / 1.96, rel=0.02)
+    assert found[0] == pytest.approx(0.1 * 3.182 / 1.96, rel=0.02)
     assert found[1] > 3.0
+
+
+def test_a_cell_the_brush_was_not_fitted_to_takes_the_error_of_such_cells() -> None:
+    cells = CELLS[:9]
+    off = np.array([0.1] * 5 + [1.0] * 4)
+    sd = np.full(9, 0.01)
+    found = model_sd(off, sd, cells, fitted=cells[:5])
+    assert found[5:] == pytest.approx(1.0 * 3.182 / 1.96, rel=0.01), "three other cells left out"
+    assert (model_sd(off, sd, cells)[5:] < 1.0).all(), "diluted by the fitted cells"
+    assert (model_sd(off[:6], sd[:6], cells[:6], fitted=cells[:5])[5:] < 0.2).all(), "none else left out: all cells"
+
+
+def test_a_press_that_its_image_hardly_determines_counts_little() -> None:
+    off, sd = np.array([0.5, -0.5, 0.5, 3.0]), np.array([0.01, 0.01, 0.01, 30.0])
+    assert common_variance(off, sd) == pytest.approx(0.25 * 3 / 4, rel=0.1)
+    assert common_variance(np.array([0.1, 0.1]), np.array([0.5, 0.5])) == 0.0
 
 
 def test_too_few_known_cells_are_flagged() -> None:
