@@ -10,8 +10,8 @@ from typing import Annotated, Any, cast
 import typer
 from typer.core import TyperGroup
 
-import calibrate.board.cli
 import calibrate.cli
+import calibrate.cli_camera
 import calibrate.fit.cli
 import calibrate.invert.cli
 import calibrate.loop.cli
@@ -79,7 +79,7 @@ app.add_typer(collect.cli.app, name="collect")
 app.command("doctor")(collect.cli.doctor)
 app.add_typer(collect.cli_rig.app, name="rig")
 app.add_typer(calibrate.cli.app, name="calibrate")
-app.add_typer(calibrate.board.cli.app, name="camera")
+app.add_typer(calibrate.cli_camera.app, name="camera")
 app.add_typer(calibrate.validate.cli.app, name="validate")
 app.command("fit")(calibrate.fit.cli.fit)
 app.command("twin")(twin.cli.twin)

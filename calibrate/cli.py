@@ -24,12 +24,14 @@ def calibrate(
         Path | None, typer.Option(help="Lens file of `camera intrinsics`; the session's own by default.")
     ] = None,
 ) -> None:
-    """Fit scale and paper plane from the board in view; writes an immutable calibration/<hash>.json."""
+    """Fit scale and paper plane from the board in view; writes an immutable calibration/<hash>.json and its page."""
 
     from calibrate.artefact import load_artefact
     from calibrate.calibration import Calibration
+    from calibrate.pages.calibration import write_calibration_page
     from calibrate.session import calibrate_session
     from sessions.progress import shown
+    from sessions.reader import Recording
 
     with shown() as progress:
         path = calibrate_session(session, lens, progress)
@@ -41,6 +43,7 @@ def calibrate(
         f"board residual {made.rms_px:.3f} px over {made.corners} corners, {made.source}",
         f"lens: {made.lens.source if made.lens else 'none'}",
         str(path),
+        f"Page: {write_calibration_page(Recording(session), path)}",
     )
 
 

@@ -8,6 +8,7 @@ import io
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar, cast
 
@@ -23,6 +24,8 @@ from sessions.recording.schemas import Source
 Image = NDArray[np.float32]
 PAPER = "#fbf9f4"
 """Background of picture files."""
+PHOTOGRAPH_PX, JPEG_QUALITY = 1600, 80
+"""Longest side and quality of a photograph in a page: at most some 500 kB."""
 REMARK = re.compile(r"\(([^()]+)\)$")
 
 
@@ -82,6 +85,28 @@ def source_note(source: Source, brush: str = "") -> str:
             return "imported simulation: simulated ink, as declared when it was imported; not a result on paper"
 
 
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One thing to know before trusting a number; `good` is None if it is neither good nor bad."""
+
+    good: bool | None
+    text: str
+
+
+def source_point(source: Source) -> Point:
+    """What the source of a recording says about its numbers."""
+    match source:
+        case Source.LOOPBACK:
+            words = "Loopback rig: the numbers test the software and the method. They say nothing about ink on paper."
+        case Source.REAL:
+            words = "Real capture: the recording says so itself, and its hash is below."
+        case Source.IMPORT:
+            words = "Imported photographs: scale and commands come from their table, not measured."
+        case Source.IMPORT_SIMULATED:
+            words = "Imported simulation: the numbers say nothing about ink on paper."
+    return Point(True if source is Source.REAL else None, words)
+
+
 def png_uri(data: bytes) -> str:
     """An encoded PNG as a data URI: no report ever fetches anything."""
     return "data:image/png;base64," + base64.b64encode(data).decode()
@@ -92,6 +117,16 @@ def image_uri(image: NDArray[np.uint8]) -> str:
     import cv2
 
     return png_uri(cv2.imencode(".png", image)[1].tobytes())
+
+
+def photograph_uri(image: NDArray[np.uint8], longest_px: int = PHOTOGRAPH_PX) -> str:
+    """An (h, w) gray photograph as a JPEG data URI, made smaller if a side is longer than `longest_px`."""
+    import cv2
+
+    share = min(1.0, longest_px / max(image.shape))
+    small = cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else image
+    data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+    return "data:image/jpeg;base64," + base64.b64encode(data).decode()
 
 
 def ink_uri(ink: Image) -> str:

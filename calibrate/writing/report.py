@@ -20,6 +20,7 @@ from calibrate.report import (
     render,
     save_picture,
     show_picture,
+    source_label,
     source_note,
     write_files,
 )
@@ -39,7 +40,7 @@ def write_written(written: WritingComparison, folder: Path, command: str) -> Pat
     picture = (folder / PICTURE).read_bytes()
     page = render(
         "written.html.j2",
-        header=written.header,
+        label=source_label(written.header.source, [written.header.brush]),
         note=source_note(written.header.source, written.header.brush),
         names=" ".join(one.name for one in written.characters),
         writings=sum(len(one.captured) for one in written.characters),

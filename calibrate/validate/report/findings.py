@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 from calibrate.compare.field import Alignment, Tone
 from calibrate.compare.paper import ORDER
 from calibrate.compare.similarity import Polarity
 from calibrate.loop.scores import AGAIN, ANOTHER, LoopRecord
+from calibrate.report import Point, source_point
 from calibrate.validate import candidates as who
 from calibrate.validate.report.data import Report, Session, Stat
 from calibrate.validate.run import CEILING
@@ -27,14 +27,6 @@ MUCH_REFUSED = 0.05
 MOVED_MM = 0.3
 """Difference between two zero touches of one session that exceeds their combined repeatability."""
 MAX_NAMED = 6
-
-
-@dataclass(frozen=True, slots=True)
-class Point:
-    """One thing to know before trusting a number; `good` is None if it is neither good nor bad."""
-
-    good: bool | None
-    text: str
 
 
 def measured(report: Report) -> str:
@@ -182,17 +174,7 @@ def order(report: Report) -> str:
 
 def trust(report: Report) -> Iterator[Point]:
     """Points to check before trusting the numbers."""
-    match report.source:
-        case Source.LOOPBACK:
-            yield Point(
-                None, "Loopback rig: the numbers test the software and the method. They say nothing about ink on paper."
-            )
-        case Source.REAL:
-            yield Point(True, "Real capture: the recording says so itself, and its hash is below.")
-        case Source.IMPORT:
-            yield Point(None, "Imported photographs: scale and commands come from their table, not measured.")
-        case Source.IMPORT_SIMULATED:
-            yield Point(None, "Imported simulation: the numbers say nothing about ink on paper.")
+    yield source_point(report.source)
     strokes = sum(s.strokes for s in report.sessions)
     lost = len({(r.session_id, r.stroke_id) for r in report.refused if "does not predict it" not in r.why})
     if lost:

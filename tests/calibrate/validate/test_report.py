@@ -21,7 +21,7 @@ from calibrate.validate.report.findings import trust
 from calibrate.validate.report.page import _of_session
 from sessions.reader import Recording
 from sessions.remarks import Remark, add_remark
-from tests.calibrate.validate.browser import BROWSER, content_widths_px
+from tests.browser import BROWSER, content_widths_px
 
 MODELS = ("ccd-bsm", "bezier", "bezier-refitted", "ellipse", "line", "circle", "qbc", "another press")
 
@@ -236,6 +236,8 @@ def test_what_was_left_out_selected_or_pressed_on_other_paper_stands_above_the_r
 def test_the_page_fits_a_telephone_and_a_wide_screen_and_the_browser_has_nothing_to_say(
     folder: Path, tmp_path: Path
 ) -> None:
-    sizes, errors = content_widths_px((folder / "report.html").read_text(), (390, 768, 1200, 1600), tmp_path)
+    sizes, errors = content_widths_px(
+        {"report": (folder / "report.html").read_text()}, (390, 768, 1200, 1600), tmp_path
+    )
     assert errors == []
-    assert all(taken <= width for width, taken in sizes.items()), sizes
+    assert all(taken <= width for (_, width), taken in sizes.items()), sizes

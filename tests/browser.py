@@ -1,4 +1,4 @@
-"""A page in headless Chromium: whether it fits its window, and what its console says."""
+"""Pages in headless Chromium: whether they fit their windows, and what the console says."""
 
 from __future__ import annotations
 
@@ -7,21 +7,29 @@ import json
 import re
 import shutil
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
 
 from tests.waiting import PATIENCE_S
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-FRAME = '<iframe width="{width}" height="900" srcdoc="{page}"></iframe>'
+FRAME = '<iframe name="{name}" width="{width}" height="900" srcdoc="{page}"></iframe>'
 SCRIPT = """<script>onload = () => document.body.insertAdjacentHTML("afterbegin", "<pre>" + JSON.stringify(
-[...document.querySelectorAll("iframe")].map(f => [f.width, f.contentDocument.documentElement.scrollWidth])) + "</pre>")
+[...document.querySelectorAll("iframe")].map(f => [f.name, f.width, f.contentDocument.documentElement.scrollWidth])) +
+"</pre>")
 </script>"""
 
 
-def content_widths_px(page: str, widths_px: tuple[int, ...], folder: Path) -> tuple[dict[int, int], list[str]]:
-    """The width that the page takes in windows of these widths, and the errors in the browser's console."""
+def content_widths_px(
+    pages: Mapping[str, str], widths_px: tuple[int, ...], folder: Path
+) -> tuple[dict[tuple[str, int], int], list[str]]:
+    """The width that each named page takes in windows of these widths, and the errors in the browser's console."""
     assert BROWSER is not None
-    frames = "".join(FRAME.format(width=width, page=html.escape(page, quote=True)) for width in widths_px)
+    frames = "".join(
+        FRAME.format(name=name, width=width, page=html.escape(page, quote=True))
+        for name, page in pages.items()
+        for width in widths_px
+    )
     outer = folder / "frames.html"
     outer.write_text(f"<!doctype html><meta charset=utf-8><body>{SCRIPT}{frames}", encoding="utf-8")
     flags = ("--headless=new", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--dump-dom")
@@ -31,5 +39,5 @@ def content_widths_px(page: str, widths_px: tuple[int, ...], folder: Path) -> tu
     )
     found = re.search(r"<pre>(.*?)</pre>", ran.stdout)
     assert found is not None, ran.stderr[-2000:]
-    sizes = {int(width): int(taken) for width, taken in json.loads(html.unescape(found[1]))}
+    sizes = {(name, int(width)): int(taken) for name, width, taken in json.loads(html.unescape(found[1]))}
     return sizes, [line for line in ran.stderr.splitlines() if ":CONSOLE" in line]

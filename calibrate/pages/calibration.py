@@ -1,0 +1,220 @@
+"""The page of a calibration: the corners over the photograph, residual arrows, the scale across the photograph."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibrate.artefact import load_artefact
+from calibrate.board.detect import find_board
+from calibrate.board.intrinsics import RMS_LIMIT_PX
+from calibrate.board.lens import Floats, Gray
+from calibrate.board.pix2len import local_scale
+from calibrate.board.session import NO_BOARD, sheet_of
+from calibrate.board.spec import BoardSpec, describe
+from calibrate.board.view import LEAST_PX_PER_MM, WORST_INTERVAL, paper_mm
+from calibrate.calibration import Calibration
+from calibrate.errors import CalibrationError
+from calibrate.files import write_whole
+from calibrate.report import Point, photograph_uri, plot, plot_uri, render, source_label, source_note, source_point
+from calibrate.session import FITTED
+from sessions.reader import Recording
+from sessions.recording.messages import decode_gray
+
+BLUE, ORANGE = "#0072B2", "#D55E00"
+ARROW_SHARE = 0.4
+"""Length of a typical arrow, as a share of the distance between corners."""
+SIDE_POINTS = 9
+SCALE_GRID = (17, 13)
+
+
+def write_calibration_page(recording: Recording, path: Path) -> Path:
+    """Write the page of the calibration at `path` beside it; returns the page's path.
+
+    Raises `CalibrationError` where the recording shows no board, and OSError.
+    """
+    made = load_artefact(path, Calibration)
+    where = str(recording.path)
+    if made.board is None:
+        raise CalibrationError(str(path), "names no board, as it was written by an earlier version")
+    image = _photograph(recording, made, where)
+    seen = find_board(image, made.board, where)
+    expected = made.to_image(paper_mm(seen, made.board))
+    off = seen.pixels - expected
+    size = np.linalg.norm(off, axis=1)
+    dropped = np.zeros(len(size), np.bool_)
+    dropped[np.argsort(-size)[: made.corners_dropped]] = True
+    sheet_mm = sheet_of(recording)
+    header = recording.header
+    label = source_label(header.source, [header.brush])
+    text = render(
+        "calibration.html.j2",
+        session=header.session_id,
+        label=label,
+        note=source_note(header.source, header.brush),
+        picture=_picture(image, seen.pixels, expected, off, dropped, made, sheet_mm),
+        verdict=list(_verdict(made)),
+        trust=[source_point(header.source), *_trust(made)],
+        residuals=_residuals(off, dropped, label),
+        scale=_scale(made, image.shape[1], image.shape[0], sheet_mm, label),
+        worst=_worst(seen.ids.tolist(), size, dropped),
+        facts=list(_facts(made, made.board, path)),
+    )
+    page = path.with_suffix(".html")
+    write_whole(page, text)
+    return page
+
+
+def _photograph(recording: Recording, made: Calibration, where: str) -> Gray:
+    stills = list(recording.stills_of("board"))
+    if not stills:
+        raise CalibrationError(where, NO_BOARD)
+    used = [still for still in stills if hashlib.sha256(still).hexdigest() == made.still_sha256]
+    return decode_gray((used or stills)[-1], where)
+
+
+def _picture(
+    image: Gray,
+    seen: Floats,
+    expected: Floats,
+    off: Floats,
+    dropped: np.ndarray[Any, np.dtype[np.bool_]],
+    made: Calibration,
+    sheet_mm: tuple[float, float] | None,
+) -> dict[str, Any]:
+    """What the template draws over the photograph, in its pixels."""
+    height, width = image.shape
+    times = _times(expected, off[~dropped])
+    ends = expected + times * off
+    rows = zip(seen.round(1).tolist(), expected.round(1).tolist(), ends.round(1).tolist(), strict=True)
+    corners = [
+        {"at": at, "from": start, "to": end, "off_px": round(float(np.hypot(*one)), 2), "dropped": bool(out)}
+        for (at, start, end), one, out in zip(rows, off, dropped, strict=True)
+    ]
+    return {
+        "uri": photograph_uri(image),
+        "width": width,
+        "height": height,
+        "unit": round(width / 1000, 2),
+        "times": f"{times:g}",
+        "corners": corners,
+        "sheet": [] if sheet_mm is None else _outline(made, sheet_mm),
+    }
+
+
+def _times(expected: Floats, off: Floats) -> float:
+    """How much longer than a residual its arrow is: 1, 2 or 5 times a power of ten."""
+    apart = np.linalg.norm(expected[:, None] - expected[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    rms = float(np.sqrt((off**2).sum(axis=1).mean()))
+    wanted = ARROW_SHARE * float(np.median(apart.min(axis=1))) / max(rms, 1e-6)
+    power = 10.0 ** math.floor(math.log10(max(wanted, 1.0)))
+    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= max(wanted, 1.0))
+
+
+def _outline(made: Calibration, sheet_mm: tuple[float, float]) -> list[list[float]]:
+    """The sheet's edge in the photograph; its sides are bent where the lens bends them."""
+    x, y = sheet_mm
+    corners = np.array([[0.0, 0.0], [x, 0.0], [x, y], [0.0, y]])
+    along = np.linspace(0.0, 1.0, SIDE_POINTS)[:-1, None]
+    sides = [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    found: list[list[float]] = made.to_image(np.concatenate(sides)).round(1).tolist()
+    return found
+
+
+def _verdict(made: Calibration) -> Iterator[str]:
+    reach = _reach(made)
+    yield (
+        f"One pixel is {made.mm_per_px:.5f} mm of paper in the middle of the board, known to ±{100 * reach:.3f} % "
+        f"(95 %, if the board is printed true): 20 mm are known to ±{20 * reach:.4f} mm."
+    )
+    yield (
+        f"{made.corners} corners lie {made.rms_px:.2f} px ({made.rms_px * made.mm_per_px:.3f} mm) from where the "
+        "fitted plane puts them (root mean square)."
+    )
+
+
+def _trust(made: Calibration) -> Iterator[Point]:
+    residual = f"The residual is {made.rms_px:.2f} px; a flat, sharp, still board gives 0.1 to 0.3 px"
+    yield Point(made.rms_px <= RMS_LIMIT_PX, f"{residual}, and above {RMS_LIMIT_PX:g} px it warns.")
+    reach = _reach(made)
+    yield Point(reach <= WORST_INTERVAL, f"Scale known to ±{100 * reach:.3f} %, goal ±{100 * WORST_INTERVAL:g} %.")
+    sharp = 1.0 / made.mm_per_px
+    yield Point(sharp >= LEAST_PX_PER_MM, f"{sharp:.1f} px/mm; at least {LEAST_PX_PER_MM:g} are needed.")
+    if made.corners_dropped:
+        many = f"{made.corners_dropped} corners do" if made.corners_dropped > 1 else "One corner does"
+        yield Point(False, f"{many} not lie on the plane of the others. The fit leaves out what is crossed in blue.")
+    else:
+        yield Point(True, "No corner was left out.")
+    if made.lens is not None and made.lens.source == FITTED:
+        words = "No lens file: the lens's bend (k1) was fitted on this one board, and holds where corners were seen."
+        yield Point(None, words)
+    elif made.lens is not None:
+        yield Point(True, f"Seen through the {made.lens.source}; k1 was refitted for this focus.")
+    for flag in made.flags:
+        yield Point(False, f"{flag[0].upper()}{flag[1:]}.")
+    if made.label:
+        yield Point(False, f"{made.label[0].upper()}{made.label[1:]}.")
+
+
+def _reach(made: Calibration) -> float:
+    return (made.mm_per_px_high - made.mm_per_px_low) / (2.0 * made.mm_per_px)
+
+
+def _residuals(off: Floats, dropped: np.ndarray[Any, np.dtype[np.bool_]], label: str) -> str:
+    figure, axis = plot(1, 1, (4.6, 4.4))
+    kept = off[~dropped]
+    rms = float(np.sqrt((kept**2).sum(axis=1).mean()))
+    turn = np.linspace(0.0, 2.0 * np.pi, 73)
+    for circle in (rms, 2.0 * rms):
+        axis.plot(circle * np.cos(turn), circle * np.sin(turn), color="0.6", lw=0.8)
+    axis.plot(kept[:, 0], kept[:, 1], ".", ms=4, alpha=0.6, color=ORANGE)
+    axis.set_aspect("equal")
+    axis.invert_yaxis()
+    axis.set_xlabel("to the right, px")
+    axis.set_ylabel("down, px")
+    axis.set_title(f"residual of each corner ({label})", fontsize=10)
+    axis.grid(alpha=0.3)
+    return plot_uri(figure)
+
+
+def _scale(made: Calibration, width: int, height: int, sheet_mm: tuple[float, float] | None, label: str) -> str:
+    """Contours of mm per pixel across the photograph."""
+    figure, axis = plot(1, 1, (5.6, 4.4))
+    across, down = (np.linspace(0.0, side - 1.0, n) for side, n in zip((width, height), SCALE_GRID, strict=True))
+    scale = np.array([[local_scale(made.to_paper, np.array([x, y])) for x in across] for y in down])
+    lines = axis.contour(across, down, scale, levels=8, colors=BLUE, linewidths=0.9)
+    axis.clabel(lines, fontsize=8, fmt="%.4f")
+    if sheet_mm is not None:
+        outline = np.array(_outline(made, sheet_mm))
+        axis.plot(*np.vstack([outline, outline[:1]]).T, color="0.5", lw=1.2)
+    axis.set_xlim(0, width)
+    axis.set_ylim(height, 0)
+    axis.set_aspect("equal")
+    axis.set_xlabel("px")
+    axis.set_ylabel("px")
+    axis.set_title(f"mm per pixel across the photograph ({label})", fontsize=10)
+    return plot_uri(figure)
+
+
+def _worst(ids: list[int], size: Floats, dropped: np.ndarray[Any, np.dtype[np.bool_]]) -> list[tuple[str, str, str]]:
+    rows = sorted(zip(ids, size.tolist(), dropped.tolist(), strict=True), key=lambda row: -row[1])
+    return [(str(name), f"{px:.2f}", "left out" if out else "used") for name, px, out in rows[:10]]
+
+
+def _facts(made: Calibration, board: BoardSpec, path: Path) -> Iterator[tuple[str, str]]:
+    yield "session", made.session_id
+    yield "source", made.source
+    yield "recording", f"sha256 {made.recording_sha256}"
+    yield "photograph of the board", f"sha256 {made.still_sha256}" if made.still_sha256 else "not named"
+    yield "board", describe(board)
+    if made.lens is not None:
+        yield "lens", f"{made.lens.source}; k1 {made.lens.distortion[0]:+.4f}"
+    yield "95 % interval", f"{made.mm_per_px_low:.5f} to {made.mm_per_px_high:.5f} mm/px"
+    yield "calibrated with", made.software
+    yield "artefact", path.name

@@ -1,0 +1,79 @@
+"""The picture pages of the commands: each is one file that fetches nothing, labelled, and fits every window."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from brushloop import app
+from calibrate.board.lens import Gray
+from calibrate.board.spec import BoardSpec, charuco_board
+from tests.browser import BROWSER, content_widths_px
+
+if TYPE_CHECKING:
+    from conftest import Photographed
+
+SPEC = BoardSpec(squares=(9, 7), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_100", origin_mm=(0.0, 0.0))
+WIDTHS_PX = (390, 800, 1200, 1600)
+MAX_BYTES = 3 * 1024 * 1024
+
+
+def board() -> Gray:
+    """The board at 5 px/mm, straight from above, with noise."""
+    picture = charuco_board(SPEC, "test").generateImage((900, 700))
+    page = cv2.copyMakeBorder(picture, *[50] * 4, cv2.BORDER_CONSTANT, value=240).astype(np.float64)
+    noisy = cv2.GaussianBlur(page, (0, 0), 0.9) + np.random.default_rng(0).normal(0.0, 1.5, page.shape)
+    return np.clip(noisy, 0, 235).astype(np.uint8)
+
+
+def run(*arguments: object) -> str:
+    """Run a command; returns the page that its last line names."""
+    ran = CliRunner().invoke(app, [*map(str, arguments)])
+    assert ran.exit_code == 0, ran.output
+    *_, last = ran.output.splitlines()
+    assert last.startswith("Page: "), last
+    return Path(last.removeprefix("Page: ")).read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def pages(photographed: Photographed, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """A page of every command, by the command's name."""
+    folder = tmp_path_factory.mktemp("pages")
+    session = photographed(folder / "2026-<u>", SPEC, [board()], sheet_mm=(100.0, 80.0))
+    return {"calibrate": run("calibrate", session)}
+
+
+def test_a_page_is_one_labelled_file_without_scripts_that_fetches_nothing(pages: dict[str, str]) -> None:
+    for name, page in pages.items():
+        assert len(page.encode()) <= MAX_BYTES, name
+        assert re.findall(r"(?:src|href)=\"(?!data:|#)[^\"]*\"|<script|@import|<u>", page) == [], name
+        assert '<span class="source">' in page
+        for figure in re.findall(r"<img[^>]*>", page):
+            assert re.search(r'alt="[^"]{3}', figure), f"{name}: {figure[:80]} has no text for a screen reader"
+        for drawing in re.findall(r"<svg[^>]*>", page):
+            assert 'role="img"' in drawing, name
+            assert "aria-label" in drawing, name
+
+
+def test_the_page_of_a_calibration_draws_every_corner_with_its_residual(pages: dict[str, str]) -> None:
+    page = pages["calibrate"]
+    assert page.count('class="arrow"') == 48
+    assert 'class="sheet-edge"' in page
+    assert "simulated brush, ink and camera" in page
+    assert "2026-&lt;u&gt;" in page
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+def test_every_page_fits_a_telephone_and_a_wide_screen_and_the_browser_has_nothing_to_say(
+    pages: dict[str, str], tmp_path: Path
+) -> None:
+    sizes, errors = content_widths_px(pages, WIDTHS_PX, tmp_path)
+    assert errors == []
+    assert {where: taken for where, taken in sizes.items() if taken > where[1]} == {}
+    assert len(sizes) == len(pages) * len(WIDTHS_PX)
