@@ -16,7 +16,8 @@ from calibrate.validate.heldout import RefitJob, bezier_body, bezier_pixels, cro
 from calibrate.validate.jobs import ABSENT, ScoreJob, score_job
 from calibrate.validate.pool import Scheduler
 from calibrate.validate.report.data import Step
-from calibrate.validate.run import CHUNK, Outcome
+from calibrate.validate.rows import CHUNK
+from calibrate.validate.run import Outcome
 from calibrate.validate.store import VERSION
 from sessions.progress import Progress
 
@@ -43,7 +44,7 @@ def similarity_by_strokes(outcome: Outcome, scheduler: Scheduler, progress: Prog
     jobs: dict[str, tuple[Trial, RefitJob]] = {}
     for trial in _trials(outcome):
         brush = brush_of(outcome.sessions[trial.session].header)
-        strokes = tuple((*outcome.rows[k].cell, outcome.press(k).pixels) for k in trial.chosen)
+        strokes = tuple((*outcome.rows.cell(k), outcome.rows.pixels(k)) for k in trial.chosen)
         job = RefitJob(strokes, float(brush.radius_mm), float(brush.length_mm), None, outcome.options.view)
         key = hashlib.sha256(f"fit {VERSION} {job.key}".encode()).hexdigest()
         jobs[f"{key}:{len(jobs)}"] = (trial, job)
@@ -75,14 +76,12 @@ def fit_job(job: RefitJob) -> dict[str, Any]:
 
 def _trials(outcome: Outcome) -> Iterator[Trial]:
     for session in range(len(outcome.sessions)):
-        cells: dict[tuple[float, float], list[int]] = {}
-        for k, row in enumerate(outcome.rows):
-            if row.session == session and not row.press.cut:
-                cells.setdefault(row.cell, []).append(k)
+        cut = outcome.rows.index["cut"]
+        cells = [group[~cut[group]] for number, _, group in outcome.rows.groups() if number == session]
         for draw in range(DRAWS):
             rng = np.random.default_rng([draw, session])
             # Every cell once before any cell twice, as a person would choose.
-            groups = [[int(k) for k in rng.permutation(cells[cell])] for cell in sorted(cells)]
+            groups = [[int(k) for k in rng.permutation(group)] for group in cells if len(group)]
             groups = [groups[int(g)] for g in rng.permutation(len(groups))]
             deepest = max(map(len, groups), default=0)
             order = [group[depth] for depth in range(deepest) for group in groups if depth < len(group)]
@@ -101,7 +100,7 @@ def _scored(
     press = fitted_press(fit["fitted"], float(brush.radius_mm), float(brush.length_mm))
     cells: dict[tuple[float, float], list[int]] = {}
     for k in trial.scored:
-        cells.setdefault(outcome.rows[k].cell, []).append(k)
+        cells.setdefault(outcome.rows.cell(k), []).append(k)
 
     def jobs() -> Iterator[tuple[str, ScoreJob]]:
         for cell, group in cells.items():
@@ -109,7 +108,7 @@ def _scored(
             predictions = (pack(loop_pixels(press.outline(*cell), view)), bezier)
             for start in range(0, len(group), CHUNK):
                 chunk = group[start : start + CHUNK]
-                presses = tuple(outcome.press(k).pixels for k in chunk)
+                presses = tuple(outcome.rows.pixels(k) for k in chunk)
                 nothing = tuple(() for _ in chunk)
                 yield str(chunk[0]), ScoreJob(presses, predictions, (), nothing, (ABSENT,) * len(chunk))
 

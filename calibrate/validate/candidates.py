@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from calibrate.compare.field import Field
 from calibrate.compare.images import Pixels, brush_of, loop_pixels, simulated_pixels
-from calibrate.validate.heldout import Cell, bezier_pixels, fitted_press
+from calibrate.validate.heldout import bezier_pixels, fitted_press
+from calibrate.validate.rows import Cell
 from calibrate.validate.sources import LoadedSession
 from model.brush import Brush, DomainError
 from model.fitted import NAME

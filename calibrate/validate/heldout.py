@@ -19,15 +19,14 @@ from calibrate.fit.captures import MARGIN_MM, grid_of
 from calibrate.fit.fit import refit
 from calibrate.fit.heldout import BEZIER_SIZES, RefittedBezier, refit_bezier
 from calibrate.fit.strokes import Grid, Pressed
-from calibrate.validate.jobs import Row, pixels_of
 from calibrate.validate.pool import Scheduler
+from calibrate.validate.rows import Cell, Numbers, Rows
 from calibrate.validate.sources import LoadedSession
 from calibrate.validate.store import VERSION, Store
 from model.fitted import MODES, NAMES, TERMS, FittedPress
 from model.plane import Plane
 from sessions.progress import Progress
 
-Cell = tuple[float, float]
 MAX_FOLDS = 15
 """Most folds: the paper's grid leaves out one cell at a time, a larger grid several."""
 PER_CELL = 3
@@ -119,17 +118,16 @@ def bezier_pixels(coefficients: Sequence[float], height_mm: float, tilt_deg: flo
 
 def refits_by_cell(
     session: LoadedSession,
-    rows: Sequence[Row],
+    number: int,
+    rows: Rows,
     view: Field,
     scheduler: Scheduler,
     store: Store,
     progress: Progress,
     most_folds: int = MAX_FOLDS,
 ) -> dict[Cell, dict[str, Any]]:
-    """Refit for each cell to uncut presses of other cells; return the results by cell."""
-    cells: dict[Cell, list[Row]] = {}
-    for row in rows:
-        cells.setdefault(row.cell, []).append(row)
+    """Refit for each cell of session `number` to uncut presses of its other cells; return the results by cell."""
+    cells = {cell: _first_uncut(rows, group) for session_of, cell, group in rows.groups() if session_of == number}
     brush = brush_of(session.header)
     start = start_of(session.fit) if session.fit is not None else None
     fits: dict[Cell, dict[str, Any]] = {}
@@ -137,11 +135,12 @@ def refits_by_cell(
     jobs: list[tuple[str, RefitJob]] = []
     of_key: dict[str, list[Cell]] = {}
     for fold in left:
-        others = [row for cell, group in sorted(cells.items()) if cell not in fold for row in _uncut(group)[:PER_CELL]]
+        alone = set(fold)
+        others = [row for cell, group in cells.items() if cell not in alone for row in group]
         others = others[:: max(1, -(-len(others) // MAX_STROKES))]
         if not others:
             continue
-        strokes = tuple((*row.cell, pixels_of(store, row.key)) for row in others)
+        strokes = tuple((*rows.cell(row), rows.pixels(row)) for row in others)
         job = RefitJob(strokes, float(brush.radius_mm), float(brush.length_mm), start, view)
         of_key[job.key] = fold
         if job.key not in store:
@@ -156,5 +155,6 @@ def refits_by_cell(
     return fits
 
 
-def _uncut(group: list[Row]) -> list[Row]:
-    return [row for row in group if not row.press.cut]
+def _first_uncut(rows: Rows, group: Numbers) -> list[int]:
+    """The rows of one cell that a fit uses."""
+    return [int(row) for row in group[~rows.index["cut"][group]][:PER_CELL]]

@@ -1,4 +1,4 @@
-"""Work of the workers: pure functions of picklable jobs, run here or on another machine; and the prepared rows.
+"""Work of the workers: pure functions of picklable jobs, run here or on another machine; and the prepared presses.
 
 Nothing here imports torch, which preparing and scoring do not need.
 """
@@ -116,66 +116,51 @@ def read_job(job: ReadJob) -> Press | None:
     return prepare_job(PrepareJob(capture, job.calibration, job.view))
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """A captured stroke without its pixels; `key` finds them in the store."""
-
-    session: int
-    number: int
-    press: Press
-    key: str
-
-    @property
-    def cell(self) -> tuple[float, float]:
-        """(H, alpha) as commanded."""
-        return self.press.height_mm, self.press.tilt_deg
-
-
-def prepared_rows(
-    number: int, session: LoadedSession, view: Field, scheduler: Scheduler, store: Store, progress: Progress
-) -> Iterator[Row]:
-    """Every stroke of a session, in order of capture; those not yet in the store are prepared first."""
+def key_of(session: LoadedSession, view: Field) -> str:
+    """The beginning of the keys of a session's prepared strokes; `:` and the number of the stroke follow."""
     calibration = session.calibration.digest if session.calibration is not None else ""
     bad = sorted(session.recording.marked_bad().items())
-    base = hashlib.sha256(f"prepare {VERSION} {session.sha256} {calibration} {view} {bad}".encode()).hexdigest()
-    keys = [f"{base}:{k}" for k in range(session.count)]
+    return hashlib.sha256(f"prepare {VERSION} {session.sha256} {calibration} {view} {bad}".encode()).hexdigest()
+
+
+def prepared(
+    session: LoadedSession, view: Field, scheduler: Scheduler, store: Store, progress: Progress
+) -> Iterator[Press]:
+    """Every stroke of a session without its pixels, in order of capture; those not in the store are prepared first."""
+    base = key_of(session, view)
     what = f"{session.header.session_id}: found"
-    missing = [key for key in keys if key not in store]
-    done = len(keys) - len(missing)
-    if missing and scheduler.opens(session.place, session.sha256):
-        waiting = set(missing)
+    every = range(session.count)
+    waiting = np.fromiter((f"{base}:{k}" not in store for k in every), np.bool_, session.count)
+    done = session.count - int(waiting.sum())
+
+    def put(number: str, press: Press) -> None:
+        nonlocal done
+        store.put(f"{base}:{number}", press.to_body())
+        waiting[int(number)] = False
+        done += 1
+        progress(what, done, session.count)
+
+    if waiting.any() and scheduler.opens(session.place, session.sha256):
 
         def reading() -> Iterator[tuple[str, ReadJob]]:
-            for key, place in zip(keys, session.recording.places(), strict=True):
-                if key in waiting:
-                    yield key, ReadJob(session.place, session.sha256, place, session.calibration, view)
+            for k, place in zip(every, session.recording.places(), strict=True):
+                if waiting[k]:
+                    yield str(k), ReadJob(session.place, session.sha256, place, session.calibration, view)
 
-        for key, read in scheduler.run(read_job, reading()):
+        for number, read in scheduler.run(read_job, reading()):
             if read is not None:
-                store.put(key, read.to_body())
-                done += 1
-                progress(what, done, len(keys))
-        missing = [key for key in missing if key not in store]
-    if missing:
-        waiting = set(missing)
+                put(number, read)
+    if waiting.any():
 
         def jobs() -> Iterator[tuple[str, PrepareJob]]:
-            for key, capture in zip(keys, session.recording.captures(), strict=True):
-                if key in waiting:
-                    yield key, PrepareJob(capture, session.calibration, view)
+            for k, capture in zip(every, session.recording.captures(), strict=True):
+                if waiting[k]:
+                    yield str(k), PrepareJob(capture, session.calibration, view)
 
-        for key, press in scheduler.run(prepare_job, jobs()):
-            store.put(key, press.to_body())
-            done += 1
-            progress(what, done, len(keys))
-    for k, key in enumerate(keys):
-        body = store.get(key)
-        yield Row(number, k, press_of(body | {"pixels": b""}), key)
-
-
-def pixels_of(store: Store, key: str) -> bytes:
-    """`Press.pixels` of a prepared stroke."""
-    return store.get(key)["pixels"]
+        for number, press in scheduler.run(prepare_job, jobs()):
+            put(number, press)
+    for k in every:
+        yield press_of(store.get(f"{base}:{k}") | {"pixels": b""})
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """The run: prepare every capture, fit to other cells, score everything. Finished work is never repeated.
 
-Captures stream from the recording through the workers into the store; only the scores stay in memory, a few hundred
-bytes a stroke. Each result depends only on its inputs, so neither the order nor the place of work changes it.
+Captures stream from the recording through the workers into the store, and so do their scores; memory holds only where
+they are. Each result depends only on its inputs, so neither the order nor the place of work changes it.
 """
 
 from __future__ import annotations
@@ -9,20 +9,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from calibrate.compare.field import KEYS, Field
+from calibrate.compare.field import Field
 from calibrate.compare.images import brush_of, pack
 from calibrate.compare.paper import ROBOT_WRITING
 from calibrate.errors import CalibrationError
 from calibrate.validate import candidates as who
 from calibrate.validate.candidates import Candidate, Generator
-from calibrate.validate.heldout import Cell, refits_by_cell
-from calibrate.validate.jobs import ABSENT, Press, Row, ScoreJob, pixels_of, prepared_rows, press_of, score_job
+from calibrate.validate.heldout import refits_by_cell
+from calibrate.validate.jobs import ABSENT, ScoreJob, key_of, prepared, score_job
 from calibrate.validate.pool import Scheduler
+from calibrate.validate.rows import CHUNK, Entry, Numbers, Rows, Scores
 from calibrate.validate.sources import LoadedSession
 from calibrate.validate.store import Store
 from calibrate.validate.tuning import FOLDS, tuned_by_cell
@@ -35,7 +32,6 @@ REPEATED = ROBOT_WRITING
 """A press compared with the stroke of another session that it repeats: the third row of the paper's Table 1."""
 MAX_OTHERS = 9
 """Most presses that predict one: all others of a cell of ten, as in the paper, or the next nine of a larger one."""
-CHUNK = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,17 +57,12 @@ class Outcome:
     """Candidates of each session."""
     names: list[str]
     """Columns: every candidate of any session, then the comparisons with presses."""
-    rows: list[Row]
+    rows: Rows
     """Compared strokes, by session and order of capture."""
-    values: NDArray[np.float64]
-    """(rows, names, KEYS, 2): CSIM and SSIM from 0 to 1; NaN where there is nothing to compare with."""
+    scores: Scores
     refused: list[tuple[str, str, str]]
     """(session, stroke, why) of strokes that could not be used, by all models or one. None is dropped silently."""
     store: Store
-
-    def press(self, row: int) -> Press:
-        """A stroke with its pixels."""
-        return press_of(self.store.get(self.rows[row].key))
 
 
 def validate_presses(
@@ -98,21 +89,23 @@ def _validate(
 ) -> Outcome:
     # What is named is checked before hours of work begin; what is not waits, because models take seconds to load.
     known = _known(sessions, options) if options.models or options.generators else []
-    rows: list[Row] = []
     refused: list[tuple[str, str, str]] = []
-    for number, session in enumerate(sessions):
-        for row in prepared_rows(number, session, options.view, scheduler, store, progress):
-            if row.press.refused:
-                refused.append((session.header.session_id, row.press.stroke_id, row.press.refused))
-            else:
-                rows.append(row)
+
+    def used() -> Iterator[Entry]:
+        for number, session in enumerate(sessions):
+            for k, press in enumerate(prepared(session, options.view, scheduler, store, progress)):
+                if press.refused:
+                    refused.append((session.header.session_id, press.stroke_id, press.refused))
+                else:
+                    yield number, k, press.height_mm, press.tilt_deg, press.cut
+
+    rows = Rows(store, [key_of(session, options.view) for session in sessions], used())
     known = known or _known(sessions, options)
     candidates: list[list[Candidate]] = []
     for number, session in enumerate(sessions):
-        mine = [row for row in rows if row.session == number]
-        known_and_held_out = [*known[number], *_held_out(session, mine, options, scheduler, store, work, progress)]
+        held_out = _held_out(session, number, rows, options, scheduler, store, work, progress)
         candidates.append(
-            [one for one in _ordered(known_and_held_out) if not options.models or one.name in options.models]
+            [one for one in _ordered([*known[number], *held_out]) if not options.models or one.name in options.models]
         )
     for name in options.models:
         if not any(one.name == name for group in candidates for one in group):
@@ -120,33 +113,28 @@ def _validate(
                 "--model", f"{name} needs a fit, or --tune: see `brushloop validate sessions --help`"
             )
     names = [*_ordered_names(candidates), CEILING, REPEATED]
-    values = np.full((len(rows), len(names), len(KEYS), 2), np.nan)
-    jobs: dict[str, tuple[list[int], list[int]]] = {}
-    total = len(rows)
+    columns = [[*(names.index(one.name) for one in group), len(names) - 2, len(names) - 1] for group in candidates]
+    scores = Scores(store, rows, names, columns)
     done = 0
 
-    def waiting() -> Iterator[tuple[str, ScoreJob]]:
+    def compared(strokes: int) -> None:
         nonlocal done
-        for chunk, job in _score_jobs(sessions, candidates, rows, store, refused):
-            columns = [names.index(one.name) for one in candidates[rows[chunk[0]].session]] + [-2, -1]
-            key = job.key
-            if key in store:
-                _put(values, chunk, columns, store.get(key))
-                done += len(chunk)
-                progress("compared", done, total)
-                continue
-            name = f"{key}:{chunk[0]}"
-            jobs[name] = (chunk, columns)
-            yield name, job
+        done += strokes
+        progress("compared", done, len(rows))
 
-    for name, found in scheduler.run(score_job, waiting()):
-        chunk, columns = jobs.pop(name)
-        body = {"shape": list(found.shape), "values": found.tobytes()}
-        store.put(name.partition(":")[0], body)
-        _put(values, chunk, columns, body)
-        done += len(chunk)
-        progress("compared", done, total)
-    return Outcome(sessions, options, candidates, names, rows, values, refused, store)
+    def waiting() -> Iterator[tuple[str, ScoreJob]]:
+        for chunk, job in _score_jobs(sessions, candidates, rows, refused):
+            key = job.key
+            scores.add(chunk, key)
+            if key in store:
+                compared(len(chunk))
+            else:
+                yield key, job
+
+    for key, found in scheduler.run(score_job, waiting()):
+        store.put(key, {"shape": list(found.shape), "values": found.tobytes()})
+        compared(len(found))
+    return Outcome(sessions, options, candidates, names, rows, scores, refused, store)
 
 
 def _known(sessions: list[LoadedSession], options: Options) -> list[list[Candidate]]:
@@ -165,7 +153,8 @@ def _known(sessions: list[LoadedSession], options: Options) -> list[list[Candida
 
 def _held_out(
     session: LoadedSession,
-    rows: list[Row],
+    number: int,
+    rows: Rows,
     options: Options,
     scheduler: Scheduler,
     store: Store,
@@ -176,11 +165,11 @@ def _held_out(
     names = options.models or who.HELD_OUT_NAMES
     brush, view = brush_of(session.header), options.view
     if options.held_out and (who.FITTED_HELD_OUT in names or who.BEZIER_REFITTED in names):
-        fits = refits_by_cell(session, rows, view, scheduler, store, progress)
+        fits = refits_by_cell(session, number, rows, view, scheduler, store, progress)
         if fits:
             yield from who.held_out(fits, brush, view, fitted=session.fit is not None)
     if options.tune_steps and who.GENERATOR_HELD_OUT in names:
-        fits = refits_by_cell(session, rows, view, scheduler, store, progress, FOLDS)
+        fits = refits_by_cell(session, number, rows, view, scheduler, store, progress, FOLDS)
         for number, generator in enumerate(options.generators):
             files = tuned_by_cell(session, fits, generator, options.tune_steps, work, progress)
             if files:
@@ -190,16 +179,12 @@ def _held_out(
 def _score_jobs(
     sessions: list[LoadedSession],
     candidates: list[list[Candidate]],
-    rows: list[Row],
-    store: Store,
+    rows: Rows,
     refused: list[tuple[str, str, str]],
-) -> Iterator[tuple[list[int], ScoreJob]]:
-    """Yield (rows, job), cell by cell."""
-    cells: dict[tuple[int, Cell], list[int]] = {}
-    for k, row in enumerate(rows):
-        cells.setdefault((row.session, row.cell), []).append(k)
-    originals = _originals(rows)
-    for (session, cell), group in sorted(cells.items()):
+) -> Iterator[tuple[Numbers, ScoreJob]]:
+    """Yield (rows, job), cell by cell, in the order of `Rows.groups`."""
+    originals = _originals(rows) if len(sessions) > 1 else {}
+    for session, cell, group in rows.groups():
         predictions: list[bytes] = []
         for one in candidates[session]:
             try:
@@ -207,40 +192,39 @@ def _score_jobs(
             except DomainError as error:
                 predictions.append(ABSENT)
                 why = f"{one.name} does not predict it: {error}"
-                refused.extend((sessions[session].header.session_id, rows[k].press.stroke_id, why) for k in group)
+                refused.extend((sessions[session].header.session_id, rows[int(k)].press.stroke_id, why) for k in group)
         for start in range(0, len(group), CHUNK):
             chunk = group[start : start + CHUNK]
             reach = min(MAX_OTHERS, len(group) - 1)
             theirs = [
-                [group[(start + n + step) % len(group)] for step in range(1, reach + 1)] for n in range(len(chunk))
+                [int(group[(start + n + step) % len(group)]) for step in range(1, reach + 1)] for n in range(len(chunk))
             ]
             others = sorted({k for mine in theirs for k in mine})
             job = ScoreJob(
-                tuple(pixels_of(store, rows[k].key) for k in chunk),
+                tuple(rows.pixels(k) for k in map(int, chunk)),
                 tuple(predictions),
-                tuple(pixels_of(store, rows[k].key) for k in others),
+                tuple(rows.pixels(k) for k in others),
                 tuple(tuple(others.index(k) for k in mine) for mine in theirs),
-                tuple(pixels_of(store, rows[originals[k]].key) if k in originals else ABSENT for k in chunk),
+                tuple(rows.pixels(originals[k]) if k in originals else ABSENT for k in map(int, chunk)),
             )
             yield chunk, job
 
 
-def _originals(rows: list[Row]) -> dict[int, int]:
+def _originals(rows: Rows) -> dict[int, int]:
     """Map a row to the row of another session that it repeats, if that session is given too."""
+    again = {k: row.press.again_of for k, row in enumerate(rows) if row.press.again_of}
+    named = set(again.values())
     by_name: dict[str, list[int]] = {}
-    for k, row in enumerate(rows):
-        by_name.setdefault(row.press.stroke_id, []).append(k)
+    for k, row in enumerate(rows if named else ()):
+        if row.press.stroke_id in named:
+            by_name.setdefault(row.press.stroke_id, []).append(k)
+    session = rows.index["session"]
     found: dict[int, int] = {}
-    for k, row in enumerate(rows):
-        of = [n for n in by_name.get(row.press.again_of, []) if rows[n].session != row.session]
+    for k, name in again.items():
+        of = [n for n in by_name.get(name, []) if session[n] != session[k]]
         if len(of) == 1:
             found[k] = of[0]
     return found
-
-
-def _put(values: NDArray[np.float64], chunk: list[int], columns: list[int], body: dict[str, Any]) -> None:
-    found = np.frombuffer(body["values"]).reshape(body["shape"])
-    values[np.ix_(chunk, [c % values.shape[1] for c in columns])] = found
 
 
 def _ordered_names(candidates: list[list[Candidate]]) -> list[str]:

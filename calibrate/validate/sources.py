@@ -28,7 +28,7 @@ from sessions.errors import SessionDamaged
 from sessions.journal.journal import JOURNAL_NAME, replay
 from sessions.reader import Recording
 from sessions.recording.mcap_file import file_sha256
-from sessions.recording.schemas import Header, Source
+from sessions.recording.schemas import Header, Source, Stroke
 
 PIECE = 1024 * 1024
 MAX_DOWNLOAD_BYTES = 64 * 1024**3
@@ -76,10 +76,14 @@ def open_session(place: str, work: Path, calibration: Path | None, fit: Path | N
     recording = Recording(path)
     digest = recording.sha256
     _check_journal(recording, digest)
-    strokes = list(recording.stroke_records())
-    if not strokes:
+    first: Stroke | None = None
+    kinds, count = frozenset[str](), 0
+    for stroke in recording.stroke_records():
+        first = first or stroke
+        kinds |= {stroke.kind}
+        count += 1
+    if first is None:
         raise CalibrationError(str(recording.path), "holds no strokes")
-    kinds = frozenset(stroke.kind for stroke in strokes)
     if len(kinds) > 1:
         raise CalibrationError(str(recording.path), "mixes presses and drags; validate them as two sessions")
     # A fit of drags is read with the strokes that it predicts.
@@ -87,10 +91,10 @@ def open_session(place: str, work: Path, calibration: Path | None, fit: Path | N
     return LoadedSession(
         recording,
         digest,
-        calibration_of(recording, strokes[0], digest, calibration),
+        calibration_of(recording, first, digest, calibration),
         load_artefact(found, BrushFit) if found is not None else None,
         kinds,
-        len(strokes),
+        count,
         place if URL.match(place) else str(recording.path.resolve()),
     )
 

@@ -24,7 +24,8 @@ from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.stroke.params import PX_PER_MM, Params
 from calibrate.stroke.preprocess import Prepared
 from calibrate.validate.candidates import Generator
-from calibrate.validate.heldout import Cell, fitted_press, folds
+from calibrate.validate.heldout import fitted_press, folds
+from calibrate.validate.rows import Cell
 from calibrate.validate.sources import LoadedSession, one_source
 from calibrate.validate.store import VERSION
 from model.brush import DomainError

@@ -38,7 +38,7 @@ def distributions(outcome: Outcome, report: Report) -> str:
         key = KEYS.index((alignment, Tone.BINARY))
         rng = np.random.default_rng(0)  # jitter only, so that points do not hide each other
         for place, name in enumerate(reversed(names)):
-            values = 100.0 * outcome.values[:, outcome.names.index(name), key, 0]
+            values = 100.0 * outcome.scores.of(name)[:, key, 0]
             values = values[np.isfinite(values)]
             stat = report.stat(name, alignment, Tone.BINARY, "csim")
             if stat is None:
@@ -127,7 +127,9 @@ def samples(outcome: Outcome, shown: str) -> list[dict[str, Any]]:
         row = outcome.rows[k]
         measured = row.press.measured
         size = "" if measured is None else f"{measured.length_mm:.1f} × {measured.breadth_mm:.1f} mm"
-        csim, ssim = 100.0 * outcome.values[k, outcome.names.index(shown), MM_BINARY] if shown else (np.nan, np.nan)
+        csim, ssim = np.nan, np.nan
+        if shown:
+            csim, ssim = 100.0 * outcome.scores.of_row(k)[outcome.names.index(shown), MM_BINARY]
         scores = f"CSIM {csim:.1f}, SSIM {ssim:.1f}" if np.isfinite(csim) else ""
         figures.append({"row": row, "size": size, "scores": scores, "images": triple(outcome, k, shown)})
     return figures
@@ -162,22 +164,9 @@ def of_one_cell(outcome: Outcome, names: Sequence[str]) -> list[tuple[str, str]]
 
 def _first_of_cells(outcome: Outcome, most: int) -> list[int]:
     """The first capture of each cell; with more than `most` cells, of evenly spaced ones."""
-    first: dict[tuple[float, float], int] = {}
-    for k, row in enumerate(outcome.rows):
-        first.setdefault(row.cell, k)
-    cells = sorted(first)
-    count = min(len(cells), most)
-    return [first[cells[n * (len(cells) - 1) // max(count - 1, 1)]] for n in range(count)]
-
-
-def extreme(outcome: Outcome, session_id: str, stroke_id: str, model: str) -> dict[str, str]:
-    """Captured, predicted and difference image of one stroke, as data URIs."""
-    k = next(
-        k
-        for k, row in enumerate(outcome.rows)
-        if row.press.stroke_id == stroke_id and outcome.sessions[row.session].header.session_id == session_id
-    )
-    return triple(outcome, k, model)
+    first = list(outcome.rows.first_of_cells().values())
+    count = min(len(first), most)
+    return [first[n * (len(first) - 1) // max(count - 1, 1)] for n in range(count)]
 
 
 def triple(outcome: Outcome, k: int, model: str) -> dict[str, str]:
@@ -203,7 +192,7 @@ def predicted(outcome: Outcome, k: int, name: str) -> Pixels | None:
 
 def captured_image(outcome: Outcome, k: int) -> Pixels:
     """(128, 128) gray on the millimetre field."""
-    return unpack(outcome.press(k).pixels)[GRAY_MM]
+    return unpack(outcome.rows.pixels(k))[GRAY_MM]
 
 
 def _ink(image: Pixels) -> str:

@@ -24,7 +24,7 @@ from sessions.cells import CsvWriter
 from sessions.terminal import narrow
 
 COLUMNS = ("session_id", "stroke_id", "height_mm", "tilt_deg", "model", "alignment", "tone", "csim", "ssim", "source")
-GROUP = 2000
+GROUP = 500
 """Strokes per row group of the Parquet file."""
 MAX_REFUSED = 20
 """Refused strokes listed on the terminal."""
@@ -37,10 +37,10 @@ def score_rows(outcome: Outcome) -> Iterator[Cells]:
     """Yield one row per score, by session and order of capture; missing scores are left out."""
     for k, row in enumerate(outcome.rows):
         header = outcome.sessions[row.session].header
-        press = row.press
+        press, scores = row.press, outcome.scores.of_row(k)
         for m, model in enumerate(outcome.names):
             for j, (alignment, tone) in enumerate(KEYS):
-                csim, ssim = (float(v) for v in outcome.values[k, m, j])
+                csim, ssim = (float(v) for v in scores[m, j])
                 if np.isfinite(csim):
                     yield (
                         header.session_id,

@@ -12,8 +12,9 @@ from calibrate.compare.paper import TABLE_3
 from calibrate.report import render, source_note
 from calibrate.validate import candidates as who
 from calibrate.validate.report import figures, findings, tables
-from calibrate.validate.report.data import Report, Session
+from calibrate.validate.report.data import Extreme, Report, Session
 from calibrate.validate.report.figures import Curve
+from calibrate.validate.report.summary import extremes
 from calibrate.validate.run import CEILING, Outcome
 
 CELL_COLUMNS = ("ccd-bsmg", who.GENERATOR_HELD_OUT, "ccd-bsm", who.FITTED_HELD_OUT, who.BEZIER_REFITTED, CEILING)
@@ -28,6 +29,12 @@ def page_of(
     `figures_13` are pictures of written characters as data URIs, empty if missing.
     """
     shown = tables.candidate(report, report.shown)
+    best, worst = extremes(outcome, report.shown)
+
+    def pictured(found: Sequence[Extreme], rows: Sequence[int]) -> list[tuple[Extreme, dict[str, str]]]:
+        images = (figures.triple(outcome, row, report.shown) for row in rows)
+        return list(zip(found, images, strict=True))
+
     normal, strict = (Alignment.SIZE_NORMALISED, Tone.BINARY), (Alignment.MM, Tone.BINARY)
     return render(
         "presses.html.j2",
@@ -59,17 +66,13 @@ def page_of(
         samples=figures.samples(outcome, report.shown),
         side=figures.side_by_side(outcome, tuple(who.LAMBDAS)),
         shown=shown.label if shown is not None else "",
-        best=[(one, _extreme(outcome, one)) for one in report.best],
-        worst=[(one, _extreme(outcome, one)) for one in report.worst],
+        best=pictured(report.best, best),
+        worst=pictured(report.worst, worst),
         ablations=_ablations(outcome, report, curves),
         refused=report.refused[:MAX_REFUSED],
         more_refused=max(0, len(report.refused) - MAX_REFUSED),
         provenance=[*(_of_session(one) for one in report.sessions), *_of_others(report), _of_run(report)],
     )
-
-
-def _extreme(outcome: Outcome, one: Any) -> dict[str, str]:
-    return figures.extreme(outcome, one.session_id, one.stroke_id, one.model)
 
 
 def _cells(report: Report) -> dict[str, Any]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
+from numpy.typing import NDArray
 
 from calibrate.compare.field import KEYS, Alignment, Key, Tone
 from calibrate.compare.images import brush_of
@@ -10,7 +13,6 @@ from calibrate.compare.similarity import SSIM_SETTINGS
 from calibrate.compare.stats import summarise
 from calibrate.validate import candidates as who
 from calibrate.validate.extras import Extras
-from calibrate.validate.jobs import Row
 from calibrate.validate.report.data import (
     CandidateInfo,
     Collected,
@@ -23,6 +25,7 @@ from calibrate.validate.report.data import (
     Step,
     software,
 )
+from calibrate.validate.rows import Cell, Rows
 from calibrate.validate.run import CEILING, REPEATED, Outcome
 from calibrate.validate.sources import LoadedSession, one_source
 from model.brush import DomainError
@@ -48,10 +51,12 @@ def report_of(
     outcome: Outcome, command: str, scores_sha256: str, by_strokes: tuple[Step, ...], extras: Extras
 ) -> Report:
     """Build one frozen report of a whole run."""
-    cells = sorted({row.cell for row in outcome.rows})
+    cells = list(outcome.rows.first_of_cells())
     each_cell = len(cells) <= MAX_CELLS
-    shown = _shown(outcome)
-    best, worst = _extremes(outcome, shown)
+    stats = _stats(outcome, cells if each_cell else [])
+    present = [name for name in outcome.names if any(stat.model == name for stat in stats)]
+    shown = _shown(present)
+    best, worst = extremes(outcome, shown)
     return Report(
         source=one_source(outcome.sessions),
         software=software(),
@@ -59,12 +64,12 @@ def report_of(
         mm_per_px=outcome.options.view.mm_per_px,
         ssim_settings=SSIM_SETTINGS,
         sessions=tuple(_session(outcome, k, one) for k, one in enumerate(outcome.sessions)),
-        rivals=_candidates(outcome),
+        rivals=_candidates(outcome, present),
         shown=shown,
-        stats=tuple(_stats(outcome, cells if each_cell else [])),
+        stats=tuple(stats),
         cells_told=each_cell,
-        best=best,
-        worst=worst,
+        best=tuple(_extreme(outcome, row, shown) for row in best),
+        worst=tuple(_extreme(outcome, row, shown) for row in worst),
         refused=tuple(Refused(session_id=s, stroke_id=n, why=why) for s, n, why in outcome.refused),
         by_strokes=by_strokes,
         scores_sha256=scores_sha256,
@@ -73,24 +78,21 @@ def report_of(
     ).sealed()
 
 
-def _stats(outcome: Outcome, cells: list[tuple[float, float]]) -> list[Stat]:
-    rows = outcome.rows
-    strata = {key: k for k, key in enumerate(sorted({(row.session, row.cell) for row in rows}))}
-    stratum = np.array([strata[(row.session, row.cell)] for row in rows], np.int64)
-    groups: list[tuple[tuple[float, float] | None, np.ndarray]] = [(None, np.arange(len(rows)))]
-    by_cell: dict[tuple[float, float], list[int]] = {}
-    for k, row in enumerate(rows):
-        by_cell.setdefault(row.cell, []).append(k)
-    groups += [(cell, np.array(by_cell[cell])) for cell in cells]
-    stats: list[Stat] = []
-    for cell, at in groups:
-        for m, model in enumerate(outcome.names):
+def _stats(outcome: Outcome, cells: list[Cell]) -> list[Stat]:
+    """Of all cells together, then of each of these; the scores of one model at a time are in memory."""
+    stratum = outcome.rows.stratum
+    groups: list[tuple[Cell | None, NDArray[np.int64]]] = [(None, np.arange(len(outcome.rows)))]
+    groups += [(cell, outcome.rows.of_cell(cell)) for cell in cells]
+    stats: list[list[Stat]] = [[] for _ in groups]
+    for model in outcome.names:
+        scores = outcome.scores.of(model)
+        for mine, (cell, at) in zip(stats, groups, strict=True):
             for k, (alignment, tone) in enumerate(KEYS):
                 for j, measure in enumerate(MEASURES):
-                    found = summarise(100.0 * outcome.values[at, m, k, j], stratum[at])
+                    found = summarise(100.0 * scores[at, k, j], stratum[at])
                     if found is None:
                         continue
-                    stats.append(
+                    mine.append(
                         Stat(
                             model=model,
                             alignment=alignment,
@@ -106,39 +108,40 @@ def _stats(outcome: Outcome, cells: list[tuple[float, float]]) -> list[Stat]:
                             median_interval=_interval(found.median_interval),
                         )
                     )
-    return stats
+    return list(itertools.chain.from_iterable(stats))
 
 
-def _shown(outcome: Outcome) -> str:
-    present = [name for name in outcome.names if np.isfinite(outcome.values[:, outcome.names.index(name)]).any()]
+def _shown(present: list[str]) -> str:
     order = (who.FITTED_HELD_OUT, who.FITTED, "ccd-bsmg", "ccd-bsm", *present)
     return next((name for name in order if name in present), "")
 
 
-def _extremes(outcome: Outcome, model: str) -> tuple[tuple[Extreme, ...], tuple[Extreme, ...]]:
+def extremes(outcome: Outcome, model: str) -> tuple[list[int], list[int]]:
+    """Rows of the best and of the worst strokes of a model, from the outermost; none without a model."""
     if not model:
-        return (), ()
-    scores = outcome.values[:, outcome.names.index(model), KEYS.index(JUDGED)]
-    known = np.flatnonzero(np.isfinite(scores[:, 0]))
-    order = known[np.argsort(scores[known, 0], kind="stable")]
-
-    def extreme(k: int) -> Extreme:
-        row: Row = outcome.rows[k]
-        return Extreme(
-            session_id=outcome.sessions[row.session].header.session_id,
-            stroke_id=row.press.stroke_id,
-            height_mm=row.press.height_mm,
-            tilt_deg=row.press.tilt_deg,
-            model=model,
-            csim=_round(100.0 * float(scores[k, 0])),
-            ssim=_round(100.0 * float(scores[k, 1])),
-        )
-
+        return [], []
+    scores = outcome.scores.of(model)[:, KEYS.index(JUDGED), 0]
+    known = np.flatnonzero(np.isfinite(scores))
+    order = known[np.argsort(scores[known], kind="stable")]
     count = min(EXTREMES, max(1, len(order) // 2))
-    return tuple(extreme(int(k)) for k in order[::-1][:count]), tuple(extreme(int(k)) for k in order[:count])
+    return order[::-1][:count].tolist(), order[:count].tolist()
 
 
-def _candidates(outcome: Outcome) -> tuple[CandidateInfo, ...]:
+def _extreme(outcome: Outcome, k: int, model: str) -> Extreme:
+    row = outcome.rows[k]
+    csim, ssim = outcome.scores.of_row(k)[outcome.names.index(model), KEYS.index(JUDGED)]
+    return Extreme(
+        session_id=outcome.sessions[row.session].header.session_id,
+        stroke_id=row.press.stroke_id,
+        height_mm=row.press.height_mm,
+        tilt_deg=row.press.tilt_deg,
+        model=model,
+        csim=_round(100.0 * float(csim)),
+        ssim=_round(100.0 * float(ssim)),
+    )
+
+
+def _candidates(outcome: Outcome, present: list[str]) -> tuple[CandidateInfo, ...]:
     files = {one.path: one.sha256 for one in outcome.options.generators}
     by_name = {one.name: one for group in outcome.candidates for one in group}
     bases: dict[str, list[str]] = {}
@@ -159,7 +162,7 @@ def _candidates(outcome: Outcome) -> tuple[CandidateInfo, ...]:
         if name in by_name
     ]
     for name, (label, definition) in PRESSES.items():
-        if np.isfinite(outcome.values[:, outcome.names.index(name)]).any():
+        if name in present:
             basis = "captured presses"
             infos.append(CandidateInfo(name=name, label=label, definition=definition, basis=basis, sha256=""))
     return tuple(infos)
@@ -167,8 +170,8 @@ def _candidates(outcome: Outcome) -> tuple[CandidateInfo, ...]:
 
 def _session(outcome: Outcome, number: int, one: LoadedSession) -> Session:
     header, calibration = one.header, one.calibration
-    mine = [row for row in outcome.rows if row.session == number]
-    length, width = _ratios(one, mine)
+    mine = np.flatnonzero(outcome.rows.index["session"] == number)
+    length, width = _ratios(one, outcome.rows, mine)
     scale = None
     if calibration is not None:
         scale = Interval(low=calibration.mm_per_px_low, high=calibration.mm_per_px_high)
@@ -191,7 +194,7 @@ def _session(outcome: Outcome, number: int, one: LoadedSession) -> Session:
         licence=header.licence,
         strokes=one.count,
         compared=len(mine),
-        cut=tuple(row.press.stroke_id for row in mine if row.press.cut),
+        cut=tuple(outcome.rows[int(k)].press.stroke_id for k in mine[outcome.rows.index["cut"][mine]]),
         calibration=calibration.named if calibration is not None else "",
         mm_per_px=calibration.mm_per_px if calibration is not None else None,
         mm_per_px_interval=scale,
@@ -218,14 +221,14 @@ def _collected(one: LoadedSession) -> Collected | None:
     )
 
 
-def _ratios(one: LoadedSession, mine: list[Row]) -> tuple[float | None, float | None]:
+def _ratios(one: LoadedSession, rows: Rows, mine: NDArray[np.int64]) -> tuple[float | None, float | None]:
     """Mean ratio of length and width of uncut marks to those of CCD-BSM for a brush of this size."""
     from model.ccdbsm import ccdbsm
 
     brush = brush_of(one.header)
-    drawn: dict[tuple[float, float], tuple[float, float]] = {}
-    found: list[tuple[float, float]] = []
-    for row in mine:
+    drawn: dict[Cell, tuple[float, float]] = {}
+    total, strokes = np.zeros(2), 0
+    for row in map(rows.__getitem__, map(int, mine)):
         measured = row.press.measured
         if measured is None or row.press.cut:
             continue
@@ -236,10 +239,11 @@ def _ratios(one: LoadedSession, mine: list[Row]) -> tuple[float | None, float | 
                 continue
             drawn[row.cell] = float(mark.length_mm[0]), float(mark.width_mm[0])
         length, width = drawn[row.cell]
-        found.append((measured.length_mm / length, measured.breadth_mm / width))
-    if not found:
+        total += measured.length_mm / length, measured.breadth_mm / width
+        strokes += 1
+    if not strokes:
         return None, None
-    mean = np.mean(found, axis=0)
+    mean = total / strokes
     return _round(float(mean[0])), _round(float(mean[1]))
 
 

@@ -154,7 +154,7 @@ def test_workers_open_the_recording_themselves_or_are_sent_the_photographs(
 from dataclasses import replace
 from pathlib import Path
 from calibrate.compare.field import Field
-from calibrate.validate.jobs import pixels_of, prepared_rows
+from calibrate.validate import jobs
 from calibrate.validate.pool import Dask, Threads
 from calibrate.validate.sources import open_session, opened
 from calibrate.validate.store import Store
@@ -164,8 +164,9 @@ def prepared(scheduler, session, name):
     run = scheduler.run
     scheduler.run = lambda function, jobs: (ran.append(function.__name__), run(function, jobs))[1]
     with Store(Path({str(tmp_path)!r}) / name) as store:
-        rows = list(prepared_rows(0, session, Field(), scheduler, store, lambda *_: None))
-        return ran, [(row.press, pixels_of(store, row.key)) for row in rows]
+        presses = list(jobs.prepared(session, Field(), scheduler, store, lambda *_: None))
+        base = jobs.key_of(session, Field())
+        return ran, [(press, store.get(f"{{base}}:{{k}}")["pixels"]) for k, press in enumerate(presses)]
 
 there = open_session({str(session)!r}, Path({str(tmp_path)!r}), None, None)
 with Threads(1) as pool:

@@ -37,12 +37,12 @@ def test_the_repetition_is_scored_against_its_original_only(
     with Threads(1) as pool:
         outcome = validate_presses(sessions, Options(held_out=False), pool, tmp_path, lambda *_: None)
     with outcome.store:
-        found = outcome.values[:, outcome.names.index(REPEATED), :, 0]
+        found = outcome.scores.of(REPEATED)[:, :, 0]
         repeats = [row.session == 1 for row in outcome.rows]
         assert np.array_equal(np.isfinite(found).all(axis=1), repeats)
         assert sum(repeats) == 5
         # Two presses of one command by one brush: about as alike as the originals among themselves.
-        ceiling = outcome.values[:10, outcome.names.index(CEILING), :, 0]
+        ceiling = outcome.scores.of(CEILING)[:10, :, 0]
         assert np.nanmean(found) == pytest.approx(np.nanmean(ceiling), abs=0.05)
     assert running.MAX_OTHERS == 9
 
