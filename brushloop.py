@@ -115,8 +115,8 @@ def sim(
     fps: Annotated[float, typer.Option(min=1, max=60, help="Camera pictures per real second.")] = 8.0,
     idle_exit: Annotated[float, typer.Option(min=0, help="End after so many seconds without clients; 0: never.")] = 0.0,
     brush: Annotated[
-        Path | None, typer.Option(help="Brush described in a brush.toml, or `paper`; default: the rig's own.")
-    ] = None,
+        Path, typer.Option(help="A shipped brush, `loopback` or `paper`, or one described in a brush.toml.")
+    ] = Path("loopback"),
     faults: Annotated[Path | None, typer.Option(help="Script of faults, faults.toml.")] = None,
     control: Annotated[Path | None, typer.Option(help="Make a control socket here, for `fault` and `hand`.")] = None,
     unknown: Annotated[
@@ -130,19 +130,18 @@ def sim(
     Ctrl-C ends it; SIGUSR1 puts a fresh sheet in. An unknown lab has a loopback address of its own and no rig.toml,
     which `brushloop rig new` has to find out.
     """
-    from drivers.sim.brush.brush import BrushSpec
-    from drivers.sim.brush_file import NamedBrush, load_brush
+    from drivers.sim.brush_file import load_brush
     from drivers.sim.config import SimConfig, View
     from drivers.sim.serve import LabRefused, serve, serve_unknown
 
     if unknown is not None:
-        if write_rig is not None or brush is not None or faults is not None or arcs_port or camera_port:
+        if write_rig is not None or brush != Path("loopback") or faults is not None or arcs_port or camera_port:
             raise LabRefused("--unknown: can only be combined with --trap, --truth, --control, --rate and --idle-exit")
         serve_unknown(unknown, trap, rate, idle_exit, say, truth=truth, control=control)
         return
     if trap is not None or truth is not None:
         raise LabRefused("--trap and --truth: need --unknown SEED")
-    pressed = NamedBrush(BrushSpec(seed=seed), "") if brush is None else load_brush(brush)
+    pressed = load_brush(brush, seed)
     config = SimConfig(
         seed=seed,
         rate=rate,
@@ -150,6 +149,7 @@ def sim(
         camera_port=camera_port,
         brush=pressed.spec,
         brush_name=pressed.name,
+        head=pressed.head,
         view=View(fps=fps) if pressed.noise_gray is None else View(fps=fps, noise=pressed.noise_gray),
     )
     serve(config, write_rig, idle_exit, say, faults=faults, control=control)
@@ -205,8 +205,8 @@ def demo(
     rate: Annotated[float, typer.Option(min=0.01, max=1000, help="Simulated seconds per real second.")] = 60.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the rig and of the order of presses.")] = 1,
     brush: Annotated[
-        str | None, typer.Option(help="The rig's brush, as for `brushloop sim`: a brush.toml, or `paper`.")
-    ] = None,
+        Path, typer.Option(help="The rig's brush: `paper`, `loopback`, or one described in a brush.toml.")
+    ] = Path("paper"),
 ) -> None:
     """Press, calibrate, press again and validate on the loopback rig. Run it again to continue where it stopped."""
     from collect.chains.demo import FULL, QUICK, Demo

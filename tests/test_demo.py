@@ -30,7 +30,7 @@ from pathlib import Path
 from collect.chains.demo import Demo, Size
 
 size = Size((11.0, 15.0, 20.0), (0.0, 8.0), again=2, writings=0)
-sys.exit(Demo(Path(sys.argv[1]), size, repeats=1, rate=60.0, seed=1).run())
+sys.exit(Demo(Path(sys.argv[1]), size, repeats=1, rate=60.0, seed=1, brush=Path("paper")).run())
 """
 """`brushloop demo` with as few presses as tell depth and tilt to the fit."""
 

@@ -69,7 +69,7 @@ class Step:
 class Demo:
     """Collect, calibrate, press again, write if asked, and validate, all under `out`."""
 
-    def __init__(self, out: Path, size: Size, repeats: int, rate: float, seed: int, brush: str | None = None) -> None:
+    def __init__(self, out: Path, size: Size, repeats: int, rate: float, seed: int, brush: Path) -> None:
         self._out = out
         self._size = size
         self._repeats = repeats

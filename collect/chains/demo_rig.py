@@ -27,7 +27,7 @@ MAX_CONTROL_BYTES = 100
 class DemoRig:
     """Starts the rig, or finds the one of an earlier demo in the same folder."""
 
-    def __init__(self, folder: Path, *, rate: float, seed: int, brush: str | None = None) -> None:
+    def __init__(self, folder: Path, *, rate: float, seed: int, brush: Path) -> None:
         self.config = folder / "rig.toml"
         self._folder = folder
         self._rate = rate
@@ -65,10 +65,9 @@ class DemoRig:
     def _serve(self, arcs_port: int, camera_port: int) -> None:
         log = self._folder / "rig.log"
         command: list[str | Path] = [sys.executable, "-m", "brushloop", "sim", "--write-rig", self.config]
-        command += ["--rate", str(self._rate), "--fps", str(FPS), "--seed", str(self._seed)]
+        command += ["--rate", str(self._rate), "--fps", str(FPS), "--seed", str(self._seed), "--brush", self._brush]
         command += ["--arcs-port", str(arcs_port), "--camera-port", str(camera_port)]
         command += ["--control", self._control(arcs_port), "--idle-exit", str(IDLE_EXIT_S)]
-        command += [] if self._brush is None else ["--brush", self._brush]
         # In a process session of its own: Ctrl-C at the demo must not end the rig under the arm.
         with log.open("ab") as file:
             self._process = subprocess.Popen(

@@ -24,7 +24,7 @@ SLOPE_PX2 = 1.0 / 3.0
 """Variance of the blur that a difference over two pixels adds."""
 BRIGHT_PX_PER_MM = 2.5
 """Raster on which glare is looked for."""
-INK_WIDTH_MM = 12.0
+INK_WIDTH_MM = 20.0
 """Strokes are narrower than this: closing fills them with the paper beside them."""
 SPOT_MM = 36.0
 """A bright area wider than this is uneven illumination, not glare."""

@@ -6,6 +6,9 @@ name = "our goat-hair brush no. 3, simulated"   # in every recording and report 
 stiffness_n_mm2 = 150.0                         # the fields of `BrushSpec`; the default of each that is left out
 [camera]
 noise = 1.4                                     # gray levels; may be left out
+[quality]                                       # for the `[quality]` of the rig.toml; may be left out
+head_mm = 2.2
+misplaced_mm = 4.0
 ```
 """
 
@@ -18,9 +21,12 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from drivers.sim.brush.spec import BrushSpec
+from drivers.sim.config import SoundHead
 from drivers.sim.described import SimFileError, load_described
 
 MAX_NOISE_GRAY = 30.0
+LOOPBACK = "loopback"
+"""Name of the brush whose constants are the defaults of `BrushSpec`."""
 PAPER = "paper"
 """Name under which the brush of `PAPER_FILE` is chosen."""
 PAPER_FILE = Path(__file__).with_name("brush") / "paper_brush.toml"
@@ -39,6 +45,8 @@ class NamedBrush:
     name: str
     noise_gray: float | None = None
     """Standard deviation of the camera's noise that was measured with it; None for the rig's default."""
+    head: SoundHead | None = None
+    """Where its sound marks begin; None for the default of `rig.toml`."""
 
 
 class _Camera(BaseModel):
@@ -53,9 +61,15 @@ class _File(BaseModel):
     name: Annotated[str, Field(min_length=1, max_length=120, pattern=r'^[^\x00-\x1f\x7f"\\]+$')]
     brush: BrushSpec
     camera: _Camera | None = None
+    quality: SoundHead | None = None
 
 
-def load_brush(path: Path) -> NamedBrush:
-    """Read the file, or the shipped brush if `path` is just `paper`. Raises `BrushFileError`."""
+def load_brush(path: Path, seed: int = BrushSpec().seed) -> NamedBrush:
+    """Read the file, or take one of the shipped brushes if `path` is just `paper` or `loopback`.
+
+    `seed` is that of the individual for `loopback`; any other brush has its own. Raises `BrushFileError`.
+    """
+    if str(path) == LOOPBACK:
+        return NamedBrush(BrushSpec(seed=seed), "")
     found = load_described(PAPER_FILE if str(path) == PAPER else path, _File, BrushFileError)
-    return NamedBrush(found.brush, found.name, None if found.camera is None else found.camera.noise)
+    return NamedBrush(found.brush, found.name, None if found.camera is None else found.camera.noise, found.quality)

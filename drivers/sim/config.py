@@ -8,6 +8,21 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from drivers.sim.brush.brush import BrushSpec
+from drivers.sim.brush.spec import within
+
+
+@dataclass(frozen=True, slots=True)
+class SoundHead:
+    """The `[quality]` settings of a rig.toml that depend on the brush; raises ValueError out of range."""
+
+    head_mm: float
+    """How far a sound mark begins behind the zero-touch point, on the side away from its tip."""
+    misplaced_mm: float
+    """Distance from there at which a mark counts as misplaced."""
+
+    def __post_init__(self) -> None:
+        within("head_mm", self.head_mm, -20.0, 20.0)
+        within("misplaced_mm", self.misplaced_mm, 0.1, 20.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,5 +162,7 @@ class SimConfig:
     brush: BrushSpec = field(default_factory=BrushSpec)
     brush_name: str = ""
     """How recordings call the brush; by default a simulated bundle with its seed."""
+    head: SoundHead | None = None
+    """Where sound marks of the brush begin; None for the default of `rig.toml`."""
     table: Table = field(default_factory=Table)
     view: View = field(default_factory=View)

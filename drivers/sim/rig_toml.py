@@ -92,7 +92,7 @@ park_mm = [{config.home_mm[0]}, {config.home_mm[1]}, {config.home_mm[2]}]
 travel_speed_mm_s = 200.0
 press_speed_mm_s = 20.0
 acc_mm_s2 = 800.0
-{_dwell(config)}"""
+{_dwell(config)}{_quality(config)}"""
 
 
 def _ink_device(config: SimConfig, at: Addresses) -> str:
@@ -130,3 +130,13 @@ def _staleness(config: SimConfig) -> str:
     if config.rate <= 1.0:
         return "stale_ms = 100.0\n"
     return f"stale_ms = 1000.0    # allowed on this bus alone: simulated time runs at {config.rate:g} times real time\n"
+
+
+def _quality(config: SimConfig) -> str:
+    if config.head is None:
+        return ""
+    return f"""
+[quality]
+head_mm = {config.head.head_mm}
+misplaced_mm = {config.head.misplaced_mm}
+"""

@@ -100,7 +100,7 @@ EVALUATED = ["calibrate", "fit", "rig", "fresh sheet", "loop 6", "validate"]
 
 
 def run(folder: Path, size: Size = QUICK) -> int:
-    return Demo(folder, size, 1, 20.0, 1).run()
+    return Demo(folder, size, 1, 20.0, 1, Path("paper")).run()
 
 
 def test_strokes_that_were_left_out_end_in_a_report_and_exit_code_3(chain: Chain, tmp_path: Path) -> None:
@@ -155,11 +155,11 @@ def test_the_command_passes_on_what_was_asked_for(monkeypatch: pytest.MonkeyPatc
     words = ["demo", "--out", str(tmp_path)]
     assert CliRunner().invoke(brushloop.app, words).exit_code == GIVEN_UP
     assert CliRunner().invoke(brushloop.app, [*words, "--full", "--repeats", "1", "--seed", "5"]).exit_code == GIVEN_UP
-    assert CliRunner().invoke(brushloop.app, [*words, "--brush", "paper"]).exit_code == GIVEN_UP
+    assert CliRunner().invoke(brushloop.app, [*words, "--brush", "loopback"]).exit_code == GIVEN_UP
     assert asked == [
-        (tmp_path, QUICK, 2, 60.0, 1, None),
-        (tmp_path, FULL, 1, 60.0, 5, None),
-        (tmp_path, QUICK, 2, 60.0, 1, "paper"),
+        (tmp_path, QUICK, 2, 60.0, 1, Path("paper")),
+        (tmp_path, FULL, 1, 60.0, 5, Path("paper")),
+        (tmp_path, QUICK, 2, 60.0, 1, Path("loopback")),
     ]
 
 
@@ -181,4 +181,4 @@ def test_the_sheet_is_not_changed_under_a_session_that_has_begun(chain: Chain, t
 
 def test_a_folder_whose_path_is_too_long_for_a_socket_is_refused_before_anything_starts(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="at most 100 bytes: use another --out"):
-        DemoRig(tmp_path / ("long" * 30), rate=20.0, seed=1).start()
+        DemoRig(tmp_path / ("long" * 30), rate=20.0, seed=1, brush=Path("paper")).start()

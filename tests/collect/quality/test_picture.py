@@ -89,6 +89,15 @@ def test_a_lamp_is_glare_and_the_edge_of_a_shadow_is_not() -> None:
     assert glare(np.clip(lamp, 0, 255).astype(np.uint8), 0.1).any()
 
 
+@pytest.mark.parametrize("width_mm", [8.0, 12.0, 16.0, 20.0])
+def test_bare_paper_between_wide_marks_is_not_glare(width_mm: float) -> None:
+    px = 20  # the scale at which glare is looked for
+    image = np.full((68 * px, 84 * px), 200, np.uint8)
+    for x_mm, y_mm in [(22, 10), (62, 10), (22, 34), (62, 34), (22, 58), (62, 58)]:
+        cv2.ellipse(image, (x_mm * px, y_mm * px), (14 * px, round(0.5 * width_mm * px)), 0, 0, 360, 20, -1)
+    assert not glare(image, 0.1).any()
+
+
 def test_a_sound_mark_passes_and_its_place_is_measured() -> None:
     anchor = CELL.anchor_mm
     image = stroke(paper(), anchor[0] + 0.7, anchor[1])

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import brushloop
 from bench.brushfit_brushes import FROZEN
 from drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
-from drivers.sim.brush_file import PAPER, BrushFileError, load_brush
+from drivers.sim.brush_file import LOOPBACK, PAPER, BrushFileError, load_brush
+from drivers.sim.config import SimConfig
+from drivers.sim.rig_toml import Addresses, rig_toml
 from drivers.sim.serve import LabRefused
 
+SOUND_HEAD_MM, SOUND_MISPLACED_MM = 0.7, 1.6
+"""The defaults of `[quality]` in a rig.toml."""
 PRESSED = (
     (3986.908, 3129.639, 3100.391),
     (4034.102, 3255.779, 3098.008),
@@ -75,6 +81,34 @@ def test_the_paper_s_brush_marks_nearly_as_wide_as_ccd_bsm_says_and_says_for_wha
     mark = Brush(found.spec).press(depth_mm, 5.0, ink_load=1.0, press_seed=1)
     width = (mark.density > 0.4).sum(axis=0) / mark.px_per_mm
     assert 0.8 < width.max() / width_mm < 1.2
+
+
+def test_the_rig_toml_of_the_paper_s_brush_says_where_its_marks_begin() -> None:
+    found = load_brush(Path(PAPER))
+    assert found.head is not None
+    heads_mm: list[float] = []
+    for depth_mm, tilt_deg in itertools.product((11.0, 20.0), (0.0, 5.0, 10.0)):
+        mark = Brush(found.spec).press(depth_mm, tilt_deg, ink_load=1.0, press_seed=1)
+        columns = np.flatnonzero((mark.density > 0.5).any(axis=0))
+        heads_mm.append((columns[-1] + 1 - mark.origin_px[0]) / mark.px_per_mm)
+    assert max(abs(at - found.head.head_mm) for at in heads_mm) < found.head.misplaced_mm - 0.5
+    assert max(abs(at - SOUND_HEAD_MM) for at in heads_mm) > SOUND_MISPLACED_MM
+
+    at = Addresses("127.0.0.1", 1, 2, 3, None, None)
+    quality = tomllib.loads(rig_toml(SimConfig(brush=found.spec, head=found.head), at))["quality"]
+    assert quality == {"head_mm": found.head.head_mm, "misplaced_mm": found.head.misplaced_mm}
+    assert "quality" not in tomllib.loads(rig_toml(SimConfig(), at))
+
+
+def test_settings_of_quality_out_of_range_are_refused(tmp_path: Path) -> None:
+    text = 'name = "any"\n[brush]\n[quality]\nhead_mm = 2.0\nmisplaced_mm = 50.0\n'
+    with pytest.raises(BrushFileError, match=r"quality: misplaced_mm = 50 is outside 0\.1 \.\. 20"):
+        load_brush(written(tmp_path, text))
+
+
+def test_the_loopback_brush_is_an_individual_of_the_rig_s_seed() -> None:
+    found = load_brush(Path(LOOPBACK), 7)
+    assert found.spec == BrushSpec(seed=7)
 
 
 def test_the_rig_is_served_with_the_brush_and_records_its_name(tmp_path: Path) -> None:
