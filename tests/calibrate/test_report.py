@@ -11,6 +11,7 @@ MADE = "simulated bristle bundle, paper (made to agree with the paper's Table 2:
 def test_the_remark_of_a_described_brush_is_part_of_the_label() -> None:
     remark = "brush made to agree with the paper's Table 2: no evidence for the model"
     assert source_label(Source.LOOPBACK, [MADE, MADE]) == f"loopback rig, {remark}"
+    assert source_label(Source.LOOPBACK, [f"{MADE}, R = 6 mm, L = 48 mm"]) == f"loopback rig, {remark}"
     assert source_note(Source.LOOPBACK, MADE).endswith(f"not a result on paper, {remark}")
 
 
