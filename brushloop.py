@@ -25,6 +25,19 @@ import twin.cli
 from calibrate.path_or_command import PathOrCommand
 from sessions.terminal import plain, say
 
+EXIT_CODES = {
+    0: "done",
+    1: "a defect: please report it with its traceback",
+    2: "input or configuration cannot be used; nothing half-written is left",
+    3: "finished, but strokes were left out, or a repair lost something",
+    4: "stopped or aborted; once the cause has been removed, the same command continues",
+    5: "finished, but a required score was missed (`validate --gate`), the camera drifted, or the rig's settings "
+    "contradict each other",
+    6: "a recording is damaged: `brushloop sessions repair`",
+    130: "interrupted by Ctrl-C; `collect`, `train` and `sim` end in order instead, with a code from above",
+}
+"""What each exit code of every command means."""
+
 
 class OptionRefused(Exception):
     """A number on the command line is not a number, or lies outside its range."""

@@ -14,9 +14,8 @@ import typer
 
 import brushloop
 from calibrate.path_or_command import PathOrCommand
+from tests.blocks import DOCUMENTS, ROOT, blocks_of
 
-ROOT = Path(__file__).parent.parent
-DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
 LINK = re.compile(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)")
 
 
@@ -49,17 +48,16 @@ def test_files_and_folders_of_ours_that_a_document_names_are_there(document: Pat
 
 def commands_in(document: Path) -> list[str]:
     """Lines of a document's blocks that begin with `brushloop`, without their comments."""
-    blocks = re.findall(r"^```(?:sh)?\n(.*?)^```", document.read_text(encoding="utf-8"), re.M | re.S)
-    lines = [line.strip() for block in blocks for line in block.splitlines()]
-    return [line for line in lines if re.match(r"brushloop( |$)", line)]
+    shown = [block for block in blocks_of(document) if block.kind == "sh"]
+    return [line for block in shown for line in block.commands if re.match(r"brushloop( |$)", line)]
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_commands_that_a_document_shows_exist_with_their_options(document: Path) -> None:
-    """Only the tutorial's commands are run as well (tests/test_tutorial.py): others need an arm or a long session."""
+    """`make soak` runs them as well, in tests/test_blocks.py."""
     for line in commands_in(document):
         command: Any = typer.main.get_command(brushloop.app)
-        words = shlex.split(line.split(" | ")[0], comments=True)[1:]
+        words = shlex.split(line.split(" | ")[0])[1:]
         while words:
             word = words.pop(0)
             further = getattr(command, "commands", {})

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from bench import exit_codes
+from brushloop import EXIT_CODES
 from tests.command import brushloop
 
 ROOT = Path(__file__).parent.parent
@@ -137,3 +139,8 @@ def test_a_process_ends_with_that_line_and_that_code() -> None:
     command = [sys.executable, "-m", "brushloop", "sessions", "list", "nowhere"]
     ran = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (ran.returncode, ran.stderr) == (2, brushloop("sessions", "list", "nowhere").stderr)
+
+
+def test_the_page_about_exit_codes_is_that_of_the_code() -> None:
+    assert exit_codes.PAGE.read_text(encoding="utf-8") == exit_codes.page(), "run `python -m bench.exit_codes`"
+    assert {code for code, _name, text in exit_codes.raised() if text} <= EXIT_CODES.keys()
