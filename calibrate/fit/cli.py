@@ -41,7 +41,7 @@ def fit(
         int | None, typer.Option(min=1, help="With --prior: only this many strokes, as different as possible.")
     ] = None,
 ) -> None:
-    """Fit the stroke model to a session's presses; writes an immutable brushfit/<hash>.json."""
+    """Fit the stroke model to a session's presses; writes an immutable brushfit/<hash>.json and its page."""
     if (prior is not None and not drags) or (strokes is not None and prior is None):
         raise typer.BadParameter("--prior needs --drags, and --strokes needs --prior")
     if drags:
@@ -54,6 +54,7 @@ def fit(
     from calibrate.compare.field import Field
     from calibrate.fit.artefact import BrushFit
     from calibrate.fit.captures import read_presses
+    from calibrate.fit.report import write_fit_page
     from calibrate.fit.run import correction as corrected
     from calibrate.fit.run import fit_session, save
     from sessions.progress import shown
@@ -68,7 +69,7 @@ def fit(
     say(*_tables(captures, fitted))
     if correction:
         say(*_correction(corrected(captures, fitted.artefact, before)))
-    say(f"Fit: {path}")
+    say(f"Fit: {path}", f"Page: {write_fit_page(captures, fitted, path)}")
 
 
 def _fit_drags(

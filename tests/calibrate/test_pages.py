@@ -14,7 +14,9 @@ from typer.testing import CliRunner
 from brushloop import app
 from calibrate.board.lens import Gray
 from calibrate.board.spec import BoardSpec, charuco_board
+from drivers.sim.brush.brush import Brush, BrushSpec
 from tests.browser import BROWSER, content_widths_px
+from tests.photographed import imported, photograph
 
 if TYPE_CHECKING:
     from conftest import Photographed
@@ -46,7 +48,20 @@ def pages(photographed: Photographed, tmp_path_factory: pytest.TempPathFactory) 
     """A page of every command, by the command's name."""
     folder = tmp_path_factory.mktemp("pages")
     session = photographed(folder / "2026-<u>", SPEC, [board()], sheet_mm=(100.0, 80.0))
-    return {"calibrate": run("calibrate", session)}
+    return {
+        "calibrate": run("calibrate", session),
+        "fit": run("fit", _pressed(folder), "--mm-per-px", "0.8"),
+    }
+
+
+def _pressed(folder: Path) -> Path:
+    """An imported session of two presses at two depths."""
+    lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
+    for number, height_mm in enumerate((11.0, 15.0)):
+        mark = Brush(BrushSpec()).press(height_mm, 0.0, ink_load=1.0, press_seed=number)
+        photograph(folder / f"{number}.png", mark, (300, 480), (380, 150))
+        lines.append(f"{number}.png,{height_mm},0.0,10.0,380.0,150.0")
+    return imported(folder, lines, folder / "presses", "press")
 
 
 def test_a_page_is_one_labelled_file_without_scripts_that_fetches_nothing(pages: dict[str, str]) -> None:
@@ -67,6 +82,14 @@ def test_the_page_of_a_calibration_draws_every_corner_with_its_residual(pages: d
     assert 'class="sheet-edge"' in page
     assert "simulated brush, ink and camera" in page
     assert "2026-&lt;u&gt;" in page
+
+
+def test_the_page_of_a_fit_draws_both_outlines_over_the_ink_of_each_cell(pages: dict[str, str]) -> None:
+    page = pages["fit"]
+    assert page.count('class="fitted" d="M') == page.count('class="published" d="M') == 2
+    assert "H 11 mm, α 0° · 1 press · CSIM" in page
+    assert "held out" in page
+    assert "imported photographs" in page
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")

@@ -1,0 +1,206 @@
+"""The page of a fit: the fitted outline over the ink of each cell, sizes by depth, parameters, held-out scores."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibrate.compare.similarity import csim
+from calibrate.files import write_whole
+from calibrate.fit.captures import Captures
+from calibrate.fit.heldout import CEILING, FITTED, UNCALIBRATED, Cell, by_cell, predictor
+from calibrate.fit.run import Fitted
+from calibrate.fit.strokes import Floats, Grid, Pressed
+from calibrate.report import Point, ink_uri, plot, plot_uri, render, source_label, source_note, source_point
+from model.brush import DomainError
+from model.fitted import PARAMETERS, FittedPress
+from model.loops import Loop
+
+MAX_CELLS = 48
+MARGIN_MM = 1.5
+SMOOTH_POINTS = 24
+LITTLE = 0.1
+"""Share of a parameter's variance below which the strokes say next to nothing about it."""
+NEAR_CEILING = 1.5
+"""Distance from the ceiling that counts as near, in points of CSIM."""
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+"""Of Okabe and Ito, one for each tilt in turn."""
+
+
+def write_fit_page(captures: Captures, fitted: Fitted, path: Path) -> Path:
+    """Write the page of the fit at `path` beside it; returns the page's path. Raises OSError."""
+    header, artefact = captures.header, fitted.artefact
+    label = source_label(header.source, [header.brush])
+    cells = by_cell(captures.strokes)
+    published = FittedPress(captures.radius_mm, captures.length_mm)
+    step = max(1, -(-len(cells) // MAX_CELLS))
+    text = render(
+        "fit.html.j2",
+        session=header.session_id,
+        label=label,
+        note=source_note(header.source, header.brush),
+        window=_window(captures, (fitted.fit.press, published)),
+        cells=[_cell(cell, cells[cell], fitted.fit.press, published, captures.grid) for cell in list(cells)[::step]],
+        left_out=len(cells) - len(range(0, len(cells), step)),
+        verdict=list(_verdict(captures, fitted, len(cells))),
+        trust=[source_point(header.source), *_trust(captures, fitted)],
+        sizes=_sizes(captures, fitted.fit.press, label),
+        parameters=[
+            (parameter, artefact.parameters[parameter.name], artefact.from_strokes[parameter.name])
+            for parameter in PARAMETERS
+        ],
+        held_out=fitted.held_out,
+        refused=captures.refused,
+        facts=[(name, text) for name, text in _facts(captures, fitted, path) if text],
+    )
+    page = path.with_suffix(".html")
+    write_whole(page, text)
+    return page
+
+
+def _window(captures: Captures, presses: tuple[FittedPress, ...]) -> tuple[float, float, float, float]:
+    """The (left, top, width, height) in mm, y downward, that holds all ink and every outline."""
+    grid = captures.grid
+    inked = np.any([one.ink > 0.5 for one in captures.strokes], axis=0)
+    x, y = grid.x_mm[inked.any(axis=0)], -grid.y_mm[inked.any(axis=1)]
+    low, high = np.array([x[0], y[0]]), np.array([x[-1], y[-1]])
+    for loop in (_outline(press, cell) for press in presses for cell in by_cell(captures.strokes)):
+        if loop is not None:
+            points = loop.points.reshape(-1, 2) * np.array([1.0, -1.0])
+            low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
+    (left, top), (width, height) = (low - MARGIN_MM).tolist(), (high - low + 2.0 * MARGIN_MM).tolist()
+    return round(left, 3), round(top, 3), round(width, 3), round(height, 3)
+
+
+def _cell(cell: Cell, strokes: list[Pressed], press: FittedPress, published: FittedPress, grid: Grid) -> dict[str, Any]:
+    """One picture: the mean ink of the cell's presses, and both outlines as SVG paths in mm."""
+    mean = np.mean([one.ink for one in strokes], axis=0).astype(np.float32)
+    left, top = float(grid.x_mm[0]) - 0.5 * grid.px_mm, -float(grid.y_mm[0]) - 0.5 * grid.px_mm
+    across, down = len(grid.x_mm) * grid.px_mm, len(grid.y_mm) * grid.px_mm
+    return {
+        "height_mm": f"{cell[0]:g}",
+        "tilt_deg": f"{cell[1]:g}",
+        "presses": len(strokes),
+        "ink": ink_uri(mean),
+        "place": (round(left, 3), round(top, 3), round(across, 3), round(down, 3)),
+        "fitted": _path(press, cell),
+        "published": _path(published, cell),
+        "csim": _csim(press, cell, strokes, grid),
+    }
+
+
+def _csim(press: FittedPress, cell: Cell, strokes: list[Pressed], grid: Grid) -> str:
+    """Average CSIM of the fit and the presses that it was fitted to, percent; empty where it draws no mark."""
+    try:
+        drawn = np.asarray(predictor(press, grid)(*cell) > 0.5, np.float32)
+    except DomainError:
+        return ""
+    if not drawn.any():
+        return ""
+    seen = [np.asarray(one.ink > 0.5, np.float32) for one in strokes]
+    return f"{100.0 * np.mean([csim(drawn, image) for image in seen if image.any()]):.1f}"
+
+
+def _outline(press: FittedPress, cell: Cell) -> Loop | None:
+    try:
+        return press.outline(*cell)
+    except DomainError:  # so light that the brush leaves no mark
+        return None
+
+
+def _path(press: FittedPress, cell: Cell) -> str:
+    """The outline as an SVG path, x to the right and y downward in mm; empty where the brush leaves no mark."""
+    loop = _outline(press, cell)
+    if loop is None:
+        return ""
+    points = np.round(loop.points * np.array([1.0, -1.0]), 2)
+    x, y = points[0, 0].tolist()
+    curves = "".join(f"Q{a:g} {b:g} {c:g} {d:g}" for (a, b), (c, d) in points[:, 1:].tolist())
+    return f"M{x:g} {y:g}{curves}Z"
+
+
+def _sizes(captures: Captures, press: FittedPress, label: str) -> str:
+    """Length and width against depth: the ink of each press as a point, the fit as a line for each tilt."""
+    figure, axes = plot(1, 2, (10.0, 3.6))
+    strokes, grid = captures.strokes, captures.grid
+    heights = np.linspace(min(s.height_mm for s in strokes), max(s.height_mm for s in strokes), SMOOTH_POINTS)
+    tilts = sorted({one.tilt_deg for one in strokes})
+    shown = tilts if len(tilts) <= len(COLOURS) else [tilts[0], tilts[len(tilts) // 2], tilts[-1]]
+    for tilt, colour in zip(shown, COLOURS, strict=False):
+        seen = np.array([(s.height_mm, *_measured(s.ink, grid)) for s in strokes if s.tilt_deg == tilt])
+        drawn = np.array([_fitted_sizes(press, height, tilt, grid.x_mm) for height in heights])
+        for axis, column in zip(axes, (0, 1), strict=True):
+            axis.plot(seen[:, 0], seen[:, 1 + column], "o", ms=4, alpha=0.7, color=colour)
+            axis.plot(heights, drawn[:, column], color=colour, lw=1.5, label=f"α {tilt:g}°")
+    for axis, what in zip(axes, ("length", "width"), strict=True):
+        axis.set_xlabel("commanded depth H, mm")
+        axis.set_ylabel(f"{what} of the mark, mm")
+        axis.set_title(f"{what} ({label})", fontsize=10)
+        axis.grid(alpha=0.3)
+    axes[0].legend()
+    return plot_uri(figure)
+
+
+def _measured(ink: Any, grid: Grid) -> tuple[float, float]:
+    inked = np.flatnonzero((ink > 0.5).any(axis=0))
+    return float(inked[-1] - inked[0] + 1) * grid.px_mm, float(ink.sum(axis=0).max()) * grid.px_mm
+
+
+def _fitted_sizes(press: FittedPress, height_mm: float, tilt_deg: float, x_mm: Floats) -> tuple[float, float]:
+    try:
+        sizes = press.sizes(height_mm, tilt_deg)
+        width = np.maximum(press.edges_at(height_mm, tilt_deg, x_mm), 0.0).sum(axis=0).max()
+    except DomainError:
+        return float("nan"), float("nan")
+    return float(sizes.tip + sizes.heel), float(width)
+
+
+def _verdict(captures: Captures, fitted: Fitted, cells: int) -> Iterator[str]:
+    brush = captures.header.brush or "a brush without a name"
+    yield f"The stroke model was fitted to {len(captures.strokes)} presses at {cells} combinations of H and α: {brush}."
+    scores = {row.model: row.csim for row in fitted.held_out}
+    if FITTED not in scores:
+        yield "Only one combination was pressed, so nothing says how well it predicts others."
+        return
+    ceiling = f"; another press of the same combination reaches {scores[CEILING]:.1f} %" if CEILING in scores else ""
+    yield (
+        f"On combinations that were left out of the fit it predicts the ink with a CSIM of {scores[FITTED]:.1f} %, "
+        f"the model as published with {scores[UNCALIBRATED]:.1f} %{ceiling}."
+    )
+
+
+def _trust(captures: Captures, fitted: Fitted) -> Iterator[Point]:
+    scores = {row.model: row.csim for row in fitted.held_out}
+    if not scores:
+        yield Point(False, "One combination of H and α says nothing about growth with depth or tilt.")
+    elif CEILING in scores:
+        off = scores[CEILING] - scores[FITTED]
+        words = f"Held out, the fit is {off:.1f} points of CSIM below the ceiling"
+        yield Point(off <= NEAR_CEILING, f"{words}; {NEAR_CEILING:g} or less is near.")
+    else:
+        yield Point(None, "No combination was pressed three times: how repeatable the brush is, is not known here.")
+    if captures.refused:
+        yield Point(False, f"{len(captures.refused)} presses could not be used; each is named below.")
+    else:
+        yield Point(True, "Every press was used.")
+    little = [name for name, share in fitted.artefact.from_strokes.items() if share < LITTLE]
+    if little:
+        words = "These presses say next to nothing about some parameters, which are those of known brushes"
+        yield Point(None, f"{words}: {', '.join(little)}.")
+    yield Point(None, "The pictures above show presses that were fitted. The held-out scores are the honest ones.")
+
+
+def _facts(captures: Captures, fitted: Fitted, path: Path) -> Iterator[tuple[str, str]]:
+    header, artefact = captures.header, fitted.artefact
+    yield "session", header.session_id
+    yield "source", str(header.source)
+    yield "recording", f"sha256 {captures.recording_sha256}"
+    yield "brush", f"{header.brush or 'not named'}, R {captures.radius_mm:g} mm, L {captures.length_mm:g} mm"
+    yield "ink, paper", ", ".join(part for part in (header.ink, header.paper) if part)
+    yield "calibration", captures.calibration.named if captures.calibration else "the import's own scale"
+    yield "images", f"{artefact.mm_per_px:g} mm a pixel"
+    yield "fitted with", artefact.software
+    yield "artefact", path.name
