@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import os
+import pty
+import select
+import shutil
 import subprocess
 import sys
 import tarfile
+import time
 import venv
 from pathlib import Path
 
 import pytest
+
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parent.parent
 
@@ -60,14 +66,59 @@ COMPLETIONS = [
 ]
 
 
+@pytest.fixture
+def command() -> Path:
+    """The command beside this Python."""
+    path = Path(sys.executable).with_name("brushloop")
+    if not path.is_file():
+        pytest.skip("brushloop is not installed beside this Python")
+    return path
+
+
 @pytest.mark.parametrize(("shell", "typed", "completed"), COMPLETIONS, ids=["bash", "zsh"])
 def test_a_shell_is_given_what_completes_a_command(
-    tmp_path: Path, shell: str, typed: dict[str, str], completed: str
+    command: Path, tmp_path: Path, shell: str, typed: dict[str, str], completed: str
 ) -> None:
-    command = Path(sys.executable).with_name("brushloop")
-    if not command.is_file():
-        pytest.skip("brushloop is not installed beside this Python")
     assert completed in run(command, cwd=tmp_path, _BRUSHLOOP_COMPLETE=f"complete_{shell}", **typed)
+
+
+LOAD = 'eval "$(brushloop --show-completion)"'
+SHELLS = [
+    ("bash", ["--norc", "--noprofile", "-i"], LOAD),
+    ("zsh", ["-f", "-i"], f"autoload -U compinit; compinit -u; {LOAD}"),
+]
+
+
+@pytest.mark.soak  # an interactive shell that starts brushloop twice
+@pytest.mark.parametrize(("shell", "options", "load"), SHELLS, ids=["bash", "zsh"])
+def test_tab_completes_a_command_in_a_shell(
+    command: Path, tmp_path: Path, shell: str, options: list[str], load: str
+) -> None:
+    if shutil.which(shell) is None:
+        pytest.skip(f"{shell} is not installed")
+    here, there = pty.openpty()
+    path = f"{command.parent}:{os.environ['PATH']}"
+    environment = {"PATH": path, "HOME": str(tmp_path), "TERM": "dumb", "LANG": "C.UTF-8", "PS1": "> "}
+    started = {"stdin": there, "stdout": there, "stderr": there, "start_new_session": True}
+    with subprocess.Popen([shell, *options], env=environment, cwd=tmp_path, **started) as process:
+        os.close(there)
+        try:
+            os.write(here, f'{load}; echo rea""dy\n'.encode())
+            read_until(here, b"ready\r\n")
+            os.write(here, b"brushloop ses\t")
+            read_until(here, b"brushloop sessions ")
+        finally:
+            process.kill()
+            os.close(here)
+
+
+def read_until(terminal: int, words: bytes) -> None:
+    """Read what a terminal shows until it shows these words; fails after `PATIENCE_S`."""
+    shown, deadline = b"", time.monotonic() + PATIENCE_S
+    while words not in shown:
+        assert time.monotonic() < deadline, shown
+        if select.select([terminal], [], [], 1.0)[0]:
+            shown += os.read(terminal, 4096)
 
 
 LABS_TEST = """
