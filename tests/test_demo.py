@@ -88,7 +88,7 @@ def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactl
     printed = re.search(r"Report: (\S+report\.html)\nMCAP:   (\S+\.mcap)", ran.stdout)
     assert printed is not None
     page = Path(printed[1]).read_text()
-    assert '<span class="source">loopback rig</span>' in page
+    assert '<span class="source">loopback rig, brush made to agree with the paper&#39;s Table 2: no evidence' in page
     assert "not a result on paper" in page
     assert Path(printed[2]).is_file()
     report = load_report(Path(printed[1]).with_name("report.json"))
