@@ -3,7 +3,7 @@
 ```toml
 name = "our goat-hair brush no. 3, simulated"   # in every recording and report made with it
 [brush]
-stiffness_n_mm2 = 150.0                         # the fields of `BrushSpec`; the default of each that is left out
+stiffness_n_mm2 = 150.0                         # the fields of `BrushSpec`; a field that is left out has its default
 [camera]
 noise = 1.4                                     # gray levels; may be left out
 [quality]                                       # for the `[quality]` of the rig.toml; may be left out

@@ -77,7 +77,7 @@ def _normal(slope_deg: tuple[float, float]) -> tuple[float, float, float]:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """The camera: where it looks and how well."""
+    """The camera: its place, its picture and its errors."""
 
     width_px: int = 2048
     height_px: int = 1536
@@ -88,8 +88,8 @@ class View:
     centre_mm: tuple[float, float] = (122.0, 86.0)
     """The point of the paper plane in the middle of the image, in the paper frame."""
     lens_mm: tuple[float, float, float] | None = None
-    """Place of a pinhole over the sheet, in the paper frame; `px_per_mm` and `keystone` then shape nothing. Without
-    it they describe the perspective."""
+    """Place of a pinhole over the sheet, in the paper frame: it determines the perspective. If it is None, `px_per_mm`
+    and `keystone` do."""
     focal: float = 1.0
     """Focal length, in image widths."""
     mirrored: bool = False
@@ -107,7 +107,7 @@ class View:
     glare_sigma_mm: float = 6.0
     """Standard deviation of the reflection's Gaussian profile."""
     k1: float = 0.0
-    """Radial distortion in OpenCV's model; 0 until calibration corrects it."""
+    """First radial distortion coefficient of OpenCV's lens model."""
     blur_px: float = 0.7
     fps: float = 8.0
     jpeg_quality: int = 95
@@ -161,7 +161,7 @@ class SimConfig:
     """-1 for a sensor that reports the push of the tool on the paper instead of the paper's on the tool."""
     brush: BrushSpec = field(default_factory=BrushSpec)
     brush_name: str = ""
-    """How recordings call the brush; by default a simulated bundle with its seed."""
+"""Name of the brush in recordings; if empty, "simulated bristle bundle" and its seed."""
     head: SoundHead | None = None
     """Where sound marks of the brush begin; None for the default of `rig.toml`."""
     table: Table = field(default_factory=Table)

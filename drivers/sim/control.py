@@ -10,7 +10,7 @@ The control socket takes one JSON object per line and answers with one per line,
 | `{"do": "state"}` | state of the world: phase, tip, presses, ink load, modes |
 | `{"do": "release"}` | `was`: the safety mode that a person at the arm has ended |
 | `{"do": "fresh-sheet"}` | |
-| `{"do": "hand", "act": ...}` | `says`, and `reached` of an act that goes somewhere; only in an unknown lab |
+| `{"do": "hand", "act": ...}` | `says`, and `reached` for an act that moves the arm; only in an unknown lab |
 
 Anything else is answered with `{"ok": false, "error": "one line"}`.
 """
@@ -33,7 +33,7 @@ from drivers.sim.rig import Faults
 from drivers.sim.server import LoopbackServer
 
 Person = Callable[[Mapping[str, object]], Awaitable[dict[str, Any]]]
-"""Carries out a `hand` request. Raises ValueError, with one line, for one that is none."""
+"""Carries out a `hand` request. Raises ValueError, with a one-line message, for an invalid request."""
 MAX_LINE_BYTES = 8192
 MAX_CLIENTS = 16
 MAX_PATH_BYTES = 100
@@ -140,7 +140,7 @@ class ControlServer(LoopbackServer):
             case "hand", _, _ if self._person is not None:
                 return await self._person(request)
             case "hand", _, _:
-                raise ValueError("nobody is here: a person is only in a lab of `brushloop sim --unknown`")
+                raise ValueError("there is no person here: only the lab of `brushloop sim --unknown` has one")
             case _:
                 raise ValueError(USAGE)
 

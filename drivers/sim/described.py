@@ -1,4 +1,4 @@
-"""What a person describes to the simulator in a TOML file, faults or a brush: read whole, or refused in one line."""
+"""TOML files that describe faults or a brush to the simulator: read completely, or refused with one line."""
 
 from __future__ import annotations
 

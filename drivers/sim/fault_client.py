@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 TIMEOUT_S = 5.0
 GUIDING_S = 120.0
-"""Longest time for which a person is busy with one thing."""
+"""Longest wait for an act of the person in the lab."""
 MAX_ANSWER_BYTES = 4 * 1024 * 1024
 PLAIN = ("list", "clear", "state", "release", "fresh-sheet")
 
@@ -30,7 +30,8 @@ def request_of(what: str, kind: str | None, options: Mapping[str, object]) -> di
         given.pop("id", None)
         return {"do": "add", "fault": {"device": what, "kind": kind, **given}}
     if kind is not None or set(given) - ({"id"} if what == "clear" else set[str]()):
-        raise FaultRefused(f"{what}: takes nothing else" + (" but --id" if what == "clear" else ""))
+        allowed = "no option but --id" if what == "clear" else "no options"
+        raise FaultRefused(f"{what}: takes no kind and {allowed}")
     return {"do": what, **given}
 
 

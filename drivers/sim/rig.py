@@ -91,9 +91,9 @@ class Faults:
         if before == SafetyMode.PROTECTIVE_STOP:
             cabinet.power.unlock()
         elif before == SafetyMode.SAFEGUARD_STOP:
-            cabinet.power.safety = SafetyMode.NORMAL
+            cabinet.power.reset_safeguard()
         elif before in EMERGENCY_STOPS:
-            cabinet.power.button_down = False
+            cabinet.power.release_emergency_stop()
             cabinet.power.restart_interface_board()
         return before.value
 

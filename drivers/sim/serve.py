@@ -66,7 +66,7 @@ def serve_unknown(
     truth: Path | None = None,
     control: Path | None = None,
 ) -> None:
-    """Serve the unknown lab of this seed and tell what a person sees there; its truth goes to the file `truth`.
+    """Serve the unknown lab of this seed and print what a person sees there; its truth goes to the file `truth`.
 
     Raises `LabRefused` for an unknown trap or a file that cannot be written, and `ControlPathError`.
     """
@@ -108,7 +108,7 @@ async def _serve_unknown(
 
 
 def _signalled() -> asyncio.Event:
-    """An event that Ctrl-C and the system's request to end set."""
+    """An event that SIGINT (Ctrl-C) and SIGTERM set."""
     over, loop = asyncio.Event(), asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, over.set)
@@ -116,7 +116,7 @@ def _signalled() -> asyncio.Event:
 
 
 async def _until_over(rig: LoopbackRig, over: asyncio.Event, idle_exit_s: float) -> None:
-    """Serve until the event is set, or until nobody has called for `idle_exit_s`; SIGUSR1 changes the sheet."""
+    """Serve until the event is set or no client was connected for `idle_exit_s`; SIGUSR1 changes the sheet."""
     asyncio.get_running_loop().add_signal_handler(signal.SIGUSR1, rig.world.fresh_sheet)
     waits: list[asyncio.Task[object]] = [asyncio.create_task(over.wait())]
     if idle_exit_s > 0:

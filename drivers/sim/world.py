@@ -140,7 +140,7 @@ class World:
         """Force of a person's finger on the tip, in the base frame."""
         self.motion = ArmQueue(brush_pose(*config.home_mm), self._travelled, tool_of(config))
         self._felt: tuple[object, Wrench] | None = None
-        """The last wrench and what it follows from; it stays the same while the arm rests."""
+        """The state that the last wrench was computed from, and the wrench: neither changes while the arm rests."""
 
     def flaw_next(self, flaw: Flaw, severity: float = 1.0) -> None:
         """Give a flaw to the next press that lifts off; raises ValueError unless severity is in 0 .. 1."""

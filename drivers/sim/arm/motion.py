@@ -31,7 +31,7 @@ AGREES = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A timed piece of a move. If `stop_s` is set, it decelerates from then on instead."""
+    """A timed piece of a move, which begins at distance `enter` of `path`. From `stop_s`, if set, it decelerates."""
 
     ident: int
     path: Path

@@ -82,7 +82,7 @@ class Brush:
         return print_footprint(spine, self._tuft(press_seed, trouble), ink_load, px_per_mm, self._paper(press_seed))
 
     def descents(self, depths_mm: Sequence[float], tilt_deg: float) -> dict[float, Descent]:
-        """The way down to each of the depths, from one descent to the deepest: quicker than one for each.
+        """The way down to each of the depths, all taken from one descent to the deepest, which is quicker than many.
 
         The load steps end at multiples of half a mm and at each depth; `press` divides each way into equal steps, so
         that the shapes differ slightly where a depth is not such a multiple. Raises ValueError as `press` does.
@@ -99,7 +99,7 @@ class Brush:
         }
 
     def print_descent(self, descent: Descent, *, ink_load: float, press_seed: int, px_per_mm: float) -> Footprint:
-        """The mark that a way down leaves, as `press` would print it. Raises ValueError as `press` does."""
+        """The mark that a descent leaves, as `press` would print it. Raises ValueError as `press` does."""
         _check_print(ink_load, press_seed, px_per_mm)
         return print_footprint(descent, self._tuft(press_seed, None), ink_load, px_per_mm, self._paper(press_seed))
 

@@ -159,13 +159,13 @@ def _between(a: SpineShape, b: SpineShape, share: float) -> SpineShape:
 
 
 def middle_mm(shape: SpineShape) -> float:
-    """Where along x a spine rests on the paper on average; its tip where it does not rest."""
+    """Mean x of a spine's contact with the paper, weighted by force; the x of its tip if it does not touch."""
     force = float(shape.normal_n.sum())
     return float(shape.x_mm @ shape.normal_n) / force if force > 1e-6 else float(shape.x_mm[-1])
 
 
 def _half_mm(shape: SpineShape) -> float:
-    """Half the length of what is near enough to the paper to wet it."""
+    """Half the length of the part of a spine that is near enough to the paper to wet it."""
     near = shape.x_mm[shape.squash_mm > -WET_MM]
     return 0.5 * float(near.max() - near.min()) if near.size else 0.0
 

@@ -46,7 +46,7 @@ SPOILED: dict[str, Callable[[bytes], bytes]] = {"torn": torn}
 """Faults of a single picture: JPEG in, JPEG out."""
 BOUNDARY = "brushloop"
 NEXT_S = 1e-6
-"""Time between two pictures that are due at once: timers of one time run in any order."""
+"""Time between two pictures that are due at once, because timers with the same time run in any order."""
 BACKLOG = 64
 """Images that a stalled stream keeps, as the buffers of a real one do."""
 
@@ -62,7 +62,7 @@ class _Line:
         self._random = random.Random(0)
 
     def exposed(self) -> None:
-        """The next picture shows the world as it is now: its delay is counted from here, and drawing it is a part."""
+        """Note that the next picture is exposed now: its delay counts from here and includes the time to draw it."""
         self._exposed_s = self._loop.time()
 
     async def send(self, data: bytes) -> None:

@@ -29,14 +29,14 @@ class Optics:
 
     def image_of(self, paper_mm: Floats) -> Floats:
         """(n, 2) pixels (centres on integers) of (n, 2) points of the paper plane, distortion included."""
-        undistorted = self.straight(paper_mm)
+        undistorted = self.undistorted_image_of(paper_mm)
         rays = np.column_stack([undistorted, np.ones(len(undistorted))]) @ np.linalg.inv(self.camera_matrix).T
         none = np.zeros(3)
         distorted, _ = cv2.projectPoints(rays[:, None], none, none, self.camera_matrix, self.distortion)
         return np.asarray(distorted, np.float64).reshape(-1, 2)
 
-    def straight(self, paper_mm: Floats) -> Floats:
-        """The same as `image_of`, through a lens without distortion."""
+    def undistorted_image_of(self, paper_mm: Floats) -> Floats:
+        """The same as `image_of`, for a lens without distortion."""
         mapped = np.column_stack([paper_mm, np.ones(len(paper_mm))]) @ self.homography.T
         return np.asarray(mapped[:, :2] / mapped[:, 2:], np.float64)
 

@@ -143,7 +143,7 @@ class Scene:
         view, radius_px = self._world.config.view, self._disc_radius_px
         x_mm, y_mm = self._world.to_paper(tool.x_mm, tool.y_mm)
         at_mm = np.array([[x_mm, y_mm]])
-        if np.abs(self.optics.straight(at_mm)).max() > FAR_WIDTHS * view.width_px:
+        if np.abs(self.optics.undistorted_image_of(at_mm)).max() > FAR_WIDTHS * view.width_px:
             return None  # so far outside, the formula of the distortion leads back into the image
         [[u, v]] = self.optics.image_of(at_mm)
         u_px, v_px = round(float(u)), round(float(v))

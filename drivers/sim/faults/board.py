@@ -65,7 +65,7 @@ class FaultBoard:
     def hang(self, fault: Fault) -> int:
         """Add a fault; return the number by which it can be removed. Raises ValueError above `MOST`."""
         if len(self._hanging) >= MOST:
-            raise ValueError(f"{MOST} faults hang already")
+            raise ValueError(f"there are already {MOST} faults on the board")
         hung = Hung(next(self._idents), fault)
         self._hanging = (*self._hanging, hung)
         return hung.ident

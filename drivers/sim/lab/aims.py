@@ -18,20 +18,22 @@ from drivers.sim.lab.facts import PIN_TILT_DEG, Facts
 from drivers.sim.lab.places import Place, azimuth_deg, board_size_mm, corner, held, in_base, over_sheet
 
 TOUCHED = ("pin", "board-corner", "sheet-corner", "well-rim", "wash-rim")
-"""Things that the tip touches; to the others it is brought as near as the eye can tell."""
+"""Things that the tip touches; it is brought to the others by eye."""
 BY_EYE_MM = 1.0
+"""Standard deviation of a tip that is brought near a thing by eye, along each axis."""
 SEEN_SIGMAS = 2.5
+"""Errors beyond this many standard deviations are seen and corrected by the person."""
 UPRIGHT_DEG = 1.0
 """Standard deviation of a brush that is held upright by eye, about either axis."""
 SQUARE_DEG = 0.15
-"""The same against a set square."""
+"""The same for a brush that is held upright against a set square."""
 DIP_ABOVE_BOTTOM_MM = 2.5
 UPRIGHT_ABOVE_MM = 70.0
 
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """A way to hold the board: slanted toward a side of the picture, turned in it, away from its middle."""
+    """A way to hold the board: its slant and the side toward which it slants, its turn in the picture, its place."""
 
     slant_deg: float = 0.0
     toward_deg: float = 0.0
@@ -49,7 +51,7 @@ HELD = (
     Way(22.0, 315.0, 0.0, (-0.17, 0.17)),
     Way(25.0, 60.0, 90.0),
 )
-"""As a person is asked to: flat, to the left and right, away and toward, in the four corners, turned by a quarter."""
+"""How a person is asked to hold it: flat, slanted to each side, in the four corners, and turned by a quarter."""
 
 
 def _any_way(rng: np.random.Generator) -> Way:
@@ -98,7 +100,8 @@ class Aims:
         return Held((rx, ry, rz), (x * across_mm, y * across_mm * high, view.focal * across_mm))
 
     def _pin(self, index: int, wrist_deg: float, rng: np.random.Generator) -> tuple[float, float, float]:
-        """Leaning to each side in turn; after a round the wrist is turned, and the sides lie between the first ones."""
+        """(tilt, its direction, wrist) in deg. The brush leans to each of four sides in turn; in every second round the
+        sides lie between those of the first, and from round to round the wrist turns."""
         tilt_deg = PIN_TILT_DEG + float(rng.uniform(-4, 0))
         toward_deg = 90.0 * index + 45.0 * (index // 4 % 2) + float(rng.uniform(-8, 8))
         return tilt_deg, toward_deg, wrist_deg + (0.0, 70.0, -70.0)[index // 4 % 3]
@@ -140,7 +143,7 @@ class Aims:
 
 
 def _error_mm(rng: np.random.Generator, spread_mm: float) -> Floats:
-    """(3,) normal along each axis; a person sees what is farther off than that, and tries again."""
+    """(3,) normal error along each axis; drawn again while it is larger than what a person would see and correct."""
     while True:
         error = rng.normal(0.0, spread_mm, 3)
         if np.abs(error).max() <= SEEN_SIGMAS * spread_mm:
@@ -148,7 +151,7 @@ def _error_mm(rng: np.random.Generator, spread_mm: float) -> Floats:
 
 
 def _unsteady(pose: Pose, spread_deg: float, rng: np.random.Generator) -> Pose:
-    """The pose with the brush leaning a little otherwise; the tip stays."""
+    """The pose with a small random rotation of the brush about its tip."""
     lean = Rotation.from_rotvec([*rng.normal(0.0, spread_deg, 2), 0.0], degrees=True)
     qx, qy, qz, qw = (float(v) for v in (lean * Rotation.from_quat(pose.quaternion)).as_quat())
     return Pose(*pose.position_mm, qx, qy, qz, qw)

@@ -44,7 +44,7 @@ BASE_CLEAR_MM = 230.0
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """One lab. Numbers are true ones; only tests may compare them with what was found."""
+    """One lab. All numbers are the true ones; only tests may compare them with what was found."""
 
     seed: int
     config: SimConfig
@@ -55,15 +55,15 @@ class Facts:
     park_mm: Place
     """A place for the tip outside the picture."""
     cabinet_tcp: tuple[float, ...] = (0.0,) * 6
-    """What somebody once typed at the pendant: m and rad."""
+    """Tool offset that somebody once typed at the pendant: x, y, z in m and three angles in rad."""
     payload_kg: float = 0.0
     sheet_camera: int = 0
     """Which of the two streams shows the sheet."""
     printed_square_mm: float = 12.0
     printed_marker_mm: float = 9.0
-    """As the line below the print says."""
+    """Sizes that the line below the print states, mm."""
     hand_mm: float = 0.3
-    """Standard deviation of a hand along each axis, where the tip is brought to a thing."""
+    """Standard deviation, along each axis, of the place to which a hand brings the tip."""
     swapped: tuple[str, str] | None = None
     """Corners that the person takes for each other."""
     parks_in_picture: bool = False

@@ -34,27 +34,16 @@ from drivers.sim.lab.places import shifted, withdrawn
 from drivers.sim.world import World
 
 THINGS = (
-    *(
-        "pin",
-        "upright",
-        "board-corner",
-        "sheet-corner",
-        "well",
-        "well-rim",
-        "wash-pot",
-        "wash-rim",
-        "park",
-        "clear-view",
-    ),
-    *("hold-board", "push-sensor"),
+    *("pin", "upright", "board-corner", "sheet-corner", "well", "well-rim", "wash-pot", "wash-rim"),
+    *("park", "clear-view", "hold-board", "push-sensor"),
 )
 SPEED_RAD_S, ACC_RAD_S2 = 0.35, 1.0
 LOOK_S = 0.005
 PUSH_N, PUSH_S = 2.0, 1.0
 PUSHES = ((0.0, 0.0, -PUSH_N), (PUSH_N, 0.0, 0.0), (0.0, PUSH_N, 0.0))
-"""In the brush's frame: along the brush toward the flange, and sideways."""
+"""Forces in the brush's frame, N: along the brush toward the flange, then along its x and y."""
 HALVINGS = 5
-"""Of the way to a thing out of reach, to find how near the arm comes."""
+"""Bisection steps on the way to a thing out of reach, which find how near the arm can come."""
 
 
 class Lab(Protocol):
@@ -80,7 +69,7 @@ class Lab(Protocol):
         ...
 
     async def mend(self) -> str:
-        """See to the trap; return what was done."""
+        """Correct the mistake that the trap is; return what was done."""
         ...
 
     def plug(self) -> str:
@@ -93,7 +82,7 @@ class Lab(Protocol):
 
 
 class Hand:
-    """One pair of hands: one act at a time."""
+    """The person's hands, which do one thing at a time."""
 
     def __init__(self, lab: Lab) -> None:
         self._lab = lab
@@ -101,7 +90,7 @@ class Hand:
         self._busy = asyncio.Lock()
 
     async def obey(self, request: Mapping[str, object]) -> dict[str, Any]:
-        """Carry out a request as in the table above. Raises ValueError, with one line, for one that is none."""
+        """Carry out a request as in the table above. Raises ValueError, with a one-line message, for an invalid one."""
         act, to = request.get("act"), str(request.get("to", ""))
         index, corner = request.get("index", 0), str(request.get("corner", ""))
         if type(index) is not int or not 0 <= index < 1000:
@@ -120,7 +109,7 @@ class Hand:
                     raise ValueError(f"act = {act!r} is not one of bring, measure, mend, plug")
 
     async def bring(self, to: str, index: int = 0, corner: str = "") -> dict[str, Any]:
-        """Do what `Target` asks for. Raises ValueError for a thing that the lab does not have."""
+        """Carry out `bring`, as in the table above. Raises ValueError for a thing that the lab does not have."""
         if to not in THINGS:
             raise ValueError(f"to = {to!r} is not one of {', '.join(THINGS)}")
         self._lab.hold(self._aims.board(index) if to == "hold-board" else None)

@@ -107,7 +107,7 @@ class UnknownLab:
         self.rig.scene.held = board
 
     def touched(self) -> None:
-        """Another thing was touched; in one lab, somebody then trips over the cable."""
+        """Count another touched thing; with one trap, somebody then trips over the cable."""
         self._touches += 1
         if self._touches == self.facts.cable_after:
             board = self.rig.faults.board
@@ -124,7 +124,7 @@ class UnknownLab:
         return "The cable was out; it is in again." if pulled else "Every cable is in."
 
     async def mend(self) -> str:
-        """See to the trap: the lab is from now on as the trap's description says."""
+        """Correct the mistake that the trap is, as `traps.mended` describes; return what was done."""
         trap, self.trap = self.trap, None
         if trap is None:
             return "Nothing is wrong that I know of."

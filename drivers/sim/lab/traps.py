@@ -1,6 +1,6 @@
 """What goes wrong in a lab, one trap each: a mistake of the person, of whoever set a device up, or an accident.
 
-`spring` puts a trap into a lab, `mended` gives the lab as it is once the person was asked to correct it and did so.
+`spring` puts a trap into a lab; `mended` gives the lab after the person was asked to correct the mistake and did so.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def spring(facts: Facts, trap: Trap) -> Facts:
 
 
 def mended(trapped: Facts, clean: Facts, trap: Trap) -> Facts:
-    """The lab once the person has seen to the trap. A board that was printed too small is measured."""
+    """The lab once the person has corrected the mistake. A board that was printed too small is measured."""
     match trap:
         case Trap.WRONG_BOARD_SIZE:
             table = trapped.config.table

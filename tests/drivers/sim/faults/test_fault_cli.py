@@ -60,8 +60,8 @@ def test_the_words_of_a_command_line_become_a_request():
     ("what", "kind", "options", "words"),
     [
         ("robot", None, {}, "give a device and a kind"),
-        ("state", "mute", {}, "takes nothing else"),
-        ("clear", None, {"on": "moveLine"}, "takes nothing else but --id"),
+        ("state", "mute", {}, "takes no kind and no options"),
+        ("clear", None, {"on": "moveLine"}, "takes no kind and no option but --id"),
     ],
 )
 def test_words_that_do_not_go_together_are_refused(what: str, kind: str | None, options: dict[str, str], words: str):

@@ -54,5 +54,5 @@ async def test_a_person_at_the_command_line_guides_the_arm(tmp_path: Path):
 async def test_nobody_is_in_a_known_rig(tmp_path: Path):
     lab, socket = UnknownLab(4, rate=500.0, picture_px=(640, 480)), tmp_path / "rig.sock"
     async with live_control(lab.rig.faults, socket):
-        with pytest.raises(FaultRefused, match="nobody is here"):
+        with pytest.raises(FaultRefused, match="there is no person here"):
             await asyncio.to_thread(run, "hand", str(socket), "bring", "pin")
