@@ -26,8 +26,8 @@ def twin(
 ) -> None:
     """Fit the simulator's brush, ink and camera noise to a session's presses; writes twin.toml.
 
-    `brushloop sim --brush twin.toml` is then a rig that presses like that brush. A run that was broken off goes on
-    where it was when the same command is given again.
+    `brushloop sim --brush twin.toml` is then a rig that presses like that brush. A run that was interrupted
+    continues when the same command is given again.
     """
     from importlib.metadata import version
 

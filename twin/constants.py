@@ -19,7 +19,7 @@ Vector = NDArray[np.float64]
 FARTHEST = 6.0
 """Scales by which a constant may differ from its default."""
 OFFSETS_MM = (0.3, 1.0, 1.0)
-"""Scale of the depth, and of the place along x and y, at which the brush touched other than the rig believes."""
+"""Scales of the differences in depth, x and y between where the brush touched and where the rig believes it did."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ MECHANICS = (
     Constant("belly_share", "", 0.1),
     Constant("taper_power", "", 0.25, factor=True),
 )
-"""What bends and shapes the bundle: the spine must be solved again when one of these changes."""
+"""Constants that bend and shape the bundle: the spine must be solved again when one of these changes."""
 INK = (
     Constant("splay_power", "", 0.5),
     Constant("film_mm", "mm", 0.4, factor=True),
@@ -71,7 +71,7 @@ INK = (
     Constant("need_per_mm2", "1/mm^2", 0.5, factor=True),
     Constant("uneven_mm", "mm", 2.0),
 )
-"""What decides where the hairs of a solved spine lay ink."""
+"""Constants that decide where the hairs of a solved spine lay ink."""
 SHAPE = MECHANICS + INK
 SPREAD = (
     Constant("spread_wander", "", 0.7, factor=True),
@@ -79,12 +79,12 @@ SPREAD = (
     Constant("bow_wander_mm", "mm", 0.7, factor=True),
     Constant("strand_mm", "mm", 0.7, factor=True),
 )
-"""How presses of one cell differ."""
+"""Constants by which presses of one cell differ."""
 
 
 @dataclass(frozen=True, slots=True)
 class Offset:
-    """Where the brush really touched, seen from where the rig believes that it did, mm."""
+    """Difference between where the brush really touched and where the rig believes that it did, mm."""
 
     depth_mm: float
     """How much deeper each press was."""

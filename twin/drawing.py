@@ -1,4 +1,4 @@
-"""Draws the presses of a described brush on the grid of the captured ones.
+"""Drawings of the presses of a simulated brush, on the grid of the captured ones.
 
 The descents of the last few brushes are remembered, because a search changes one constant at a time and half of them
 leave the mechanics alone. Every press of a cell has the same seed for every brush: differences between brushes are then
@@ -28,11 +28,11 @@ PX_PER_MM = 5.0
 INKED = 0.3
 """Density from which a place counts as inked, as in the loopback rig's own benches."""
 FINE = 3
-"""Each pixel of the grid is the mean of so many by so many samples."""
+"""Each pixel of the grid is the mean of this many by this many samples."""
 LEAST_MM = 0.5
 REMEMBERED = 4
 STILL = {"spread_wander": 0.0, "reach_wander_mm": 0.0, "bow_wander_mm": 0.0}
-"""Constants of a brush whose presses of a cell differ by their paper only."""
+"""Values for a brush whose presses of a cell differ only by their paper."""
 
 
 def draw(
@@ -59,7 +59,7 @@ def still(spec: BrushSpec) -> BrushSpec:
 
 
 def mechanics(spec: BrushSpec) -> BrushSpec:
-    """The brush with every constant at its default that the bundle's shape does not depend on."""
+    """The brush with every constant that does not affect the bundle's shape at its default."""
     default = BrushSpec()
     return replace(spec, seed=0, **{one.name: getattr(default, one.name) for one in (*INK, *SPREAD)})
 

@@ -1,4 +1,4 @@
-"""`twin.toml`, which `brushloop sim --brush` presses with, and the notes of a run that may be broken off."""
+"""`twin.toml`, which `brushloop sim --brush` presses with, and the file that lets an interrupted run continue."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def resumed(path: Path, fresh: Notes) -> Notes:
     try:
         old = Notes.model_validate_json(read_bounded(path))
     except ValidationError:
-        raise CalibrationError(str(path), "is not the notes of a twin that was broken off: move it away") from None
+        raise CalibrationError(str(path), "is not the file of an interrupted `brushloop twin`: move it away") from None
     return old if old.model_copy(update={"steps": {}}) == fresh else fresh
 
 

@@ -1,4 +1,4 @@
-"""Fits a twin to the presses of a session: shape, intervals, spread, camera noise, and scores on cells left out."""
+"""Fit of a twin to the presses of a session: shape, intervals, spread, and scores on cells left out."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MOST_SD = 0.7
 """Standard error, in scales, above which the presses count as not determining a constant."""
 NORMAL_95 = 1.96
 Keep = Callable[[str, Found], None]
-"""Called with the name of a finished step and where the search stands."""
+"""Called after each step with its name and the point that the search has reached."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ def fit_twin(
 ) -> Twin:
     """Fit the twin of a brush of this size to its presses.
 
-    `before` holds the finished steps of a run that was broken off; `keep` is given each new one.
+    `before` holds the finished steps of an interrupted run; `keep` is called with each new one.
     Raises ValueError for a press that is deeper than a brush of this size allows.
     """
     cells = by_cell(strokes)
@@ -123,7 +123,7 @@ def _score_part(
     drawn = predicted(_brush(there, target, spread), offset_at(there.point), held, target.grid)
     others = [one for cell, group in cells.items() if cell not in held for one in group]
     bezier = None
-    with contextlib.suppress(ValueError):  # the other cells span no plane
+    with contextlib.suppress(ValueError):  # the other cells are too few to fit a plane
         bezier = refit_bezier(others, target.grid)
     for cell in held:
         images: dict[str, Images] = {TWIN: drawn[cell]}
@@ -177,7 +177,7 @@ class _Ticks:
 
 
 class _Run:
-    """The searches of one twin, of which those that are known from before are not repeated."""
+    """The searches of one twin; those that an interrupted run finished are not repeated."""
 
     def __init__(self, pool: Executor, ticks: _Ticks, before: dict[str, Found], keep: Keep) -> None:
         self._pool = pool

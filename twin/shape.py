@@ -1,4 +1,4 @@
-"""Fits the mean press of each cell: mechanics, ink and place, by least squares on blurred images.
+"""Fit of mechanics, ink and place to the mean press of each cell, by least squares on blurred images.
 
 The images are blurred less from round to round: a wide blur gives the search a slope from far away, a narrow one the
 detail. The minimiser is SciPy's trust-region least squares with bounds; its derivatives are differences between brushes
@@ -22,10 +22,10 @@ from twin.constants import SHAPE, Vector, brush_at, offset_at, search_bounds
 from twin.drawing import Cell, Images, draw, still
 
 IMAGE_SD = 0.12
-"""Deviation of a blurred pixel that weighs as much as a constant one scale from its default: the deviations of
-neighbouring pixels are not independent, and a brush differs from this one in more than its constants."""
+"""Standard deviation that the fit assumes for a blurred pixel. It is large because neighbouring pixels deviate
+together, and because a real brush differs from the simulated one in more than its constants."""
 PRIOR_SD = 2.5
-"""Standard deviation of the prior, in scales: brushes of another make lie farther off than brushes of one kind."""
+"""Standard deviation of the prior, in scales; wide, because a brush of another make differs by several scales."""
 STEP = 0.3
 """Scales by which a constant is changed for its derivative."""
 EVERY = 2
@@ -38,7 +38,7 @@ FINEST_MM = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """One pass of the search: the blur, and the most steps."""
+    """One pass of the search: its blur, and its largest number of steps."""
 
     blur_mm: float
     steps: int
@@ -67,7 +67,7 @@ class Target:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Where a search stands: the point, and the seed of the individual."""
+    """The state of a search: the point, and the seed of the individual."""
 
     point: Vector
     seed: int
@@ -83,7 +83,7 @@ def start() -> Found:
 
 
 def off(target: Target, seed: int, blur_mm: float, point: Vector) -> Vector:
-    """Differences of blurred pixels between brush and captures, in `IMAGE_SD`, then the prior's."""
+    """Residuals: differences of blurred pixels between brush and captures over `IMAGE_SD`, then those of the prior."""
     base = replace(target.base, seed=seed)
     drawn = draw(still(brush_at(point, base)), offset_at(point), target.cells, target.grid)[:, 0]
     apart = blurred(drawn - target.mean, blur_mm, target.grid)
@@ -98,7 +98,7 @@ def blurred(images: Images, blur_mm: float, grid: Grid) -> NDArray[np.float64]:
 
 
 def search(target: Target, found: Found, one: Round, workers: Executor, tick: Callable[[], None]) -> Found:
-    """One pass from where the search stands; `tick` is called after each step's derivatives."""
+    """One pass, starting from `found`; `tick` is called before the derivatives of each step."""
     from scipy.optimize import least_squares  # slow to import
 
     low, high = search_bounds()
@@ -132,7 +132,7 @@ def choose_individual(target: Target, found: Found, workers: Executor) -> Found:
 
 
 def covariance(target: Target, found: Found, workers: Executor) -> NDArray[np.float64]:
-    """Covariance (constants, constants) of the point in scales, with whole cells as what varies.
+    """Covariance (constants, constants) of the point in scales, clustered by cell.
 
     The sandwich of a least-squares fit: what each cell asks to be changed, the model's own errors included, spreads
     over the cells. The prior counts as one more observation of each constant.

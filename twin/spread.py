@@ -1,4 +1,4 @@
-"""Fits how presses of one cell differ: spread, reach and bow of the tip, and stray of the hairs.
+"""Fit of how presses of one cell differ: spread, reach and bow of the tip, and stray of the hairs.
 
 Four statistics of repeats, four constants. Simulated presses have the same seeds for every brush tried.
 """
@@ -24,7 +24,7 @@ REPEATS = 6
 """Simulated presses of a cell."""
 FIRST_SEED = 500
 TIP_SHARE = 1.0 / 3.0
-"""Share of the mark, from its tip, whose middle tells the bow."""
+"""Share of the mark, from its tip, whose middle measures the bow."""
 PRIOR_SD = 2.0
 STEP = 0.3
 STEPS = 6
@@ -32,7 +32,7 @@ STEPS = 6
 
 @dataclass(frozen=True, slots=True)
 class Repeats:
-    """Captures of the cells that have several; (n, len(y_mm), len(x_mm)) each."""
+    """The cells with several captures, and their ink, (n, len(y_mm), len(x_mm)) each."""
 
     cells: tuple[Cell, ...]
     ink: tuple[Images, ...]

@@ -1,4 +1,4 @@
-"""`twin.toml`, and the notes of a run that was broken off."""
+"""`twin.toml`, and the file of an interrupted run."""
 
 from __future__ import annotations
 
@@ -55,5 +55,5 @@ def test_notes_of_other_captures_are_not_used_and_foreign_ones_are_refused(tmp_p
     other = FRESH.model_copy(update={"recording_sha256": "b" * 64})
     assert resumed(path, other) == other
     path.write_text('{"steps": 3}')
-    with pytest.raises(CalibrationError, match=r"twin\.toml\.unfinished\.json: is not the notes of a twin"):
+    with pytest.raises(CalibrationError, match=r"twin\.toml\.unfinished\.json: is not the file of an interrupted"):
         resumed(path, FRESH)
