@@ -25,9 +25,6 @@ from torch import Tensor
 from model.brush import Brush, DomainError, require_positive
 from model.outline import Outline, column, disc_integral, loop, safe_sqrt
 
-DILATIONS = {"1": 1.0, "pi/2": 0.5 * math.pi, "pi": math.pi}
-"""The values of lambda in the paper's figure 3; a fitted lambda may be any positive number."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CcdBsm:

@@ -49,7 +49,7 @@ class Parameter:
 
 PARAMETERS = (
     Parameter("lam", "1", math.pi, 1.5, 0.3, 10.0, "dilation across the axis"),
-    Parameter("h0_mm", "mm", 0.0, 2.0, -8.0, 12.0, "zero offset: the ink is that of a press so much deeper"),
+    Parameter("h0_mm", "mm", 0.0, 2.0, -8.0, 12.0, "zero offset: the ink is that of a press deeper by this much"),
     Parameter("origin_mm", "mm", 0.0, 3.0, -15.0, 15.0, "the widest place, from the point of touch"),
     Parameter("heel_gain", "1", 1.0, 4.0, 0.1, 15.0, "length of the heel side over O3A"),
     Parameter("tip_gain", "1", 1.0, 0.5, 0.1, 3.0, "length of the tip side over O4O3"),
@@ -65,7 +65,13 @@ PARAMETERS = (
     Parameter("length_tilt", "1/deg", 0.0, 0.02, -0.1, 0.1, "growth of the length with tilt"),
     Parameter("lean", "1", 1.0, 0.5, -2.0, 3.0, "share of H tan(alpha) by which the widest place moves with tilt"),
     Parameter(
-        "heel_tilt", "1/deg", 0.0, 0.03, -0.09, 0.2, "growth of the heel side with tilt, beside that of the length"
+        "heel_tilt",
+        "1/deg",
+        0.0,
+        0.03,
+        -0.09,
+        0.2,
+        "growth of the heel side with tilt, in addition to that of the length",
     ),
 )
 NAMES = tuple(parameter.name for parameter in PARAMETERS)
@@ -154,7 +160,7 @@ class FittedPress:
         return chance_within(self.edges_at(height_mm, tilt_deg, x_mm), y_mm, spread_mm)
 
     def outline(self, height_mm: float, tilt_deg: float, points: int = 97) -> Loop:
-        """The boundary through so many points of either edge (an odd number), x from the point of touch, y upward."""
+        """The boundary through `points` points of each edge (an odd number), x from the point of touch, y upward."""
         s = self.sizes(height_mm, tilt_deg)
         # Points are denser at both ends, where the outline turns fastest.
         share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, points))

@@ -46,7 +46,7 @@ def press_images(
     inside = lengths(presses, marks)
     if inside < len(presses):
         height, tilt, radius, length, dilation = presses[inside].tolist()
-        ccdbsm(Brush(radius, length), height, tilt, dilation)  # says what is wrong with it
+        ccdbsm(Brush(radius, length), height, tilt, dilation)  # raises a DomainError that names the value
         raise ValueError(f"press {inside}: H = {height:g} mm at {tilt:g} deg makes no mark")
     if origin_mm is not None and np.shape(origin_mm) not in ((2,), (len(marks), 2)):
         raise ValueError(f"origin_mm has shape {np.shape(origin_mm)}, expected (2,) or ({len(marks)}, 2)")

@@ -68,7 +68,7 @@ def written(
 ) -> Image:
     """The image of whole trajectories, each (N, 5), with marks dense enough that edges join to a tenth of a pixel.
 
-    With `drag`, strokes that travel are drawn with that model.
+    With `drag`, dragged strokes are drawn with that model.
     """
     image = np.zeros((size_px, size_px), np.float32)
     for points in strokes:

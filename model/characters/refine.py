@@ -48,7 +48,7 @@ def refine(
 ) -> Refined:
     """Adjust trajectories to an image (N, N) of the cell. `steps` = 0 leaves them unchanged.
 
-    With `drag`, strokes that travel are drawn with that model, so that the plan compensates for bristle lag.
+    With `drag`, dragged strokes are drawn with that model, so that the plan compensates for bristle lag.
     """
     size = wanted.shape[0]
     target = torch.from_numpy(wanted).double()

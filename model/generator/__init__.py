@@ -1,1 +1,1 @@
-"""The neural stroke generator: its targets, the network, the fitted field basis beside it, and what both draw."""
+"""The neural stroke generator: its targets, the network, an alternative to the network, and the shapes they draw."""

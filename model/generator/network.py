@@ -77,7 +77,7 @@ class Layers:
 
     def __post_init__(self) -> None:
         if self.size_px % self.side:
-            raise ValueError(f"size_px = {self.size_px} is no multiple of side = {self.side}")
+            raise ValueError(f"size_px = {self.size_px} is not a multiple of side = {self.side}")
 
 
 class Generator(nn.Module):

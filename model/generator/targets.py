@@ -63,7 +63,9 @@ class Target:
         if self.placement is Placement.BASE:
             known |= {spec.name: spec for spec in BASE_SPECS}
         if self.placement is Placement.ZERO_TOUCH and not {"height_mm", "tilt_deg"} <= known.keys():
-            raise ValueError(f"placement zero-touch needs height_mm and tilt_deg, which {self.model.name} has not")
+            raise ValueError(
+                f"placement zero-touch needs height_mm and tilt_deg, which {self.model.name} does not have"
+            )
         if not self.ranges:
             raise ValueError("ranges is empty: a generator needs an input")
         specs: list[ParameterSpec] = []

@@ -31,10 +31,10 @@ class Flag(StrEnum):
     ALPHA_UNKNOWN = "alpha_unknown"
     """No zero-touch anchor: shape does not determine alpha, since 1 % error of R or lambda moves it by 4.4 deg."""
     AT_BOUND = "at_bound"
-    """H, alpha or place lies at the limit of its range; its interval holds for one side at most."""
+    """H, alpha or place lies at the limit of its range; its interval is valid on one side at most."""
     UPRIGHT = "upright"
-    """alpha is 0, where its range ends because a lean to the other side is another heading. That says nothing against
-    the model: half of all upright presses are recovered so. The interval of alpha holds for one side."""
+    """alpha is 0, the end of its range: a lean to the other side is a lean at another heading. This is no sign of a bad
+    model, as half of all upright presses are recovered with 0. The interval of alpha is valid on one side only."""
     DID_NOT_CONVERGE = "did_not_converge"
     CUT = "cut"
     """The mark reaches the edge of the image; ink beyond it is unknown."""

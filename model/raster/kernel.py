@@ -17,10 +17,10 @@ from typing import Any
 import numba
 import numpy as np
 
-FURTHEST = 1e9  # px; what lies beyond, or nowhere, is refused: it has no place among whole numbers
+FURTHEST = 1e9  # px; shapes that reach beyond this, or are not finite, have no integer pixel and are refused
 TINY = 1e-300  # keeps 0 / 0 at a tangent from becoming NaN
 STRAIGHT = 1e-10  # px^2; a parabola that is flatter has a segment below a tenth of this
-ROUNDING = 5e-7  # a running sum this close to 0 or 1 between two boundaries is taken for it
+ROUNDING = 5e-7  # a running sum this close to 0 or 1 between two boundaries counts as it
 # Without reference counts: they are atomic, and cost more than the arithmetic here.
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}, "_nrt": False}
 compiled = numba.njit(**OPTIONS)
@@ -193,7 +193,7 @@ def _cells(x, y, x2, y2, sign, elliptic, shape, steps, crossings, spans):
         je = int(min(max(np.floor(xe), -1.0), size))
         spans[i, side] = min(spans[i, side], min(j, je))
         spans[i, side + 1] = max(spans[i, side + 1], max(j, je))
-        carry = 0.0  # what the cell left behind owes the cell on its right (going right), or its own (going left)
+        carry = 0.0  # ink that the previous cell passes on: to the cell on its right (going right), or to itself
         while j != je:
             edge = j + 1 if right else j
             xc, yc = float(edge), min(max(crossings[1, np.uint64(edge + 1)], y), ye)
@@ -241,7 +241,7 @@ def _fill(out, n, steps, spans):
     for i in range(size):
         row, image = steps[i], out[n, i]
         first, second = (0, 2) if spans[i, 0] <= spans[i, 2] else (2, 0)
-        # Stretches of four cells and more: the number of rounds is easier to guess, and further cells have no steps.
+        # Stretches of four cells and more: their number of rounds is easier to predict; further cells have no steps.
         a, c = spans[i, first] + 1, spans[i, second] + 1
         b, d = a + ((spans[i, first + 1] + 6 - a) & -4), c + ((spans[i, second + 1] + 6 - c) & -4)
         if b <= a:

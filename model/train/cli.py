@@ -13,12 +13,12 @@ app = typer.Typer(help="Train the neural stroke generator, tune it on captures, 
 @app.callback(invoke_without_command=True)
 def train(
     context: typer.Context,
-    out: Annotated[Path, typer.Option(help="Folder of this training; the same command goes on there.")] = Path(
+    out: Annotated[Path, typer.Option(help="Folder of this training; the same command resumes it.")] = Path(
         "generator"
     ),
     target: Annotated[str, typer.Option(help="press, anchored, all, qbc or bezier.")] = "press",
     config: Annotated[Path | None, typer.Option(help="A train.toml instead of a target's defaults.")] = None,
-    steps: Annotated[int | None, typer.Option(help="G, the most steps.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Largest number of steps, G in Algorithm 1.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of weights and images.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads of each process.")] = None,
     workers: Annotated[int | None, typer.Option(help="Threads of each process that draw images ahead.")] = None,
@@ -45,8 +45,8 @@ def tune(
     generator: Annotated[Path, typer.Argument(help="The generator.safetensors to start from.")],
     captures: Annotated[Path, typer.Argument(help="Captured strokes, a safetensors file.")],
     out: Annotated[Path, typer.Option(help="Folder of this training.")] = Path("generator-tuned"),
-    steps: Annotated[int, typer.Option(min=1, help="How many steps.")] = 300,
-    learning_rate: Annotated[float, typer.Option(min=0, max=1, help="The highest rate.")] = 3e-4,
+    steps: Annotated[int, typer.Option(min=1, help="Number of steps.")] = 300,
+    learning_rate: Annotated[float, typer.Option(min=0, max=1, help="Peak learning rate.")] = 3e-4,
     held_out: Annotated[float, typer.Option(min=0, max=1, help="Share of captures to validate on.")] = 0.2,
     seed: Annotated[int, typer.Option(min=0, help="Which captures are held out, and the order of the rest.")] = 0,
     tensorboard: Annotated[bool, typer.Option(help="Write TensorBoard's event files too.")] = False,

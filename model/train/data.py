@@ -153,5 +153,5 @@ def load_captures(path: Path, config: TrainConfig) -> tuple[Kept, str]:
             raise TrainError(path, f"{spec.name} = {float(value[bad][0]):g} is outside [{spec.low:g}, {spec.high:g}]")
         columns.append(value.float())
     for name in sorted(tensors):
-        raise TrainError(path, f"{name[:60]!r} is no input of the generator")
+        raise TrainError(path, f"{name[:60]!r} is not an input of the generator")
     return Kept(torch.stack(columns, dim=-1), images), metadata.get("source", "not stated")[:200].replace("\n", " ")
