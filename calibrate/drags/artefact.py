@@ -1,4 +1,4 @@
-"""The fitted drag model on disk, with all that predicts the strokes of another session."""
+"""The fitted drag model on disk, with everything that is needed to predict the strokes of another session."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ class DragArtefact(SessionFit):
     """A pixel counts as ink above this probability: chosen on the training strokes."""
     stamps: Stamps | None = None
     kept: Kept | None = None
-    """The training strokes, for what the lag misses; None for figures of several strokes, and before version 2."""
+    """Training strokes, from which the correction of the lag is computed; None for figures, and before version 2."""
     fitted_strokes: tuple[str, ...] = ()
-    """The strokes that were fitted: nobody is scored on them as if they were new."""
+    """The strokes that were fitted, which must not be scored as held out."""
     prior: str = ""
     """Digest of the fit whose brush was adapted to this session; empty for a fit of its own."""
     prior_session: str = ""

@@ -38,7 +38,8 @@ NODES = 28
 COMMANDS = ("length_mm", "bend_mm", "depth_mm", "depth_ends_mm", "tilt_deg")
 ENDS, SHARE_ENDS, SHARE_MID = "depth_ends_mm", "z_frac_ends", "z_frac_mid"
 SPECK_SHARE = 0.002
-"""Lower than for a press: relative to its longest stroke, a figure's dot is smaller than a drop is to a press."""
+"""Smallest share of the ink that counts as ink of a figure. It is lower than for a press, because a figure may have
+dots."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +86,7 @@ def read_drags(
     digest, strokes = recording.sha256, list(recording.stroke_records())
     where = str(recording.path)
     if not strokes or {stroke.kind for stroke in strokes} != {"drag"}:
-        raise CalibrationError(where, "holds no strokes that travel: fit its presses without --drags")
+        raise CalibrationError(where, "holds no drags: fit its presses without --drags")
     calibration = calibration_of(recording, strokes[0], digest, calibration_path)
     figures = figures_of(recording.header) if calibration is not None else {}
     ends, travel_mm = _ends(strokes)

@@ -25,7 +25,7 @@ SPREAD_MM = 0.9
 INK_ABOVE = 0.42
 """A pixel counts as ink above this probability: half of the attainable Dice score maximises its expectation."""
 PRIOR = (2.0, 0.2, 0.01, 3.0, 1.0, 4.0, 1.5, 1.5, 0.2, 0.2, 3.0, 3.0, 0.5, 0.5)
-"""How far each parameter may be from its start before it costs as much as one pixel of wrong ink."""
+"""Standard deviations of the prior: a parameter this far from its start costs as much as a pixel of wrong ink."""
 PLACE_PRIOR_MM = 1.5
 ROUNDS = 25
 UNDETERMINED = 0.5
@@ -49,7 +49,7 @@ class DragFit:
     centre: Floats = field(default_factory=lambda: DragModel().vector())
     """(14,) parameters that the prior pulls towards."""
     scale: Floats = field(default_factory=lambda: np.array(PRIOR))
-    """(14,) how far each may be from there."""
+    """(14,) standard deviations of the prior."""
     squares: Floats = field(default_factory=lambda: np.zeros((0, 0, 0)))
     """(images, P, P) scaled J'J of each image at the end, for the P free parameters."""
     gradients: Floats = field(default_factory=lambda: np.zeros((0, 0)))
@@ -168,7 +168,7 @@ def fit_drags(
 def bootstrap(fit: DragFit, draws: int = 500, seed: int = 0) -> Floats:
     """(draws, P) values of the free parameters, by bootstrap over images; a draw is one Gauss-Newton step from the fit.
 
-    With fewer than some 8 images the intervals are too short.
+    With fewer than about 8 images the intervals are too short.
     """
     at = [DragModel.names().index(name) for name in fit.free]
     scale, found = fit.scale[at], fit.model.vector()[at]

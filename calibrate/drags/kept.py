@@ -1,4 +1,4 @@
-"""Training strokes kept in an artefact, as packed bits: what a kernel ridge predicts from.
+"""Training strokes kept in an artefact, as packed bits, from which a kernel ridge predicts.
 
 Files come from elsewhere: sizes are checked before anything is unpacked.
 """
@@ -22,9 +22,9 @@ Floats = NDArray[np.float64]
 
 MOST_STROKES = 200
 MOST_PIXELS = 400_000
-"""Of one stroke's image."""
+"""Largest number of pixels of one stroke's image."""
 MOST_BYTES = 400_000
-"""Of the packed images in base64."""
+"""Largest size of the packed images in base64."""
 MOST_UNPACKED = 100_000_000
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 

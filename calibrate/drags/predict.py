@@ -26,8 +26,8 @@ FIT_MM = 0.8
 """Scale of the images that the parameters are fitted to: finer ones do not change the fit."""
 STAMP_SPREAD_MM = 1.5
 STAMP_ABOVE = (0.22, 0.26, 0.3, 0.34, 0.38, 0.42)
-"""What the stamps lack varies more, so they get an edge spread of their own, and the threshold that is best for them on
-the training strokes."""
+"""Thresholds tried for circle stamps, of which the best on the training strokes is used. The errors of stamps vary more
+than those of the lag, so their edge spread differs, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class Predictor:
         return self.kept.placed(change, drawn.x_mm, drawn.y_mm)
 
     def is_ink(self, away_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Whether a signed distance is called ink."""
+        """Whether a pixel at this signed distance counts as ink."""
         return chance(np.asarray(away_mm, np.float64), self.spread_mm) > self.above
 
 

@@ -1,7 +1,7 @@
 """What a drag model misses, learned from its training strokes by kernel ridge regression on clipped signed distances.
 
-The chance from which a pixel is called ink follows from how well each training stroke is predicted by the others, which
-a ridge gives in closed form: half of the attainable Dice score maximises its expectation.
+The probability above which a pixel counts as ink is half of the attainable Dice score, which maximises that score's
+expectation. It is estimated by how well each training stroke is predicted from the others, in closed form for a ridge.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, chance
 Floats = NDArray[np.float64]
 
 REACH_MM = 6.0
-"""Where the signed distance levels off: far from the edge it says nothing."""
+"""Distance at which signed distances level off, because far from the edge they carry no information."""
 SPREADS = 2.2
 """Width of the kernel in standard deviations of each column of the training commands."""
 TILT_SPREADS = 5.0
@@ -27,7 +27,7 @@ TILT_SPREADS = 5.0
 RIDGE = 1.0
 LEAST_ABOVE, MOST_ABOVE = 0.3, 0.46
 LEAST = 8
-"""Fewer training strokes say too little about the threshold."""
+"""With fewer training strokes the threshold is not estimated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class Residual:
         return Residual(commands, scales, _solved(_gram(commands, scales, ridge), _flat(captured_mm) - _flat(base_mm)))
 
     def add(self, commands: Floats, base_mm: Floats) -> Floats:
-        """The corrected signed distances, (B, h, w), of the model's."""
+        """The model's signed distances (B, h, w), corrected."""
         found = _flat(base_mm) + _kernel(commands, self.commands, self.scales) @ self.weights
         return np.asarray(found, np.float64).reshape(base_mm.shape)
 
@@ -54,7 +54,7 @@ class Residual:
 def threshold(
     commands: Floats, base_mm: Floats, captured_mm: Floats, stride: int = 2, spread_mm: float = SPREAD_MM
 ) -> float:
-    """The chance above which a pixel counts as ink: half the mean CSIM of training strokes predicted from the others.
+    """The probability above which a pixel is ink: half the mean CSIM of training strokes predicted from the others.
 
     `INK_ABOVE` for fewer than `LEAST` strokes.
     """
@@ -100,7 +100,7 @@ def _gram(commands: Floats, scales: Floats, ridge: float) -> Floats:
 
 
 def _left_out(gram: Floats, target: NDArray[np.float32]) -> NDArray[np.float32]:
-    """By how much each row of `target` is missed if a ridge is fitted to the others."""
+    """The error in each row of `target` of a ridge that is fitted to the other rows."""
     inverse = np.asarray(np.linalg.solve(gram, np.eye(len(gram))), np.float64)
     return np.asarray((inverse @ target) / np.diag(inverse)[:, None], np.float32)
 

@@ -1,7 +1,7 @@
 """Fit dragged strokes of a session: parameters with intervals, held-out scores, and the artefact.
 
-A brush known from another session is adapted by its place and its width, which change whenever a brush is mounted and
-its zero set, and within narrow bounds by its leash and by what grows with depth, as another session may go deeper.
+A brush known from another session is adapted in its place and its width, which change whenever a brush is mounted and
+its zero touch is found. Its leash and the terms that grow with depth are adapted within narrow bounds.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ SESSION_MM = {"drift_x_mm": 1.0, "drift_y_mm": 1.0, "half_mm": 0.4}
 """How far place and half width change from one session to another of the same brush (standard deviation)."""
 LEASH_MM = 2.0
 GROWTH_MM = {"half_per_mm": 0.5, "leash_per_mm": 2.0, "drift_x_per_mm": 0.5, "drift_y_per_mm": 0.5}
-"""The same for the leash, and for what grows with depth, at the deepest stroke that the brush was fitted to."""
+"""The same for the leash, and for the terms that grow with depth at the known brush's deepest stroke."""
 STROKE_MM2 = 0.14
-"""Weight of a square millimetre of wrong ink in such a fit: one stroke then tells its place to about 1 mm, which is how
-far strokes of one session scatter."""
+"""Weight of a square millimetre of wrong ink in such a fit. One stroke then determines the place to about 1 mm, as far as
+strokes of one session scatter."""
 DEPTH = COMMANDS.index("depth_mm")
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -102,8 +102,8 @@ def refit_drawn(drawn: Drawn, prior: DragArtefact, where: str, strokes: int) -> 
 def different(drawn: Drawn, among: Indices, count: int) -> Indices:
     """`count` images among these whose commands are as different as possible, the most ordinary one first.
 
-    Strokes of one kind would pass off what the model misses of that kind as a change of the brush's place. Figures have
-    no commands: of them, the first are taken. Raises ValueError if there are fewer images.
+    With strokes of one kind, the model's error for that kind would look like a change of the brush's place. Figures
+    have no commands, so the first ones are taken. Raises ValueError if there are fewer images.
     """
     if drawn.commands is None:
         return among[:count]
@@ -114,7 +114,7 @@ def different(drawn: Drawn, among: Indices, count: int) -> Indices:
 
 
 def adapt(drawn: Drawn, images: Indices, known: Predictor) -> DragFit:
-    """Fit what changes with a session to these images, on top of what the known brush is known to miss."""
+    """Fit the parameters that change with a session to these images; the known brush's correction is kept."""
     paths, groups = chosen(drawn, images)
     ink, x_mm, y_mm = coarse(drawn, images)
     weights = drawn.weights[images] * STROKE_MM2 * float(x_mm[1] - x_mm[0]) ** 2
@@ -136,7 +136,7 @@ def adapt(drawn: Drawn, images: Indices, known: Predictor) -> DragFit:
 def session_change(known: Predictor) -> dict[str, float]:
     """How far each parameter may change with a session (standard deviation).
 
-    What grows with depth is free only where the depth of the strokes is known that the brush was fitted to.
+    Terms that grow with depth are free only if the depths of the strokes that the brush was fitted to are known.
     """
     deepest = max(row[DEPTH] for row in known.kept.commands) if known.kept is not None else 0.0
     if deepest <= 0.0:
@@ -155,7 +155,7 @@ def save(fitted: FittedDrags, session: Path) -> Path:
 
 
 def _values(fit: DragFit) -> dict[str, FittedValue]:
-    """All parameters; those that the strokes do not determine have no interval, nor does any parameter of one image."""
+    """All parameters. Those that the strokes do not determine have no interval; with one image, none has."""
     low, high = np.quantile(bootstrap(fit), [0.025, 0.975], axis=0)
     known = determined(fit)
     values = {

@@ -42,7 +42,7 @@ class BrushFit(SessionFit):
     """Missing in files of earlier versions, whose edges also lack the last term."""
     stages: tuple[FittedStage, ...]
     from_strokes: dict[str, float] = Field(default_factory=dict[str, float])
-    """Share of each parameter's variance among known brushes that the strokes took away; missing in earlier files."""
+    """Share of each parameter's prior variance that the strokes removed; missing in earlier files."""
     proportional_h0_mm: float
     """Absolute zero offset, with every size held proportional to depth; see docs/brushfit.md."""
     proportional_h0_se_mm: float

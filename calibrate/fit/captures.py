@@ -56,7 +56,7 @@ def read_presses(
     digest = recording.sha256
     strokes = list(recording.stroke_records())
     if not strokes or {stroke.kind for stroke in strokes} != {"press"}:
-        raise CalibrationError(str(recording.path), "holds no presses, or strokes that travel, which --drags fits")
+        raise CalibrationError(str(recording.path), "holds no presses, or holds drags, which --drags fits")
     calibration = calibration_of(recording, strokes[0], digest, calibration_path)
     params = Params(**calibration.preprocess) if calibration else Params()
     pressed: list[Pressed] = []

@@ -32,7 +32,7 @@ def fit(
     correction: Annotated[bool, typer.Option("--correction", help="Print the zero-touch offset for rig.toml.")] = False,
     reference: Annotated[Path | None, typer.Option(help="An earlier fit of this brush, for --correction.")] = None,
     drags: Annotated[
-        bool, typer.Option("--drags", help="Fit bristle lag to strokes that travel; writes dragfit/<hash>.json.")
+        bool, typer.Option("--drags", help="Fit bristle lag to drags; writes dragfit/<hash>.json.")
     ] = False,
     prior: Annotated[
         Path | None, typer.Option(help="With --drags: a dragfit of this brush, whose place and width are adapted.")
@@ -154,8 +154,8 @@ def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
         out.add_row(name, *start, f"{found.value:.3f}", f"{found.low:.3f} to {found.high:.3f}", f"{share:.0%}")
     yield out
     yield (
-        "The intervals hold within the model. “From strokes” is the share of the variance among known brushes that "
-        "these strokes took away; at 0 % value and interval are those of known brushes."
+        "The intervals assume that the model is right. “From strokes” is the share of the variance among known brushes "
+        "that these strokes removed; at 0 %, value and interval are those of known brushes."
     )
     out = Table("stage", "condition", title="condition numbers")
     for stage in artefact.stages:
@@ -173,7 +173,7 @@ def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
 def _correction(found: Correction) -> Iterator[str]:
     low, high = found.lift_interval_mm
     if found.reference:
-        yield f"Zero touch relative to the fit of {found.reference}, all other parameters of the brush fixed:"
+        yield f"Zero touch relative to the fit of {found.reference}, with all other parameters of the brush fixed:"
     else:
         yield (
             "Absolute zero touch: where the sizes of the marks, assumed proportional to depth, become zero. "

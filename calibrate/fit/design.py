@@ -1,4 +1,4 @@
-"""The order in which the cells of a grid tell most about a brush, whatever the brush: a fixed design."""
+"""A fixed order of a grid's cells in which the first few already describe any brush well."""
 
 from __future__ import annotations
 

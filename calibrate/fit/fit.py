@@ -1,7 +1,7 @@
 """Least squares of `model.fitted` on coverage images with a prior, and a condition number for each stage. No torch.
 
 No press repeats exactly: width, place and lengths differ from press to press, each by one amount along the whole mark.
-These strays (`STRAYS`) are integrated out of the likelihood, linearised at the fit.
+These differences (`STRAYS`) are integrated out of the likelihood, linearised at the fit.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ ROUNDS = 40
 STEP = 1e-4
 """Step of a derivative, as a share of the parameter's spread."""
 STRAYS = {"lam": 0.09, "origin_mm": 0.3, "heel_gain": 0.3, "tip_gain": 0.04}
-"""Standard deviations by which single presses of a brush differ: some 5 % of width and lengths, .3 mm of place."""
+"""Standard deviations by which single presses of a brush differ: about 5 % of width and lengths, 0.3 mm of place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class Stage:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A brush fitted to presses, with what the strokes tell of its parameters."""
+    """A brush fitted to presses, and how well the strokes determine its parameters."""
 
     press: FittedPress
     free: tuple[str, ...]
@@ -72,7 +72,7 @@ class Fit:
 
     @property
     def from_strokes(self) -> Floats:
-        """Share of each free parameter's variance before the fit that the strokes took away, (P,), 0 to 1."""
+        """Share of each free parameter's prior variance that the strokes removed, (P,), 0 to 1."""
         at = [NAMES.index(name) for name in self.free]
         before = np.diag(_inverse(self.prior.precision[np.ix_(at, at)]))
         return 1.0 - (self.errors / spreads()[at]) ** 2 / before
@@ -89,7 +89,7 @@ def fit_presses(
     prior: Prior | None = None,
     progress: Progress = unseen,
 ) -> Fit:
-    """Fit the parameters of the stages, then what they cannot express. The prior is the learned one by default.
+    """Fit the parameters of the stages, then the residual that they cannot express. By default the prior is `learned`.
 
     Parameters that the strokes do not determine have the values and the deviations that the prior expects.
     Raises ValueError without a stroke.
@@ -122,7 +122,7 @@ def refit(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> FittedP
 
 
 def zero_touch(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> tuple[FittedPress, Floats]:
-    """Fit only depth and place of the zero touch, all else of the brush held: what changed since `press` was fitted.
+    """Fit only depth and place of the zero touch, with all other parameters held, to see how they changed.
 
     Returns the brush and the standard deviations of (h0_mm, origin_mm).
     """

@@ -67,7 +67,7 @@ def leave_cell_out(fit: Fit, strokes: Sequence[Pressed], grid: Grid, progress: P
             FITTED: predictor(refit(fit.press, others, grid), grid)(*cell),
             UNCALIBRATED: image_of(published.outline(*cell), grid),
         }
-        with contextlib.suppress(ValueError):  # the other cells span no plane
+        with contextlib.suppress(ValueError):  # the other cells are too few to fit a plane
             images[BEZIER] = image_of(refit_bezier(others, grid).outline(*cell), grid)
         scores.add(held, images)
     return scores.rows((CEILING, FITTED, BEZIER, UNCALIBRATED))
@@ -121,7 +121,7 @@ def image_of(loop: Loop, grid: Grid) -> Images:
 
 
 def refit_bezier(strokes: Sequence[Pressed], grid: Grid) -> RefittedBezier:
-    """Measure each stroke's ends, width and area, and regress. Raises ValueError where the cells span no plane."""
+    """Measure each stroke's ends, width and area, and regress. Raises ValueError for too few cells to fit a plane."""
     rows: list[tuple[float, float, float, float]] = []
     for stroke in strokes:
         ink = stroke.ink > 0.5

@@ -4,7 +4,7 @@ Each stroke is compared with the fitted parameters: how much further its tip and
 of its edges differs from the profile. Over the strokes, each of these numbers is a polynomial in depth and tilt plus
 the stroke's own deviation. The scales of the polynomial's constant, of its other terms and of the deviations are those
 with the greatest marginal likelihood on a grid (D. MacKay, "Bayesian interpolation", 1992), with a weak prior on each
-scale. So strokes that repeat badly are smoothed, and strokes that repeat well are followed.
+scale. So the fit smooths strokes that repeat badly and follows strokes that repeat well.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from model.fitted import MODES, TERMS, FittedPress, command_terms, modes
 Floats = NDArray[np.float64]
 
 TERM_SCALE = (1.0, 1.0, 0.8, 0.5, 0.5, 0.5)
-"""Expected size of a term, beside the scale of the constant for the first and that of the others for the rest."""
+"""Expected sizes of the terms: the first in units of the constant's scale, the rest in units of the others' scale."""
 CONSTANT = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 OTHERS = (0.03, 0.07, 0.15, 0.3, 0.6, 1.2)
 OWN = (0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8)
@@ -49,7 +49,7 @@ def fit_residual(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> 
 
 
 def regress(seen: Floats, terms: Floats, scale: Floats) -> Floats:
-    """Coefficients (K, TERMS) of K numbers `seen` (strokes, K) that are expected to be of the sizes `scale` (K,)."""
+    """Coefficients (K, TERMS) of the polynomials for K numbers `seen` (strokes, K), of expected sizes `scale` (K,)."""
     count = len(seen)
     square, right = terms.T @ terms, terms.T @ (seen / scale)
     total = float(np.sum((seen / scale) ** 2))

@@ -28,13 +28,13 @@ class Correction:
     """Difference between the zero touch that the ink shows and the rig's; 95 % intervals."""
 
     lift_mm: float
-    """Add to `paper.touch_z_mm`: positive where the paper is met higher than the rig believes."""
+    """Add to `paper.touch_z_mm`: positive if the paper is higher than the rig believes."""
     lift_interval_mm: tuple[float, float]
     along_mm: float
     """Offset of the ink along the heading from where it should lie."""
     along_interval_mm: tuple[float, float]
     reference: str
-    """The fit that it is measured against; empty for a brush whose sizes are proportional to depth."""
+    """The fit that it is measured against; empty if every size is instead assumed proportional to depth."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,15 +21,15 @@ def invert(
     lam: Annotated[float | None, typer.Option(min=0.1, max=10, help="lambda of CCD-BSM; pi when left out.")] = None,
     height_range: Annotated[tuple[float, float], typer.Option(help="Depths to look for, mm.")] = (2.0, 30.0),
     tilt_range: Annotated[tuple[float, float], typer.Option(help="Tilts to look for, deg; at most 30.")] = (0.0, 30.0),
-    anchor_sd: Annotated[float, typer.Option(min=0, max=5, help="How well the touch point is known, mm.")] = 0.1,
+    anchor_sd: Annotated[float, typer.Option(min=0, max=5, help="Standard deviation of the touch point, mm.")] = 0.1,
     assume_tilt: Annotated[float, typer.Option(min=0, max=30, help="alpha where there is no anchor, deg.")] = 0.0,
     mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = MM_PER_PX,
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
     presses: Annotated[
-        int | None, typer.Option(min=1, help="Only so many presses, spread evenly over the session.")
+        int | None, typer.Option(min=1, help="Only this many presses, spread evenly over the session.")
     ] = None,
-    repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often the protocol presses each again.")] = 1,
-    seed: Annotated[int, typer.Option(min=0, help="Of the order in which the protocol presses.")] = 1,
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="How many times the protocol presses each stroke.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the order in which the protocol presses.")] = 1,
 ) -> None:
     """Recover depth and tilt of every captured press; writes a CSV and a protocol that presses them again."""
 
@@ -79,8 +79,8 @@ def invert(
         unit = "mm" if name == "H" else "deg"
         say(f"{name}: recovered - commanded {mean:+.3f} {unit}, sd {sd:.3f}; {inside:.0%} of {n} in the interval")
     say(
-        "alpha is known from how far the mark lies from the zero-touch point, as far as the model places it; "
-        "it cannot be known from the shape of the mark alone."
+        "alpha follows from how far the mark lies from the zero-touch point, and is as accurate as the model's "
+        "prediction of that distance; the shape of the mark alone does not determine it."
     )
     bare = sum(NO_MODEL_ERROR in row.flags for row in made.rows)
     if bare:
@@ -88,15 +88,15 @@ def invert(
     for name, flag in NOT_INFORMATIVE.items():
         vague = sum(flag in row.flags for row in made.rows)
         if vague:
-            say(f"warning: {vague} not informative on {name}: the interval covers most of what the session commanded")
+            say(f"warning: {vague} not informative on {name}: the interval covers most of the commanded range")
     unknown = sum("alpha_unknown" in row.flags for row in made.rows)
     if unknown:
-        say(f"warning: {unknown} without a zero-touch anchor: their alpha is assumed, shape does not tell it")
+        say(f"warning: {unknown} without a zero-touch anchor: alpha is assumed, because shape does not determine it")
     bound = sum("at_bound" in row.flags for row in made.rows)
     if 2 * bound > len(made.rows):
         say(f"warning: {bound} at a bound: the model does not fit this brush; do not press these again")
     elif bound:
-        say(f"warning: {bound} at a bound of the range: their interval holds for one side at most")
+        say(f"warning: {bound} at a bound of the range: their intervals are valid on one side at most")
     for stroke_id, why in made.refused:
         say(f"not used: {stroke_id}: {why}")
     say(str(out), str(protocol))

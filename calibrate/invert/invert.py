@@ -36,11 +36,11 @@ from sessions.recording.schemas import Header, Stroke
 
 _T = TypeVar("_T")
 NO_MODEL_ERROR = "no_model_error"
-"""Flag of a press whose deviations say only how well its image identifies it within the model."""
+"""Flag of a press whose standard deviations leave out the error of the model."""
 NOT_INFORMATIVE = {"H": "height_not_informative", "alpha": "tilt_not_informative"}
 """Flags of a value whose 95 % interval covers most of the range that was commanded in the session."""
 MOST = 0.8
-"""How much of that range."""
+"""Share of that range from which on an interval is not informative."""
 BATCH = 64
 USELESS = frozenset({Flag.BLANK, Flag.DID_NOT_CONVERGE, Flag.CUT})
 """Flags that exclude a stroke: it is listed with the reason and not pressed again."""
@@ -90,7 +90,7 @@ class Inversion:
     settings: Settings
     rows: list[Row]
     refused: list[tuple[str, str]]
-    """(stroke, why), never dropped in silence."""
+    """(stroke, reason) of each stroke that was not recovered."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +147,7 @@ def invert_recording(
 
 
 def with_model_error(rows: Sequence[Row], fitted: Collection[Cell] = ()) -> list[Row]:
-    """The rows with model error in their deviations, flagged where it is unknown and where an interval says little.
+    """The rows with the model error added to their standard deviations, and flags for unknown or wide intervals.
 
     `fitted` are the cells that the model was fitted to.
     """
@@ -251,7 +251,7 @@ def _file(made: Inversion, batch: list[AlignedStroke], found: Recovered) -> None
 def _unnameable(ident: str, taken: set[str]) -> str:
     """Reason why a protocol cannot press a stroke of this name again; empty if it can."""
     if ident in taken:
-        return "its name stands for two strokes"
+        return "its name is that of another stroke too"
     if not 1 <= len(ident) <= 100 or not ident.isprintable() or any(c in ' /\\<>:"|?*' for c in ident):
         return "its name cannot stand in a protocol"
     return "its name cannot stand in a protocol" if ident[0] in ".-~" else ""

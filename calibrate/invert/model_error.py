@@ -1,4 +1,4 @@
-"""Model error of recovered presses, from how far those of other cells lie from their commands.
+"""Model error of recovered presses, estimated from how far presses of other cells lie from their commands.
 
 The interval of one image says how well that image identifies a press within the model. How far the model and the
 brush's own variation move a recovered value is seen only where the command is known: a variance that is common to the
@@ -30,9 +30,9 @@ ROUNDS = 100
 def model_sd(off: Floats, sd: Floats, cells: list[Cell], fitted: Collection[Cell] = ()) -> Floats:
     """Standard deviation of the model error of N presses, (N,); NaN where too few other cells are known.
 
-    `off` (N,) is recovered - commanded, NaN where no command is known, and `sd` (N,) that of the image alone. `fitted`
-    are the cells that the brush was fitted to. The deviation is enlarged so that 1.96 of it hold 95 % with so few
-    cells, by Student's t with a degree of freedom for each cell.
+    `off` (N,) is recovered - commanded, NaN where no command is known; `sd` (N,) is the standard deviation from the
+    image alone. `fitted` are the cells that the brush was fitted to. The result is enlarged by Student's t with a degree
+    of freedom for each cell, so that 1.96 times it covers 95 % with few cells.
     """
     out = np.full(len(off), np.nan)
     known = np.isfinite(off) & np.isfinite(sd)

@@ -1,1 +1,1 @@
-"""Validation at any scale: every model against every captured press, and what comes out of it."""
+"""Validation: every model compared with every captured press, and the report."""

@@ -68,7 +68,7 @@ def similarity_by_strokes(outcome: Outcome, scheduler: Scheduler, progress: Prog
 
 
 def fit_job(job: RefitJob) -> dict[str, Any]:
-    """Fit as `refit_job` does, but from scratch: the fit itself finds what few strokes can determine."""
+    """Fit as `refit_job` does, but from the prior instead of from a fit to the whole session."""
     strokes, grid = cropped(job)
     press = fit_presses(strokes, grid, job.radius_mm, job.length_mm).press
     return {"fitted": press_body(press), "bezier": bezier_body(strokes, grid)}

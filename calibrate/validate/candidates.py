@@ -1,6 +1,6 @@
 """The models compared with captures: every registered one, the fitted brush, refits to other cells, generators.
 
-Models need torch, which takes seconds to load, so that they are imported when the first is made.
+Models need torch, which takes seconds to load; therefore they are imported when the first one is made.
 """
 
 from __future__ import annotations
@@ -159,5 +159,5 @@ def _of_model(model: StrokeModel, basis: str, view: Field, name: str = "", label
 def _of_cell(fits: dict[Cell, dict[str, Any]], height_mm: float, tilt_deg: float, what: str) -> Any:
     found = fits.get((height_mm, tilt_deg), {}).get(what)
     if found is None:
-        raise DomainError("height_mm", height_mm, "other cells", "the other cells do not determine it")
+        raise DomainError("height_mm", height_mm, "other cells", "the other cells do not determine this press")
     return found

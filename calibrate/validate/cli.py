@@ -103,7 +103,7 @@ def validate(
 @app.command()
 def diff(
     before: Annotated[Path, typer.Argument(help="A report.json, or a session that was validated.")],
-    after: Annotated[Path, typer.Argument(help="Another.")],
+    after: Annotated[Path, typer.Argument(help="A report.json or session to compare it with.")],
     json: Annotated[bool, typer.Option("--json", help="Print every series as JSON.")] = False,
 ) -> None:
     """Show what got better or worse between two reports, sessions or software versions, by a paired test."""

@@ -135,7 +135,7 @@ def sentences(found: Difference) -> Iterator[str]:
     yield f"Before: {_named(found.before)}, brushloop {versions[0]}. After: {_named(found.after)}, {versions[1]}."
     what = "the same stroke" if found.paired_by == "stroke" else "the average of the same (H, α)"
     yield (
-        f"Paired by {what}, n = {found.changes[0].test.n}; p by flipping signs, corrected by Holm for "
+        f"Paired by {what}, n = {found.changes[0].test.n}; p by a sign-flip test, corrected by Holm for "
         f"{len(found.changes)} series ({found.before.label})."
     )
     if found.paired_by == "cell":

@@ -70,7 +70,7 @@ def folds(cells: Sequence[Cell], most: int = MAX_FOLDS) -> list[list[Cell]]:
 
 
 def refit_job(job: RefitJob) -> dict[str, Any]:
-    """Fit `fitted` (values, edges) and `bezier` (coefficients), each None if the strokes do not determine it."""
+    """Fit `fitted` (values, edges) and `bezier` (coefficients), each None if there are too few strokes for it."""
     strokes, grid = cropped(job)
     out: dict[str, Any] = {"fitted": None}
     if job.start is not None:
@@ -85,7 +85,7 @@ def press_body(press: FittedPress) -> dict[str, Any]:
 
 
 def bezier_body(strokes: Sequence[Pressed], grid: Grid) -> list[float] | None:
-    """A refitted Bezier as plain data; None if the cells do not span a plane."""
+    """A refitted Bezier as plain data; None if the cells are too few to fit a plane."""
     try:
         coefficients = refit_bezier(strokes, grid).plane.coefficients
     except ValueError:

@@ -106,8 +106,8 @@ def prepare_job(job: PrepareJob) -> Press:
 
 
 def read_job(job: ReadJob) -> Press | None:
-    """Read a capture and prepare it; None where it does not follow the stroke before, as our recordings have it."""
-    from calibrate.validate.sources import opened  # what prepares alone needs no URLs
+    """Read a capture and prepare it; None if it does not directly follow its stroke, as in a recording of ours."""
+    from calibrate.validate.sources import opened  # not needed by jobs that get their photograph
 
     try:
         capture = capture_at(opened(job.session, job.sha256), job.place)

@@ -116,7 +116,7 @@ def validate(request: Request, progress: Progress) -> ValidationOutput:
 def check(output: ValidationOutput, request: Request) -> None:
     """Check the gates. Raises `GateMissed` if any is missed."""
     if request.gates and output.report is None:
-        raise CalibrationError("--gate", "applies to presses; these strokes travel")
+        raise CalibrationError("--gate", "applies to presses; these are drags")
     if output.report is not None:
         check_gates(output.report, [parse_gate(text) for text in request.gates])
 
@@ -136,7 +136,7 @@ def _kind(sessions: list[LoadedSession], request: Request) -> str:
     [kind] = kinds
     for option, paths in (("--loop", request.extras.loops), ("--written", request.extras.written)):
         if paths and kind == "drag":
-            raise CalibrationError(option, "is for a report of presses; these strokes travel")
+            raise CalibrationError(option, "is for a report of presses; these are drags")
     return kind
 
 

@@ -63,7 +63,7 @@ class Threads(AbstractContextManager["Threads"]):
         cv2.setNumThreads(1)
 
     def opens(self, session: str, sha256: str) -> bool:
-        """Never: what this process reads costs the threads nothing."""
+        """Never: threads share what this process reads."""
         return False
 
     def run(self, function: Callable[[J], R], jobs: Iterator[tuple[str, J]]) -> Iterator[tuple[str, R]]:
@@ -112,7 +112,7 @@ class Dask(AbstractContextManager["Dask"]):
         except (OSError, ValueError, TypeError, ImportError) as error:
             raise ClusterError(f"--scheduler {address}: no Dask scheduler there ({_line(error)})") from None
         self.notes: list[str] = []
-        """What a person should know of how the work was done."""
+        """Remarks for the user on how the work was done."""
         try:
             self.workers = self._check(address)
         except BaseException:

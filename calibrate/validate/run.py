@@ -61,7 +61,7 @@ class Outcome:
     """Compared strokes, by session and order of capture."""
     scores: Scores
     refused: list[tuple[str, str, str]]
-    """(session, stroke, why) of strokes that could not be used, by all models or one. None is dropped silently."""
+    """(session, stroke, reason) of strokes that could not be used, or that one of the models does not predict."""
     store: Store
 
 
@@ -87,7 +87,7 @@ def validate_presses(
 def _validate(
     sessions: list[LoadedSession], options: Options, scheduler: Scheduler, store: Store, work: Path, progress: Progress
 ) -> Outcome:
-    # What is named is checked before hours of work begin; what is not waits, because models take seconds to load.
+    # Models that the user names are checked before hours of work begin; otherwise they are loaded later.
     known = _known(sessions, options) if options.models or options.generators else []
     refused: list[tuple[str, str, str]] = []
 

@@ -13,7 +13,6 @@ from calibrate.validate.report.data import CandidateInfo, Report, Stat
 from calibrate.validate.run import CEILING, REPEATED
 from calibrate.writing.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED, Table3Row, WrittenRecord
 
-CALIBRATED = (who.FITTED_HELD_OUT, who.FITTED, who.BEZIER_REFITTED)
 MISSING = {
     "ccd-bsmg": "not in this run: give a trained one with --generator",
     REPEATED: "not in this run: “brushloop loop SESSION --config RIG” presses recovered strokes again; then validate "

@@ -47,7 +47,7 @@ def test_a_brush_of_the_family_is_found_again() -> None:
 
 
 def known(strokes: list[Pressed], name: str) -> tuple[float, float]:
-    """Standard deviation of a parameter, and the share of its variance that the strokes took away."""
+    """Standard deviation of a parameter, and the share of its variance that the strokes removed."""
     fit = fit_presses(strokes, GRID, 6.0, 48.0, residual=False)
     at = fit.free.index(name)
     return float(fit.errors[at]), float(fit.from_strokes[at])

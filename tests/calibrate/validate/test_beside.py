@@ -316,8 +316,8 @@ def test_strokes_that_travel_have_no_such_tables(
     drags = tmp_path / "drags"
     import_photographs(photos, photos / "strokes.csv", drags, ImportOptions(kind="drag"), "test", lambda: 1)
     loop = put(tmp_path / "l", a_loop().to_json())
-    assert refused(drags, "--loop", loop) == "--loop: is for a report of presses; these strokes travel"
-    assert refused(drags, "--written", loop) == "--written: is for a report of presses; these strokes travel"
+    assert refused(drags, "--loop", loop) == "--loop: is for a report of presses; these are drags"
+    assert refused(drags, "--written", loop) == "--written: is for a report of presses; these are drags"
     assert not (drags / "validation").exists()
 
 
