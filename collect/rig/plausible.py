@@ -122,12 +122,6 @@ def board_rim(board_mm: tuple[float, float], origin_mm: tuple[float, float], she
     return within("board around the sheet", min(rims), 8.0, math.inf, "mm", remedy)
 
 
-def sheet_slope(slope_deg: float) -> Check:
-    """How far the sheet leans from level."""
-    remedy = "A table leans less: one of the touched points was not on the paper, or the base is tilted."
-    return within("slope of the sheet", slope_deg, 0.0, 3.0, "deg", remedy)
-
-
 def touch_height(points: int, method: str) -> Check:
     """How the height of the paper is known."""
     if method == "taught":
