@@ -35,8 +35,8 @@ LEASH_MM = 2.0
 GROWTH_MM = {"half_per_mm": 0.5, "leash_per_mm": 2.0, "drift_x_per_mm": 0.5, "drift_y_per_mm": 0.5}
 """The same for the leash, and for the terms that grow with depth at the known brush's deepest stroke."""
 STROKE_MM2 = 0.14
-"""Weight of a square millimetre of wrong ink in such a fit. One stroke then determines the place to about 1 mm, as far as
-strokes of one session scatter."""
+"""Weight of a square millimetre of wrong ink in such a fit. One stroke then determines the place to about 1 mm, as far
+as strokes of one session scatter."""
 DEPTH = COMMANDS.index("depth_mm")
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
