@@ -31,8 +31,8 @@ def model_sd(off: Floats, sd: Floats, cells: list[Cell], fitted: Collection[Cell
     """Standard deviation of the model error of N presses, (N,); NaN where too few other cells are known.
 
     `off` (N,) is recovered - commanded, NaN where no command is known; `sd` (N,) is the standard deviation from the
-    image alone. `fitted` are the cells that the brush was fitted to. The result is enlarged by Student's t with a degree
-    of freedom for each cell, so that 1.96 times it covers 95 % with few cells.
+    image alone. `fitted` are the cells that the brush was fitted to. The result is enlarged by Student's t with a
+    degree of freedom for each cell, so that 1.96 times it covers 95 % with few cells.
     """
     out = np.full(len(off), np.nan)
     known = np.isfinite(off) & np.isfinite(sd)
