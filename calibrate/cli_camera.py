@@ -76,14 +76,18 @@ def intrinsics(
     from calibrate.board.spec import describe
     from calibrate.errors import CalibrationError
     from calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
+    from calibrate.pages.lens import MAX_THUMBNAILS, Thumbnail, thumbnail, write_lens_page
     from sessions.progress import counted, shown
 
     made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
     seen, unusable, digests = list[BoardView](), dict[str, str](), dict[str, str]()
+    small = dict[str, Thumbnail]()
     given = named(photographs)
     with shown() as progress:
         for name, path in counted(given.items(), "photographs searched for the board", len(given), progress):
             image = read_gray(path)
+            if len(small) < MAX_THUMBNAILS:
+                small[name] = thumbnail(image)
             digests[name] = hashlib.sha256(read_bounded(path, MAX_PHOTOGRAPH_BYTES)).hexdigest()
             try:
                 seen.append(find_board(image, made, name))
@@ -107,7 +111,8 @@ def intrinsics(
     )
     for line in (*(f"warning: {w}" for w in file.warnings), *(f"to do: {g}" for g in file.guidance)):
         say(line)
-    say(str(file.save(out)))
+    path = file.save(out)
+    say(str(path), f"Page: {write_lens_page(path, file, fitted, seen, small)}")
 
 
 @app.command()

@@ -12,8 +12,12 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop import app
-from calibrate.board.lens import Gray
+from calibrate.board.artefact import lens_file
+from calibrate.board.detect import BoardView
+from calibrate.board.intrinsics import fit_lens
+from calibrate.board.lens import Gray, lens_of
 from calibrate.board.spec import BoardSpec, charuco_board
+from calibrate.pages.lens import thumbnail, write_lens_page
 from drivers.sim.brush.brush import Brush, BrushSpec
 from tests.browser import BROWSER, content_widths_px
 from tests.photographed import imported, photograph
@@ -50,8 +54,29 @@ def pages(photographed: Photographed, tmp_path_factory: pytest.TempPathFactory) 
     session = photographed(folder / "2026-<u>", SPEC, [board()], sheet_mm=(100.0, 80.0))
     return {
         "calibrate": run("calibrate", session),
+        "camera": _lens(folder),
         "fit": run("fit", _pressed(folder), "--mm-per-px", "0.8"),
     }
+
+
+def _lens(folder: Path) -> str:
+    """The page of a lens from six views of a board in the left half of the image, and one photograph of nothing."""
+    true = lens_of((800.0, 805.0, 322.0, 236.0), (-0.2, 0.05, 0.0, 0.0, 0.0), (640, 480))
+    ids = np.arange(54)
+    board_mm = np.column_stack([ids % 9 + 1.0, ids // 9 + 1.0]) * 10.0
+    views: list[BoardView] = []
+    for number, turn in enumerate(
+        ((0.4, 0, 0), (-0.4, 0, 0), (0, 0.4, 0), (0, -0.4, 0), (0.4, 0.4, 0), (0.3, -0.5, 1))
+    ):
+        place = np.array([-150.0, -60.0 + 10.0 * number, 480.0])
+        flat = np.column_stack([board_mm, np.zeros(54)])
+        seen, _ = cv2.projectPoints(flat, np.array(turn, np.float64), place, true.matrix, true.distortion)
+        noise = np.random.default_rng(number).normal(0.0, 0.1, (54, 2))
+        views.append(BoardView(f"{number}<u>.png", (640, 480), seen.reshape(-1, 2) + noise, board_mm, ids))
+    fitted = fit_lens(views, unusable={"7.png": "is blank"})
+    file = lens_file(fitted, "a board", {f"{n}<u>.png": "ab" for n in range(6)} | {"7.png": "cd"}, 0.5, "test")
+    small = {"0<u>.png": thumbnail(board()), "7.png": thumbnail(board())}
+    return write_lens_page(file.save(folder), file, fitted, views, small).read_text(encoding="utf-8")
 
 
 def _pressed(folder: Path) -> Path:
@@ -90,6 +115,14 @@ def test_the_page_of_a_fit_draws_both_outlines_over_the_ink_of_each_cell(pages: 
     assert "H 11 mm, α 0° · 1 press · CSIM" in page
     assert "held out" in page
     assert "imported photographs" in page
+
+
+def test_the_page_of_a_lens_shades_what_no_board_covered_and_names_each_photograph(pages: dict[str, str]) -> None:
+    page = pages["camera"]
+    assert "To do: bring the board into the" in page
+    assert page.count('class="part empty"') == page.count(">no corner<") > 0
+    assert "7.png: not used: is blank" in page
+    assert "0&lt;u&gt;.png: 0." in page
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
