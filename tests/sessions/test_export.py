@@ -110,13 +110,17 @@ def test_force_is_an_array_of_its_own_in_npz(felt, to):
 
 
 @pytest.mark.soak  # importing `datasets` takes longer than everything else here
-def test_hugging_face_datasets_loads_poses_and_forces(felt, to):
-    datasets = pytest.importorskip("datasets")
+def test_hugging_face_datasets_loads_strokes_poses_and_forces(make, felt, to):
+    datasets = pytest.importorskip("datasets", reason="needs `pip install datasets`, which the lock leaves out")
     export(felt, to, "parquet")
-    forces = datasets.load_dataset(str(to), "forces", split="train", cache_dir=str(to.parent / "cache"))
-    assert forces[1]["observation.force"] == [0.1, 0.0, -1.0, 0.0, 0.0, 0.0]
-    poses = datasets.load_dataset(str(to), "poses", split="train", cache_dir=str(to.parent / "cache"))
+    cache = str(to.parent / "cache")
+    strokes, poses, forces = (
+        datasets.load_dataset(str(to), name, split="train", cache_dir=cache) for name in ("strokes", "poses", "forces")
+    )
+    assert strokes[0]["stroke_id"] == "H13-a05-r00"
+    np.testing.assert_array_equal(strokes[0]["image"], decode_gray(make.png(0), "made"))
     assert poses[0]["observation.state"][:3] == [1.0, 2.0, 3.0]
+    assert forces[1]["observation.force"] == [0.1, 0.0, -1.0, 0.0, 0.0, 0.0]
 
 
 def test_npz_loads_without_pickle(make, session, to):
