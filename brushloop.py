@@ -126,7 +126,9 @@ def sim(
     arcs_port: Annotated[int, typer.Option(min=0, max=65535, help="Controller port; 0: any.")] = 0,
     camera_port: Annotated[int, typer.Option(min=0, max=65535, help="Camera port; 0: any.")] = 0,
     fps: Annotated[float, typer.Option(min=1, max=60, help="Camera pictures per real second.")] = 8.0,
-    idle_exit: Annotated[float, typer.Option(min=0, help="End after so many seconds without clients; 0: never.")] = 0.0,
+    idle_exit: Annotated[
+        float, typer.Option(min=0, help="Seconds without clients after which to end; 0: never.")
+    ] = 0.0,
     brush: Annotated[
         Path, typer.Option(help="A shipped brush, `loopback` or `paper`, or one described in a brush.toml.")
     ] = Path("loopback"),

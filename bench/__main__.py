@@ -1,6 +1,6 @@
 """`python -m bench [NAME] [-n N] [--json] [--table]`: run one benchmark, or many, and print a line for each figure.
 
-Without NAME, those of speed and memory (some 12 minutes), or with --accuracy those that train, fit and press (hours).
+Without NAME, those of speed and memory (about 12 minutes), or with --accuracy those that train, fit and press (hours).
 `growth` is run by name only. With --table, docs/bench.md gets the figures as well.
 
 Exit codes: 0 measured, 1 a benchmark could not be measured, 2 unknown name.

@@ -1,4 +1,4 @@
-"""How near a fitted brush comes to the ceiling from few strokes.
+"""How close a fitted brush comes to the ceiling with few strokes.
 
 Brushes: the five frozen ones of the loopback rig, and two of an independent bristle simulation. Scores are CSIM of ink
 as 0 or 1 at 0.3 mm a pixel over cells that no training stroke came from; the ceiling is the majority of the other

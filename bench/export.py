@@ -14,7 +14,7 @@ from bench.press_sessions import CLOSE, Presses, session
 
 STROKES = 2000
 FEW = 10
-"""The other session of the comparison of memory has so many times fewer strokes."""
+"""The other session of the comparison of memory has this many times fewer strokes."""
 GOAL_S = 5.0
 MOST_GROWTH = 1.05
 

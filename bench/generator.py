@@ -126,7 +126,7 @@ def _compare(target: str, name: str, n: int | None, seed: int, *, with_basis: bo
 
 
 def _drawing_s(config: TrainConfig, training: Exact, steps: int) -> float:
-    """The CPU seconds for drawing the batches of so many steps, measured on some of them."""
+    """The CPU seconds for drawing the batches of this many steps, measured on some of them."""
     some = min(steps, _DRAWN)
     began = time.process_time()
     for _ in batches(config.model_copy(update={"steps": some}), training, Group(), 0):

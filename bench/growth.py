@@ -40,7 +40,7 @@ COMMANDS = ("import", "verify", "merge", *(f"export-{kind}" for kind in EXPORTS)
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """What one command took for so many strokes."""
+    """What one command took for this many strokes."""
 
     command: str
     strokes: int

@@ -26,7 +26,7 @@ from bench.processes import ROOT, started, tell
 MOST_STARTS = 4
 """A camera that is refused so often stays refused."""
 MOST_STARTS_WITH_STOPS = 40
-"""A rig that is silent for longer than its driver waits ends a run; the same command goes on."""
+"""A rig that is silent for longer than its driver waits ends a run; the same command resumes."""
 BETWEEN_STOPS_S = (8.0, 20.0)
 LONGEST_S = 1200.0
 PROTOCOL = """kind = "grid"

@@ -27,7 +27,7 @@ ENDS = (0, 3)
 
 def run(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
     """Re-pressed minus another press, in points, of the first `n` frozen brushes (default two): the least and the mean
-    of eight comparisons each (two alignments, two tones, CSIM and SSIM). 27 presses, 27 again, some 4 minutes a brush.
+    of eight comparisons each (two alignments, two tones, CSIM and SSIM). 27 presses, 27 again, about 4 minutes a brush.
 
     ratio = the goal (1 point less) over the points that are lost. Raises BenchError where a command fails.
     """

@@ -145,7 +145,7 @@ def _collect(folder: Path) -> None:
     except Exception as error:
         raise BenchError(f"the session failed: {error}") from error
     if engine.snapshot().voids:
-        raise BenchError("a step was cut; the figures would tell of two attempts")
+        raise BenchError("a step was cut; the figures would cover two attempts")
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ from pathlib import Path
 from bench.harness import BenchError
 
 # The kernel charges a process with what it held before `exec`, so a command that is started from here would be charged
-# with the bench's own memory. A small interpreter of some 10 MB starts it instead.
+# with the bench's own memory. A small interpreter of about 10 MB starts it instead.
 _STARTER = """
 import json, os, sys, time
 began = time.monotonic()

@@ -182,7 +182,7 @@ def stop(pid: int) -> None:
 
 @contextlib.contextmanager
 def busy(count: int) -> Iterator[None]:
-    """So many loops beside, until the block ends."""
+    """This many loops beside, until the block ends."""
     loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
     try:
         yield

@@ -73,7 +73,7 @@ def board_of(table: Table) -> BoardSpec:
 
 
 def aimed(view: View, rng: np.random.Generator) -> View:
-    """The same camera, set up anew: its place, turn and slant differ a little, its lens and light do not."""
+    """The same camera, set up again: its place, turn and slant differ a little, its lens and light do not."""
     x, y = view.centre_mm
     return dataclasses.replace(
         view,
@@ -85,7 +85,7 @@ def aimed(view: View, rng: np.random.Generator) -> View:
 
 
 def boards(rig: int, draws: int, seed: int = 0) -> Iterator[Shot]:
-    """Blank sheets on the board, the camera aimed anew for each."""
+    """Blank sheets on the board, the camera aimed again for each."""
     for draw in range(draws):
         rng = np.random.default_rng([seed, rig, draw])
         config = SimConfig(seed=int(rng.integers(1, 2**30)), view=aimed(CAMERAS[rig], rng))
@@ -93,7 +93,7 @@ def boards(rig: int, draws: int, seed: int = 0) -> Iterator[Shot]:
 
 
 def sheet(rig: int, presses: int, seed: int = 0) -> Shot:
-    """One sheet with so many presses (at most 15, one of each H and alpha at most) by this rig's brush."""
+    """One sheet with this many presses (at most 15, one of each H and alpha at most) by this rig's brush."""
     rng = np.random.default_rng([seed, rig, 10_000])
     config = SimConfig(seed=int(rng.integers(1, 2**30)), view=aimed(CAMERAS[rig], rng), brush=BRUSHES[rig])
     world = World(config)

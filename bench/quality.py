@@ -1,4 +1,4 @@
-"""How well the quality checks tell sound captures from failed ones: precision and recall per failure, loopback rig."""
+"""How well the quality checks distinguish good from failed captures: precision and recall per failure, loopback rig."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def run(*, n: int | None = None, seed: int = 0) -> list[Result]:
 
 
 def _load(seed: int, seconds: float) -> Iterator[Outgoing]:
-    """The messages of so many seconds, in order of time, starting with a still."""
+    """The messages of this many seconds, in order of time, starting with a still."""
     random = np.random.default_rng(seed)
     paper = np.clip(random.normal(225, 6, (1536, 2048)), 0, 255).astype(np.uint8)
     png = encode_png(paper)

@@ -39,7 +39,7 @@ from sessions.reader import Recording
 
 STROKES = 60
 FEW = 4
-"""Memory is compared with that of so many times fewer strokes."""
+"""Memory is compared with that of this many times fewer strokes."""
 SAME = 1e-6
 START_S = 60.0
 
@@ -184,7 +184,7 @@ def cluster(under: Path, found: Sequence[PrepareJob], seed: int) -> list[Result]
 
 @contextmanager
 def _workers(under: Path, count: int) -> Iterator[str]:
-    """The address of a scheduler with so many workers of one thread."""
+    """The address of a scheduler with this many workers of one thread."""
     scheduler_file = under / f"scheduler-{count}.json"
     here = ("--host", "127.0.0.1", "--no-dashboard")
     words = ("distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", str(scheduler_file), *here)

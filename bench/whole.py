@@ -45,7 +45,7 @@ ACCURACY = {
 }
 """What takes longer, because it trains, fits or presses: how good the results are, rather than how quick."""
 MOST_TIMES, MORE_S = 6, 180
-"""A bench is given up after so many times its usual seconds and so many more."""
+"""A bench is given up after its usual seconds times the first number, plus the second."""
 
 
 def run_all(plan: Mapping[str, int], options: Sequence[str], say: Callable[[str], None]) -> list[str]:

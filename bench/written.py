@@ -26,13 +26,13 @@ MOST_SHEETS = 20
 ASKED = re.compile(r"--sheet\s+(\d+)")
 STRICT = (Alignment.MM, Tone.BINARY, Polarity.INK)
 AS_THE_PAPER = (Alignment.SIZE_NORMALISED, Tone.BINARY, Polarity.PAPER)
-"""The polarity in which the paper's numbers lie within reach; it does not tell its own."""
+"""The polarity in which the paper's numbers are within reach; the paper does not state its own."""
 
 
 def run(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
     """CSIM of the captured 字 against the reference and against the simulated image, for the first `n` frozen brushes.
 
-    value = average in percent over ten writings (mm, binary, ink = 1), all five brushes by default, some 4 minutes
+    value = average in percent over ten writings (mm, binary, ink = 1), all five brushes by default, about 4 minutes
     each; ratio = 100 less the CSIM of the unlearned round, over 100 less that of the learned one. `seed` is the rig's.
     Raises BenchError where a command fails or asks for something else than a sheet.
     """

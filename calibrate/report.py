@@ -25,7 +25,7 @@ Image = NDArray[np.float32]
 PAPER = "#fbf9f4"
 """Background of picture files."""
 PHOTOGRAPH_PX, JPEG_QUALITY = 1600, 80
-"""Longest side and quality of a photograph in a page: at most some 500 kB."""
+"""Longest side and quality of a photograph in a page: at most 500 kB."""
 REMARK = re.compile(r"\(([^()]+)\)(?:, R = [^()]*)?$")
 """What a described brush says in brackets at the end of its name, which its size may follow."""
 

@@ -36,7 +36,7 @@ def torch_arguments(build: str) -> list[str]:
         return [TORCH]
     if answers(CPU_INDEX):
         return ["--index-url", CPU_INDEX, "--no-deps", TORCH]
-    sys.stderr.write(f"{CPU_INDEX} does not answer: installing the default build of torch, some 3 GB larger\n")
+    sys.stderr.write(f"{CPU_INDEX} does not answer: installing the default build of torch, about 3 GB larger\n")
     return [TORCH]
 
 

@@ -43,7 +43,7 @@ class Constant:
         return max(low, -FARTHEST), min(high, FARTHEST)
 
     def value(self, scales: float) -> float:
-        """The value that lies so many scales from the default, within what `BrushSpec` allows."""
+        """The value that lies this many scales from the default, within what `BrushSpec` allows."""
         moved = self.default * math.exp(self.scale * scales) if self.factor else self.default + self.scale * scales
         low, high = ALLOWED[self.name]
         return min(max(moved, low), high)
@@ -98,7 +98,7 @@ def brush_at(point: Vector, base: BrushSpec) -> BrushSpec:
 
 
 def with_values(base: BrushSpec, constants: Sequence[Constant], point: Sequence[float] | Vector) -> BrushSpec:
-    """`base` with these constants moved from their defaults by so many scales each."""
+    """`base` with these constants moved from their defaults by this many scales each."""
     values = {one.name: one.value(float(scales)) for one, scales in zip(constants, point, strict=False)}
     return replace(base, **values)
 

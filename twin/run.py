@@ -164,7 +164,7 @@ class _Ticks:
         self._show(min(self._done + 1, self._total))
 
     def passed(self, steps: int) -> None:
-        """A pass of so many steps has ended."""
+        """A pass of this many steps has ended."""
         self._due += steps
         self._show(max(self._done, self._due))
 

@@ -62,7 +62,7 @@ def fit_spread(spec: BrushSpec, offset: Offset, repeats: Repeats, grid: Grid) ->
     if not repeats.cells:
         raise ValueError(f"no cell has {FEWEST_REPEATS} captures")
     seen = statistics(repeats.ink, grid)
-    # twice the relative standard error of a deviation with so many degrees of freedom: the simulated one has its own
+    # twice the relative standard error of a deviation with this many degrees of freedom: the simulated one has its own
     sd = 2.0 / math.sqrt(2.0 * repeats.freedom)
 
     def off(point: Vector) -> Vector:

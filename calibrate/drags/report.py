@@ -137,7 +137,7 @@ def fit_sentences(results: DragResults) -> Iterator[str]:
             f"{width.intercept:+.2f} mm at depth 0, r = {width.r:.2f}, n = {width.n}."
         )
         if low <= 0.0:
-            yield "The slope's interval reaches 0: these strokes do not tell how the brush opens with depth."
+            yield "The slope's interval reaches 0: these strokes do not show how the brush opens with depth."
         else:
             ratio = width.slope / (2.0 * math.pi)
             yield (

@@ -1,4 +1,4 @@
-"""The compared strokes of a run and their scores. Both stay in the store; memory holds where they are, some 50 bytes a
+"""The compared strokes of a run and their scores. Both stay in the store; memory holds where they are, about 50 bytes a
 stroke.
 """
 

@@ -27,7 +27,7 @@ class CommandFailed(Exception):
         self.words = words
         self.exit_code = code
         super().__init__(
-            f"`brushloop {' '.join(words)}` ended with exit code {code}; the same command goes on from there"
+            f"`brushloop {' '.join(words)}` ended with exit code {code}; the same command resumes from there"
         )
 
 

@@ -222,7 +222,7 @@ class Engine:
             self._end(State.FAILED, describe(self._stop_failure))
             raise self._stop_failure
         self._end(State.STOPPED, "stopped by the operator")
-        raise CollectAborted("stopped; the same command goes on from here")
+        raise CollectAborted("stopped; the same command resumes from here")
 
     async def _session(self) -> None:
         self._progress.doing("connect")

@@ -26,7 +26,7 @@ class Action(StrEnum):
     ASK = "ask"
     """Let a person decide; if nobody watches, stop the run."""
     ABORT = "stop the run"
-    """Leave the session open; the same command goes on from there."""
+    """Leave the session open; the same command resumes from there."""
 
 
 def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:

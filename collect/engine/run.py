@@ -140,7 +140,7 @@ class Run:
 
     async def _park(self) -> None:
         await self._once_arm_is_free(self._recover)
-        raise Parked("parked on request; the same command goes on from here")
+        raise Parked("parked on request; the same command resumes from here")
 
     async def _new_sheet(self) -> None:
         sheet = self.context.store.state.sheet

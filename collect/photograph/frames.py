@@ -18,7 +18,7 @@ from drivers.samples import Frame, Stamp
 
 Thumbnail = NDArray[np.float32]
 WIDTH_PX = 160
-"""Width of a thumbnail. A pixel averages some 2 mm of a sheet: noise is gone, and an arm is tens of pixels wide."""
+"""Width of a thumbnail. A pixel averages about 2 mm of a sheet: noise is gone, and an arm is tens of pixels wide."""
 CHANGED_LEVELS = 25.0
 """Difference in gray levels, corrected for the light, from which on a pixel counts as changed."""
 

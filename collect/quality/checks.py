@@ -97,7 +97,7 @@ def check_drawing(
 def cell_is_blank(
     image: Gray, plane: Plane, cell: Cell, *, limits: QualityConfig, sheet_mm: tuple[float, float] | None = None
 ) -> Check:
-    """Check in an (h, w) photograph that the cell is blank; `NEIGHBOUR` if it holds ink or is not wholly seen.
+    """Check in an (h, w) photograph that the cell is blank; `NEIGHBOUR` if it holds ink or is not completely seen.
 
     `sheet_mm` (width, height) excludes the sheet's edge and what lies beyond it.
     """
@@ -196,7 +196,7 @@ def blurred(image: Gray, plane: Plane, limits: QualityConfig) -> tuple[Check, ..
 
 
 def cut(ink: Ink, plane: Plane, shape: tuple[int, ...], anchor_mm: Point, limits: QualityConfig) -> Check:
-    """The stroke, or the zero-touch point if there is none, lies wholly in the frame."""
+    """The stroke, or the zero-touch point if there is none, lies completely in the frame."""
     points = ink.patch.points_mm(ink.own) if ink.own.any() else np.array([anchor_mm])
     gap_mm = measure.edge_mm(points, plane, shape)
     reason = f"The stroke ends {max(gap_mm, 0.0):.1f} mm from the edge of the picture. Move the camera or the sheet."
@@ -224,7 +224,7 @@ def before_press(cell: int, area_mm2: float, limits: QualityConfig) -> Check:
 def unseen(cell: int, hidden_mm2: float, limits: QualityConfig) -> Check:
     """A cell that lies partly outside the frame cannot be called blank."""
     reason = (
-        f"Cell {cell} is not wholly in the picture, {hidden_mm2:.0f} mm^2 are hidden. Move the camera or the sheet."
+        f"Cell {cell} is not completely in the picture, {hidden_mm2:.0f} mm^2 are hidden. Move the camera or the sheet."
     )
     return Check(Failure.NEIGHBOUR, hidden_mm2, "mm^2", limits.foreign_mm2, False, reason)
 

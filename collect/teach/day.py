@@ -156,7 +156,7 @@ class Step(Protocol):
         ...
 
     def forget(self, notebook: Notebook) -> Notebook:
-        """The notebook without what this step observed, for teaching it anew."""
+        """The notebook without what this step observed, for teaching it again."""
         ...
 
     def summary(self, notebook: Notebook) -> str:

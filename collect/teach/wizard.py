@@ -33,7 +33,7 @@ class Wizard:
         """Teach every step that is not done, then write `rig.toml`; returns its path.
 
         It is written before the proof too, and says then that it is not proven. Raises `CollectAborted` where the
-        person leaves off: the same command goes on from there.
+        person leaves off: the same command resumes from there.
         """
         for step in self._steps:
             if step.name in self._day.notebook.done:
@@ -45,7 +45,7 @@ class Wizard:
         return await self._written()
 
     async def again(self, name: str) -> Path | None:
-        """Teach one step anew; returns the path of `rig.toml` if it could be written.
+        """Teach one step again; returns the path of `rig.toml` if it could be written.
 
         Raises `ConfigError` for a name that is none, otherwise as `run` does.
         """
@@ -74,7 +74,7 @@ class Wizard:
                 await self._derive(step, before)
                 return
             except LeftOff:
-                raise CollectAborted("left off; the same command goes on from there") from None
+                raise CollectAborted("left off; the same command resumes from there") from None
             except WentBack:
                 await self._day.say("This step was left; it begins again where it was.")
             except (CannotTeach, DeviceError, CalibrationError, StepError, ConfigError) as error:
@@ -87,7 +87,7 @@ class Wizard:
         except (LeftOff, WentBack):
             answer = LEAVE.key
         if answer == LEAVE.key:
-            raise CollectAborted("left off; the same command goes on from there")
+            raise CollectAborted("left off; the same command resumes from there")
 
     async def _derive(self, step: Step, before: Notebook) -> None:
         """Finish a step: compute what rests on it again, and list what that changed. Proofs of the past are void."""

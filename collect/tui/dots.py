@@ -32,7 +32,7 @@ GRAYS = grays(LEVELS)
 
 
 class Cells:
-    """A picture fitted into so many cells of the terminal."""
+    """A picture fitted into this many cells of the terminal."""
 
     def __init__(self, image: NDArray[np.uint8] | Coloured | None, size: Size, before: Cells | None = None) -> None:
         """`before` is the picture before, of which the grays stay that are still right; see `fitted`."""

@@ -21,7 +21,7 @@ class Coloured:
 
 
 def grays(levels: int) -> tuple[RGB, ...]:
-    """So many grays from black to white."""
+    """This many grays from black to white."""
     return tuple((gray, gray, gray) for gray in (round(255 * k / (levels - 1)) for k in range(levels)))
 
 

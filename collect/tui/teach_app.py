@@ -28,7 +28,7 @@ HELP = f"""\
 enter     take the answer that is offered, or: the tip is there
 esc       leave this step; it begins again where it was
 k         skip this thing, where the step can do without it
-q         leave; everything taught is kept, the same command goes on
+q         leave; everything taught is kept, the same command resumes
 ctrl-q    the same while you type
 s, ctrl-c stop the arm at once (ctrl-c while you type)
 tab       picture, on a narrow screen
@@ -157,5 +157,5 @@ def run_teaching(work: Work, name: str, pictures: Pictures | None = None) -> Pat
                 app.teaching.stop()
     app.teaching.join()
     if app.teaching.stopped:
-        raise CollectAborted("stopped; the same command goes on from there")
+        raise CollectAborted("stopped; the same command resumes from there")
     return app.teaching.written

@@ -144,7 +144,7 @@ class SimConfig:
     force_hz: float = 200.0
     """Rounds per real second."""
     force_noise_n: float = 0.002
-    """Standard deviation of each round, as of a sensor for a few N, which a soft brush needs."""
+    """Standard deviation of each round: that of a sensor for a few N, which a soft brush needs."""
     force_noise_nm: float = 2e-4
     sensor_to_tip_mm: float = 180.0
     hanging_kg: float = 0.12

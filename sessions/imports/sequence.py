@@ -18,7 +18,7 @@ from sessions.progress import Progress, unseen
 from sessions.recording.messages import decode_gray
 
 SEQUENCE = "page sequence"
-"""Start of the header's `protocol`: tells a reader that each still also shows all earlier strokes."""
+"""Start of the header's `protocol`: says that each still also shows all earlier strokes."""
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg")
 
 

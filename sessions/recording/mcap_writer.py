@@ -42,7 +42,7 @@ _INDEX_START = struct.Struct("<BQHI")
 _FOOTER_START = struct.Struct("<BQQQ")
 _CHANNEL = struct.Struct("<H")
 INDEX_IN_MEMORY_BYTES = 64 * 1024
-"""A longer index of chunks waits in a temporary file: some 100 bytes for each chunk."""
+"""A longer index of chunks waits in a temporary file: about 100 bytes for each chunk."""
 
 
 class _Writable(Protocol):

@@ -31,7 +31,7 @@ def test_a_signal_stops_the_arm_and_the_same_command_goes_on(lab: Lab) -> None:
         first.send_signal(number)
         _, stderr = first.communicate(timeout=PATIENCE_S)
         assert first.returncode == 4, stderr
-        assert stderr.splitlines()[-1] == "brushloop: stopped; the same command goes on from here"
+        assert stderr.splitlines()[-1] == "brushloop: stopped; the same command resumes from here"
         assert "Traceback" not in stderr
         still = lab.rig.world.tool()
         time.sleep(0.1)

@@ -84,7 +84,7 @@ def test_two_hundred_kills_over_forty_sessions_lose_nothing(lab: Lab) -> None:
 
 
 def session(lab: Lab, toll: Toll, kills: int) -> None:
-    """One session from its first process to its merged file, with up to so many kills on the way."""
+    """One session from its first process to its merged file, with up to this many kills on the way."""
     lab = replace(lab, folder=lab.folder / f"{toll.sessions:03d}", processes=lab.processes)
     lab.folder.mkdir()
     for name in ("rig.toml", "protocol.toml"):

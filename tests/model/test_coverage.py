@@ -25,7 +25,7 @@ PRESS = (15.0, 7.0)
 
 
 def curve_of(name: str, mark: CcdBsm) -> tuple[Curve, list[float]]:
-    """The half width of one mark in numpy, written anew from the definitions, and where it is not smooth."""
+    """The half width of one mark in numpy, written independently from the definitions, and where it is not smooth."""
     a, b, t = mark.o3a_mm.item(), mark.half_width_mm.item(), mark.o4o3_mm.item()
     centre, half = (a - t) / 2, (a + t) / 2
     reach = half - b

@@ -77,7 +77,7 @@ class _Line:
             raise ConnectionResetError("the client has gone")
         self._last_s = max(self._last_s + NEXT_S, self._exposed_s + late_s)
         self._loop.call_at(self._last_s, self._write, data)
-        await self._writer.drain()  # of earlier pictures: without it, a slow client would be ever farther behind
+        await self._writer.drain()  # of earlier pictures: else a slow client would fall farther and farther behind
 
     def _write(self, data: bytes) -> None:
         if not self._writer.is_closing():
@@ -113,7 +113,7 @@ class MjpegServer(LoopbackServer):
         """Faults of this server; a rig shares one board among all its servers."""
 
     def show(self, scene: Picture, view: View) -> None:
-        """Look at something else, with other settings. Every stream begins anew, as when a camera is set up again."""
+        """Look at something else, with other settings. Every stream begins again, as when a camera is set up again."""
         self._scene, self._view = scene, view
         self._coded.clear()
         self.drop_clients()

@@ -176,7 +176,7 @@ def _frame(can_id: str, length: str, data: list[str]) -> CanFrame:
 
 
 def _ascii(frame: CanFrame) -> str:
-    # Real time, as of the adapter's clock, whatever the rate of the simulated world.
+    # Real time, like that of an adapter's clock, whatever the rate of simulated time.
     if frame.error:
         return f"< error {frame.can_id:03X} {time.time():.6f} >"
     return f"< frame {frame.can_id:03X} {time.time():.6f} {frame.data.hex().upper()} >"

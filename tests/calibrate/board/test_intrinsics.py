@@ -142,7 +142,7 @@ def test_an_interval_is_given_where_the_views_allow_it_and_then_holds_the_truth(
 
 
 def other_camera(f: float, x_px: float, y_px: float) -> Lens:
-    """One like TRUE, its focal length f times as long, its axis so many px away."""
+    """One like TRUE, its focal length f times as long, its axis this many px away."""
     (fx, _, cx), (_, fy, cy), _ = TRUE.matrix
     return lens_of((f * fx, f * fy, cx + x_px, cy + y_px), (-0.21, 0.06, 0.001, -0.0005, 0.0), TRUE.size_px)
 

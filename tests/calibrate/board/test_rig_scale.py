@@ -18,7 +18,7 @@ BOARD = board_of(Table())
 
 
 def draws(rig: int, count: int, seed: int = 0) -> list[tuple[float, bool]]:
-    """(relative error of pix2len, whether the interval holds the truth) for the camera aimed anew each time."""
+    """(relative error of pix2len, whether the interval holds the truth) for the camera aimed again each time."""
     found: list[tuple[float, bool]] = []
     for shot in boards(rig, count, seed):
         plane = see_board_and_lens(shot.image, shot.board)

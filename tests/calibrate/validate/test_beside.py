@@ -288,7 +288,7 @@ def test_an_edited_table_3_or_another_picture_is_refused(lab: Path, place: Path)
     figure.unlink()
     # A terminal breaks a long path anywhere.
     assert f"{figure} does not exist".replace(" ", "") in invoke(place, "--written", path).replace(" ", "")
-    # Rows of another source, sealed anew by somebody's script.
+    # Rows of another source, sealed again by somebody's script.
     rows = (*table_of(source=Source.IMPORT), *table_of())
     path.write_text(written_record(rows).to_json())
     assert "is of loopback rig" in refused(place, "--written", path)

@@ -18,7 +18,7 @@ FILES = ("report.json", "report.html", "scores.csv", "summary.csv", "failures.cs
 
 
 COMMAND = ("validate", "presses", "--out", "out", "--workers", "1", "--model", "ccd-bsm", "--model", "bezier-refitted")
-"""One model as it is, and one that is fitted anew for each cell."""
+"""One model as it is, and one that is fitted again for each cell."""
 
 
 def records(work: Path) -> list[str]:

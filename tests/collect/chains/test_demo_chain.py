@@ -114,7 +114,7 @@ def test_a_demo_that_ended_after_its_collection_goes_on_there_and_begins_no_new_
     chain: Chain, tmp_path: Path
 ) -> None:
     chain.validate_fails = True
-    with pytest.raises(CommandFailed, match="goes on from there"):
+    with pytest.raises(CommandFailed, match="resumes from there"):
         run(tmp_path)
     chain.validate_fails = False
     chain.ran.clear()

@@ -159,7 +159,7 @@ def test_a_figure_is_sound_where_its_cell_has_new_ink_and_blank_where_it_has_non
 def test_a_cell_that_is_not_wholly_seen_is_not_called_blank() -> None:
     hidden = cell_is_blank(paper(), plane(), Cell(3, -10.0, 15.0, 40.0, 24.0), limits=LIMITS)
     assert not hidden.passed
-    assert "not wholly in the picture" in hidden.reason
+    assert "not completely in the picture" in hidden.reason
     inked = cell_is_blank(stroke(paper(), 50.0, 27.0), plane(), CELL, limits=LIMITS)
     assert not inked.passed
     assert "Cell 0 is not blank" in inked.reason

@@ -228,4 +228,4 @@ class FakeEngine:
     def join(self) -> None:
         self.calls.append("join")
         assert self._over.wait(5.0)
-        raise CollectAborted("stopped; the same command goes on from here")
+        raise CollectAborted("stopped; the same command resumes from here")

@@ -28,7 +28,7 @@ ORIGIN = (12.117, 13.743)
 
 
 def half_width_of(mark: CcdBsm) -> Callable[[float], float]:
-    """Eq. 1 of one mark, written anew."""
+    """Eq. 1 of one mark, written independently."""
     a, w, t = mark.o3a_mm.item(), mark.half_width_mm.item(), mark.o4o3_mm.item()
 
     def half_width(x: float) -> float:

@@ -19,7 +19,7 @@ STOP = "rob1.MotionControl.stopLine"
 
 @pytest.fixture(params=["sof", "short sof", "bare"])
 async def ask(request: pytest.FixtureRequest, cabinet: ArcsServer) -> AsyncIterator[Ask]:
-    """Send the bytes of requests in one framing, and hand back so many replies."""
+    """Send the bytes of requests in one framing, and hand back this many replies."""
     reader, writer = await asyncio.open_connection(HOST, cabinet.port)
     decoder = BareDecoder() if request.param == "bare" else FrameDecoder()
 

@@ -24,9 +24,9 @@ def test_a_perfect_lens_is_the_homography_alone() -> None:
 
 
 def test_distortion_leaves_the_middle_and_pulls_the_corners_in() -> None:
-    straight, bent = Optics(replace(BENT, k1=0.0), 1), Optics(BENT, 1)
+    undistorted, distorted = Optics(replace(BENT, k1=0.0), 1), Optics(BENT, 1)
     points = np.array([[122.0, 86.0], [0.0, 0.0]])
-    moved = np.linalg.norm(bent.image_of(points) - straight.image_of(points), axis=1)
+    moved = np.linalg.norm(distorted.image_of(points) - undistorted.image_of(points), axis=1)
     assert moved[0] < 0.05
     assert 3.0 < moved[1] < 40.0
 
