@@ -25,11 +25,11 @@ from mcap.writer import MCAP0_MAGIC
 
 from sessions.errors import InputError, in_one_line
 from sessions.recording.chunk import RECORD_START
-from sessions.recording.container import (
+from sessions.recording.container import Record
+from sessions.recording.index import (
     MAX_RECORD_BYTES,
     UNREADABLE,
     BoundedFile,
-    Record,
     check_chunk_at,
     chunk_at,
     index_records,

@@ -5,13 +5,13 @@ import random
 
 import pytest
 import zstandard
-from mcap.data_stream import RecordBuilder
+from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.reader import make_reader
 from mcap.records import Chunk
 
 from sessions.errors import InputError, SessionDamaged
 from sessions.reader import Recording
-from sessions.recording import container
+from sessions.recording import index as index_file
 
 CUTS = 120
 FLIPS = 400
@@ -88,7 +88,7 @@ def with_chunk(whole, **changes):
     index = make_reader(io.BytesIO(whole)).get_summary().chunk_indexes[0]
     start = index.chunk_start_offset
     builder = RecordBuilder()
-    chunk = Chunk.read(container.ReadDataStream(io.BytesIO(whole[start + 9 :])))
+    chunk = Chunk.read(ReadDataStream(io.BytesIO(whole[start + 9 :])))
     for name, value in changes.items():
         setattr(chunk, name, value)
     chunk.write(builder)
@@ -121,6 +121,6 @@ def test_a_file_that_may_not_be_read_is_refused(whole, path, monkeypatch):
     def refuse(*_):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(container.io, "FileIO", refuse)
+    monkeypatch.setattr(index_file.io, "FileIO", refuse)
     with pytest.raises(InputError, match="cannot open: Permission denied"):
         Recording(path)
