@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from model.protocol import StrokeModel
 
 
+NOT_AGAIN = "was not pressed again"
+
+
 @dataclass(frozen=True, slots=True)
 class Pairs:
     """Every pair, every original, and what could not be used."""
@@ -141,7 +144,7 @@ def pair_up(
             continue
         repeated.add(of)
         found.pairs.append(Pair(found.originals[of], press, images))
-    found.refused.extend((name, "was not pressed again") for name in found.originals if name not in repeated)
+    found.refused.extend((name, NOT_AGAIN) for name in found.originals if name not in repeated)
     return found
 
 

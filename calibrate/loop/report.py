@@ -1,4 +1,4 @@
-"""Write the loop's report: a picture, one self-contained HTML file, and every number behind it as CSV and JSON."""
+"""Write the loop's report: one self-contained HTML page, a picture, and every number behind them as CSV and JSON."""
 
 from __future__ import annotations
 
@@ -12,20 +12,24 @@ import numpy as np
 from calibrate.compare.field import KEYS, Alignment, Tone
 from calibrate.compare.paper import ROBOT_WRITING, TABLE_1
 from calibrate.compare.similarity import SSIM_SETTINGS
-from calibrate.loop.compare import ComparedSession, LoopComparison
+from calibrate.loop.compare import NOT_AGAIN, ComparedSession, LoopComparison
 from calibrate.loop.scores import AGAIN, GOAL_POINTS, LoopRecord, Pair, PairScore, Table1Row
 from calibrate.loop.scores import FILE as NUMBERS
 from calibrate.report import (
+    Point,
     csv_text,
     ink_uri,
     overlay,
     overlay_uri,
     picture_grid,
-    png_uri,
+    plot,
+    plot_uri,
     render,
     save_picture,
     show_picture,
+    source_label,
     source_note,
+    source_point,
     write_files,
 )
 
@@ -43,14 +47,17 @@ def write_loop(loop: LoopComparison, folder: Path, command: str) -> Path:
     draw(loop, folder / PICTURE)
     header, source = loop.original.header, loop.again.header.source
     paper = TABLE_1[ROBOT_WRITING]
+    label = source_label(source, [header.brush])
     page = render(
         "loop.html.j2",
         header=header,
         again=loop.again.header,
-        source=source,
+        label=label,
         note=source_note(source, header.brush),
+        trust=[source_point(source), *_trust(loop)],
+        plot=_recovered(loop, label),
+        beside=(PICTURE, TABLE, NUMBERS),
         model=loop.model,
-        in_sample=loop.in_sample,
         goal=f"{GOAL_POINTS:g}",
         pairs=len(loop.paired.pairs),
         answer=answer(loop),
@@ -58,10 +65,10 @@ def write_loop(loop: LoopComparison, folder: Path, command: str) -> Path:
         tables=_tables(loop.table),
         paper=(paper.csim, paper.ssim),
         rows=_rows(loop),
+        not_shown=max(0, len(loop.paired.pairs) - MAX_PAIRS_SHOWN),
         refused=loop.paired.refused,
         field=loop.field,
         ssim_settings=SSIM_SETTINGS,
-        picture=png_uri((folder / PICTURE).read_bytes()),
         provenance=list(_provenance(loop, command)),
     )
     record = record_of(loop, command)
@@ -195,11 +202,61 @@ def _rows(loop: LoopComparison) -> list[dict[str, Any]]:
                 "original": pair.original,
                 "again": pair.again,
                 "score": scores[pair.again.stroke_id],
-                "images": [ink_uri(image) for image in images],
-                "difference": overlay_uri(images[0], images[2]),
+                "images": {
+                    "original": ink_uri(images[0]),
+                    "recovered, simulated": ink_uri(images[1]),
+                    "pressed again": ink_uri(images[2]),
+                    "original and pressed again": overlay_uri(images[0], images[2]),
+                },
             }
         )
     return rows
+
+
+def _trust(loop: LoopComparison) -> Iterator[Point]:
+    failed = [v for v in loop.verdicts if not v.holds]
+    uncertain = sum(not v.certain for v in loop.verdicts)
+    if not loop.verdicts:
+        yield Point(None, "No cell of the original session was pressed twice: there is no yardstick.")
+    elif failed:
+        yield Point(False, f"{len(failed)} of {len(loop.verdicts)} comparisons miss the goal of {GOAL_POINTS:g} point.")
+    else:
+        yield Point(True, f"All {len(loop.verdicts)} comparisons stay within {GOAL_POINTS:g} point of another press.")
+    if uncertain:
+        words = "with these few presses the interval reaches over the limit, or is not known"
+        yield Point(None, f"{uncertain} of {len(loop.verdicts)} comparisons are not certain: {words}.")
+    if loop.in_sample:
+        words = "The model that recovered them was fitted to these same presses, with their commanded depths and tilts"
+        yield Point(
+            None, f"{words}: recovered numbers near the commanded ones are no proof of it. The marks are compared."
+        )
+    left = sum(why == NOT_AGAIN for _, why in loop.paired.refused)
+    if left:
+        yield Point(None, f"{'One original was' if left == 1 else f'{left} originals were'} not pressed again.")
+    if len(loop.paired.refused) > left:
+        yield Point(False, f"{len(loop.paired.refused) - left} strokes could not be compared; each is named below.")
+    else:
+        yield Point(True, "Every stroke that was pressed again was compared.")
+
+
+def _recovered(loop: LoopComparison, label: str) -> str:
+    """Depth and tilt as recovered against as commanded, with the line where both are equal."""
+    figure, axes = plot(1, 2, (10.0, 3.8))
+    pairs = loop.paired.pairs
+    values = (
+        ("depth H, mm", [(p.original.height_mm, p.again.height_mm) for p in pairs]),
+        ("tilt α, deg", [(p.original.tilt_deg, p.again.tilt_deg) for p in pairs]),
+    )
+    for axis, (name, points) in zip(axes, values, strict=True):
+        low, high = min(map(min, points)), max(map(max, points))
+        margin = 0.05 * (high - low) or 0.5
+        axis.plot([low - margin, high + margin], [low - margin, high + margin], color="0.6", lw=1.0)
+        axis.plot([x for x, _ in points], [y for _, y in points], "o", ms=4, alpha=0.6, color="#0072B2")
+        axis.set_xlabel(f"commanded {name}")
+        axis.set_ylabel(f"recovered {name}")
+        axis.set_title(f"{name.split(',')[0]} ({label})", fontsize=10)
+        axis.grid(alpha=0.3)
+    return plot_uri(figure)
 
 
 def _provenance(loop: LoopComparison, command: str) -> Iterator[tuple[str, str]]:

@@ -17,15 +17,27 @@ from calibrate.board.detect import BoardView
 from calibrate.board.intrinsics import fit_lens
 from calibrate.board.lens import Gray, lens_of
 from calibrate.board.spec import BoardSpec, charuco_board
+from calibrate.compare.field import KEYS, Field, Tone
+from calibrate.loop.compare import NOT_AGAIN, ComparedSession, LoopComparison, Pairs
+from calibrate.loop.report import write_loop
+from calibrate.loop.scores import CapturedPress, Pair, score_pairs, table_1, verdicts
 from calibrate.pages.lens import thumbnail, write_lens_page
+from calibrate.stroke.measure import Measured
+from calibrate.writing.compare import WritingComparison
+from calibrate.writing.plan_files import PlanRecord, figure_record
+from calibrate.writing.report import write_written
+from calibrate.writing.scores import Character, score_character, table_3
 from drivers.sim.brush.brush import Brush, BrushSpec
+from sessions.recording.schemas import Header, Source
 from tests.browser import BROWSER, content_widths_px
+from tests.calibrate.given import BY, CALIBRATION
 from tests.photographed import imported, photograph
 
 if TYPE_CHECKING:
     from conftest import Photographed
 
 SPEC = BoardSpec(squares=(9, 7), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_100", origin_mm=(0.0, 0.0))
+TWIN = "simulated bristle bundle (twin of 2026-03-02-grid-01)"
 WIDTHS_PX = (390, 800, 1200, 1600)
 MAX_BYTES = 3 * 1024 * 1024
 
@@ -55,6 +67,8 @@ def pages(photographed: Photographed, tmp_path_factory: pytest.TempPathFactory) 
     return {
         "calibrate": run("calibrate", session),
         "camera": _lens(folder),
+        "loop": _loop(folder),
+        "write": _written(folder),
         "fit": run("fit", _pressed(folder), "--mm-per-px", "0.8"),
     }
 
@@ -79,6 +93,63 @@ def _lens(folder: Path) -> str:
     return write_lens_page(file.save(folder), file, fitted, views, small).read_text(encoding="utf-8")
 
 
+def _loop(folder: Path) -> str:
+    """The page of two presses of one cell, of which one was pressed again, a little shorter."""
+    measured = Measured(length_mm=15.0, width_mm=4.0, mid_width_mm=4.0, breadth_mm=4.0, area_mm2=60.0)
+
+    def press(name: str, height_mm: float, end: int) -> CapturedPress:
+        image = np.zeros((128, 128), np.float32)
+        image[58:70, 40:end] = 1.0
+        return CapturedPress(name, height_mm, 5.0, measured, dict.fromkeys(KEYS, image))
+
+    first, second = press("a-r01", 15.0, 90), press("a-r02", 15.0, 88)
+    pairs = [Pair(first, press("a-r01~1", 14.6, 89), first.images)]
+    scores = score_pairs(pairs, [first, second])
+    sessions = [
+        ComparedSession(
+            Header(session_id=name, source=Source.LOOPBACK, software="test", brush=TWIN), folder, "ab", None
+        )
+        for name in ("grid", "replay")
+    ]
+    made = LoopComparison(
+        original=sessions[0],
+        again=sessions[1],
+        model="CCD-BSM",
+        in_sample=True,
+        field=Field(),
+        paired=Pairs(pairs, {"a-r01": first, "a-r02": second}, [("a-r02", NOT_AGAIN), ("x<u>", "is blank")]),
+        scores=scores,
+        table=table_1(scores, source=Source.LOOPBACK, original="grid", again="replay", model="CCD-BSM"),
+        verdicts=verdicts(scores),
+        software="test",
+    )
+    return write_loop(made, folder / "loop", "brushloop loop").read_text(encoding="utf-8")
+
+
+def _written(folder: Path) -> str:
+    """The page of one character, written twice."""
+    cross = np.zeros((128, 128), np.float32)
+    cross[60:68, 30:100] = cross[30:100, 60:68] = 1.0
+    ink = dict.fromkeys(Tone, cross)
+    strokes = [np.array([[1.0, 2.0, 3.0, 4.0, 0.0], [5.0, 6.0, 7.0, 8.0, 9.0]])]
+    figure = figure_record("字", "a font", strokes, strokes, wanted=cross, simulated=cross)
+    one = Character("字", "a font", ink, ink, {"zi-r01": ink, "zi-r02": ink})
+    scores = list(score_character(one))
+    made = WritingComparison(
+        header=Header(session_id="write-01", source=Source.LOOPBACK, software="test", brush=TWIN),
+        recording=folder,
+        recording_sha256="ab",
+        calibration=CALIBRATION,
+        plan=PlanRecord(model="CCD-BSM", planned_by=BY, cell_mm=60.0, software="test", figures=(figure,)),
+        characters=[one],
+        scores=scores,
+        table=table_3(
+            scores, source=Source.LOOPBACK, session_id="write-01", model="CCD-BSM", references={"字": "a font"}
+        ),
+    )
+    return write_written(made, folder / "written", "brushloop write").read_text(encoding="utf-8")
+
+
 def _pressed(folder: Path) -> Path:
     """An imported session of two presses at two depths."""
     lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
@@ -92,7 +163,10 @@ def _pressed(folder: Path) -> Path:
 def test_a_page_is_one_labelled_file_without_scripts_that_fetches_nothing(pages: dict[str, str]) -> None:
     for name, page in pages.items():
         assert len(page.encode()) <= MAX_BYTES, name
-        assert re.findall(r"(?:src|href)=\"(?!data:|#)[^\"]*\"|<script|@import|<u>", page) == [], name
+        assert (
+            re.findall(r"(?:src|href)=\"(?!data:|#|[\w.-]+\.(?:png|csv|json)\")[^\"]*\"|<script|@import|<u>", page)
+            == []
+        ), name
         assert '<span class="source">' in page
         for figure in re.findall(r"<img[^>]*>", page):
             assert re.search(r'alt="[^"]{3}', figure), f"{name}: {figure[:80]} has no text for a screen reader"
@@ -123,6 +197,14 @@ def test_the_page_of_a_lens_shades_what_no_board_covered_and_names_each_photogra
     assert page.count('class="part empty"') == page.count(">no corner<") > 0
     assert "7.png: not used: is blank" in page
     assert "0&lt;u&gt;.png: 0." in page
+
+
+def test_a_page_of_a_twin_says_whose_twin_on_every_figure(pages: dict[str, str]) -> None:
+    for name in ("loop", "write"):
+        assert '<span class="source">loopback rig, brush twin of 2026-03-02-grid-01</span>' in pages[name]
+        assert pages[name].count("brush twin of 2026-03-02-grid-01") > 5
+    assert "One original was not pressed again." in pages["loop"]
+    assert "x&lt;u&gt;: is blank" in pages["loop"]
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
