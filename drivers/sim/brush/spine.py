@@ -9,6 +9,7 @@ ACM TOG 39(4), 2020), by damped Newton.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -164,26 +165,28 @@ class _LoadStep:
 
     def shape(self, phi: Vector) -> SpineShape:
         """Positions, squash and contact forces that belong to the angles `phi`."""
-        x, z = self._nodes(phi)
-        squash = self.bundle.radius_mm * _broadside(phi) - z
+        sin = np.sin(phi)
+        x, z = self._nodes(sin, np.cos(phi))
+        squash = self.bundle.radius_mm * _broadside(sin) - z
         return SpineShape(x, z, phi, squash, np.maximum(0.0, self._contact(squash)[1]))
 
     def energy(self, phi: Vector) -> float:
         """Bending, squash and lagged friction energy in N mm."""
-        x, z = self._nodes(phi)
+        sin = np.sin(phi)
+        x, z = self._nodes(sin, np.cos(phi))
         bend = self._bend(phi)
-        squash = self.bundle.radius_mm * _broadside(phi) - z
+        squash = self.bundle.radius_mm * _broadside(sin) - z
         slid = np.hypot(x - self.last_x, SLIP_SMOOTHING_MM)
         stored = 0.5 * self.bundle.joint_n_mm @ bend**2 + self._contact(squash)[0].sum()
         return float(stored + self.bundle.friction * self.last_normal @ slid)
 
     def derivatives(self, phi: Vector) -> tuple[float, Vector, Vector]:
         """Energy, its gradient (n,) and a Hessian (n, n), without its concave terms if it is not convex."""
-        b, ds, n = self.bundle, self.bundle.link_mm, phi.size
-        x, z = self._nodes(phi)
+        b, n = self.bundle, phi.size
         sin, cos = np.sin(phi), np.cos(phi)
+        x, z = self._nodes(sin, cos)
         bend = self._bend(phi)
-        broad = _broadside(phi)
+        broad = _broadside(sin)
         squash = b.radius_mm * broad - z
         stored, normal, stiffness = self._contact(squash)
         slip = x - self.last_x
@@ -193,36 +196,43 @@ class _LoadStep:
         drag_stiffness = limit * SLIP_SMOOTHING_MM**2 / slid**3
 
         # rows: nodes, columns: angles; a node moves with every link above it, and `sink` is d(squash)
-        lower = ds * np.tri(n)
-        along = -lower * cos
-        sink = -lower * sin + np.diag(b.radius_mm * sin * cos / broad)
+        above = _minus_links(b.link_mm, n)
+        along, sink = above * cos, above * sin
+        sink.ravel()[:: n + 1] += b.radius_mm * sin * cos / broad
 
         torque = b.joint_n_mm * bend
-        gradient = torque - np.append(torque[1:], 0.0) + sink.T @ normal + along.T @ drag
+        gradient = torque.copy()
+        gradient[:-1] -= torque[1:]
+        gradient += sink.T @ normal
+        gradient += along.T @ drag
         below_normal = np.cumsum(normal[::-1])[::-1]
         below_drag = np.cumsum(drag[::-1])[::-1]
         section_curve = (cos**2 - sin**2) / broad - (sin * cos) ** 2 / broad**3
-        curve = ds * (sin * below_drag - cos * below_normal) + b.radius_mm * section_curve * normal
+        curve = b.link_mm * (sin * below_drag - cos * below_normal) + b.radius_mm * section_curve * normal
         hessian = sink.T @ (np.maximum(stiffness, 0.0)[:, None] * sink)
         hessian += along.T @ (drag_stiffness[:, None] * along)
         spring = b.joint_n_mm
-        diagonal = np.diag_indices(n)
-        hessian[diagonal] += spring + np.append(spring[1:], 0.0)
-        above = np.arange(n - 1)
-        hessian[above, above + 1] -= spring[1:]
-        hessian[above + 1, above] -= spring[1:]
-        hessian[diagonal] += curve
+        flat = hessian.ravel()
+        diagonal = flat[:: n + 1]
+        diagonal += _with_next(spring)
+        flat[1 :: n + 1] -= spring[1:]
+        flat[n :: n + 1] -= spring[1:]
+        diagonal += curve
         if not _is_convex(hessian):
-            hessian[diagonal] -= np.minimum(curve, 0.0)
+            diagonal -= np.minimum(curve, 0.0)
         total = float(0.5 * torque @ bend + stored.sum() + b.friction * self.last_normal @ slid)
         return total, gradient, hessian
 
-    def _nodes(self, phi: Vector) -> tuple[Vector, Vector]:
+    def _nodes(self, sin: Vector, cos: Vector) -> tuple[Vector, Vector]:
+        """Places of the nodes, given the sines and cosines of the links' angles."""
         ds = self.bundle.link_mm
-        return self.clamp_x - ds * np.cumsum(np.sin(phi)), self.clamp_z - ds * np.cumsum(np.cos(phi))
+        return self.clamp_x - ds * np.cumsum(sin), self.clamp_z - ds * np.cumsum(cos)
 
     def _bend(self, phi: Vector) -> Vector:
-        return np.diff(phi, prepend=self.tilt_rad) - self.bundle.rest_bend_rad
+        bend = phi.copy()
+        bend[0] -= self.tilt_rad
+        bend[1:] -= phi[:-1]
+        return bend - self.bundle.rest_bend_rad
 
     def _contact(self, squash: Vector) -> tuple[Vector, Vector, Vector]:
         """Energy, force and stiffness (n,): soft, then packed, and pulled down when just clear."""
@@ -231,7 +241,7 @@ class _LoadStep:
         inside = np.maximum(0.0, squash)
         over = np.maximum(0.0, squash - HARD_CORE * self.bundle.radius_mm)
         # the pull is a parabola over the meniscus, 0 at touch and at its end, so that Newton sees no jump
-        gap = np.clip(-squash / MENISCUS_MM, 0.0, 1.0)
+        gap = np.minimum(np.maximum(-squash / MENISCUS_MM, 0.0), 1.0)
         pull = 8.0 * self.bundle.suction_n_per_mm2 * self.bundle.radius_mm * self.bundle.link_mm
         energy = 0.5 * soft * inside**2 + 0.5 * hard * over**2
         energy += pull * MENISCUS_MM * (gap**2 / 2.0 - gap**3 / 3.0)
@@ -241,9 +251,24 @@ class _LoadStep:
         return energy, force, stiffness
 
 
-def _broadside(phi: Vector) -> Vector:
+def _broadside(sin: Vector) -> Vector:
     """|sin phi|, rounded where the spine is upright: how much of the local radius points at the paper."""
-    return np.hypot(np.sin(phi), UPRIGHT_SMOOTHING)
+    return np.hypot(sin, UPRIGHT_SMOOTHING)
+
+
+@functools.lru_cache(maxsize=8)
+def _minus_links(link_mm: float, n: int) -> NDArray[np.float64]:
+    """(n, n) lower triangle of -`link_mm`; not to be written to."""
+    triangle = -link_mm * np.tri(n)
+    triangle.flags.writeable = False
+    return triangle
+
+
+def _with_next(values: Vector) -> Vector:
+    """Each value plus the one after it; the last has none."""
+    both = values.copy()
+    both[:-1] += values[1:]
+    return both
 
 
 def _is_convex(hessian: NDArray[np.float64]) -> bool:
