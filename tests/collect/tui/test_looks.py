@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from textual.pilot import Pilot
+from textual.widgets import Input
 
 from collect.engine.control import State
 from collect.tui.app import OperatorApp
@@ -134,11 +135,15 @@ def test_first_day(snap_compare: Callable[..., bool], kind: str, size: str) -> N
     async def asked(pilot: Pilot[None]) -> None:
         while not app._screen.asking:
             await pilot.pause(0.02)
+        for field in app.screen.query(Input):
+            field.cursor_blink = False  # on a busy machine the picture may be taken while it is dark
         await pilot.pause()
 
-    assert snap_compare(app, terminal_size=SIZES[size], run_before=asked)
-    app.teaching.stop()
-    app.teaching._thread.join()
+    try:
+        assert snap_compare(app, terminal_size=SIZES[size], run_before=asked)
+    finally:
+        app.teaching.stop()
+        app.teaching._thread.join()
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -223,15 +223,23 @@ async def test_a_late_reply_does_not_pass_for_the_next(line: PtyLine, firmware: 
     assert firmware.starts == 1
 
 
-async def test_a_host_that_was_held_up_reports_the_excess(firmware: PumpFirmware, line: PtyLine):
+async def test_a_host_that_was_held_up_reports_the_excess(
+    firmware: PumpFirmware, line: PtyLine, monkeypatch: pytest.MonkeyPatch
+):
     pump = pump_at(line.path, max_overrun_s=0.1)
     await pump.connect()
-    dosing = asyncio.create_task(pump.dose(0.01))
-    while not firmware.running:
-        await asyncio.sleep(0.01)
-    time.sleep(0.25)  # the fault under test
-    with pytest.raises(DeviceError, match=r"instead of 0.10 s\. About .* too much.*is stopped"):
-        await dosing
+    sleep, ran = asyncio.sleep, list[bool]()
+
+    async def sleep_and_be_held_up(delay_s: float) -> None:
+        await sleep(delay_s)
+        ran.append(firmware.running)
+        time.sleep(0.25)  # the fault under test
+
+    with monkeypatch.context() as holding_up:
+        holding_up.setattr("drivers.ink.pump.asyncio.sleep", sleep_and_be_held_up)
+        with pytest.raises(DeviceError, match=r"instead of 0.10 s\. About .* too much.*is stopped"):
+            await pump.dose(0.01)
+    assert ran == [True]
     assert not firmware.running
     await pump.close()
 
