@@ -101,16 +101,20 @@ class Reader:
         self.rig = None
 
 
-@pytest.fixture(scope="module")
-def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Reader]:
-    """A reader who has done the tutorial; its recording and its rig are there for the other pages."""
-    folder = tmp_path_factory.mktemp("lab")
+def new_lab(folder: Path) -> Reader:
+    """A clone as a reader has it, with a protocol and a script of faults."""
     shutil.copytree(ROOT / "examples", folder / "examples")
     (folder / ".venv").symlink_to(sys.prefix)
     shutil.copy(ROOT / "examples" / "protocol-quick.toml", folder / "protocol.toml")
     [script] = [b.text for b in blocks_of(ROOT / "docs" / "faults.md") if b.kind == "toml"]
     (folder / "faults.toml").write_text(script, encoding="utf-8")
-    reader = Reader(folder)
+    return Reader(folder)
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Reader]:
+    """A reader who has done the tutorial; its recording and its rig are there for the other pages."""
+    reader = new_lab(tmp_path_factory.mktemp("lab"))
     try:
         reader.follow(TUTORIAL)
         yield reader
@@ -130,11 +134,18 @@ def test_every_command_of_the_tutorial_does_what_it_says(lab: Reader) -> None:
 @pytest.mark.soak
 @pytest.mark.timeout(3000)
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_command_of_a_page_runs(lab: Reader, page: Path) -> None:
-    if lab.rig is None or "--write-rig" not in lab.rig.args:
-        lab.serve("brushloop sim --write-rig rig.toml --rate 20")
-    shutil.rmtree(lab.folder / "exported", ignore_errors=True)  # an export never overwrites
-    lab.follow(page)
+def test_every_command_of_a_page_runs(lab: Reader, tmp_path: Path, page: Path) -> None:
+    shown = [line for block in blocks_of(page) if block.kind == "sh" and not block.remark for line in block.commands]
+    collects = any(line.startswith("brushloop collect --") for line in shown)
+    # Beside earlier sessions, a new one would ask for a fresh sheet.
+    reader = new_lab(tmp_path) if collects else lab
+    try:
+        if reader.rig is None or "--write-rig" not in reader.rig.args:
+            reader.serve("brushloop sim --write-rig rig.toml --rate 20")
+        reader.follow(page)
+    finally:
+        if collects:
+            reader.leave()
 
 
 @pytest.mark.soak
