@@ -30,7 +30,6 @@ def benches() -> dict[str, Bench]:
         "generator-qbc": _late("generator", "run_qbc"),
         "growth": _late("growth"),
         "inversion": _late("inversion"),
-        "kept": _late("kept"),
         "loop": _late("loop"),
         "overhead": _late("overhead"),
         "paper-brush": _late("paper_brush"),

@@ -1,16 +1,18 @@
-"""Time and peak memory of commands by number of strokes, with stills of the size and noise of the rig's camera.
+"""Time and peak memory of commands by number of strokes, on small pictures and on stills of the rig's camera.
 
 Each command is a process of its own, started by a small one, so that its peak is its own. A few dozen stills are drawn;
 the others are links to them. A brush is fitted to these few, and `validate` compares it with all.
 
-`python -m bench.growth 20000` measures up to 20,000 strokes, renews the rows in docs/bench.md and draws
-docs/growth.svg; `python -m bench growth --largest 5000` only measures. With `--small`, pictures are of 480 x 300 px
-without noise: for the number of strokes alone, in a twentieth of the time and of the disk.
+`python -m bench.growth` measures up to 5,000 strokes on pictures of 480 x 300 px without noise, and up to 1,000 on
+stills of 2048 x 1536 px with noise, which take some twenty times the time and disk. It keeps every point in
+docs/growth.csv, draws docs/growth.svg from them and renews the rows in docs/bench.md; `--small 0` or `--full 0` leaves
+one kind out, whose points stay as they are. `python -m bench growth` only measures, on the full stills.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import itertools
 import shutil
 import sys
@@ -23,7 +25,7 @@ from typing import Any
 from bench import table
 from bench.harness import BenchError, Result, machine
 from bench.peak import Used, measure
-from bench.press_sessions import CLOSE, STILL, Presses, View, photographs, session, write_table
+from bench.press_sessions import CLOSE, STILL, Presses, photographs, session, write_table
 from calibrate.artefact import current
 from calibrate.fit.artefact import FOLDER as FITS
 
@@ -33,18 +35,22 @@ LARGEST = 300
 LEVEL_FROM = 1000
 """Memory is compared with what this many strokes take, where more are measured."""
 MOST_GROWTH = 1.05
-PICTURE = Path(__file__).resolve().parent.parent / "docs" / "growth.svg"
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+POINTS, PICTURE = DOCS / "growth.csv", DOCS / "growth.svg"
+VIEWS = {"small": CLOSE, "full": STILL}
+COLUMNS = ("view", "command", "strokes", "wall_s", "cpu_s", "peak_mb")
 EXPORTS = ("png", "npz", "parquet")
 COMMANDS = ("import", "verify", "merge", *(f"export-{kind}" for kind in EXPORTS), "validate")
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """What one command took for this many strokes."""
+    """What one command took for this many strokes, on pictures of one of `VIEWS`."""
 
     command: str
     strokes: int
     used: Used
+    view: str = "full"
 
 
 def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
@@ -56,11 +62,11 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     return results(list(measured(LARGEST if n is None else n, seed)), seed)
 
 
-def measured(largest: int, seed: int, view: View = STILL) -> Iterator[Point]:
+def measured(largest: int, seed: int, view: str = "full") -> Iterator[Point]:
     """Every command at each size, with at most one session of the largest size and a copy of it on the disk."""
     if largest < SIZES[0] + 1:
         raise ValueError(f"n = {largest}: more than {SIZES[0]} strokes are needed")
-    presses = Presses(largest, seed, view=view)
+    presses = Presses(largest, seed, view=VIEWS[view])
     with tempfile.TemporaryDirectory() as folder:
         under = Path(folder)
         photos = photographs(under / "photos", presses)
@@ -92,16 +98,16 @@ def measured(largest: int, seed: int, view: View = STILL) -> Iterator[Point]:
             }
             for name, words in commands.items():
                 out.mkdir()
-                yield Point(name, strokes, measure(*brushloop, *map(str, words)))
+                yield Point(name, strokes, measure(*brushloop, *map(str, words)), view)
                 shutil.rmtree(out)
             shutil.rmtree(place)
 
 
-def results(points: Sequence[Point], seed: int, view: View = STILL) -> list[Result]:
-    """Two figures of each command."""
+def results(points: Sequence[Point], seed: int) -> list[Result]:
+    """Two figures of each command; the points are of one view."""
     made: list[Result] = []
-    name = "growth" if view is STILL else "growth-small"
-    size = f"stills of {view.width_px} x {view.height_px} px{' with noise' if view.noise else ''}"
+    name = "growth" if points[0].view == "full" else "growth-small"
+    size = _size(points[0].view)
     for command, mine in by_command(points).items():
         (a, b), (y, z) = mine[:2], mine[-2:]
         level = next((point for point in mine[:-1] if point.strokes == LEVEL_FROM), mine[0])
@@ -149,48 +155,74 @@ def each_ms(few: Point, many: Point) -> float:
     return 1e3 * (many.used.cpu_s - few.used.cpu_s) / (many.strokes - few.strokes)
 
 
-def draw(points: Sequence[Point], path: Path, title: str) -> None:
-    """CPU time and peak memory by number of strokes, which is on a logarithmic axis."""
+def kept(measured_now: Sequence[Point], path: Path = POINTS) -> list[Point]:
+    """Renew the file with what was measured now; all points that it then holds."""
+    points: dict[tuple[str, str, int], Point] = {}
+    if path.exists():
+        for row in csv.DictReader(path.read_text().splitlines()):
+            used = Used(*(float(row[name]) for name in COLUMNS[3:]))
+            points[row["view"], row["command"], int(row["strokes"])] = Point(
+                row["command"], int(row["strokes"]), used, row["view"]
+            )
+    points |= {(point.view, point.command, point.strokes): point for point in measured_now}
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for (view, command, strokes), point in points.items():
+            used = point.used
+            writer.writerow((view, command, strokes, f"{used.wall_s:.1f}", f"{used.cpu_s:.2f}", f"{used.peak_mb:.1f}"))
+    return list(points.values())
+
+
+def draw(points: Sequence[Point], path: Path = PICTURE) -> None:
+    """CPU time and peak memory by number of strokes, a row of plots for each view."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    figure: Any = Figure(figsize=(10.0, 4.0), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for command, mine in by_command(points).items():
-        strokes = [point.strokes for point in mine]
-        left.loglog(strokes, [point.used.cpu_s for point in mine], marker=".", label=command)
-        right.semilogx(strokes, [point.used.peak_mb for point in mine], marker=".", label=command)
-    left.set(xlabel="strokes", ylabel="CPU time, s")
-    right.set(xlabel="strokes", ylabel="peak memory, MB", ylim=(0, None))
-    for axis in (left, right):
-        axis.grid(alpha=0.3)
-    right.legend(fontsize=8)
-    figure.suptitle(title, fontsize=9)
+    views = [view for view in VIEWS if any(point.view == view for point in points)]
+    figure: Any = Figure(figsize=(10.0, 4.0 * len(views)), layout="constrained")
+    for view, (left, right) in zip(views, figure.subplots(len(views), 2, squeeze=False), strict=True):
+        for command, mine in by_command([point for point in points if point.view == view]).items():
+            strokes = [point.strokes for point in mine]
+            left.loglog(strokes, [point.used.cpu_s for point in mine], marker=".", label=command)
+            right.semilogx(strokes, [point.used.peak_mb for point in mine], marker=".", label=command)
+        left.set(xlabel="strokes", ylabel="CPU time, s")
+        right.set(xlabel="strokes", ylabel="peak memory, MB", ylim=(0, None))
+        for axis in (left, right):
+            axis.set_title(f"simulated presses, {_size(view)}", fontsize=9)
+            axis.grid(alpha=0.3)
+        right.legend(fontsize=7, ncols=2)
     with mpl.rc_context({"svg.hashsalt": "growth", "svg.fonttype": "none"}):
         figure.savefig(path, metadata={"Date": None})
 
 
+def _size(view: str) -> str:
+    size = VIEWS[view]
+    return f"{view} pictures of {size.width_px} x {size.height_px} px{' with noise' if size.noise else ''}"
+
+
 def main() -> None:
-    """Measure, draw the picture, renew the table and print the figures."""
+    """Measure, keep the points, draw the picture, renew the table and print the figures."""
     parser = argparse.ArgumentParser(prog="python -m bench.growth", description="Time and memory by number of strokes.")
-    parser.add_argument("largest", nargs="?", type=int, default=SIZES[-2])
+    parser.add_argument(
+        "--small", type=int, default=5000, metavar="STROKES", help="most, on small pictures; 0 for none"
+    )
+    parser.add_argument("--full", type=int, default=1000, metavar="STROKES", help="on full stills; 0 for none")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--small", action="store_true", help="pictures of 480 x 300 px without noise")
     options = parser.parse_args()
-    points: list[Point] = []
-    view = CLOSE if options.small else STILL
-    for point in measured(options.largest, options.seed, view):
-        points.append(point)
-        used = point.used
-        words = f"{point.command}: {point.strokes:,} strokes, {used.wall_s:.1f} s, {used.cpu_s:.1f} CPU-s"
-        sys.stdout.write(f"# {words}, {used.peak_mb:.0f} MB\n")
-        sys.stdout.flush()
-    command = f"python -m bench.growth {options.largest}{' --small' if options.small else ''} --seed {options.seed}"
-    title = f"simulated presses, pictures of {view.width_px} x {view.height_px} px; {command}"
-    draw(points, PICTURE.with_stem("growth-small") if options.small else PICTURE, title)
-    found = results(points, options.seed, view)
-    table.renew(found)
-    sys.stdout.writelines(f"{result.to_line()}\n" for result in found)
+    for view, largest in (("small", options.small), ("full", options.full)):
+        points: list[Point] = []
+        for point in measured(largest, options.seed, view) if largest else ():
+            points.append(point)
+            used = point.used
+            words = f"{view}, {point.command}: {point.strokes:,} strokes, {used.wall_s:.1f} s, {used.cpu_s:.1f} CPU-s"
+            sys.stdout.write(f"# {words}, {used.peak_mb:.0f} MB\n")
+            sys.stdout.flush()
+            draw(kept([point]))
+        if points:
+            found = results(points, options.seed)
+            table.renew(found)
+            sys.stdout.writelines(f"{result.to_line()}\n" for result in found)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ TIME_GOAL = 0.9
 """For `growth-...-time`: a further stroke may take a tenth longer at the largest sizes than at the smallest."""
 _HEAD = """# Figures of the benches
 Written by `make bench` (speed and memory, about 12 minutes), `python -m bench --accuracy --table` (hours),
-`python -m bench.growth 5000`, or `python -m bench NAME --table`, which renews the rows of one bench.
+`python -m bench.growth` (75 minutes), or `python -m bench NAME --table`, which renews the rows of one bench.
 
 A ratio compares with the peer or limit named beside it, in the same run; above 1 is better for us. Figures of strokes
 and photographs are of the loopback rig, which is simulated.

@@ -24,7 +24,6 @@ SPEED = {
     "preprocess": 20,
     "rpc": 120,
     "validate": 100,
-    "kept": 40,
 }
 """What `make bench` measures, and about how many seconds each bench takes on two quiet cores."""
 ACCURACY = {

@@ -10,7 +10,7 @@ import cv2
 import pytest
 
 import bench.__main__
-from bench import footprints, growth, kept, paper_brush, raster, rpc, table, whole
+from bench import footprints, growth, paper_brush, raster, rpc, table, whole
 from bench.harness import BenchError, Result, interleave, percentile, results_of
 from bench.peak import Used, measure
 from bench.processes import started
@@ -78,6 +78,18 @@ def test_growth_compares_the_largest_sizes_with_the_smallest() -> None:
     assert (time.name, time.value) == ("growth-merge-time", 6.0)
     assert time.ratio == pytest.approx(5.0 / 6.0)
     assert memory.ratio == pytest.approx(1.05 * 100 / 104)
+
+
+def test_a_point_of_growth_replaces_only_the_same_point(tmp_path: Path) -> None:
+    def point(view: str, cpu_s: float) -> growth.Point:
+        return growth.Point("merge", 100, Used(1.0, cpu_s, 80.0), view)
+
+    path = tmp_path / "growth.csv"
+    growth.kept([point("small", 2.0), point("full", 3.0)], path)
+    assert growth.kept([point("full", 4.0)], path) == [point("small", 2.0), point("full", 4.0)]
+    growth.draw(growth.kept([], path), tmp_path / "growth.svg")
+    picture = (tmp_path / "growth.svg").read_text()
+    assert all(size in picture for size in ("small pictures of 480 x 300 px", "full pictures of 2048 x 1536 px"))
 
 
 def test_peak_memory_is_of_the_command_alone() -> None:
@@ -183,11 +195,6 @@ def test_a_bench_that_fails_or_hangs_costs_its_own_figures_only(monkeypatch: pyt
     ]
     assert "b: not measured: it was ended after 360 s" in said
     assert "c: not measured: it ended with 1" in said
-
-
-def test_what_a_stroke_takes_needs_more_than_a_few_strokes() -> None:
-    with pytest.raises(ValueError, match="at least 40"):
-        kept.run(n=39)
 
 
 def test_a_number_of_rounds_goes_with_one_bench(capsys: pytest.CaptureFixture[str]) -> None:
