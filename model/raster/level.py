@@ -28,8 +28,9 @@ def draw(marks, out):
     """
     size = out.shape[1]
     means, areas = np.empty(size, np.int32), np.zeros(size + 2)
-    columns, missing = np.empty((2, size + 2), np.int64), np.empty((2, size + 2))
-    if not _draw_all(marks, out, means, areas, columns, missing):
+    columns = np.empty((2, size + 2), np.int64)
+    places, missing = np.empty((2, 2, size + 2))
+    if not _draw_all(marks, out, means, areas, places, columns, missing):
         raise ValueError(f"a shape is not finite, or lies more than {FURTHEST:g} pixels away")
 
 
@@ -54,7 +55,7 @@ def lengths(presses, marks):
 
 
 @numba.njit(**OPTIONS, cache=True)
-def _draw_all(marks, out, means, areas, columns, missing):
+def _draw_all(marks, out, means, areas, places, columns, missing):
     """Draw one image after another; false for a shape that cannot be drawn."""
     size = out.shape[1]
     unit = np.int32(1 << min(23, 30 - math.ceil(math.log2(size))))
@@ -76,12 +77,18 @@ def _draw_all(marks, out, means, areas, columns, missing):
         _columns(heel, tip, wide, cx, left, right, beyond, unit, means, areas)
         flat[: top * size] = 0
         flat[bottom * size :] = 0
-        _rows(out[n], cy, beyond, top, bottom, unit, means)
+        copied = mirrored and top + bottom == twice and twice % 2 == 0  # the lower half is the upper one, line by line
+        _rows(out[n], cy, beyond, top, (top + bottom) // 2 if copied else bottom, unit, means)
         up, down = np.floor(cy) - beyond, np.ceil(cy) + beyond
-        count = _crossings(heel, tip, wide, cx, cy - up, size, areas, columns, missing)
+        count = _crossings(heel, tip, wide, cx, cy - up, size, areas, places, columns, missing)
         _correct(out[n], cy - up, count, int(up), -1, columns, missing)
+        if copied:
+            for i in range(top, (top + bottom) // 2):
+                for k in range(size):
+                    out[n, top + bottom - 1 - i, k] = out[n, i, k]
+            continue
         if not mirrored:
-            count = _crossings(heel, tip, wide, cx, down - cy, size, areas, columns, missing)
+            count = _crossings(heel, tip, wide, cx, down - cy, size, areas, places, columns, missing)
         _correct(out[n], down - cy, count, int(down), 1, columns, missing)
     return True
 
@@ -132,24 +139,25 @@ def _rows(image, cy, beyond, top, bottom, unit, means):
 
 
 @compiled
-def _crossings(heel, tip, wide, cx, start, size, areas, columns, missing):
+def _crossings(heel, tip, wide, cx, start, size, areas, places, columns, missing):
     """Set the columns where w crosses the levels start, start + 1... on either side, and P(a) - min(m, a) there.
 
     Returns how many levels there are.
     """
     half = 2 / 3 * wide * tip
     count = min(columns.shape[1], int(max(0.0, np.ceil(wide - start))))
-    for k in range(count):
-        a = start + k
-        v = a / wide
+    for k in range(count):  # nothing here depends on `columns` or `areas`: several levels are computed at a time
+        v = (start + k) / wide
         u, s = math.sqrt(1 - v), math.sqrt((1 - v) * (1 + v))
-        x, y = cx - tip * u, cx + heel * s
+        places[0, k], places[1, k] = cx - tip * u, cx + heel * s
+        missing[0, k] = half - wide * tip * (u - u * u * u / 3)
+        missing[1, k] = half + 0.5 * wide * heel * (s * v + _angle(s, v))
+    for k in range(count):
+        a, x, y = start + k, places[0, k], places[1, k]
         i, j = int(min(max(np.floor(x), -1.0), size)), int(min(max(np.floor(y), -1.0), size))
-        before = half - wide * tip * (u - u * u * u / 3)
-        until = half + 0.5 * wide * heel * (s * v + _angle(s, v))
         p, q = max(i, 0), max(j, 0)
-        lack = before - areas[p] - a * (x - i)
-        short = areas[q + 1] - until - a * (j + 1 - y)
+        lack = missing[0, k] - areas[p] - a * (x - i)
+        short = areas[q + 1] - missing[1, k] - a * (j + 1 - y)
         both = i == j
         missing[0, k] = lack + (short if both else 0.0) + max(a - areas[p + 1] + areas[p], 0.0)
         missing[1, k] = 0.0 if both else short + max(a - areas[q + 1] + areas[q], 0.0)
@@ -164,8 +172,8 @@ def _angle(sine, cosine):
     t /= 1 + math.sqrt(1 + t * t)
     q = t * t
     total = 0.0
-    for k in (33, 31, 29, 27, 25, 23, 21, 19, 17, 15, 13, 11, 9, 7, 5, 3, 1):
-        total = 1 / k - q * total
+    for k in range(16, -1, -1):
+        total = 1 / (2 * k + 1) - q * total
     return 4 * t * total
 
 
