@@ -4,7 +4,7 @@ Each command is a process of its own, started by a small one, so that its peak i
 the others are links to them. A brush is fitted to these few, and `validate` compares it with all.
 
 `python -m bench.growth` measures up to 5,000 strokes on pictures of 480 x 300 px without noise, and up to 1,000 on
-stills of 2048 x 1536 px with noise, which take some twenty times the time and disk. It keeps every point in
+stills of 2048 x 1536 px with noise, which take about twenty times the time and disk. It keeps every point in
 docs/growth.csv, draws docs/growth.svg from them and renews the rows in docs/bench.md; `--small 0` or `--full 0` leaves
 one kind out, whose points stay as they are. `python -m bench growth` only measures, on the full stills.
 """

@@ -1,6 +1,4 @@
-"""The compared strokes of a run and their scores. Both stay in the store; memory holds where they are, about 50 bytes a
-stroke.
-"""
+"""The compared strokes of a run and their scores: both stay in the store, and memory holds where they are."""
 
 from __future__ import annotations
 
