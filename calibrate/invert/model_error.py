@@ -3,8 +3,8 @@
 The interval of one image says how well that image identifies a press within the model. How far the model and the
 brush's own variation move a recovered value is seen only where the command is known: a variance that is common to the
 presses, beside what each image's own interval explains. Each press takes it from the other cells of its session, so
-that its own command does not enter its interval. A brush predicts the cells that it was fitted to better than others,
-so a press of another cell takes it from such cells only, where there are enough.
+that its own command does not enter its interval. A brush predicts the cells that it was fitted to better than others;
+for a press of another cell it is estimated from such cells too, and the larger estimate counts.
 
 R. C. Paule and J. Mandel, "Consensus values and weighting factors", Journal of Research of the National Bureau of
 Standards 87 (1982), give the variance: with it, the mean of squared errors over their expected squares is 1.
@@ -12,6 +12,7 @@ Standards 87 (1982), give the variance: with it, the mean of squared errors over
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 
 import numpy as np
@@ -38,13 +39,10 @@ def model_sd(off: Floats, sd: Floats, cells: list[Cell], fitted: Collection[Cell
     known = np.isfinite(off) & np.isfinite(sd)
     for cell in set(cells):
         others = [k for k, other in enumerate(cells) if other != cell and known[k]]
-        unseen = [k for k in others if cells[k] not in fitted]
-        if cell not in fitted and _count(cells, unseen) >= LEAST_CELLS:
-            others = unseen
-        count = _count(cells, others)
-        if count >= LEAST_CELLS:
-            found = np.sqrt(common_variance(off[others], sd[others])) * float(stdtrit(count, 0.975)) / NORMAL_95
-            out[[k for k, other in enumerate(cells) if other == cell]] = found
+        unseen = [] if cell in fitted else [k for k in others if cells[k] not in fitted]
+        found = [_spread(off[k], sd[k], len({cells[at] for at in k})) for k in (others, unseen) if k]
+        if len({cells[k] for k in others}) >= LEAST_CELLS:
+            out[[k for k, other in enumerate(cells) if other == cell]] = max(found)
     return out
 
 
@@ -64,5 +62,8 @@ def common_variance(off: Floats, sd: Floats) -> float:
     return variance
 
 
-def _count(cells: list[Cell], presses: list[int]) -> int:
-    return len({cells[k] for k in presses})
+def _spread(off: Floats, sd: Floats, cells: int) -> float:
+    """The deviation from presses of so many cells, enlarged; 0 from too few."""
+    if cells < LEAST_CELLS:
+        return 0.0
+    return math.sqrt(common_variance(off, sd)) * float(stdtrit(cells, 0.975)) / NORMAL_95
