@@ -21,12 +21,12 @@ from model.fitted import MODES, TERMS, FittedPress, command_terms, modes
 
 Floats = NDArray[np.float64]
 
-TERM_SCALE = (1.0, 1.0, 0.8, 0.5, 0.5, 0.5)
+TERM_SCALE = (1.0, 1.0, 0.8, 0.8, 0.8, 0.8)
 """Expected sizes of the terms: the first in units of the constant's scale, the rest in units of the others' scale."""
 CONSTANT = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 OTHERS = (0.03, 0.07, 0.15, 0.3, 0.6, 1.2)
 OWN = (0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8)
-EXPECTED = (0.3, 0.15, 0.2)
+EXPECTED = (0.3, 0.3, 0.1)
 """Scales of constant, other terms and a stroke's own deviation that are most plausible beforehand, mm for the first
 sine; each may well be e times larger or smaller."""
 END_MM = 1.5

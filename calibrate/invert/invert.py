@@ -160,7 +160,12 @@ def with_model_error(rows: Sequence[Row], fitted: Collection[Cell] = ()) -> list
     known = [
         cell for cell, one, other in zip(cells, deep, tilted, strict=True) if np.isfinite(one) and np.isfinite(other)
     ]
-    more_mm, more_deg = model_sd(deep, height_sd, cells, fitted), model_sd(tilted, tilt_sd, cells, fitted)
+    more_mm = model_sd(deep, height_sd, cells, fitted)
+    # alpha follows from the distance H tan(alpha), in which the model errs by so many mm whatever the depth. An upright
+    # press that was recovered at 0, the end of the range, does not show its error.
+    depth = np.array([row.height_mm for row in rows])
+    shown = np.where(tilted == 0.0, nan, tilted)
+    more_deg = model_sd(shown * depth, tilt_sd * depth, cells, fitted) / depth
     out: list[Row] = []
     for k, row in enumerate(rows):
         flags = set(row.flags)

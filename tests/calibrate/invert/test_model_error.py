@@ -1,5 +1,7 @@
 """Intervals of recovered presses hold the command although the model is wrong, or say that they may not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -67,3 +69,15 @@ def test_an_interval_over_most_of_the_commanded_range_is_flagged_and_still_given
 def test_an_interval_is_cut_to_what_was_commanded(value: float, sd: float, vague: bool) -> None:
     assert covers_most(value, sd, [0.0, 5.0, 10.0]) is vague
     assert not covers_most(value, sd, [5.0, 5.0]), "one tilt only: there is no range to compare with"
+
+
+def test_alpha_is_less_certain_where_the_brush_is_pressed_less() -> None:
+    made = with_model_error(rows(CELLS, 0.3, 2.0))
+    shallow, deep = ([r.tilt_sd_deg or 0.0 for r in made if r.commanded_height_mm == h] for h in (11.0, 20.0))
+    assert np.mean(shallow) == pytest.approx(np.mean(deep) * 20.0 / 11.0, rel=0.1)
+
+
+def test_upright_presses_recovered_at_0_do_not_count_as_exact() -> None:
+    half = [replace(r, tilt_deg=max(r.tilt_deg, 0.0)) for r in rows(CELLS[::3], 0.3, 2.0)]
+    assert np.mean([r.tilt_deg == 0.0 for r in half]) > 0.4
+    assert np.mean([r.tilt_sd_deg or 0.0 for r in with_model_error(half)]) > 1.9
