@@ -1,7 +1,8 @@
 """What a person waits for between collecting and the report: `fit` and `validate`.
 
-30 presses of the simulated brush (loopback rig), photographed at 10 px/mm and imported. Each figure is beside its
-goal, and is of a whole command in a process of its own: CPU seconds of all cores, for `validate` those of a clock.
+30 presses of the simulated brush (loopback rig), photographed at 10 px/mm and imported. Each figure stands
+beside its goal and is that of a whole command in a process of its own: CPU seconds of all cores, for `validate`
+wall-clock seconds.
 """
 
 from __future__ import annotations

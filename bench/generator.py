@@ -40,7 +40,7 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
 
 
 def run_qbc(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
-    """The same network on QBC strokes, 8 inputs (the paper's ablation), beside the peer; see `_compare`."""
+    """The same network on QBC strokes, 8 inputs (the paper's ablation), compared with the peer; see `_compare`."""
     return _compare("qbc", "generator-qbc", n, seed, with_basis=False)
 
 

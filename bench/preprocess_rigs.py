@@ -144,7 +144,7 @@ def lens_views(rig: int, count: int, seed: int = 0) -> list[Gray]:
 
 
 def true_scale(shot: Shot, pixel: tuple[float, float]) -> float:
-    """mm per pixel of the photograph as it was taken, at one of its pixels: from the true optics, by differences."""
+    """True mm per pixel at one pixel of the photograph as it was taken, by finite differences of the true optics."""
     step = 0.5
     start = shot.optics.homography
     around = np.array(pixel) + step * np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])

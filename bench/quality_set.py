@@ -222,7 +222,7 @@ class Bench:
         return left, self.table.sheet_mm[1] - top - height, width, height
 
     def _overrun(self, cell: Cell) -> None:
-        """Another press, from next door, that reaches into the cell."""
+        """A press in a neighbouring cell whose mark reaches into this one."""
         rng = self.rng
         for _ in range(20):
             aside = rng.choice([-1.0, 1.0]) * rng.uniform(10.0, 16.0)

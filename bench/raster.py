@@ -132,7 +132,7 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
 
 
 def _many(work: Work) -> Work:
-    """BULK images in calls of BATCH: a single short call would mostly measure the caches after the peer."""
+    """Draw BULK images in calls of BATCH; a single short call would mostly measure caches that the peer has emptied."""
 
     def repeated() -> None:
         for _ in range(BULK // BATCH):

@@ -137,8 +137,8 @@ def predict(
     *,
     page: bool = False,
 ) -> tuple[Floats, Floats, float]:
-    """The chance of ink at the test strokes, of the fitted drag model and corrected by what it misses; and the chance
-    from which a pixel is called ink, chosen on the training strokes."""
+    """Probabilities of ink at the test strokes, by the fitted drag model alone and with its learned correction; and the
+    probability above which a pixel counts as ink, chosen on the training strokes."""
     rows, columns = (slice(s.start, s.stop, 2) for s in region(strokes)[1:])
     place = strokes.place if page else np.zeros((len(strokes.paths), 0))
     paths = [strokes.paths[k] for k in chosen]

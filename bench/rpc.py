@@ -96,7 +96,7 @@ def _framings() -> tuple[Framing, ...]:
 
 
 async def _in_turns(calls: dict[str, Call], n: int) -> dict[str, list[float]]:
-    """The seconds of each of `n` calls of every kind, after one unmeasured block of each."""
+    """Seconds of each of `n` calls of every kind, called in turns, after one unmeasured block of each."""
     clock = asyncio.get_running_loop().time
     took_s: dict[str, list[float]] = {name: [] for name in calls}
     measured = False

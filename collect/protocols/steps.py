@@ -56,7 +56,7 @@ class Step:
 
     @property
     def run_scoped(self) -> bool:
-        """Whether it must be done again even if a stored result exists."""
+        """Whether every process must do the step again, even if a stored result exists."""
         return self.kind in RUN_SCOPED
 
 

@@ -122,7 +122,7 @@ def _force(config: RigConfig) -> Iterator[Check]:
 
 
 def check_page(checks: list[Check]) -> Text:
-    """A line for each check, its verdict a word and a colour, and below it what to do, if anything."""
+    """A line for each check, with its verdict as a word and a colour, followed by what to do, if anything."""
     page, width = Text(), max(len(check.name) for check in checks)
     for check in checks:
         page.append(f"{check.verdict:<12}", COLOURS[check.verdict])

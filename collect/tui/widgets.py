@@ -118,7 +118,7 @@ class KeyBar(Widget):
 
 
 class HelpScreen(ModalScreen[None]):
-    """Every key on one page; any of its own keys closes it."""
+    """Every key on one page; escape, q, ? and Enter close it."""
 
     DEFAULT_CSS = """
     HelpScreen { align: center middle; }

@@ -172,14 +172,14 @@ class Watchdog:
         self._feeding = asyncio.create_task(self._feed(self._timeout_s), name="robot watchdog")
 
     async def disarm(self) -> None:
-        """Stop feeding and disarm it. Where the controller cannot be reached, the watchdog fires: the arm stops."""
+        """Stop refreshing the watchdog and disarm it. If the controller cannot be reached, it fires: the arm stops."""
         if self.armed and self._timeout_s is not None:
             await self.abandon()
             with contextlib.suppress(DeviceError):
                 await self._set(self._timeout_s, NOTHING)
 
     async def abandon(self) -> None:
-        """Stop feeding and leave it armed, so that it fires."""
+        """Stop refreshing the watchdog and leave it armed, so that it fires."""
         feeding, self._feeding = self._feeding, None
         if feeding is not None:
             feeding.cancel()

@@ -198,7 +198,7 @@ class RoundStream:
 
 
 def command(data: bytes) -> can.Message:
-    """A command frame to the board."""
+    """Make the CAN frame of a command to the board."""
     import can
 
     return can.Message(arbitration_id=COMMAND_ID, is_extended_id=False, data=data)

@@ -119,14 +119,14 @@ port = {at.force_port}
 
 
 def _dwell(config: SimConfig) -> str:
-    """If simulated time runs fast, a tenth of a simulated second passes between two polls."""
+    """`least_dwell_s` if simulated time runs fast: else a whole dwell could pass between two polls."""
     if config.rate <= 2.0:
         return ""
     return f"least_dwell_s = {SEEN_S * config.rate:g}    # simulated time runs at {config.rate:g} times real time\n"
 
 
 def _staleness(config: SimConfig) -> str:
-    """That of a real sensor, unless simulated time is fast: then the age of a sample says nothing about the arm."""
+    """`stale_ms` of a real sensor; more if simulated time is fast: a sample's age then says little about the arm."""
     if config.rate <= 1.0:
         return "stale_ms = 100.0\n"
     return f"stale_ms = 1000.0    # allowed on this bus alone: simulated time runs at {config.rate:g} times real time\n"

@@ -153,7 +153,7 @@ class Paper:
         self._coming.append((make, x_mm, y_mm, heading_deg))
 
     def lay(self, footprint: Footprint, x_mm: float, y_mm: float, heading_deg: float) -> None:
-        """Lay a footprint with its zero-touch point at (x, y) and its +x along the heading; ink only adds up."""
+        """Lay a footprint with its zero-touch point at (x, y) and its +x along the heading, on top of earlier ink."""
         self.lay_later(lambda: footprint, x_mm, y_mm, heading_deg)
 
     def _lay(self, footprint: Footprint, x_mm: float, y_mm: float, heading_deg: float) -> None:
