@@ -148,7 +148,7 @@ def _word(label: Called) -> str:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """`python -m bench.quality [CAPTURES [SEED [alone]]]`: the confusion matrix; `alone` leaves out the still before."""
+    """`python -m bench.quality [CAPTURES [SEED [alone]]]`: the confusion matrix; `alone` omits the earlier still."""
     captures = int(arguments[0]) if arguments else CAPTURES
     seed = int(arguments[1]) if len(arguments) > 1 else 0
     scores = score(draw_set(seed, captures), QualityConfig(), with_previous="alone" not in arguments[2:])
