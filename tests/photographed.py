@@ -9,6 +9,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from drivers.sim.brush.brush import Brush, BrushSpec
 from drivers.sim.brush.paper import Footprint
 from sessions.imports.photographs import ImportOptions, import_photographs
 
@@ -32,3 +33,15 @@ def imported(photos: Path, lines: Sequence[str], out: Path, kind: Literal["press
     table.write_text("\n".join(lines) + "\n")
     import_photographs(photos, table, out, ImportOptions(kind=kind), "test", lambda: 1)
     return out
+
+
+def imported_presses(
+    photos: Path, out: Path, cells: Sequence[tuple[float, float]], size_px: tuple[int, int], touch_px: tuple[int, int]
+) -> Path:
+    """The session of one press of the default brush for each (H, alpha), photographed at 10 px/mm."""
+    lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
+    for k, (height, tilt) in enumerate(cells):
+        mark = Brush(BrushSpec()).press(height, tilt, ink_load=1.0, press_seed=k)
+        photograph(photos / f"{k}.png", mark, size_px, touch_px)
+        lines.append(f"{k}.png,{height},{tilt},10.0,{touch_px[0]:.1f},{touch_px[1]:.1f}")
+    return imported(photos, lines, out, "press")

@@ -12,9 +12,8 @@ from typer.testing import CliRunner
 
 import brushloop
 from calibrate.errors import CalibrationError
-from drivers.sim.brush.brush import Brush, BrushSpec
 from drivers.sim.brush_file import load_brush
-from tests.photographed import imported, photograph
+from tests.photographed import imported_presses
 from tests.twin.serial import Serial
 from twin.file import notes_path
 from twin.score import PARTS
@@ -25,13 +24,8 @@ CELLS = [(height, tilt) for height in (3.0, 4.0, 5.0) for tilt in (0.0, 5.0)]
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("photos")
-    lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
-    for k, (height, tilt) in enumerate(CELLS):
-        mark = Brush(BrushSpec()).press(height, tilt, ink_load=1.0, press_seed=k)
-        photograph(folder / f"{k}.png", mark, (200, 320), (250, 100))
-        lines.append(f"{k}.png,{height},{tilt},10.0,250.0,100.0")
-    return imported(folder, lines, tmp_path_factory.mktemp("sessions") / "presses", "press")
+    out = tmp_path_factory.mktemp("sessions") / "presses"
+    return imported_presses(tmp_path_factory.mktemp("photos"), out, CELLS, (200, 320), (250, 100))
 
 
 @contextmanager

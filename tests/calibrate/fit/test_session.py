@@ -15,9 +15,8 @@ from calibrate.fit.artefact import FOLDER, BrushFit
 from calibrate.fit.captures import read_presses
 from calibrate.fit.run import correction, fit_session
 from calibrate.validate.report.data import load_report
-from drivers.sim.brush.brush import Brush, BrushSpec
 from model.fitted import NAME, NAMES
-from tests.photographed import imported, photograph
+from tests.photographed import imported_presses
 
 CELLS = [(11.0, 0.0), (11.0, 10.0), (15.0, 5.0), (20.0, 0.0), (20.0, 10.0)]
 VIEW = Field(mm_per_px=0.4)
@@ -25,13 +24,8 @@ VIEW = Field(mm_per_px=0.4)
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("photos")
-    lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
-    for k, (height, tilt) in enumerate(CELLS):
-        mark = Brush(BrushSpec()).press(height, tilt, ink_load=1.0, press_seed=k)
-        photograph(folder / f"{k}.png", mark, (300, 480), (380, 150))
-        lines.append(f"{k}.png,{height},{tilt},10.0,380.0,150.0")
-    return imported(folder, lines, tmp_path_factory.mktemp("sessions") / "presses", "press")
+    out = tmp_path_factory.mktemp("sessions") / "presses"
+    return imported_presses(tmp_path_factory.mktemp("photos"), out, CELLS, (300, 480), (380, 150))
 
 
 def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> None:
