@@ -1,9 +1,19 @@
-"""One SVG that shows several in turn, as a moving picture: CSS only, so that it also moves inside a page's `<img>`."""
+"""`python -m bench.moving`: a moving picture of a session, docs/screens/session.svg, from the pictures of its screens.
+
+One SVG shows them in turn, by CSS only, so that it also moves inside a page's `<img>`.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from pathlib import Path
+
+SCREENS = ("start", "set-up-camera", "set-up-self-check", "ask", "run", "end")
+"""In the order of a session; all of them have one size."""
+SECONDS_EACH = 2.0
+NAME = "session.svg"
+FOLDER = Path(__file__).resolve().parent.parent / "docs" / "screens"
 
 SVG = re.compile(r"<svg[^>]*viewBox=\"([^\"]+)\"[^>]*>(.*)</svg>\s*$", re.S)
 
@@ -31,3 +41,17 @@ def moving(pictures: Sequence[str], seconds_each: float) -> str:
         "@media (prefers-reduced-motion:reduce){.frame{animation:none}.frame:last-child{visibility:visible}}"
         f"</style>{''.join(frames)}</svg>\n"
     )
+
+
+def session_picture(folder: Path) -> str:
+    """The moving picture from the pictures in this folder."""
+    return moving([(folder / f"{name}.svg").read_text(encoding="utf-8") for name in SCREENS], SECONDS_EACH)
+
+
+def write_moving(folder: Path) -> None:
+    """Write `session.svg` beside the pictures that it is made of."""
+    (folder / NAME).write_text(session_picture(folder), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write_moving(FOLDER)

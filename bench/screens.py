@@ -19,7 +19,7 @@ from pathlib import Path
 
 from textual.pilot import Pilot
 
-from bench.moving import moving
+from bench.moving import write_moving
 from collect.engine.control import State
 from collect.errors import CollectAborted
 from collect.start import engine_for
@@ -40,8 +40,6 @@ SIZE = (120, 40)
 SMALL = (80, 24)
 RATE = 20.0
 WAIT_S = 120.0
-FRAME_S = 1.5
-"""How long a frame of the moving picture stays."""
 PROTOCOL = 'kind = "grid"\nheights_mm = [11.0, 13.0, 15.0]\ntilts_deg = [0.0, 10.0]\nrepeats = 2\nseed = 1\n'
 
 
@@ -61,6 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
                 app.engine.stop()
                 with contextlib.suppress(CollectAborted):
                     app.engine.join()
+    write_moving(out)
     return 0
 
 
@@ -90,13 +89,13 @@ class _Tour:
     def __init__(self, app: OperatorApp, pilot: Pilot[None], out: Path) -> None:
         self.app, self.pilot, self._out = app, pilot, out
         self.asked_split = False
-        self._frames: list[str] = []
 
     async def until(self, seen: Callable[[], bool]) -> None:
         deadline = time.monotonic() + WAIT_S
         while not seen():
             if time.monotonic() > deadline:
-                raise TimeoutError(f"never seen; the screen is {self.app.screen}")
+                now = None if self.app.engine is None else self.app.engine.snapshot().prompt
+                raise TimeoutError(f"never seen; the screen is {self.app.screen}, the question {now}")
             await self._answer()
             await self.pilot.pause(0.05)
         await self.pilot.pause(0.4)
@@ -115,18 +114,9 @@ class _Tour:
 
     async def take(self, name: str) -> None:
         await self.pilot.pause(0.3)
-        self._write(name, self.app.export_screenshot(title=f"brushloop, loopback rig: {name}"))
-
-    def add_frame(self) -> None:
-        """Keep the screen as it is as the next frame of the moving picture."""
-        self._frames.append(self.app.export_screenshot(title="brushloop, loopback rig"))
-
-    def write_frames(self, name: str) -> None:
-        self._write(name, moving(self._frames, FRAME_S))
-
-    def _write(self, name: str, picture: str) -> None:
-        (self._out / f"{name}.svg").write_text(picture, encoding="utf-8")
-        sys.stdout.write(f"{name}.svg\n")
+        path = self._out / f"{name}.svg"
+        path.write_text(self.app.export_screenshot(title=f"brushloop, loopback rig: {name}"), encoding="utf-8")
+        sys.stdout.write(f"{path.name}\n")
 
     def asked(self, words: str) -> bool:
         now = None if self.app.engine is None else self.app.engine.snapshot()
@@ -171,13 +161,10 @@ async def _tour(app: OperatorApp, rig: LoopbackRig, out: Path) -> None:
         await pilot.press("g")
         await tour.until(lambda: tour.asked(Flaw.SPLIT))
         await tour.take("ask")
-        tour.add_frame()
         tour.asked_split = True
         await pilot.press("r")
-        begun = tour.strokes()
-        for count in range(1, 5):
-            await tour.until(lambda goal=begun + count: tour.strokes() >= goal)
-            tour.add_frame()
+        before = tour.strokes()
+        await tour.until(lambda: tour.strokes() > before + 3)
         await tour.take("run")
         await pilot.resize_terminal(*SMALL)
         await tour.take("run-80x24")
@@ -191,8 +178,6 @@ async def _tour(app: OperatorApp, rig: LoopbackRig, out: Path) -> None:
         await tour.until(lambda: isinstance(app.screen, EndScreen))
         await app.workers.wait_for_complete()
         await tour.take("end")
-        tour.add_frame()
-        tour.write_frames("session")
         await pilot.press("escape")
         await tour.take("done")
         await pilot.press("enter")

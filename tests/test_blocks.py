@@ -134,11 +134,11 @@ def test_every_command_of_the_tutorial_does_what_it_says(lab: Reader) -> None:
 @pytest.mark.soak
 @pytest.mark.timeout(3000)
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_command_of_a_page_runs(lab: Reader, tmp_path: Path, page: Path) -> None:
+def test_every_command_of_a_page_runs(request: pytest.FixtureRequest, tmp_path: Path, page: Path) -> None:
     shown = [line for block in blocks_of(page) if block.kind == "sh" and not block.remark for line in block.commands]
     collects = any(line.startswith("brushloop collect --") for line in shown)
     # Beside earlier sessions, a new one would ask for a fresh sheet.
-    reader = new_lab(tmp_path) if collects else lab
+    reader = new_lab(tmp_path) if collects else request.getfixturevalue("lab")
     try:
         if reader.rig is None or "--write-rig" not in reader.rig.args:
             reader.serve("brushloop sim --write-rig rig.toml --rate 20")

@@ -13,6 +13,7 @@ import pytest
 import typer
 
 import brushloop
+from bench import moving
 from calibrate.path_or_command import PathOrCommand
 from tests.blocks import DOCUMENTS, ROOT, blocks_of
 
@@ -72,6 +73,12 @@ def test_commands_that_a_document_shows_exist_with_their_options(document: Path)
                 command = next(iter(further.values()))
             else:
                 assert not further, line
+
+
+def test_the_moving_picture_is_made_of_the_pictures_of_the_screens() -> None:
+    made = moving.session_picture(moving.FOLDER)
+    assert (moving.FOLDER / moving.NAME).read_text(encoding="utf-8") == made, "run `python -m bench.moving`"
+    assert made.count('<g class="frame"') == len(moving.SCREENS)
 
 
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
