@@ -108,12 +108,14 @@ def preprocess(
     """Show every stage of one capture in one picture, and write each fitted number to a JSON file."""
     from calibrate.files import check_target
     from calibrate.show_stages import show_photograph, show_stroke
+    from sessions.progress import shown
 
     check_target(out, ".png", capture, before)
     if capture.suffix.lower() in (".png", ".jpg", ".jpeg"):
         trace = show_photograph(capture, px_per_mm, before, out)
     else:
-        trace = show_stroke(capture, stroke, out, lens=lens)
+        with shown() as progress:
+            trace = show_stroke(capture, stroke, out, lens=lens, progress=progress)
     for name, value in trace.log.items():
         say(f"{name} {value:.6g}")
     for flag in trace.flags:

@@ -22,6 +22,7 @@ from calibrate.stages import Trace, contact_sheet, trace_scaled, trace_seen
 from calibrate.stroke.difference import new_stroke
 from calibrate.stroke.params import Params
 from sessions.imports.sequence import SEQUENCE
+from sessions.progress import Progress, counted, unseen
 from sessions.reader import Capture, Recording
 from sessions.recording.messages import decode_gray
 from sessions.recording.schemas import Stroke
@@ -29,7 +30,14 @@ from sessions.recording.schemas import Stroke
 PAPER = 255
 
 
-def show_stroke(session: Path, stroke: str, out: Path, params: Params | None = None, lens: Path | None = None) -> Trace:
+def show_stroke(
+    session: Path,
+    stroke: str,
+    out: Path,
+    params: Params | None = None,
+    lens: Path | None = None,
+    progress: Progress = unseen,
+) -> Trace:
     """Show a stroke of a session by its name, or the first one if the name is empty.
 
     It is rectified by the calibration that the session uses, as in a validation; with a lens file, or without a
@@ -37,7 +45,7 @@ def show_stroke(session: Path, stroke: str, out: Path, params: Params | None = N
     """
     recording = Recording(session)
     before: Capture | None = None
-    for capture in recording.captures():
+    for capture in counted(recording.captures(), "strokes read", recording.strokes(), progress):
         if stroke in ("", capture.stroke.stroke_id):
             break
         before = capture

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from bench.press_sessions import Presses, session
 from calibrate.cli import app
 from calibrate.compare import MM_PER_PX
 from calibrate.compare.field import Field
 from calibrate.errors import CaptureRefused
 from calibrate.stages import trace_scaled
 from calibrate.stroke.params import Params
+from sessions.reader import Recording
 
 
 def photograph(*strokes: tuple[int, int], glare: tuple[int, int] | None = None, paper: int = 225) -> np.ndarray:
@@ -109,3 +111,13 @@ def test_the_command_still_takes_a_session_as_it_did(tmp_path: Path) -> None:
     ran = CliRunner().invoke(app, [str(tmp_path / "nosuch")])
     assert "no such session" in str(ran.exception)
     assert CliRunner().invoke(app, []).exit_code == 2
+
+
+def test_reading_up_to_a_stroke_says_how_far_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sessions.progress.QUIET_S", 0.0)
+    place = session(tmp_path, "three", Presses(3, seed=0))
+    last = [stroke.stroke_id for stroke in Recording(place).stroke_records()][-1]
+    arguments = ["preprocess", str(place), "--stroke", last, "--out", str(tmp_path / "stages.png")]
+    ran = CliRunner().invoke(app, arguments)
+    assert ran.exit_code == 0, ran.output
+    assert "strokes read: 2 of 3, about" in ran.output
