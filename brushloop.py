@@ -115,7 +115,7 @@ write.command("plan")(calibrate.writing.cli.plan)
 write.command("compare")(calibrate.writing.cli.compare)
 write.command("learn")(calibrate.writing.cli.learn)
 app.add_typer(write, name="write")
-app.add_typer(model.train.cli.app, name="train")
+app.add_typer(model.train.cli.app, name="train", result_callback=calibrate.cli.training_page)
 
 
 @app.command()

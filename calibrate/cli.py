@@ -123,6 +123,14 @@ def preprocess(
     say(str(out))
 
 
+def training_page(folder: Path | None, **_: object) -> None:
+    """Write the page of a finished training; `folder` is what the commands of `brushloop train` return."""
+    if folder is not None:
+        from calibrate.pages.training import write_training_page
+
+        say(f"Page: {write_training_page(folder)}")
+
+
 def export(
     session: Annotated[Path, typer.Argument(help="A closed session's folder, or an .mcap file.")],
     out: Annotated[Path, typer.Argument(help="The new folder.")],

@@ -1,4 +1,7 @@
-"""`brushloop train`: train, tune and export the generator. Heavy imports wait until a command runs."""
+"""`brushloop train`: train, tune and export the generator. Heavy imports wait until a command runs.
+
+A command that trains returns the folder of the training, of which `brushloop.py` has the page written.
+"""
 
 from __future__ import annotations
 
@@ -24,10 +27,10 @@ def train(
     workers: Annotated[int | None, typer.Option(help="Threads of each process that draw images ahead.")] = None,
     device: Annotated[str | None, typer.Option(help="cpu or cuda.")] = None,
     tensorboard: Annotated[bool, typer.Option(help="Write TensorBoard's event files too.")] = False,
-) -> None:
+) -> Path | None:
     """Train on exact images of a stroke model (Algorithm 1). Under torchrun, its processes share each batch."""
     if context.invoked_subcommand is not None:
-        return
+        return None
     from model.train import config as configs
     from model.train.run import train_with_bar
 
@@ -37,7 +40,7 @@ def train(
         chosen = configs.preset(target, **changes)
     else:
         chosen = configs.checked(config, configs.load_config(config).model_dump() | changes)
-    train_with_bar(chosen, out, None, tensorboard)
+    return train_with_bar(chosen, out, None, tensorboard)
 
 
 @app.command()
@@ -50,7 +53,7 @@ def tune(
     held_out: Annotated[float, typer.Option(min=0, max=1, help="Share of captures to validate on.")] = 0.2,
     seed: Annotated[int, typer.Option(min=0, help="Which captures are held out, and the order of the rest.")] = 0,
     tensorboard: Annotated[bool, typer.Option(help="Write TensorBoard's event files too.")] = False,
-) -> None:
+) -> Path | None:
     """Fine-tune a generator on captured strokes; some are held out to validate on."""
     from model.train.checkpoint import load_weights, sha256
     from model.train.config import checked
@@ -71,7 +74,7 @@ def tune(
             "held_out": held_out,
         },
     }
-    train_with_bar(checked("tune", fields), out, Tuning(generator, captures), tensorboard)
+    return train_with_bar(checked("tune", fields), out, Tuning(generator, captures), tensorboard)
 
 
 @app.command()

@@ -1,20 +1,23 @@
-"""Reports of a training: loss curves (the paper's figure 9), pictures, TensorBoard's events, and the model card."""
+"""Reports of a training: loss curves (the paper's figure 9), pictures, samples, TensorBoard's events, model card."""
 
 from __future__ import annotations
 
 import csv
 import io
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import numpy as np
+import torch
+from safetensors.torch import save
 from torch import Tensor
 
 from model.protocol import ParameterSpec
-from model.train.checkpoint import COLUMNS, State, sha256, write_whole
+from model.train.checkpoint import COLUMNS, State, read_tensors, sha256, write_whole
 from model.train.config import TrainConfig
-from model.train.errors import MissingExtra
+from model.train.errors import MissingExtra, TrainError
 
 
 def write_curves(folder: Path, state: State, title: str) -> None:
@@ -63,6 +66,42 @@ def write_pictures(
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=100)
     write_whole(path, out.getvalue())
+
+
+SAMPLES = "samples.safetensors"
+MOST_SAMPLES = 12
+_MAX_SAMPLES_BYTES = 16 * 1024 * 1024
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Some validation strokes: `inputs` (n, P), `targets` and `drawn` (n, N, N) uint8 with ink = 255."""
+
+    inputs: Tensor
+    targets: Tensor
+    drawn: Tensor
+
+
+def save_samples(folder: Path, samples: Samples) -> None:
+    """Write `samples.safetensors`. Raises OSError."""
+    tensors = {name: getattr(samples, name).contiguous() for name in ("inputs", "targets", "drawn")}
+    write_whole(folder / SAMPLES, save(tensors))
+
+
+def load_samples(folder: Path, count: int) -> Samples:
+    """Read the samples of a generator with `count` inputs; none where there is no file. Raises TrainError."""
+    path = folder / SAMPLES
+    if not path.exists():
+        return Samples(torch.zeros((0, count)), *torch.zeros((2, 0, 1, 1), dtype=torch.uint8))
+    _, tensors = read_tensors(path, _MAX_SAMPLES_BYTES)
+    inputs, targets, drawn = (tensors.get(name) for name in ("inputs", "targets", "drawn"))
+    if inputs is None or targets is None or drawn is None:
+        raise TrainError(path, "does not hold inputs, targets and drawn")
+    if inputs.shape != (len(targets), count) or not inputs.is_floating_point():
+        raise TrainError(path, f"inputs is not {len(targets)} x {count} floating-point numbers")
+    if targets.ndim != 3 or targets.shape != drawn.shape or {targets.dtype, drawn.dtype} != {torch.uint8}:
+        raise TrainError(path, "targets and drawn are not uint8 images of one size")
+    return Samples(inputs, targets, drawn)
 
 
 class Events:

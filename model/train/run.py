@@ -1,7 +1,7 @@
 """One training in one folder: start or resume, write the outputs of Algorithm 1, finish with a generator and its card.
 
 A folder holds `checkpoint.safetensors` during and after training, `generator.safetensors` with `generator.md` at the
-end, `loss.png`, `loss.csv`, `validation.csv`, `pictures/`, and `tensorboard/` if requested.
+end, `samples.safetensors`, `loss.png`, `loss.csv`, `validation.csv`, `pictures/`, and `tensorboard/` if requested.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from rich.progress import Progress as ProgressBar
 from torch import Tensor
 
 from model.generator.metrics import SSIM_SETTINGS, quality
+from model.generator.network import Generator
 from model.train.checkpoint import (
     State,
     load_checkpoint,
@@ -35,7 +36,7 @@ from model.train.data import Images, exact_sets, load_captures, split
 from model.train.distributed import Group, joined
 from model.train.errors import TrainError
 from model.train.loop import Validation, converged, new_state, train
-from model.train.report import Events, write_card, write_curves, write_pictures
+from model.train.report import MOST_SAMPLES, Events, Samples, save_samples, write_card, write_curves, write_pictures
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,10 +180,22 @@ def _finish(config: TrainConfig, folder: Path, state: State, images: Images, cpu
     end = "converged" if converged(config, rows) else "all steps done"
     report: dict[str, Any] = asdict(found) | {"psnr_db": found.psnr_db, "ssim_settings": SSIM_SETTINGS}
     report |= {"steps": state.step, "end": end, "cpu_s": round(cpu_s, 1), "torch": torch.__version__}
+    save_samples(folder, _drawn(network, images))
     write_curves(folder, state, f"{config.target.model}, seed {config.seed}")
     path = folder / "generator.safetensors"
     save_generator(path, config, state.weights, report)
     write_card(path, config, report)
+
+
+def _drawn(network: Generator, images: Images) -> Samples:
+    """Validation strokes, evenly chosen, with what the network draws for them."""
+    import torch
+
+    numbers = torch.linspace(0, len(images) - 1, min(MOST_SAMPLES, len(images))).long()
+    inputs, targets = images.pick(numbers)
+    with torch.no_grad():
+        drawn = network(inputs)
+    return Samples(inputs, *((255 * part.clamp(0, 1)).round().to(torch.uint8) for part in (targets, drawn)))
 
 
 class Bar:
@@ -212,8 +225,11 @@ class Bar:
             )
 
 
-def train_with_bar(config: TrainConfig, folder: Path, tuning: Tuning | None, events: bool) -> None:
-    """Train with a progress bar in the first process. Raises as `run_training`."""
+def train_with_bar(config: TrainConfig, folder: Path, tuning: Tuning | None, events: bool) -> Path | None:
+    """Train with a progress bar in the first process, which returns the folder; others None.
+
+    Raises as `run_training`.
+    """
     with joined(config.device) as group, _asked_to_stop() as stopping:
         console = Console(quiet=not group.first)
         words = TextColumn("{task.fields[loss]} {task.fields[validation]}")
@@ -222,6 +238,7 @@ def train_with_bar(config: TrainConfig, folder: Path, tuning: Tuning | None, eve
             bar = Bar(progress, config.steps)
             path = run_training(config, folder, group, bar, stopping, tuning=tuning, events=events)
         console.print(f"Generator: {path}, its card: {path.with_suffix('.md')}", markup=False, soft_wrap=True)
+        return folder if group.first else None
 
 
 @contextmanager

@@ -1,0 +1,187 @@
+"""The page of a training: held-out strokes as the network draws them, losses, and what the generator is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.compare.similarity import csim
+from calibrate.errors import CalibrationError
+from calibrate.files import write_whole
+from calibrate.report import Image, Point, ink_uri, overlay_uri, plot, plot_uri, render
+from model.protocol import ParameterSpec
+from model.train.checkpoint import load_checkpoint, load_weights, sha256
+from model.train.config import TrainConfig
+from model.train.report import load_samples
+
+PAGE = "training.html"
+SMOOTH_STEPS = 50
+MAX_POINTS = 2000
+"""Points of the loss curve that are drawn, evenly chosen from all."""
+BLUE, ORANGE = "#0072B2", "#D55E00"
+MUCH_ABOVE = 1.5
+"""Times its lowest value that the last validation loss may be."""
+SHOWN_INPUTS = 4
+EXACT = "exact images of a stroke model"
+
+
+def write_training_page(folder: Path) -> Path:
+    """Write the page of the finished training in `folder`; returns its path.
+
+    Raises TrainError for a folder that holds no finished training, and OSError.
+    """
+    path = folder / "generator.safetensors"
+    config, _, report = load_weights(path)
+    _, state = load_checkpoint(folder / "checkpoint.safetensors")
+    if not len(state.losses):
+        raise CalibrationError(str(folder), "holds no training step")
+    losses = np.asarray(state.losses.numpy(), np.float64)
+    checks = np.asarray(state.validations.numpy(), np.float64)
+    label = config.tuning.source if config.tuning else EXACT
+    text = render(
+        "training.html.j2",
+        label=label,
+        note=_note(config),
+        samples=list(_samples(folder, config.build_target().inputs)),
+        images=f"{config.target.size_px} × {config.target.size_px} pixels of {config.target.px_mm:g} mm",
+        verdict=list(_verdict(config, report)),
+        trust=list(_trust(config, report, checks)),
+        losses=_losses(losses, checks, label),
+        likeness=_likeness(checks, label) if len(checks) > 1 else "",
+        tuned=config.tuning is not None,
+        numbers=list(_numbers(report)),
+        inputs=config.build_target().inputs,
+        facts=list(_facts(config, report, path)),
+    )
+    page = folder / PAGE
+    write_whole(page, text)
+    return page
+
+
+def _note(config: TrainConfig) -> str:
+    if config.tuning:
+        return "captured strokes, tuned on a part of them and judged by the rest"
+    return "the network learns to draw what a closed-form model draws: no ink, neither real nor simulated"
+
+
+def _samples(folder: Path, inputs: Sequence[ParameterSpec]) -> Iterator[dict[str, Any]]:
+    """Target, network and difference of each stroke that the training kept, the worst first."""
+    found = load_samples(folder, len(inputs))
+    values: list[list[float]] = np.asarray(found.inputs.numpy(), np.float64).tolist()
+    targets, images = _images(found.targets), _images(found.drawn)
+    scores = [_score(target, drawn) for target, drawn in zip(targets, images, strict=True)]
+    for k in sorted(range(len(scores)), key=lambda k: scores[k]):
+        target, drawn = targets[k], images[k]
+        named = [f"{spec.name} {value:.3g}" for spec, value in zip(inputs, values[k], strict=True)]
+        yield {
+            "name": ", ".join(named[:SHOWN_INPUTS]) + (" …" if len(named) > SHOWN_INPUTS else ""),
+            "csim": f"{100.0 * scores[k]:.2f}",
+            "images": {
+                "target": ink_uri(target),
+                "network": ink_uri(drawn),
+                "difference": overlay_uri(target, drawn),
+            },
+        }
+
+
+def _score(target: Image, drawn: Image) -> float:
+    return csim(target, drawn) if target.any() and drawn.any() else 0.0
+
+
+def _images(pixels: Any) -> list[Image]:
+    stack: NDArray[np.float32] = np.asarray(pixels.numpy(), np.float32) / np.float32(255.0)
+    return list(stack)
+
+
+def _verdict(config: TrainConfig, report: dict[str, Any]) -> Iterator[str]:
+    end = f"{report.get('steps')} steps: {report.get('end')}"
+    yield f"The network has {config.weight_count():,} weights and was trained for {end}."
+    score = report.get("csim")
+    if isinstance(score, int | float):
+        which = "captured strokes that were held out" if config.tuning else "strokes that it was not trained on"
+        yield f"On {report.get('images')} {which} its images reach a CSIM of {100.0 * score:.2f} %."
+
+
+def _trust(config: TrainConfig, report: dict[str, Any], checks: NDArray[np.float64]) -> Iterator[Point]:
+    if config.tuning:
+        words = f"Tuned on captures of: {config.tuning.source}. Other captures of that kind are no blind test."
+    else:
+        words = "It has seen no ink: on paper it is no better than the closed-form model that it learned."
+    yield Point(None, words)
+    if len(checks) > 1:
+        best = int(np.argmin(checks[:, 1]))
+        last, lowest = checks[-1, :2], checks[best, :2]
+        if last[1] > MUCH_ABOVE * lowest[1]:
+            words = f"was lowest at step {lowest[0]:.0f} and is {last[1] / lowest[1]:.1f} times that at the end"
+            yield Point(False, f"The validation loss {words}: the network learns its training strokes by heart.")
+        else:
+            yield Point(True, f"The validation loss is at its lowest, or near it, at the end (step {last[0]:.0f}).")
+    yield Point(None, "Outside the ranges of its inputs it extrapolates polynomials: do not use it there.")
+
+
+def _losses(losses: NDArray[np.float64], checks: NDArray[np.float64], label: str) -> str:
+    """Training loss of the steps with its running mean, and the validation losses: the paper's figure 9."""
+    figure, axis = plot(1, 1, (10.0, 3.8))
+    steps = np.arange(1, len(losses) + 1)
+    every = slice(None, None, max(1, -(-len(losses) // MAX_POINTS)))
+    axis.semilogy(steps[every], losses[every], color="0.75", lw=0.6, label="training, Eq. 6, each step")
+    if len(losses) > 10 * SMOOTH_STEPS:
+        mean = np.convolve(losses, np.full(SMOOTH_STEPS, 1.0 / SMOOTH_STEPS), "valid")
+        axis.semilogy(
+            steps[SMOOTH_STEPS - 1 :][every], mean[every], color=BLUE, lw=1.2, label=f"mean of {SMOOTH_STEPS} steps"
+        )
+    if len(checks):
+        axis.semilogy(checks[:, 0], checks[:, 1], ".-", color=ORANGE, lw=1.2, label="validation, MSE")
+    axis.set_xlabel("step")
+    axis.set_ylabel("loss")
+    axis.set_title(f"losses ({_printable(label)})", fontsize=10, parse_math=False)
+    axis.grid(alpha=0.3)
+    axis.legend()
+    return plot_uri(figure)
+
+
+def _likeness(checks: NDArray[np.float64], label: str) -> str:
+    figure, axis = plot(1, 1, (6.4, 3.4))
+    for column, name, colour in ((3, "CSIM", BLUE), (2, "IoU", ORANGE)):
+        axis.plot(checks[:, 0], 100.0 * checks[:, column], ".-", color=colour, lw=1.2, label=name)
+    axis.set_xlabel("step")
+    axis.set_ylabel("percent")
+    axis.set_title(f"likeness on held-out strokes ({_printable(label)})", fontsize=10, parse_math=False)
+    axis.grid(alpha=0.3)
+    axis.legend()
+    return plot_uri(figure)
+
+
+def _printable(text: str) -> str:
+    short = "".join(c if c.isprintable() else "?" for c in text)
+    return short if len(short) <= 60 else f"{short[:59]}…"
+
+
+def _numbers(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for label, name, form in (
+        ("MSE", "mse", ".3g"),
+        ("PSNR, dB", "psnr_db", ".2f"),
+        ("IoU", "iou", ".5f"),
+        ("CSIM", "csim", ".5f"),
+        ("SSIM, mean", "ssim", ".5f"),
+        ("SSIM, least", "ssim_min", ".5f"),
+    ):
+        value = report.get(name)
+        if isinstance(value, int | float):
+            yield label, format(value, form)
+
+
+def _facts(config: TrainConfig, report: dict[str, Any], path: Path) -> Iterator[tuple[str, str]]:
+    target = config.target
+    yield "stroke model", f"{target.model}, R {target.radius_mm:g} mm, L {target.length_mm:g} mm, λ {target.lam:.5g}"
+    yield "network", ", ".join(f"{name} {value}" for name, value in config.layers.model_dump().items())
+    yield "training", f"{config.batch} images a step, seed {config.seed}, highest rate {config.learning_rate:g}"
+    if config.tuning:
+        yield "captures", f"{config.tuning.source}, sha256 {config.tuning.captures_sha256}"
+        yield "started from", f"sha256 {config.tuning.start_sha256}"
+    yield "CPU time", f"{report.get('cpu_s')} s since the last start; torch {report.get('torch')}"
+    yield "generator", f"{path.name}, sha256 {sha256(path)}; its card is {path.with_suffix('.md').name}"
