@@ -61,7 +61,7 @@ def run(*arguments: object) -> str:
 
 @pytest.fixture(scope="module")
 def pages(photographed: Photographed, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """A page of every command, by the command's name."""
+    """A page of every command but `train` (tests/model/train/test_commands.py), by the command's name."""
     folder = tmp_path_factory.mktemp("pages")
     session = photographed(folder / "2026-<u>", SPEC, [board()], sheet_mm=(100.0, 80.0))
     return {
@@ -69,7 +69,6 @@ def pages(photographed: Photographed, tmp_path_factory: pytest.TempPathFactory) 
         "camera": _lens(folder),
         "loop": _loop(folder),
         "write": _written(folder),
-        "train": _trained(folder),
         "fit": run("fit", _pressed(folder), "--mm-per-px", "0.8"),
     }
 
@@ -151,17 +150,6 @@ def _written(folder: Path) -> str:
     return write_written(made, folder / "written", "brushloop write").read_text(encoding="utf-8")
 
 
-def _trained(folder: Path) -> str:
-    """The page of a training of four steps."""
-    toml = folder / "train.toml"
-    toml.write_text(
-        "steps = 4\nbatch = 8\ntraining_images = 16\nvalidation_images = 8\nvalidate_every = 2\nblank_after = 9\n"
-        "[target]\nranges = {height_mm = [11, 20], tilt_deg = [0, 10]}\npx_mm = 0.8\nsize_px = 32\n"
-        "[layers]\nwidth = 8\nchannels = 2\nside = 8\n"
-    )
-    return run("train", "--config", toml, "--out", folder / "generator")
-
-
 def _pressed(folder: Path) -> Path:
     """An imported session of two presses at two depths."""
     lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
@@ -209,14 +197,6 @@ def test_the_page_of_a_lens_shades_what_no_board_covered_and_names_each_photogra
     assert page.count('class="part empty"') == page.count(">no corner<") > 0
     assert "7.png: not used: is blank" in page
     assert "0&lt;u&gt;.png: 0." in page
-
-
-def test_the_page_of_a_training_draws_held_out_strokes_and_says_that_there_is_no_ink(pages: dict[str, str]) -> None:
-    page = pages["train"]
-    assert page.count('alt="network: height_mm ') == 8
-    assert '<span class="source">exact images of a stroke model</span>' in page
-    assert "was trained for 4 steps: all steps done" in page
-    assert "Training and validation loss by step" in page
 
 
 def test_a_page_of_a_twin_says_whose_twin_on_every_figure(pages: dict[str, str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -13,12 +14,15 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+import brushloop
 from model.train import export as exporting
 from model.train.checkpoint import load_generator
 from model.train.cli import app
 from model.train.data import save_captures
 from model.train.errors import MissingExtra, TrainError
 from model.train.export import export
+from model.train.report import Samples, load_samples, save_samples
+from tests.browser import BROWSER, content_widths_px
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +60,36 @@ def test_fine_tuning_on_captures_is_marked_as_such(trained: Path, tmp_path: Path
     assert new < 0.7 * old
     again = CliRunner().invoke(app, [*command, "--learning-rate", "0.02"])
     assert "learning_rate: 0.01 -> 0.02" in str(again.exception)
+
+
+def test_the_page_draws_held_out_strokes_and_says_that_there_is_no_ink(once: Path, tmp_path: Path) -> None:
+    """The same command again trains nothing, and writes the page again."""
+    words = ["train", "--config", str(once.parents[1] / "train.toml"), "--out", str(once.parent)]
+    ran = CliRunner().invoke(brushloop.app, words)
+    assert ran.exit_code == 0, ran.exception
+    path = once.with_name("training.html")
+    assert ran.output.splitlines()[-1] == f"Page: {path}"
+    page = path.read_text(encoding="utf-8")
+    assert page.count('alt="network: height_mm ') == 12
+    assert '<span class="source">exact images of a stroke model</span>' in page
+    assert "was trained for 30 steps: all steps done" in page
+    assert re.findall(r"(?:src|href)=\"(?!data:|#)", page) == []
+    assert len(page.encode()) < 3 * 1024 * 1024
+    if BROWSER is not None:
+        sizes, errors = content_widths_px({"train": page}, (390, 800, 1200, 1600), tmp_path)
+        assert errors == []
+        assert all(taken <= width for (_, width), taken in sizes.items()), sizes
+
+
+def test_samples_that_are_not_of_this_generator_are_refused(tmp_path: Path) -> None:
+    images = torch.zeros((3, 8, 8), dtype=torch.uint8)
+    save_samples(tmp_path, Samples(torch.zeros((3, 2)), images, images.clone()))
+    assert len(load_samples(tmp_path, 2).drawn) == 3
+    with pytest.raises(TrainError, match="inputs is not 3 x 8 floating-point numbers"):
+        load_samples(tmp_path, 8)
+    save_samples(tmp_path, Samples(torch.zeros((3, 2)), images, images[:, :4].clone()))
+    with pytest.raises(TrainError, match="targets and drawn are not uint8 images of one size"):
+        load_samples(tmp_path, 2)
 
 
 def test_exports_draw_what_the_network_draws(trained: Path) -> None:
