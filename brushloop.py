@@ -114,6 +114,8 @@ write.command("characters")(collect.cli.write)
 write.command("plan")(calibrate.writing.cli.plan)
 write.command("compare")(calibrate.writing.cli.compare)
 write.command("learn")(calibrate.writing.cli.learn)
+write.command("practice")(calibrate.writing.cli.practice)
+write.command("fit")(calibrate.writing.cli.fit)
 app.add_typer(write, name="write")
 app.add_typer(model.train.cli.app, name="train", result_callback=calibrate.cli.training_page)
 

@@ -23,6 +23,7 @@ def benches() -> dict[str, Bench]:
         "adaptive": _late("adaptive"),
         "analysis": _late("analysis"),
         "brushfit": _late("brushfit"),
+        "characters": _late("characters"),
         "curves": _late("curves"),
         "drawing": _late("generator", "run_drawing"),
         "export": _late("export"),

@@ -20,6 +20,9 @@ def plan(
     drag: Annotated[
         Path | None, typer.Option(help="Artefact of `fit --drags`: strokes that travel are drawn with its bristle lag.")
     ] = None,
+    footprint: Annotated[
+        Path | None, typer.Option(help="Footprint of `write fit`: leads the brush by what its own drags showed.")
+    ] = None,
     lam: Annotated[float | None, typer.Option(min=0.1, max=10, help="lambda of CCD-BSM; pi when left out.")] = None,
     cell_mm: Annotated[float, typer.Option(min=10, max=500, help="Side of the character's paper cell.")] = 70.0,
     margin_mm: Annotated[float, typer.Option(min=0, max=200, help="Margin around the font's square.")] = 6.0,
@@ -33,11 +36,13 @@ def plan(
 ) -> None:
     """Plan characters: depth from the stroke's width, heading along the stroke, refined by the model's image."""
     import math
+    from dataclasses import replace
 
     from calibrate.artefact import load_artefact
     from calibrate.drags.artefact import DragArtefact
     from calibrate.errors import CalibrationError
     from calibrate.files import check_folder
+    from calibrate.writing.footprint import load_footprint
     from calibrate.writing.plan import Settings
     from calibrate.writing.plan import plan as planned
     from calibrate.writing.plan_files import PICTURE, PlannedBy, write_plan
@@ -48,12 +53,17 @@ def plan(
 
     check_folder(out)
     lagging = load_artefact(drag, DragArtefact) if drag is not None else None
+    fitted = load_footprint(footprint) if footprint is not None else None
+    if lagging is not None and fitted is not None:
+        raise CalibrationError("write plan", "give --drag or --footprint, not both")
     try:
         if tilt_range[1] > 30 or height_range[0] <= 0:
             raise ValueError("tilts end at 30 deg, depths begin above 0 mm")
         reach = Reach(height_range, tilt_range, turn_deg_mm=wrist_deg_s / speed_mm_s)
         seen = lagging.model() if lagging is not None else None
         settings = Settings(Cell(cell_mm, margin_mm), reach, tilt, steps=steps, drag=seen)
+        if fitted is not None:
+            settings = replace(settings, footprint=fitted.footprint())
         of = stroke_model(model, Brush(radius_mm, length_mm), math.pi if lam is None else lam)
         of.profile(height_range[1], tilt_range[1])
     except (ValueError, UnknownModelError, DomainError) as error:
@@ -69,9 +79,13 @@ def plan(
         turn_deg_mm=reach.turn_deg_mm,
         speed_mm_s=speed_mm_s,
         drag_fit=lagging.digest if lagging is not None else "",
+        footprint=fitted.footprint().values if fitted is not None else None,
     )
-    protocol = write_plan(figures, settings, by, of.label, repeats, out)
-    if lagging is None:
+    label = of.label if fitted is None else "fitted footprint"
+    protocol = write_plan(figures, settings, by, label, repeats, out)
+    if fitted is not None:
+        say(f"simulated with the footprint fitted to {fitted.session_id}, {fitted.source}: not ink")
+    elif lagging is None:
         say(f"simulated by {model}, marks laid over each other along the way: not ink")
     else:
         say(f"simulated with the bristle lag of {lagging.session_id}, {lagging.source}: not ink")
@@ -125,13 +139,13 @@ def learn(
     session: Annotated[Path, typer.Argument(help="The session in which a plan was written.")],
     plan: Annotated[Path, typer.Option(help="The plan's folder, or its plan.json.")],
     out: Annotated[Path, typer.Option(help="Folder for the next plan.")],
-    gain: Annotated[float, typer.Option(min=0.05, max=1.5, help="Share of the deviation that is corrected.")] = 0.8,
+    gain: Annotated[float, typer.Option(min=0.05, max=1.5, help="Share of the miss that is corrected.")] = 0.7,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written next.")] = 1,
 ) -> None:
-    """Correct a plan's trajectories by the deviation of their ink, for the next writing."""
+    """Make the next plan from what the ink of this one showed, phase by phase."""
     from calibrate.files import check_folder
     from calibrate.writing.compare import compare_written
-    from calibrate.writing.learn import learned
+    from calibrate.writing.learn import learned, lost_in_words
     from calibrate.writing.plan_files import load_plan, write_record
     from sessions.progress import shown
 
@@ -141,5 +155,58 @@ def learn(
     out.mkdir(parents=True, exist_ok=True)
     protocol = write_record(made, repeats, out)
     for one in lessons:
-        say(f"{one.name}: was off by {one.sideways_mm:.2f} mm in place, {one.depth_mm:.2f} mm in depth")
+        ends = "; settled: the best round is kept" if one.settled else ""
+        say(f"{one.name}: CSIM {one.found.csim_percent:.2f}, ink = 1, mm; lost in {lost_in_words([one.found])}{ends}")
     say(str(protocol))
+
+
+def practice(
+    out: Annotated[Path, typer.Option(help="Folder for protocol-write.toml.")] = Path("practice"),
+    length_mm: Annotated[float, typer.Option(min=5, max=200, help="L of the brush; limits the depth.")] = 48.0,
+    radius_mm: Annotated[float, typer.Option(min=0.5, max=50, help="R of the brush.")] = 6.0,
+    cell_mm: Annotated[float, typer.Option(min=30, max=500, help="Side of each paper cell.")] = 70.0,
+    height_range: Annotated[tuple[float, float], typer.Option(help="Feasible depths, mm.")] = (0.5, 20.0),
+    speed_mm_s: Annotated[float, typer.Option(min=1, max=100, help="Speed of the tip.")] = 15.0,
+    wrist_deg_s: Annotated[float, typer.Option(min=1, max=720, help="Greatest speed of the wrist.")] = 180.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the strokes.")] = 1,
+) -> None:
+    """Plan a practice sheet: strokes from which `write fit` learns how this brush is dragged."""
+    from calibrate.errors import CalibrationError
+    from calibrate.files import check_folder
+    from calibrate.writing.plan_files import PlannedBy
+    from calibrate.writing.practice import TILT_DEG, write_practice
+    from model.characters.brush import Reach
+
+    check_folder(out)
+    turn_deg_mm = wrist_deg_s / speed_mm_s
+    try:
+        Reach(height_range, turn_deg_mm=turn_deg_mm)
+    except ValueError as error:
+        raise CalibrationError("write practice", str(error)) from None
+    by = PlannedBy(
+        model="ccd-bsm",
+        radius_mm=radius_mm,
+        length_mm=length_mm,
+        lam=None,
+        height_range_mm=height_range,
+        tilt_range_deg=(0.0, 2.0 * TILT_DEG),
+        turn_deg_mm=turn_deg_mm,
+        speed_mm_s=speed_mm_s,
+    )
+    say(str(write_practice(out, cell_mm, by, seed)))
+
+
+def fit(
+    session: Annotated[Path, typer.Argument(help="A calibrated session of a practice sheet, or of any figures.")],
+) -> None:
+    """Fit the footprint of the dragged brush, for `write plan --footprint`."""
+    from calibrate.writing.footprint import fit_session
+    from sessions.progress import shown
+
+    with shown() as progress:
+        made, path = fit_session(session, progress)
+    say(
+        f"footprint of {made.strokes} strokes on {made.images} cells ({made.source}): draws them with CSIM "
+        f"{made.csim_percent:.1f} %, ink = 1",
+        str(path),
+    )

@@ -18,10 +18,12 @@ from model.characters.brush import Reach
 from model.characters.glyph import MAX_CHARS, Glyph, GlyphError, parse_glyph
 from model.characters.hand import parse_csv, parse_json
 from model.characters.ink import Image, reference, swept, written
+from model.characters.lead import covered, drawn, first_lead, lead
 from model.characters.plan import Cell, paths_of, trajectory
 from model.characters.plan import Path as Way
 from model.characters.refine import refine
 from model.drag import DragModel
+from model.footprint import Footprint
 from model.protocol import StrokeModel
 
 Floats = NDArray[np.float64]
@@ -45,6 +47,8 @@ class Settings:
     """Steps of refinement; 0 keeps the first plan."""
     drag: DragModel | None = None
     """Draws travelling strokes with bristle lag; None superimposes presses."""
+    footprint: Footprint | None = None
+    """Leads the brush so that the ink of this footprint follows the character; replaces model, `steps` and `drag`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,12 +109,22 @@ def _planned(request: FigureRequest, model: StrokeModel, settings: Settings) -> 
     low, high = reach.tilt_deg
     if not low <= settings.tilt_deg <= high:
         raise CalibrationError("--tilt", f"{settings.tilt_deg:g} deg is outside {low:g} to {high:g}")
-    first = [trajectory(way, model, reach, cell, settings.tilt_deg, settings.drag) for way in request.ways]
     if not request.image.any():
         raise CalibrationError(request.name, "has no width anywhere: nothing would be written")
+    if settings.footprint is not None:
+        return _led(request, settings.footprint, settings)
+    first = [trajectory(way, model, reach, cell, settings.tilt_deg, settings.drag) for way in request.ways]
     better = refine(model, first, request.image, cell.side_mm, reach, settings.steps, drag=settings.drag)
     strokes = [reach.spaced(np.round(reach.within(stroke, cell.side_mm), 3)) for stroke in better.strokes]
     before, after = (written(model, one, cell.side_mm, drag=settings.drag) for one in (first, strokes))
+    return PlannedFigure(request, strokes, before, after)
+
+
+def _led(request: FigureRequest, footprint: Footprint, settings: Settings) -> PlannedFigure:
+    reach, side_mm, size_px = settings.reach, settings.cell.side_mm, len(request.image)
+    first = first_lead(request.ways, footprint, reach, side_mm, settings.tilt_deg)
+    strokes = lead(footprint, first, request.image, side_mm, reach)
+    before, after = (covered(drawn(footprint, one, side_mm, size_px), side_mm) for one in (first, strokes))
     return PlannedFigure(request, strokes, before, after)
 
 

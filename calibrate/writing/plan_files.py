@@ -19,6 +19,8 @@ from calibrate.compare.field import SIZE_PX, Image
 from calibrate.errors import CalibrationError, invalid
 from calibrate.files import read_bounded
 from calibrate.report import picture_grid, save_picture, write_files
+from model.characters.phases import Phase, phases_of
+from model.characters.plan import Path as Way
 from sessions.errors import SessionDamaged
 from sessions.recording.messages import decode_gray, encode_png
 
@@ -26,7 +28,16 @@ if TYPE_CHECKING:
     from calibrate.writing.plan import PlannedFigure, Settings
 
 FILE, PROTOCOL, PICTURE = "plan.json", "protocol-write.toml", "plan.png"
-BLUE, RED = "#2d72ff", "#d1341f"
+BLUE = "#2d72ff"
+COLOURS = {
+    Phase.INITIATION_HIDDEN: "#117733",
+    Phase.INITIATION_EXPOSED: "#44aa99",
+    Phase.EXECUTION: "#888888",
+    Phase.TURNING: "#e69f00",
+    Phase.FOLDING: "#d1341f",
+    Phase.TERMINATION_HIDDEN: "#332288",
+    Phase.TERMINATION_EXPOSED: "#cc79a7",
+}
 MAX_PLAN_BYTES = 4 * 1024 * 1024
 Text = Annotated[str, Field(max_length=64 * 1024)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -52,6 +63,18 @@ class PlannedBy(BaseModel):
     speed_mm_s: Number
     drag_fit: Annotated[str, Field(max_length=64)] = ""
     """Digest of the drag fit that images were drawn with; empty for superimposed presses."""
+    footprint: Annotated[tuple[Number, ...], Field(max_length=64)] | None = None
+    """Values of the fitted footprint (`model.footprint`) that the plan leads the brush by; None without one."""
+
+
+class Round(BaseModel):
+    """What one round of learning found: the mean of its writings against the wanted image, mm, binary, ink = 1."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    csim_percent: Number
+    lost_percent: dict[str, Number]
+    """Phase -> wrong pixels (missing or too much) there, in percent of the wanted ink."""
 
 
 class FigureRecord(BaseModel):
@@ -65,11 +88,24 @@ class FigureRecord(BaseModel):
     commanded: Points
     """Where the arm goes."""
     intended: Points
-    """The presses whose marks the ink should look like; differs from `commanded`, point by point, once a plan has
-    learned from ink."""
+    """What `commanded` was before learning moved its points; the same as `commanded` in plans of today."""
     wanted_png: Text
     """128 x 128 gray in base64, ink black, row 0 at the cell's far edge."""
     simulated_png: Text
+    medians: tuple[tuple[tuple[Number, Number, Number], ...], ...] = ()
+    """[stroke][point] of x, y and half width in mm: what the phases follow from; empty in older plans."""
+    rounds: Annotated[tuple[Round, ...], Field(max_length=1000)] = ()
+    """The rounds of learning so far, in order."""
+    best: Points = ()
+    """What was commanded in the best of them."""
+    settled: bool = False
+    """Whether a further round is not expected to help: `commanded` is then the best that was written."""
+
+    @property
+    def ways(self) -> list[Way]:
+        """The medians as paths."""
+        arrays = (np.array(one, np.float64) for one in self.medians)
+        return [Way(one[:, :2], one[:, 2]) for one in arrays]
 
     @property
     def points_sha256(self) -> str:
@@ -110,15 +146,23 @@ def figure_record(
     *,
     wanted: Image,
     simulated: Image,
+    ways: Sequence[Way] = (),
 ) -> FigureRecord:
-    """Record of a planned figure: trajectories (N, 5), images (128, 128)."""
+    """Record of a planned figure: trajectories (N, 5), images (128, 128), medians with half widths."""
     return FigureRecord(
         name=name,
         source=source,
-        commanded=_points(commanded),
-        intended=_points(intended),
-        wanted_png=_encoded(wanted),
-        simulated_png=_encoded(simulated),
+        commanded=as_points(commanded),
+        intended=as_points(intended),
+        wanted_png=encoded(wanted),
+        simulated_png=encoded(simulated),
+        medians=tuple(
+            tuple(
+                (round(x, 4), round(y, 4), round(half, 4))
+                for (x, y), half in zip(way.points, way.half_width_mm, strict=True)
+            )
+            for way in ways
+        ),
     )
 
 
@@ -153,6 +197,7 @@ def write_plan(
             one.strokes,
             wanted=one.request.image,
             simulated=one.simulated,
+            ways=one.request.ways,
         )
         for one in figures
     )
@@ -194,7 +239,7 @@ def write_toml(record: PlanRecord, repeats: int) -> str:
 
 
 def draw(figures: list[PlannedFigure], settings: Settings, path: Path) -> None:
-    """Draw a row per figure: wanted, first plan, refined plan, and the brush axis over the wanted strokes."""
+    """Draw a row per figure: wanted, first plan, refined plan, and the tip's trajectory over the strokes' phases."""
     side = settings.cell.side_mm
     picture, rows = picture_grid(len(figures), 4, (12.0, 3.4 * len(figures)))
     extent = (0.0, side, 0.0, side)
@@ -205,17 +250,22 @@ def draw(figures: list[PlannedFigure], settings: Settings, path: Path) -> None:
             f"wanted: {code_points(figure.request.name)}",
             f"first plan, simulated: CSIM {first_csim:.4f}, SSIM {first_ssim:.4f}",
             f"refined, simulated: CSIM {last_csim:.4f}, SSIM {last_ssim:.4f}",
-            "points of the trajectory",
+            "phases of the strokes; blue: trajectory",
         )
         images = (wanted, figure.first, figure.simulated, 0.25 * wanted)
         for axis, image, title in zip(axes, images, titles, strict=True):
             axis.imshow(1 - image, cmap="gray", vmin=0, vmax=1, extent=extent, interpolation="nearest")
             axis.set_title(title, fontsize=8)
             axis.tick_params(labelsize=7)
-        for stroke in figure.strokes:
+        for stroke, way in zip(figure.strokes, figure.request.ways, strict=True):
             axes[3].plot(stroke[:, 0], stroke[:, 1], "-", color=BLUE, lw=0.8)
-            axes[3].scatter(stroke[:, 0], stroke[:, 1], s=2 * stroke[:, 2], color=RED, zorder=3)
+            colours = [COLOURS[phase] for phase in phases_of(way)]
+            axes[3].scatter(way.points[:, 0], way.points[:, 1], s=14, color=colours, marker="s", zorder=2)
+            axes[3].scatter(stroke[:, 0], stroke[:, 1], s=1.5 * stroke[:, 2], color=BLUE, zorder=3)
         axes[0].set_ylabel("mm", fontsize=7)
+    for phase, colour in COLOURS.items():
+        rows[0][3].scatter([], [], s=14, color=colour, marker="s", label=str(phase))
+    rows[0][3].legend(fontsize=5, loc="lower right")
     save_picture(picture, path)
 
 
@@ -230,12 +280,14 @@ def points_digest(strokes: Sequence[Any]) -> str:
     return hashlib.sha256(json.dumps(rounded, separators=(",", ":")).encode()).hexdigest()
 
 
-def _points(strokes: Sequence[Floats]) -> Points:
+def as_points(strokes: Sequence[Floats]) -> Points:
+    """Convert trajectories (N, 5) to points, rounded like the protocol to 0.001."""
     rounded = (np.round(stroke, 3).tolist() for stroke in strokes)
     return tuple(tuple((x, y, height, tilt, heading) for x, y, height, tilt, heading in stroke) for stroke in rounded)
 
 
-def _encoded(ink: Image) -> str:
+def encoded(ink: Image) -> str:
+    """(128, 128) ink as a PNG in base64."""
     return base64.b64encode(encode_png(np.rint(255.0 * (1.0 - ink)).astype(np.uint8))).decode()
 
 

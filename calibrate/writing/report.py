@@ -27,9 +27,17 @@ from calibrate.report import (
 from calibrate.writing.compare import WritingComparison
 from calibrate.writing.plan_files import code_points
 from calibrate.writing.scores import FILE as NUMBERS
-from calibrate.writing.scores import PAIRS, PICTURE, REFERENCE, Character, Table3Row, WrittenRecord, WrittenScore
+from calibrate.writing.scores import (
+    HEADLINE,
+    PAIRS,
+    PICTURE,
+    REFERENCE,
+    Character,
+    Table3Row,
+    WrittenRecord,
+    WrittenScore,
+)
 
-HEADLINE = (Alignment.MM, Tone.BINARY, Polarity.INK)
 PAGE, TABLE = "written.html", "written.csv"
 
 

@@ -24,6 +24,8 @@ FORMAT = "brushloop-written-1"
 MAX_BYTES = 8 * 1024 * 1024
 Key = tuple[Alignment, Tone, Polarity]
 KEYS: tuple[Key, ...] = tuple(itertools.product(Alignment, Tone, Polarity))
+HEADLINE: Key = (Alignment.MM, Tone.BINARY, Polarity.INK)
+"""The comparison that decides which writing is better."""
 Ink = dict[Tone, Image]
 """(128, 128) ink of a cell from 0 to 1 by tone: coverage of what counts as ink, and how dark it is."""
 SIMULATED, REFERENCE = "captured, simulated", "captured, reference"

@@ -1,0 +1,185 @@
+"""Plans that lead a dragged brush, so that its ink rather than its tip follows the character.
+
+The points of all strokes are adjusted together until the ink that `model.footprint` predicts matches the wanted image:
+least squares over the pixels, by Levenberg-Marquardt, through an edge that is first soft and then sharp. Every trial is
+made feasible by `Reach.within` before it is judged.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.characters.brush import Reach
+from model.characters.ink import Image
+from model.characters.plan import Path, tangents
+from model.damped import Equations, descend
+from model.drag import distances, ink
+from model.footprint import Footprint, Marks, ink_equations, marks, sampled
+
+Floats = NDArray[np.float64]
+UNITS = np.array([0.3, 0.3, 0.5, 10.0])
+"""Steps of x, y, depth (mm) and heading (deg) that count as equally large."""
+BENT = 0.005
+"""Cost of a squared second difference along a stroke, in these units: keeps the path calm where ink tells nothing."""
+FIRST_SPREADS_MM, LATER_SPREADS_MM = (0.8, 0.3), (0.5, 0.3)
+ROUNDS = 20
+GAIN = 3e-3
+"""Smallest share by which a step must lower the cost for another one to be made."""
+
+
+def first_lead(
+    paths: Sequence[Path], footprint: Footprint, reach: Reach, side_mm: float, tilt_deg: float
+) -> list[Floats]:
+    """Trajectories (N, 5) with the depth of each width, whose tip is one lag ahead along the stroke."""
+    depths = np.linspace(*reach.height_mm, 64)
+    halves = np.maximum.accumulate(footprint.half_width_mm(depths))
+    out: list[Floats] = []
+    for path in paths:
+        depth = np.interp(path.half_width_mm, halves, depths)
+        heading = tangents(path.points)
+        way = np.column_stack((np.cos(np.radians(heading)), np.sin(np.radians(heading))))
+        tip = path.points + footprint.lag_mm(depth)[:, None] * way
+        out.append(reach.within(np.column_stack((tip, depth, np.full(len(depth), tilt_deg), heading)), side_mm))
+    return out
+
+
+def lead(
+    footprint: Footprint,
+    strokes: Sequence[Floats],
+    wanted: Image,
+    side_mm: float,
+    reach: Reach,
+    *,
+    added_mm: Floats | None = None,
+    held: float = 0.0,
+    spreads_mm: Sequence[float] = FIRST_SPREADS_MM,
+    rounds: int = ROUNDS,
+) -> list[Floats]:
+    """Adjust trajectories (N, 5) until their predicted ink is `wanted` (S, S), row 0 at the cell's far edge.
+
+    x, y and depth of every point change, and the heading in which a stroke lands. `added_mm` (S, S) is added to the
+    predicted signed distances: what the footprint is known to miss. `held` is the cost of the squared change of each
+    variable, in `UNITS`: what was measured along one path holds only near it. Points stay `Reach.apart_mm` apart.
+    """
+    problem = _Problem(footprint, strokes, wanted, side_mm, reach, added_mm, held)
+    vector = problem.vector(strokes)
+    for spread_mm in spreads_mm:
+        vector = descend(
+            lambda v, s=spread_mm: problem.equations(v, s),
+            vector,
+            rounds=rounds,
+            most=3.0,
+            gain=GAIN,
+            cost=lambda v, s=spread_mm: problem.cost(v, s),
+            feasible=lambda v: problem.vector(problem.strokes(v)),
+        )
+    return [reach.spaced(np.round(stroke, 3)) for stroke in problem.strokes(vector)]
+
+
+def drawn(footprint: Footprint, strokes: Sequence[Floats], side_mm: float, size_px: int) -> Floats:
+    """Signed distance in mm to the edge of the predicted ink, (size, size), positive in ink, row 0 at the far edge."""
+    x_mm, y_mm = grid(side_mm, size_px)
+    return footprint.distance([_four(stroke) for stroke in strokes], x_mm, y_mm)
+
+
+def covered(distance_mm: Floats, side_mm: float) -> Image:
+    """Ink from 0 to 1 of (size, size) signed distances: rises over one pixel."""
+    return np.clip(0.5 + distance_mm * len(distance_mm) / side_mm, 0.0, 1.0).astype(np.float32)
+
+
+def grid(side_mm: float, size_px: int) -> tuple[Floats, Floats]:
+    """Pixel centres of a cell: x from the left, y from the far edge."""
+    middle = (np.arange(size_px) + 0.5) * side_mm / size_px
+    return middle, np.ascontiguousarray(side_mm - middle)
+
+
+def _four(stroke: Floats) -> Floats:
+    return np.ascontiguousarray(stroke[:, [0, 1, 2, 4]])
+
+
+class _Problem:
+    """The least squares of one character. Its vector holds x, y, depth, heading of every point, in `UNITS`."""
+
+    def __init__(
+        self,
+        footprint: Footprint,
+        strokes: Sequence[Floats],
+        wanted: Image,
+        side_mm: float,
+        reach: Reach,
+        added_mm: Floats | None,
+        held: float,
+    ) -> None:
+        self._values = np.array(footprint.values)
+        self._like = [stroke.copy() for stroke in strokes]
+        self._ends = np.cumsum([0, *(len(stroke) for stroke in strokes)])
+        self._wanted, self._side_mm, self._reach = wanted[None], side_mm, reach
+        self._added_mm = np.zeros(wanted.shape) if added_mm is None else added_mm
+        self._grid = grid(side_mm, len(wanted))
+        self._bent = _bending(self._ends)
+        self._from, self._held = self.vector(strokes), held
+
+    def vector(self, strokes: Sequence[Floats]) -> Floats:
+        return (np.concatenate([_four(stroke) for stroke in strokes]) / UNITS).ravel()
+
+    def strokes(self, vector: Floats) -> list[Floats]:
+        points = vector.reshape(-1, 4) * UNITS
+        out: list[Floats] = []
+        for like, first, last in zip(self._like, self._ends, self._ends[1:], strict=False):
+            stroke = like.copy()
+            stroke[:, :3], stroke[0, 4] = points[first:last, :3], points[first, 3]
+            out.append(self._reach.within(stroke, self._side_mm))
+        return out
+
+    def cost(self, vector: Floats, spread_mm: float) -> float:
+        made = self._marks([_four(stroke) for stroke in self.strokes(vector)])
+        each = np.array([0, len(made.starts) - 1])
+        distance = distances(made.discs, made.starts, *self._grid, each)[0] + self._added_mm
+        off = ink(distance, spread_mm) - self._wanted[0]
+        return 0.5 * float(np.sum(off**2)) + self._penalty(vector)
+
+    def equations(self, vector: Floats, spread_mm: float) -> Equations:
+        paths = [_four(stroke) for stroke in self.strokes(vector)]
+        made = self._marks(paths)
+        slopes = np.zeros((len(made.discs), 3, len(vector)))
+        row = 0
+        for number, path in enumerate(paths):
+            base = marks([sampled(path)], self._values).discs
+            for point in range(len(path)):
+                for column in range(4 if point == 0 else 3):
+                    moved = path.copy()
+                    moved[point, column] += 1e-3 * UNITS[column]
+                    changed = marks([sampled(moved, path)], self._values).discs
+                    at = 4 * (self._ends[number] + point) + column
+                    slopes[row : row + len(base), :, at] = (changed - base) / 1e-3
+            row += len(base)
+        each = np.array([0, len(made.starts) - 1])
+        found = ink_equations(made, each, slopes, self._wanted, *self._grid, spread_mm, self._added_mm)
+        gradient = found.gradient + self._bent @ vector + self._held * (vector - self._from)
+        square = found.square + self._bent + self._held * np.eye(len(vector))
+        return Equations(found.cost + self._penalty(vector), square, gradient)
+
+    def _penalty(self, vector: Floats) -> float:
+        moved = vector - self._from
+        return 0.5 * float(vector @ self._bent @ vector) + 0.5 * self._held * float(moved @ moved)
+
+    def _marks(self, paths: Sequence[Floats]) -> Marks:
+        return marks([sampled(path) for path in paths], self._values)
+
+
+def _bending(ends: NDArray[np.int64]) -> Floats:
+    """The quadratic form of the squared second differences of x, y and depth along each stroke."""
+    size = 4 * int(ends[-1])
+    out = np.zeros((size, size))
+    for first, last in itertools.pairwise(ends):
+        for point in range(first + 1, last - 1):
+            for column in range(3):
+                row = np.zeros(size)
+                at = 4 * point + column
+                row[[at - 4, at, at + 4]] = 1.0, -2.0, 1.0
+                out += BENT * UNITS[column] ** 2 * np.outer(row, row)
+    return out

@@ -1,0 +1,171 @@
+"""A dragged brush as a footprint that has a length: three discs, each pulled by the tip on a leash of its own.
+
+`model.drag` draws with a single disc, which is enough for long strokes. A character consists of ends and corners, and
+there the length of the footprint shows: it lands behind the tip, swings round behind a corner, and reaches ahead of its
+middle when the brush lifts. Here the footprint is the hull of neighbouring discs, from the heel to the tips of the
+hairs. Each disc rests until its leash is taut and then follows straight towards the tip (a tractrix). Leash and half
+width are polynomials of the depth. The mark is the union of the footprints along the path. Lengths are mm, x and y in
+the frame of the path, y upward, depth into the paper.
+
+The simulated brush of the loopback rig is pulled on a taut leash as well (`drivers.sim.brush.drag`), though its
+footprint is computed from bristles. What this model scores there is therefore no evidence for a real brush.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.damped import Equations, descend
+from model.drag import distances
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+DISCS = 3
+STEP_MM = 0.5
+"""Longest distance of the tip between two footprints of a mark."""
+PER_DISC = ("leash_mm", "leash_per_mm", "land_mm", "land_per_mm", "half_mm", "half_per_mm", "half_per_mm2")
+"""Leash, distance behind the tip at which the disc lands, half width: each at depth 0, then its growth."""
+NAMES = (*(f"{name}_{disc}" for disc in range(1, DISCS + 1) for name in PER_DISC), "drift_along_mm", "drift_across_mm")
+START = (
+    *(0.5, 0.1, 0.5, 0.1, 0.2, 0.12, 0.0),
+    *(0.5, 0.5, 0.5, 0.5, 0.3, 0.25, 0.0),
+    *(0.5, 1.0, 0.5, 1.0, 0.1, 0.08, 0.0),
+    *(0.0, 0.0),
+)
+"""A starting point for a fit, not a real brush."""
+SCALE = (*(1.5, 0.4, 1.5, 0.4, 0.5, 0.15, 0.01) * DISCS, 1.0, 1.0)
+"""How far each parameter may be from its start before it costs as much as one pixel of wrong ink."""
+SPREADS_MM = (0.8, 0.3)
+"""Softness of the edge in a fit: first wide, so that ink that is far off still pulls, then narrow."""
+ROUNDS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Marks:
+    """Footprints of several strokes: rows x, y, half width of the discs, and the row at which each footprint begins."""
+
+    discs: Floats
+    starts: Indices
+    strokes: Indices
+    """(strokes + 1,): footprints `strokes[i]` to `strokes[i + 1]` belong to stroke i."""
+
+
+@dataclass(frozen=True, slots=True)
+class Footprint:
+    """One brush: the values of `NAMES`."""
+
+    values: tuple[float, ...] = START
+
+    def __post_init__(self) -> None:
+        if len(self.values) != len(NAMES) or not all(map(math.isfinite, self.values)):
+            raise ValueError(f"a footprint has {len(NAMES)} finite values, got {len(self.values)}")
+
+    def half_width_mm(self, depth_mm: Floats) -> Floats:
+        """Half width of a straight mark, (N,) -> (N,) mm."""
+        discs = [self.values[k : k + len(PER_DISC)] for k in range(0, DISCS * len(PER_DISC), len(PER_DISC))]
+        return np.max([d[4] + d[5] * depth_mm + d[6] * depth_mm**2 for d in discs], axis=0)
+
+    def lag_mm(self, depth_mm: Floats) -> Floats:
+        """Distance of the middle disc behind the tip in a straight stroke, (N,) -> (N,) mm."""
+        leash_mm, per_mm = self.values[len(PER_DISC) : len(PER_DISC) + 2]
+        return np.maximum(leash_mm + per_mm * depth_mm, 0.0)
+
+    def distance(self, paths: Sequence[Floats], x_mm: Floats, y_mm: Floats) -> Floats:
+        """Signed distance in mm to the edge of the ink of all paths, positive in ink, (len(y_mm), len(x_mm)).
+
+        A path is (N, 4): x, y, depth, heading in deg.
+        """
+        made = marks([sampled(path) for path in paths], np.array(self.values))
+        return distances(made.discs, made.starts, x_mm, y_mm, np.array([0, len(made.starts) - 1]))[0]
+
+
+def sampled(path: Floats, like: Floats | None = None) -> Floats:
+    """(N, 4) path -> (M, 4), at most `STEP_MM` apart, corners included; divided as the path `like` would be."""
+    pieces = [path[:1]]
+    for (a, b), (c, d) in zip(
+        itertools.pairwise(path), itertools.pairwise(path if like is None else like), strict=True
+    ):
+        count = max(1, math.ceil(float(np.linalg.norm((d - c)[:3])) / STEP_MM))
+        pieces.append(a + np.linspace(0.0, 1.0, count + 1)[1:, None] * (b - a))
+    return np.concatenate(pieces)
+
+
+def marks(paths: Sequence[Floats], values: Floats) -> Marks:
+    """The footprints along sampled paths, each (M, 4) of x, y, depth, heading in deg."""
+    from model import footprint_kernel  # numba takes a fifth of a second to import
+
+    kernel: Any = footprint_kernel
+    ends = np.cumsum([0, *(len(path) for path in paths)])
+    discs = np.empty((int(ends[-1]) * DISCS, 3))
+    kernel.pull(np.ascontiguousarray(np.concatenate(paths)), ends, values, discs)
+    return Marks(discs, DISCS * np.arange(int(ends[-1]) + 1), ends)
+
+
+def fit_footprint(
+    paths: Sequence[Floats],
+    groups: Indices,
+    ink: NDArray[np.float32],
+    x_mm: Floats,
+    y_mm: Floats,
+    start: Footprint | None = None,
+) -> Footprint:
+    """Fit the footprint to (B, len(y_mm), len(x_mm)) images of ink.
+
+    Paths `groups[i]` to `groups[i + 1]`, each (N, 4), are the strokes of image i. From a `start`, values change half as
+    freely and only the narrow edge is used. Raises ValueError if the sizes do not match.
+    """
+    if ink.shape != (len(groups) - 1, len(y_mm), len(x_mm)) or groups[-1] != len(paths):
+        raise ValueError(f"{len(groups) - 1} images of {len(paths)} strokes, ink {ink.shape}: not alike")
+    ways = [sampled(path) for path in paths]
+    scale = np.array(SCALE) * (1.0 if start is None else 0.5)
+    first = np.array(START if start is None else start.values)
+
+    def at(scaled: Floats) -> Marks:
+        return marks(ways, first + scale * scaled)
+
+    def equations(scaled: Floats, spread_mm: float) -> Equations:
+        made = at(scaled)
+        slopes = np.empty((len(made.discs), 3, len(scaled)))
+        for k, unit in enumerate(np.eye(len(scaled))):
+            slopes[:, :, k] = (at(scaled + 1e-4 * unit).discs - made.discs) / 1e-4
+        found = ink_equations(made, made.strokes[groups], slopes, ink, x_mm, y_mm, spread_mm)
+        cost = found.cost + 0.5 * float(scaled @ scaled)
+        return Equations(cost, found.square + np.eye(len(scaled)), found.gradient + scaled)
+
+    moved = np.zeros(len(first))
+    for spread_mm in SPREADS_MM if start is None else SPREADS_MM[-1:]:
+        moved = descend(lambda v, s=spread_mm: equations(v, s), moved, rounds=ROUNDS, most=2.0, gain=1e-3)
+    return Footprint(tuple((first + scale * moved).tolist()))
+
+
+def ink_equations(
+    made: Marks,
+    images: Indices,
+    slopes: Floats,
+    ink: NDArray[np.float32],
+    x_mm: Floats,
+    y_mm: Floats,
+    spread_mm: float,
+    added_mm: Floats | None = None,
+) -> Equations:
+    """Normal equations of the modelled less the given ink. `slopes` are derivatives of the discs (rows, 3, P);
+    `added_mm` (len(y_mm), len(x_mm)) is added to the signed distances."""
+    from model import drag_kernel
+
+    kernel: Any = drag_kernel
+    count = slopes.shape[2]
+    square, gradient = np.zeros((count, count)), np.zeros(count)
+    added = np.zeros((1, *ink.shape[1:])) if added_mm is None else np.ascontiguousarray(added_mm[None], np.float64)
+    target, weights = np.ascontiguousarray(ink, np.float32), np.ones(len(ink))
+    x_mm, y_mm = np.ascontiguousarray(x_mm), np.ascontiguousarray(y_mm)
+    cost = kernel.normal_equations(
+        made.discs, made.starts, images, slopes, x_mm, y_mm, target, added, weights, spread_mm, square, gradient
+    )
+    return Equations(float(cost), np.tril(square) + np.tril(square, -1).T, gradient)

@@ -1,0 +1,93 @@
+"""A plan that knows the footprint leads the brush: the tip runs ahead, the ink lands where it is wanted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from model.characters.brush import Reach
+from model.characters.ink import swept
+from model.characters.lead import covered, drawn, first_lead, lead
+from model.characters.phases import Phase, phase_map, phases_of
+from model.characters.plan import Path
+from model.footprint import NAMES, Footprint, fit_footprint, sampled
+
+SIDE_MM, SIZE_PX = 48.0, 96
+HOOK = np.array([[12.0, 36.0], [20.0, 36.0], [28.0, 36.0], [34.0, 34.0], [34.0, 26.0], [33.0, 18.0], [30.0, 21.0]])
+
+
+def hook() -> Path:
+    from model.characters.plan import resampled
+
+    points = resampled(HOOK, 2.0)
+    half = np.full(len(points), 2.0)
+    half[-2:] = 1.0, 0.3
+    return Path(points, half)
+
+
+def test_leading_the_brush_puts_the_ink_on_the_corner() -> None:
+    path, brush, reach = hook(), Footprint(), Reach()
+    wanted = swept([path], SIDE_MM, SIZE_PX)
+
+    def wrong(strokes: list[np.ndarray]) -> int:
+        seen = covered(drawn(brush, strokes, SIDE_MM, SIZE_PX), SIDE_MM)
+        return np.count_nonzero((seen > 0.5) != (wanted > 0.5))
+
+    first = first_lead([path], brush, reach, SIDE_MM, 5.0)
+    led = lead(brush, first, wanted, SIDE_MM, reach, rounds=8)
+    assert wrong(led) < 0.5 * wrong(first)
+    assert led[0][:, 0].max() > HOOK[:, 0].max() + 0.5  # the tip goes on beyond the corner
+    assert np.all(np.linalg.norm(np.diff(led[0][:, :3], axis=0), axis=1) >= reach.apart_mm)
+    assert led[0][:, 2].max() <= reach.height_mm[1]
+
+
+def test_a_footprint_is_found_again_from_its_ink() -> None:
+    true = Footprint(
+        tuple({**dict(zip(NAMES, Footprint().values, strict=True)), "leash_mm_2": 3.0, "half_mm_2": 0.9}.values())
+    )
+    x_mm = (np.arange(64) + 0.5) * SIDE_MM / 64
+    y_mm = SIDE_MM - x_mm
+    paths = [
+        np.array([[14.0, 24.0, depth, turn], [34.0, 24.0, depth, turn], [30.0, 14.0, 0.5 * depth, turn]])
+        for depth, turn in ((3.0, 0.0), (6.0, 30.0), (9.0, -20.0))
+    ]
+    ink = np.array([true.distance([path], x_mm, y_mm) > 0.0 for path in paths], np.float32)
+    found = fit_footprint(paths, np.arange(4), ink, x_mm, y_mm)
+
+    def wrong(brush: Footprint) -> int:
+        seen = [brush.distance([path], x_mm, y_mm) > 0.0 for path in paths]
+        return np.count_nonzero(np.array(seen) != (ink > 0.5))
+
+    assert wrong(found) < 0.4 * wrong(Footprint())
+    with pytest.raises(ValueError, match="not alike"):
+        fit_footprint(paths[:2], np.arange(4), ink, x_mm, y_mm)
+    with pytest.raises(ValueError, match="a footprint has 23 finite values, got 2"):
+        Footprint((1.0, 2.0))
+
+
+def test_a_path_is_sampled_densely_and_keeps_its_corners() -> None:
+    path = np.array([[0.0, 0.0, 1.0, 0.0], [3.0, 0.0, 1.0, 0.0], [3.0, 4.0, 2.0, 90.0]])
+    dense = sampled(path)
+    assert np.linalg.norm(np.diff(dense[:, :3], axis=0), axis=1).max() <= 0.5
+    assert all((dense == corner).all(axis=1).any() for corner in path)
+    assert len(sampled(2.0 * path, like=path)) == len(dense)
+
+
+def test_a_stroke_is_divided_into_phases() -> None:
+    phases = phases_of(hook())
+    assert phases[0] is Phase.INITIATION_HIDDEN
+    assert phases[-1] is Phase.TERMINATION_EXPOSED
+    corner = int(np.argmin(np.linalg.norm(hook().points - (34.0, 34.0), axis=1)))
+    assert phases[corner] is Phase.TURNING
+    assert Phase.EXECUTION in phases
+    back = Path(np.array([[x, 0.0] for x in range(10)] + [[8.0 - x, 1.0] for x in range(8)]), np.full(18, 1.0))
+    assert Phase.FOLDING in phases_of(back)
+
+
+def test_every_pixel_belongs_to_the_phase_that_is_nearest() -> None:
+    where = phase_map([hook()], SIDE_MM, SIZE_PX)
+    order = list(Phase)
+    px = SIZE_PX / SIDE_MM
+    assert order[where[int((SIDE_MM - 36.0) * px), int(12.0 * px)]] is Phase.INITIATION_HIDDEN
+    assert order[where[int((SIDE_MM - 36.0) * px), int(23.0 * px)]] is Phase.EXECUTION
+    assert order[where[int((SIDE_MM - 21.5) * px), int(29.5 * px)]] is Phase.TERMINATION_EXPOSED
