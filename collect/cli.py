@@ -232,8 +232,11 @@ def write(
     out: Annotated[Path, typer.Option(help="Folder for the plan and the report.")] = Path("written"),
     sessions: Annotated[Path, typer.Option(help="Folder that holds sessions.")] = Path("sessions"),
     count: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written.")] = 10,
-    learn: Annotated[int, typer.Option(min=0, max=20, help="Rounds that first correct the plan by its own ink.")] = 0,
+    learn: Annotated[
+        int, typer.Option(min=0, max=20, help="At most so many rounds that learn from their ink first.")
+    ] = 0,
     learn_count: Annotated[int, typer.Option(min=1, max=100, help="How often each is written in such a round.")] = 2,
+    practice: Annotated[bool, typer.Option(help="First write a practice sheet, and plan with its fit.")] = False,
     data: Annotated[Path | None, typer.Option(help="hanzi-writer folder or makemeahanzi graphics.txt.")] = None,
     reference: Annotated[list[str] | None, typer.Option(help="字=picture.png: compare with this picture.")] = None,
     cell_mm: Annotated[float, typer.Option(min=10, max=500, help="Side of the character's paper cell.")] = 70.0,
@@ -256,6 +259,7 @@ def write(
         count=count,
         learn=learn,
         learn_count=learn_count,
+        practice=practice,
         sheet=sheet,
         plan_options=tuple(plan_options),
         references=tuple(reference or ()),

@@ -141,6 +141,9 @@ def learn(
     out: Annotated[Path, typer.Option(help="Folder for the next plan.")],
     gain: Annotated[float, typer.Option(min=0.05, max=1.5, help="Share of the miss that is corrected.")] = 0.7,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written next.")] = 1,
+    settled_repeats: Annotated[
+        int | None, typer.Option(min=1, max=1000, help="The same once no character is to be learned further.")
+    ] = None,
 ) -> None:
     """Make the next plan from what the ink of this one showed, phase by phase."""
     from calibrate.files import check_folder
@@ -153,6 +156,8 @@ def learn(
     with shown() as progress:
         made, lessons = learned(compare_written(session, load_plan(plan), {}, progress), gain)
     out.mkdir(parents=True, exist_ok=True)
+    if settled_repeats is not None and all(one.settled for one in lessons):
+        repeats = settled_repeats
     protocol = write_record(made, repeats, out)
     for one in lessons:
         ends = "; settled: the best round is kept" if one.settled else ""

@@ -158,8 +158,8 @@ def _corrected(
         side_mm,
         reach,
         added_mm=miss,
-        held=HELD,
-        spreads_mm=LATER_SPREADS_MM if first else LATER_SPREADS_MM[-1:],
+        spreads_mm=LATER_SPREADS_MM,
+        held=0.0 if first else HELD,
     )
     simulated = covered(drawn(footprint, moved, side_mm, size_px) + miss, side_mm)
     points = as_points(moved)

@@ -1,20 +1,25 @@
 """Stages of `brushloop write 字`: plan, write on the rig, calibrate, compare; optionally, learn first.
 
+With practice, a sheet of practice strokes is written before the plan, which then knows how this brush is dragged.
 Results of finished stages stay on disk and are reused. Every round is an ordinary session of `brushloop collect`.
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from calibrate.artefact import current
 from collect.chains.commands import Say, collected_session, finished_session, run_command
 from collect.errors import ConfigError
 from collect.protocols.config import load_protocol
 from collect.protocols.write import WriteConfig
 from collect.rig.config import load_rig
 
-PROTOCOL, PAGE = "protocol-write.toml", "written.html"
+PROTOCOL, PLAN, PAGE = "protocol-write.toml", "plan.json", "written.html"
+FOOTPRINT = "footprint"
+"""Folder of a session that holds the footprints fitted to it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +36,8 @@ class WritingRequest:
     """Rounds before the final writings; each writes a few copies and corrects the plan by them."""
     learn_count: int = 2
     """How often each character is written in such a round."""
+    practice: bool = False
+    """Whether a practice sheet comes first."""
     sheet: int | None = None
     """Number of the sheet that the operator has put in; valid for one collection, as the next needs a fresh sheet."""
     plan_options: tuple[str, ...] = ()
@@ -57,6 +64,9 @@ class Writing:
         plan = self._first_plan()
         for number in range(1, request.learn + 1):
             plan = self._learn(plan, number)
+            if _settled(plan):
+                self._say("No character gained by the last round: the best plans are written.")
+                break
         _check_plan(plan / PROTOCOL, request, request.count)
         session = self._written(plan / PROTOCOL)
         references = [word for given in request.references for word in ("--reference", given)]
@@ -69,8 +79,25 @@ class Writing:
             brush = load_rig(request.config).brush
             options = ["--radius-mm", str(brush.radius_mm), "--length-mm", str(brush.length_mm)]
             options += ["--repeats", str(self._repeats(1)), *request.plan_options]
+            options += ["--footprint", str(self._footprint())] if request.practice else []
             self._do("write", "plan", "--out", plan, *options, "--", request.what)
         return plan
+
+    def _footprint(self) -> Path:
+        """Write the practice sheet and fit the footprint of the brush to it, if that is not done; return its file."""
+        request, folder = self._request, self._request.out / "practice"
+        if not (folder / PROTOCOL).exists():
+            brush = load_rig(request.config).brush
+            options = ["--radius-mm", str(brush.radius_mm), "--length-mm", str(brush.length_mm)]
+            self._do("write", "practice", "--out", folder, *options)
+        session = self._written(folder / PROTOCOL)
+        found = current(session, FOOTPRINT)
+        if found is None:
+            self._do("write", "fit", session)
+            found = current(session, FOOTPRINT)
+        if found is None:
+            raise ConfigError(session, "", "holds no footprint, although `write fit` ended")
+        return found
 
     def _learn(self, plan: Path, number: int) -> Path:
         """Write one round and learn from it; return the folder of the next plan."""
@@ -79,7 +106,8 @@ class Writing:
             _check_plan(plan / PROTOCOL, self._request, self._repeats(number))
             session = self._written(plan / PROTOCOL)
             self._do("write", "compare", session, "--plan", plan, "--out", self._request.out / f"round-{number}")
-            options = ("--out", after, "--repeats", str(self._repeats(number + 1)))
+            repeats = str(self._repeats(number + 1))
+            options = ("--out", after, "--repeats", repeats, "--settled-repeats", str(self._request.count))
             self._do("write", "learn", session, "--plan", plan, *options)
         return after
 
@@ -97,6 +125,17 @@ class Writing:
 
     def _do(self, *arguments: str | Path) -> None:
         run_command(self._say, *arguments)
+
+
+def _settled(plan: Path) -> bool:
+    """Whether no character of a plan is to be learned further."""
+    try:
+        figures = json.loads((plan / PLAN).read_text("utf-8"))["figures"]
+        return all(figure.get("settled", False) for figure in figures)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        raise ConfigError(
+            plan / PLAN, "figures", "cannot be read: remove the folder to learn this round again"
+        ) from None
 
 
 def _check_plan(path: Path, request: WritingRequest, repeats: int) -> None:
