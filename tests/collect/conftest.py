@@ -35,7 +35,7 @@ SMALL_TABLE = Table(
     board_marker_mm=7.0,
     well_mm=(150.0, 20.0),
 )
-SHARP_VIEW = View(width_px=1024, height_px=832, px_per_mm=6.25, centre_mm=(55.0, 40.0), fps=8.0)
+SHARP_VIEW = View(width_px=1024, height_px=832, px_per_mm=6.25, centre_mm=(55.0, 40.0), fps=12.0)
 """Of the small table, as sharp as the camera is by default: a quarter of its pixels."""
 
 
@@ -181,7 +181,7 @@ def sharp_lab(tmp_path: Path) -> Iterator[Lab]:
 @pytest.fixture
 def bent_lab(tmp_path: Path) -> Iterator[Lab]:
     """A whole sheet through a lens that distorts by ten pixels and more; no lens file is named yet."""
-    view = View(width_px=1024, height_px=768, px_per_mm=3.125, fps=8.0, k1=-0.08)
+    view = View(width_px=1024, height_px=768, px_per_mm=3.125, fps=12.0, k1=-0.08)
     with sharp(tmp_path, view, Table(), latency_ms=500) as made:
         yield made
 
