@@ -23,6 +23,8 @@ from sessions.store import SessionStore
 
 PLACES = 30
 """Random places in each of the two sessions, open and closed. The soak has more, and each boundary both ways."""
+EVERY = 2
+"""One record boundary of so many is damaged here, cut there or with a bit flipped in turn."""
 
 
 @dataclass
@@ -65,13 +67,16 @@ def record_boundaries(path):
 
 
 def places(whole, chosen, count, both_ways):
-    """(file, offset, bit or None to cut there): each boundary cut or flipped in turn, or `both_ways`; then random."""
-    for name in whole.sizes:
-        for number, at in enumerate(record_boundaries(whole.folder / name)):
-            if both_ways or number % 2 == 0:
+    """(file, offset, bit or None to cut there): each boundary `both_ways`, or some cut or flipped; then random."""
+    for file, name in enumerate(whole.sizes):
+        boundaries = record_boundaries(whole.folder / name)
+        if both_ways:
+            for at in boundaries:
                 yield name, at, None
-            if both_ways or number % 2 == 1:
                 yield name, at, chosen.randrange(8)
+            continue
+        for number, at in enumerate(boundaries[file % EVERY :: EVERY]):
+            yield name, at, None if number % 2 == 0 else chosen.randrange(8)
     names, sizes = list(whole.sizes), list(whole.sizes.values())
     for _ in range(count):
         [name] = chosen.choices(names, sizes)
