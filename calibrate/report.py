@@ -25,9 +25,9 @@ Image = NDArray[np.float32]
 PAPER = "#fbf9f4"
 """Background of picture files."""
 PHOTOGRAPH_PX, JPEG_QUALITY = 1600, 80
-"""Longest side and quality of a photograph in a page: at most 500 kB."""
+"""Longest side and quality of a photograph in a page: about 500 kB at most."""
 REMARK = re.compile(r"\(([^()]+)\)(?:, R = [^()]*)?$")
-"""What a described brush says in brackets at the end of its name, which its size may follow."""
+"""Finds the remark in brackets that ends the name of a described brush; the brush's size may follow it."""
 
 
 def render(template: str, **values: Any) -> str:
@@ -64,7 +64,7 @@ def write_files(folder: Path, texts: Mapping[str, str]) -> None:
 
 
 def source_label(source: Source, brushes: Iterable[str] = ()) -> str:
-    """The label of tables and figures: the source, and what the names of simulated brushes remark.
+    """The label of tables and figures: the source, and the remarks in the names of simulated brushes.
 
     A remark is what a described brush (`brushloop sim --brush FILE`) has in brackets at the end of its name.
     """

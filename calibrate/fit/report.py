@@ -163,7 +163,7 @@ def _verdict(captures: Captures, fitted: Fitted, cells: int) -> Iterator[str]:
     yield f"The stroke model was fitted to {len(captures.strokes)} presses at {cells} combinations of H and α: {brush}."
     scores = {row.model: row.csim for row in fitted.held_out}
     if FITTED not in scores:
-        yield "Only one combination was pressed, so nothing says how well it predicts others."
+        yield "Only one combination was pressed, so how well it predicts others is not known."
         return
     ceiling = f"; another press of the same combination reaches {scores[CEILING]:.1f} %" if CEILING in scores else ""
     yield (
