@@ -21,10 +21,11 @@ from calibrate.calibration import Calibration
 from calibrate.compare.field import SIZE_PX, Alignment, Tone
 from calibrate.compare.similarity import Polarity
 from calibrate.writing.compare import WritingComparison, as_ink
-from calibrate.writing.learn import learned, lost_in_words
+from calibrate.writing.learn import learned
 from calibrate.writing.plan import Settings, plan
 from calibrate.writing.plan_files import FigureRecord, PlannedBy, PlanRecord, arrays, figure_record
 from calibrate.writing.practice import PER_FIGURE, practice_strokes
+from calibrate.writing.rounds import lost_in_words, round_of
 from calibrate.writing.scores import HEADLINE, Character, compare_ink
 from drivers.sim.brush.brush import Brush, BrushSpec
 from drivers.sim.brush.drag import Waypoint
@@ -170,7 +171,7 @@ def _result(name: str, figure: FigureRecord, one: Character, rounds: list[dict[s
         f"simulated brush {name}, written directly, {one.name}, {len(each)} writings; rounds "
         f"{' '.join(f'{found[one.name]:.1f}' for found in rounds)}; CSIM {csim:.1f} and SSIM {ssim:.1f} (mm, ink = 1), "
         f"{paper_csim:.2f} and {paper_ssim:.2f} (paper = 1); first writing {each[0]:.1f}, tenth {each[-1]:.1f}; most "
-        f"lost in {lost_in_words(figure.rounds)}; {machine()}"
+        f"lost in {lost_in_words([round_of(figure, one, SIDE_MM)])}; {machine()}"
     )
     ratio = (100.0 - unlearned) / (100.0 - csim)
     return Result(

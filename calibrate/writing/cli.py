@@ -148,8 +148,9 @@ def learn(
     """Make the next plan from what the ink of this one showed, phase by phase."""
     from calibrate.files import check_folder
     from calibrate.writing.compare import compare_written
-    from calibrate.writing.learn import learned, lost_in_words
+    from calibrate.writing.learn import learned
     from calibrate.writing.plan_files import load_plan, write_record
+    from calibrate.writing.rounds import lost_in_words
     from sessions.progress import shown
 
     check_folder(out)

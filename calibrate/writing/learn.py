@@ -12,17 +12,16 @@ A character whose last round was no better than the best one goes back to the be
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.field import Image, Tone
+from calibrate.compare.field import Image
 from calibrate.drags.residual import captured_distance
 from calibrate.errors import CalibrationError
-from calibrate.writing.compare import WritingComparison, as_ink
+from calibrate.writing.compare import WritingComparison
 from calibrate.writing.plan_files import (
     FigureRecord,
     PlannedBy,
@@ -32,7 +31,7 @@ from calibrate.writing.plan_files import (
     as_points,
     encoded,
 )
-from calibrate.writing.scores import HEADLINE, Character, compare_ink
+from calibrate.writing.rounds import round_of
 from model.characters.brush import Reach
 from model.characters.lead import LATER_SPREADS_MM, covered, drawn, grid, lead
 from model.characters.phases import Phase, phase_map
@@ -76,7 +75,7 @@ def learned(written: WritingComparison, gain: float = 0.7) -> tuple[PlanRecord, 
     figures: list[FigureRecord] = []
     lessons: list[Lesson] = []
     for figure in plan.figures:
-        found = _round(figure, writings[figure.name], plan.cell_mm)
+        found = round_of(figure, writings[figure.name], plan.cell_mm)
         after = _after(figure, found)
         if not after.settled:
             after = _corrected(after, captured[figure.name], footprint, reach, plan.cell_mm, gain)
@@ -104,26 +103,6 @@ def _refitted(plan: PlanRecord, captured: dict[str, Image]) -> Footprint:
     except ValueError as error:
         raise CalibrationError("plan.json", f"planned_by.footprint: {error}") from None
     return fit_footprint([path for one in strokes for path in one], groups, ink, x_mm, y_mm, start)
-
-
-def _round(figure: FigureRecord, one: Character, side_mm: float) -> Round:
-    reference = as_ink(figure.wanted())
-    scores = [compare_ink(reference, ink, HEADLINE)[0] for ink in one.captured.values()]
-    lost = [lost_by_phase(figure, ink[Tone.BINARY], side_mm) for ink in one.captured.values()]
-    mean = {phase: round(float(np.mean([share[phase] for share in lost])), 2) for phase in lost[0]}
-    return Round(csim_percent=round(100.0 * float(np.mean(scores)), 3), lost_percent=mean)
-
-
-def lost_by_phase(figure: FigureRecord, ink: Image, side_mm: float) -> dict[str, float]:
-    """Wrong pixels (missing or too much) of (128, 128) ink by phase, in percent of the wanted ink."""
-    if not figure.medians:
-        return {}
-    wanted = figure.wanted() > 0.5
-    where = phase_map(figure.ways, side_mm, len(ink))
-    wrong = np.bincount(where[wanted != (ink > 0.5)], minlength=len(Phase))
-    share = 100.0 * wrong / max(1, np.count_nonzero(wanted))
-    present = np.unique(where)
-    return {str(phase): float(share[k]) for k, phase in enumerate(Phase) if k in present}
 
 
 def _after(figure: FigureRecord, found: Round) -> FigureRecord:
@@ -188,9 +167,3 @@ def _trust(figure: FigureRecord, side_mm: float, size_px: int) -> Floats:
         if now.get(phase, 0.0) > before.get(phase, 0.0):
             factors[k] = WORSE
     return factors[phase_map(figure.ways, side_mm, size_px)]
-
-
-def lost_in_words(rounds: Sequence[Round]) -> str:
-    """The phases of the last round in which most is lost, most first."""
-    lost = sorted(rounds[-1].lost_percent.items(), key=lambda item: -item[1]) if rounds else []
-    return ", ".join(f"{phase} {share:.1f} %" for phase, share in lost[:3])

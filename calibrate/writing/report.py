@@ -26,6 +26,7 @@ from calibrate.report import (
 )
 from calibrate.writing.compare import WritingComparison
 from calibrate.writing.plan_files import code_points
+from calibrate.writing.rounds import phase_table, round_of
 from calibrate.writing.scores import FILE as NUMBERS
 from calibrate.writing.scores import (
     HEADLINE,
@@ -152,7 +153,11 @@ def _tables(table: list[Table3Row]) -> list[dict[str, Any]]:
 def _characters(written: WritingComparison) -> Iterator[dict[str, Any]]:
     for one in written.characters:
         reference = one.reference[Tone.GRAY]
+        figure = written.plan.figure(one.name)
+        rounds = [] if figure is None else [*figure.rounds, round_of(figure, one, written.plan.cell_mm)]
         yield {
+            "rounds": rounds,
+            "phases": phase_table(rounds),
             "name": one.name,
             "reference_name": one.reference_name,
             "reference": ink_uri(reference),

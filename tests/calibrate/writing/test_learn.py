@@ -10,8 +10,9 @@ import pytest
 from calibrate.calibration import Calibration
 from calibrate.errors import CalibrationError
 from calibrate.writing.compare import WritingComparison, as_ink
-from calibrate.writing.learn import MOST_MM, learned, lost_by_phase, missed, reach_of
+from calibrate.writing.learn import MOST_MM, learned, missed, reach_of
 from calibrate.writing.plan_files import PlanRecord, arrays, figure_record
+from calibrate.writing.rounds import lost_by_phase, phase_table, round_of
 from calibrate.writing.scores import Character
 from model.characters.ink import swept
 from model.characters.lead import covered, drawn, first_lead, lead
@@ -132,3 +133,8 @@ def test_what_is_lost_is_listed_by_phase(plan: PlanRecord) -> None:
     lost = lost_by_phase(figure, cut, SIDE_MM)
     assert max(lost, key=lambda phase: lost[phase]) == "initiation, hidden tip"
     assert lost["termination, hidden tip"] == 0.0
+    found = round_of(figure, session(plan, ink=cut).characters[0], SIDE_MM)
+    assert phase_table([found, found])[0] == (
+        "initiation, hidden tip",
+        [found.lost_percent["initiation, hidden tip"]] * 2,
+    )
