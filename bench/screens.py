@@ -101,7 +101,7 @@ class _Tour:
         await self.pilot.pause(0.4)
 
     async def _answer(self) -> None:
-        """Answers to every question that no picture shows: a pale stroke is kept, a late frame taken again."""
+        """Answer every question that no picture shows: a pale stroke is kept, a late frame taken again."""
         asked = None if self.app.engine is None else self.app.engine.snapshot().prompt
         if asked is None or not isinstance(self.app.screen, AskScreen | SetUpScreen):
             return

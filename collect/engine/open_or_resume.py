@@ -134,9 +134,9 @@ def find_resumable(opening: Opening) -> Path | None:
 
 
 def resuming(opening: Opening, session_id: str) -> Opening:
-    """Return `opening` to go on with that open session, and with no other.
+    """Return `opening` if it resumes that open session.
 
-    Raises `ConfigError` where these files begin or go on with another session.
+    Raises `ConfigError` if these files begin or resume another session.
     """
     opening = replace(opening, new=False)
     found = find_resumable(opening)

@@ -29,7 +29,7 @@ VT340_CELL_PX = (10, 20)
 def lines_of(
     image: NDArray[np.uint8] | Coloured | None, size: Size, cell_px: tuple[int, int] = VT340_CELL_PX
 ) -> list[NDArray[np.int64]]:
-    """Numbers of the picture's colours cut into lines of the terminal, one array as high as a cell for each line.
+    """The picture's colour numbers, cut into one array for each line of the terminal, as high as a cell.
 
     `NOTHING` fills the last line below the picture.
     """

@@ -21,7 +21,7 @@ NOISE = 2.0
 
 
 class RoomScene:
-    """The arm seen along a level direction, `azimuth_rad` from the base's y axis; its picture changes as the arm moves."""
+    """The arm, seen along a level direction at `azimuth_rad` from the base's y axis."""
 
     def __init__(self, world: World, azimuth_rad: float) -> None:
         self._world = world
