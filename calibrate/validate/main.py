@@ -26,7 +26,7 @@ from calibrate.validate.pool import Dask, Threads
 from calibrate.validate.report.data import Report
 from calibrate.validate.report.figures import read_curve
 from calibrate.validate.report.outputs import summary_csv, table_3_csv, write_csv, write_parquet
-from calibrate.validate.report.page import page_of
+from calibrate.validate.report.page import page_of, pages_beside
 from calibrate.validate.report.summary import report_of
 from calibrate.validate.run import Options, Outcome, validate_presses
 from calibrate.validate.sources import URL, LoadedSession, one_source, open_session
@@ -172,7 +172,8 @@ def _write(
         (folder / TABLE_3).unlink(missing_ok=True)  # left by an earlier run with characters
     refused = [(r.session_id, r.stroke_id, r.why) for r in report.refused]
     files["failures.csv"] = csv_text(("session_id", "stroke_id", "why"), refused)
-    files["report.html"] = page_of(outcome, report, curves, [*beside, *files, "report.json"], extras.figures)
+    pages = list(pages_beside(outcome.sessions, folder))
+    files["report.html"] = page_of(outcome, report, curves, [*beside, *files, "report.json"], extras.figures, pages)
     files["report.json"] = report.to_json()
     write_files(folder, files)
     progress(what, parts, parts)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ from calibrate.loop.report import write_loop
 from calibrate.loop.scores import CapturedPress, Pair, score_pairs, table_1, verdicts
 from calibrate.pages.lens import thumbnail, write_lens_page
 from calibrate.stroke.measure import Measured
+from calibrate.validate.report.page import pages_beside
 from calibrate.writing.compare import WritingComparison
 from calibrate.writing.plan_files import PlanRecord, figure_record
 from calibrate.writing.report import write_written
@@ -205,6 +207,19 @@ def test_a_page_of_a_twin_says_whose_twin_on_every_figure(pages: dict[str, str])
         assert pages[name].count("brush twin of 2026-03-02-grid-01") > 5
     assert "One original was not pressed again." in pages["loop"]
     assert "x&lt;u&gt;: is blank" in pages["loop"]
+
+
+def test_a_report_in_the_session_links_to_the_pages_that_are_there_and_one_elsewhere_to_none(tmp_path: Path) -> None:
+    home = tmp_path / "2026-03-02-grid-01"
+    page = home / "calibration" / f"{CALIBRATION.digest}.html"
+    page.parent.mkdir(parents=True)
+    recording, header = SimpleNamespace(path=home / "x.mcap"), SimpleNamespace(session_id=home.name)
+    session: Any = SimpleNamespace(recording=recording, header=header, calibration=CALIBRATION, fit=None)
+    assert list(pages_beside([session], home / "validation")) == []
+    page.touch()
+    expected = [(f"calibration of {home.name}", f"../calibration/{page.name}")]
+    assert list(pages_beside([session], home / "validation")) == expected
+    assert list(pages_beside([session], tmp_path / "elsewhere")) == []
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")

@@ -5,10 +5,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+from calibrate.artefact import FOLDER
 from calibrate.compare.field import Alignment, Tone
 from calibrate.compare.paper import TABLE_3
+from calibrate.fit.artefact import FOLDER as FITS
 from calibrate.report import render, source_note
 from calibrate.validate import candidates as who
 from calibrate.validate.report import figures, findings, tables
@@ -16,15 +19,21 @@ from calibrate.validate.report.data import Extreme, Report, Session
 from calibrate.validate.report.figures import Curve
 from calibrate.validate.report.summary import extremes
 from calibrate.validate.run import CEILING, Outcome
+from calibrate.validate.sources import LoadedSession
 
 CELL_COLUMNS = ("ccd-bsmg", who.GENERATOR_HELD_OUT, "ccd-bsm", who.FITTED_HELD_OUT, who.BEZIER_REFITTED, CEILING)
 MAX_REFUSED = 200
 
 
 def page_of(
-    outcome: Outcome, report: Report, curves: Sequence[Curve], beside: Sequence[str], figures_13: Sequence[str] = ()
+    outcome: Outcome,
+    report: Report,
+    curves: Sequence[Curve],
+    beside: Sequence[str],
+    figures_13: Sequence[str] = (),
+    pages: Sequence[tuple[str, str]] = (),
 ) -> str:
-    """The whole page. `beside` names the data files in its folder.
+    """The whole page. `beside` names the data files in its folder, `pages` is what `pages_beside` finds.
 
     `figures_13` are pictures of written characters as data URIs, empty if missing.
     """
@@ -43,6 +52,7 @@ def page_of(
         + (f" and {len(report.sessions) - 4} more" if len(report.sessions) > 4 else ""),
         note=source_note(report.source),
         beside=beside,
+        pages=pages,
         verdict=list(findings.verdict(report)),
         measured=findings.measured(report),
         findings=list(findings.findings(report)),
@@ -73,6 +83,17 @@ def page_of(
         more_refused=max(0, len(report.refused) - MAX_REFUSED),
         provenance=[*(_of_session(one) for one in report.sessions), *_of_others(report), _of_run(report)],
     )
+
+
+def pages_beside(sessions: Sequence[LoadedSession], folder: Path) -> Iterator[tuple[str, str]]:
+    """Name and relative address of the calibration's and the fit's page, where `folder` lies in the session's own."""
+    for one in sessions:
+        home = one.recording.path.parent
+        if folder.resolve().parent != home.resolve():
+            continue
+        for name, made, kind in (("calibration", one.calibration, FOLDER), ("brush fit", one.fit, FITS)):
+            if made is not None and (home / kind / f"{made.digest}.html").is_file():
+                yield f"{name} of {one.header.session_id}", f"../{kind}/{made.digest}.html"
 
 
 def _cells(report: Report) -> dict[str, Any]:
