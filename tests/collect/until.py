@@ -12,6 +12,9 @@ from collect.engine.engine import Engine
 from collect.engine.snapshot import Snapshot
 from tests.waiting import PATIENCE_S
 
+LOOK_S = 0.01
+"""Between two looks at a run; a snapshot of it is not free."""
+
 
 def until(engine: Engine, condition: Callable[[Snapshot], bool], timeout_s: float = PATIENCE_S) -> Snapshot:
     """The first snapshot that meets the condition; fails where it does not come in time, or the run is over."""
@@ -21,7 +24,7 @@ def until(engine: Engine, condition: Callable[[Snapshot], bool], timeout_s: floa
             pytest.fail(f"waited {timeout_s:g} s for {_source(condition)}; the run is: {now}")
         if engine.finished:
             pytest.fail(f"the run ended while a test waited for {_source(condition)}: {now}")
-        time.sleep(0.005)
+        time.sleep(LOOK_S)
     return now
 
 
@@ -33,7 +36,7 @@ def wait_for_end(engine: Engine, timeout_s: float = PATIENCE_S) -> None:
             now = engine.snapshot()
             engine.stop()
             pytest.fail(f"waited {timeout_s:g} s for the end of the run; it is: {now}")
-        time.sleep(0.005)
+        time.sleep(LOOK_S)
     engine.join()
 
 
