@@ -50,7 +50,7 @@ def teach(
     plain: Plain = False,
     arm: Arm = False,
 ) -> None:
-    """Teach one step again. Only its own values change, and what rests on them, which is listed."""
+    """Teach one step again. Only its own values change, and what depends on them, which is listed."""
     _teach(rig, step, plain=plain, arm=arm)
 
 

@@ -145,7 +145,7 @@ class Step(Protocol):
     title: str
     minutes: int
     needs: tuple[StepName, ...]
-    """Steps whose values this one rests on."""
+    """Steps whose values this one depends on."""
 
     async def teach(self, day: Day) -> None:
         """Ask, measure and keep. Raises `WentBack`, `LeftOff`, `CannotTeach` and what the devices raise."""

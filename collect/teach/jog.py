@@ -99,7 +99,7 @@ async def jogged(day: JogDay, what: str) -> Brought:
 async def _step(robot: Robot, step: JogStep) -> str:
     """Make one step, or return why it is not made."""
     if not any(math.isclose(abs(step.mm), size) for size in STEPS_MM):
-        return f"{step.mm:g} mm is none of the steps"
+        return f"{step.mm:g} mm is not one of the steps"
     here = await robot.take_up()
     x, y, z = (v + step.mm * (name == step.axis) for name, v in zip("xyz", here.position_mm, strict=True))
     try:

@@ -78,7 +78,7 @@ class PlainGuide:
             answer = await self._line() or default
             if answer in keys:
                 return answer
-            say(f"  {answer!r} is none of {', '.join(keys)}")
+            say(f"  {answer!r} is not one of {', '.join(keys)}")
 
     async def number(self, question: str, unit: str, low: float, high: float, default: float | None) -> float:
         """Read a number in the range."""
@@ -117,7 +117,7 @@ class PlainGuide:
                 case "jog" if target.may_jog:
                     return Brought.JOG
                 case other:
-                    say(f"  {other!r} is none of Enter, {', '.join(words)}")
+                    say(f"  {other!r} is not one of Enter, {', '.join(words)}")
 
     async def jog(self, view: JogView) -> JogStep | Brought:
         """Read a step such as `z -0.1`."""

@@ -1,7 +1,7 @@
 """What has been taught so far: one file beside the future `rig.toml`, written whole after each value.
 
 It holds what was observed (where the flange stood at each thing) and what was found from it, so that a session that
-was cut asks nothing again, and a value that rests on others is computed again when they change.
+was cut asks nothing again, and a value that depends on others is computed again when they change.
 """
 
 from __future__ import annotations

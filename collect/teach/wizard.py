@@ -51,11 +51,11 @@ class Wizard:
         """
         step = next((one for one in self._steps if one.name == name), None)
         if step is None:
-            raise ConfigError("STEP", "", f"{name!r} is none of {', '.join(one.name for one in self._steps)}")
+            raise ConfigError("STEP", "", f"{name!r} is not one of {', '.join(one.name for one in self._steps)}")
         missing = [need for need in step.needs if need not in self._day.notebook.done]
         if missing:
             raise CollectAborted(
-                f"`{name}` rests on {', '.join(missing)}, not taught yet: `brushloop rig new` goes on from there"
+                f"`{name}` depends on {', '.join(missing)}, which is not taught yet: `brushloop rig new` resumes there"
             )
         if name in self._day.notebook.done:
             self._day.save(step.forget(self._day.notebook).reopened(step.name))
@@ -90,7 +90,7 @@ class Wizard:
             raise CollectAborted("left off; the same command resumes from there")
 
     async def _derive(self, step: Step, before: Notebook) -> None:
-        """Finish a step: compute what rests on it again, and list what that changed. Proofs of the past are void."""
+        """Finish a step: compute what depends on it again, and list what that changed. Proofs of the past are void."""
         notebook = self._day.notebook
         dependent = self._resting_on(step.name)
         for one in self._steps:
@@ -106,7 +106,7 @@ class Wizard:
             and not _same(old.value, new.value)
         ]
         if changed:
-            await self._day.say("Changed with it, because it rests on this step:", *changed)
+            await self._day.say("Changed with it, because it depends on this step:", *changed)
         await self._day.say(f"{step.title}: {step.summary(notebook)}")
 
     def _resting_on(self, name: StepName) -> set[StepName]:

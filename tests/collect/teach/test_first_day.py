@@ -134,7 +134,7 @@ async def test_killed_again_and_again_it_asks_nothing_twice_and_a_step_taught_ag
     assert {field.split(".")[0] for field in changed} <= {"robot", "paper", "ink", "motion", "board", "aside", "touch"}
     assert {"camera.source", "brush.radius_mm", "touch.force.push_axis"}.isdisjoint(changed)
     assert rig.with_name("rig.toml.bak").read_text(encoding="utf-8") == text
-    assert any("Changed with it, because it rests on this step:" in line for line in person.lines)
+    assert any("Changed with it, because it depends on this step:" in line for line in person.lines)
 
     await _killed_in_each_part_of_the_proof(person, rig, monkeypatch)
     assert "NOT PROVEN" not in rig.read_text(encoding="utf-8")
@@ -223,7 +223,7 @@ async def test_thirty_labs(seed: int, tmp_path: Path) -> None:
         person.mends = trap is not None
         rig = tmp_path / "rig.toml"
         made = await first_day(person, rig)
-        if trap is Trap.WRONG_BOARD_SIZE:  # the way out that is named: the camera's step rests on the board's size
+        if trap is Trap.WRONG_BOARD_SIZE:  # the way out that is named: the camera's step depends on the board's size
             assert await Wizard(Day(person, rig, HostClock(), armed=True)).again("camera") is None
             made = await first_day(person, rig)
         assert trap is None or _named(person, trap), person.trouble

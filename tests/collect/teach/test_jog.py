@@ -116,7 +116,7 @@ async def test_a_step_out_of_the_box_is_refused_and_said(server: ArcsServer, tmp
     refused = [view.refused for view in person.views]
     assert refused[:2] == ["", ""]
     assert refused[2].startswith("not made: z = 250.000 mm is outside [255.000,")
-    assert refused[3:] == ["", "100 mm is none of the steps"]
+    assert refused[3:] == ["", "100 mm is not one of the steps"]
     assert sent(server) == 2
 
 
