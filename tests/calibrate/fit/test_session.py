@@ -41,6 +41,7 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     assert path is not None
     fit = load_artefact(path, BrushFit)
     assert fit.strokes == 5
+    assert set(fit.cells) == set(CELLS)
     assert fit.csim_percent["fitted"] > fit.csim_percent["uncalibrated"] + 3.0
     ran = narrow.invoke(app, ["validate", str(session), "--mm-per-px", "0.4", "--model", "ccd-bsm", "--model", NAME])
     assert ran.exit_code == 0, ran.output
