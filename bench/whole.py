@@ -30,6 +30,7 @@ ACCURACY = {
     "quality": 300,
     "structure": 120,
     "paper-brush": 120,
+    "characters": 130,
     "inversion": 300,
     "curves": 300,
     "loop": 600,
