@@ -13,28 +13,36 @@ from sessions.terminal import say
 def plan(
     what: Annotated[str, typer.Argument(help="Characters (字 子 永 are shipped), or a .csv or .json trajectory.")],
     out: Annotated[Path, typer.Option(help="Folder for protocol-write.toml and plan.png.")] = Path("write-plan"),
-    data: Annotated[Path | None, typer.Option(help="hanzi-writer folder or makemeahanzi graphics.txt.")] = None,
-    model: Annotated[str, typer.Option(help="The stroke model that plans and draws.")] = "ccd-bsm",
-    radius_mm: Annotated[float, typer.Option(min=0.5, max=50, help="R of the brush.")] = 6.0,
-    length_mm: Annotated[float, typer.Option(min=5, max=200, help="L of the brush.")] = 48.0,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder of hanzi-writer files, or makemeahanzi's graphics.txt.")
+    ] = None,
+    model: Annotated[
+        str, typer.Option(help="Stroke model that plans and draws; without influence with --footprint.")
+    ] = "ccd-bsm",
+    radius_mm: Annotated[float, typer.Option(min=0.5, max=50, help="Radius R of the brush.")] = 6.0,
+    length_mm: Annotated[float, typer.Option(min=5, max=200, help="Length L of the brush.")] = 48.0,
     drag: Annotated[
-        Path | None, typer.Option(help="Artefact of `fit --drags`: strokes that travel are drawn with its bristle lag.")
+        Path | None, typer.Option(help="Result of `fit --drags`: strokes that travel are drawn with its bristle lag.")
     ] = None,
     footprint: Annotated[
-        Path | None, typer.Option(help="Footprint of `write fit`: leads the brush by what its own drags showed.")
+        Path | None,
+        typer.Option(help="Result of `write fit`: the plan leads the brush by the footprint of its own drags."),
     ] = None,
-    lam: Annotated[float | None, typer.Option(min=0.1, max=10, help="lambda of CCD-BSM; pi when left out.")] = None,
+    lam: Annotated[float | None, typer.Option(min=0.1, max=10, help="Lambda of CCD-BSM; pi by default.")] = None,
     cell_mm: Annotated[float, typer.Option(min=10, max=500, help="Side of the character's paper cell.")] = 70.0,
     margin_mm: Annotated[float, typer.Option(min=0, max=200, help="Margin around the font's square.")] = 6.0,
-    height_range: Annotated[tuple[float, float], typer.Option(help="Feasible depths, mm.")] = (0.5, 20.0),
-    tilt_range: Annotated[tuple[float, float], typer.Option(help="Feasible tilts, deg; at most 30.")] = (0.0, 10.0),
-    tilt: Annotated[float, typer.Option(min=0, max=30, help="Tilt to start from, deg.")] = 5.0,
-    speed_mm_s: Annotated[float, typer.Option(min=1, max=100, help="Of the tip.")] = 15.0,
-    wrist_deg_s: Annotated[float, typer.Option(min=1, max=720, help="How fast the wrist may turn.")] = 180.0,
-    steps: Annotated[int, typer.Option(min=0, max=1000, help="Of refinement; 0 keeps the first plan.")] = 60,
+    height_range: Annotated[tuple[float, float], typer.Option(help="Least and greatest depth, mm.")] = (0.5, 20.0),
+    tilt_range: Annotated[tuple[float, float], typer.Option(help="Least and greatest tilt, deg; at most 30.")] = (
+        0.0,
+        10.0,
+    ),
+    tilt: Annotated[float, typer.Option(min=0, max=30, help="Initial tilt, deg.")] = 5.0,
+    speed_mm_s: Annotated[float, typer.Option(min=1, max=100, help="Speed of the tip.")] = 15.0,
+    wrist_deg_s: Annotated[float, typer.Option(min=1, max=720, help="Greatest speed of the wrist.")] = 180.0,
+    steps: Annotated[int, typer.Option(min=0, max=1000, help="Steps of refinement; 0 keeps the first plan.")] = 60,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written.")] = 1,
 ) -> None:
-    """Plan characters: depth from the stroke's width, heading along the stroke, refined by the model's image."""
+    """Plan characters: depth from the width of each stroke, heading along it, then refined until the image matches."""
     import math
     from dataclasses import replace
 
@@ -103,7 +111,7 @@ def compare(
     session: Annotated[Path, typer.Argument(help="The session in which a plan was written.")],
     plan: Annotated[Path, typer.Option(help="The plan's folder, or its plan.json.")],
     reference: Annotated[
-        list[str] | None, typer.Option(help="字=picture.png: compare with this, not with the plan's own font.")
+        list[str] | None, typer.Option(help="字=picture.png: compare with this picture instead of the plan's font.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for written.html, .csv, .json and figure-13.png.")] = Path(
         "written"
@@ -142,7 +150,7 @@ def learn(
     gain: Annotated[float, typer.Option(min=0.05, max=1.5, help="Share of the miss that is corrected.")] = 0.7,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written next.")] = 1,
     settled_repeats: Annotated[
-        int | None, typer.Option(min=1, max=1000, help="The same once no character is to be learned further.")
+        int | None, typer.Option(min=1, max=1000, help="The same, used once every character is settled.")
     ] = None,
 ) -> None:
     """Make the next plan from what the ink of this one showed, phase by phase."""
@@ -168,10 +176,12 @@ def learn(
 
 def practice(
     out: Annotated[Path, typer.Option(help="Folder for protocol-write.toml.")] = Path("practice"),
-    length_mm: Annotated[float, typer.Option(min=5, max=200, help="L of the brush; limits the depth.")] = 48.0,
-    radius_mm: Annotated[float, typer.Option(min=0.5, max=50, help="R of the brush.")] = 6.0,
+    length_mm: Annotated[
+        float, typer.Option(min=5, max=200, help="Length L of the brush; strokes go no deeper than 0.3 of it.")
+    ] = 48.0,
+    radius_mm: Annotated[float, typer.Option(min=0.5, max=50, help="Radius R of the brush.")] = 6.0,
     cell_mm: Annotated[float, typer.Option(min=30, max=500, help="Side of each paper cell.")] = 70.0,
-    height_range: Annotated[tuple[float, float], typer.Option(help="Feasible depths, mm.")] = (0.5, 20.0),
+    height_range: Annotated[tuple[float, float], typer.Option(help="Least and greatest depth, mm.")] = (0.5, 20.0),
     speed_mm_s: Annotated[float, typer.Option(min=1, max=100, help="Speed of the tip.")] = 15.0,
     wrist_deg_s: Annotated[float, typer.Option(min=1, max=720, help="Greatest speed of the wrist.")] = 180.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the strokes.")] = 1,

@@ -1,0 +1,71 @@
+"""A practice sheet can be drawn by the rig, and its ink becomes the footprint that plans lead the brush by."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrate.drags.captures import Drawn
+from calibrate.errors import CalibrationError
+from calibrate.writing import footprint
+from calibrate.writing.footprint import FOLDER, fit_session, load_footprint
+from calibrate.writing.practice import FIGURES, MARGIN, practice_strokes, write_practice
+from collect.protocols.config import load_protocol
+from collect.protocols.write import WriteConfig
+from model.characters.brush import Reach
+from model.footprint import NAMES, Footprint
+from sessions.recording.schemas import Header, Source
+from tests.calibrate.given import BY, CALIBRATION
+from tests.command import brushloop
+
+SIDE_MM = 70.0
+
+
+def test_a_practice_sheet_is_a_protocol_that_stays_inside_its_cells(tmp_path: Path) -> None:
+    protocol = load_protocol(write_practice(tmp_path, SIDE_MM, BY, seed=1))
+    assert isinstance(protocol, WriteConfig)
+    assert len(protocol.figures) == FIGURES
+    points = np.concatenate([np.array(stroke.points) for one in protocol.figures for stroke in one.strokes])
+    assert points[:, :2].min() >= MARGIN * SIDE_MM - 1e-3
+    assert points[:, :2].max() <= (1.0 - MARGIN) * SIDE_MM + 1e-3
+    assert points[:, 2].max() <= 14.0
+    again, other = (practice_strokes(SIDE_MM, Reach(), 14.0, seed)[0] for seed in (1, 2))
+    assert np.array_equal(again, practice_strokes(SIDE_MM, Reach(), 14.0, 1)[0])
+    assert not np.array_equal(again[:2], other[:2])
+
+
+def test_a_session_of_practice_becomes_a_footprint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    true = Footprint(tuple({**dict(zip(NAMES, Footprint().values, strict=True)), "half_mm_2": 0.8}.values()))
+    strokes = practice_strokes(SIDE_MM, Reach(), 10.0)[:4]
+    x_mm = (np.arange(70) + 0.5) * SIDE_MM / 70
+    y_mm = SIDE_MM - x_mm
+    paths = [stroke[:, [0, 1, 2, 4]] for stroke in strokes]
+    ink = np.array([true.distance(paths[k : k + 2], x_mm, y_mm) > 0.0 for k in (0, 2)], np.float32)
+
+    def drawn(count: int) -> Drawn:
+        header = Header(session_id="practice-01", source=Source.LOOPBACK, software="test")
+        groups = np.array([0, 2, 4])[: count + 1]
+        names = ["practice-01-r01", "practice-02-r01"][:count]
+        flat, images = paths[: 2 * count], ink[:count]
+        return Drawn(header, "ab", CALIBRATION, x_mm, y_mm, flat, groups, images, names, [], None, [()] * count, "")
+
+    monkeypatch.setattr(footprint, "read_drags", lambda *_, **__: drawn(2))
+    made, path = fit_session(tmp_path)
+    assert path.parent == tmp_path / FOLDER
+    assert load_footprint(path) == made
+    assert made.source == "loopback rig"
+    assert made.strokes == 4
+    assert made.csim_percent > 95.0
+    monkeypatch.setattr(footprint, "read_drags", lambda *_, **__: drawn(1))
+    with pytest.raises(CalibrationError, match="holds 2 strokes, at least 3 are needed"):
+        fit_session(tmp_path)
+
+
+def test_a_file_that_is_no_footprint_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "0123456789abcdef.json").write_text("{}", encoding="utf-8")
+    ran = brushloop("write", "plan", "子", "--footprint", "0123456789abcdef.json", cwd=tmp_path)
+    assert ran.returncode == 2
+    assert "0123456789abcdef.json" in ran.stderr
+    assert not (tmp_path / "write-plan").exists()

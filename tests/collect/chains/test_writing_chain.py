@@ -1,0 +1,67 @@
+"""The chain of `brushloop write`: practice comes before the plan, and learning ends when no character gains."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from collect.chains import writing
+from collect.chains.writing import FOOTPRINT, PLAN, PROTOCOL, Writing, WritingRequest
+from collect.errors import ConfigError
+
+CELL = 'kind = "write"\ncell_mm = [48.0, 48.0]\nrepeats = {repeats}\n[[figures]]\nname = "子"\n[[figures.strokes]]\n'
+POINTS = "points = [[10.0, 24.0, 3.0, 0.0, 0.0], [20.0, 24.0, 3.0, 0.0, 0.0]]\n"
+
+
+class Commands:
+    """Stands in for brushloop's commands: writes what each would leave."""
+
+    def __init__(self, settled_after: int) -> None:
+        self.ran: list[str] = []
+        self._rounds, self._settled_after = 0, settled_after
+
+    def __call__(self, _say: object, *words: object) -> None:
+        said = [str(word) for word in words]
+        self.ran.append(" ".join(said[:2]))
+        if said[1] == "fit":
+            place = Path(said[2]) / FOOTPRINT
+            place.mkdir(parents=True)
+            (place / "0123456789abcdef.json").write_text("{}", encoding="utf-8")
+            (place / "current").write_text("0123456789abcdef.json\n", encoding="utf-8")
+        elif said[1] in ("plan", "practice", "learn"):
+            self._rounds += said[1] == "learn"
+            settled = self._rounds >= self._settled_after
+            option = "--settled-repeats" if settled and said[1] == "learn" else "--repeats"
+            repeats = said[said.index(option) + 1] if option in said else "1"
+            folder = Path(said[said.index("--out") + 1])
+            folder.mkdir(parents=True)
+            (folder / PROTOCOL).write_text(CELL.format(repeats=repeats) + POINTS, encoding="utf-8")
+            (folder / PLAN).write_text(json.dumps({"figures": [{"settled": settled}]}), encoding="utf-8")
+
+
+@pytest.mark.parametrize(("settled_after", "rounds"), [(1, 1), (9, 3)])
+def test_practice_comes_first_and_learning_ends_when_all_is_settled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settled_after: int, rounds: int
+) -> None:
+    class Rig:
+        class brush:  # noqa: N801
+            radius_mm, length_mm = 6.0, 48.0
+
+    commands = Commands(settled_after)
+    monkeypatch.setattr(writing, "run_command", commands)
+    monkeypatch.setattr(writing, "load_rig", lambda _: Rig)
+    monkeypatch.setattr(writing, "collected_session", lambda *_: tmp_path / "session")
+    said: list[str] = []
+    request = WritingRequest("子", tmp_path / "rig.toml", tmp_path / "out", tmp_path, count=10, learn=3, practice=True)
+    assert Writing(request, said.append).run() == tmp_path / "out" / "written.html"
+    learning = ["write compare", "write learn"] * rounds
+    assert commands.ran == ["write practice", "write fit", "write plan", *learning, "write compare"]
+    assert bool(said) == (rounds < 3)
+
+
+def test_a_plan_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    (tmp_path / PLAN).write_text("[]", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"plan\.json"):
+        writing._settled(tmp_path)
