@@ -7,6 +7,7 @@ calibration between. `bench written` writes the same with all of them, and takes
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -162,15 +163,24 @@ def _average(one: Character, key: tuple[Alignment, Tone, Polarity]) -> tuple[flo
     return float(csim), float(ssim)
 
 
+def _repeated(one: Character, key: tuple[Alignment, Tone, Polarity]) -> str:
+    """How nearly neighbouring writings of one plan agree."""
+    pairs = itertools.pairwise(one.captured.values())
+    csim, ssim = 100.0 * np.mean([compare_ink(a, b, key) for a, b in pairs], axis=0)
+    return f"{csim:.2f} / {ssim:.2f}"
+
+
 def _result(name: str, figure: FigureRecord, one: Character, rounds: list[dict[str, float]], seed: int) -> Result:
     csim, ssim = _average(one, HEADLINE)
     paper_csim, paper_ssim = _average(one, PAPER_POLARITY)
+    again = " and ".join(_repeated(one, key) for key in (HEADLINE, PAPER_POLARITY))
     unlearned = rounds[0][one.name]
     each = [100.0 * compare_ink(one.reference, ink, HEADLINE)[0] for ink in one.captured.values()]
     conditions = (
         f"simulated brush {name}, written directly, {one.name}, {len(each)} writings; rounds "
         f"{' '.join(f'{found[one.name]:.1f}' for found in rounds)}; CSIM {csim:.1f} and SSIM {ssim:.1f} (mm, ink = 1), "
-        f"{paper_csim:.2f} and {paper_ssim:.2f} (paper = 1); first writing {each[0]:.1f}, tenth {each[-1]:.1f}; most "
+        f"{paper_csim:.2f} and {paper_ssim:.2f} (paper = 1); two writings agree to "
+        f"{again} (CSIM / SSIM); first writing {each[0]:.1f}, tenth {each[-1]:.1f}; most "
         f"lost in {lost_in_words([round_of(figure, one, SIDE_MM)])}; {machine()}"
     )
     ratio = (100.0 - unlearned) / (100.0 - csim)
