@@ -134,7 +134,7 @@ def test_captures_must_fit_the_generator(tmp_path: Path, tiny: TrainConfig) -> N
         ({"placement": "zero-touch"}, "placement is 'zero-touch'"),
         ({"images": torch.rand(3, 16, 16)}, "images must be"),
         ({"inputs": inputs | {"height_mm": torch.tensor([11.0, 15, 21])}}, "height_mm = 21 is outside"),
-        ({"inputs": inputs | {"speed": torch.zeros(3)}}, "'speed' is no input"),
+        ({"inputs": inputs | {"speed": torch.zeros(3)}}, "'speed' is not an input"),
         ({"inputs": {"height_mm": inputs["height_mm"]}}, "tilt_deg must be 3"),
     ):
         fields = {"inputs": inputs, "images": images, "px_mm": 0.8, "placement": "centred", "source": "x"} | change
