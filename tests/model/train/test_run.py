@@ -100,6 +100,7 @@ def test_the_folder_holds_all_that_the_algorithm_puts_out(finished: Path) -> Non
         "checkpoint.safetensors",
         "generator.safetensors",
         "generator.md",
+        "samples.safetensors",
         "loss.png",
         "loss.csv",
         "validation.csv",
