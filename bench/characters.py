@@ -183,7 +183,7 @@ def _result(name: str, figure: FigureRecord, one: Character, rounds: list[dict[s
         f"{again} (CSIM / SSIM); first writing {each[0]:.1f}, tenth {each[-1]:.1f}; most "
         f"lost in {lost_in_words([round_of(figure, one, SIDE_MM)])}; {machine()}"
     )
-    ratio = (100.0 - unlearned) / (100.0 - csim)
+    ratio = (100.0 - unlearned) / (100.0 - csim) if csim < 100.0 else float("inf")
     return Result(
         f"characters: {name}, {one.name}", csim, "% CSIM", "the unlearned shortfall", ratio, len(each), seed, conditions
     )

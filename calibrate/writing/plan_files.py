@@ -260,8 +260,8 @@ def draw(figures: list[PlannedFigure], settings: Settings, path: Path) -> None:
         for stroke, way in zip(figure.strokes, figure.request.ways, strict=True):
             axes[3].plot(stroke[:, 0], stroke[:, 1], "-", color=BLUE, lw=0.8)
             colours = [COLOURS[phase] for phase in phases_of(way)]
-            axes[3].scatter(way.points[:, 0], way.points[:, 1], s=14, color=colours, marker="s", zorder=2)
-            axes[3].scatter(stroke[:, 0], stroke[:, 1], s=1.5 * stroke[:, 2], color=BLUE, zorder=3)
+            axes[3].scatter(way.points[:, 0], way.points[:, 1], s=22, color=colours, marker="s", zorder=2)
+            axes[3].scatter(stroke[:, 0], stroke[:, 1], s=0.4 * stroke[:, 2], color=BLUE, zorder=3)
         axes[0].set_ylabel("mm", fontsize=7)
     for phase, colour in COLOURS.items():
         rows[0][3].scatter([], [], s=14, color=colour, marker="s", label=str(phase))

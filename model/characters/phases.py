@@ -1,9 +1,10 @@
 """The phases of a stroke: how it begins, what is drawn, where it turns or folds, and how it ends.
 
 A stroke begins and ends with an exposed tip where its outline comes to a point, and with a hidden tip where it ends
-broadly. It turns where its median bends by at least `TURN_DEG`, and folds where it bends by at least `FOLD_DEG`, as in
-a hook. The terms are those of the literature on robotic calligraphy, such as "Brush Stroke-Based Writing Trajectory
-Control Model for Robotic Chinese Calligraphy", Electronics 14 (15) 3000, 2025; the rules here are our own.
+broadly. It turns where its median bends by at least `TURN_DEG` over one width of the stroke, and such a turn is a
+folding, as in a hook, where the bend grows to `FOLD_DEG` over three widths. The terms are those of the literature on
+robotic calligraphy, such as "Brush Stroke-Based Writing Trajectory Control Model for Robotic Chinese Calligraphy",
+Electronics 14 (15) 3000, 2025; the rules here are our own.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from model.characters.plan import Path, tangents
 
 Floats = NDArray[np.float64]
 TURN_DEG, FOLD_DEG = 35.0, 90.0
-"""Least bend of the median, over one width of the stroke, of a turning and of a folding."""
+"""Least bend of the median of a turning and of a folding."""
 POINTED = 0.5
 """An end narrower than this share of the stroke's median width is an exposed tip."""
 
@@ -55,12 +56,15 @@ def phases_of(path: Path) -> list[Phase]:
             exposed = _pointed(path.half_width_mm[-1], width_mm)
             out.append(Phase.TERMINATION_EXPOSED if exposed else Phase.TERMINATION_HIDDEN)
         else:
-            before, after = np.interp((at - 0.5 * width_mm, at + 0.5 * width_mm), along, heading)
-            bend_deg = abs(float(after - before))
-            out.append(
-                Phase.FOLDING if bend_deg >= FOLD_DEG else Phase.TURNING if bend_deg >= TURN_DEG else Phase.EXECUTION
-            )
+            near_deg, wide_deg = (_bend_deg(at, widths * width_mm, along, heading) for widths in (1.0, 3.0))
+            turned = Phase.FOLDING if wide_deg >= FOLD_DEG else Phase.TURNING
+            out.append(turned if near_deg >= TURN_DEG else Phase.EXECUTION)
     return out
+
+
+def _bend_deg(at_mm: float, over_mm: float, along_mm: Floats, heading_deg: Floats) -> float:
+    before, after = np.interp((at_mm - 0.5 * over_mm, at_mm + 0.5 * over_mm), along_mm, heading_deg)
+    return abs(float(after - before))
 
 
 def _pointed(half_width_mm: float, width_mm: float) -> bool:
