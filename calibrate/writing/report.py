@@ -25,7 +25,7 @@ from calibrate.report import (
     write_files,
 )
 from calibrate.writing.compare import WritingComparison
-from calibrate.writing.plan_files import code_points
+from calibrate.writing.picture import code_points
 from calibrate.writing.rounds import phase_table, round_of
 from calibrate.writing.scores import FILE as NUMBERS
 from calibrate.writing.scores import (
