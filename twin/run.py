@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import threading
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -66,11 +67,24 @@ class Twin:
 
 @contextlib.contextmanager
 def workers(most: int = MOST_WORKERS) -> Generator[Executor]:
-    """Processes that draw presses, one for each core."""
+    """Processes that draw presses, one for each core; they end with this one, even if it is killed."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads of matrix products would compete with the processes
     count = min(os.cpu_count() or 1, most)
-    with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(count, mp_context=spawn, initializer=_end_with_parent) as pool:
         yield pool
+
+
+def _end_with_parent() -> None:
+    """Watch the process that started this one: a killed parent closes no pool."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
 def fit_twin(
