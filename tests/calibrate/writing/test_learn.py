@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +13,15 @@ from calibrate.errors import CalibrationError
 from calibrate.writing.compare import WritingComparison, as_ink
 from calibrate.writing.learn import MOST_MM, learned, missed, reach_of
 from calibrate.writing.plan_files import PlanRecord, arrays, figure_record
+from calibrate.writing.report import write_written
 from calibrate.writing.rounds import lost_by_phase, phase_table, round_of
-from calibrate.writing.scores import Character
+from calibrate.writing.scores import Character, score_character
 from model.characters.ink import swept
 from model.characters.lead import covered, drawn, first_lead, lead
 from model.characters.plan import Path as Way
 from model.footprint import NAMES, START, Footprint
 from sessions.recording.schemas import Header, Source
-from tests.calibrate.given import BY
+from tests.calibrate.given import BY, CALIBRATION
 
 SIDE_MM = 48.0
 WAY = Way(np.column_stack((np.linspace(12.0, 36.0, 9), np.full(9, 24.0))), np.full(9, 2.0))
@@ -94,6 +96,15 @@ def test_a_round_that_does_not_help_goes_back_to_the_best_one(after: PlanRecord)
     # Once settled it stays, whatever the next round shows.
     again, _ = learned(session(last))
     assert again.figures[0].settled
+
+
+def test_the_report_lists_rounds_and_what_each_phase_lost(after: PlanRecord, tmp_path: Path) -> None:
+    written = session(after)
+    written = replace(written, calibration=CALIBRATION, scores=list(score_character(written.characters[0])))
+    page = write_written(written, tmp_path, "brushloop write compare").read_text(encoding="utf-8")
+    assert "bar: wrong pixels (missing or too much) by phase of the strokes" in page
+    assert "<th>phase</th><th>round 1</th><th>these writings</th>" in page
+    assert "<td>initiation, hidden tip</td>" in page
 
 
 def test_a_correction_stays_within_reach(plan: PlanRecord) -> None:
