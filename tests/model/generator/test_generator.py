@@ -74,7 +74,7 @@ def test_strokes_that_the_model_refuses_are_not_drawn() -> None:
         ({"ranges": {}}, "ranges is empty"),
         ({"fixed": {"height_mm": 3}}, "fixed.height_mm: not a parameter"),
         ({"fixed": {"lam": 30}}, "fixed.lam = 30 is outside"),
-        ({"model": stroke_model("circle", Brush()), "ranges": {"radius_mm": (1, 2)}}, "circle has not"),
+        ({"model": stroke_model("circle", Brush()), "ranges": {"radius_mm": (1, 2)}}, "circle does not have"),
     ],
 )
 def test_a_target_that_makes_no_sense_is_refused(changes: dict, words: str) -> None:
@@ -96,7 +96,7 @@ def test_the_network_is_differentiable_in_its_inputs() -> None:
     inputs = torch.tensor([[13.3, 4.0], [17.0, 9.0]], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda values: network(values).mean((1, 2)), (inputs,), eps=1e-6, atol=1e-6)
     assert network(inputs).shape == (2, 32, 32)
-    with pytest.raises(ValueError, match="no multiple"):
+    with pytest.raises(ValueError, match="not a multiple"):
         Layers(side=16, size_px=40)
 
 
