@@ -24,7 +24,7 @@ from calibrate.compare.similarity import Polarity
 from calibrate.writing.compare import WritingComparison, as_ink
 from calibrate.writing.learn import learned
 from calibrate.writing.plan import Settings, plan
-from calibrate.writing.plan_files import FigureRecord, PlannedBy, PlanRecord, arrays, figure_record
+from calibrate.writing.plan_files import FigureRecord, PlannedBy, PlanRecord, arrays, record_of
 from calibrate.writing.practice import PER_FIGURE, practice_strokes
 from calibrate.writing.rounds import lost_in_words, round_of
 from calibrate.writing.scores import HEADLINE, Character, compare_ink
@@ -137,19 +137,9 @@ def _planned(spec: BrushSpec, footprint: Footprint) -> PlanRecord:
         speed_mm_s=15.0,
         footprint=footprint.values,
     )
-    records = (
-        figure_record(
-            one.request.name,
-            one.request.source,
-            one.strokes,
-            one.strokes,
-            wanted=one.request.image,
-            simulated=one.simulated,
-            ways=one.request.ways,
-        )
-        for one in figures
+    return PlanRecord(
+        model="footprint", planned_by=by, cell_mm=SIDE_MM, software="bench", figures=tuple(map(record_of, figures))
     )
-    return PlanRecord(model="footprint", planned_by=by, cell_mm=SIDE_MM, software="bench", figures=tuple(records))
 
 
 def _comparison(record: PlanRecord, written: list[Character]) -> WritingComparison:

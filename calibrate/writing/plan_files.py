@@ -170,6 +170,15 @@ def load_plan(path: Path) -> PlanRecord:
         raise invalid(str(path), error) from None
 
 
+def record_of(planned: PlannedFigure) -> FigureRecord:
+    """Record of a figure as it was planned."""
+    wanted = planned.request
+    strokes, ways = planned.strokes, wanted.ways
+    return figure_record(
+        wanted.name, wanted.source, strokes, strokes, wanted=wanted.image, simulated=planned.simulated, ways=ways
+    )
+
+
 def write_plan(
     figures: list[PlannedFigure], settings: Settings, by: PlannedBy, label: str, repeats: int, out: Path
 ) -> Path:
@@ -179,24 +188,12 @@ def write_plan(
     """
     out.mkdir(parents=True, exist_ok=True)
     draw(figures, settings, out / PICTURE)
-    records = tuple(
-        figure_record(
-            one.request.name,
-            one.request.source,
-            one.strokes,
-            one.strokes,
-            wanted=one.request.image,
-            simulated=one.simulated,
-            ways=one.request.ways,
-        )
-        for one in figures
-    )
     record = PlanRecord(
         model=label,
         planned_by=by,
         cell_mm=settings.cell.side_mm,
         software=f"brushloop {version('brushloop')}",
-        figures=records,
+        figures=tuple(record_of(one) for one in figures),
     )
     return write_record(record, repeats, out)
 
