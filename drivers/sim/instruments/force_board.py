@@ -93,6 +93,8 @@ class ForceBoard:
                 yield CanFrame(can_id, data[:4] if fault is ForceFault.SHORT and place == 1 else data)
 
 
+FRAME_S = 0.0002
+"""From one frame of a round to the next on the bus."""
 MAX_LINE_BYTES = 256
 BACKLOG_BYTES = 32 * 1024
 """A client that does not read is sent nothing more until it has caught up."""
@@ -146,7 +148,11 @@ class SocketcandServer(LoopbackServer):
         loop = asyncio.get_running_loop()
         due_s = loop.time()
         while self.board.streaming and self._listeners:
-            text = "".join(_ascii(frame) for frame in self.board.round(self._now_s())).encode()
+            # Real time, like that of an adapter's clock, whatever the rate of simulated time. It is read once: a board
+            # sends its frames in one burst, however busy the computer is.
+            at_s = time.time()
+            frames = self.board.round(self._now_s())
+            text = "".join(_ascii(frame, at_s + place * FRAME_S) for place, frame in enumerate(frames)).encode()
             for writer in self._listeners:
                 if not writer.is_closing() and writer.transport.get_write_buffer_size() < BACKLOG_BYTES:
                     writer.write(text)
@@ -175,8 +181,7 @@ def _frame(can_id: str, length: str, data: list[str]) -> CanFrame:
     return frame
 
 
-def _ascii(frame: CanFrame) -> str:
-    # Real time, like that of an adapter's clock, whatever the rate of simulated time.
+def _ascii(frame: CanFrame, at_s: float) -> str:
     if frame.error:
-        return f"< error {frame.can_id:03X} {time.time():.6f} >"
-    return f"< frame {frame.can_id:03X} {time.time():.6f} {frame.data.hex().upper()} >"
+        return f"< error {frame.can_id:03X} {at_s:.6f} >"
+    return f"< frame {frame.can_id:03X} {at_s:.6f} {frame.data.hex().upper()} >"
