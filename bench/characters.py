@@ -33,7 +33,7 @@ from drivers.sim.brush.drag import Waypoint
 from drivers.sim.brush_file import PAPER, load_brush
 from model.brush import Brush as Size
 from model.characters.brush import Reach
-from model.characters.lead import grid
+from model.characters.plan import grid, without_tilt
 from model.footprint import Footprint, fit_footprint
 from model.registry import stroke_model
 from sessions.recording.schemas import Header, Source
@@ -83,11 +83,10 @@ class Writer:
 
     def footprint(self) -> Footprint:
         """The footprint fitted to a practice sheet."""
-        deepest_mm = math.floor(0.3 * self._brush.spec.length_mm)
-        strokes = practice_strokes(SIDE_MM, Reach(), deepest_mm)
+        strokes = practice_strokes(SIDE_MM, Reach(), self._brush.spec.length_mm)
         firsts = range(0, len(strokes), PER_FIGURE)
         ink = np.stack([self.ink(strokes[first : first + PER_FIGURE]) for first in firsts])
-        paths = [stroke[:, [0, 1, 2, 4]] for stroke in strokes]
+        paths = [without_tilt(stroke) for stroke in strokes]
         return fit_footprint(paths, np.array([*firsts, len(strokes)]), ink, *grid(SIDE_MM, SIZE_PX))
 
     def character(self, figure: FigureRecord, number: int, count: int) -> Character:

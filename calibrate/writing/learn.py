@@ -33,8 +33,9 @@ from calibrate.writing.plan_files import (
 )
 from calibrate.writing.rounds import round_of
 from model.characters.brush import Reach
-from model.characters.lead import LATER_SPREADS_MM, covered, drawn, grid, lead
+from model.characters.lead import LATER_SPREADS_MM, covered, drawn, lead
 from model.characters.phases import Phase, phase_map
+from model.characters.plan import grid, without_tilt
 from model.footprint import Footprint, fit_footprint
 
 Floats = NDArray[np.float64]
@@ -94,7 +95,7 @@ def reach_of(by: PlannedBy) -> Reach:
 def _refitted(plan: PlanRecord, captured: dict[str, Image]) -> Footprint:
     """The footprint that fits the captured characters, from that of the plan where it has one."""
     known = plan.planned_by.footprint
-    strokes = [[points[:, [0, 1, 2, 4]] for points in arrays(figure.commanded)] for figure in plan.figures]
+    strokes = [[without_tilt(points) for points in arrays(figure.commanded)] for figure in plan.figures]
     groups = np.cumsum([0, *(len(one) for one in strokes)])
     ink = np.stack([captured[figure.name] for figure in plan.figures])
     x_mm, y_mm = grid(plan.cell_mm, ink.shape[1])

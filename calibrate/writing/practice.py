@@ -12,21 +12,29 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.compare.field import SIZE_PX
 from calibrate.writing.plan_files import FigureRecord, PlannedBy, PlanRecord, figure_record, write_record
 from model.characters.brush import Reach
+from model.characters.plan import directions
 
 Floats = NDArray[np.float64]
 FIGURES, PER_FIGURE = 10, 2
 MARGIN = 0.22
 """Share of the cell at each side that is kept free: ink lands behind its command, and must not reach the edge."""
+DEEPEST = 0.3
+"""Greatest depth as a share of the brush's length."""
 MM_BETWEEN = 2.0
 TILT_DEG = 5.0
 NAME = "practice"
 
 
-def practice_strokes(side_mm: float, reach: Reach, deepest_mm: float, seed: int = 1) -> list[Floats]:
-    """`FIGURES` x `PER_FIGURE` trajectories (N, 5) on a cell of that side; every third has a sharp turn."""
+def practice_strokes(side_mm: float, reach: Reach, brush_length_mm: float, seed: int = 1) -> list[Floats]:
+    """`FIGURES` x `PER_FIGURE` trajectories (N, 5) on a cell of that side; every third has a sharp turn.
+
+    None is deeper than `DEEPEST` of the brush's length.
+    """
     rng = np.random.default_rng(seed)
+    deepest_mm = min(reach.height_mm[1], math.floor(DEEPEST * brush_length_mm))
     room_mm = (1.0 - 2.0 * MARGIN) * side_mm
     out: list[Floats] = []
     while len(out) < FIGURES * PER_FIGURE:
@@ -35,8 +43,7 @@ def practice_strokes(side_mm: float, reach: Reach, deepest_mm: float, seed: int 
         heading = rng.uniform(-180.0, 180.0) + np.cumsum(rng.normal(0.0, 8.0, count))
         if len(out) % 3 == 0:
             heading[count // 2 :] += rng.choice([-1.0, 1.0]) * rng.uniform(50.0, 150.0)
-        way = np.column_stack((np.cos(np.radians(heading)), np.sin(np.radians(heading))))
-        places = np.cumsum(way * length_mm / count, axis=0)
+        places = np.cumsum(directions(heading) * length_mm / count, axis=0)
         low, high = places.min(axis=0), places.max(axis=0)
         places += MARGIN * side_mm - low + rng.uniform(0.0, 1.0, 2) * np.maximum(room_mm - (high - low), 0.0)
         depths = rng.uniform(0.1, 1.0, 3) * deepest_mm
@@ -51,10 +58,9 @@ def practice_strokes(side_mm: float, reach: Reach, deepest_mm: float, seed: int 
 def write_practice(out: Path, cell_mm: float, by: PlannedBy, seed: int) -> Path:
     """Write the protocol of a practice sheet, each stroke on a cell of its own; returns its path. Raises OSError."""
     reach = Reach(by.height_range_mm, by.tilt_range_deg, turn_deg_mm=by.turn_deg_mm)
-    deepest_mm = min(by.height_range_mm[1], math.floor(0.3 * by.length_mm))
-    blank = np.zeros((128, 128), np.float32)
+    blank = np.zeros((SIZE_PX, SIZE_PX), np.float32)
     figures: list[FigureRecord] = []
-    strokes = practice_strokes(cell_mm, reach, deepest_mm, seed)
+    strokes = practice_strokes(cell_mm, reach, by.length_mm, seed)
     for number in range(FIGURES):
         some = strokes[number * PER_FIGURE : (number + 1) * PER_FIGURE]
         source = f"practice strokes, seed {seed}"

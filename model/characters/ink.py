@@ -17,7 +17,7 @@ from torch import Tensor
 
 from model.characters.drag import dragged, is_dragged
 from model.characters.glyph import Glyph
-from model.characters.plan import Cell, Path
+from model.characters.plan import Cell, Path, grid
 from model.drag import DragModel
 from model.outline import Outline
 from model.protocol import StrokeModel
@@ -97,8 +97,7 @@ def reference(glyph: Glyph, cell: Cell, size_px: int = SIZE_PX) -> Image:
 
 def swept(paths: Sequence[Path], side_mm: float, size_px: int = SIZE_PX) -> Image:
     """The image of discs along paths: the intended look of a user's trajectory with widths."""
-    middle = (np.arange(size_px) + 0.5) * side_mm / size_px
-    x, y = np.meshgrid(middle, side_mm - middle)
+    x, y = np.meshgrid(*grid(side_mm, size_px))
     image = np.zeros((size_px, size_px))
     for path in paths:
         steps = np.linalg.norm(np.diff(path.points, axis=0), axis=1)

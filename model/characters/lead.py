@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from model.characters.brush import Reach
 from model.characters.ink import Image
-from model.characters.plan import Path, tangents
+from model.characters.plan import Path, directions, grid, tangents, without_tilt
 from model.damped import Equations, descend
 from model.drag import distances, ink
 from model.footprint import Footprint, Marks, ink_equations, marks, sampled
@@ -41,8 +41,7 @@ def first_lead(
     for path in paths:
         depth = np.interp(path.half_width_mm, halves, depths)
         heading = tangents(path.points)
-        way = np.column_stack((np.cos(np.radians(heading)), np.sin(np.radians(heading))))
-        tip = path.points + footprint.lag_mm(depth)[:, None] * way
+        tip = path.points + footprint.lag_mm(depth)[:, None] * directions(heading)
         out.append(reach.within(np.column_stack((tip, depth, np.full(len(depth), tilt_deg), heading)), side_mm))
     return out
 
@@ -83,22 +82,12 @@ def lead(
 def drawn(footprint: Footprint, strokes: Sequence[Floats], side_mm: float, size_px: int) -> Floats:
     """Signed distance in mm to the edge of the predicted ink, (size, size), positive in ink, row 0 at the far edge."""
     x_mm, y_mm = grid(side_mm, size_px)
-    return footprint.distance([_four(stroke) for stroke in strokes], x_mm, y_mm)
+    return footprint.distance([without_tilt(stroke) for stroke in strokes], x_mm, y_mm)
 
 
 def covered(distance_mm: Floats, side_mm: float) -> Image:
     """Ink from 0 to 1 of (size, size) signed distances: rises over one pixel."""
     return np.clip(0.5 + distance_mm * len(distance_mm) / side_mm, 0.0, 1.0).astype(np.float32)
-
-
-def grid(side_mm: float, size_px: int) -> tuple[Floats, Floats]:
-    """Pixel centres of a cell: x from the left, y from the far edge."""
-    middle = (np.arange(size_px) + 0.5) * side_mm / size_px
-    return middle, np.ascontiguousarray(side_mm - middle)
-
-
-def _four(stroke: Floats) -> Floats:
-    return np.ascontiguousarray(stroke[:, [0, 1, 2, 4]])
 
 
 class _Problem:
@@ -124,7 +113,7 @@ class _Problem:
         self._from, self._held = self.vector(strokes), held
 
     def vector(self, strokes: Sequence[Floats]) -> Floats:
-        return (np.concatenate([_four(stroke) for stroke in strokes]) / UNITS).ravel()
+        return (np.concatenate([without_tilt(stroke) for stroke in strokes]) / UNITS).ravel()
 
     def strokes(self, vector: Floats) -> list[Floats]:
         points = vector.reshape(-1, 4) * UNITS
@@ -136,14 +125,14 @@ class _Problem:
         return out
 
     def cost(self, vector: Floats, spread_mm: float) -> float:
-        made = self._marks([_four(stroke) for stroke in self.strokes(vector)])
+        made = self._marks([without_tilt(stroke) for stroke in self.strokes(vector)])
         each = np.array([0, len(made.starts) - 1])
         distance = distances(made.discs, made.starts, *self._grid, each)[0] + self._added_mm
         off = ink(distance, spread_mm) - self._wanted[0]
         return 0.5 * float(np.sum(off**2)) + self._penalty(vector)
 
     def equations(self, vector: Floats, spread_mm: float) -> Equations:
-        paths = [_four(stroke) for stroke in self.strokes(vector)]
+        paths = [without_tilt(stroke) for stroke in self.strokes(vector)]
         made = self._marks(paths)
         slopes = np.zeros((len(made.discs), 3, len(vector)))
         row = 0

@@ -15,7 +15,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from model.characters.plan import Path, tangents
+from model.characters.plan import Path, grid, tangents
 
 Floats = NDArray[np.float64]
 TURN_DEG, FOLD_DEG = 35.0, 90.0
@@ -80,7 +80,6 @@ def phase_map(paths: Sequence[Path], side_mm: float, size_px: int) -> NDArray[np
     points = np.concatenate([path.points for path in paths])
     half = np.concatenate([path.half_width_mm for path in paths])
     number = np.array([order.index(phase) for path in paths for phase in phases_of(path)])
-    middle = (np.arange(size_px) + 0.5) * side_mm / size_px
-    x, y = np.meshgrid(middle, side_mm - middle)
+    x, y = np.meshgrid(*grid(side_mm, size_px))
     far = np.hypot(x[..., None] - points[:, 0], y[..., None] - points[:, 1]) - half
     return number[np.argmin(far, axis=-1)]

@@ -70,8 +70,7 @@ def trajectory(
     height = np.minimum(height, (along + half[0]) / back)
     heading = tangents(points)
     ahead = (height * np.tan(np.radians(tilt_deg)))[:, None]
-    way = np.column_stack((np.cos(np.radians(heading)), np.sin(np.radians(heading))))
-    made = np.column_stack((points - ahead * way, height, np.full(len(points), tilt_deg), heading))
+    made = np.column_stack((points - ahead * directions(heading), height, np.full(len(points), tilt_deg), heading))
     return reach.within(made, cell.side_mm)
 
 
@@ -80,6 +79,23 @@ def tangents(points: Floats) -> Floats:
     ahead = np.diff(points, axis=0)
     middle = np.concatenate((ahead[:1], ahead[1:] + ahead[:-1], ahead[-1:]))
     return np.degrees(np.unwrap(np.arctan2(middle[:, 1], middle[:, 0])))
+
+
+def directions(heading_deg: Floats) -> Floats:
+    """Unit vectors (N, 2) of headings (N,) in degrees, counter-clockwise from x."""
+    turn = np.radians(heading_deg)
+    return np.column_stack((np.cos(turn), np.sin(turn)))
+
+
+def without_tilt(stroke: Floats) -> Floats:
+    """x, y, depth and heading (N, 4) of a trajectory (N, 5): a path as `model.footprint` and `model.drag` take it."""
+    return np.ascontiguousarray(stroke[:, [0, 1, 2, 4]])
+
+
+def grid(side_mm: float, size_px: int) -> tuple[Floats, Floats]:
+    """Pixel centres of a cell, (size,) each: x from the left, y of the rows from the far edge down."""
+    middle = (np.arange(size_px) + 0.5) * side_mm / size_px
+    return middle, np.ascontiguousarray(side_mm - middle)
 
 
 def resampled(points: Floats, step_mm: float) -> Floats:

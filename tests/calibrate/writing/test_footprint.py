@@ -15,6 +15,7 @@ from calibrate.writing.practice import FIGURES, MARGIN, practice_strokes, write_
 from collect.protocols.config import load_protocol
 from collect.protocols.write import WriteConfig
 from model.characters.brush import Reach
+from model.characters.plan import without_tilt
 from model.footprint import NAMES, Footprint
 from sessions.recording.schemas import Header, Source
 from tests.calibrate.given import BY, CALIBRATION
@@ -31,17 +32,17 @@ def test_a_practice_sheet_is_a_protocol_that_stays_inside_its_cells(tmp_path: Pa
     assert points[:, :2].min() >= MARGIN * SIDE_MM - 1e-3
     assert points[:, :2].max() <= (1.0 - MARGIN) * SIDE_MM + 1e-3
     assert points[:, 2].max() <= 14.0
-    again, other = (practice_strokes(SIDE_MM, Reach(), 14.0, seed)[0] for seed in (1, 2))
-    assert np.array_equal(again, practice_strokes(SIDE_MM, Reach(), 14.0, 1)[0])
+    again, other = (practice_strokes(SIDE_MM, Reach(), 48.0, seed)[0] for seed in (1, 2))
+    assert np.array_equal(again, practice_strokes(SIDE_MM, Reach(), 48.0, 1)[0])
     assert not np.array_equal(again[:2], other[:2])
 
 
 def test_a_session_of_practice_becomes_a_footprint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     true = Footprint(tuple({**dict(zip(NAMES, Footprint().values, strict=True)), "half_mm_2": 0.8}.values()))
-    strokes = practice_strokes(SIDE_MM, Reach(), 10.0)[:4]
+    strokes = practice_strokes(SIDE_MM, Reach(), 34.0)[:4]
     x_mm = (np.arange(70) + 0.5) * SIDE_MM / 70
     y_mm = SIDE_MM - x_mm
-    paths = [stroke[:, [0, 1, 2, 4]] for stroke in strokes]
+    paths = [without_tilt(stroke) for stroke in strokes]
     ink = np.array([true.distance(paths[k : k + 2], x_mm, y_mm) > 0.0 for k in (0, 2)], np.float32)
 
     def drawn(count: int) -> Drawn:

@@ -11,7 +11,7 @@ from model.brush import Brush
 from model.characters.brush import Reach, dragged_depth_of
 from model.characters.drag import dragged, trail
 from model.characters.ink import swept, written
-from model.characters.plan import Cell, Path, trajectory
+from model.characters.plan import Cell, Path, grid, trajectory, without_tilt
 from model.characters.refine import refine
 from model.drag import DragModel
 from model.registry import stroke_model
@@ -42,14 +42,13 @@ def corner() -> NDArray[np.float64]:
 
 def test_it_is_the_trail_of_the_fitted_model() -> None:
     points = corner()
-    wanted = LAG.trail(points[:, [0, 1, 2, 4]])
+    wanted = LAG.trail(without_tilt(points))
     assert trail(LAG, torch.from_numpy(points)).numpy() == pytest.approx(wanted, abs=1e-9)
 
 
 def test_its_image_is_that_of_the_fitted_model() -> None:
     points = corner()
-    middle = (np.arange(SIZE) + 0.5) * SIDE_MM / SIZE
-    distance = LAG.distance(points[:, [0, 1, 2, 4]], middle, SIDE_MM - middle)
+    distance = LAG.distance(without_tilt(points), *grid(SIDE_MM, SIZE))
     seen = dragged(LAG, torch.from_numpy(points), SIDE_MM, SIZE).numpy()
     assert seen == pytest.approx(np.clip(0.5 + distance * SIZE / SIDE_MM, 0.0, 1.0), abs=1e-6)
 
