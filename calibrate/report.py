@@ -24,6 +24,8 @@ from sessions.recording.schemas import Source
 Image = NDArray[np.float32]
 PAPER = "#fbf9f4"
 """Background of picture files."""
+BLUE, ORANGE = "#0072B2", "#D55E00"
+"""Colours of Okabe and Ito for a plot's lines and points."""
 PHOTOGRAPH_PX, JPEG_QUALITY = 1600, 80
 """Longest side and quality of a photograph in a page: about 500 kB at most."""
 REMARK = re.compile(r"\(([^()]+)\)(?:, R = [^()]*)?$")

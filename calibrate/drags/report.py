@@ -14,7 +14,18 @@ from rich.table import Column, Table
 
 from calibrate.drags.measure import DEPTH_NAMES, LENGTH_NAME, DragResults
 from calibrate.drags.predicted import CEILING, OURS, Predictions
-from calibrate.report import csv_text, image_uri, overlay_uri, plot, plot_uri, render, source_note, write_files
+from calibrate.report import (
+    BLUE,
+    ORANGE,
+    csv_text,
+    image_uri,
+    overlay_uri,
+    plot,
+    plot_uri,
+    render,
+    source_note,
+    write_files,
+)
 from sessions.recording.schemas import Header
 
 MAX_THUMBNAILS = 60
@@ -169,10 +180,10 @@ def _plot(results: DragResults, source: str) -> str:
         ("commanded length, mm", "measured length, mm"),
     )
     for axis, (points, line), (x_title, y_title) in zip(axes, pairs, titles, strict=True):
-        axis.plot([x for x, _ in points], [y for _, y in points], ".", ms=5, alpha=0.6, color="#0072B2")
+        axis.plot([x for x, _ in points], [y for _, y in points], ".", ms=5, alpha=0.6, color=BLUE)
         if line is not None:
             ends = np.array([min(x for x, _ in points), max(x for x, _ in points)])
-            axis.plot(ends, line.slope * ends + line.intercept, color="#D55E00", lw=1.5)
+            axis.plot(ends, line.slope * ends + line.intercept, color=ORANGE, lw=1.5)
         axis.set_xlabel(x_title)
         axis.set_ylabel(y_title)
         axis.grid(alpha=0.3)

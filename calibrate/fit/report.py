@@ -14,7 +14,18 @@ from calibrate.fit.captures import Captures
 from calibrate.fit.heldout import CEILING, FITTED, UNCALIBRATED, Cell, by_cell, predictor
 from calibrate.fit.run import Fitted
 from calibrate.fit.strokes import Floats, Grid, Pressed
-from calibrate.report import Point, ink_uri, plot, plot_uri, render, source_label, source_note, source_point
+from calibrate.report import (
+    BLUE,
+    ORANGE,
+    Point,
+    ink_uri,
+    plot,
+    plot_uri,
+    render,
+    source_label,
+    source_note,
+    source_point,
+)
 from model.brush import DomainError
 from model.fitted import PARAMETERS, FittedPress
 from model.loops import Loop
@@ -26,7 +37,7 @@ LITTLE = 0.1
 """Share of a parameter's variance below which the strokes say next to nothing about it."""
 NEAR_CEILING = 1.5
 """Distance from the ceiling that counts as near, in points of CSIM."""
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+COLOURS = (BLUE, ORANGE, "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Of Okabe and Ito, one for each tilt in turn."""
 
 

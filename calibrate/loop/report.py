@@ -16,6 +16,7 @@ from calibrate.loop.compare import NOT_AGAIN, ComparedSession, LoopComparison
 from calibrate.loop.scores import AGAIN, GOAL_POINTS, LoopRecord, Pair, PairScore, Table1Row
 from calibrate.loop.scores import FILE as NUMBERS
 from calibrate.report import (
+    BLUE,
     Point,
     csv_text,
     ink_uri,
@@ -251,7 +252,7 @@ def _recovered(loop: LoopComparison, label: str) -> str:
         low, high = min(map(min, points)), max(map(max, points))
         margin = 0.05 * (high - low) or 0.5
         axis.plot([low - margin, high + margin], [low - margin, high + margin], color="0.6", lw=1.0)
-        axis.plot([x for x, _ in points], [y for _, y in points], "o", ms=4, alpha=0.6, color="#0072B2")
+        axis.plot([x for x, _ in points], [y for _, y in points], "o", ms=4, alpha=0.6, color=BLUE)
         axis.set_xlabel(f"commanded {name}")
         axis.set_ylabel(f"recovered {name}")
         axis.set_title(f"{name.split(',')[0]} ({label})", fontsize=10)

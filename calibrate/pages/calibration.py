@@ -21,12 +21,22 @@ from calibrate.board.view import LEAST_PX_PER_MM, WORST_INTERVAL, paper_mm
 from calibrate.calibration import Calibration
 from calibrate.errors import CalibrationError
 from calibrate.files import write_whole
-from calibrate.report import Point, photograph_uri, plot, plot_uri, render, source_label, source_note, source_point
+from calibrate.report import (
+    BLUE,
+    ORANGE,
+    Point,
+    photograph_uri,
+    plot,
+    plot_uri,
+    render,
+    source_label,
+    source_note,
+    source_point,
+)
 from calibrate.session import FITTED
 from sessions.reader import Recording
 from sessions.recording.messages import decode_gray
 
-BLUE, ORANGE = "#0072B2", "#D55E00"
 ARROW_SHARE = 0.4
 """Length of a typical arrow, as a share of the distance between corners."""
 SIDE_POINTS = 9

@@ -15,11 +15,10 @@ from calibrate.board.detect import BoardView
 from calibrate.board.intrinsics import GRID, GRID_WORDS, Fitted
 from calibrate.board.lens import Floats, Gray, Lens
 from calibrate.files import write_whole
-from calibrate.report import Point, photograph_uri, plot, plot_uri, render
+from calibrate.report import BLUE, ORANGE, Point, photograph_uri, plot, plot_uri, render
 
 LABEL = "photographs as given"
 NOTE = "photographs do not say which camera took them, or whether they were simulated"
-BLUE, ORANGE = "#0072B2", "#D55E00"
 THUMBNAIL_PX, MAX_THUMBNAILS = 320, 30
 MAX_BARS = 60
 MAX_CORNERS = 6000

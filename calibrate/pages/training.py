@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calibrate.compare.similarity import csim
 from calibrate.errors import CalibrationError
 from calibrate.files import write_whole
-from calibrate.report import Image, Point, ink_uri, overlay_uri, plot, plot_uri, render
+from calibrate.report import BLUE, ORANGE, Image, Point, ink_uri, overlay_uri, plot, plot_uri, render
 from model.protocol import ParameterSpec
 from model.train.checkpoint import load_checkpoint, load_weights, sha256
 from model.train.config import TrainConfig
@@ -22,7 +22,6 @@ PAGE = "training.html"
 SMOOTH_STEPS = 50
 MAX_POINTS = 2000
 """Points of the loss curve that are drawn, evenly chosen from all."""
-BLUE, ORANGE = "#0072B2", "#D55E00"
 MUCH_ABOVE = 1.5
 """Times its lowest value that the last validation loss may be."""
 SHOWN_INPUTS = 4

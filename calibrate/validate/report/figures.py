@@ -15,7 +15,7 @@ from calibrate.compare.field import KEYS, Alignment, Tone
 from calibrate.compare.images import Pixels, unpack
 from calibrate.errors import CalibrationError
 from calibrate.files import read_bounded
-from calibrate.report import ink_uri, overlay_uri, plot, plot_uri
+from calibrate.report import BLUE, ORANGE, ink_uri, overlay_uri, plot, plot_uri
 from calibrate.validate.report.data import Report
 from calibrate.validate.run import Outcome
 from model.brush import DomainError
@@ -26,7 +26,6 @@ MAX_POINTS = 200
 MAX_SAMPLES, MAX_CELLS = 15, 5
 GRAY_MM, MM_BINARY = KEYS.index((Alignment.MM, Tone.GRAY)), KEYS.index((Alignment.MM, Tone.BINARY))
 MAX_CURVE_BYTES = 64 * 1024 * 1024
-BLUE, RED = "#0072B2", "#D55E00"
 
 
 def distributions(outcome: Outcome, report: Report) -> str:
@@ -51,8 +50,8 @@ def distributions(outcome: Outcome, report: Report) -> str:
             axis.plot(some, place + 0.14 * rng.uniform(-1, 1, len(some)), ".", ms=3, alpha=0.5, color=BLUE)
             if stat.avg_interval is not None:
                 span = stat.avg_interval
-                axis.plot([span.low, span.high], [place] * 2, color=RED, lw=2.5, solid_capstyle="butt")
-            axis.plot(stat.avg, place, "|", ms=15, mew=2.5, color=RED)
+                axis.plot([span.low, span.high], [place] * 2, color=ORANGE, lw=2.5, solid_capstyle="butt")
+            axis.plot(stat.avg, place, "|", ms=15, mew=2.5, color=ORANGE)
         axis.set_yticks(range(len(names)), [labels[name] for name in reversed(names)])
         axis.set_xlabel("CSIM, %")
         axis.set_title(f"{alignment}, binary ({report.label})", fontsize=10)
@@ -64,7 +63,7 @@ def distributions(outcome: Outcome, report: Report) -> str:
 def by_strokes(report: Report) -> str:
     """CSIM on presses that were not fitted, against the number of presses that were."""
     figure, axis = plot(1, 1, (6.4, 3.2))
-    for name, colour in (("CCD-BSM", RED), ("Bézier", BLUE)):
+    for name, colour in (("CCD-BSM", ORANGE), ("Bézier", BLUE)):
         counts = sorted({step.strokes for step in report.by_strokes if step.model == name})
         means = [np.mean([s.csim for s in report.by_strokes if (s.model, s.strokes) == (name, n)]) for n in counts]
         if counts:
