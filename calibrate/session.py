@@ -7,11 +7,9 @@ import hashlib
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
-
 from calibrate.artefact import current, load_artefact, put_to_use
 from calibrate.board.detect import find_board
-from calibrate.board.lens import LensUsed
+from calibrate.board.lens import LensUsed, rms
 from calibrate.board.session import NO_BOARD, board_of, board_stills, known_lens, lens_of_session, sheet_of
 from calibrate.board.view import calibration_plane, paper_mm
 from calibrate.calibration import Calibration, Foreign
@@ -148,6 +146,5 @@ def _board_off_mm(given: Calibration, recording: Recording) -> float | None:
             view = find_board(image, spec, where)
         except CalibrationError:
             continue
-        there = given.to_paper(view.pixels) - paper_mm(view, spec)
-        off_mm = float(np.sqrt((there**2).sum(axis=1).mean()))
+        off_mm = rms(given.to_paper(view.pixels) - paper_mm(view, spec))
     return off_mm

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.board.detect import BoardView
-from calibrate.board.lens import Floats, Lens
+from calibrate.board.lens import Floats, Lens, rms
 from calibrate.errors import CalibrationError
 
 LEAST = 3
@@ -59,7 +59,7 @@ class Solved:
 def solve(views: Sequence[BoardView], where: str) -> Solved:
     """Fit a lens by `cv2.calibrateCamera` (k1, k2, p1, p2, k3). Raises `CalibrationError` if none fits the views."""
     size = views[0].size_px
-    objects = [flat(view).astype(np.float32) for view in views]
+    objects = [_flat(view).astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32).reshape(-1, 1, 2) for view in views]
     try:
         rms, matrix, distortion, turns, shifts, _, _, per_view = cv2.calibrateCameraExtended(
@@ -76,18 +76,18 @@ def solve(views: Sequence[BoardView], where: str) -> Solved:
     )
 
 
-def flat(view: BoardView) -> Floats:
+def _flat(view: BoardView) -> Floats:
     """(n, 3) corners of a view in its board's own plane, z = 0."""
     return np.column_stack([view.board_mm, np.zeros(len(view.board_mm))])
 
 
-def through(lens: Lens, view: BoardView) -> float:
-    """Root mean square residual of a view in px, at the pose of its board that fits this lens best."""
-    board = flat(view)
+def residuals(lens: Lens, view: BoardView) -> Floats:
+    """(n, 2) px from where the lens puts each corner to where it was found, at the pose of the board that fits best."""
+    board = _flat(view)
     _, turn, shift = cv2.solvePnP(board, view.pixels, lens.matrix, lens.distortion)
     turn, shift = cv2.solvePnPRefineLM(board, view.pixels, lens.matrix, lens.distortion, turn, shift)
     seen, _ = cv2.projectPoints(board, turn, shift, lens.matrix, lens.distortion)
-    return float(np.sqrt(((view.pixels - np.asarray(seen, np.float64).reshape(-1, 2)) ** 2).sum(axis=1).mean()))
+    return view.pixels - np.asarray(seen, np.float64).reshape(-1, 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +128,7 @@ def _halves(views: Sequence[BoardView], part: Part) -> tuple[list[BoardView], li
 
 
 def _worse(half: Sequence[BoardView], own: Solved, other: Solved) -> bool:
-    return float(np.median([through(other.lens, v) / through(own.lens, v) for v in half])) >= WORSE
+    return float(np.median([rms(residuals(other.lens, v)) / rms(residuals(own.lens, v)) for v in half])) >= WORSE
 
 
 def _as_named(names: Sequence[str], part: Part) -> Part | None:
@@ -184,7 +184,7 @@ def _reduced(views: Sequence[BoardView], solved: Solved) -> tuple[Floats, Floats
     """Normal equations of each view for the lens, (n, 9, 9) and (n, 9), with its board's pose eliminated."""
     curves, pulls = list[Floats](), list[Floats]()
     for view, turn, shift in zip(views, solved.turns, solved.shifts_mm, strict=True):
-        seen, slopes = cv2.projectPoints(flat(view), turn, shift, solved.lens.matrix, solved.lens.distortion)
+        seen, slopes = cv2.projectPoints(_flat(view), turn, shift, solved.lens.matrix, solved.lens.distortion)
         off = (view.pixels - np.asarray(seen, np.float64).reshape(-1, 2)).ravel()
         of_board, of_lens = np.asarray(slopes, np.float64)[:, :6], np.asarray(slopes, np.float64)[:, 6:15] * UNITS
         basis, _ = np.linalg.qr(of_board)

@@ -104,6 +104,11 @@ def distort(rays: Floats, distortion: Floats) -> Floats:
     return np.column_stack([across, along])
 
 
+def rms(residuals: Floats) -> float:
+    """Root mean square of the lengths of (n, 2) residuals."""
+    return float(np.sqrt((residuals**2).sum(axis=1).mean()))
+
+
 def unknown_lens(size_px: tuple[int, int]) -> Lens:
     """Lens assumed without intrinsics: no distortion, axis in the middle, focal length of one image width."""
     width, height = size_px

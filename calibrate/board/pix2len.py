@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.lens import Floats, Lens
+from calibrate.board.lens import Floats, Lens, rms
 from calibrate.errors import CalibrationError
 
 MOST_OUTLIERS = 0.1
@@ -129,7 +129,7 @@ def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_t
     refined, image_to_paper = model.parts(fitted.x)
     undistorted = lens.undistorted(pixels[kept])
     flat = apply(homography(paper_mm[kept], undistorted, where), paper_mm[kept]) - undistorted
-    flat_rms_px = float(np.sqrt((flat**2).sum(axis=1).mean()))
+    flat_rms_px = rms(flat)
     return Plane(
         refined,
         image_to_paper,

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.lens import Floats
+from calibrate.board.lens import Floats, rms
 from calibrate.errors import CalibrationError
 from calibrate.files import read_bounded
 
@@ -50,7 +50,7 @@ class Registration:
     def left_out_rms_mm(self) -> float:
         """Root mean square error of the kept points, each predicted by the others: what to expect of a new point."""
         kept = np.array([name not in self.dropped for name in self.names])
-        return _rms(self.left_out_mm[kept])
+        return rms(self.left_out_mm[kept])
 
     @property
     def yaw_deg(self) -> float:
@@ -103,8 +103,8 @@ def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats, model: Mod
         raise CalibrationError(where, f"only {kept.sum()} agree: are their names mixed up?")
     matrix = _fit(robot_mm[kept], seen_mm[kept], model)
     residuals = seen_mm - _apply(matrix, robot_mm)
-    if _rms(residuals[kept]) > WORST_RMS_MM:
-        problem = f"{_rms(residuals[kept]):.1f} mm off on average, allowed {WORST_RMS_MM:g}: are their names mixed up?"
+    if rms(residuals[kept]) > WORST_RMS_MM:
+        problem = f"{rms(residuals[kept]):.1f} mm off on average, allowed {WORST_RMS_MM:g}: are their names mixed up?"
         raise CalibrationError(where, problem)
     left_out = residuals.copy()
     for index in np.flatnonzero(kept):
@@ -117,7 +117,7 @@ def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats, model: Mod
         tuple(names),
         residuals,
         tuple(name for name, keep in zip(names, kept, strict=True) if not keep),
-        _rms(residuals[kept]),
+        rms(residuals[kept]),
         left_out,
     )
 
@@ -190,10 +190,6 @@ def _fit(robot_mm: Floats, seen_mm: Floats, model: Model) -> Floats:
 
 def _apply(matrix: Floats, points: Floats) -> Floats:
     return points @ matrix[:, :2].T + matrix[:, 2]
-
-
-def _rms(residuals: Floats) -> float:
-    return float(np.sqrt((residuals**2).sum(axis=1).mean()))
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ import numpy as np
 from calibrate.artefact import load_artefact
 from calibrate.board.detect import find_board
 from calibrate.board.intrinsics import RMS_LIMIT_PX
-from calibrate.board.lens import Floats, Gray
+from calibrate.board.lens import Floats, Gray, rms
 from calibrate.board.pix2len import local_scale
 from calibrate.board.session import NO_BOARD, sheet_of
 from calibrate.board.spec import BoardSpec, describe
@@ -121,8 +121,7 @@ def _times(expected: Floats, off: Floats) -> float:
     """How much longer than a residual its arrow is: 1, 2 or 5 times a power of ten."""
     apart = np.linalg.norm(expected[:, None] - expected[None], axis=2)
     np.fill_diagonal(apart, np.inf)
-    rms = float(np.sqrt((off**2).sum(axis=1).mean()))
-    wanted = ARROW_SHARE * float(np.median(apart.min(axis=1))) / max(rms, 1e-6)
+    wanted = ARROW_SHARE * float(np.median(apart.min(axis=1))) / max(rms(off), 1e-6)
     power = 10.0 ** math.floor(math.log10(max(wanted, 1.0)))
     return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= max(wanted, 1.0))
 
@@ -179,9 +178,9 @@ def _reach(made: Calibration) -> float:
 def _residuals(off: Floats, dropped: np.ndarray[Any, np.dtype[np.bool_]], label: str) -> str:
     figure, axis = plot(1, 1, (4.6, 4.4))
     kept = off[~dropped]
-    rms = float(np.sqrt((kept**2).sum(axis=1).mean()))
+    rms_px = rms(kept)
     turn = np.linspace(0.0, 2.0 * np.pi, 73)
-    for circle in (rms, 2.0 * rms):
+    for circle in (rms_px, 2.0 * rms_px):
         axis.plot(circle * np.cos(turn), circle * np.sin(turn), color="0.6", lw=0.8)
     axis.plot(kept[:, 0], kept[:, 1], ".", ms=4, alpha=0.6, color=ORANGE)
     axis.set_aspect("equal")

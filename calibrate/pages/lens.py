@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from calibrate.board.artefact import LensFile
+from calibrate.board.cameras import residuals
 from calibrate.board.detect import BoardView
 from calibrate.board.intrinsics import GRID, GRID_WORDS, Fitted
-from calibrate.board.lens import Floats, Gray, Lens
+from calibrate.board.lens import Gray, Lens, rms
 from calibrate.files import write_whole
 from calibrate.report import BLUE, ORANGE, Point, photograph_uri, plot, plot_uri, render
 
@@ -73,11 +73,10 @@ def _coverage(file: LensFile, lens: Lens, kept: Sequence[BoardView]) -> dict[str
     """Corners of all used photographs on the image, and how many lie in each part of it."""
     width, height = file.size_px
     seen = np.concatenate([view.pixels for view in kept])
-    off = np.concatenate([_off(view, lens) for view in kept])
+    off = np.concatenate([residuals(lens, view) for view in kept])
     counts, _, _ = np.histogram2d(seen[:, 1], seen[:, 0], bins=(GRID[1], GRID[0]), range=((0, height), (0, width)))
     step = max(1, -(-len(seen) // MAX_CORNERS))
-    rms = float(np.sqrt((off**2).sum(axis=1).mean()))
-    times = max(1.0, round(ARROW_SHARE * width / max(rms, 1e-6), -1))
+    times = max(1.0, round(ARROW_SHARE * width / max(rms(off), 1e-6), -1))
     ends = seen + times * off
     starts_text = (f"{x:.1f} {y:.1f}" for x, y in seen[::step].tolist())
     ends_text = (f"{x:.1f} {y:.1f}" for x, y in ends[::step].tolist())
@@ -104,14 +103,6 @@ def _coverage(file: LensFile, lens: Lens, kept: Sequence[BoardView]) -> dict[str
         "cells": cells,
         "corners": len(seen),
     }
-
-
-def _off(view: BoardView, lens: Lens) -> Floats:
-    """(n, 2) px from where the lens puts each corner to where it was found, with the board placed as fits best."""
-    flat = np.column_stack([view.board_mm, np.zeros(len(view.board_mm))])
-    _, turn, shift = cv2.solvePnP(flat, view.pixels, lens.matrix, lens.distortion)
-    drawn, _ = cv2.projectPoints(flat, turn, shift, lens.matrix, lens.distortion)
-    return view.pixels - np.asarray(drawn, np.float64).reshape(-1, 2)
 
 
 def _verdict(file: LensFile, fitted: Fitted) -> Iterator[str]:
