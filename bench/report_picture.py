@@ -17,9 +17,14 @@ WINDOW_PX = (900, 1150)
 MOST_S = 120.0
 
 
+def find_browser() -> str | None:
+    """Path of an installed Chromium; None without one."""
+    return next((found for name in BROWSERS if (found := shutil.which(name))), None)
+
+
 def picture(report: Path, out: Path) -> None:
     """Draw the top of the page. Raises FileNotFoundError without a browser or page, subprocess errors if it fails."""
-    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    browser = find_browser()
     if browser is None:
         raise FileNotFoundError(f"none of {', '.join(BROWSERS)} is installed")
     if not report.is_file():

@@ -163,6 +163,11 @@ def plot(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
     return figure, figure.subplots(rows, columns)
 
 
+def printable(text: str) -> str:
+    """A name or label for the text of a plot, with `?` for every character that no font draws."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
 def plot_uri(figure: Any) -> str:
     """A figure of `plot` as an SVG data URI; the same figure gives the same bytes."""
     import matplotlib

@@ -5,14 +5,14 @@ from __future__ import annotations
 import html
 import json
 import re
-import shutil
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 
+from bench.report_picture import find_browser
 from tests.waiting import PATIENCE_S
 
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+BROWSER = find_browser()
 FRAME = '<iframe name="{name}" width="{width}" height="900" srcdoc="{page}"></iframe>'
 SCRIPT = """<script>onload = () => document.body.insertAdjacentHTML("afterbegin", "<pre>" + JSON.stringify(
 [...document.querySelectorAll("iframe")].map(f => [f.name, f.width, f.contentDocument.documentElement.scrollWidth])) +

@@ -15,7 +15,7 @@ from calibrate.board.detect import BoardView
 from calibrate.board.intrinsics import GRID, GRID_WORDS, Fitted
 from calibrate.board.lens import Gray, Lens, rms
 from calibrate.files import write_whole
-from calibrate.report import BLUE, ORANGE, Point, photograph_uri, plot, plot_uri, render
+from calibrate.report import BLUE, ORANGE, Point, photograph_uri, plot, plot_uri, printable, render
 
 LABEL = "photographs as given"
 NOTE = "photographs do not say which camera took them, or whether they were simulated"
@@ -146,7 +146,7 @@ def _residuals(file: LensFile) -> str:
 
 
 def _short(name: str) -> str:
-    text = "".join(c if c.isprintable() else "?" for c in name)
+    text = printable(name)
     return text if len(text) <= 28 else f"…{text[-27:]}"
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calibrate.compare.similarity import csim
 from calibrate.errors import CalibrationError
 from calibrate.files import write_whole
-from calibrate.report import BLUE, ORANGE, Image, Point, ink_uri, overlay_uri, plot, plot_uri, render
+from calibrate.report import BLUE, ORANGE, Image, Point, ink_uri, overlay_uri, plot, plot_uri, printable, render
 from model.protocol import ParameterSpec
 from model.train.checkpoint import load_checkpoint, load_weights, sha256
 from model.train.config import TrainConfig
@@ -137,7 +137,7 @@ def _losses(losses: NDArray[np.float64], checks: NDArray[np.float64], label: str
         axis.semilogy(checks[:, 0], checks[:, 1], ".-", color=ORANGE, lw=1.2, label="validation, MSE")
     axis.set_xlabel("step")
     axis.set_ylabel("loss")
-    axis.set_title(f"losses ({_printable(label)})", fontsize=10, parse_math=False)
+    axis.set_title(f"losses ({_short(label)})", fontsize=10, parse_math=False)
     axis.grid(alpha=0.3)
     axis.legend()
     return plot_uri(figure)
@@ -149,14 +149,14 @@ def _likeness(checks: NDArray[np.float64], label: str) -> str:
         axis.plot(checks[:, 0], 100.0 * checks[:, column], ".-", color=colour, lw=1.2, label=name)
     axis.set_xlabel("step")
     axis.set_ylabel("percent")
-    axis.set_title(f"likeness on held-out strokes ({_printable(label)})", fontsize=10, parse_math=False)
+    axis.set_title(f"likeness on held-out strokes ({_short(label)})", fontsize=10, parse_math=False)
     axis.grid(alpha=0.3)
     axis.legend()
     return plot_uri(figure)
 
 
-def _printable(text: str) -> str:
-    short = "".join(c if c.isprintable() else "?" for c in text)
+def _short(text: str) -> str:
+    short = printable(text)
     return short if len(short) <= 60 else f"{short[:59]}…"
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from calibrate.report import source_label, source_note
+from calibrate.report import printable, source_label, source_note
 from sessions.recording.schemas import Source
 
 MADE = "simulated bristle bundle, paper (made to agree with the paper's Table 2: no evidence for the model)"
@@ -19,3 +19,7 @@ def test_the_label_of_any_other_brush_is_its_source() -> None:
     assert source_label(Source.LOOPBACK, ["simulated bristle bundle, seed 1"]) == "loopback rig"
     assert source_label(Source.REAL, ["Langhao brush (12 mm)"]) == "real capture"
     assert source_note(Source.REAL, "Langhao brush (12 mm)") == source_note(Source.REAL)
+
+
+def test_a_plot_shows_a_question_mark_for_what_no_font_draws() -> None:
+    assert printable("left\t\x1b[31m.png") == "left??[31m.png"
