@@ -25,12 +25,6 @@ from drivers.errors import (
 )
 
 PARAMETERS: dict[str, tuple[str, ...]] = {
-    "IoControl.getConfigurableDigitalOutput": ("index",),
-    "IoControl.getStandardDigitalOutput": ("index",),
-    "IoControl.getToolDigitalOutput": ("index",),
-    "IoControl.setConfigurableDigitalOutput": ("index", "value"),
-    "IoControl.setStandardDigitalOutput": ("index", "value"),
-    "IoControl.setToolDigitalOutput": ("index", "value"),
     "MotionControl.moveJoint": ("q", "a", "v", "blend_radius", "duration"),
     "MotionControl.moveLine": ("pose", "a", "v", "blend_radius", "duration"),
     "MotionControl.setSpeedFraction": ("fraction",),

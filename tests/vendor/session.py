@@ -75,7 +75,7 @@ def move(rpc: Any, robot: Any) -> None:
 
     start = state.getTcpPose()
     SEEN["move"] = [motion.moveLine(shifted(start, 0.05), 1.0, 0.1, 0.0, 0.0), motion.getExecId()]
-    SEEN["queue"] = [motion.getQueueSize(), motion.getTrajectoryQueueSize()]
+    SEEN["queue"] = motion.getQueueSize()
     SEEN["arrived"] = until(at_rest)
     SEEN["moved by"] = state.getTcpPose()[0] - start[0]
     SEEN["same"] = motion.moveLine(state.getTcpPose(), 1.0, 0.1, 0.0, 0.0)
@@ -116,53 +116,23 @@ def blend(robot: Any) -> None:
     motion.stopMove(True, True)
     SEEN["blend sent"] = [motion.moveLine(pose, 1.0, 0.02, 0.015, 0.0) for pose in (corner, end)]
     SEEN["blend start"] = motion.startMove()
-    nearest, ids, blending = 1.0, set(), False
+    nearest, ids = 1.0, set()
     while not at_rest():
         pose = state.getTcpPose()
         nearest = min(nearest, sum((a - b) ** 2 for a, b in zip(pose[:3], corner[:3], strict=True)) ** 0.5)
         ids.add(motion.getExecId())
-        blending = blending or motion.isBlending()
-    SEEN["blend"] = [
-        nearest,
-        len(ids - {-1}),
-        blending,
-        max(abs(a - b) for a, b in zip(end, state.getTcpPose(), strict=True)),
-    ]
+    off = max(abs(a - b) for a, b in zip(end, state.getTcpPose(), strict=True))
+    SEEN["blend"] = [nearest, len(ids - {-1}), off]
 
 
-def limits(rpc: Any, robot: Any) -> None:
-    config, state = robot.getRobotConfig(), robot.getRobotState()
-    SEEN["limits"] = [
-        *(config.getJointMaxPositions(), config.getJointMinPositions(), config.getJointMaxSpeeds()),
-        *(config.getJointMaxAccelerations(), config.getTcpMaxSpeeds(), config.getTcpMaxAccelerations()),
-    ]
+def state(rpc: Any, robot: Any) -> None:
     SEEN["version"] = rpc.getSystemInfo().getControlSoftwareFullVersion()
-    SEEN["joint state"] = [str(s) for s in state.getJointState()]
-    SEEN["speeds at rest"] = [state.getTcpSpeed(), state.getJointSpeeds()]
+    SEEN["joint state"] = [str(s) for s in robot.getRobotState().getJointState()]
     SEEN["simulated"] = robot.getRobotManage().isSimulationEnabled()
 
 
-def refused(robot: Any) -> None:
-    """What the loopback knows and does not simulate, force control aside, would have moved the arm or put a level."""
-    motion, force, control = robot.getMotionControl(), robot.getForceControl(), robot.getIoControl()
-    pose, q = robot.getRobotState().getTcpPose(), robot.getRobotState().getJointPositions()
-    SEEN["force control"] = force.isFcEnabled()
-    SEEN["not simulated"] = [
-        *(force.fcEnable(), motion.pathBufferAlloc("x", 2, 3)),
-        *(motion.moveCircle(pose, pose, 1.0, 0.1, 0.0, 0.0), motion.moveSpline(q, 1.0, 0.5, 0.0)),
-        *(motion.speedLine([0.0, 0.0, 0.01, 0.0, 0.0, 0.0], 0.5, 0.0), motion.setServoModeSelect(2)),
-        *(motion.servoJoint(q, 0.0, 0.0, 0.05, 0.1, 200.0), control.setToolDigitalOutputPulse(2, True, 0.1)),
-        control.setStandardAnalogOutput(0, 0.5),
-    ]
-    SEEN["still at rest"] = motion.getExecId() == -1
-
-
-def io(rpc: Any, robot: Any) -> None:
-    control, register = robot.getIoControl(), rpc.getRegisterControl()
-    SEEN["tool io"] = [control.setToolDigitalOutput(1, True), control.getToolDigitalOutput(1)]
-    SEEN["standard io"] = [control.setStandardDigitalOutput(3, True), control.getStandardDigitalOutputs()]
-    SEEN["configurable io"] = [control.setConfigurableDigitalOutput(4, True), control.getConfigurableDigitalOutputs()]
-    SEEN["bad io"] = control.setStandardDigitalOutput(99, True)
+def watchdog(rpc: Any) -> None:
+    register = rpc.getRegisterControl()
     SEEN["watchdog"] = [register.setWatchDog("test", 5.0, 3), register.setWatchDog("test", 5.0, 0)]
 
 
@@ -206,7 +176,7 @@ def main(port: int, rtde_port: int) -> None:
     rpc.setRequestTimeout(1000)
     SEEN["connect"] = rpc.connect("127.0.0.1", port)
     SEEN["login"] = [rpc.login("aubo", "123456"), rpc.hasLogined()]
-    SEEN["names"] = [rpc.getRobotNames(), rpc.getAxisNames()]
+    SEEN["names"] = rpc.getRobotNames()
     robot = rpc.getRobotInterface(rpc.getRobotNames()[0])
     identify(rpc, robot)
     set_up(robot)
@@ -214,9 +184,8 @@ def main(port: int, rtde_port: int) -> None:
     move(rpc, robot)
     joints(robot)
     blend(robot)
-    limits(rpc, robot)
-    refused(robot)
-    io(rpc, robot)
+    state(rpc, robot)
+    watchdog(rpc)
     subscribe(rtde_port)
     go_wrong(robot)
     SEEN["power off"] = robot.getRobotManage().poweroff()

@@ -20,8 +20,6 @@ from drivers.sim.world import World
 
 ROBOT = "rob1"
 IK_NO_CONVERGE = -23
-OUTPUTS = {"Standard": 8, "Configurable": 16, "Tool": 4}
-"""Number of digital outputs by place, as in the examples of the SDK's headers."""
 HARD_STOP_M_S2 = 10.0
 SOFT_STOP_M_S2 = 2.0
 
@@ -35,8 +33,6 @@ class Cabinet:
         self.world = world
         self.motion = world.motion
         self.power = Power(self.now_s)
-        self.outputs = {place: [False] * count for place, count in OUTPUTS.items()}
-        """Digital outputs by place. They keep their levels and drive nothing."""
         self.tcp_offset = [0.0] * 6
         self.payload: list[Any] = [0.0, [0.0] * 3, [0.0] * 3, [0.0] * 6]
         self.collision_level = 6
@@ -104,11 +100,6 @@ class Cabinet:
         """Where the configured tool centre point is when the true tip is there."""
         return tip if self.fix is None else pose_of(matrix_of(tip) @ inverted(self.fix))
 
-    def tcp_speed(self) -> list[float]:
-        """[vx, vy, vz m/s, wx, wy, wz rad/s] of the true tip, in the base frame."""
-        velocity = self.motion.velocity(self.now_s())
-        return [*(v / 1e3 for v in velocity[:3]), *velocity[3:]]
-
     def joints(self) -> Joints:
         """Joint positions for the present pose of the tip."""
         return self.motion.joints(self.now_s())
@@ -122,14 +113,6 @@ class Cabinet:
         target = matrix_of(from_wire([float(v) for v in pose]))
         found = inverse(target @ inverted(self.tool()), near)
         return [list(near), IK_NO_CONVERGE] if found is None else [list(found), 0]
-
-    def put(self, place: str, index: object, value: object) -> int:
-        """Set a digital output."""
-        levels = self.outputs[place]
-        if type(index) is not int or type(value) is not bool or not 0 <= index < len(levels):
-            return -ReturnCode.INVALID_ARGUMENT
-        levels[index] = value
-        return ReturnCode.OK
 
     def stop(self, acc_m_s2: float, acc_rad_s2: float) -> int:
         """Decelerate and forget the path."""

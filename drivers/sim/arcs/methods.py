@@ -1,8 +1,4 @@
-"""The methods of the loopback controller by their names on the wire: those that it simulates, and those it refuses.
-
-A known method that is not simulated answers with the controller's own NOT_IMPLEMENTED. If its answer would not be a
-return code, it is unknown here (-32601).
-"""
+"""The methods of the loopback controller by their names on the wire; any other method is unknown to it (-32601)."""
 
 from __future__ import annotations
 
@@ -12,7 +8,7 @@ from typing import Any
 
 from drivers.arcs.codes import LOOPBACK_CONTROL_BOX, ReturnCode, RobotMode
 from drivers.geometry import to_wire
-from drivers.sim.arcs.cabinet import OUTPUTS, ROBOT, SOFT_STOP_M_S2, Cabinet
+from drivers.sim.arcs.cabinet import ROBOT, SOFT_STOP_M_S2, Cabinet
 from drivers.sim.arcs.moves import Moves
 
 INTERFACE_VERSION = 24000
@@ -23,71 +19,11 @@ OPERATIONAL_MODES = ("Disabled", "Automatic", "Manual")
 Params = dict[str, Any]
 Table = dict[str, Callable[[Params], Any]]
 
-REFUSED_BY_ROBOT: dict[str, tuple[str, ...]] = {
-    "ForceControl": (
-        *("fcEnable", "fcDisable", "setTargetForce", "setDynamicModel", "toolContact", "softFloatEnable"),
-        *("setSoftFloatParams", "speedChangeEnable", "speedChangeTune", "setDamping", "resetDamping", "setLpFilter"),
-        *("resetLpFilter", "setCondActive", "setCondAdvanced", "setCondCylinder", "setCondDistance", "setCondForce"),
-        *("setCondOrient", "setCondPlane", "setCondSphere", "setCondTcpSpeed", "setSupvForce", "setSupvOrient"),
-        *("setSupvPosBox", "setSupvPosCylinder", "setSupvPosSphere", "setSupvReoriSpeed", "setSupvTcpSpeed"),
-    ),
-    "IoControl": (
-        *("setStandardDigitalOutputPulse", "setConfigurableDigitalOutputPulse", "setToolDigitalOutputPulse"),
-        *("setStandardAnalogOutput", "setToolAnalogOutput", "setStandardAnalogInputDomain", "setToolAnalogInputDomain"),
-        *("setStandardAnalogOutputDomain", "setToolAnalogOutputDomain", "setToolIoInput", "setToolVoltageOutputDomain"),
-        *("setStandardDigitalInputAction", "setConfigurableDigitalInputAction", "setToolDigitalInputAction"),
-        *("setStandardDigitalOutputRunstate", "setConfigurableDigitalOutputRunstate", "setToolDigitalOutputRunstate"),
-        *("setStandardAnalogOutputRunstate", "setToolAnalogOutputRunstate", "setDigitalInputActionDefault"),
-        *("setDigitalOutputRunstateDefault", "setEncDecoderType", "setEncTickCount", "unwindEncDeltaTickCount"),
-    ),
-    "MotionControl": (
-        *("moveCircle", "setCirclePathMode", "moveSpline", "speedLine", "speedJoint", "setServoMode"),
-        *("setServoModeSelect", "servoJoint", "servoCartesian", "servoJointWithAxes", "servoCartesianWithAxes"),
-        *("pathBufferAlloc", "pathBufferAppend", "pathBufferEval", "pathBufferFree", "movePathBuffer"),
-        *("moveCircle2", "moveSpiral", "moveIntersection", "moveProcess", "setEqradius", "setLookAheadSize"),
-        *("pathOffsetEnable", "pathOffsetSet", "pathOffsetLimits", "pathOffsetCoordinate", "jointOffsetEnable"),
-        *("jointOffsetSet", "trackJoint", "trackCartesian", "followJoint", "followLine", "weaveStart", "weaveEnd"),
-        *("storePath", "restoPath", "setWorkObjectHold", "conveyorTrackLine", "conveyorTrackCircle"),
-        *("conveyorTrackStop", "speedFractionCritical", "resumeMoveJoint", "resumeMoveLine", "resumeSpeedJoint"),
-        *("resumeSpeedLine", "resumeStopJoint", "resumeStopLine", "setFuturePointSamplePeriod"),
-    ),
-    "RobotConfig": (
-        *("setGravity", "setMountingPose", "setHomePosition", "setCollisionStopType", "selectTcpForceSensor"),
-        *("setTcpForceOffset", "setTcpForceSensorPose", "selectBaseForceSensor", "setBaseForceOffset"),
-        *("setToolInertial", "setFreedriveDamp", "setSlowDownFraction", "setPersistentParameters"),
-        *("setKinematicsCompensate", "setHardwareCustomParameters", "setRobotZero", "confirmSafetyParameters"),
-        *("firmwareUpdate",),
-    ),
-    "RobotManage": (
-        *("freedrive", "backdrive", "handguideMode", "exitHandguideMode", "setSim", "setLinkModeEnable"),
-        *("startRecord", "stopRecord", "pauseRecord"),
-    ),
-    "Trace": ("textmsg", "popup"),
-}
-REFUSED_BY_CONTROLLER: dict[str, tuple[str, ...]] = {
-    "RuntimeMachine": (
-        *("loadProgram", "runProgram", "start", "step", "gotoLine", "setPlanContext", "newTask", "deleteTask"),
-        *("setBreakPoint", "removeBreakPoint", "clearBreakPoints"),
-    ),
-}
-
 
 def methods(cabinet: Cabinet) -> Table:
     """Every method that the controller knows; each takes named params and returns what goes on the wire."""
-    of_robot = _refusals(REFUSED_BY_ROBOT) | _of_the_robot(cabinet) | _of_the_state(cabinet) | Moves(cabinet).methods()
-    for place in OUTPUTS:
-        of_robot |= _outputs(cabinet, place)
-    whole = {f"{ROBOT}.{name}": method for name, method in of_robot.items()}
-    return whole | _refusals(REFUSED_BY_CONTROLLER) | _of_the_controller(cabinet)
-
-
-def refuse(_: Params) -> int:
-    """Answer of a method that is not simulated, whatever its params."""
-    return -ReturnCode.NOT_IMPLEMENTED
-
-
-def _refusals(names: dict[str, tuple[str, ...]]) -> Table:
-    return {f"{owner}.{name}": refuse for owner, of_owner in names.items() for name in of_owner}
+    of_robot = _of_the_robot(cabinet) | _of_the_state(cabinet) | Moves(cabinet).methods()
+    return {f"{ROBOT}.{name}": method for name, method in of_robot.items()} | _of_the_controller(cabinet)
 
 
 def _of_the_controller(cabinet: Cabinet) -> Table:
@@ -96,7 +32,6 @@ def _of_the_controller(cabinet: Cabinet) -> Table:
         "SystemInfo.getControlSoftwareVersionCode": lambda _: CONTROL_SOFTWARE_VERSION,
         "SystemInfo.getControlSoftwareFullVersion": lambda _: SOFTWARE_VERSION,
         "getRobotNames": lambda _: [ROBOT],
-        "getAxisNames": lambda _: [],
         "RuntimeMachine.abort": lambda _: cabinet.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2),
         # Stops a program, not motion that clients asked for.
         "RuntimeMachine.stop": lambda _: ReturnCode.OK,
@@ -132,7 +67,6 @@ def _of_the_robot(cabinet: Cabinet) -> Table:
         "RobotManage.restartInterfaceBoard": lambda _: power.restart_interface_board(),
         # No arm is behind this controller.
         "RobotManage.isSimulationEnabled": lambda _: True,
-        "ForceControl.isFcEnabled": lambda _: False,
         "Trace.peek": lambda p: _peek(cabinet, int(p["num"]), int(p.get("last_time", 0))),
     }
 
@@ -145,22 +79,10 @@ def _of_the_state(cabinet: Cabinet) -> Table:
         "RobotState.isPowerOn": lambda _: power.on,
         "RobotState.isSteady": lambda _: motion.steady(now_s()),
         "RobotState.getTcpPose": lambda _: to_wire(cabinet.tcp()),
-        "RobotState.getTcpSpeed": lambda _: cabinet.tcp_speed(),
         "RobotState.getJointPositions": lambda _: cabinet.joints(),
-        "RobotState.getJointSpeeds": lambda _: motion.joint_velocity(now_s()),
         "RobotState.getJointState": lambda _: [_joint_state(power.mode)] * 6,
         "RobotAlgorithm.forwardKinematics": lambda p: cabinet.fk(p["q"]),
         "RobotAlgorithm.inverseKinematics": lambda p: cabinet.ik(_floats(p["qnear"], 6), p["pose"]),
-    }
-
-
-def _outputs(cabinet: Cabinet, place: str) -> Table:
-    levels = cabinet.outputs[place]
-    name = f"IoControl.{{}}{place}DigitalOutput"
-    return {
-        name.format("set"): lambda p: cabinet.put(place, p["index"], p["value"]),
-        name.format("get"): lambda p: dict(enumerate(levels)).get(p["index"], False),
-        name.format("get") + "s": lambda _: sum(1 << i for i, level in enumerate(levels) if level),
     }
 
 

@@ -43,27 +43,17 @@ class Moves:
     def methods(self) -> dict[str, Callable[[Params], Any]]:
         """The methods by `Class.method`, without the robot's name."""
         cabinet, motion = self._cabinet, self._cabinet.motion
-        positions = [math.radians(v) for v in LIMITS_DEG]
         return {
             "MotionControl.moveLine": self._line,
             "MotionControl.moveJoint": self._joint,
             "MotionControl.stopLine": lambda p: cabinet.stop(float(p["acc"]), float(p["acc_rot"])),
             "MotionControl.stopJoint": lambda p: cabinet.stop(SOFT_STOP_M_S2, float(p["acc"])),
-            "MotionControl.clearPath": lambda _: cabinet.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2),
             "MotionControl.stopMove": lambda _: cabinet.hold(),
             "MotionControl.startMove": lambda _: cabinet.resume(),
             "MotionControl.setSpeedFraction": lambda p: cabinet.set_speed_fraction(float(p["fraction"])),
             "MotionControl.getSpeedFraction": lambda _: motion.fraction,
             "MotionControl.getExecId": lambda _: motion.exec_id(cabinet.now_s()),
             "MotionControl.getQueueSize": lambda _: self._queue_size(),
-            "MotionControl.getTrajectoryQueueSize": lambda _: self._queue_size(),
-            "MotionControl.isBlending": lambda _: motion.blending(cabinet.now_s()),
-            "RobotConfig.getJointMaxPositions": lambda _: positions,
-            "RobotConfig.getJointMinPositions": lambda _: [-v for v in positions],
-            "RobotConfig.getJointMaxSpeeds": lambda _: JOINT_SPEEDS_RAD_S,
-            "RobotConfig.getJointMaxAccelerations": lambda _: JOINT_ACCS_RAD_S2,
-            "RobotConfig.getTcpMaxSpeeds": lambda _: [TCP_SPEED_M_S, TCP_TURN_RAD_S],
-            "RobotConfig.getTcpMaxAccelerations": lambda _: [TCP_ACC_M_S2, TCP_TURN_RAD_S2],
         }
 
     def _line(self, p: Params) -> int:

@@ -17,7 +17,7 @@ from drivers.arcs.framing import BareDecoder, FrameDecoder, encode
 from drivers.arcs.rpc import named
 from drivers.errors import ProtocolViolation
 from drivers.sim.arcs.cabinet import Cabinet
-from drivers.sim.arcs.methods import methods, refuse
+from drivers.sim.arcs.methods import methods
 from drivers.sim.faults.board import FaultBoard
 from drivers.sim.faults.kinds import ALWAYS, LOST, REPLIES, STOPS, Device, Fault
 from drivers.sim.faults.phases import Truth
@@ -235,7 +235,7 @@ class ArcsServer(LoopbackServer):
             return _error(ident, METHOD_NOT_FOUND, f"method not found: {name}")
         try:
             if isinstance(params, list):
-                params = {} if method is refuse else named(name, params)  # pyright: ignore[reportUnknownArgumentType]
+                params = named(name, params)  # pyright: ignore[reportUnknownArgumentType]
             result = method(params or {})
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             return _error(ident, INVALID_PARAMS, f"invalid params: {error!r}")

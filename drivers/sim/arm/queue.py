@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivers import rotation
 from drivers.geometry import distance
 from drivers.samples import Pose
 from drivers.sim.arm.kinematics import Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
@@ -16,7 +15,6 @@ from drivers.sim.arm.paths import JointLine, Part
 from drivers.sim.arm.plan import Move
 
 SAME_JOINT_RAD = 1e-6
-DT_S = 1e-3
 
 
 class ArmQueue(MotionQueue):
@@ -107,32 +105,6 @@ class ArmQueue(MotionQueue):
         self.advance(now_s)
         exact = self._queue[0].joints(now_s) if self._queue else None
         return exact or self.near_joints(self.pose(now_s))
-
-    def blending(self, now_s: float) -> bool:
-        """True in a corner between two moves."""
-        self.advance(now_s)
-        return bool(self._queue) and self._queue[0].corner
-
-    def velocity(self, now_s: float) -> tuple[float, ...]:
-        """[mm/s x3, rad/s x3] of the tip in the base frame, over the next millisecond."""
-        self.advance(now_s)
-        if not self._queue:
-            return (0.0,) * 6
-        front = self._queue[0]
-        a, b = front.pose(now_s), front.pose(now_s + DT_S)
-        turn = rotation.product(rotation.unit(b.quaternion), rotation.inverse(rotation.unit(a.quaternion)))
-        way = (q - p for p, q in zip(a.position_mm, b.position_mm, strict=True))
-        return tuple(v / DT_S for v in (*way, *rotation.vector(turn)))
-
-    def joint_velocity(self, now_s: float) -> tuple[float, ...]:
-        """Velocity of every joint in rad/s, over the next millisecond."""
-        self.advance(now_s)
-        if not self._queue:
-            return (0.0,) * 6
-        front, later_s = self._queue[0], now_s + DT_S
-        a = self.joints(now_s)
-        b = front.joints(later_s) or self.near_joints(front.pose(later_s))
-        return tuple((q - p) / DT_S for p, q in zip(a, b, strict=True))
 
     def near_joints(self, tip: Pose) -> Joints:
         """The joints for a tip pose, near the last known ones; the last known ones if no solution is found."""

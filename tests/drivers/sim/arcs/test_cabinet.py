@@ -55,7 +55,7 @@ def test_moves_queue_up_to_a_limit_and_the_same_pose_is_ignored(on: Any):
     assert on.line(START) == 13
     codes = [on.line(brush_pose(250.0 + k, -230.0, 260.0)) for k in range(1, 67)]
     assert (codes.count(0), codes.count(2)) == (64, 2)
-    assert on.ask("MotionControl.getQueueSize") == on.ask("MotionControl.getTrajectoryQueueSize") == 64
+    assert on.ask("MotionControl.getQueueSize") == 64
     on.clock.s += 100.0
     assert on.ask("MotionControl.getQueueSize") == 0
 
@@ -263,30 +263,6 @@ def test_what_is_set_is_what_is_got(on: Any):
     assert on.ask("RobotManage.setOperationalMode", mode="Sideways") == -5
     assert on.ask("RobotManage.getOperationalMode") == "Manual"
     assert on.ask("RobotConfig.setTcpOffset", offset=[0.0] * 5) == -5
-
-
-@pytest.mark.parametrize("place", ["Standard", "Configurable", "Tool"])
-def test_outputs_stay_as_they_are_put(on: Any, place: str):
-    digital = f"IoControl.set{place}DigitalOutput"
-    assert on.ask(digital, index=1, value=True) == 0
-    assert on.ask(f"IoControl.get{place}DigitalOutput", index=1) is True
-    assert on.ask(f"IoControl.get{place}DigitalOutputs") == 2
-    for index, value in ((-1, True), (99, True), (0, 1), ("0", True)):
-        assert on.ask(digital, index=index, value=value) == -5
-    assert on.ask(f"IoControl.get{place}DigitalOutput", index=99) is False
-
-
-@pytest.mark.parametrize(
-    "method",
-    [
-        *("ForceControl.fcEnable", "IoControl.setToolDigitalOutputPulse", "MotionControl.moveCircle"),
-        *("MotionControl.moveSpline", "MotionControl.speedLine", "MotionControl.servoJoint"),
-        *("MotionControl.pathBufferAlloc", "RobotManage.freedrive", "RuntimeMachine.loadProgram"),
-    ],
-)
-def test_what_is_known_and_not_simulated_is_refused(on: Any, method: str):
-    assert on.ask(method, any_parameter=1) == -6
-    assert on.exec_id == -1
 
 
 def test_the_brush_pushes_back_only_while_it_is_on_the_paper(on: Any):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import pytest
@@ -103,17 +102,17 @@ def test_reduced_mode_comes_and_goes_with_its_input_and_moves_are_slow_meanwhile
     assert on.safety == "ReducedMode"
     on.line(brush_pose(600.0, -230.0, 260.0), v=1.0)
     on.clock.s += 0.8
-    assert math.hypot(*on.ask("RobotState.getTcpSpeed")[:3]) == pytest.approx(0.25)
+    assert on.speed_m_s() == pytest.approx(0.25)
     on.clock.s += 10.0
     on.cabinet.power.reduce(False)
     assert on.safety == "Normal"
     on.line(NEAR, v=1.0)
     on.clock.s += 0.48
-    assert math.hypot(*on.ask("RobotState.getTcpSpeed")[:3]) > 0.4
+    assert on.speed_m_s() > 0.4
 
 
 def test_manual_operation_is_as_slow_as_reduced_mode(on: Any):
     on.ask("RobotManage.setOperationalMode", mode="Manual")
     on.line(brush_pose(600.0, -230.0, 260.0), v=1.0)
     on.clock.s += 0.8
-    assert math.hypot(*on.ask("RobotState.getTcpSpeed")[:3]) == pytest.approx(0.25)
+    assert on.speed_m_s() == pytest.approx(0.25)

@@ -108,7 +108,7 @@ async def bare(cabinet: ArcsServer, *pieces: bytes, count: int) -> list[Any]:
 
 
 async def test_bare_requests_may_come_together_or_in_pieces(cabinet: ArcsServer):
-    first, second = request("getRobotNames", id=1), request("getAxisNames", id=2)
+    first, second = request("getRobotNames", id=1), request("RuntimeMachine.getRuntimeState", id=2)
     whole = first + b"\n" + second
     for pieces in ([whole], [whole[:1], whole[1:30], whole[30:31], whole[31:]]):
         assert [r["id"] for r in await bare(cabinet, *pieces, count=2)] == [1, 2]
