@@ -87,6 +87,11 @@ def _lines(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator[st
         yield ""
         yield "[camera]"
         yield f"noise = {noise_gray:.2f}    # gray levels, from pairs of stills"
+    if twin.head is not None:
+        yield ""
+        yield "[quality]"
+        yield f"head_mm = {twin.head.head_mm:g}    # where its marks begin behind the point of touch, in the middle"
+        yield f"misplaced_mm = {twin.head.misplaced_mm:g}    # the farthest from there, and a margin"
     yield ""
     yield "[brush]"
     yield f"radius_mm = {twin.spec.radius_mm:g}    # as recorded with the session"

@@ -25,9 +25,11 @@ from calibrate.fit.heldout import (
 )
 from calibrate.fit.strokes import Grid, Pressed
 from drivers.sim.brush.spec import BrushSpec
+from drivers.sim.config import SoundHead
 from sessions.progress import Progress, unseen
 from twin.constants import SHAPE, SPREAD, Constant, Offset, brush_at, offset_at, with_values
 from twin.drawing import Cell
+from twin.quality import sound_head
 from twin.score import TWIN, parts_of, predicted
 from twin.shape import COARSE, FINE, Found, Round, Target, choose_individual, covariance, search, start
 from twin.spread import Repeats, Spread, fit_spread
@@ -63,6 +65,8 @@ class Twin:
     """None where no cell has enough captures; the spread is then the default brush's."""
     held_out: tuple[HeldOut, ...]
     """Empty where the cells cannot be divided."""
+    head: SoundHead | None = None
+    """Where its marks begin; None if it leaves no ink."""
 
 
 @contextlib.contextmanager
@@ -122,7 +126,8 @@ def fit_twin(
         there = run.shape(f"part {number} left out", target.only(kept))
         _score_part(scores, cells, [target.cells[k] for k in part], there, target, spread)
     ticks.end()
-    return Twin(spec, offset, tuple(estimates), spread, tuple(scores.rows((CEILING, TWIN, BEZIER))))
+    held_out = tuple(scores.rows((CEILING, TWIN, BEZIER)))
+    return Twin(spec, offset, tuple(estimates), spread, held_out, sound_head(spec, target.cells, grid))
 
 
 def _score_part(

@@ -11,6 +11,7 @@ from calibrate.errors import CalibrationError
 from calibrate.fit.heldout import HeldOut
 from drivers.sim.brush.spec import BrushSpec
 from drivers.sim.brush_file import load_brush
+from drivers.sim.config import SoundHead
 from twin.constants import SHAPE, Offset
 from twin.file import Notes, notes_path, resumed, save_notes, twin_toml
 from twin.run import Estimate, Twin
@@ -23,6 +24,7 @@ TWIN = Twin(
     tuple(Estimate(one, float(getattr(SPEC, one.name)), 0.1, 0.4, one.name != "set_deg") for one in SHAPE),
     None,
     (HeldOut("twin", 95.1, 90.2, 45),),
+    SoundHead(2.2, 4.0),
 )
 FRESH = Notes(recording_sha256="a" * 64, calibration="", mm_per_px=0.3, software="brushloop 0.1.0")
 FOUND = Found(np.linspace(-1.0, 1.0, len(SHAPE) + 3), 4)
@@ -34,6 +36,7 @@ def test_a_twin_is_read_back_as_the_brush_that_was_fitted(tmp_path: Path) -> Non
     found = load_brush(path)
     assert found.spec == SPEC
     assert found.noise_gray == 1.23
+    assert found.head == SoundHead(2.2, 4.0)
     assert found.name == "simulated bristle bundle (twin of session ?1??, simulated)"
     lines = {line.split(" = ")[0]: line for line in path.read_text().splitlines()}
     assert lines["friction"].endswith("# 0.1 to 0.4")

@@ -12,14 +12,13 @@ from typer.testing import CliRunner
 
 import brushloop
 from bench.brushfit_brushes import FROZEN
+from collect.rig.config_quality import QualityConfig
 from drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
 from drivers.sim.brush_file import LOOPBACK, PAPER, BrushFileError, load_brush
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml
 from drivers.sim.serve import LabRefused
 
-SOUND_HEAD_MM, SOUND_MISPLACED_MM = 0.7, 1.6
-"""The defaults of `[quality]` in a rig.toml."""
 PRESSED = (
     (3986.908, 3129.639, 3100.391),
     (4034.102, 3255.779, 3098.008),
@@ -92,7 +91,7 @@ def test_the_rig_toml_of_the_paper_s_brush_says_where_its_marks_begin() -> None:
         columns = np.flatnonzero((mark.density > 0.5).any(axis=0))
         heads_mm.append((columns[-1] + 1 - mark.origin_px[0]) / mark.px_per_mm)
     assert max(abs(at - found.head.head_mm) for at in heads_mm) < found.head.misplaced_mm - 0.5
-    assert max(abs(at - SOUND_HEAD_MM) for at in heads_mm) > SOUND_MISPLACED_MM
+    assert max(abs(at - QualityConfig().head_mm) for at in heads_mm) > QualityConfig().misplaced_mm
 
     at = Addresses("127.0.0.1", 1, 2, 3, None, None)
     quality = tomllib.loads(rig_toml(SimConfig(brush=found.spec, head=found.head), at))["quality"]
