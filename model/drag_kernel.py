@@ -67,24 +67,50 @@ def _nearest(nodes, a, b, gx, gy):
 
 
 @_compile
-def _nearest_of(nodes, starts, first, last, gx, gy):
-    """The same as `_nearest`, over several trails."""
-    found = _nearest(nodes, starts[first], starts[first + 1], gx, gy)
-    for i in range(first + 1, last):
+def _circles(nodes, starts):
+    """For each trail a circle that contains all its discs, (trails, 3) of x, y, radius.
+
+    No point lies deeper in the trail than in the circle, which is much quicker to compare with.
+    """
+    out = np.empty((len(starts) - 1, 3))
+    for i in range(len(starts) - 1):
+        a, b = starts[i], starts[i + 1]
+        x, y, radius = np.mean(nodes[a:b, 0]), np.mean(nodes[a:b, 1]), -1e30
+        for k in range(a, b):
+            radius = max(radius, math.hypot(nodes[k, 0] - x, nodes[k, 1] - y) + nodes[k, 2])
+        out[i, 0], out[i, 1], out[i, 2] = x, y, radius + 1e-9
+    return out
+
+
+@_compile
+def _nearest_of(nodes, starts, circles, first, last, likely, gx, gy):
+    """The same as `_nearest`, over several trails, and which one it is. Quickest if that is the `likely` one.
+
+    Of trails that cover the point equally deeply, the first counts.
+    """
+    found, which = _nearest(nodes, starts[likely], starts[likely + 1], gx, gy), likely
+    for i in range(first, last):
+        room = circles[i, 2] - found[0]
+        dx, dy = gx - circles[i, 0], gy - circles[i, 1]
+        if i == likely or room < 0.0 or dx * dx + dy * dy > room * room:
+            continue
         other = _nearest(nodes, starts[i], starts[i + 1], gx, gy)
-        if other[0] > found[0]:
-            found = other
-    return found
+        if other[0] > found[0] or (other[0] == found[0] and i < which):
+            found, which = other, i
+    return found, which
 
 
 @_compile
 def signed(nodes, starts, groups, x, y, out):
     """Fill `out` (B, len(y), len(x)) with signed distances, positive in ink; trails `groups[i]` to `groups[i + 1]` make
     image i."""
+    circles = _circles(nodes, starts)
     for i in range(len(groups) - 1):
+        likely = groups[i]
         for r in range(len(y)):
             for c in range(len(x)):
-                out[i, r, c] = _nearest_of(nodes, starts, groups[i], groups[i + 1], x[c], y[r])[0]
+                found, likely = _nearest_of(nodes, starts, circles, groups[i], groups[i + 1], likely, x[c], y[r])
+                out[i, r, c] = found[0]
 
 
 @_compile
@@ -96,12 +122,15 @@ def normal_equations(nodes, starts, groups, slopes, x, y, target, added, weights
     what is `added` to the signed distances, one array for each image or a single one for all of them.
     """
     count = slopes.shape[2]
-    j = np.empty(count)
+    j, which = np.empty(count), np.empty(count, np.int64)
+    circles = _circles(nodes, starts)
     cost = 0.0
     for i in range(len(groups) - 1):
+        likely = groups[i]
         for r in range(len(y)):
             for c in range(len(x)):
-                value, k, t, ux, uy = _nearest_of(nodes, starts, groups[i], groups[i + 1], x[c], y[r])
+                found, likely = _nearest_of(nodes, starts, circles, groups[i], groups[i + 1], likely, x[c], y[r])
+                value, k, t, ux, uy = found
                 u = (value + added[min(i, len(added) - 1), r, c]) / spread
                 seen = 1.0 / (1.0 + math.exp(-min(max(u, -40.0), 40.0)))
                 miss = seen - target[i, r, c]
@@ -109,13 +138,17 @@ def normal_equations(nodes, starts, groups, slopes, x, y, target, added, weights
                 if abs(u) > _FAR:
                     continue
                 slope = seen * (1.0 - seen) / spread
+                used = 0  # most parameters move only other strokes
                 for m in range(count):
                     before = slopes[k, 2, m] + ux * slopes[k, 0, m] + uy * slopes[k, 1, m]
                     after = slopes[k + 1, 2, m] + ux * slopes[k + 1, 0, m] + uy * slopes[k + 1, 1, m]
-                    j[m] = slope * ((1.0 - t) * before + t * after)
-                for m in range(count):
+                    change = slope * ((1.0 - t) * before + t * after)
+                    if change != 0.0:
+                        j[used], which[used] = change, m
+                        used += 1
+                for m in range(used):
                     weighted = weights[i] * j[m]
-                    gradient[m] += weighted * miss
+                    gradient[which[m]] += weighted * miss
                     for n in range(m + 1):
-                        square[m, n] += weighted * j[n]
+                        square[which[m], which[n]] += weighted * j[n]
     return cost

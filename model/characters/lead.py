@@ -137,12 +137,13 @@ class _Problem:
         slopes = np.zeros((len(made.discs), 3, len(vector)))
         row = 0
         for number, path in enumerate(paths):
-            base = marks([sampled(path)], self._values).discs
+            nodes, shares = sampled(path), sampled(np.eye(len(path)), path)
+            base = marks([nodes], self._values).discs
             for point in range(len(path)):
                 for column in range(4 if point == 0 else 3):
-                    moved = path.copy()
-                    moved[point, column] += 1e-3 * UNITS[column]
-                    changed = marks([sampled(moved, path)], self._values).discs
+                    moved = nodes.copy()
+                    moved[:, column] += 1e-3 * UNITS[column] * shares[:, point]
+                    changed = marks([moved], self._values).discs
                     at = 4 * (self._ends[number] + point) + column
                     slopes[row : row + len(base), :, at] = (changed - base) / 1e-3
             row += len(base)
