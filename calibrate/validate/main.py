@@ -163,7 +163,7 @@ def _write(
                 raise
             notes.append(f"no scores.parquet: {error.what}")
     progress(what, 1, parts)
-    report = report_of(outcome, request.command, digest, steps, extras)
+    report, extremes = report_of(outcome, request.command, digest, steps, extras)
     progress(what, 2, parts)
     files = {"summary.csv": summary_csv(report)}
     if report.written:
@@ -173,7 +173,9 @@ def _write(
     refused = [(r.session_id, r.stroke_id, r.why) for r in report.refused]
     files["failures.csv"] = csv_text(("session_id", "stroke_id", "why"), refused)
     pages = list(pages_beside(outcome.sessions, folder))
-    files["report.html"] = page_of(outcome, report, curves, [*beside, *files, "report.json"], extras.figures, pages)
+    files["report.html"] = page_of(
+        outcome, report, extremes, curves, [*beside, *files, "report.json"], extras.figures, pages
+    )
     files["report.json"] = report.to_json()
     write_files(folder, files)
     progress(what, parts, parts)

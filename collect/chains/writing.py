@@ -129,6 +129,7 @@ class Writing:
 
 def _settled(plan: Path) -> bool:
     """Whether no character of a plan is to be learned further."""
+    # Not by `calibrate.writing.plan_files`: its records hold paths of `model.characters`, which need torch.
     try:
         figures = json.loads((plan / PLAN).read_text("utf-8"))["figures"]
         return all(figure.get("settled", False) for figure in figures)

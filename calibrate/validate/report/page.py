@@ -17,7 +17,7 @@ from calibrate.validate import candidates as who
 from calibrate.validate.report import figures, findings, tables
 from calibrate.validate.report.data import Extreme, Report, Session
 from calibrate.validate.report.figures import Curve
-from calibrate.validate.report.summary import extremes
+from calibrate.validate.report.summary import Extremes
 from calibrate.validate.run import CEILING, Outcome
 from calibrate.validate.sources import LoadedSession
 
@@ -28,6 +28,7 @@ MAX_REFUSED = 200
 def page_of(
     outcome: Outcome,
     report: Report,
+    extremes: Extremes,
     curves: Sequence[Curve],
     beside: Sequence[str],
     figures_13: Sequence[str] = (),
@@ -35,10 +36,11 @@ def page_of(
 ) -> str:
     """The whole page. `beside` names the data files in its folder, `pages` is what `pages_beside` finds.
 
+    `extremes` is what `report_of` returns beside the report.
     `figures_13` are pictures of written characters as data URIs, empty if missing.
     """
     shown = tables.candidate(report, report.shown)
-    best, worst = extremes(outcome, report.shown)
+    best, worst = extremes
 
     def pictured(found: Sequence[Extreme], rows: Sequence[int]) -> list[tuple[Extreme, dict[str, str]]]:
         images = (figures.triple(outcome, row, report.shown) for row in rows)

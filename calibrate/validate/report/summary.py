@@ -47,17 +47,21 @@ PRESSES = {
 }
 
 
+Extremes = tuple[list[int], list[int]]
+"""Rows of the best and of the worst strokes, from the outermost."""
+
+
 def report_of(
     outcome: Outcome, command: str, scores_sha256: str, by_strokes: tuple[Step, ...], extras: Extras
-) -> Report:
-    """Build one frozen report of a whole run."""
+) -> tuple[Report, Extremes]:
+    """Build one frozen report of a whole run; return with it the rows of its best and worst strokes."""
     cells = list(outcome.rows.first_of_cells())
     each_cell = len(cells) <= MAX_CELLS
     stats = _stats(outcome, cells if each_cell else [])
     present = [name for name in outcome.names if any(stat.model == name for stat in stats)]
     shown = _shown(present)
-    best, worst = extremes(outcome, shown)
-    return Report(
+    best, worst = _extremes(outcome, shown)
+    report = Report(
         source=one_source(outcome.sessions),
         software=software(),
         command=command,
@@ -75,7 +79,8 @@ def report_of(
         scores_sha256=scores_sha256,
         loops=extras.loops,
         written=extras.written,
-    ).sealed()
+    )
+    return report.sealed(), (best, worst)
 
 
 def _stats(outcome: Outcome, cells: list[Cell]) -> list[Stat]:
@@ -116,7 +121,7 @@ def _shown(present: list[str]) -> str:
     return next((name for name in order if name in present), "")
 
 
-def extremes(outcome: Outcome, model: str) -> tuple[list[int], list[int]]:
+def _extremes(outcome: Outcome, model: str) -> Extremes:
     """Rows of the best and of the worst strokes of a model, from the outermost; none without a model."""
     if not model:
         return [], []
