@@ -6,15 +6,11 @@ import asyncio
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
 
-from textual import events, work
-from textual.app import SystemCommand
-from textual.binding import BindingType
-from textual.screen import Screen
+from textual import work
 
 from collect.engine.control import FINAL, State
 from collect.engine.snapshot import Snapshot
@@ -22,29 +18,23 @@ from collect.errors import ConfigError
 from collect.headless import REFRESH_S, RunnableEngine
 from collect.operator import OperatorRequest
 from collect.tui.browser import SessionBrowser
-from collect.tui.keys import CAN_GO_ON, CAN_PAUSE, CAN_RESUME, RUN_BINDINGS, RUN_KEYS, help_text, is_stop_key
 from collect.tui.pictures import Pictures
 from collect.tui.question_screens import AT_WORK, NOT_AT_REST, NOT_PARKED, RESUME, RESUME_UNSEEN, AskScreen, Confirm
+from collect.tui.run_app import RunApp
 from collect.tui.run_screen import RunScreen
 from collect.tui.set_up_screen import SetUpScreen
 from collect.tui.start_screen import StartScreen
-from collect.tui.terminal import PlainApp
 from collect.tui.text import plain
-from collect.tui.widgets import HelpScreen
 from sessions.errors import SessionError
-from sessions.remarks import mark_bad_or_good
 
 BOUNCE_S = 0.7
 """Time after an answer in which the keys of requests do nothing: pressing an answer's key twice sends no request."""
 
 
-class OperatorApp(PlainApp):
+class OperatorApp(RunApp):
     """The operator's app: for a whole day with a browser, for one run with an engine."""
 
     TITLE = "brushloop"
-    # A selection would be copied with ctrl+c, which is a stop key here.
-    ALLOW_SELECT = False
-    BINDINGS: ClassVar[list[BindingType]] = [*RUN_BINDINGS]
 
     def __init__(
         self,
@@ -61,14 +51,9 @@ class OperatorApp(PlainApp):
         `again` makes the engine that resumes a session after a stop. `theme_file` keeps the colours for
         the next start. `now_s` is the clock of questions and ages.
         """
-        super().__init__(theme_file)
-        self.engine = engine
+        super().__init__(engine, again, pictures or Pictures(), theme_file)
         self._browser = browser
-        self._again = again
-        self._pictures = pictures or Pictures()
         self._now_s = now_s
-        self._now: Snapshot | None = None if engine is None else engine.snapshot()
-        self._main: RunScreen | SetUpScreen | None = None
         self._leave = threading.Event()
         self._leave_when_over = False
         self._deaf_until_s = 0.0
@@ -100,87 +85,11 @@ class OperatorApp(PlainApp):
         """End the app soon, whatever the state; from any thread."""
         self._leave.set()
 
-    @property
-    def at_work(self) -> bool:
-        """Whether a run is in progress."""
-        return self._now is not None and self._now.state not in FINAL
-
-    async def on_event(self, event: events.Event) -> None:
-        """Handle stop keys before textual, which would give a letter to a field that takes text, as in the palette."""
-        if is_stop_key(event) and self.at_work:
-            self.action_stop()
-            return
-        await super().on_event(event)
-
-    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Disable the keys of a run if there is no run."""
-        if action == "stop":
-            return self.at_work
-        if action == "pause":
-            return self._now is not None and self._now.state in CAN_PAUSE | CAN_RESUME
-        if action in ("request", "mark_last"):
-            return self.at_work
-        if action == "enter":
-            return self._can_go_on or (self._now is not None and self._now.last is not None)
-        if action == "review":
-            return self._now is not None and bool(self._now.folder)
-        return super().check_action(action, parameters)
-
-    def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
-        """List the keys of a run by name, then the colours."""
-        for key in RUN_KEYS:
-            if key.title and self.check_action(key.action.partition("(")[0], ()):
-                run = partial(self.call_later, self.run_action, key.action)
-                yield SystemCommand(key.title, key.what, run)
-        yield from super().get_system_commands(screen)
-
-    def action_stop(self) -> None:
-        """Stop the arm at once and show that, even if another screen covers the run."""
-        if self.engine is not None:
-            self.engine.stop()
-            if self._main is not None and self._main.is_mounted:
-                self._main.stop_sent()
-            if self.screen is not self._main:
-                self.notify("STOP SENT", severity="warning", timeout=2)
-
-    def action_pause(self) -> None:
-        """Pause before the next step, or go on."""
-        if self.engine is not None and self._now is not None:
-            (self.engine.resume if self._now.state in CAN_RESUME else self.engine.pause)()
-
     def action_request(self, name: str) -> None:
         """Send the engine a request, or withdraw it."""
         if self.engine is not None and self._now_s() >= self._deaf_until_s:
             self.engine.request(OperatorRequest[name])
             self._poll()
-
-    def action_mark_last(self) -> None:
-        """Mark the newest capture bad, or good again; the mark is on disk at once."""
-        last = None if self._now is None else self._now.last
-        if self._now is None or last is None or not last.kept or self.screen is not self._main:
-            return
-        try:
-            bad = mark_bad_or_good(Path(self._now.folder), last.still, last.stroke_id, time.time_ns())
-        except SessionError as error:
-            self.notify(plain(str(error)), severity="error")
-            return
-        mark = "marked bad: pressed again after the planned strokes" if bad else "marked good again"
-        self.notify(f"{last.stroke_id}: {mark}")
-
-    def action_help(self) -> None:
-        """Show every key."""
-        if not isinstance(self.screen, HelpScreen):
-            self.push_screen(HelpScreen(help_text()))
-
-    def action_review(self) -> None:
-        """Look through the captures of the run that is shown."""
-        if self._now is not None and self._now.folder and self.screen is self._main:
-            self._review(Path(self._now.folder))
-
-    @property
-    def _can_go_on(self) -> bool:
-        now = self._now
-        return self._again is not None and now is not None and now.state in CAN_GO_ON and bool(now.folder)
 
     def action_enter(self) -> None:
         """Resume the session of a run that ended before its time, asking first; else show the last capture large."""
@@ -191,14 +100,6 @@ class OperatorApp(PlainApp):
             self.push_screen(Confirm(*question), self._go_on_answered)
         else:
             self.action_enlarge()
-
-    def action_enlarge(self) -> None:
-        """Show the last capture large."""
-        if self._now is not None and self._now.last is not None and self.screen is self._main:
-            from collect.tui.capture_screen import CaptureScreen
-            from collect.tui.large import of_last
-
-            self.push_screen(CaptureScreen(of_last(self._now.last), self._pictures, at_work=self.at_work))
 
     def _go_on_answered(self, yes: bool | None) -> None:
         if yes and self._can_go_on and self._now is not None and self._again is not None:
@@ -265,17 +166,6 @@ class OperatorApp(PlainApp):
     def _review_named(self, session_id: str) -> None:
         assert self._browser is not None
         self._review(self._browser.paths.root / session_id)
-
-    def _review(self, folder: Path) -> None:
-        from collect.tui.captures import Review
-        from collect.tui.review_screen import ReviewScreen
-
-        try:
-            review = Review(folder)
-        except SessionError as error:
-            self.notify(plain(str(error)), severity="error")
-            return
-        self.push_screen(ReviewScreen(review, self._pictures, at_work=lambda: self.at_work))
 
     def _show_run(self) -> None:
         """Show the wizard while the set-up lasts, then the run screen."""
