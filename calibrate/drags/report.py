@@ -31,9 +31,9 @@ from sessions.recording.schemas import Header
 MAX_THUMBNAILS = 60
 MAX_WORST = 12
 LIMITS = (
-    "These are strokes that travel along the paper, by a brush whose radius and bundle length are not known. "
-    "CCD-BSM describes one vertical press: its length, outline, CSIM and SSIM cannot be compared with a drag, and are "
-    "not given. What can be compared is how width grows with depth."
+    "These strokes travel along the paper, and the radius and bundle length of their brush are not known. CCD-BSM "
+    "describes one vertical press, so its length, outline, CSIM and SSIM cannot be compared with these strokes and "
+    "are not given. What can be compared is how the width grows with depth."
 )
 
 
@@ -94,20 +94,21 @@ def drags_csv(results: DragResults, source: str) -> str:
 
 
 def prediction_sentences(predictions: Predictions) -> Iterator[str]:
-    """What predicted these strokes, and what the scores are over."""
+    """Sentences on what predicted these strokes, and over which strokes the scores are."""
     fit, header = predictions.artefact, predictions.drawn.header
     adapted = f", adapted to {fit.images} strokes of {fit.session_id}" if fit.prior else ""
     origin = fit.prior_session if fit.prior else f"{fit.session_id}, {fit.source}"
     yield (
         f"{len(predictions.scored)} strokes ({header.source}) predicted by the fit {fit.digest} of {origin}{adapted}; "
-        f"ink as 0 or 1 at the commanded place, {fit.mm_per_px:g} mm a pixel, no shift."
+        f"ink as 0 or 1 at the commanded place, {fit.mm_per_px:g} mm per pixel, no shift."
     )
     if predictions.in_sample:
         yield "In sample: the fit was fitted to every one of these strokes."
     elif len(predictions.scored) < len(predictions.strokes):
-        yield f"{len(predictions.strokes) - len(predictions.scored)} strokes that were fitted are not in the means."
+        fitted = len(predictions.strokes) - len(predictions.scored)
+        yield f"The means leave out {fitted} strokes that the fit was fitted to."
     if CEILING not in predictions.means():
-        yield "No command was repeated: how well one stroke predicts another of its kind, the ceiling, is not known."
+        yield "No command was repeated, so the ceiling (one stroke predicting another of its command) is not known."
     if predictions.drawn.commands is not None:
         yield ends_sentence(predictions.drawn.ends)
 
@@ -154,7 +155,7 @@ def fit_sentences(results: DragResults) -> Iterator[str]:
             yield (
                 "CCD-BSM opens linearly with depth from zero, 2 λ R/L per mm. With λ = π this slope would be that of a "
                 f"brush with R/L = {ratio:.4f} (the paper's brush: 6/48 = {6 / 48:.4f}); a width at depth 0 is an "
-                "error of the zero touch, or ink that spreads, which CCD-BSM does not have."
+                "error of the zero touch, or ink that spreads, which CCD-BSM does not describe."
             )
     if length is not None:
         yield (

@@ -186,22 +186,24 @@ def _verdict(captures: Captures, fitted: Fitted, cells: int) -> Iterator[str]:
 def _trust(captures: Captures, fitted: Fitted) -> Iterator[Point]:
     scores = {row.model: row.csim for row in fitted.held_out}
     if not scores:
-        yield Point(False, "One combination of H and α says nothing about growth with depth or tilt.")
+        yield Point(False, "One combination of H and α does not show how the mark changes with depth or tilt.")
     elif CEILING in scores:
         off = scores[CEILING] - scores[FITTED]
         words = f"Held out, the fit is {off:.1f} points of CSIM below the ceiling"
         yield Point(off <= NEAR_CEILING, f"{words}; {NEAR_CEILING:g} or less is near.")
     else:
-        yield Point(None, "No combination was pressed three times: how repeatable the brush is, is not known here.")
+        yield Point(
+            None, "No combination was pressed three times, so the repeatability of the brush is not known here."
+        )
     if captures.refused:
         yield Point(False, f"{len(captures.refused)} presses could not be used; each is named below.")
     else:
         yield Point(True, "Every press was used.")
     little = [name for name, share in fitted.artefact.from_strokes.items() if share < LITTLE]
     if little:
-        words = "These presses say next to nothing about some parameters, which are those of known brushes"
+        words = "These presses say next to nothing about some parameters, whose values are those of known brushes"
         yield Point(None, f"{words}: {', '.join(little)}.")
-    yield Point(None, "The pictures above show presses that were fitted. The held-out scores are the honest ones.")
+    yield Point(None, "The pictures above show presses that were fitted; judge the fit by the held-out scores.")
 
 
 def _facts(captures: Captures, fitted: Fitted, path: Path) -> Iterator[tuple[str, str]]:
@@ -212,6 +214,6 @@ def _facts(captures: Captures, fitted: Fitted, path: Path) -> Iterator[tuple[str
     yield "brush", f"{header.brush or 'not named'}, R {captures.radius_mm:g} mm, L {captures.length_mm:g} mm"
     yield "ink, paper", ", ".join(part for part in (header.ink, header.paper) if part)
     yield "calibration", captures.calibration.named if captures.calibration else "the import's own scale"
-    yield "images", f"{artefact.mm_per_px:g} mm a pixel"
+    yield "images", f"{artefact.mm_per_px:g} mm per pixel"
     yield "fitted with", artefact.software
     yield "artefact", path.name

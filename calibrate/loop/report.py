@@ -87,7 +87,7 @@ def answer(loop: LoopComparison) -> str:
     if not failed:
         return (
             f"In all {len(loop.verdicts)} comparisons the re-pressed strokes are as similar to their originals as the "
-            f"brush's own presses are to each other, or less than {GOAL_POINTS:g} point below "
+            f"brush's own presses are to each other, or less than {GOAL_POINTS:g} point less similar "
             f"(least: {least.difference:+.2f} points, {where})."
         )
     return (
@@ -218,18 +218,19 @@ def _trust(loop: LoopComparison) -> Iterator[Point]:
     failed = [v for v in loop.verdicts if not v.holds]
     uncertain = sum(not v.certain for v in loop.verdicts)
     if not loop.verdicts:
-        yield Point(None, "No cell of the original session was pressed twice: there is no yardstick.")
+        yield Point(None, "No cell of the original session was pressed twice: the brush's repeatability is not known.")
     elif failed:
         yield Point(False, f"{len(failed)} of {len(loop.verdicts)} comparisons miss the goal of {GOAL_POINTS:g} point.")
     else:
         yield Point(True, f"All {len(loop.verdicts)} comparisons stay within {GOAL_POINTS:g} point of another press.")
     if uncertain:
-        words = "with these few presses the interval reaches over the limit, or is not known"
+        words = "there are so few presses that the interval includes the limit or is not known"
         yield Point(None, f"{uncertain} of {len(loop.verdicts)} comparisons are not certain: {words}.")
     if loop.in_sample:
         words = "The model that recovered them was fitted to these same presses, with their commanded depths and tilts"
         yield Point(
-            None, f"{words}: recovered numbers near the commanded ones are no proof of it. The marks are compared."
+            None,
+            f"{words}: recovered numbers near the commanded ones prove nothing about it. Compare the marks.",
         )
     left = sum(why == NOT_AGAIN for _, why in loop.paired.refused)
     if left:

@@ -140,7 +140,7 @@ def _verdict(made: Calibration) -> Iterator[str]:
     reach = _reach(made)
     yield (
         f"One pixel is {made.mm_per_px:.5f} mm of paper in the middle of the board, known to ±{100 * reach:.3f} % "
-        f"(95 %, if the board is printed true): 20 mm are known to ±{20 * reach:.4f} mm."
+        f"(95 %, if the board is printed to scale): 20 mm are known to ±{20 * reach:.4f} mm."
     )
     yield (
         f"{made.corners} corners lie {made.rms_px:.2f} px ({made.rms_px * made.mm_per_px:.3f} mm) from where the "
@@ -157,11 +157,14 @@ def _trust(made: Calibration) -> Iterator[Point]:
     yield Point(sharp >= LEAST_PX_PER_MM, f"{sharp:.1f} px/mm; at least {LEAST_PX_PER_MM:g} are needed.")
     if made.corners_dropped:
         many = f"{made.corners_dropped} corners do" if made.corners_dropped > 1 else "One corner does"
-        yield Point(False, f"{many} not lie on the plane of the others. The fit leaves out what is crossed in blue.")
+        yield Point(
+            False,
+            f"{many} not lie on the plane of the others. The fit leaves out the corners that are crossed in blue.",
+        )
     else:
         yield Point(True, "No corner was left out.")
     if made.lens is not None and made.lens.source == FITTED:
-        words = "No lens file: the lens's bend (k1) was fitted on this one board, and holds where corners were seen."
+        words = "No lens file: k1 was fitted on this one board and is known only where corners were seen."
         yield Point(None, words)
     elif made.lens is not None:
         yield Point(True, f"Seen through the {made.lens.source}; k1 was refitted for this focus.")

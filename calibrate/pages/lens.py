@@ -107,10 +107,10 @@ def _coverage(file: LensFile, lens: Lens, kept: Sequence[BoardView]) -> dict[str
 
 def _verdict(file: LensFile, fitted: Fitted) -> Iterator[str]:
     reach = fitted.focal_reach_px
-    known = "how well is not known yet" if reach is None else f"known to ±{reach[0]:.1f} and ±{reach[1]:.1f} px (95 %)"
+    known = "with unknown precision" if reach is None else f"known to ±{reach[0]:.1f} and ±{reach[1]:.1f} px (95 %)"
     yield f"The focal lengths are {file.matrix[0]:.1f} px across and {file.matrix[1]:.1f} px down, {known}."
     yield (
-        f"The corners of {len(file.residuals_px)} photographs, in which the board is held in {fitted.ways} ways, lie "
+        f"The corners of {len(file.residuals_px)} photographs, which hold the board in {fitted.ways} ways, lie "
         f"{file.rms_px:.2f} px from where this lens puts them (root mean square)."
     )
 
@@ -120,7 +120,7 @@ def _trust(file: LensFile, fitted: Fitted) -> Iterator[Point]:
     words = f"The residual is {file.rms_px:.2f} px; the limit is {file.rms_limit_px:g} px"
     yield Point(file.rms_px <= file.rms_limit_px, f"{words}; a flat, sharp, still board gives 0.1 to 0.3 px.")
     if fitted.focal_se_px is None:
-        yield Point(False, f"The board is held in {fitted.ways} ways: too few to say how well the lens is known.")
+        yield Point(False, f"The board is held in {fitted.ways} ways: too few to say how precisely the lens is known.")
     for warning in file.warnings:
         yield Point(False, f"{warning[0].upper()}{warning[1:]}.")
     for advice in file.guidance:

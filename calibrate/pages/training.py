@@ -63,7 +63,7 @@ def write_training_page(folder: Path) -> Path:
 
 def _note(config: TrainConfig) -> str:
     if config.tuning:
-        return "captured strokes, tuned on a part of them and judged by the rest"
+        return "captured strokes: tuned on some of them, judged by the others"
     return "the network learns to draw what a closed-form model draws: no ink, neither real nor simulated"
 
 
@@ -107,16 +107,16 @@ def _verdict(config: TrainConfig, report: dict[str, Any]) -> Iterator[str]:
 
 def _trust(config: TrainConfig, report: dict[str, Any], checks: NDArray[np.float64]) -> Iterator[Point]:
     if config.tuning:
-        words = f"Tuned on captures of: {config.tuning.source}. Other captures of that kind are no blind test."
+        words = f"Tuned on captures of: {config.tuning.source}. Captures of the same kind are not an independent test."
     else:
-        words = "It has seen no ink: on paper it is no better than the closed-form model that it learned."
+        words = "It has seen no ink, so on paper it is no better than the closed-form model that it learned."
     yield Point(None, words)
     if len(checks) > 1:
         best = int(np.argmin(checks[:, 1]))
         last, lowest = checks[-1, :2], checks[best, :2]
         if last[1] > MUCH_ABOVE * lowest[1]:
             words = f"was lowest at step {lowest[0]:.0f} and is {last[1] / lowest[1]:.1f} times that at the end"
-            yield Point(False, f"The validation loss {words}: the network learns its training strokes by heart.")
+            yield Point(False, f"The validation loss {words}: the network memorises its training strokes.")
         else:
             yield Point(True, f"The validation loss is at its lowest, or near it, at the end (step {last[0]:.0f}).")
     yield Point(None, "Outside the ranges of its inputs it extrapolates polynomials: do not use it there.")

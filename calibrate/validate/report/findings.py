@@ -67,7 +67,7 @@ def verdict(report: Report) -> Iterator[str]:
         yield f"{words[0].upper()}{words[1:]}."
     yield {
         Source.LOOPBACK: "The brush and its ink are simulated, so this tests the method and says nothing about paper.",
-        Source.REAL: "The ink is real, pressed by the arm and photographed as the recording says.",
+        Source.REAL: "The ink is real: pressed by the arm and photographed, as the recording says.",
         Source.IMPORT: "The photographs come from elsewhere; their scale and commands were not measured here.",
         Source.IMPORT_SIMULATED: "The ink was simulated elsewhere, so this says nothing about paper.",
     }[report.source]
@@ -78,7 +78,7 @@ def findings(report: Report) -> Iterator[str]:
     top = _avg(report, CEILING)
     if top is not None:
         yield (
-            f"How repeatable the brush is: one press predicts another of the same H and α with a CSIM of "
+            f"Repeatability of the brush: one press predicts another of the same H and α with a CSIM of "
             f"{_interval(top)}. No model can be expected to do much better; this is the ceiling."
         )
     held, bezier = _avg(report, who.FITTED_HELD_OUT), _avg(report, who.BEZIER_REFITTED)
@@ -101,7 +101,7 @@ def findings(report: Report) -> Iterator[str]:
     if published:
         yield from _sizes(report)
     if held is None and not report.source.imported:
-        yield "No model was calibrated to this brush: “brushloop fit” does that; then validate again."
+        yield "No model was calibrated to this brush: run “brushloop fit”, then validate again."
 
 
 def _pressed_again(report: Report) -> Iterator[str]:
@@ -158,7 +158,7 @@ def order(report: Report) -> str:
     ]
     near = f" Too close to separate: {'; '.join(close)}." if close else ""
     if ours == wanted:
-        return f"By average CSIM in the size-normalised alignment the models stand in the paper's order: {words}.{near}"
+        return f"By average CSIM in the size-normalised alignment the models have the paper's order: {words}.{near}"
     swapped = [
         f"{_label(report, b)} before {_label(report, a)}"
         for k, a in enumerate(wanted)
@@ -167,8 +167,8 @@ def order(report: Report) -> str:
     ]
     return (
         f"By average CSIM in the size-normalised alignment: {words}. The paper's order differs: here "
-        f"{', '.join(swapped)}. Uncalibrated models carry the proportions of the paper's brush; where this brush's "
-        "marks have others, a model can win by its size alone, and the order says little about the models." + near
+        f"{', '.join(swapped)}. Uncalibrated models have the proportions of the paper's brush. If those of this brush "
+        "differ, a model can win by its size alone, and the order says little about the models." + near
     )
 
 
@@ -199,7 +199,9 @@ def trust(report: Report) -> Iterator[Point]:
             False, "No cell was pressed twice: the repeatability of the brush is unknown, and there is no ceiling."
         )
     elif min(repeats) < FEW_REPEATS:
-        words = f"Some cells were pressed only {min(repeats)} times: the ceiling is rough. The paper has ten."
+        words = (
+            f"Some cells were pressed only {min(repeats)} times, so the ceiling is rough. The paper presses ten times."
+        )
         yield Point(None, words)
     held, bezier, top = (_avg(report, name) for name in (who.FITTED_HELD_OUT, who.BEZIER_REFITTED, CEILING))
     if held is not None and top is not None:
@@ -216,14 +218,14 @@ def trust(report: Report) -> Iterator[Point]:
 
 
 def _collection(one: Session) -> Iterator[Point]:
-    """What the recording alone does not show: planned strokes that never counted, and paper that moved."""
+    """Points that the recording alone does not show: planned strokes that were left out, and paper that moved."""
     collected = one.collected
     if collected is None:
         return
     if collected.left_out:
         of = "" if collected.planned is None else f" of {collected.planned} planned"
         some = ", ".join(collected.left_out[:MAX_NAMED]) + (", ..." if len(collected.left_out) > MAX_NAMED else "")
-        words = f"{one.session_id}: {len(collected.left_out)}{of} strokes were left out while it was collected: {some}."
+        words = f"{one.session_id}: {len(collected.left_out)}{of} strokes were left out during collection: {some}."
         yield Point(False, words)
     if collected.pressed_again:
         takes = f"{len(collected.pressed_again)} of {collected.photographed} takes"
@@ -233,12 +235,12 @@ def _collection(one: Session) -> Iterator[Point]:
         )
     if collected.moved_mm > MOVED_MM:
         words = f"two zero touches differ by {collected.moved_mm:.2f} mm ({', '.join(collected.touches[:MAX_NAMED])})"
-        yield Point(False, f"{one.session_id}: {words}: presses of one H do not have the same depth.")
+        yield Point(False, f"{one.session_id}: {words}: presses with the same H do not have the same depth.")
 
 
 def _verdict(loop: LoopRecord) -> Iterator[Point]:
     if not loop.verdicts:
-        yield Point(None, f"{loop.again}: no original cell was pressed twice, so the repeatability is unknown.")
+        yield Point(None, f"{loop.again}: no original cell was pressed twice, so its repeatability is unknown.")
         return
     least = min(loop.verdicts, key=lambda verdict: verdict.difference)
     failed = sum(not verdict.holds for verdict in loop.verdicts)

@@ -40,10 +40,13 @@ JUDGED: Key = (Alignment.MM, Tone.BINARY)
 PRESSES = {
     CEILING: (
         "another press",
-        "A capture predicted by other captures of its cell, averaged: about what a perfect model of this brush could "
-        "reach.",
+        "A capture predicted by the average of other captures of its cell: about what a perfect model of this brush "
+        "could reach.",
     ),
-    REPEATED: ("robot writing", "A stroke pressed again with what was recovered from it, against the original."),
+    REPEATED: (
+        "robot writing",
+        "A stroke pressed again with the depth and tilt that were recovered from it, against the original.",
+    ),
 }
 
 

@@ -224,9 +224,9 @@ def test_what_was_left_out_selected_or_pressed_on_other_paper_stands_above_the_r
         one = report.model_copy(update={"sessions": (session,)})
         return " ".join([*(point.text for point in trust(one)), *dict(_of_session(session)).values()])
 
-    assert "left out while" not in said()
+    assert "left out during" not in said()
     assert "8 planned, 8 photographed" in said()
-    assert "2 of 8 planned strokes were left out while it was collected: a, b." in said(left_out=("a", "b"))
+    assert "2 of 8 planned strokes were left out during collection: a, b." in said(left_out=("a", "b"))
     assert "1 of 8 takes did not count and were pressed again" in said(pressed_again=("a",))
     touches = ("taught 1 mm", "jog 3 mm")
     assert "two zero touches differ by 2.00 mm (taught 1 mm, jog 3 mm)" in said(moved_mm=2.0, touches=touches)
