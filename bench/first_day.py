@@ -114,7 +114,7 @@ class _Person:
     async def _bring(self, target: Target) -> None:
         index = self._held if target.kind == "hold-board" else target.index
         self._held += target.kind == "hold-board"
-        act = self._lab.hand.bring(target.kind, index, target.corner)
+        act = self._lab.bring(target.kind, index, target.corner)
         await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(act, self._loop))
 
     def _typed(self, words: str) -> str:

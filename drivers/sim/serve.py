@@ -94,7 +94,7 @@ async def _serve_unknown(
     over, lab = _signalled(), UnknownLab(seed, trap, rate=rate)
 
     async def obey(request: Mapping[str, object]) -> dict[str, Any]:
-        answer = await lab.hand.obey(request)
+        answer = await lab.obey(request)
         if truth is not None:
             _write_whole(truth, truth_text(lab.facts, lab.trap))  # what was mended is no longer as it was
         return answer

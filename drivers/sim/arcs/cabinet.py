@@ -51,7 +51,7 @@ class Cabinet:
         stamp = max(int(self.now_s() * 1e9), self.messages[-1]["timestamp"] + 1 if self.messages else 1)
         self.messages.append({"code": code, "level": "ERROR", "source": ROBOT, "args": list(args), "timestamp": stamp})
 
-    def safety_stop(self, mode: SafetyMode) -> None:
+    def safety_stop(self, mode: SafetyMode = SafetyMode.PROTECTIVE_STOP) -> None:
         """Enter a safety stop where the arm is. A protective stop keeps the path; only a person can clear a stop."""
         if mode in EMERGENCY_STOPS:
             self.emergency_stop(mode)

@@ -15,7 +15,7 @@ from drivers.geometry import to_wire
 from drivers.sim.arcs.cabinet import Cabinet
 from drivers.sim.arm.motion import Rest
 from drivers.sim.faults.board import FaultBoard
-from drivers.sim.faults.kinds import ALWAYS, KINDS, Device, Fault
+from drivers.sim.faults.kinds import KINDS, Device
 from drivers.sim.faults.phases import Truth
 from drivers.sim.server import LoopbackServer
 
@@ -43,7 +43,6 @@ class RtdeServer(LoopbackServer):
         self.faults = FaultBoard(Truth(cabinet.world))
         """Faults of this server; a rig shares one board among all its servers."""
         self._cabinet = cabinet
-        self._muted: int | None = None
         self.pings = 0
         """Keep-alives seen, for tests."""
         self._outputs: dict[str, tuple[int, Callable[[], Any]]] = {
@@ -53,19 +52,6 @@ class RtdeServer(LoopbackServer):
             "R1_safety_mode": (1015, lambda: cabinet.power.safety.value),
             "R1_actual_TCP_pose": (1021, lambda: to_wire(cabinet.tcp())),
         }
-
-    @property
-    def mute(self) -> bool:
-        """While True, nothing is pushed (a fault for tests)."""
-        return self._muted is not None
-
-    @mute.setter
-    def mute(self, mute: bool) -> None:
-        if mute and self._muted is None:
-            self._muted = self.faults.hang(Fault(device=Device.TELEMETRY, kind="mute", count=ALWAYS))
-        elif not mute and self._muted is not None:
-            self.faults.take(self._muted)
-            self._muted = None
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Greet the client, then serve its topics until it disconnects."""

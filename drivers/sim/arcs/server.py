@@ -12,14 +12,14 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-from drivers.arcs.codes import RobotMode, SafetyMode
+from drivers.arcs.codes import SafetyMode
 from drivers.arcs.framing import BareDecoder, FrameDecoder, encode
 from drivers.arcs.rpc import named
 from drivers.errors import ProtocolViolation
 from drivers.sim.arcs.cabinet import Cabinet
 from drivers.sim.arcs.methods import methods
 from drivers.sim.faults.board import FaultBoard
-from drivers.sim.faults.kinds import ALWAYS, LOST, REPLIES, STOPS, Device, Fault
+from drivers.sim.faults.kinds import LOST, REPLIES, STOPS, Device, Fault
 from drivers.sim.faults.phases import Truth
 from drivers.sim.server import LoopbackServer
 from drivers.sim.world import World
@@ -109,22 +109,15 @@ class ArcsServer(LoopbackServer):
 
     def __init__(self, world: World) -> None:
         super().__init__()
-        self._world = world
         self.cabinet = Cabinet(world)
         self.faults = FaultBoard(Truth(world))
         """Faults of this server; a rig shares one board among all its servers."""
-        self._mutes: dict[str, int] = {}
-        """Faults that `mute` and `mute_to` have added, by method; "" means any."""
         self._methods = methods(self.cabinet)
 
     async def stop(self) -> None:
         """Close the listener, every client, and the cabinet's watchdogs."""
         self.cabinet.close()
         await super().stop()
-
-    def protective_stop(self, mode: SafetyMode = SafetyMode.PROTECTIVE_STOP) -> None:
-        """Enter a safety stop where the arm is (a fault for tests); only a person can clear it."""
-        self.cabinet.safety_stop(mode)
 
     def stop_as(self, kind: str) -> None:
         """Enter the safety stop that a fault of this kind asks for; `emergency-stop` also switches the power off."""
@@ -135,59 +128,6 @@ class ArcsServer(LoopbackServer):
                 self.cabinet.safety_stop(SafetyMode.SAFEGUARD_STOP)
             case _:
                 self.cabinet.emergency_stop()
-
-    @property
-    def mute(self) -> bool:
-        """While True, requests are lost: neither carried out nor answered (a fault for tests)."""
-        return "" in self._mutes
-
-    @mute.setter
-    def mute(self, mute: bool) -> None:
-        if mute and not self.mute:
-            self._mutes[""] = self.faults.hang(Fault(device=Device.ROBOT, kind="deaf", count=ALWAYS))
-        elif not mute and self.mute:
-            self.faults.take(self._mutes.pop(""))
-
-    @property
-    def mute_to(self) -> set[str]:
-        """Methods that are carried out but never answered (a fault for tests); assign a whole set."""
-        return set(self._mutes) - {""}
-
-    @mute_to.setter
-    def mute_to(self, methods: set[str]) -> None:
-        for method in self.mute_to - methods:
-            self.faults.take(self._mutes.pop(method))
-        for method in methods - self.mute_to:
-            fault = Fault(device=Device.ROBOT, kind="mute", on=method, count=ALWAYS)
-            self._mutes[method] = self.faults.hang(fault)
-
-    @property
-    def mode(self) -> RobotMode:
-        """The robot mode now."""
-        return self.cabinet.power.mode
-
-    @property
-    def safety(self) -> SafetyMode:
-        """The safety mode now; tests set it as a person at the pendant would."""
-        return self.cabinet.power.safety
-
-    @safety.setter
-    def safety(self, mode: SafetyMode) -> None:
-        self.cabinet.power.safety = mode
-
-    @property
-    def tcp_offset(self) -> list[float]:
-        """Flange to tip: [x, y, z m, rx, ry, rz rad]."""
-        return self.cabinet.tcp_offset
-
-    @property
-    def messages(self) -> list[dict[str, Any]]:
-        """The messages that `Trace.peek` returns."""
-        return self.cabinet.messages
-
-    @property
-    def _now_s(self) -> float:
-        return self.cabinet.now_s()
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer requests in order. The motion queue continues after the client disconnects, as a cabinet's would."""

@@ -1,4 +1,17 @@
-"""The unknown lab as a whole: the loopback rig on an address and on the ports of a real one, and a person in it."""
+"""The unknown lab as a whole: the loopback rig on an address and on the ports of a real one, and a person in it.
+
+| request, with `"do": "hand"` | what the person does |
+|---|---|
+| `{"act": "bring", "to": "pin", "index": 2}` | guides the tip to a thing, of `THINGS`, and lets go |
+| `{"act": "bring", "to": "board-corner", "corner": "lower left"}` | the same, for a corner of the board or sheet |
+| `{"act": "bring", "to": "hold-board", "index": 0}` | holds the print before the camera until the next act |
+| `{"act": "bring", "to": "push-sensor", "index": 0}` | pushes the tip: 0 toward the flange, 1 and 2 aside |
+| `{"act": "measure", "to": "square"}` | measures with calipers or a ruler: `square`, `marker`, `tool` |
+| `{"act": "mend"}` | corrects what is wrong, once the person was asked to: the trap's mistake ends |
+| `{"act": "plug"}` | puts a cable back |
+
+Every answer has `says`, what the person would say; `bring` has `reached` too.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +20,9 @@ import contextlib
 import math
 import os
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 from drivers.arcs.robot import AUBOPE_PORT
 from drivers.force.rounds import LOOPBACK_CHANNEL
@@ -18,7 +32,8 @@ from drivers.sim.camera.mjpeg_server import MjpegServer
 from drivers.sim.camera.room import RoomScene
 from drivers.sim.config import View
 from drivers.sim.faults.kinds import ALWAYS, Device, Fault
-from drivers.sim.lab.facts import PICTURE_PX, draw
+from drivers.sim.lab.aims import TOUCHED, Aims
+from drivers.sim.lab.facts import LIFT_MM, PICTURE_PX, draw
 from drivers.sim.lab.hand import Hand
 from drivers.sim.lab.seen import Seen, printed
 from drivers.sim.lab.traps import Trap, mended, spring
@@ -31,6 +46,10 @@ CAMERA_PORTS = (8080, 8081)
 ROOM_FPS = 5.0
 MOST_ROUNDS = 3.0
 """The sensor's rounds come faster with simulated time, up to this many times: what one process can send and read."""
+THINGS = (
+    *("pin", "upright", "board-corner", "sheet-corner", "well", "well-rim", "wash-pot", "wash-rim"),
+    *("park", "clear-view", "hold-board", "push-sensor"),
+)
 ADDRESSES = 200
 """How many labs of one seed can be open at once on a machine."""
 
@@ -45,7 +64,7 @@ class OlderSoftware(LoopbackServer):
 
 
 class UnknownLab:
-    """`async with UnknownLab(seed) as lab:` serves until the block ends; `lab.hand` is the person."""
+    """`async with UnknownLab(seed) as lab:` serves until the block ends; `obey` asks the person for something."""
 
     def __init__(
         self, seed: int, trap: Trap | None = None, *, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX
@@ -70,7 +89,10 @@ class UnknownLab:
         self._older = OlderSoftware()
         self._touches = 0
         self._pulled: list[int] = []
-        self.hand = Hand(self)
+        self._hand = Hand(self.cabinet)
+        self._aims = Aims(lambda: self.facts)
+        self._busy = asyncio.Lock()
+        """The person does one thing at a time."""
 
     async def __aenter__(self) -> UnknownLab:
         await self.rig.__aenter__()
@@ -102,11 +124,62 @@ class UnknownLab:
             **printed(self.facts),
         )
 
-    def hold(self, board: Held | None) -> None:
+    async def obey(self, request: Mapping[str, object]) -> dict[str, Any]:
+        """Carry out a request as in the table above. Raises ValueError, with a one-line message, for an invalid one."""
+        act, to = request.get("act"), str(request.get("to", ""))
+        index, corner = request.get("index", 0), str(request.get("corner", ""))
+        if type(index) is not int or not 0 <= index < 1000:
+            raise ValueError(f"index = {index!r}: must be a whole number from 0 to 999")
+        async with self._busy:
+            match act:
+                case "bring":
+                    return await self.bring(to, index, corner)
+                case "measure":
+                    return {"says": self.measure(to)}
+                case "mend":
+                    return {"says": await self.mend()}
+                case "plug":
+                    return {"says": self.plug()}
+                case _:
+                    raise ValueError(f"act = {act!r} is not one of bring, measure, mend, plug")
+
+    async def bring(self, to: str, index: int = 0, corner: str = "") -> dict[str, Any]:
+        """Carry out `bring`, as in the table above. Raises ValueError for a thing that the lab does not have."""
+        if to not in THINGS:
+            raise ValueError(f"to = {to!r} is not one of {', '.join(THINGS)}")
+        self._hold(self._aims.board(index) if to == "hold-board" else None)
+        if to == "hold-board":
+            return {"reached": True, "says": "I hold the print before the camera."}
+        if to == "push-sensor":
+            await self._hand.push(index)
+            return {"reached": True, "says": "I pushed the tip for a second."}
+        aim = self._aims.tip(to, index, corner)
+        if (trouble := await self._hand.take_hold()) is not None:
+            return {"reached": False, "says": trouble}
+        short_mm = await self._hand.guide(aim, back_mm=LIFT_MM if to == "pin" else 0.0)
+        if to in TOUCHED:
+            self._touched()
+        if short_mm > 0.0:
+            return {"reached": False, "says": f"The arm is stretched out, {short_mm:.0f} mm before the {to}."}
+        return {"reached": True, "says": f"The tip is at the {to}{f', {corner}' if corner else ''}."}
+
+    def measure(self, what: str) -> str:
+        """A length as the person writes it down. Raises ValueError for one that nobody can measure."""
+        facts = self.facts
+        lengths_mm = {
+            "square": round(facts.config.table.board_square_mm, 2),
+            "marker": round(facts.config.table.board_marker_mm, 2),
+            "tool": round(facts.config.tool_mm),
+        }
+        if what not in lengths_mm:
+            raise ValueError(f"to = {what!r} is not one of {', '.join(lengths_mm)}")
+        return f"{lengths_mm[what] / 1e3:g}" if facts.ruler_unit == "m" and what == "tool" else f"{lengths_mm[what]:g}"
+
+    def _hold(self, board: Held | None) -> None:
         """Hold the print before the camera, or put it away."""
         self.rig.scene.held = board
 
-    def touched(self) -> None:
+    def _touched(self) -> None:
         """Count another touched thing; with one trap, somebody then trips over the cable."""
         self._touches += 1
         if self._touches == self.facts.cable_after:

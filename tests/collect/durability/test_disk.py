@@ -55,7 +55,7 @@ def test_a_folder_that_may_not_be_written_is_refused_before_anything_is_connecte
     disk.read_only(True)
     code, printed = run(lab)
     assert (code, printed) == (2, f"brushloop: {lab.sessions}: may not be written: it is read-only, or another user's")
-    assert lab.rig.arcs.mode == "PowerOff"
+    assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
 
     disk.read_only(False)
     first = lab.process()
@@ -74,4 +74,4 @@ def test_a_folder_that_may_not_be_written_is_refused_before_anything_is_connecte
 def test_a_file_in_place_of_the_folder_is_refused(lab: Lab) -> None:
     lab.sessions.write_text("not a folder", encoding="utf-8")
     assert run(lab) == (2, f"brushloop: {lab.sessions}: is a file; a folder is needed")
-    assert lab.rig.arcs.mode == "PowerOff"
+    assert lab.rig.arcs.cabinet.power.mode == "PowerOff"

@@ -45,7 +45,7 @@ def test_a_session_that_is_open_elsewhere_is_refused_before_anything_is_powered(
         second = brushloop("collect", "--no-tui", *lab.options)  # this process is the second
         assert second.returncode == 2, second.stderr
         assert second.stderr.splitlines()[-1].endswith("another brushloop has this session open")
-        assert rig.arcs.mode == "PowerOff"
+        assert rig.arcs.cabinet.power.mode == "PowerOff"
         assert not rig.world.presses
     _, stderr = first.communicate(timeout=PATIENCE_S)
     assert first.returncode == 0, stderr

@@ -125,13 +125,13 @@ def test_a_protective_stop_ends_the_run_and_says_what_to_do(lab: Lab) -> None:
     engine = lab.engine()
     engine.start()
     until(engine, lambda now: now.step.startswith("press"))
-    lab.rig.arcs.protective_stop(SafetyMode.PROTECTIVE_STOP)
+    lab.rig.arcs.cabinet.safety_stop()
     with pytest.raises(RobotNotSafe, match="pendant"):
         wait_for_end(engine)
     now = engine.snapshot()
     assert now.state == State.FAILED
     assert "ProtectiveStop" in now.error
-    assert lab.rig.arcs.safety == SafetyMode.PROTECTIVE_STOP, "nothing is ever cleared automatically"
+    assert lab.rig.arcs.cabinet.power.safety == SafetyMode.PROTECTIVE_STOP, "nothing is ever cleared automatically"
 
 
 def test_a_changed_protocol_is_refused_with_the_difference(lab: Lab) -> None:
@@ -202,7 +202,7 @@ def test_real_hardware_is_not_moved_unless_armed(lab: Lab, monkeypatch: pytest.M
     with pytest.raises(ConfigError, match=r"real hardware.*--arm"):
         run(lab.engine())
     assert not lab.sessions.exists()
-    assert lab.rig.arcs.mode == "PowerOff"
+    assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
 
 
 def test_an_armed_run_without_its_self_check_says_so(lab: Lab) -> None:

@@ -45,13 +45,13 @@ def test_a_safety_stop_holds_the_session_until_a_person_has_released_it(lab: Lab
     engine = lab.engine(watched=True)
     engine.start()
     pressing(lab, engine)
-    lab.rig.arcs.protective_stop(mode)
+    lab.rig.arcs.cabinet.safety_stop(mode)
 
     prompt = asked(engine)
     assert mode in prompt.question
     assert prompt.default == "x"
     assert engine.snapshot().state is State.ASKING
-    lab.rig.arcs.safety = SafetyMode.NORMAL  # a person, at the pendant
+    lab.rig.arcs.cabinet.power.safety = SafetyMode.NORMAL  # a person, at the pendant
     assert engine.answer(prompt.number, "g")
     wait_for_end(engine)
     now = engine.snapshot()
@@ -63,7 +63,7 @@ def test_an_answer_before_the_stop_is_released_is_asked_again_and_moves_nothing(
     engine = lab.engine(watched=True)
     engine.start()
     pressing(lab, engine)
-    lab.rig.arcs.protective_stop()
+    lab.rig.arcs.cabinet.safety_stop()
     first = asked(engine)
     where = lab.rig.world.tool()
     assert engine.answer(first.number, "g")

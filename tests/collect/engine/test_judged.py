@@ -121,7 +121,7 @@ def test_saying_no_to_real_hardware_leaves_it_as_it_is(sharp_lab: Lab, monkeypat
     engine = sharp_lab.engine(watched=True)
     with pytest.raises(CollectAborted, match="nothing moved"):
         answered(engine, "x", over=lambda now: now.state in (State.STOPPED, State.FAILED))
-    assert sharp_lab.rig.arcs.mode == "PowerOff"
+    assert sharp_lab.rig.arcs.cabinet.power.mode == "PowerOff"
 
 
 FIGURE = """kind = "write"

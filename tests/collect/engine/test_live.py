@@ -307,5 +307,5 @@ def test_the_command_refuses_a_port_that_is_taken_before_anything_is_connected(l
     done = brushloop(*command, "--config", lab.folder / "rig.toml", "--protocol", lab.folder / "protocol.toml")
     assert done.returncode == 2, done.stderr
     assert done.stderr.startswith(f"brushloop: --live: cannot listen on 127.0.0.1:{live.port}")
-    assert lab.rig.arcs.mode == "PowerOff"
+    assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
     assert not lab.sessions.exists()

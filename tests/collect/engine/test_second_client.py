@@ -214,5 +214,5 @@ def test_whoever_watches_has_the_tool_set_anew_and_goes_on(lab: Lab) -> None:
     engine.answer(prompt.number, "g")
     wait_for_end(engine)
     assert engine.snapshot().strokes_done == 2
-    assert lab.rig.arcs.tcp_offset[2] == 0.18
+    assert lab.rig.arcs.cabinet.tcp_offset[2] == 0.18
     assert max(press.depth_mm for press in lab.rig.world.presses) < 11.1, "none went deeper than asked"

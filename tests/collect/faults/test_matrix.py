@@ -245,7 +245,7 @@ def test_a_fault_in_a_phase_ends_as_the_table_says(
     assert not (now.rest_unknown and now.parked)
     if isinstance(ended, RobotNotSafe):
         assert ended.remedy in now.error
-        assert stage.rig.arcs.safety != SafetyMode.NORMAL, "nothing is ever cleared automatically"
+        assert stage.rig.arcs.cabinet.power.safety != SafetyMode.NORMAL, "nothing is ever cleared automatically"
 
     assert stage.at_rest
     [target] = targets

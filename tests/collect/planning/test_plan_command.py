@@ -134,7 +134,7 @@ async def test_the_controller_is_asked_for_every_pose_and_nothing_is_powered_set
         "getJointPositions",
         "inverseKinematics",
     }
-    assert cabinet.mode == RobotMode.POWER_OFF
+    assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
     assert cabinet.cabinet.tcp_offset[0] == 0.01
 
 

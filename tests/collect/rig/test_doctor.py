@@ -25,7 +25,7 @@ async def test_a_rig_in_order_is_reported_as_it_is_and_left_as_it_was(lab: Lab) 
     assert robot.latency_ms is not None
     assert robot.latency_ms < 1000.0
     assert "PowerOff, safety Normal, simulated" in robot.notes
-    assert lab.rig.arcs.mode == "PowerOff"
+    assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
     assert camera.well
     assert camera.notes.startswith("board: ")
     assert "ended" not in camera.notes
@@ -67,12 +67,12 @@ async def test_a_board_that_cannot_be_seen_is_a_problem_with_a_remedy(lab: Lab) 
 
 
 async def test_a_protective_stop_is_reported_and_not_cleared(lab: Lab) -> None:
-    lab.rig.arcs.protective_stop(SafetyMode.PROTECTIVE_STOP)
+    lab.rig.arcs.cabinet.safety_stop()
     *_, robot = await examine(load_rig(lab.folder / "rig.toml"), HostClock())
     assert robot.answers
     assert not robot.well
     assert "ProtectiveStop" in robot.problem
-    assert lab.rig.arcs.safety == SafetyMode.PROTECTIVE_STOP
+    assert lab.rig.arcs.cabinet.power.safety == SafetyMode.PROTECTIVE_STOP
 
 
 @pytest.mark.parametrize("flag", [(), ("--json",)])

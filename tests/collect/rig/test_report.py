@@ -51,7 +51,7 @@ def test_an_archive_holds_what_every_device_answered(lab: Lab) -> None:
     assert answered["rob1.RobotState.getSafetyModeType"] == {"result": "Normal"}
     assert answered["rob1.MotionControl.getSpeedFraction"]["result"] == 1.0
     assert all(line["took_ms"] > 0.0 for line in lines)
-    assert lab.rig.arcs.mode == "PowerOff"
+    assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
     assert lab.rig.world.motion._next_id == 0
 
 

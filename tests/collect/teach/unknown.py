@@ -100,7 +100,7 @@ class InLab:
         if self.leave_after is not None and len(self.brought) >= self.leave_after:
             raise LeftOff
         self.brought.append(target)
-        answer = await self._in_lab(self.lab.hand.bring(target.kind, target.index, target.corner))
+        answer = await self._in_lab(self.lab.bring(target.kind, target.index, target.corner))
         self.lines.append(f"person: {answer['says']}")
         return Brought.DONE if answer["reached"] else Brought.SKIP
 

@@ -33,9 +33,9 @@ async def serve(path: Path, rate: float) -> None:
                 case "split":
                     rig.world.flaws[len(rig.world.presses)] = (Flaw.SPLIT, 1.0)
                 case "stop":
-                    rig.arcs.protective_stop()
+                    rig.arcs.cabinet.safety_stop()
                 case "release":
-                    rig.arcs.safety = SafetyMode.NORMAL
+                    rig.arcs.cabinet.power.safety = SafetyMode.NORMAL
                 case _:
                     pass
             tell(str(rig.world.tool()))

@@ -44,16 +44,16 @@ async def sleeping_arm(
 
 async def test_enabling_runs_the_arm_and_moves_nothing(sleeping_arm: AuboArcs, cabinet: ArcsServer):
     await sleeping_arm.enable()
-    assert cabinet.mode == RobotMode.RUNNING
-    assert cabinet.tcp_offset == [0.0, 0.0, 0.18, 0.0, 0.0, 0.0]
-    assert distance(cabinet._world.tool(), brush_pose(250.0, -230.0, 260.0))[0] < 1e-6
+    assert cabinet.cabinet.power.mode == RobotMode.RUNNING
+    assert cabinet.cabinet.tcp_offset == [0.0, 0.0, 0.18, 0.0, 0.0, 0.0]
+    assert distance(cabinet.cabinet.world.tool(), brush_pose(250.0, -230.0, 260.0))[0] < 1e-6
 
 
 async def test_a_move_arrives_and_the_same_again_is_done(arm: AuboArcs, cabinet: ArcsServer):
     target = brush_pose(300.0, -200.0, 240.0, heading_deg=40.0, tilt_deg=10.0)
     for _ in range(2):
         await arm.move(target, **QUICK)
-        off_mm, off_deg = distance(cabinet._world.tool(), target)
+        off_mm, off_deg = distance(cabinet.cabinet.world.tool(), target)
         assert off_mm <= 0.05
         assert off_deg <= 0.1
 
@@ -63,16 +63,18 @@ async def test_an_arm_whose_power_went_refuses(arm: AuboArcs, cabinet: ArcsServe
     with pytest.raises(MotionRefused) as caught:
         await arm.move(NEAR, **QUICK)
     assert caught.value.code == -1
-    assert cabinet.mode != RobotMode.RUNNING
+    assert cabinet.cabinet.power.mode != RobotMode.RUNNING
 
 
 async def test_a_protective_stop_in_mid_move_ends_it_and_the_path_is_dropped(arm: AuboArcs, cabinet: ArcsServer):
     move = asyncio.create_task(arm.move(FAR, **SLOW))
     await asyncio.sleep(0.2)
-    cabinet.protective_stop()
+    cabinet.cabinet.safety_stop()
     with pytest.raises(RobotNotSafe, match="ProtectiveStop"):
         await move
-    assert cabinet._world.motion.exec_id(cabinet._now_s) == -1, "nothing goes on when a person unlocks the arm"
+    assert cabinet.cabinet.world.motion.exec_id(cabinet.cabinet.now_s()) == -1, (
+        "nothing goes on when a person unlocks the arm"
+    )
 
 
 async def test_an_unknown_method_is_an_error_with_its_code(arm: AuboArcs, cabinet: ArcsServer):
@@ -89,4 +91,4 @@ async def test_a_connection_that_drops_in_mid_move_ends_the_move(arm: AuboArcs, 
     with pytest.raises(ConnectionLost):
         await move
     await asyncio.sleep(0.1)
-    assert cabinet._world.motion.exec_id(cabinet._now_s) == -1
+    assert cabinet.cabinet.world.motion.exec_id(cabinet.cabinet.now_s()) == -1

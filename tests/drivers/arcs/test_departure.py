@@ -39,7 +39,7 @@ async def send(client: Controller, target: Pose) -> None:
 
 
 def lines(cabinet: ArcsServer) -> int:
-    return cabinet._world.motion._next_id
+    return cabinet.cabinet.world.motion._next_id
 
 
 async def test_an_arm_that_was_moved_is_not_sent_anywhere_until_it_is_taken_up(
@@ -92,22 +92,22 @@ async def test_what_a_press_depends_on_is_read_back_before_each_way_down(
 ):
     await arm.move(ABOVE, **QUICK)
     assert await other.ask(method, **params) == 0
-    sent, before = lines(cabinet), cabinet._world.tool()
+    sent, before = lines(cabinet), cabinet.cabinet.world.tool()
     for refused in (arm.move(LOW, **QUICK), arm.follow([ABOVE, LOW], blend_mm=1.0, **QUICK), arm.take_up()):
         with pytest.raises(SettingsChanged, match=words):
             await refused
     assert lines(cabinet) == sent
-    assert cabinet._world.tool() == before
+    assert cabinet.cabinet.world.tool() == before
     await other.ask("RobotManage.setOperationalMode", mode="Automatic")
     await arm.enable()  # sets what is configured again; what is not is taken as it is
     await arm.move(LOW, **QUICK)
-    assert distance(cabinet._world.tool(), LOW)[0] < 0.05
+    assert distance(cabinet.cabinet.world.tool(), LOW)[0] < 0.05
 
 
 async def test_a_safety_stop_is_reported_before_what_it_changes(arm: AuboArcs, other: Controller, cabinet: ArcsServer):
     await arm.move(ABOVE, **QUICK)
     await other.ask("RobotManage.setOperationalMode", mode="Manual")
-    cabinet.protective_stop()
+    cabinet.cabinet.safety_stop()
     with pytest.raises(RobotNotSafe):
         await arm.move(LOW, **QUICK)
 
@@ -117,7 +117,7 @@ async def test_a_return_code_is_no_proof_that_the_tool_was_set(sleeping_arm: Aub
     cabinet._methods["rob1.RobotConfig.setTcpOffset"] = lambda _: code
     with pytest.raises(SettingsChanged, match=r"tool offset is \(0, 0, 0\) mm, .*, not \(0, 0, 180\) mm"):
         await sleeping_arm.enable()
-    assert cabinet.mode == "PowerOff"
+    assert cabinet.cabinet.power.mode == "PowerOff"
 
 
 async def test_ignored_is_fine_where_it_is_set_already(sleeping_arm: AuboArcs, cabinet: ArcsServer):
@@ -140,7 +140,7 @@ async def test_from_below_the_floor_only_the_tool_axis_leads_up(arm: AuboArcs, o
             await arm.move(wrong, **QUICK)
     up = brush_pose(x_mm, -200.0, 200.0, tilt_deg=10.0)
     await arm.move(up, **QUICK)
-    assert distance(cabinet._world.tool(), up)[0] < 0.05
+    assert distance(cabinet.cabinet.world.tool(), up)[0] < 0.05
 
 
 @pytest.mark.parametrize(

@@ -42,14 +42,14 @@ def line(points: int, step_mm: float = 5.0) -> list[Pose]:
 
 
 def sent(cabinet: ArcsServer) -> int:
-    return cabinet._world.motion._next_id
+    return cabinet.cabinet.world.motion._next_id
 
 
 @pytest.fixture
 async def way(arm: AuboArcs, cabinet: ArcsServer) -> AsyncIterator[asyncio.Task[None]]:
     """A long slow way that is under way, with more points than are queued at a time."""
     task = asyncio.create_task(arm.follow(line(130, 3.0), **SLOW))
-    while sent(cabinet) < queueing.MOST_QUEUED or cabinet._world.motion.exec_id(cabinet._now_s) < 1:
+    while sent(cabinet) < queueing.MOST_QUEUED or cabinet.cabinet.world.motion.exec_id(cabinet.cabinet.now_s()) < 1:
         await asyncio.sleep(0.01)
     yield task
     task.cancel()
@@ -57,23 +57,23 @@ async def way(arm: AuboArcs, cabinet: ArcsServer) -> AsyncIterator[asyncio.Task[
 
 
 def to_go_mm(cabinet: ArcsServer) -> float:
-    return distance(cabinet._world.tool(), line(130, 3.0)[-1])[0]
+    return distance(cabinet.cabinet.world.tool(), line(130, 3.0)[-1])[0]
 
 
 async def rests_short(cabinet: ArcsServer) -> bool:
     """At rest well before the end, and no line comes after it."""
     before = sent(cabinet)
     await asyncio.sleep(0.15)
-    idle = cabinet._world.motion.exec_id(cabinet._now_s) == -1
+    idle = cabinet.cabinet.world.motion.exec_id(cabinet.cabinet.now_s()) == -1
     return idle and sent(cabinet) == before and to_go_mm(cabinet) > 100.0
 
 
 async def test_the_arm_ends_at_the_last_pose_having_passed_near_all_the_others(arm: AuboArcs, cabinet: ArcsServer):
     travelled: list[Pose] = []
-    world_saw = cabinet._world.motion._on_path
-    cabinet._world.motion._on_path = lambda a, b: (travelled.extend((a, b)), world_saw(a, b))[1]
+    world_saw = cabinet.cabinet.world.motion._on_path
+    cabinet.cabinet.world.motion._on_path = lambda a, b: (travelled.extend((a, b)), world_saw(a, b))[1]
     await arm.follow(arc(), **WAY)
-    off_mm, off_deg = distance(cabinet._world.tool(), arc()[-1])
+    off_mm, off_deg = distance(cabinet.cabinet.world.tool(), arc()[-1])
     assert off_mm <= 0.05
     assert off_deg <= 0.1
     for pose in arc():
@@ -82,7 +82,7 @@ async def test_the_arm_ends_at_the_last_pose_having_passed_near_all_the_others(a
 
 
 async def test_the_arm_halts_nowhere_but_at_the_end(arm: AuboArcs, cabinet: ArcsServer):
-    motion, halts = cabinet._world.motion, list[float]()
+    motion, halts = cabinet.cabinet.world.motion, list[float]()
     finish = motion._finish
     motion._finish = lambda segment: (
         halts.append(segment.end_s) if segment.ramp.v_out == 0.0 else None,
@@ -98,7 +98,7 @@ async def test_the_arm_halts_nowhere_but_at_the_end(arm: AuboArcs, cabinet: Arcs
 
 
 async def test_never_more_lines_are_queued_than_allowed(arm: AuboArcs, cabinet: ArcsServer):
-    motion = cabinet._world.motion
+    motion = cabinet.cabinet.world.motion
     cabinet.cabinet.hold()
     task = asyncio.create_task(arm.follow(arc(), **WAY))
     while motion.size < queueing.MOST_QUEUED:
@@ -145,7 +145,7 @@ async def test_a_stop_by_somebody_else_is_noticed_and_not_driven_over(cabinet: A
 
 
 async def test_a_protective_stop_in_mid_path_is_reported_as_such(cabinet: ArcsServer, way: asyncio.Task[None]):
-    cabinet.protective_stop()
+    cabinet.cabinet.safety_stop()
     with pytest.raises(RobotNotSafe, match="ProtectiveStop"):
         await way
     assert to_go_mm(cabinet) > 100.0
@@ -162,9 +162,9 @@ async def test_a_connection_that_is_lost_in_mid_path_stops_the_arm(
 
 
 async def test_a_controller_that_holds_few_lines_is_fed_as_it_takes_them(arm: AuboArcs, cabinet: ArcsServer):
-    cabinet._world.motion._capacity = 3
+    cabinet.cabinet.world.motion._capacity = 3
     await arm.follow(arc(), **WAY)
-    assert distance(cabinet._world.tool(), arc()[-1])[0] <= 0.05
+    assert distance(cabinet.cabinet.world.tool(), arc()[-1])[0] <= 0.05
 
 
 async def test_a_queue_that_somebody_else_fills_is_an_error(arm: AuboArcs, cabinet: ArcsServer):
@@ -199,7 +199,7 @@ async def test_a_way_that_is_fed_too_slowly_goes_on_and_is_reported(
     arm._notice = reported.append
     monkeypatch.setattr(queueing, "MOST_QUEUED", 1)
     await arm.follow(line(4), **WAY)
-    assert distance(cabinet._world.tool(), line(4)[-1])[0] <= 0.05
+    assert distance(cabinet.cabinet.world.tool(), line(4)[-1])[0] <= 0.05
     assert reported[0] == "the arm halted at point 1 of 4: lines did not reach the controller in time"
 
 

@@ -13,6 +13,7 @@ from drivers.errors import ConnectionLost, LimitExceeded, MotionFailed, MotionRe
 from drivers.geometry import brush_pose, distance
 from drivers.samples import Pose, QueuedLine
 from drivers.sim.arcs.server import ArcsServer
+from tests.drivers.muting import mute
 
 HOME = brush_pose(250.0, -230.0, 260.0)
 TOP, DEEP = brush_pose(250.0, -230.0, 300.0), brush_pose(250.0, -230.0, 200.0)
@@ -23,12 +24,12 @@ LINE, STOP_MOVE, START_MOVE = (f"rob1.MotionControl.{name}" for name in ("moveLi
 
 
 def z_mm(cabinet: ArcsServer) -> float:
-    return cabinet._world.tool().z_mm
+    return cabinet.cabinet.world.tool().z_mm
 
 
 def queued(cabinet: ArcsServer) -> int:
-    cabinet._world.motion.advance(cabinet._now_s)
-    return cabinet._world.motion.size
+    cabinet.cabinet.world.motion.advance(cabinet.cabinet.now_s())
+    return cabinet.cabinet.world.motion.size
 
 
 def before_each(cabinet: ArcsServer, method: str, act: Callable[[int], object]) -> None:
@@ -46,17 +47,17 @@ def before_each(cabinet: ArcsServer, method: str, act: Callable[[int], object]) 
 
 async def nothing_is_left(cabinet: ArcsServer) -> bool:
     """No line is queued, and none begins when somebody lets the path go on."""
-    here = cabinet._world.tool()
+    here = cabinet.cabinet.world.tool()
     cabinet.cabinet.resume()
     await asyncio.sleep(0.1)
-    return queued(cabinet) == 0 and cabinet._world.tool() == here
+    return queued(cabinet) == 0 and cabinet.cabinet.world.tool() == here
 
 
 async def test_the_arm_goes_down_dwells_and_comes_up_and_the_lowest_pose_is_seen(arm: AuboArcs, cabinet: ArcsServer):
     seen = await arm.sequence(PRESS, acc_mm_s2=ACC)
-    assert distance(cabinet._world.tool(), TOP)[0] <= 0.05
+    assert distance(cabinet.cabinet.world.tool(), TOP)[0] <= 0.05
     assert min(pose.z_mm for pose in seen) == pytest.approx(200.0, abs=0.05)
-    near, deep, top = list(cabinet._world.motion.rests)[-3:]
+    near, deep, top = list(cabinet.cabinet.world.motion.rests)[-3:]
     assert (near.pose.z_mm, deep.pose.z_mm, top.pose.z_mm) == pytest.approx((200.05, 200.0, 300.0))
     assert deep.at_s - near.at_s == pytest.approx(DWELL_S)
 
@@ -73,7 +74,7 @@ async def test_nothing_moves_before_the_controller_has_every_line(arm: AuboArcs,
 
 async def test_a_host_that_is_gone_once_the_path_was_let_go_is_not_needed(arm: AuboArcs, cabinet: ArcsServer):
     lowest: list[float] = []
-    cabinet._world.motion._on_path = lambda a, b: lowest.append(min(a.z_mm, b.z_mm))
+    cabinet.cabinet.world.motion._on_path = lambda a, b: lowest.append(min(a.z_mm, b.z_mm))
     task = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
     while z_mm(cabinet) > 250.0:
         await asyncio.sleep(0.002)
@@ -81,7 +82,7 @@ async def test_a_host_that_is_gone_once_the_path_was_let_go_is_not_needed(arm: A
         writer = controller.connection._writer
         assert writer is not None
         writer.transport.abort()
-    cabinet.mute = True
+    mute(cabinet)
     async with asyncio.timeout(10.0):
         while queued(cabinet):
             await asyncio.sleep(0.01)
@@ -89,7 +90,7 @@ async def test_a_host_that_is_gone_once_the_path_was_let_go_is_not_needed(arm: A
     assert min(lowest) == pytest.approx(DEEP.z_mm)
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
-    cabinet.mute = False
+    cabinet.faults.clear()
 
 
 @pytest.mark.parametrize("number", [1, 3])

@@ -62,8 +62,8 @@ async def test_an_arm_that_is_not_on_automatic_is_neither_set_nor_powered(
     with pytest.raises(WrongOperationalMode, match="on the pendant") as caught:
         await enabled(make_arm)
     assert caught.value.mode == str(mode)
-    assert cabinet.mode == RobotMode.POWER_OFF
-    assert cabinet.tcp_offset == [0.0] * 6
+    assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
+    assert cabinet.cabinet.tcp_offset == [0.0] * 6
 
 
 async def test_a_cabinet_without_operational_modes_is_reported(
@@ -94,7 +94,8 @@ async def test_what_is_configured_is_set_in_the_wires_units(make_arm: MakeArm, c
 async def test_a_brush_that_is_not_square_to_the_flange_is_pressed_upright(make_arm: MakeArm, cabinet: ArcsServer):
     turn = {"tcp_offset_mm": (4.0, -7.0, 180.0), "tcp_rotation_deg": (2.0, -1.5, 0.0)}
     arm = await enabled(make_arm, **turn)
-    assert cabinet.tcp_offset == pytest.approx([0.004, -0.007, 0.18, math.radians(2.0), math.radians(-1.5), 0.0])
+    expected = [0.004, -0.007, 0.18, math.radians(2.0), math.radians(-1.5), 0.0]
+    assert cabinet.cabinet.tcp_offset == pytest.approx(expected)
     await arm.move(NEAR, **QUICK)
     flange = from_wire(cabinet.cabinet.fk([*cabinet.cabinet.joints()])[0])
     assert distance(flange, NEAR)[0] < 0.1
@@ -107,16 +108,16 @@ async def test_what_the_controller_does_not_take_keeps_the_power_off(
 ):
     with pytest.raises(MotionRefused):
         await enabled(make_arm, **wrong)
-    assert cabinet.mode == RobotMode.POWER_OFF
+    assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
 
 
 async def test_reduced_mode_is_allowed_and_reported_once(make_arm: MakeArm, cabinet: ArcsServer, notices: list[str]):
     arm = await enabled(make_arm)
-    cabinet.safety = SafetyMode.REDUCED
+    cabinet.cabinet.power.safety = SafetyMode.REDUCED
     await arm.move(NEAR, **QUICK)
     assert len(notices) == 1
     assert "ReducedMode" in notices[0]
-    cabinet.safety = SafetyMode.NORMAL
+    cabinet.cabinet.power.safety = SafetyMode.NORMAL
     await arm.move(brush_pose(265.0, -220.0, 250.0), **QUICK)
     assert len(notices) == 1
 
@@ -161,11 +162,11 @@ async def test_the_watchdog_is_armed_while_enabled_and_fed(make_arm: MakeArm, ca
     await arm.enable()
     assert cabinet.cabinet.watchdogs == {"brushloop": (0.3, 3)}
     await asyncio.sleep(0.8)
-    assert cabinet.safety == SafetyMode.NORMAL
+    assert cabinet.cabinet.power.safety == SafetyMode.NORMAL
     await arm.close()
     assert cabinet.cabinet.watchdogs == {"brushloop": (0.3, 0)}
     await asyncio.sleep(0.5)
-    assert cabinet.safety == SafetyMode.NORMAL
+    assert cabinet.cabinet.power.safety == SafetyMode.NORMAL
     assert not notices
 
 
@@ -176,8 +177,8 @@ async def test_a_host_that_dies_leaves_a_protective_stop_and_no_motion(make_arm:
         await controller.connection.close()
     arm._enabled = False  # who is dead does not say goodbye
     await asyncio.sleep(0.5)
-    assert cabinet.safety == SafetyMode.PROTECTIVE_STOP
-    assert cabinet._world.motion.steady(cabinet._now_s)
+    assert cabinet.cabinet.power.safety == SafetyMode.PROTECTIVE_STOP
+    assert cabinet.cabinet.world.motion.steady(cabinet.cabinet.now_s())
 
 
 async def test_no_watchdog_where_none_is_wanted(make_arm: MakeArm, cabinet: ArcsServer):
@@ -211,7 +212,7 @@ async def test_an_arm_that_cannot_be_stopped_is_left_to_the_watchdog(make_arm: M
     await arm.close()
     assert cabinet.cabinet.watchdogs["brushloop"][1] == 3
     await asyncio.sleep(0.5)
-    assert cabinet.safety == SafetyMode.PROTECTIVE_STOP
+    assert cabinet.cabinet.power.safety == SafetyMode.PROTECTIVE_STOP
 
 
 async def test_an_error_other_than_unknown_method_is_not_taken_for_an_old_controller(
@@ -223,4 +224,4 @@ async def test_an_error_other_than_unknown_method_is_not_taken_for_an_old_contro
     cabinet._methods["rob1.RobotManage.getOperationalMode"] = broken
     with pytest.raises(RpcError):
         await enabled(make_arm)
-    assert cabinet.mode == RobotMode.POWER_OFF
+    assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF

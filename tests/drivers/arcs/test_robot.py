@@ -28,6 +28,7 @@ from drivers.limits import Limits
 from drivers.protocols import Robot
 from drivers.samples import Pose, PoseSample
 from drivers.sim.arcs.server import ArcsServer
+from tests.drivers.muting import mute
 
 NEAR = brush_pose(260.0, -220.0, 250.0)
 QUICK = {"speed_mm_s": 200.0, "acc_mm_s2": 800.0}
@@ -58,7 +59,7 @@ async def test_a_cabinet_of_another_make_is_not_taken_for_the_loopback_rig(cabin
 async def test_an_arm_that_was_not_enabled_is_not_moved(sleeping_arm: AuboArcs, cabinet: ArcsServer):
     with pytest.raises(NotConnected, match="not enabled"):
         await sleeping_arm.move(NEAR, **QUICK)
-    assert cabinet.mode == RobotMode.POWER_OFF
+    assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
 
 
 async def test_an_arm_whose_power_went_refuses_to_move(arm: AuboArcs, cabinet: ArcsServer):
@@ -69,12 +70,12 @@ async def test_an_arm_whose_power_went_refuses_to_move(arm: AuboArcs, cabinet: A
 
 
 async def test_enabling_runs_the_arm_and_sets_the_tool_but_moves_nothing(sleeping_arm: AuboArcs, cabinet: ArcsServer):
-    before = cabinet._world.tool()
+    before = cabinet.cabinet.world.tool()
     await sleeping_arm.enable()
     await sleeping_arm.enable()
-    assert cabinet.mode == RobotMode.RUNNING
-    assert cabinet.tcp_offset == [0.0, 0.0, 0.18, 0.0, 0.0, 0.0]
-    assert distance(before, cabinet._world.tool())[0] == 0.0
+    assert cabinet.cabinet.power.mode == RobotMode.RUNNING
+    assert cabinet.cabinet.tcp_offset == [0.0, 0.0, 0.18, 0.0, 0.0, 0.0]
+    assert distance(before, cabinet.cabinet.world.tool())[0] == 0.0
     assert distance(before, sleeping_arm.latest().pose)[0] < 1e-6, "with the tool set, it speaks of the tip"
 
 
@@ -82,16 +83,16 @@ async def test_an_arm_that_does_not_take_the_tool_offset_is_not_powered(sleeping
     cabinet._methods["rob1.RobotConfig.setTcpOffset"] = lambda _: -5
     with pytest.raises(MotionRefused, match="setTcpOffset"):
         await sleeping_arm.enable()
-    assert cabinet.mode == RobotMode.POWER_OFF
+    assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
 
 
 async def test_a_move_returns_when_the_arm_rests_at_the_target(arm: AuboArcs, cabinet: ArcsServer):
     target = brush_pose(300.0, -200.0, 240.0, heading_deg=40.0, tilt_deg=10.0)
     await arm.move(target, **QUICK)
-    off_mm, off_deg = distance(cabinet._world.tool(), target)
+    off_mm, off_deg = distance(cabinet.cabinet.world.tool(), target)
     assert off_mm <= 0.05
     assert off_deg <= 0.1
-    assert cabinet._world.motion.steady(cabinet._now_s)
+    assert cabinet.cabinet.world.motion.steady(cabinet.cabinet.now_s())
 
 
 async def test_a_move_to_where_the_arm_already_is_is_done(arm: AuboArcs):
@@ -148,7 +149,7 @@ async def test_a_target_beyond_the_limits_is_refused_before_anything_is_sent(
 async def test_a_protective_stop_names_condition_and_remedy_and_nothing_clears_it(arm: AuboArcs, cabinet: ArcsServer):
     move = asyncio.create_task(arm.move(brush_pose(350.0, -150.0, 250.0), **SLOW))
     await asyncio.sleep(0.2)
-    cabinet.protective_stop()
+    cabinet.cabinet.safety_stop()
     with pytest.raises(RobotNotSafe, match="ProtectiveStop") as caught:
         await move
     assert caught.value.mode == "ProtectiveStop"
@@ -157,7 +158,7 @@ async def test_a_protective_stop_names_condition_and_remedy_and_nothing_clears_i
     for attempt in (arm.move(NEAR, **QUICK), arm.enable()):
         with pytest.raises(RobotNotSafe):
             await attempt
-    assert cabinet.safety == SafetyMode.PROTECTIVE_STOP
+    assert cabinet.cabinet.power.safety == SafetyMode.PROTECTIVE_STOP
 
 
 @pytest.mark.parametrize("mode", ["ArmOnFire", 5, ["Normal"], None])
@@ -174,7 +175,7 @@ async def test_a_pose_out_of_reach_is_a_failed_motion(cabinet: ArcsServer, arm_a
     await arm.enable()
     with pytest.raises(MotionFailed, match="within reach"):
         await arm.move(brush_pose(900.0, 0.0, 250.0), **QUICK)
-    assert cabinet.messages[-1]["code"] == 30047
+    assert cabinet.cabinet.messages[-1]["code"] == 30047
     await arm.close()
 
 
@@ -185,16 +186,16 @@ async def test_a_connection_that_drops_in_mid_move_ends_the_move_and_stops_the_a
     with pytest.raises(ConnectionLost):
         await move
     await asyncio.sleep(0.1)
-    assert cabinet._world.motion.exec_id(cabinet._now_s) == -1
+    assert cabinet.cabinet.world.motion.exec_id(cabinet.cabinet.now_s()) == -1
 
 
 async def test_latest_goes_stale_when_the_controller_falls_silent(arm: AuboArcs, cabinet: ArcsServer):
-    cabinet.mute = True
+    mute(cabinet)
     await asyncio.sleep(0.6)
     with pytest.raises(Stale) as caught:
         arm.latest()
     assert caught.value.age_ms > 500.0
-    cabinet.mute = False
+    cabinet.faults.clear()
     async with asyncio.timeout(2.0):  # and is fresh again by itself
         while True:
             try:

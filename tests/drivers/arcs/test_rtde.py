@@ -28,6 +28,7 @@ from drivers.sim.arcs.rtde_server import RtdeServer
 from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.rig import HOST
 from drivers.sim.server import LoopbackServer
+from tests.drivers.muting import mute
 
 GREETING = b'{"protocol":"rtde","version":1,"input":{"set_recipe":100},"output":{"R1_actual_TCP_pose":1021}}\n\n'
 POSE = ["R1_actual_TCP_pose"]
@@ -241,7 +242,7 @@ async def test_poses_are_pushed_at_the_frequency_that_was_asked_for(
     assert all(a.stamp.host_ns <= b.stamp.host_ns for a, b in itertools.pairwise(samples))
     await arm.move(brush_pose(300.0, -200.0, 240.0), speed_mm_s=200.0, acc_mm_s2=800.0)
     await asyncio.sleep(0.05)
-    assert distance(arm.latest().pose, cabinet._world.tool())[0] < 0.01
+    assert distance(arm.latest().pose, cabinet.cabinet.world.tool())[0] < 0.01
     assert not notices
     await arm.close()
     await asyncio.sleep(0.02)
@@ -261,7 +262,7 @@ async def test_a_closed_port_is_reported_and_poses_are_polled(
 async def test_a_port_that_is_silent_from_the_start_is_not_fatal(
     rtde: RtdeServer, make_arm: MakeArm, notices: list[str]
 ):
-    rtde.mute = True
+    mute(rtde)
     arm = make_arm(rtde.port)
     assert (await arm.connect()).firmware.endswith("polling")
     assert len(await samples_of(arm, 0.2)) >= 3
@@ -271,10 +272,10 @@ async def test_a_port_that_is_silent_from_the_start_is_not_fatal(
 async def test_a_silence_that_ends_is_bridged_by_asking(rtde: RtdeServer, make_arm: MakeArm, notices: list[str]):
     arm = make_arm(rtde.port)
     await arm.connect()
-    rtde.mute = True
+    mute(rtde)
     await asyncio.sleep(0.7)
     assert arm.latest()
-    rtde.mute = False
+    rtde.faults.clear()
     await asyncio.sleep(0.1)
     assert len(await samples_of(arm, 0.2)) >= 3
     assert not notices
@@ -289,7 +290,7 @@ async def test_a_stream_that_ends_later_is_reported_and_poses_go_on(
     arm = make_arm(rtde.port)
     await arm.connect()
     if fault == "mute":
-        rtde.mute = True
+        mute(rtde)
     else:
         rtde.drop_clients()
     await asyncio.sleep(0.8)
@@ -301,11 +302,12 @@ async def test_a_stream_that_ends_later_is_reported_and_poses_go_on(
 async def test_where_both_ways_are_silent_the_pose_goes_stale(rtde: RtdeServer, make_arm: MakeArm, cabinet: ArcsServer):
     arm = make_arm(rtde.port)
     await arm.connect()
-    rtde.mute = cabinet.mute = True
+    mute(rtde)
+    mute(cabinet)
     await asyncio.sleep(0.7)
     with pytest.raises(Stale):
         arm.latest()
-    cabinet.mute = False
+    cabinet.faults.clear()
 
 
 @pytest.mark.parametrize("pose", [[1.0, 2.0], "here", [None] * 6, [1e999] * 6, 5])

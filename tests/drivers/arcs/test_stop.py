@@ -12,6 +12,7 @@ from drivers.arcs.robot import AuboArcs
 from drivers.errors import ConnectionLost, DeviceTimeout, MotionError
 from drivers.geometry import brush_pose, distance
 from drivers.sim.arcs.server import ArcsServer
+from tests.drivers.muting import mute, mute_to
 
 FAR = brush_pose(250.0, -30.0, 260.0)  # 200 mm from home: two seconds of the fast clock
 SLOW = {"speed_mm_s": 5.0, "acc_mm_s2": 800.0}
@@ -28,13 +29,13 @@ async def move(arm: AuboArcs) -> AsyncIterator[asyncio.Task[None]]:
 
 
 def to_go_mm(cabinet: ArcsServer) -> float:
-    return distance(cabinet._world.tool(), FAR)[0]
+    return distance(cabinet.cabinet.world.tool(), FAR)[0]
 
 
 async def comes_to_rest(cabinet: ArcsServer) -> bool:
     """Within 0.1 s the arm rests, far from its target and not back at its start."""
     await asyncio.sleep(0.1)
-    at_rest = cabinet._world.motion.exec_id(cabinet._now_s) == -1
+    at_rest = cabinet.cabinet.world.motion.exec_id(cabinet.cabinet.now_s()) == -1
     return at_rest and 100.0 < to_go_mm(cabinet) < 199.0
 
 
@@ -61,7 +62,7 @@ async def test_a_second_stop_in_mid_move_changes_nothing(arm: AuboArcs, cabinet:
 
 
 async def test_a_stop_is_fine_in_a_protective_stop(arm: AuboArcs, cabinet: ArcsServer):
-    cabinet.protective_stop()
+    cabinet.cabinet.safety_stop()
     await arm.stop()
 
 
@@ -69,10 +70,10 @@ async def test_a_move_after_a_stop_starts_where_the_arm_came_to_rest(
     arm: AuboArcs, cabinet: ArcsServer, move: asyncio.Task[None]
 ):
     await arm.stop()
-    x, y, z = cabinet._world.tool().position_mm
+    x, y, z = cabinet.cabinet.world.tool().position_mm
     step = brush_pose(x, y + 1.5, z)
     await arm.move(step, speed_mm_s=100.0, acc_mm_s2=800.0)
-    assert distance(cabinet._world.tool(), step)[0] < 0.05
+    assert distance(cabinet.cabinet.world.tool(), step)[0] < 0.05
 
 
 async def test_cancelling_a_move_stops_the_arm(cabinet: ArcsServer, move: asyncio.Task[None]):
@@ -86,7 +87,7 @@ async def test_cancelling_a_move_stops_the_arm(cabinet: ArcsServer, move: asynci
 async def test_a_stop_does_not_wait_behind_a_command_that_hangs(
     arm: AuboArcs, cabinet: ArcsServer, move: asyncio.Task[None], silent: str
 ):
-    cabinet.mute_to = {f"rob1.{silent}"}
+    mute_to(cabinet, f"rob1.{silent}")
     await asyncio.sleep(0.1)  # the move now waits for an answer that does not come
     pressed = asyncio.create_task(arm.stop())
     await asyncio.sleep(0.2)
@@ -96,10 +97,10 @@ async def test_a_stop_does_not_wait_behind_a_command_that_hangs(
 
 
 async def test_a_move_whose_answer_is_lost_stops_the_arm(arm: AuboArcs, cabinet: ArcsServer):
-    cabinet.mute_to = {"rob1.MotionControl.moveLine"}
+    mute_to(cabinet, "rob1.MotionControl.moveLine")
     with pytest.raises(DeviceTimeout, match="moveLine"):
         await arm.move(FAR, **SLOW)
-    assert cabinet._world.motion.exec_id(cabinet._now_s) == -1
+    assert cabinet.cabinet.world.motion.exec_id(cabinet.cabinet.now_s()) == -1
     assert to_go_mm(cabinet) > 50.0
 
 
@@ -123,11 +124,11 @@ async def test_a_move_that_could_not_be_stopped_says_so(
     arm: AuboArcs, cabinet: ArcsServer, move: asyncio.Task[None], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(stopping, "CONFIRM_S", 1.0)
-    cabinet.mute = True
+    mute(cabinet)
     with pytest.raises(DeviceTimeout) as caught:
         await move
     assert "may still be moving" in caught.value.__notes__[0]
-    cabinet.mute = False
+    cabinet.faults.clear()
 
 
 async def test_a_stop_gets_through_while_its_own_connection_is_silently_dead(
@@ -159,7 +160,7 @@ async def test_a_line_that_was_still_on_its_way_is_stopped_too(
     monkeypatch.setattr(arm._motion.connection, "call", late)
     with pytest.raises(DeviceTimeout):
         await arm.move(FAR, **SLOW)
-    assert cabinet._world.motion.exec_id(cabinet._now_s) == -1
+    assert cabinet.cabinet.world.motion.exec_id(cabinet.cabinet.now_s()) == -1
     assert to_go_mm(cabinet) > 100.0
 
 
@@ -167,7 +168,7 @@ async def test_a_line_left_in_the_queue_by_a_dead_process_is_stopped_before_anyt
     sleeping_arm: AuboArcs, cabinet: ArcsServer
 ):
     await sleeping_arm.enable()
-    cabinet._world.motion.add(FAR, 5.0, 800.0, cabinet._now_s)
+    cabinet.cabinet.world.motion.add(FAR, 5.0, 800.0, cabinet.cabinet.now_s())
     await sleeping_arm.enable()
-    assert cabinet._world.motion.exec_id(cabinet._now_s) == -1
+    assert cabinet.cabinet.world.motion.exec_id(cabinet.cabinet.now_s()) == -1
     assert to_go_mm(cabinet) > 100.0

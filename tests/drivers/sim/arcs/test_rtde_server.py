@@ -158,7 +158,7 @@ async def test_where_the_arm_rested_between_two_pushes_is_reported_where_time_ru
     await client.greeting()
     client.writer.write(encode_topic(0, ["R1_actual_TCP_pose", "timestamp"], 10.0))
     await client.pushes(0.15)
-    motion, now_s = cabinet._world.motion, cabinet._now_s
+    motion, now_s = cabinet.cabinet.world.motion, cabinet.cabinet.now_s()
     for z_mm in (250.0, 260.0):  # over in a second of the arm's time, which is half of what lies between two pushes
         motion.add(brush_pose(250.0, -230.0, z_mm), 100.0, 1000.0, now_s)
     got = [(round(pose[2], 6), at_s) for _, pose, at_s in await client.pushes(0.3)]

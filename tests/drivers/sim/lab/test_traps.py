@@ -48,18 +48,18 @@ async def test_swapped_corners_are_taken_for_each_other_until_corrected():
     lab = trapped(4, Trap.SWAPPED_CORNER)
     assert lab.facts.swapped is not None
     asked, went = lab.facts.swapped
-    await lab.hand.bring("board-corner", 0, asked)
+    await lab.bring("board-corner", 0, asked)
     there = corner(lab.facts.config.table, "board", went)
     assert lab.world.tool().position_mm == pytest.approx(there, abs=1.0)
-    await lab.hand.obey({"act": "mend"})
-    await lab.hand.bring("board-corner", 0, asked)
+    await lab.obey({"act": "mend"})
+    await lab.bring("board-corner", 0, asked)
     there = corner(lab.facts.config.table, "board", asked)
     assert lab.world.tool().position_mm == pytest.approx(there, abs=1.0)
 
 
 async def test_a_mirrored_picture_shows_no_board_until_it_is_turned_round():
     lab = trapped(4, Trap.MIRRORED_CAMERA, (1024, 768))
-    await lab.hand.bring("clear-view")
+    await lab.bring("clear-view")
     detector = cv2.aruco.CharucoDetector(board(lab.facts.config.table))
 
     def seen(picture: np.ndarray) -> int:
@@ -68,15 +68,15 @@ async def test_a_mirrored_picture_shows_no_board_until_it_is_turned_round():
 
     mirrored = lab.rig.scene.render()
     assert seen(mirrored) < 5 < 60 < seen(np.ascontiguousarray(mirrored[:, ::-1]))
-    await lab.hand.obey({"act": "mend"})
+    await lab.obey({"act": "mend"})
     assert seen(lab.rig.scene.render()) > 60
 
 
 async def test_a_board_printed_to_fit_the_page_is_smaller_than_it_says():
     lab = trapped(4, Trap.WRONG_BOARD_SIZE)
-    said_mm, measured_mm = lab.seen().square_mm, float(lab.hand.measure("square"))
+    said_mm, measured_mm = lab.seen().square_mm, float(lab.measure("square"))
     assert measured_mm == pytest.approx(0.97 * said_mm, abs=0.01)
-    await lab.hand.obey({"act": "mend"})
+    await lab.obey({"act": "mend"})
     assert lab.seen().square_mm == pytest.approx(measured_mm, abs=0.01)
 
 
@@ -85,19 +85,19 @@ async def test_a_tool_in_metres_is_a_thousandth_at_the_cabinet_and_on_the_note()
         controller = await connected(lab)
         length_mm = lab.facts.config.tool_mm
         assert 1e3 * (await controller.ask("RobotConfig.getTcpOffset"))[2] == pytest.approx(length_mm / 1e3)
-        assert float(lab.hand.measure("tool")) == pytest.approx(length_mm / 1e3, abs=1e-3)
-        await lab.hand.obey({"act": "mend"})
+        assert float(lab.measure("tool")) == pytest.approx(length_mm / 1e3, abs=1e-3)
+        await lab.obey({"act": "mend"})
         assert tuple(await controller.ask("RobotConfig.getTcpOffset")) == draw(4).cabinet_tcp
-        assert float(lab.hand.measure("tool")) == pytest.approx(length_mm, abs=1.0)
+        assert float(lab.measure("tool")) == pytest.approx(length_mm, abs=1.0)
         await controller.connection.close()
 
 
 async def test_a_bad_park_is_in_the_picture():
     lab = trapped(4, Trap.PARK_IN_PICTURE)
-    await lab.hand.bring("park")
+    await lab.bring("park")
     assert in_picture(lab.facts.config, lab.world.tool().position_mm)
-    await lab.hand.obey({"act": "mend"})
-    await lab.hand.bring("park")
+    await lab.obey({"act": "mend"})
+    await lab.bring("park")
     assert not in_picture(lab.facts.config, lab.world.tool().position_mm)
 
 
@@ -119,28 +119,28 @@ async def test_a_sensor_with_the_wrong_sign_is_pulled_where_it_is_pushed():
     pushed = lab.world.wrench()[2]
     board_of = lab.rig.force.board
     forces = [board_of._force(0.0)[2]]
-    await lab.hand.obey({"act": "mend"})
+    await lab.obey({"act": "mend"})
     forces.append(board_of._force(0.0)[2])
     assert forces == pytest.approx([-pushed, pushed], abs=0.2)
 
 
 async def test_far_corners_are_out_of_reach_until_the_sheet_is_moved():
     lab = trapped(7, Trap.SHEET_OUT_OF_REACH)
-    answers = {name: await lab.hand.bring("board-corner", 0, name) for name in CORNERS}
+    answers = {name: await lab.bring("board-corner", 0, name) for name in CORNERS}
     missed = [name for name, answer in answers.items() if not answer["reached"]]
     assert missed
     assert "mm before the board-corner" in answers[missed[0]]["says"]
-    await lab.hand.obey({"act": "mend"})
+    await lab.obey({"act": "mend"})
     for name in missed:
-        assert (await lab.hand.bring("board-corner", 0, name))["reached"]
+        assert (await lab.bring("board-corner", 0, name))["reached"]
 
 
 async def test_the_older_software_answers_on_its_own_port_only():
     async with trapped(4, Trap.OLD_SOFTWARE) as lab:
         with pytest.raises(WrongGeneration, match="8899"):
             await connected(lab)
-        assert (await lab.hand.bring("pin"))["reached"]  # the pendant needs no network
-        await lab.hand.obey({"act": "mend"})
+        assert (await lab.bring("pin"))["reached"]  # the pendant needs no network
+        await lab.obey({"act": "mend"})
         controller = await connected(lab)
         await controller.connection.close()
 
@@ -151,10 +151,10 @@ async def test_a_pulled_cable_is_silence_until_it_is_in_again():
         assert lab.facts.cable_after is not None
         for index in range(lab.facts.cable_after):
             await controller.joint_positions()
-            await lab.hand.bring("pin", index)
+            await lab.bring("pin", index)
         with pytest.raises(DeviceTimeout):
             await controller.joint_positions()
-        assert "it is in again" in (await lab.hand.obey({"act": "plug"}))["says"]
+        assert "it is in again" in (await lab.obey({"act": "plug"}))["says"]
         again = await connected(lab)
         await again.joint_positions()
         await again.connection.close()

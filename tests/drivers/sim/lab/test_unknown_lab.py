@@ -78,10 +78,10 @@ def test_the_known_rig_has_its_tool_and_its_sensor_as_before():
 async def test_the_hand_brings_the_true_tip_to_the_thing():
     lab, off_mm = lab_of(4), list[float]()
     for index in range(12):
-        await lab.hand.bring("pin", index)
+        await lab.bring("pin", index)
         off_mm += np.subtract(lab.world.tool().position_mm, lab.facts.pin_mm).tolist()
     for name in CORNERS:
-        await lab.hand.bring("board-corner", 0, name)
+        await lab.bring("board-corner", 0, name)
         off_mm += np.subtract(lab.world.tool().position_mm, corner(lab.facts.config.table, "board", name)).tolist()
     assert 0.2 < float(np.std(off_mm)) < 0.4
     assert max(map(abs, off_mm)) < 0.8
@@ -92,7 +92,7 @@ async def test_the_pin_is_met_from_directions_that_tell_the_tool():
     """Least squares over the flange's poses, without the noise of the hand, would find the tool exactly."""
     lab, rows, sides = lab_of(9), list[np.ndarray](), list[np.ndarray]()
     for index in range(8):
-        await lab.hand.bring("pin", index)
+        await lab.bring("pin", index)
         flange = forward(lab.cabinet.joints())
         rows.append(np.hstack([flange[:3, :3], -np.eye(3)]))
         sides.append(-flange[:3, 3])
@@ -105,14 +105,14 @@ async def test_the_pin_is_met_from_directions_that_tell_the_tool():
 async def test_upright_by_a_set_square_gives_the_brushs_axis():
     lab, axes = lab_of(3), list[np.ndarray]()
     for index in range(4):
-        await lab.hand.bring("upright", index)
+        await lab.bring("upright", index)
         assert lean(lab.world.tool())[0] < 0.6
         axes.append(forward(lab.cabinet.joints())[:3, :3].T @ [0.0, 0.0, -1.0])
     assert np.mean(axes, axis=0) == pytest.approx(truth(lab.facts, None)["tool"]["brush_axis"], abs=math.radians(0.3))
 
 
 async def test_what_a_client_reads_agrees_with_the_truth(lab: UnknownLab, controller: Controller):
-    await lab.hand.bring("pin", 2)
+    await lab.bring("pin", 2)
     joints = await controller.joint_positions()
     tcp = from_wire(await controller.ask("RobotConfig.getTcpOffset"))
     reported = await controller.pose()
@@ -127,11 +127,11 @@ async def test_what_a_client_reads_agrees_with_the_truth(lab: UnknownLab, contro
 
 async def test_the_camera_shows_the_arm_where_it_was_guided(lab: UnknownLab):
     scene = lab.rig.scene
-    await lab.hand.bring("clear-view")
+    await lab.bring("clear-view")
     empty = scene.render().astype(int)
-    await lab.hand.bring("sheet-corner", 0, "lower left")
+    await lab.bring("sheet-corner", 0, "lower left")
     assert (np.abs(scene.render().astype(int) - empty) > 40).mean() > 0.02
-    await lab.hand.bring("park")
+    await lab.bring("park")
     assert (np.abs(scene.render().astype(int) - empty) > 40).mean() < 0.001
 
 
@@ -139,7 +139,7 @@ async def test_the_other_stream_shows_the_arm_and_no_board(lab: UnknownLab):
     room = lab._room._scene
     room.tool()
     before = room.render().astype(int)
-    await lab.hand.bring("well")
+    await lab.bring("well")
     room.tool()
     after = room.render()
     assert (np.abs(after.astype(int) - before) > 40).mean() > 0.003
@@ -152,7 +152,7 @@ async def test_a_held_board_is_seen_slanted_and_gives_the_lens():
     made = board(lab.facts.config.table)
     detector = cv2.aruco.CharucoDetector(made)
     for index in range(6):
-        await lab.hand.bring("hold-board", index)
+        await lab.bring("hold-board", index)
         picture = lab.rig.scene.render()
         corners, ids, _, _ = detector.detectBoard(picture)
         assert len(ids) > 60
@@ -165,7 +165,7 @@ async def test_a_held_board_is_seen_slanted_and_gives_the_lens():
     assert rms_px < 0.4
     assert matrix[0, 0] == pytest.approx(known["matrix"][0][0], rel=0.02)
     assert float(np.ravel(distortion)[0]) == pytest.approx(known["k1"], abs=0.02)
-    await lab.hand.bring("clear-view")
+    await lab.bring("clear-view")
     assert lab.rig.scene.held is None
 
 
@@ -183,7 +183,7 @@ async def test_a_finger_pushes_for_a_second(monkeypatch: pytest.MonkeyPatch):
     lab, felt = lab_of(2), list[tuple[float, ...]]()
     before = np.array(lab.world.wrench()[:3])
     monkeypatch.setattr("asyncio.sleep", lambda _s: _now(felt, lab))
-    await lab.hand.bring("push-sensor", 0)
+    await lab.bring("push-sensor", 0)
     upright = Rotation.from_quat(lab.world.tool().quaternion)
     assert upright.apply(np.array(felt[0]) - before) == pytest.approx([0.0, 0.0, 2.0], abs=1e-6)
     assert lab.world.wrench()[:3] == pytest.approx(before)
@@ -218,4 +218,4 @@ def test_the_truth_is_json_with_what_a_first_day_finds():
 )
 async def test_what_a_person_cannot_do_is_named(request_: dict[str, object], words: str):
     with pytest.raises(ValueError, match=words):
-        await lab_of(4).hand.obey(request_)
+        await lab_of(4).obey(request_)

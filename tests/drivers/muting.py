@@ -1,0 +1,20 @@
+"""Loopback servers that fall silent until `server.faults.clear()`."""
+
+from __future__ import annotations
+
+from drivers.sim.arcs.rtde_server import RtdeServer
+from drivers.sim.arcs.server import ArcsServer
+from drivers.sim.faults.kinds import ALWAYS, Device, Fault
+
+
+def mute(server: ArcsServer | RtdeServer) -> None:
+    """Requests are neither carried out nor answered; nothing is pushed."""
+    if isinstance(server, RtdeServer):
+        server.faults.hang(Fault(device=Device.TELEMETRY, kind="mute", count=ALWAYS))
+    else:
+        server.faults.hang(Fault(device=Device.ROBOT, kind="deaf", count=ALWAYS))
+
+
+def mute_to(server: ArcsServer, method: str) -> None:
+    """Requests of this method are carried out, but never answered."""
+    server.faults.hang(Fault(device=Device.ROBOT, kind="mute", on=method, count=ALWAYS))
