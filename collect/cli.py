@@ -22,7 +22,7 @@ app = typer.Typer(invoke_without_command=True, pretty_exceptions_enable=False)
 Rig = Annotated[Path, typer.Option(help="The rig: addresses, frames, limits.")]
 Arm = Annotated[bool, typer.Option("--arm", help="Let real hardware move.")]
 Tui = Annotated[bool | None, typer.Option("--tui/--no-tui", help="Show the screen; default: if there is a terminal.")]
-NewSheet = Annotated[int | None, typer.Option(min=1, help="Sheet N of the new session is in, as for collect.")]
+NewSheet = Annotated[int | None, typer.Option(min=1, help="Confirm that sheet N is in, as for collect.")]
 
 
 @app.callback()
@@ -34,7 +34,7 @@ def collect(
     new: Annotated[bool, typer.Option("--new", help="Start a new session although one is open.")] = False,
     sheet: Annotated[
         int | None,
-        typer.Option(min=1, help="Sheet N of the session is in: confirms a fresh one. Repeating it is safe."),
+        typer.Option(min=1, help="Confirm that sheet N of the session is in. Repeating it is safe."),
     ] = None,
     arm: Arm = False,
     dry_run: Annotated[
@@ -202,7 +202,7 @@ def loop(
     session: Annotated[Path, typer.Argument(help="The session whose presses are recovered and made again.")],
     config: Rig,
     out: Annotated[Path | None, typer.Option(help="Folder for what the loop makes; <session>/loop by default.")] = None,
-    fit: Annotated[Path | None, typer.Option(help="Brush fit; the one in use, or made, by default.")] = None,
+    fit: Annotated[Path | None, typer.Option(help="Brush fit; default: the one in use, or a new one.")] = None,
     presses: Annotated[
         int | None, typer.Option(min=1, help="Only this many presses, spread evenly over the session.")
     ] = None,
@@ -212,7 +212,7 @@ def loop(
     arm: Arm = False,
     tui: Tui = None,
 ) -> None:
-    """Recover every press from its image, press it again, compare. Run the same command again to resume."""
+    """Recover every press from its image, press it again and compare both. Run the same command again to resume."""
     from collect.chains.commands import CommandFailed
     from collect.chains.loop import LoopRequest, run_loop
     from sessions.reader import Recording
@@ -233,10 +233,10 @@ def write(
     sessions: Annotated[Path, typer.Option(help="Folder that holds sessions.")] = Path("sessions"),
     count: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written.")] = 10,
     learn: Annotated[
-        int, typer.Option(min=0, max=20, help="At most so many rounds that learn from their ink first.")
+        int, typer.Option(min=0, max=20, help="First learn from the ink, in at most this many rounds.")
     ] = 0,
     learn_count: Annotated[int, typer.Option(min=1, max=100, help="How often each is written in such a round.")] = 2,
-    practice: Annotated[bool, typer.Option(help="First write a practice sheet, and plan with its fit.")] = False,
+    practice: Annotated[bool, typer.Option(help="First write a practice sheet, and fit the brush to it.")] = False,
     data: Annotated[Path | None, typer.Option(help="hanzi-writer folder or makemeahanzi graphics.txt.")] = None,
     reference: Annotated[list[str] | None, typer.Option(help="字=picture.png: compare with this picture.")] = None,
     cell_mm: Annotated[float, typer.Option(min=10, max=500, help="Side of the character's paper cell.")] = 70.0,

@@ -25,8 +25,8 @@ RigFile = Annotated[Path, typer.Argument(help="The rig: addresses, frames, limit
 Json = Annotated[bool, typer.Option("--json", help="One JSON object instead of text.")]
 
 
-Plain = Annotated[bool, typer.Option("--plain", help="Questions in the terminal line by line, no screen.")]
-Arm = Annotated[bool, typer.Option("--arm", help="Let the arm move where a step needs it; each time a key asks again.")]
+Plain = Annotated[bool, typer.Option("--plain", help="Ask line by line in the terminal, without a screen.")]
+Arm = Annotated[bool, typer.Option("--arm", help="Let the arm move where a step needs it; a key confirms each time.")]
 
 
 @app.command()
@@ -37,20 +37,18 @@ def new(
     plain: Plain = False,
     arm: Arm = False,
 ) -> None:
-    """Lead through the first day: from an unboxed arm to a rig.toml. Run it again to go on where it was left."""
+    """Guide you through the first day, from an unboxed arm to a rig.toml. Run it again to resume."""
     _teach(rig, None, plain=plain, arm=arm)
 
 
 @app.command()
 def teach(
     step: Annotated[str, typer.Argument(help="arm, camera, tip, sheet, places, brush, force, limits or proof.")],
-    rig: Annotated[Path, typer.Option(help="The rig.toml that was made; what was taught lies beside it.")] = Path(
-        "rig.toml"
-    ),
+    rig: Annotated[Path, typer.Option(help="The rig.toml; what was taught is kept beside it.")] = Path("rig.toml"),
     plain: Plain = False,
     arm: Arm = False,
 ) -> None:
-    """Teach one step again. Only its own values change, and what depends on them, which is listed."""
+    """Teach one step again. Only its values change, and those that depend on them; the changes are listed."""
     _teach(rig, step, plain=plain, arm=arm)
 
 

@@ -75,7 +75,7 @@ class ForceTooHigh(StepError):
         self.limit_n = limit_n
         super().__init__(
             f"the force reached {force_n:.2f} N, the ceiling is {limit_n:g} N: the arm was stopped. "
-            "Look what is under the brush before going on."
+            "Look at what is under the brush before going on."
         )
 
 

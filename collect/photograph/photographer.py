@@ -201,7 +201,7 @@ class Photographer:
                         placed.append(ArmPlace(t_s, way))
                 await asyncio.sleep(POSE_PERIOD_S)
 
-        task = asyncio.create_task(note(), name="note the arm's way")
+        task = asyncio.create_task(note(), name="note the arm's path")
         try:
             yield placed
         finally:

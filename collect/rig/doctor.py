@@ -181,7 +181,7 @@ async def _robot(config: RigConfig, clock: Clock, address: str) -> Finding:
     condition = f"{state.mode}, safety {state.safety}" + _simulated(identity)
     problem = remedy = ""
     if state.safety not in MOVING_ALLOWED:
-        problem, remedy = f"safety mode is {state.safety}", "Look at the pendant; nothing is cleared from here."
+        problem, remedy = f"safety mode is {state.safety}", "Look at the pendant; this program clears nothing."
     elif state.mode not in (RobotMode.POWER_OFF, RobotMode.IDLE, RobotMode.RUNNING):
         problem, remedy = f"robot mode is {state.mode}", "Look at the pendant."
     return Finding(

@@ -59,7 +59,7 @@ class Address:
         """From `HOST` or `HOST:PORT`. Raises ValueError."""
         host, _, port = text.strip().partition(":")
         if not host or any(c.isspace() for c in host):
-            raise ValueError(f"{text!r} is no address like 192.0.2.7 or 192.0.2.7:30004")
+            raise ValueError(f"{text!r} is not an address like 192.0.2.7 or 192.0.2.7:30004")
         number = int(port) if port else 30004
         if not 1 <= number <= 65535:
             raise ValueError(f"port {number} is outside 1 to 65535")

@@ -39,7 +39,7 @@ def devices(folder: Path = Path("/dev")) -> list[str]:
 async def opened(
     source: str, clock: Clock, locked: Locked | None = None, timeout_s: float = 10.0
 ) -> AsyncGenerator[OpenCvCamera]:
-    """A connected camera, closed at the end. Raises `DeviceError`; a setting that does not hold is one."""
+    """A connected camera, closed at the end. Raises `DeviceError`, also for a setting that the camera does not keep."""
     camera = OpenCvCamera(CameraOptions(source, LATE_MS, timeout_s, locked=locked or Locked()), clock)
     await camera.connect()
     try:

@@ -41,7 +41,7 @@ class Day:
         self.notebook: Notebook = self._file.load()
 
     def save(self, notebook: Notebook) -> None:
-        """Replace what is known so far."""
+        """Replace the notebook."""
         if not self._held:
             self._file.save(notebook)
         self.notebook = notebook
@@ -96,7 +96,7 @@ class Day:
 
     @contextlib.asynccontextmanager
     async def arm(self) -> AsyncGenerator[ArmReader]:
-        """The arm that was found, to be read only."""
+        """The arm that was found, for reading only."""
         address = Address(str(self.notebook.get("robot.host")), int(self.notebook.number("robot.port")))
         framing = "bare" if self.notebook.get("robot.framing") == "bare" else "sof"
         async with reading(address, framing) as reader:
@@ -104,7 +104,7 @@ class Day:
 
     @contextlib.contextmanager
     def touched_again_if_refused(self, *kinds: str) -> Generator[None]:
-        """Forget what was touched of these kinds where it turns out to contradict itself: it is asked for again."""
+        """Forget the touches of these kinds because they contradict each other; they are asked for again."""
         try:
             yield
         except (CannotTeach, StepError):
@@ -112,7 +112,7 @@ class Day:
             raise
 
     async def touch(self, reader: ArmReader, target: Target, how: str, name: str) -> Pose | None:
-        """Have the tip brought to a thing, and note where the flange is then; None if the person skips it.
+        """Ask for the tip to be brought to a thing, and note the flange's pose there; None if the person skips it.
 
         A thing that was touched before is not asked for again. The person may jog to it where the arm is armed.
         Raises `WentBack`.

@@ -67,8 +67,8 @@ class Shown:
     lines: tuple[str, ...]
     picture: Picture | None = None
     tone: Tone = "finding"
-    """A warning can be gone on from; trouble ends the step, and its last line names the way out. Progress says what is
-    at work now, and need not be kept."""
+    """After a warning the step can go on; trouble ends it, and its last line says what to do. Progress describes the
+    current work and need not be kept."""
 
 
 @dataclass(frozen=True, slots=True)

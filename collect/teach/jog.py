@@ -67,7 +67,7 @@ class JogDay(Protocol):
         ...
 
     def arm(self) -> AbstractAsyncContextManager[ArmReader]:
-        """The arm, to be read only."""
+        """The arm, for reading only."""
         ...
 
 
@@ -129,7 +129,7 @@ async def _enabled(day: JogDay) -> AsyncGenerator[Robot]:
 
 
 def _options(book: Notebook, host: str, port: int, tool: Tool) -> ArcsOptions:
-    """As the pendant has it set, apart from the tool once that is taught."""
+    """The controller as set on the pendant, with the taught tool once there is one."""
     return ArcsOptions(host, port, *tool, framing="bare" if book.get("robot.framing") == "bare" else "sof")
 
 
@@ -150,7 +150,7 @@ def _as_set(wire: Sequence[float]) -> Tool:
 def limits_so_far(book: Notebook, flange: Pose, tool: Tool) -> Limits:
     """The smallest box around everything touched and where the hand has left the arm now, with some room.
 
-    The cone is as wide as the brush leans now: a jog turns nothing.
+    The cone is as wide as the brush leans now: a jog does not turn the brush.
     """
     offset_mm, turn_deg = tool
     here_mm = tip_of(flange, offset_mm)

@@ -16,7 +16,7 @@ from sessions.terminal import say
 BACK, SKIP, JOG, QUIT = "back", "skip", "jog", "quit"
 MARKS = {"open": "  ", "current": "->", "taught": "ok"}
 LOOK_S = 0.1
-"""Time between two looks whether a wait for a line was ended."""
+"""Interval at which a wait for a line checks whether it was ended."""
 
 
 class Lines:
@@ -46,7 +46,7 @@ class Lines:
 
 
 class PlainGuide:
-    """A person at a terminal. `back` leaves a step, `quit` or the end of the input leaves off."""
+    """A person at a terminal. `back` leaves a step, `quit` or the end of the input ends the session."""
 
     def __init__(self, pictures: Path, read: Callable[[], str | None] | None = None, descriptor: int = 0) -> None:
         """Pictures are written into the folder `pictures` and named; lines come from `read`, else from `descriptor`."""
@@ -57,7 +57,7 @@ class PlainGuide:
 
     async def overview(self, steps: tuple[StepState, ...]) -> None:
         """Print one line per step."""
-        say("", f"`{BACK}` leaves a step, `{QUIT}` leaves off, ctrl-c stops the arm; all that was taught is kept.")
+        say("", f"`{BACK}` leaves a step, `{QUIT}` ends the session, ctrl-c stops the arm; what was taught is kept.")
         for number, step in enumerate(steps, start=1):
             after = f": {step.summary}" if step.summary else f" (about {step.minutes} min)"
             say(f"{MARKS[step.state]} {number}. {step.title}{after}")
@@ -136,7 +136,7 @@ class PlainGuide:
                 case ["x" | "y" | "z" as axis, mm] if _is_step(mm, view.steps_mm):
                     return JogStep(axis, float(mm))
                 case _:
-                    say(f"  {' '.join(words)!r} is no step such as `z -0.1`")
+                    say(f"  {' '.join(words)!r} is not a step such as `z -0.1`")
 
     async def _line(self) -> str:
         answer = (await self._raw()).strip()

@@ -21,11 +21,11 @@ NAMES = {
     "aside.bus": "<host>",
     "ink.device.port": "<port>",
 }
-"""Values that name something of the lab, and what stands for each."""
+"""Values that identify the lab, and the placeholder for each."""
 
 
 async def write_first_report(path: Path, notebook: Notebook) -> None:
-    """Ask the controller word by word, where its address was typed, and write the archive. Raises OSError.
+    """Write the archive, with the controller's replies word for word if its address is known. Raises OSError.
 
     `check_report` must have passed.
     """
@@ -46,6 +46,6 @@ async def write_first_report(path: Path, notebook: Notebook) -> None:
 
 
 def _robot(notebook: Notebook) -> Finding:
-    """What is known of the arm; who it is stands in the transcript, word for word."""
+    """What is known of the arm; its identity is in the transcript, word for word."""
     how = "" if (kind := notebook.values.get("robot.kind")) is None else kind.how
     return Finding("robot", str(notebook.get("aside.address") or ""), answers=bool(how), notes=how)

@@ -18,16 +18,16 @@ from collect.teach.store import Notebook, Taught, Value
 
 ASIDE = "aside."
 HEAD = "# Made by `brushloop rig new`. Each value: how it was obtained, how well it is known, when."
-UNPROVEN = "# NOT PROVEN: `brushloop rig teach proof --arm` has not been done since something was taught."
+UNPROVEN = "# NOT PROVEN: `brushloop rig teach proof --arm` has not been run since the last value was taught."
 PROVEN = "# Proven by a dry run, a touch, the self-check and a judged press"
 UNTRIED = """\
-# What the software that wrote this has never been tried on: a real cabinet. What would tell:
+# The software that wrote this file has never been tried on a real cabinet. A difference would show in:
 #   framing, ports, modes: step 1 of `brushloop rig new`; flange poses: the residuals of step 3;
 #   speeds and stops: the dry run of the last step; forces: the push in the step of the brush."""
 
 
 def rig_of(notebook: Notebook, rig_path: Path) -> RigConfig:
-    """The configuration that the notebook makes, without the environment's overrides. Raises `ConfigError`."""
+    """The configuration that the notebook gives, without overrides from the environment. Raises `ConfigError`."""
     try:
         rig = RigConfig.model_validate(_tables(notebook, rig_path))
     except ValidationError as error:
@@ -86,14 +86,14 @@ def _tables(notebook: Notebook, rig_path: Path) -> dict[str, Any]:
 
 
 def _rounded(value: Value) -> Any:
-    """Round a value as it is written: no value is known better than 0.001 mm or 0.0001 deg."""
+    """Round a value for the file: no value is known better than 0.001 mm or 0.0001 deg."""
     if isinstance(value, list):
         return [_rounded(v) for v in value]
     return round(value, 4) + 0.0 if isinstance(value, float) else value
 
 
 def _toml(value: Value) -> str:
-    """A value as TOML; JSON writes the same numbers, texts and lists, and truth values alike."""
+    """A value as TOML, which writes numbers, strings, lists and booleans as JSON does."""
     return json.dumps(_rounded(value), ensure_ascii=False)
 
 

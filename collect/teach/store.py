@@ -68,7 +68,7 @@ class Notebook(Config):
 
     schema_version: Literal[1] = 1
     values: dict[FieldName, Taught] = Field(default_factory=dict[str, Taught], max_length=300)
-    """By the path of the field in `rig.toml`; `aside.` marks what is no field of it."""
+    """By the path of the field in `rig.toml`; `aside.` marks values that are not in it."""
     touches: dict[ThingName, Touch] = Field(default_factory=dict[str, Touch], max_length=300)
     """By what was touched: `pin 0`, `board-corner lower left 1`."""
     done: dict[StepName, str] = Field(default_factory=dict[StepName, str])

@@ -1,4 +1,4 @@
-"""Where the arm is and what the camera sees while a person works: read beside the steps, and only to be looked at."""
+"""Where the arm is and what the camera sees while a person works: for display only, no step depends on it."""
 
 from __future__ import annotations
 

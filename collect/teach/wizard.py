@@ -17,7 +17,7 @@ from collect.teach.steps import all_steps
 from collect.teach.store import Notebook, StepName, Value
 from drivers.errors import DeviceError
 
-AGAIN, LEAVE = Choice("a", "try this step again"), Choice("q", "leave off; what was taught is kept")
+AGAIN, LEAVE = Choice("a", "try this step again"), Choice("q", "stop here; what was taught is kept")
 SAME = 1e-6
 Refused = CannotTeach | DeviceError | CalibrationError | StepError | ConfigError
 
@@ -33,7 +33,7 @@ class Wizard:
         """Teach every step that is not done, then write `rig.toml`; returns its path.
 
         It is written before the proof too, and says then that it is not proven. Raises `CollectAborted` where the
-        person leaves off: the same command resumes from there.
+        person stops: the same command resumes from there.
         """
         for step in self._steps:
             if step.name in self._day.notebook.done:
@@ -47,7 +47,7 @@ class Wizard:
     async def again(self, name: str) -> Path | None:
         """Teach one step again; returns the path of `rig.toml` if it could be written.
 
-        Raises `ConfigError` for a name that is none, otherwise as `run` does.
+        Raises `ConfigError` for an unknown name, otherwise as `run` does.
         """
         step = next((one for one in self._steps if one.name == name), None)
         if step is None:
@@ -74,23 +74,23 @@ class Wizard:
                 await self._derive(step, before)
                 return
             except LeftOff:
-                raise CollectAborted("left off; the same command resumes from there") from None
+                raise CollectAborted("stopped; the same command resumes from there") from None
             except WentBack:
-                await self._day.say("This step was left; it begins again where it was.")
+                await self._day.say("The step was interrupted; it will go on where it was.")
             except (CannotTeach, DeviceError, CalibrationError, StepError, ConfigError) as error:
                 await self._day.say(*_in_lines(error), tone="trouble")
             await self._ask_again()
 
     async def _ask_again(self) -> None:
         try:
-            answer = await self._day.guide.choose("How to go on?", (AGAIN, LEAVE), AGAIN.key)
+            answer = await self._day.guide.choose("How do you want to go on?", (AGAIN, LEAVE), AGAIN.key)
         except (LeftOff, WentBack):
             answer = LEAVE.key
         if answer == LEAVE.key:
-            raise CollectAborted("left off; the same command resumes from there")
+            raise CollectAborted("stopped; the same command resumes from there")
 
     async def _derive(self, step: Step, before: Notebook) -> None:
-        """Finish a step: compute what depends on it again, and list what that changed. Proofs of the past are void."""
+        """Finish a step: compute again what depends on it, list what changed, and void an earlier proof."""
         notebook = self._day.notebook
         dependent = self._resting_on(step.name)
         for one in self._steps:

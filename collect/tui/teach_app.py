@@ -21,13 +21,13 @@ from collect.tui.themes import chosen_file
 from collect.tui.widgets import HelpScreen
 
 Work = Callable[[ScreenGuide], Coroutine[Any, Any, Path | None]]
-AT_WORK = ("Something is at work: stop it and leave?", "y  stop and leave      n  go on      s  stop now")
+AT_WORK = ("A step is running: stop it and leave?", "y  stop and leave      n  go on      s  stop now")
 STOPPED = "Stopped. Look at the arm before you go on.\ng  go on from the last question   q  leave, all is kept"
 DONE = "This is done.   q  leave"
 HELP = f"""\
-enter     take the answer that is offered, or: the tip is there
-esc       leave this step; it begins again where it was
-k         skip this thing, where the step can do without it
+enter     accept the suggested answer, or confirm that the tip is there
+esc       leave this step; it can be taken up again where it was
+k         skip this point, where the step can do without it
 q         leave; everything taught is kept, the same command resumes
 ctrl-q    the same while you type
 s, ctrl-c stop the arm at once (ctrl-c while you type)
@@ -37,8 +37,8 @@ j         with --arm: bring the tip the last millimetres by keys
 
 Jog: arrows move along base x and y, page up and down along z, 1 to 4
 choose the size of a step. Every step is checked against the box that is
-known so far: 25 mm around all that was touched and where your hand left
-the arm, 5 mm below. The arm makes it at 20 mm/s.
+known so far: 25 mm around all touched points and where your hand left the
+arm, and 5 mm below. The arm moves at 20 mm/s.
 
 {SOFTWARE_STOP}"""
 

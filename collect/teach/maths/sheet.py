@@ -25,7 +25,7 @@ WORST_CORNER_MM = 3.0
 WORST_SCALE = 0.004
 """Relative error of the board's size from which the print is doubted: 1 mm over a page."""
 ASKEW_DEG = 0.5
-"""A sheet turned by more against its board is to be laid straight: `rig.toml` knows one turn for both."""
+"""A sheet that is turned by more against its board must be laid straight: `rig.toml` has one turn for both."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ def check_board(board: Mapping[str, Sequence[Point]], spec: BoardSpec) -> None:
     if problem := mixed_up(CORNERS, touched, printed):
         raise CannotTeach(
             f"the corners of the board {problem}.",
-            "The print's name stands along its lower edge; seen from above the corners follow counter-clockwise.",
+            "The name on the print is along its lower edge; seen from above, the corners follow counter-clockwise.",
         )
     scale = _scale(printed, touched)
     distances = _distances(printed * scale, touched)
@@ -74,11 +74,11 @@ def check_board(board: Mapping[str, Sequence[Point]], spec: BoardSpec) -> None:
         raise CannotTeach(
             f"the corners of the board do not form its rectangle of {width_mm:g} x {height_mm:g} mm (off by, in mm: "
             f"{listed}).",
-            "Touch the corner that is off again, or correct what was said of the print in the camera's step.",
+            "Touch the corner that is off again, or correct the description of the print in the camera step.",
         )
     if abs(scale - 1.0) > WORST_SCALE:
         raise CannotTeach(
-            f"the board is {100.0 * scale:.1f} % of the size that its print gives: its squares measure "
+            f"the board is {100.0 * scale:.1f} % of its printed size: its squares measure "
             f"{scale * spec.square_mm:.2f} mm, not {spec.square_mm:g} mm.",
             "Print it again at 100 %, without `fit to page`, or measure ten squares with calipers and teach the camera "
             "again with that size.",

@@ -22,7 +22,7 @@ MIDDLE = 0.5
 LEAST_CONTRAST = 12.0
 """Least difference in gray levels between the board's pattern and the plain sheet, as standard deviations along it."""
 TIMES_PLAIN = 2.5
-"""Least ratio of the two: a board without a sheet is no plain paper."""
+"""Least ratio of the two: a board without a sheet must not pass for plain paper."""
 OFF_MM = 2.5
 """A touched edge that the camera sees farther off than this is doubted: hand and camera together err by 1 mm."""
 SIDES = ("left", "right", "lower", "upper")

@@ -17,15 +17,15 @@ from drivers.samples import Pose
 Floats = NDArray[np.float64]
 LEAST_TOUCHES = 4
 WORST_CONDITION = 60.0
-"""Above this the directions are so alike that errors of the touches appear many times larger in the length. A wrist
-that turns along with the lean makes all of them one: the same side of the flange is always up."""
+"""Above this the directions are so similar that errors of the touches appear many times larger in the length. If the
+wrist turns along with the lean, all directions are the same: one side of the flange is always up."""
 OUTLIER_SHARE = 4.0
 """A touch whose residual exceeds the others' standard deviation by this factor is named as a slip."""
 LEAST_OUTLIER_MM = 1.0
 ELSEWHERE_MM = 10.0
 """A touch that lies farther than this from where the others agree was not made at the pin."""
 HAND_MM = 0.15
-"""No hand touches better, in one axis: a few touches that agree by chance do not prove otherwise."""
+"""Smallest plausible error of a touch by hand, in one axis: a few touches may agree by chance."""
 
 
 @dataclass(frozen=True, slots=True)

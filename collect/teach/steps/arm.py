@@ -1,4 +1,4 @@
-"""Step 1: find the arm. Its address is asked; everything else is read, and nothing is set, powered or moved."""
+"""Step 1: find the arm. Its address is asked for; everything else is read, and nothing is set, powered or moved."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class ArmStep:
         if cabinet.safety_mode not in MOVING_ALLOWED:
             await day.say(
                 f"The safety mode is {cabinet.safety_mode}: the arm cannot be guided by hand until it is released.",
-                "Look at the pendant; nothing is cleared from here.",
+                "Look at the pendant; this program clears nothing.",
                 tone="warning",
             )
         rtde = await self._rtde(day, address)
@@ -71,21 +71,21 @@ class ArmStep:
         day.keep("arm", "robot.kind", "aubo-arcs", f"{cabinet.model} ({cabinet.box}) answered, {cabinet.firmware}")
         day.keep("arm", "robot.host", address.host, "typed, and answered")
         day.keep("arm", "robot.port", address.port, "answered")
-        day.keep("arm", "robot.framing", cabinet.framing, "the first that was answered")
+        day.keep("arm", "robot.framing", cabinet.framing, "the first that the controller answered")
         if rtde is not None:
-            day.keep("arm", "robot.rtde_port", rtde, "answered: poses are pushed")
+            day.keep("arm", "robot.rtde_port", rtde, "answered, and sends poses")
         day.keep("arm", "robot.payload_kg", cabinet.payload_kg, "as set on the pendant", unit="kg", known="not weighed")
         cog_mm = [float(v) for v in cabinet.payload_cog_mm]
         day.keep("arm", "robot.payload_cog_mm", cog_mm, "as set on the pendant", unit="mm", known="not measured")
         if cabinet.collision_level:
             day.keep("arm", "robot.collision_level", cabinet.collision_level, "as set on the pendant")
         day.keep("arm", "aside.pendant_tcp_mm", [float(v) for v in cabinet.tcp_mm_deg[:3]], "as set on the pendant")
-        day.keep("arm", "aside.simulated", cabinet.simulated, "as the controller says")
+        day.keep("arm", "aside.simulated", cabinet.simulated, "as the controller reports")
 
     async def _rtde(self, day: Day, address: Address) -> int:
         if address.port == Address("").port:
             return RTDE_PORT
-        question = f"Port that pushes poses ({RTDE_PORT} on a cabinet; Enter if there is none other)"
+        question = f"Port that sends poses ({RTDE_PORT} on a cabinet; press Enter unless yours differs)"
         text = await day.guide.text(question, str(RTDE_PORT))
         return int(text) if text.isdecimal() and 0 < int(text) < 65536 else RTDE_PORT
 
@@ -94,7 +94,7 @@ class ArmStep:
         return {}
 
     def forget(self, notebook: Notebook) -> Notebook:
-        """The address stays as the suggestion."""
+        """Keep the address as the suggestion."""
         return notebook
 
     def summary(self, notebook: Notebook) -> str:
@@ -103,7 +103,7 @@ class ArmStep:
 
 
 def doubtful_tool(cabinet: Cabinet) -> str:
-    """What is wrong with the tool set on the pendant, and what it means; empty if it could be one."""
+    """What is wrong with the tool set on the pendant, and what it means; empty if it is plausible."""
     length_mm = math.hypot(*cabinet.tcp_mm_deg[:3])
     if length_mm > LONGEST_TOOL_MM:
         if SHORTEST_TOOL_MM <= length_mm / 1e3 <= LONGEST_TOOL_MM:
@@ -111,7 +111,7 @@ def doubtful_tool(cabinet: Cabinet) -> str:
                 f"The pendant's tool is {length_mm / 1e3:.0f} m long: millimetres were typed where metres are taken, "
                 f"and {length_mm / 1e3:.0f} mm are meant. It is measured in the third step and replaced"
             )
-        return f"The pendant's tool is {length_mm:.0f} mm long, which no brush is. It is measured in the third step"
+        return f"The pendant's tool is {length_mm:.0f} mm long: no brush is. It is measured in the third step"
     if 0.0 < length_mm < 1.0:
         return (
             f"The pendant's tool is {length_mm:.3f} mm long: metres were typed where millimetres are taken, and "

@@ -58,7 +58,7 @@ class BrushStep:
         kind = await day.guide.choose("What keeps the ink well filled?", (NONE, STATION, PUMP), NONE.key)
         config: InkDeviceConfig | None = None
         if kind != NONE.key:
-            port = await day.guide.text("Its serial line, as /dev/ttyUSB0", "")
+            port = await day.guide.text("Its serial line, such as /dev/ttyUSB0", "")
             config = await self._device(day, kind, port)
         name = await day.guide.text("Name of the ink, for the record", "ink")
         with day.together():

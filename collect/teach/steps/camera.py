@@ -87,7 +87,7 @@ class CameraStep:
             await self._keep_lens(day, folder, fitted)
 
     def _folder(self, day: Day) -> Path:
-        """Where the photographs of the lens are, so that a session that was cut does not take them again."""
+        """Where the photographs of the lens are, so that a resumed session does not take them again."""
         if "aside.lens_folder" not in day.notebook.values:
             names = (f"{day.rig_path.stem}.lens-{number}" for number in itertools.count(1))
             name = next(name for name in names if not (day.rig_path.parent / name).exists())
@@ -100,7 +100,7 @@ class CameraStep:
         found = devices()
         if found:
             await day.say(f"Video devices of this computer: {', '.join(found)}")
-        question = "Address of the camera's stream, as http://192.0.2.8/stream.mjpg (several: with spaces between them)"
+        question = "Address of the camera's stream, as http://192.0.2.8/stream.mjpg (several: separated by spaces)"
         typed = (await day.guide.text(question, "")).split()
         seen = {source: await self._looked_at(day, source) for source in dict.fromkeys([*typed, *found])}
         usable = {source: look for source, look in seen.items() if look is not None}
@@ -193,7 +193,7 @@ class CameraStep:
     async def _lens(self, day: Day, folder: Path, take: Take) -> Fitted | None:
         """Have the board held before the camera until the lens is known and its picture covered.
 
-        None if the person skips it from the start: a lens that bends nothing needs no file.
+        None if the person skips it from the start: a lens without distortion needs no file.
         """
         spec, views = board_of(day.notebook), list[BoardView]()
         for path in sorted(folder.glob("*.png")):
@@ -206,7 +206,7 @@ class CameraStep:
                 break
             where = HOLD[index] if index < len(HOLD) else "where it is still missing"
             if not await self._held(day, folder / name, where, take, views) and not views:
-                await day.say("Without the lens: straight lines must look straight in the picture.", tone="warning")
+                await day.say("Without a lens file, straight lines must look straight in the picture.", tone="warning")
                 return None
             if views and (todo := still_missing(views)):
                 await day.say(*todo, picture=coverage_picture(views))

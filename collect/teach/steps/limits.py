@@ -24,8 +24,8 @@ BELOW_MM = 2.0
 """Room below the deepest press and the dip, for a sheet that is found a little lower."""
 DEFAULTS: tuple[tuple[str, float, str, float, str], ...] = (
     ("robot.limits.tilt_deg", 15.0, "deg", 30.0, "Widest lean of the brush"),
-    ("robot.limits.speed_mm_s", 150.0, "mm/s", 500.0, "Fastest speed of the tip, in anything"),
-    ("robot.limits.acc_mm_s2", 800.0, "mm/s2", 5000.0, "Largest acceleration, in anything"),
+    ("robot.limits.speed_mm_s", 150.0, "mm/s", 500.0, "Highest speed of the tip in any motion"),
+    ("robot.limits.acc_mm_s2", 800.0, "mm/s2", 5000.0, "Highest acceleration in any motion"),
     ("motion.travel_speed_mm_s", 100.0, "mm/s", 500.0, "Speed of travel above the sheet"),
     ("motion.press_speed_mm_s", 15.0, "mm/s", 100.0, "Speed down into a press"),
     ("motion.acc_mm_s2", 500.0, "mm/s2", 5000.0, "Acceleration of travel and press"),

@@ -194,7 +194,7 @@ def check_pot(notebook: Notebook, rim: str, middle: str, what: str) -> str:
     radius_mm = math.dist((rim_x, rim_y), (x, y))
     if not LEAST_RADIUS_MM <= radius_mm <= MOST_RADIUS_MM:
         raise CannotTeach(
-            f"the dip is {radius_mm:.0f} mm from the rim of the {what}, seen from above, which no {what} is wide.",
+            f"the dip is {radius_mm:.0f} mm from the rim of the {what}, seen from above: no {what} is that wide.",
             f"Teach the {what} again: its rim, then its middle.",
         )
     if z >= rim_z:
@@ -218,8 +218,8 @@ def check_wipe(notebook: Notebook) -> None:
     width, height = notebook.numbers("paper.size_mm")
     if not LEAST_RADIUS_MM <= radius_mm <= MOST_RADIUS_MM or z_mm <= dip_z:
         raise CannotTeach(
-            f"that place is {radius_mm:.0f} mm from the middle of the well and {z_mm - dip_z:+.1f} mm above the bottom "
-            "of a dip, which no rim is.",
+            f"that place is {radius_mm:.0f} mm from the middle of the well and {z_mm - dip_z:+.1f} mm above the "
+            "bottom of a dip: no rim can be there.",
             "Touch the rim of the same well; only this place is asked again.",
         )
     if 0.0 <= x <= width and 0.0 <= y <= height:

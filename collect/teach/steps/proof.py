@@ -35,7 +35,7 @@ POLL_S = 0.1
 
 
 class ProofStep:
-    """Only what has passed this is ready."""
+    """Prove the whole rig; it is ready once it has passed."""
 
     name: StepName = "proof"
     title = "Proof"
@@ -51,7 +51,7 @@ class ProofStep:
         await day.may_move(f"Dry run, {ABOVE_MM:g} mm above the sheet")
         with tempfile.TemporaryDirectory(prefix="brushloop-proof-") as folder:
             await self._run(day, Path(folder), protocol, dry=True)
-        await day.say("The dry run made every move of a press, and nothing was met.")
+        await day.say("The dry run made every move of a press without touching anything.")
         await day.may_move(
             f"Touch the sheet, press three marks and {PRESSES} strokes: the well must hold ink, the sheet be blank"
         )
@@ -131,7 +131,8 @@ class ProofStep:
             f"touch height {z_mm:.3f} mm ({z_mm - by_hand_mm:+.2f} mm from the touch by hand), {known}",
             f"self-check: marks {proven.offset_mm[0]:+.1f}, {proven.offset_mm[1]:+.1f} mm from where they were "
             f"commanded, turned by {proven.turn_deg:+.2f} deg",
-            f"{proven.sound} presses were judged sound, {proven.again} were made again; camera delay {delay_ms:.0f} ms",
+            f"{proven.sound} presses passed the quality checks, {proven.again} were repeated; "
+            f"camera delay {delay_ms:.0f} ms",
         )
         if delay_ms > SLOW_CAMERA_MS:
             await day.say(
@@ -204,7 +205,7 @@ def read_proof(session: Path) -> Proven:
         why = sorted({str(press["verdict"]) or "left out" for press in presses if press not in sound})
         raise CannotTeach(
             f"{len(sound)} of {PRESSES} presses were judged sound ({', '.join(why) or 'the others were not made'}).",
-            "Look at their pictures above: ink, light, sheet; then prove again.",
+            "Look at their pictures above: ink, light, sheet; then run the proof again.",
         )
     if not touch or not check:
         raise CannotTeach("the run had no touch or no self-check.", "Report this as a defect.")

@@ -17,9 +17,9 @@ WORST_MM = 0.35
 UNKNOWN_MM = 20.0
 """Error above which no place of the tip is shown."""
 LEAST_UPRIGHTS, UPRIGHTS = 3, 12
-"""Times that the brush is held against a set square, each with another turn of the wrist. Nothing but a few degrees of
-set bends an upright brush along the heading: an error of 0.12 deg across it turns every mark by 5 deg, which is judged
-bent. Twelve times, each to 0.15 deg, leave 0.04 deg."""
+"""Times that the brush is held against a set square, each with another turn of the wrist. An upright brush bends along
+the heading only by the few degrees of its set, so an error of 0.12 deg across the heading turns every mark by 5 deg,
+and the mark is judged bent. Twelve times, each accurate to 0.15 deg, leave 0.04 deg."""
 LEAST_LEAN = 3.0
 """A lean of the brush against the flange counts from this many standard errors."""
 SIDES = ("away from you", "to the right", "toward you", "to the left")
@@ -45,7 +45,7 @@ class TipStep:
             for index in range(UPRIGHTS):
                 how = (
                     f"Upright {index + 1} of {UPRIGHTS}: the brush upright along the set square"
-                    f"{', the wrist turned otherwise than before' if index else ''}, anywhere over the table."
+                    f"{', the wrist turned differently than before' if index else ''}, anywhere over the table."
                 )
                 if await day.touch(reader, Target("upright", index, may_skip=True), how, f"upright {index}") is None:
                     break
@@ -58,7 +58,7 @@ class TipStep:
                 continue
             how = (
                 f"Touch {index + 1}: bring the tip to the pin, the brush leaning by 30 deg or more "
-                f"{SIDES[index % 4]}; lean it without turning the wrist along."
+                f"{SIDES[index % 4]}; lean it without turning the wrist with it."
             )
             await day.touch(reader, Target("pin", index, may_skip=True), how, f"pin {index}")
             if await self._known(day):
@@ -89,7 +89,7 @@ class TipStep:
             return False
         x, y, z = fit.offset_mm
         if fit.error_mm > UNKNOWN_MM:
-            more = f"{len(touches)} touches do not tell yet where the tip is; if Enter was pressed too early, the next"
+            more = f"{len(touches)} touches do not give the tip yet; if Enter was pressed too early, the next"
             await day.say(f"{more} touches will show which one lies off.", tone="warning")
             return False
         await day.say(

@@ -32,7 +32,7 @@ TRAPPED = dict(zip(range(20, 30), Trap, strict=True))
 NAMED = {
     Trap.SWAPPED_CORNER: r"are swapped|as in a mirror",
     Trap.MIRRORED_CAMERA: r"mirrored.*Switch mirroring",
-    Trap.WRONG_BOARD_SIZE: r"% of the size that its print gives.*Print it again at 100 %",
+    Trap.WRONG_BOARD_SIZE: r"% of its printed size.*Print it again at 100 %",
     Trap.PARK_IN_PICTURE: r"the parked arm, or its shadow, is in the picture.*Park it farther",
     Trap.SHEET_OUT_OF_REACH: r"nearer to",
     Trap.OLD_SOFTWARE: r"older software AUBOPE.*upgrade to ARCS",

@@ -73,7 +73,7 @@ def test_the_arm_travels_above_the_rim_of_the_pot_of_water_too() -> None:
     [
         ((236.0, 40.0, 133.0), "would end over the sheet"),
         ((420.0, 40.0, 133.0), "120 mm from the middle of the well"),
-        ((316.0, 40.0, 121.0), "which no rim is"),
+        ((316.0, 40.0, 121.0), "no rim can be there"),
     ],
 )
 def test_a_wipe_that_cannot_be_one_is_refused_with_the_way_out(rim: tuple[float, float, float], said: str) -> None:

@@ -53,7 +53,7 @@ class InLab:
     async def choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
         self._asked(question)
         keys = {choice.key for choice in choices}
-        if question.startswith("How to go on"):
+        if question.startswith("How do you want to go on"):
             if self.mends:
                 await self._in_lab(self.lab.mend())
                 self.mends = False
