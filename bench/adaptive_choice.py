@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.brushfit_presses import CELLS
+from calibrate.fit.captures import SPREAD_MM, Grid
 from calibrate.fit.fit import STRAYS, draw
 from calibrate.fit.prior import Prior
-from calibrate.fit.strokes import SPREAD_MM, Grid
 from model.fitted import MODES, NAMES, PARAMETERS, FittedPress, command_terms
 
 Floats = NDArray[np.float64]

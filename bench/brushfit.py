@@ -4,7 +4,7 @@ Brushes: the five frozen ones of the loopback rig, and two of an independent bri
 as 0 or 1 at 0.3 mm a pixel over cells that no training stroke came from; the ceiling is the majority of the other
 presses of the same cell. Nothing of a brush's own family is in the prior that it is fitted with.
 
-Cells: the first of the fixed design (`calibrate.fit.design`), or any. Each draw takes other presses of them.
+Cells: the first of the fixed design (`calibrate.spread`), or any. Each draw takes other presses of them.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from bench.brushfit_brushes import DEVELOPMENT, FROZEN
 from bench.brushfit_presses import BRISTLE_SETS, CELLS, BrushPresses, Chosen, bristles, simulated
 from bench.brushfit_prior import BRISTLE, RIG
 from bench.harness import BenchError, Result, machine
-from calibrate.fit.design import spread_out
+from calibrate.fit.captures import Grid
 from calibrate.fit.fit import fit_presses
 from calibrate.fit.heldout import RefittedBezier, image_of, predictor, refit_bezier
 from calibrate.fit.prior import Prior, learned
-from calibrate.fit.strokes import Grid
+from calibrate.spread import spread_out
 from model.fitted import FittedPress
 
 DRAWS = 10

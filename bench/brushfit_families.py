@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.fit.strokes import Grid, Pressed
+from calibrate.fit.captures import Grid, Pressed
 from model.fitted import chance_within
 
 Floats = NDArray[np.float64]

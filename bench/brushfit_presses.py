@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from bench.harness import BenchError
 from calibrate.compare.field import Field
-from calibrate.fit.captures import read_presses
-from calibrate.fit.strokes import Grid, Pressed
+from calibrate.fit.captures import Grid, Pressed, read_presses
 from drivers.sim.brush.brush import Brush, BrushSpec
 from drivers.sim.brush.paper import Footprint
 from sessions.imports.photographs import ImportOptions, import_photographs

@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from bench.brushfit_brushes import DEVELOPMENT
 from bench.brushfit_families import BRUSHES, FAMILIES, made_up
 from bench.brushfit_presses import BRISTLE_SETS, CELLS, BrushPresses, bristles, grid, simulated
+from calibrate.fit.captures import Grid, Pressed
 from calibrate.fit.fit import fit_presses
 from calibrate.fit.prior import FILE, KnownBrush, KnownBrushes, wide
-from calibrate.fit.strokes import Grid, Pressed
 
 SIMULATED_REPEATS = 2
 RIG, BRISTLE = "loopback rig", "bristle simulation"

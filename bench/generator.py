@@ -16,10 +16,9 @@ from bench.learning_to_paint import LearningToPaint
 from model.generator.basis import fit_basis
 from model.generator.metrics import Quality, quality
 from model.generator.network import Generator, parameter_count
-from model.train.batches import batches
 from model.train.checkpoint import State, put_weights
 from model.train.config import TrainConfig, preset
-from model.train.data import Exact, batch_numbers, exact_sets
+from model.train.data import Exact, batch_numbers, batches, exact_sets
 from model.train.distributed import Group
 from model.train.loop import Validation, learning_rate, new_state, train
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bench.harness import BenchError
 from calibrate.drags.captures import Drawn, commanded_path
-from calibrate.drags.defects import defects
+from calibrate.drags.measure import defects
 from sessions.recording.schemas import Header, Source
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

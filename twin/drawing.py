@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.fit.strokes import Grid
+from calibrate.fit.captures import Grid
 from drivers.sim.brush.brush import Brush, BrushSpec, Descent
 from drivers.sim.brush.paper import Footprint
 from twin.constants import INK, SPREAD, Offset

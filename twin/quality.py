@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibrate.fit.strokes import Grid
+from calibrate.fit.captures import Grid
 from drivers.sim.brush.spec import BrushSpec
 from drivers.sim.config import SoundHead
 from twin.constants import Offset

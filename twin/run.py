@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calibrate.fit.captures import Grid, Pressed
 from calibrate.fit.heldout import (
     BEZIER,
     CEILING,
@@ -23,7 +24,6 @@ from calibrate.fit.heldout import (
     image_of,
     refit_bezier,
 )
-from calibrate.fit.strokes import Grid, Pressed
 from drivers.sim.brush.spec import BrushSpec
 from drivers.sim.config import SoundHead
 from sessions.progress import Progress, unseen

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from calibrate.fit.captures import Grid
 from calibrate.fit.heldout import Images
-from calibrate.fit.strokes import Grid
 from drivers.sim.brush.spec import BrushSpec
 from twin.constants import Offset
 from twin.drawing import Cell, draw

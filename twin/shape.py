@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.fit.strokes import Grid
+from calibrate.fit.captures import Grid
 from drivers.sim.brush.spec import BrushSpec
 from twin.constants import SHAPE, Vector, brush_at, offset_at, search_bounds
 from twin.drawing import Cell, Images, draw, still

@@ -13,8 +13,8 @@ from itertools import combinations
 import numpy as np
 
 from calibrate.compare.similarity import csim
+from calibrate.fit.captures import Grid
 from calibrate.fit.heldout import FEWEST_REPEATS
-from calibrate.fit.strokes import Grid
 from drivers.sim.brush.spec import BrushSpec
 from twin.constants import SPREAD, Offset, Vector, with_values
 from twin.drawing import Cell, Images, draw

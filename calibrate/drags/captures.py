@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.calibration import Calibration
-from calibrate.drags.defects import FLAGGED_WEIGHT, prepare_drag
-from calibrate.drags.measure import DEPTH_NAMES, LENGTH_NAME
+from calibrate.drags.measure import DEPTH_NAMES, FLAGGED_WEIGHT, LENGTH_NAME, prepare_drag
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.session import calibration_of
 from calibrate.stroke.params import PX_PER_MM, Params
@@ -63,7 +62,7 @@ class Drawn:
     commands: Floats | None
     """(B, 5) `COMMANDS` of imported strokes; None for figures, which no five numbers describe."""
     flags: list[tuple[str, ...]]
-    """Defects of each image (`calibrate.drags.defects`)."""
+    """Defects of each image (`calibrate.drags.measure.defects`)."""
     ends: str
     """The column that gave the depth at the ends; empty where there was none."""
 

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.compare.similarity import binary_scores
-from calibrate.drags.artefact import DragArtefact, Stamps
+from calibrate.drags.artefact import DragArtefact, Kept, Stamps
 from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, DragFit, chance, fit_drags
-from calibrate.drags.kept import Kept
 from calibrate.drags.residual import Residual, captured_distance, clipped, threshold
 from calibrate.errors import CalibrationError
 from model.drag import DragModel, distances, trails

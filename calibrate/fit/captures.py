@@ -1,4 +1,4 @@
-"""The presses of a recorded session as images around the point of touch, for the fit."""
+"""The data of a fit: the presses of a recorded session as images around the point of touch."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from calibrate.calibration import Calibration
 from calibrate.compare.field import SIZE_PX, Field
 from calibrate.compare.images import brush_of, prepare_press
 from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.fit.strokes import Grid, Pressed
 from calibrate.session import calibration_of
 from calibrate.stroke.params import Params
 from sessions.errors import SessionDamaged
@@ -20,7 +20,33 @@ from sessions.progress import Progress, counted, unseen
 from sessions.reader import Recording
 from sessions.recording.schemas import Header
 
+Floats = NDArray[np.float64]
+
+SPREAD_MM = 0.15
+"""Variation of an edge from press to press (scale of a logistic)."""
 MARGIN_MM = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Pixel centres of an image around the point of touch, mm: x toward the heel, y upward."""
+
+    x_mm: Floats
+    y_mm: Floats
+
+    @property
+    def px_mm(self) -> float:
+        """The pixel's side."""
+        return float(self.x_mm[1] - self.x_mm[0])
+
+
+@dataclass(frozen=True, slots=True)
+class Pressed:
+    """One captured press: its command and its ink, (len(y_mm), len(x_mm)) from 0 to 1."""
+
+    height_mm: float
+    tilt_deg: float
+    ink: NDArray[np.floating]
 
 
 @dataclass(frozen=True, slots=True)

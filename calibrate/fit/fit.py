@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.fit.captures import SPREAD_MM, Grid, Pressed
 from calibrate.fit.prior import Prior, learned, spreads, wide
 from calibrate.fit.residual import fit_residual
-from calibrate.fit.strokes import SPREAD_MM, Grid, Pressed
 from model.fitted import NAMES, PARAMETERS, FittedPress, chance_within, published
 from sessions.progress import Progress, counted, unseen
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from calibrate.compare.images import draw_loop
 from calibrate.compare.similarity import csim, ssim
+from calibrate.fit.captures import SPREAD_MM, Grid, Pressed
 from calibrate.fit.fit import Fit, refit
-from calibrate.fit.strokes import SPREAD_MM, Grid, Pressed
 from model.fitted import FittedPress
 from model.loops import BEZIER_PIECES, Loop, bezier_side, closed
 from model.plane import Plane, fit_plane

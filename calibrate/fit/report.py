@@ -10,10 +10,9 @@ import numpy as np
 
 from calibrate.compare.similarity import csim
 from calibrate.files import write_whole
-from calibrate.fit.captures import Captures
+from calibrate.fit.captures import Captures, Floats, Grid, Pressed
 from calibrate.fit.heldout import CEILING, FITTED, UNCALIBRATED, Cell, by_cell, predictor
 from calibrate.fit.run import Fitted
-from calibrate.fit.strokes import Floats, Grid, Pressed
 from calibrate.report import (
     BLUE,
     ORANGE,

@@ -16,7 +16,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.fit.strokes import SPREAD_MM, Grid, Pressed
+from calibrate.fit.captures import SPREAD_MM, Grid, Pressed
 from model.fitted import MODES, TERMS, FittedPress, command_terms, modes
 
 Floats = NDArray[np.float64]

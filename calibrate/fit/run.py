@@ -10,11 +10,10 @@ from pathlib import Path
 from calibrate.artefact import FittedValue, put_to_use
 from calibrate.compare.field import Field
 from calibrate.fit.artefact import FOLDER, BrushFit, FittedStage
-from calibrate.fit.captures import Captures
+from calibrate.fit.captures import Captures, Grid, Pressed
 from calibrate.fit.fit import STAGES, Fit, fit_presses, zero_touch
 from calibrate.fit.heldout import HeldOut, by_cell, leave_cell_out
 from calibrate.fit.prior import wide
-from calibrate.fit.strokes import Grid, Pressed
 from model.fitted import NAMES, PARAMETERS
 from sessions.progress import Progress, unseen
 

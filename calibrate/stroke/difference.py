@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from calibrate.errors import CaptureRefused
-from calibrate.stroke.light import LIGHT_ROUNDS
 from calibrate.stroke.params import Floats, Gray, Mask, Soft
+from calibrate.stroke.preprocess import LIGHT_ROUNDS
 
 DARK_SHARE = 0.6
 """A pixel darker than this share of the paper held ink before: new ink on top of it cannot be seen."""

@@ -15,10 +15,9 @@ import numpy as np
 from calibrate.compare.field import SIZE_PX, Field
 from calibrate.compare.images import Pixels, brush_of, loop_pixels, unpack
 from calibrate.fit.artefact import BrushFit
-from calibrate.fit.captures import MARGIN_MM, grid_of
+from calibrate.fit.captures import MARGIN_MM, Grid, Pressed, grid_of
 from calibrate.fit.fit import refit
 from calibrate.fit.heldout import BEZIER_SIZES, RefittedBezier, refit_bezier
-from calibrate.fit.strokes import Grid, Pressed
 from calibrate.validate.pool import Scheduler
 from calibrate.validate.rows import Cell, Numbers, Rows
 from calibrate.validate.sources import LoadedSession

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
-from calibrate.fit.design import spread_out
+from calibrate.spread import spread_out
 from collect.protocols.base import (
     MAX_STROKES,
     DeepMm,

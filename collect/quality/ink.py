@@ -10,8 +10,8 @@ import numpy as np
 
 from calibrate.board.lens import Floats
 from calibrate.board.pix2len import apply
-from calibrate.stroke.light import flatten
 from calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params, Soft
+from calibrate.stroke.preprocess import flatten
 from calibrate.stroke.rectify import rectify
 
 Rect = tuple[float, float, float, float]

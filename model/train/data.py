@@ -10,6 +10,9 @@ generator's, else its pixels would mean something else.
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Generator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -22,9 +25,13 @@ from torch import Tensor
 from model.generator.targets import Target
 from model.train.checkpoint import read_tensors, write_whole
 from model.train.config import TrainConfig
+from model.train.distributed import Group
 from model.train.errors import TrainError
 
 _TRAINING, _VALIDATION, _ORDER, _SPLIT = range(4)
+FORMAT = "brushloop-captures-1"
+MAX_BYTES = 2**30
+_AHEAD = 2  # batches per worker: one being drawn, one waiting
 
 
 class Images(Protocol):
@@ -108,10 +115,6 @@ def _generator(seed: int, *stream: int) -> torch.Generator:
     return torch.Generator().manual_seed(int(state) & (2**63 - 1))
 
 
-FORMAT = "brushloop-captures-1"
-MAX_BYTES = 2**30
-
-
 def save_captures(
     path: Path, inputs: dict[str, Tensor], images: Tensor, px_mm: float, placement: str, source: str
 ) -> None:
@@ -155,3 +158,42 @@ def load_captures(path: Path, config: TrainConfig) -> tuple[Kept, str]:
     for name in sorted(tensors):
         raise TrainError(path, f"{name[:60]!r} is not an input of the generator")
     return Kept(torch.stack(columns, dim=-1), images), metadata.get("source", "not stated")[:200].replace("\n", " ")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Batch:
+    """This process' share of a step's images: `inputs` (n, P), `target` (n, N, N), out of `count` in all processes."""
+
+    count: int
+    inputs: Tensor
+    target: Tensor
+
+
+def batches(config: TrainConfig, images: Images, group: Group, start: int) -> Generator[Batch]:
+    """The batches of the steps from `start` to the last, in order; close the iterator to end the threads early.
+
+    A batch follows from the seed and its step alone, so the number of `config.workers` changes no image. Without
+    workers each batch is drawn when it is asked for. The compiled rasters release the interpreter's lock, so threads
+    draw beside the training.
+    """
+
+    def draw(step: int) -> Batch:
+        numbers = batch_numbers(len(images), config.batch, config.seed, step)
+        inputs, target = images.pick(group.share(numbers))
+        return Batch(len(numbers), inputs, target)
+
+    steps = range(start, config.steps)
+    if config.workers == 0:
+        yield from map(draw, steps)
+        return
+    pool = ThreadPoolExecutor(config.workers)
+    waiting: deque[Future[Batch]] = deque()
+    try:
+        for step in steps:
+            waiting.append(pool.submit(draw, step))
+            if len(waiting) > _AHEAD * config.workers:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)

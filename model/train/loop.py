@@ -12,10 +12,9 @@ import torch
 from torch import Tensor
 
 from model.generator.network import Generator, squared_error
-from model.train.batches import Batch, batches
 from model.train.checkpoint import State, put_weights
 from model.train.config import TrainConfig
-from model.train.data import Images
+from model.train.data import Batch, Images, batches
 from model.train.distributed import Group
 from model.train.errors import BlankOutput, Diverged, TrainingStopped
 

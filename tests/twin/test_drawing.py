@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibrate.fit.strokes import Grid
+from calibrate.fit.captures import Grid
 from drivers.sim.brush.brush import Brush, BrushSpec
 from twin.constants import Offset
 from twin.drawing import draw, mechanics, still

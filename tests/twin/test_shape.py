@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.fit.strokes import Grid
+from calibrate.fit.captures import Grid
 from drivers.sim.brush.spec import BrushSpec
 from tests.twin.serial import Serial
 from twin.constants import SHAPE, Offset

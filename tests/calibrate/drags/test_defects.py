@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.drags.defects import defects
-from calibrate.drags.measure import along_axis
+from calibrate.drags.measure import along_axis, defects
 from calibrate.stroke.measure import measure
 
 

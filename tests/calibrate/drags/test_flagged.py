@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from calibrate.drags.captures import read_drags
-from calibrate.drags.defects import FLAGGED_WEIGHT
-from calibrate.drags.measure import validate_drags
+from calibrate.drags.measure import FLAGGED_WEIGHT, validate_drags
 from calibrate.drags.report import DragValidation, summary, write_drags
 from calibrate.stroke.params import Params
 from sessions.imports.photographs import ImportOptions, import_photographs

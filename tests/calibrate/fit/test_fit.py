@@ -5,10 +5,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from calibrate.fit.captures import Grid, Pressed
 from calibrate.fit.fit import STAGES, condition_number, draw, fit_presses, refit, zero_touch
 from calibrate.fit.heldout import CEILING, FITTED, leave_cell_out
 from calibrate.fit.prior import learned
-from calibrate.fit.strokes import Grid, Pressed
 from model.fitted import NAMES, PARAMETERS, FittedPress, published
 
 PX_MM = 0.4

@@ -9,10 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from model.train.batches import batches
 from model.train.checkpoint import State
 from model.train.config import TrainConfig, differences
-from model.train.data import Exact, batch_numbers, exact_sets
+from model.train.data import Exact, batch_numbers, batches, exact_sets
 from model.train.distributed import Group
 from model.train.errors import BlankOutput, Diverged, TrainingStopped
 from model.train.loop import converged, learning_rate, new_state, train
