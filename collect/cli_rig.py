@@ -120,8 +120,7 @@ def check(rig: RigFile, as_json: Json = False) -> None:
 
     from collect.rig.check import check_page, check_rig, contradictions
     from collect.rig.config import load_rig
-    from collect.teach.doubts import gaps
-    from collect.teach.store import TaughtFile
+    from collect.teach.store import TaughtFile, gaps
 
     checks = [*check_rig(load_rig(rig)), *gaps(TaughtFile(rig).load())]
     if as_json:

@@ -10,6 +10,7 @@ StepError              a step failed in a defined way; says what state it leaves
  |    +-- CameraLate   the camera's delay is too long, not steady, or cannot be measured
  +-- JogGivenUp        the operator did not find the paper by jog: its known height stays
  +-- SheetFull         no free cell is left on the sheet
+CannotTeach            what was taught on the first day contradicts itself or cannot be used
 CollectAborted         the session stopped before its protocol was finished; it can be resumed
  +-- Parked            ended between two steps on request, with the arm parked
 """
@@ -105,6 +106,17 @@ class SheetFull(StepError):
             f"all {capacity} cells of sheet {sheet} are used. "
             f"Put a fresh sheet in, then run the same command with --sheet {sheet + 1}."
         )
+
+
+class CannotTeach(Exception):
+    """What was taught contradicts itself or cannot be used; `way_out` says what to do. Nothing was written or moved."""
+
+    exit_code: ClassVar[int] = 4
+
+    def __init__(self, what: str, way_out: str) -> None:
+        self.what = what
+        self.way_out = way_out
+        super().__init__(f"{what} {way_out}")
 
 
 class CollectAborted(Exception):

@@ -9,7 +9,7 @@ from typing import Any
 from collect.engine.force_guard import ForceGuard
 from collect.engine.live import LiveView
 from collect.engine.recorder import Recorder
-from collect.engine.steps import capture, dip, press, review, touch
+from collect.engine.steps import capture, dip, press, retake, touch
 from collect.engine.steps.context import RunContext, StepContext, uninterrupted
 from collect.engine.telemetry import Telemetry
 from collect.errors import describe
@@ -115,7 +115,7 @@ class Performer:
             case StepKind.CAPTURE:
                 return await capture.capture(context)
             case StepKind.REVIEW:
-                return await review.review(context)
+                return await retake.review(context)
 
 
 def _in_words(step: Step) -> str:

@@ -14,7 +14,7 @@ from collect.engine.set_up import again
 from collect.engine.set_up import question as set_up_question
 from collect.engine.snapshot import SET_UP
 from collect.engine.steps.context import RunContext
-from collect.engine.steps.review import marked_bad
+from collect.engine.steps.retake import marked_bad
 from collect.errors import ForceTooHigh, Parked, SheetFull, StepError, describe
 from collect.operator import Choice, OperatorRequest, Prompt
 from collect.protocols.plan import takes

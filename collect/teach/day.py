@@ -4,27 +4,19 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import AsyncGenerator, Generator
-from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-from collect.errors import StepError
+from collect.errors import CannotTeach, StepError
 from collect.operator import Choice
 from collect.teach.arm_reader import Address, ArmReader, reading
-from collect.teach.errors import CannotTeach
-from collect.teach.guide import Brought, Guide, Picture, Shown, Target, TargetKind, Tone, WentBack
-from collect.teach.jog import jogged
-from collect.teach.store import Notebook, StepName, Taught, TaughtFile, Value, now_utc, touch_of
+from collect.teach.guide import Guide, Picture, Shown, Tone, WentBack
+from collect.teach.store import Notebook, StepName, Taught, TaughtFile, Value, now_utc
 from drivers.clock import Clock
-from drivers.samples import Pose
 
 ARM = Choice("a", "let it move: I look at the cell, my hand is at the emergency stop")
 STAY = Choice("x", "leave it where it is")
 YES, NO = Choice("y", "yes"), Choice("n", "no")
-JOGGED: frozenset[TargetKind] = frozenset(
-    {"pin", "board-corner", "sheet-corner", "well", "well-rim", "wash-pot", "wash-rim", "park"}
-)
-"""Places to which the last millimetres may be jogged."""
 
 
 class Day:
@@ -111,32 +103,6 @@ class Day:
             self.save(self.notebook.without_touches(*kinds))
             raise
 
-    async def touch(self, reader: ArmReader, target: Target, how: str, name: str) -> Pose | None:
-        """Ask for the tip to be brought to a thing, and note the flange's pose there; None if the person skips it.
-
-        A thing that was touched before is not asked for again. The person may jog to it where the arm is armed.
-        Raises `WentBack`.
-        """
-        if name in self.notebook.touches:
-            return self.notebook.touches[name].pose()
-        target = replace(target, may_jog=self.armed and target.kind in JOGGED)
-        brought = await self.guide.bring(target, how)
-        while brought is Brought.JOG:
-            if not target.may_jog:
-                await self.say("Nothing is moved without --arm: guide the arm by hand.", tone="warning")
-            elif await jogged(self, how) is Brought.DONE:
-                break
-            brought = await self.guide.bring(target, how)
-        match brought:
-            case Brought.BACK:
-                raise WentBack
-            case Brought.SKIP:
-                return None
-            case Brought.DONE | Brought.JOG:
-                flange = await reader.flange()
-                self.save(self.notebook.with_touch(name, touch_of(flange)))
-                return flange
-
 
 class Step(Protocol):
     """One step of the first day."""
@@ -153,11 +119,11 @@ class Step(Protocol):
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """Values that follow from the notebook alone; computed again whenever a value they depend on changes."""
-        ...
+        return {}
 
     def forget(self, notebook: Notebook) -> Notebook:
-        """The notebook without what this step observed, for teaching it again."""
-        ...
+        """The notebook without what this step observed, for teaching it again; unchanged if that may stay."""
+        return notebook
 
     def summary(self, notebook: Notebook) -> str:
         """What was taught, in a few words."""

@@ -1,4 +1,4 @@
-"""Jog: the arm brings the tip to a place in small steps by key, each checked against the box that is known so far."""
+"""Bring the tip to a place: by hand or by jog, in small steps by key, each checked against the box known so far."""
 
 from __future__ import annotations
 
@@ -6,28 +6,22 @@ import contextlib
 import math
 from collections.abc import AsyncGenerator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Protocol
 
 from scipy.spatial.transform import Rotation
 
 from collect.rig.devices import sole_driver
-from collect.teach.guide import Brought, JogStep, JogView, WentBack
+from collect.teach.arm_reader import ArmReader
+from collect.teach.day import Day
+from collect.teach.guide import Brought, JogStep, JogView, Target, TargetKind, WentBack
 from collect.teach.maths.box import hull
 from collect.teach.maths.tip import tip_of
-from collect.teach.store import Notebook
+from collect.teach.store import Notebook, touch_of
 from drivers.arcs.robot import ArcsOptions, AuboArcs
 from drivers.errors import LimitExceeded
 from drivers.geometry import lean
 from drivers.limits import Limits
 from drivers.protocols import Robot
 from drivers.samples import Pose
-
-if TYPE_CHECKING:
-    from contextlib import AbstractAsyncContextManager
-
-    from collect.teach.arm_reader import ArmReader
-    from collect.teach.guide import Guide
-    from drivers.clock import Clock
 
 STEPS_MM = (0.1, 0.5, 2.0, 5.0)
 SPEED_MM_S, ACC_MM_S2 = 20.0, 200.0
@@ -38,40 +32,40 @@ ROOM_MM, BELOW_MM = 25.0, 5.0
 LEAST_CONE_DEG, CONE_ROOM_DEG = 15.0, 1.0
 Tool = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Flange to tip: the offset in mm, and the turn about x, y and z of the flange in deg."""
+JOGGED: frozenset[TargetKind] = frozenset(
+    {"pin", "board-corner", "sheet-corner", "well", "well-rim", "wash-pot", "wash-rim", "park"}
+)
+"""Places to which the last millimetres may be jogged."""
 
 
-class JogDay(Protocol):
-    """What a jog needs of the first day that it is part of."""
+async def touch(day: Day, reader: ArmReader, target: Target, how: str, name: str) -> Pose | None:
+    """Ask for the tip to be brought to a thing, and note the flange's pose there; None if the person skips it.
 
-    @property
-    def guide(self) -> Guide:
-        """The person."""
-        ...
-
-    @property
-    def notebook(self) -> Notebook:
-        """What is known so far."""
-        ...
-
-    @property
-    def clock(self) -> Clock:
-        """The driver's clock."""
-        ...
-
-    async def may_move(self, what: str) -> None:
-        """Ask for the key that lets the arm move. Raises `CannotTeach` unless both it and `--arm` are given."""
-        ...
-
-    async def working(self, what: str) -> None:
-        """Show what is being done."""
-        ...
-
-    def arm(self) -> AbstractAsyncContextManager[ArmReader]:
-        """The arm, for reading only."""
-        ...
+    A thing that was touched before is not asked for again. The person may jog to it where the arm is armed.
+    Raises `WentBack`.
+    """
+    if name in day.notebook.touches:
+        return day.notebook.touches[name].pose()
+    target = replace(target, may_jog=day.armed and target.kind in JOGGED)
+    brought = await day.guide.bring(target, how)
+    while brought is Brought.JOG:
+        if not target.may_jog:
+            await day.say("Nothing is moved without --arm: guide the arm by hand.", tone="warning")
+        elif await jogged(day, how) is Brought.DONE:
+            break
+        brought = await day.guide.bring(target, how)
+    match brought:
+        case Brought.BACK:
+            raise WentBack
+        case Brought.SKIP:
+            return None
+        case Brought.DONE | Brought.JOG:
+            flange = await reader.flange()
+            day.save(day.notebook.with_touch(name, touch_of(flange)))
+            return flange
 
 
-async def jogged(day: JogDay, what: str) -> Brought:
+async def jogged(day: Day, what: str) -> Brought:
     """Let the person jog until the tip is there: DONE, or BACK where the person leaves the jog.
 
     Asks for the key that lets the arm move. Raises `CannotTeach` without `--arm`, `ConfigError`, and `DeviceError`
@@ -110,7 +104,7 @@ async def _step(robot: Robot, step: JogStep) -> str:
 
 
 @contextlib.asynccontextmanager
-async def _enabled(day: JogDay) -> AsyncGenerator[Robot]:
+async def _enabled(day: Day) -> AsyncGenerator[Robot]:
     """The arm, powered, with its limits around what is known; stopped and left where it is at the end."""
     book = day.notebook
     host, port = str(book.get("robot.host")), int(book.number("robot.port"))

@@ -1,11 +1,12 @@
 """What has been taught so far: one file beside the future `rig.toml`, written whole after each value.
 
 It holds what was observed (where the flange stood at each thing) and what was found from it, so that a session that
-was cut asks nothing again, and a value that depends on others is computed again when they change.
+was interrupted asks nothing again, and a value that depends on others is computed again when they change.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -14,6 +15,7 @@ from pydantic import Field, ValidationError
 
 from collect.errors import ConfigError
 from collect.rig.config_file import Config, Finite, read_text, refusal
+from collect.rig.plausible import Check, unmeasured
 from drivers.samples import Pose
 from sessions.disk import fsync_folder, sync
 
@@ -28,6 +30,8 @@ ThingName = Annotated[str, Field(max_length=60)]
 StepName = Literal["arm", "camera", "tip", "sheet", "places", "brush", "force", "limits", "proof"]
 """In the order in which they are taught: the box of the limits needs the deepest press."""
 STEPS: tuple[StepName, ...] = get_args(StepName)
+UNKNOWN = "not "
+"""Beginning of the text for a value that was taken over without a measurement."""
 
 
 class Taught(Config):
@@ -81,6 +85,11 @@ class Notebook(Config):
     def with_touch(self, name: str, touch: Touch) -> Notebook:
         """The same with one more touch, or another one in its place."""
         return self.model_copy(update={"touches": {**self.touches, name: touch}})
+
+    def without(self, *beginnings: str) -> Notebook:
+        """The same without the values whose paths begin like this."""
+        kept = {field: taught for field, taught in self.values.items() if not field.startswith(beginnings)}
+        return self.model_copy(update={"values": kept})
 
     def without_touches(self, *kinds: str) -> Notebook:
         """The same without what was touched of these kinds."""
@@ -157,3 +166,16 @@ def now_utc() -> str:
 def touch_of(pose: Pose) -> Touch:
     """The pose of the flange as a touch, with the current time."""
     return Touch(position_mm=pose.position_mm, quaternion=pose.quaternion, at=now_utc())
+
+
+def gaps(notebook: Notebook) -> Iterator[Check]:
+    """Steps that were not finished, and values that were taken over from a pendant or a default: for `rig check`."""
+    if not notebook.values:
+        return
+    for step in STEPS:
+        if step not in notebook.done:
+            arm = " --arm" if step == "proof" else ""
+            yield unmeasured(f"step {step}", "not done since something was taught", f"brushloop rig teach {step}{arm}")
+    for field, taught in notebook.values.items():
+        if taught.known.startswith(UNKNOWN) and not field.startswith("aside."):
+            yield unmeasured(field, f"{taught.value} {taught.unit}".rstrip(), f"{taught.how}, {taught.known}")

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calibrate.errors import CalibrationError
-from collect.errors import CollectAborted, ConfigError, StepError
+from collect.errors import CannotTeach, CollectAborted, ConfigError, StepError
 from collect.operator import Choice
 from collect.teach.day import Day, Step
-from collect.teach.errors import CannotTeach
 from collect.teach.guide import LeftOff, StepState, WentBack
 from collect.teach.rig_text import write_rig
 from collect.teach.steps import all_steps

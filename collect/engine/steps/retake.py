@@ -1,4 +1,4 @@
-"""Decides whether a stroke counts, is pressed again on another cell, or is left out."""
+"""Decides which strokes count, are pressed again on another cell, or are left out: after a capture, and in review."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from calibrate.stroke.params import Gray
 from collect.engine.steps.context import RunContext, StepContext
 from collect.errors import NeedsOperator
 from collect.operator import Choice, OperatorRequest, Prompt
+from collect.protocols.steps import Result, StepKind
 from collect.quality.verdict import Verdict
 from collect.rig.paper import Cell
+from sessions.remarks import remarks_of
 
 KEEP, AGAIN, SKIP = Choice("g", "good anyway: it counts"), Choice("r", "press it again"), Choice("k", "skip it")
 PICTURE_MARGIN_PX = 40
@@ -61,3 +63,28 @@ def _cut_out(run: RunContext, image: Gray, cell: Cell) -> Gray:
     (left, top), (right, bottom) = px.min(axis=0).astype(int), px.max(axis=0).astype(int)
     m = PICTURE_MARGIN_PX
     return image[max(0, top - m) : bottom + m, max(0, left - m) : right + m]
+
+
+def marked_bad(run: RunContext) -> list[str]:
+    """Strokes that count, are marked bad, and were not listed by a REVIEW step yet, in the order in which they were
+    made. Raises `SessionDamaged`."""
+    remarks = remarks_of(run.store.folder)
+    if not remarks:
+        return []
+    lines = run.store.state.segments
+    given = {str(name) for line in lines if line["kind"] == StepKind.REVIEW for name, _ in line["result"]["again"]}
+    captures = [line["result"] for line in lines if line["kind"] == StepKind.CAPTURE]
+    bad = {remark.still for remark in remarks.values() if remark.bad}
+    counted = [str(r["stroke_id"]) for r in captures if r.get("kept", True) and int(r["still"]) in bad]
+    return [name for name in counted if name not in given]
+
+
+async def review(context: StepContext) -> Result:
+    """The REVIEW step: `again` holds [stroke_id, index of its new steps] of each stroke to press again."""
+    run = context.run
+    lines = [line["result"]["again"] for line in run.store.state.segments if line["kind"] == StepKind.REVIEW]
+    first = run.progress.first_free_index + sum(map(len, lines))
+    again = [[name, first + n] for n, name in enumerate(marked_bad(run))]
+    for name, _ in again:
+        run.progress.log(f"{name} was marked bad in the review and is pressed again")
+    return {"again": again}

@@ -12,8 +12,8 @@ from scipy.optimize import least_squares
 
 from calibrate.board.register import mixed_up
 from calibrate.board.spec import BoardSpec, size_mm
+from collect.errors import CannotTeach
 from collect.rig.paper import PlaneFit, fit_plane
-from collect.teach.errors import CannotTeach
 
 Floats = NDArray[np.float64]
 Point = tuple[float, float, float]

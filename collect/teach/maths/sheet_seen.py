@@ -12,8 +12,8 @@ from calibrate.board.detect import BoardView
 from calibrate.board.pix2len import apply, homography
 from calibrate.board.spec import BoardSpec, size_mm
 from calibrate.board.view import paper_mm
+from collect.errors import CannotTeach
 from collect.rig.optics import Gray
-from collect.teach.errors import CannotTeach
 
 Floats = NDArray[np.float64]
 STEP_MM = 0.25

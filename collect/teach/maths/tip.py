@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
-from collect.teach.errors import CannotTeach
+from collect.errors import CannotTeach
 from drivers.samples import Pose
 
 Floats = NDArray[np.float64]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
+from collect.errors import CannotTeach
 from collect.teach.arm_reader import Address, Cabinet, answers, find_framing, reading
-from collect.teach.day import Day
-from collect.teach.errors import CannotTeach
-from collect.teach.store import Notebook, StepName, Taught
+from collect.teach.day import Day, Step
+from collect.teach.store import Notebook, StepName
 from drivers.arcs.codes import MOVING_ALLOWED
 from drivers.arcs.robot import AUBOPE_PORT
 
@@ -17,7 +17,7 @@ LONGEST_TOOL_MM = 600.0
 SHORTEST_TOOL_MM = 10.0
 
 
-class ArmStep:
+class ArmStep(Step):
     """Address, ports, framing, model, firmware, safety state, and what the cabinet says of tool and payload."""
 
     name: StepName = "arm"
@@ -88,14 +88,6 @@ class ArmStep:
         question = f"Port that sends poses ({RTDE_PORT} on a cabinet; press Enter unless yours differs)"
         text = await day.guide.text(question, str(RTDE_PORT))
         return int(text) if text.isdecimal() and 0 < int(text) < 65536 else RTDE_PORT
-
-    def derived(self, notebook: Notebook) -> dict[str, Taught]:
-        """No derived values: all values of this step were read."""
-        return {}
-
-    def forget(self, notebook: Notebook) -> Notebook:
-        """Keep the address as the suggestion."""
-        return notebook
 
     def summary(self, notebook: Notebook) -> str:
         """The address."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collect.errors import CannotTeach
 from collect.operator import Choice
 from collect.rig.config_devices import InkDeviceConfig, InkStationConfig, ModbusPumpConfig
 from collect.rig.devices import make_ink
 from collect.rig.plausible import brush_shorter_than_tool, deepest_press
-from collect.teach.day import Day
-from collect.teach.errors import CannotTeach
-from collect.teach.store import Notebook, StepName, Taught
+from collect.teach.day import Day, Step
+from collect.teach.store import Notebook, StepName
 from drivers.clock import Clock
 
 DEEPEST_SHARE = 0.45
@@ -17,7 +17,7 @@ PRIME_ML = 0.5
 NONE, STATION, PUMP = Choice("n", "nothing: by hand"), Choice("i", "an ink station"), Choice("p", "a Modbus pump")
 
 
-class BrushStep:
+class BrushStep(Step):
     """R, L, deepest press; the ink device."""
 
     name: StepName = "brush"
@@ -104,15 +104,9 @@ class BrushStep:
         finally:
             await device.close()
 
-    def derived(self, notebook: Notebook) -> dict[str, Taught]:
-        """No derived values: all values of this step were asked."""
-        return {}
-
     def forget(self, notebook: Notebook) -> Notebook:
         """Without brush and ink device; where the well stands is another step's."""
-        gone = ("brush.", "ink.device.", "ink.name", "aside.ink")
-        kept = {field: taught for field, taught in notebook.values.items() if not field.startswith(gone)}
-        return notebook.model_copy(update={"values": kept})
+        return notebook.without("brush.", "ink.device.", "ink.name", "aside.ink")
 
     def summary(self, notebook: Notebook) -> str:
         """R, L and the deepest press."""

@@ -17,6 +17,7 @@ from calibrate.board.intrinsics import GOOD_VIEWS, RMS_LIMIT_PX, Fitted, fit_len
 from calibrate.board.spec import BoardSpec, describe
 from calibrate.errors import CalibrationError
 from calibrate.files import read_gray
+from collect.errors import CannotTeach
 from collect.operator import Choice
 from collect.teach.cameras import (
     Gray,
@@ -28,12 +29,11 @@ from collect.teach.cameras import (
     still,
     taught_camera,
 )
-from collect.teach.day import Day
-from collect.teach.errors import CannotTeach
+from collect.teach.day import Day, Step
 from collect.teach.guide import Brought, Target, WentBack
 from collect.teach.maths.coverage import coverage_picture, still_missing
 from collect.teach.steps.sheet import board_of
-from collect.teach.store import Notebook, StepName, Taught
+from collect.teach.store import Notebook, StepName
 from drivers.errors import DeviceError
 
 Take = Callable[[], Awaitable[Gray]]
@@ -59,7 +59,7 @@ OTHER_PRINT = (
 )
 
 
-class CameraStep:
+class CameraStep(Step):
     """Source, settings, frame rate, print of the board, lens."""
 
     name: StepName = "camera"
@@ -254,15 +254,11 @@ class CameraStep:
         )
         await day.say(f"Lens: residual {fitted.rms_px:.2f} px over {len(fitted.residuals_px)} photographs.")
 
-    def derived(self, notebook: Notebook) -> dict[str, Taught]:
-        """No derived values: all values of this step were measured."""
-        return {}
-
     def forget(self, notebook: Notebook) -> Notebook:
         """Without source, settings, print and lens; the photographs of the lens are taken again."""
-        gone = ("camera.", "board.squares", "board.square_mm", "board.marker_mm", "board.dictionary", *ASIDE)
-        kept = {field: taught for field, taught in notebook.values.items() if not field.startswith(gone)}
-        return notebook.model_copy(update={"values": kept})
+        return notebook.without(
+            "camera.", "board.squares", "board.square_mm", "board.marker_mm", "board.dictionary", *ASIDE
+        )
 
     def summary(self, notebook: Notebook) -> str:
         """Source and rate."""

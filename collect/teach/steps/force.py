@@ -9,10 +9,10 @@ import statistics
 import numpy as np
 from numpy.typing import NDArray
 
+from collect.errors import CannotTeach
 from collect.rig.config_devices import ForceConfig
 from collect.rig.devices import make_force
-from collect.teach.day import Day
-from collect.teach.errors import CannotTeach
+from collect.teach.day import Day, Step
 from collect.teach.guide import Brought, Target, WentBack
 from collect.teach.maths.sheet import corners_of
 from collect.teach.store import Notebook, StepName, Taught, now_utc
@@ -37,7 +37,7 @@ INSET_MM = 6.0
 """Distance of the touch points from the sheet's edges: in its margin, where they cost no cell."""
 
 
-class ForceStep:
+class ForceStep(Step):
     """Where the sensor is, which way it points, and how zero touch is done."""
 
     name: StepName = "force"
@@ -131,9 +131,7 @@ class ForceStep:
 
     def forget(self, notebook: Notebook) -> Notebook:
         """Without bus and push."""
-        gone = ("force.", "touch.", "aside.bus", "aside.force_noise_n")
-        kept = {field: taught for field, taught in notebook.values.items() if not field.startswith(gone)}
-        return notebook.model_copy(update={"values": kept})
+        return notebook.without("force.", "touch.", "aside.bus", "aside.force_noise_n")
 
     def summary(self, notebook: Notebook) -> str:
         """The bus and the axis."""

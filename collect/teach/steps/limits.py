@@ -5,12 +5,11 @@ from __future__ import annotations
 import asyncio
 
 from calibrate.files import read_gray
-from collect.errors import ConfigError
+from collect.errors import CannotTeach, ConfigError
 from collect.planning.limit_check import ask_reach
 from collect.rig.config import RigConfig
 from collect.rig.picture import draw_rig
-from collect.teach.day import Day
-from collect.teach.errors import CannotTeach
+from collect.teach.day import Day, Step
 from collect.teach.maths.box import Point, hull
 from collect.teach.rig_text import rig_of
 from collect.teach.steps.places import sheet_corners, sheet_heights, tips
@@ -33,7 +32,7 @@ DEFAULTS: tuple[tuple[str, float, str, float, str], ...] = (
 """Field, cautious default, unit, most that `rig.toml` takes, and what it is."""
 
 
-class LimitsStep:
+class LimitsStep(Step):
     """Box, cone and speeds."""
 
     name: StepName = "limits"
@@ -95,9 +94,7 @@ class LimitsStep:
 
     def forget(self, notebook: Notebook) -> Notebook:
         """Without the defaults."""
-        names = {field for field, *_ in DEFAULTS}
-        kept = {field: taught for field, taught in notebook.values.items() if field not in names}
-        return notebook.model_copy(update={"values": kept})
+        return notebook.without(*(field for field, *_ in DEFAULTS))
 
     def summary(self, notebook: Notebook) -> str:
         """The box."""

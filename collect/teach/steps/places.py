@@ -8,14 +8,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from collect.errors import CannotTeach
 from collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumbnail
 from collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig
 from collect.rig.paper import to_base, to_paper
 from collect.teach.arm_reader import ArmReader
 from collect.teach.cameras import still, taught_camera
-from collect.teach.day import Day
-from collect.teach.errors import CannotTeach
+from collect.teach.day import Day, Step
 from collect.teach.guide import Target
+from collect.teach.jog import touch
 from collect.teach.maths.sheet import Point, corners_of
 from collect.teach.maths.tip import tip_of
 from collect.teach.store import Notebook, StepName, Taught, Value, now_utc
@@ -30,7 +31,7 @@ LEAST_RADIUS_MM, MOST_RADIUS_MM = 5.0, 100.0
 """From the rim of a well to its middle."""
 
 
-class PlacesStep:
+class PlacesStep(Step):
     """Where ink, water and rest are, and how high the arm travels between them."""
 
     name: StepName = "places"
@@ -41,9 +42,9 @@ class PlacesStep:
     async def teach(self, day: Day) -> None:
         """Have the tip brought to each place; look whether the parked arm is out of the picture."""
         async with day.arm() as reader:
-            await day.touch(reader, Target("well-rim"), "Bring the tip to the rim of the ink well.", "well-rim 0")
+            await touch(day, reader, Target("well-rim"), "Bring the tip to the rim of the ink well.", "well-rim 0")
             how = "Bring the tip into the middle of the well, as deep as a dip should go: a few mm above its bottom."
-            await day.touch(reader, Target("well"), how, "well 0")
+            await touch(day, reader, Target("well"), how, "well 0")
             with day.touched_again_if_refused("well-rim", "well"):
                 found = check_pot(day.notebook, "well-rim 0", "well 0", "well")
             await day.say(found)
@@ -51,10 +52,10 @@ class PlacesStep:
             await self._wash(day, reader)
             if not (clear := _clear_view(day.rig_path)).exists() or "clear-view 0" not in day.notebook.touches:
                 how = "Guide the arm so far away that neither it nor its shadow is in the camera's picture."
-                await day.touch(reader, Target("clear-view"), how, "clear-view 0")
+                await touch(day, reader, Target("clear-view"), how, "clear-view 0")
                 cv2.imwrite(str(clear), (await self._seen(day)).astype(np.uint8))
             how = "Bring the arm to its waiting place: brush upright, above everything, out of the camera's picture."
-            await day.touch(reader, Target("park"), how, "park 0")
+            await touch(day, reader, Target("park"), how, "park 0")
             await self._look(day, clear)
 
     async def _wipe(self, day: Day, reader: ArmReader) -> None:
@@ -66,7 +67,7 @@ class PlacesStep:
         )
         if wipe:
             how = "Bring the tip to the rim on the side where the drop shall be wiped off: the one away from the sheet."
-            wipe = await day.touch(reader, Target("well-rim", 1, may_skip=True), how, "well-rim 1") is not None
+            wipe = await touch(day, reader, Target("well-rim", 1, may_skip=True), how, "well-rim 1") is not None
         if wipe:
             try:
                 check_wipe(day.notebook)
@@ -84,9 +85,9 @@ class PlacesStep:
             "Is there a pot of water to wash the brush in?", default=False
         )
         if wash:
-            await day.touch(reader, Target("wash-rim"), "Bring the tip to the rim of the pot of water.", "wash-rim 0")
+            await touch(day, reader, Target("wash-rim"), "Bring the tip to the rim of the pot of water.", "wash-rim 0")
             how = "Bring the tip into the middle of the pot of water, as deep as a wash should go."
-            await day.touch(reader, Target("wash-pot"), how, "wash-pot 0")
+            await touch(day, reader, Target("wash-pot"), how, "wash-pot 0")
             with day.touched_again_if_refused("wash-rim", "wash-pot"):
                 check_pot(day.notebook, "wash-rim 0", "wash-pot 0", "pot of water")
         day.keep("places", "aside.wash", wash, "answered")
@@ -151,10 +152,8 @@ class PlacesStep:
 
     def forget(self, notebook: Notebook) -> Notebook:
         """Without what was touched here."""
-        gone = {"aside.wipe", "ink.wipe.rim_mm", "ink.wipe.z_mm", "aside.wash", "ink.wash.pot_mm", "ink.wash.dip_z_mm"}
-        kept = {field: taught for field, taught in notebook.values.items() if field not in gone}
-        cleared = notebook.without_touches("well-rim", "well", "wash-rim", "wash-pot", "park", "clear-view")
-        return cleared.model_copy(update={"values": kept})
+        cleared = notebook.without("aside.wipe", "ink.wipe.", "aside.wash", "ink.wash.")
+        return cleared.without_touches("well-rim", "well", "wash-rim", "wash-pot", "park", "clear-view")
 
     def summary(self, notebook: Notebook) -> str:
         """Well and park."""

@@ -13,13 +13,13 @@ from typing import Any
 from collect.engine.dry_run import DryRunEngine
 from collect.engine.engine import Engine
 from collect.engine.open_or_resume import Opening, open_store
+from collect.errors import CannotTeach
 from collect.rig.config import RigConfig
 from collect.rig.doctor import examine
 from collect.rig.paper import PaperPlane
-from collect.teach.day import Day
-from collect.teach.errors import CannotTeach
+from collect.teach.day import Day, Step
 from collect.teach.rig_text import rig_of, rig_text
-from collect.teach.store import Notebook, StepName, Taught
+from collect.teach.store import Notebook, StepName
 from sessions.journal.journal import JOURNAL_NAME, replay
 
 ABOVE_MM = 30.0
@@ -34,7 +34,7 @@ SLOW_CAMERA_MS = 600.0
 POLL_S = 0.1
 
 
-class ProofStep:
+class ProofStep(Step):
     """Prove the whole rig; it is ready once it has passed."""
 
     name: StepName = "proof"
@@ -141,14 +141,6 @@ class ProofStep:
                 tone="warning",
             )
         await day.say("Lay a fresh sheet before the first session: this one has the marks of the proof.", "READY")
-
-    def derived(self, notebook: Notebook) -> dict[str, Taught]:
-        """No derived values: all values of this step were measured."""
-        return {}
-
-    def forget(self, notebook: Notebook) -> Notebook:
-        """Measured values stay until they are measured again."""
-        return notebook
 
     def summary(self, notebook: Notebook) -> str:
         """Height and delay."""

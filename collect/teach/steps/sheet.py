@@ -12,11 +12,12 @@ from calibrate.board.artefact import read_lens
 from calibrate.board.detect import find_board
 from calibrate.board.spec import BoardSpec
 from calibrate.errors import CalibrationError
+from collect.errors import CannotTeach
 from collect.teach.arm_reader import ArmReader
 from collect.teach.cameras import still, taught_camera
-from collect.teach.day import Day
-from collect.teach.errors import CannotTeach
+from collect.teach.day import Day, Step
 from collect.teach.guide import Target, TargetKind
+from collect.teach.jog import touch
 from collect.teach.maths.sheet import CORNERS, Point, SheetFit, check_board, corners_of, expected_mm, fit_sheet
 from collect.teach.maths.sheet_seen import OFF_MM, check_seen, seen_margins, touched_margins
 from collect.teach.maths.tip import tip_of
@@ -36,7 +37,7 @@ INSET_MM = 2.0
 """Distance of the touch point from the sheet's edges: beside every cell."""
 
 
-class SheetStep:
+class SheetStep(Step):
     """Origin, turn, size and plane of the sheet, and the board's place on it."""
 
     name: StepName = "sheet"
@@ -58,8 +59,8 @@ class SheetStep:
                         continue  # the sheet's own corners give its origin, and need more touches
                     for corner in CORNERS:
                         how = f"Bring the tip to the {corner} corner of {thing}" + (" once more." if number else ".")
-                        await day.touch(
-                            reader, Target(kind, number, corner, may_skip=True), how, f"{kind} {number} {corner}"
+                        await touch(
+                            day, reader, Target(kind, number, corner, may_skip=True), how, f"{kind} {number} {corner}"
                         )
                     if kind == BOARD:
                         with day.touched_again_if_refused(BOARD):
@@ -77,7 +78,7 @@ class SheetStep:
     async def _seen(self, day: Day, reader: ArmReader) -> None:
         """Compare the touched sheet with the one that the camera sees on the board. Raises `CannotTeach`."""
         how = "Guide the arm so far away that it hides neither board nor sheet from the camera."
-        if await day.touch(reader, Target("clear-view", 1, may_skip=True), how, f"{VIEW} 0") is None:
+        if await touch(day, reader, Target("clear-view", 1, may_skip=True), how, f"{VIEW} 0") is None:
             found = "not checked against the camera: the arm was in its way"
         else:
             await day.working("looking for the sheet's edges on the board")
@@ -119,8 +120,7 @@ class SheetStep:
 
     def forget(self, notebook: Notebook) -> Notebook:
         """Without the touches of both."""
-        kept = {field: taught for field, taught in notebook.values.items() if field != SEEN}
-        return notebook.without_touches(BOARD, SHEET, VIEW).model_copy(update={"values": kept})
+        return notebook.without(SEEN).without_touches(BOARD, SHEET, VIEW)
 
     def summary(self, notebook: Notebook) -> str:
         """Origin and turn."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collect.errors import CannotTeach
 from collect.teach.arm_reader import ArmReader
-from collect.teach.day import Day
-from collect.teach.errors import CannotTeach
+from collect.teach.day import Day, Step
 from collect.teach.guide import Target
+from collect.teach.jog import touch
 from collect.teach.maths.tip import LEAST_TOUCHES, elsewhere, find_axis, find_tip
 from collect.teach.store import Notebook, StepName, Taught, now_utc
 
@@ -25,7 +26,7 @@ LEAST_LEAN = 3.0
 SIDES = ("away from you", "to the right", "toward you", "to the left")
 
 
-class TipStep:
+class TipStep(Step):
     """The offset from the flange to the tip of the brush."""
 
     name: StepName = "tip"
@@ -47,7 +48,7 @@ class TipStep:
                     f"Upright {index + 1} of {UPRIGHTS}: the brush upright along the set square"
                     f"{', the wrist turned differently than before' if index else ''}, anywhere over the table."
                 )
-                if await day.touch(reader, Target("upright", index, may_skip=True), how, f"upright {index}") is None:
+                if await touch(day, reader, Target("upright", index, may_skip=True), how, f"upright {index}") is None:
                     break
 
     async def _pin(self, day: Day, reader: ArmReader) -> None:
@@ -60,7 +61,7 @@ class TipStep:
                 f"Touch {index + 1}: bring the tip to the pin, the brush leaning by 30 deg or more "
                 f"{SIDES[index % 4]}; lean it without turning the wrist with it."
             )
-            await day.touch(reader, Target("pin", index, may_skip=True), how, f"pin {index}")
+            await touch(day, reader, Target("pin", index, may_skip=True), how, f"pin {index}")
             if await self._known(day):
                 return
         with day.touched_again_if_refused("pin"):

@@ -12,11 +12,12 @@ import pytest
 from collect.operator import Choice
 from collect.teach.day import Day
 from collect.teach.guide import Brought, JogStep, JogView, Shown, Target
-from collect.teach.jog import BELOW_MM, ROOM_MM, SPEED_MM_S
+from collect.teach.jog import BELOW_MM, ROOM_MM, SPEED_MM_S, touch
 from collect.teach.plain import PlainGuide
 from collect.teach.store import touch_of
 from collect.tui.teach_app import TeachApp
 from collect.tui.teach_guide import ScreenGuide
+from drivers.arcs.codes import RobotMode
 from drivers.clock import HostClock
 from drivers.geometry import brush_pose
 from drivers.sim.arcs.server import ArcsServer
@@ -71,7 +72,7 @@ def day_of(port: int, person: object, folder: Path, *, armed: bool) -> Day:
 
 async def touched(day: Day) -> None:
     async with asyncio.timeout(20.0), day.arm() as reader:
-        await day.touch(reader, Target("well"), "Bring the tip into the well.", "well 0")
+        await touch(day, reader, Target("well"), "Bring the tip into the well.", "well 0")
 
 
 def sent(server: ArcsServer) -> int:
@@ -95,7 +96,7 @@ async def test_without_arm_nothing_moves_even_if_a_jog_is_asked_for(server: Arcs
     assert person.views == []
     assert any("Nothing is moved without --arm" in line for line in person.said)
     assert sent(server) == 0
-    assert server.mode == "PowerOff"
+    assert server.cabinet.power.mode == RobotMode.POWER_OFF
 
 
 async def test_without_the_key_nothing_moves(server: ArcsServer, tmp_path: Path) -> None:
@@ -103,7 +104,7 @@ async def test_without_the_key_nothing_moves(server: ArcsServer, tmp_path: Path)
     await touched(day_of(server.port, person, tmp_path, armed=True))
     assert person.views == []
     assert sent(server) == 0
-    assert server.mode == "PowerOff"
+    assert server.cabinet.power.mode == RobotMode.POWER_OFF
 
 
 async def test_a_step_out_of_the_box_is_refused_and_said(server: ArcsServer, tmp_path: Path) -> None:

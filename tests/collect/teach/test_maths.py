@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from calibrate.board.register import mixed_up, register
 from calibrate.board.spec import BoardSpec
 from calibrate.errors import CalibrationError
-from collect.teach.errors import CannotTeach
+from collect.errors import CannotTeach
 from collect.teach.maths.box import hull
 from collect.teach.maths.sheet import CORNERS, Point, check_board, corners_of, fit_sheet
 from collect.teach.maths.tip import elsewhere, find_axis, find_tip, tip_of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from collect.teach.errors import CannotTeach
+from collect.errors import CannotTeach
 from collect.teach.steps.places import PlacesStep, check_pot, check_wipe
 from collect.teach.store import Notebook, Taught, now_utc, touch_of
 from drivers.geometry import brush_pose

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from collect.errors import CannotTeach
 from collect.operator import Choice
 from collect.rig.config import load_rig
 from collect.teach.day import Day
-from collect.teach.errors import CannotTeach
 from collect.teach.guide import Shown, WentBack
 from collect.teach.steps import proof
 from collect.teach.steps.proof import ProofStep, folder_beside, slowly

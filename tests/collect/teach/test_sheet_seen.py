@@ -8,7 +8,7 @@ import pytest
 
 from calibrate.board.detect import find_board
 from calibrate.board.spec import BoardSpec, charuco_board, size_mm
-from collect.teach.errors import CannotTeach
+from collect.errors import CannotTeach
 from collect.teach.maths.sheet_seen import Margins, check_seen, seen_margins, touched_margins
 
 SPEC = BoardSpec(squares=(26, 20), square_mm=12.0, marker_mm=9.0, origin_mm=(0.0, 0.0))

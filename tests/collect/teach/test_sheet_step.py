@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from collect.teach.errors import CannotTeach
+from collect.errors import CannotTeach
 from collect.teach.steps.sheet import BOARD, all_corners
 from collect.teach.store import Notebook, Taught, Value, now_utc, touch_of
 from drivers.geometry import brush_pose
