@@ -70,6 +70,8 @@ INK = (
     Constant("wick_mm", "mm", 0.4, factor=True),
     Constant("need_per_mm2", "1/mm^2", 0.5, factor=True),
     Constant("uneven_mm", "mm", 2.0),
+    Constant("trail_share", "", 0.3),
+    Constant("bow_mm", "mm", 0.25),
 )
 """Constants that decide where the hairs of a solved spine lay ink."""
 SHAPE = MECHANICS + INK

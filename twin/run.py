@@ -27,11 +27,11 @@ from calibrate.fit.heldout import (
 from drivers.sim.brush.spec import BrushSpec
 from drivers.sim.config import SoundHead
 from sessions.progress import Progress, unseen
-from twin.constants import SHAPE, SPREAD, Constant, Offset, brush_at, offset_at, with_values
+from twin.constants import SHAPE, SPREAD, Constant, Offset, Vector, brush_at, offset_at, with_values
 from twin.drawing import Cell
 from twin.quality import sound_head
 from twin.score import TWIN, parts_of, predicted
-from twin.shape import COARSE, FINE, Found, Round, Target, choose_individual, covariance, search, start
+from twin.shape import COARSE, FINE, Found, Round, Target, choose_individual, covariance, of_parts, search, start
 from twin.spread import Repeats, Spread, fit_spread
 
 MOST_WORKERS = 8
@@ -112,20 +112,22 @@ def fit_twin(
     ticks = _Ticks(progress, (1 + len(parts)) * sum(one.steps for one in (*COARSE, FINE)))
     run = _Run(pool, ticks, before or {}, keep)
     found = run.shape("all cells", target)
-    errors = np.sqrt(np.diagonal(covariance(target, found, pool)))
+    variance = np.diagonal(covariance(target, found, pool))
     spec, offset = _brush(found, target), offset_at(found.point)
     repeats = repeats_of(cells)
     spread = fit_spread(spec, offset, repeats, grid) if repeats.cells else None
+    scores, points = Scores(), list[Vector]()
+    for number, part in enumerate(parts, 1):
+        kept = [k for k in range(len(cells)) if k not in part]
+        there = run.shape(f"part {number} left out", target.only(kept))
+        points.append(there.point)
+        _score_part(scores, cells, [target.cells[k] for k in part], there, target, spread)
+    ticks.end()
+    errors = np.sqrt(variance + of_parts(points))
     estimates = [_estimate(*one) for one in zip(SHAPE, found.point, errors, strict=False)]
     if spread is not None:
         spec = _brush(found, target, spread)
         estimates += [_estimate(*one) for one in zip(SPREAD, spread.point, spread.error, strict=True)]
-    scores = Scores()
-    for number, part in enumerate(parts, 1):
-        kept = [k for k in range(len(cells)) if k not in part]
-        there = run.shape(f"part {number} left out", target.only(kept))
-        _score_part(scores, cells, [target.cells[k] for k in part], there, target, spread)
-    ticks.end()
     held_out = tuple(scores.rows((CEILING, TWIN, BEZIER)))
     return Twin(spec, offset, tuple(estimates), spread, held_out, sound_head(spec, target.cells, grid))
 

@@ -7,6 +7,7 @@ that press with the same seeds. A wide prior on each constant keeps what the pre
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -31,21 +32,28 @@ STEP = 0.3
 EVERY = 2
 """Blurred images are compared at each second row and column."""
 NEAR_BOUND = 1e-3
-INDIVIDUALS = 32
-"""Seeds of the individual (its hairs and how they clump) that are tried."""
+STARTS = {"trail_share": 0.25}
+"""Values from which the search starts where the default is a bad place: under a full trail, its share has no effect."""
+INDIVIDUALS = range(1000, 1032)
+"""Seeds of the individual (its hairs and how they clump) that are tried. A captured brush has none of them: the brushes
+on which twins are measured have seeds below 1000."""
 FINEST_MM = 0.3
+MOST_TRIALS = 4
+"""Brushes tried for each step: one that is not nearer to the captures costs little beside the derivatives."""
+FTOL = 3e-4
+"""A step that brings the sum of squares down by less than this share is the last of its pass."""
 
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """One pass of the search: its blur, and its largest number of steps."""
+    """One pass of the search: its blur, and its largest number of steps, each with derivatives of its own."""
 
     blur_mm: float
     steps: int
 
 
 COARSE = (Round(1.2, 6), Round(0.5, 6))
-FINE = Round(FINEST_MM, 4)
+FINE = Round(FINEST_MM, 6)
 """The pass after the individual has been chosen."""
 
 
@@ -78,8 +86,12 @@ Map = Callable[[Callable[[Vector], Vector], Iterable[Vector]], Iterable[Vector]]
 
 
 def start() -> Found:
-    """The default brush."""
-    return Found(np.zeros(len(SHAPE) + 3), 0)
+    """The default brush, but with a trail faint enough for the search to see whether there is more of it or less."""
+    point = np.zeros(len(SHAPE) + 3)
+    for at, one in enumerate(SHAPE):
+        if one.name in STARTS:
+            point[at] = one.scales(STARTS[one.name])
+    return Found(point, INDIVIDUALS[0])
 
 
 def off(target: Target, seed: int, blur_mm: float, point: Vector) -> Vector:
@@ -102,17 +114,39 @@ def search(target: Target, found: Found, one: Round, workers: Executor, tick: Ca
     from scipy.optimize import least_squares  # slow to import
 
     low, high = search_bounds()
-    evaluate = partial(off, target, found.seed, one.blur_mm)
-
-    def slopes(point: Vector) -> NDArray[np.float64]:
-        tick()
-        return derivatives(evaluate, point, high, STEP, workers.map)
-
     began = np.clip(found.point, low + NEAR_BOUND, high - NEAR_BOUND)
-    best = least_squares(
-        evaluate, began, jac=slopes, bounds=(low, high), max_nfev=one.steps, xtol=1e-3, ftol=1e-3, gtol=None
-    )
-    return Found(np.asarray(best.x, np.float64), found.seed)
+    reached = [began]
+
+    def evaluate(moved: Vector) -> Vector:
+        return off(target, found.seed, one.blur_mm, began + moved)
+
+    def slopes(moved: Vector) -> NDArray[np.float64]:
+        reached.append(began + moved)
+        if len(reached) > one.steps + 1:
+            raise _EnoughSteps
+        tick()
+        at_point = partial(off, target, found.seed, one.blur_mm)
+        return derivatives(at_point, reached[-1], high, STEP, workers.map)
+
+    # the search is for the way from where it began, because the minimiser's first step is as long as its start is far
+    # from 0, and 1 if that is 0
+    with contextlib.suppress(_EnoughSteps):
+        best = least_squares(
+            evaluate,
+            np.zeros_like(began),
+            jac=slopes,
+            bounds=(low - began, high - began),
+            max_nfev=MOST_TRIALS * one.steps,
+            xtol=1e-3,
+            ftol=FTOL,
+            gtol=None,
+        )
+        reached.append(began + np.asarray(best.x, np.float64))
+    return Found(reached[-1], found.seed)
+
+
+class _EnoughSteps(Exception):
+    """The pass has taken its steps; the point of the last one is the best so far."""
 
 
 def derivatives(
@@ -127,8 +161,8 @@ def derivatives(
 def choose_individual(target: Target, found: Found, workers: Executor) -> Found:
     """The seed whose hairs, with the constants found, come nearest to the captures."""
     residuals = partial(off, target, blur_mm=FINEST_MM, point=found.point)
-    squares = [float(one @ one) for one in workers.map(residuals, range(INDIVIDUALS), chunksize=4)]
-    return Found(found.point, int(np.argmin(squares)))
+    squares = [float(one @ one) for one in workers.map(residuals, INDIVIDUALS, chunksize=4)]
+    return Found(found.point, INDIVIDUALS[int(np.argmin(squares))])
 
 
 def covariance(target: Target, found: Found, workers: Executor) -> NDArray[np.float64]:
@@ -148,3 +182,15 @@ def covariance(target: Target, found: Found, workers: Executor) -> NDArray[np.fl
     spread = pulls.T @ pulls * count / max(count - 1, 1)
     inverse = np.linalg.inv(jacobian.T @ jacobian)
     return np.asarray(inverse @ (spread + np.eye(constants) / PRIOR_SD**2) @ inverse, np.float64)
+
+
+def of_parts(points: Sequence[Vector]) -> Vector | float:
+    """Variance (constants,) of the point, from the points (parts, constants) found with one part of the cells left out.
+
+    The jackknife of groups. It includes what `covariance` cannot know: that another individual was chosen, or that the
+    search ended elsewhere.
+    """
+    if len(points) < 2:
+        return 0.0
+    apart = np.asarray(points) - np.mean(points, axis=0)
+    return (len(points) - 1) / len(points) * (apart**2).sum(axis=0)

@@ -38,7 +38,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     first, last = Round(1.0, 1), Round(0.5, 1)
     for name, value in {"COARSE": (first,), "FINE": last, "workers": _in_this_process}.items():
         monkeypatch.setattr(f"twin.run.{name}", value)
-    monkeypatch.setattr("twin.shape.INDIVIDUALS", 2)
+    monkeypatch.setattr("twin.shape.INDIVIDUALS", range(2))
     monkeypatch.setattr("twin.score.VOTES", 1)
 
 

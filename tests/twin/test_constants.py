@@ -27,7 +27,7 @@ def test_the_middle_of_the_search_is_the_default_brush_of_the_captured_size() ->
     assert brush_at(middle, base) == base
     assert offset_at(middle) == Offset(0.0, 0.0, 0.0)
     assert np.all(low < middle)
-    assert np.all(middle < high)
+    assert np.all(middle <= high)
 
 
 def test_the_spread_is_set_without_touching_the_shape() -> None:

@@ -16,7 +16,7 @@ from rich.table import Column, Table
 from calibrate.compare.field import KEYS, Alignment, Tone
 from calibrate.errors import CalibrationError
 from calibrate.loop.scores import AGAIN
-from calibrate.report import csv_text, source_note
+from calibrate.report import csv_text, source_label, source_note
 from calibrate.validate.report import findings, tables
 from calibrate.validate.report.data import Report, Stat
 from calibrate.validate.run import REPEATED, Outcome
@@ -38,6 +38,7 @@ def score_rows(outcome: Outcome) -> Iterator[Cells]:
     for k, row in enumerate(outcome.rows):
         header = outcome.sessions[row.session].header
         press, scores = row.press, outcome.scores.of_row(k)
+        label = source_label(header.source, [header.brush])
         for m, model in enumerate(outcome.names):
             for j, (alignment, tone) in enumerate(KEYS):
                 csim, ssim = (float(v) for v in scores[m, j])
@@ -52,7 +53,7 @@ def score_rows(outcome: Outcome) -> Iterator[Cells]:
                         str(tone),
                         csim,
                         ssim,
-                        str(header.source),
+                        label,
                     )
 
 
@@ -93,9 +94,8 @@ def write_parquet(outcome: Outcome, path: Path) -> None:
     except ImportError:
         raise CalibrationError("--parquet", "needs pyarrow: pip install 'brushloop[parquet]'") from None
     kinds = [pa.float64() if name in ("height_mm", "tilt_deg", "csim", "ssim") else pa.string() for name in COLUMNS]
-    schema: Any = pa.schema(
-        list(zip(COLUMNS, kinds, strict=True)), metadata={"source": str(outcome.sessions[0].header.source)}
-    )
+    label = source_label(outcome.sessions[0].header.source, (one.header.brush for one in outcome.sessions))
+    schema: Any = pa.schema(list(zip(COLUMNS, kinds, strict=True)), metadata={"source": label})
     part = path.with_name(path.name + ".part")
     try:
         with pq.ParquetWriter(part, schema) as writer:

@@ -164,8 +164,9 @@ def print_footprint(
 
     # hairs slide over their own wet trail: the sheet keeps the wettest moment, not the sum
     wet = np.zeros(shape_px, np.float32)
-    for d in dots:
-        np.maximum(wet, scatter(d, shape_px, origin, px_per_mm, load, tuft.spec), out=wet)
+    for moment, d in enumerate(dots):
+        laid = scatter(d, shape_px, origin, px_per_mm, load, tuft.spec)
+        np.maximum(wet, laid if moment == 0 else laid * np.float32(tuft.spec.trail_share), out=wet)
     density = soak(wet, load, px_per_mm, paper_rng, tuft.spec)
     if tuft.trouble is not None:
         density = density * np.float32(tuft.trouble.tone)

@@ -24,6 +24,7 @@ ALLOWED: Mapping[str, tuple[float, float]] = MappingProxyType(
         "uneven_mm": (0.0, 12.0),
         "wick_mm": (0.04, 1.0),
         "need_per_mm2": (0.5, 15.0),
+        "trail_share": (0.0, 1.0),
         "bow_mm": (0.0, 3.0),
         "spread_wander": (0.0, 0.3),
         "reach_wander_mm": (0.0, 3.0),
@@ -72,6 +73,8 @@ class BrushSpec:
     """Capillary spread of a full brush's ink in the paper, standard deviation."""
     need_per_mm2: float = 3.5
     """Deposits per area below which the paper stays white under a full brush."""
+    trail_share: float = 1.0
+    """Ink that hairs leave while they slide down, as a share of what they leave where they rest: ink needs time."""
     bow_mm: float = 0.25
     """Sideways offset of the pressed tip, standard deviation between brushes."""
     spread_wander: float = 0.015

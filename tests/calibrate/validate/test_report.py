@@ -7,19 +7,25 @@ import json
 import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
+import numpy as np
 import pyarrow.parquet
 import pytest
 from typer.testing import CliRunner
 
 from brushloop import app
-from calibrate.compare.field import Alignment, Tone
+from calibrate.compare.field import KEYS, Alignment, Tone
 from calibrate.errors import CalibrationError
 from calibrate.validate.gates import GateMissed, parse_gate
 from calibrate.validate.report.data import Collected, Report, load_report
 from calibrate.validate.report.findings import trust
+from calibrate.validate.report.outputs import COLUMNS, score_rows
 from calibrate.validate.report.page import _of_session
+from calibrate.validate.run import Outcome
 from sessions.reader import Recording
+from sessions.recording.schemas import Source
 from sessions.remarks import Remark, add_remark
 from tests.browser import BROWSER, content_widths_px
 
@@ -118,6 +124,17 @@ def test_csv_and_parquet_hold_the_same_scores(folder: Path) -> None:
         assert {k: text[k] for k in ("stroke_id", "model", "source")} == {
             k: binary[k] for k in ("stroke_id", "model", "source")
         }
+
+
+def test_every_score_of_a_twin_is_labelled_as_one() -> None:
+    header = SimpleNamespace(
+        session_id="s", source=Source.LOOPBACK, brush="simulated bristle bundle (twin of monday, simulated), R = 5 mm"
+    )
+    row = SimpleNamespace(session=0, press=SimpleNamespace(stroke_id="a", height_mm=11.0, tilt_deg=0.0))
+    scores = SimpleNamespace(of_row=lambda _: np.full((1, len(KEYS), 2), 0.9))
+    outcome = SimpleNamespace(sessions=[SimpleNamespace(header=header)], rows=[row], scores=scores, names=["ccd-bsm"])
+    labels = {one[COLUMNS.index("source")] for one in score_rows(cast(Outcome, outcome))}
+    assert labels == {"loopback rig, brush twin of monday, simulated"}
 
 
 def test_averages_of_the_report_are_those_of_the_scores(folder: Path, report: Report) -> None:

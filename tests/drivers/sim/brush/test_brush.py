@@ -92,6 +92,13 @@ def test_two_brushes_of_one_make_differ_more_than_repeats(brush):
     assert wet(brush, 15, 5).density.tobytes() != wet(other, 15, 5).density.tobytes()
 
 
+def test_without_a_trail_a_press_leaves_ink_only_where_its_hairs_come_to_rest(brush):
+    still = wet(Brush(replace(brush.spec, trail_share=0.0)), 17, 0)
+    slid = wet(brush, 17, 0)
+    assert extent_mm(still)[0] < extent_mm(slid)[0] - 3.0  # the tip touched beside the place where the heel rests
+    assert np.all(still.density <= slid.density + 1e-6)
+
+
 def test_a_dry_brush_leaves_less_ink_and_streaks(brush):
     loads = (1.0, 0.7, 0.4, 0.2, 0.0)
     marks = {load: brush.press(17, 5, ink_load=load, press_seed=3) for load in loads}
