@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import re
 import select
 import shutil
 import subprocess
@@ -121,11 +122,9 @@ def read_until(terminal: int, words: bytes) -> None:
             shown += os.read(terminal, 4096)
 
 
-LABS_TEST = """
+DOCUMENTED = re.compile(r"<!-- tested by tests/test_release\.py -->\n```(\w+)\n(.*?)```", re.DOTALL)
+OF_A_TWIN = """
 import tomllib
-
-def test_the_rig_is_served(brushloop_rig):
-    assert tomllib.loads(brushloop_rig.read_text())["name"] == "loopback rig"
 
 def test_the_twin_presses(brushloop_twin):
     assert tomllib.loads(brushloop_twin.read_text())["brush"]["name"] == "our brush, simulated"
@@ -134,8 +133,10 @@ def test_the_twin_presses(brushloop_twin):
 
 @pytest.mark.soak  # builds and installs
 def test_a_labs_own_tests_get_a_rig_and_its_twin(brushloop: Path, tmp_path: Path) -> None:
+    documented = dict(DOCUMENTED.findall((ROOT / "docs" / "twin.md").read_text()))
     (tmp_path / "twin.toml").write_text('name = "our brush, simulated"\n[brush]\nfriction = 0.3\n')
-    (tmp_path / "pytest.ini").write_text("[pytest]\nbrushloop_twin = twin.toml\n")
-    (tmp_path / "test_ours.py").write_text(LABS_TEST)
-    said = run(brushloop.with_name("python"), "-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=tmp_path)
+    (tmp_path / "pytest.ini").write_text(documented["ini"])
+    (tmp_path / "test_ours.py").write_text(documented["python"] + OF_A_TWIN)
+    path = f"{brushloop.parent}:{os.environ['PATH']}"
+    said = run(brushloop.with_name("python"), "-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=tmp_path, PATH=path)
     assert "2 passed" in said

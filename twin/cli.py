@@ -30,6 +30,7 @@ def twin(
     continues when the same command is given again.
     """
     from importlib.metadata import version
+    from shlex import quote
 
     from calibrate.compare.field import Field
     from calibrate.errors import CalibrationError
@@ -71,7 +72,7 @@ def twin(
     noise = noise_gray(recording)
     write_whole(target, twin_toml(fitted, captures.header.session_id, noise))
     notes_file.unlink(missing_ok=True)
-    say(*_tables(captures, fitted, noise), f"Twin: {target}")
+    say(*_tables(captures, fitted, noise), f"Twin: {target}", f"next: brushloop sim --brush {quote(str(target))}")
 
 
 def _tables(captures: Captures, fitted: Twin, noise: float | None) -> Iterator[object]:

@@ -70,7 +70,7 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
     said = made(session, out)
     assert searched == [1.0, 0.5] * (1 + PARTS)  # those of all cells were not repeated
     unknown = "No cell has three captures", "The camera's noise was not measured"
-    for words in ("friction", "a third of the cells left out in turn", *unknown):
+    for words in ("friction", "a third of the cells left out in turn", "next: brushloop sim --brush", *unknown):
         assert words in said
     assert not notes_path(out).exists()
     assert load_brush(out).name == "simulated bristle bundle (twin of presses, simulated)"
