@@ -141,7 +141,7 @@ def fit_footprint(
 
     moved = np.zeros(len(first))
     for spread_mm in SPREADS_MM if start is None else SPREADS_MM[-1:]:
-        moved = descend(lambda v, s=spread_mm: equations(v, s), moved, rounds=ROUNDS, most=2.0, gain=1e-3)
+        moved = descend(lambda v, s=spread_mm: equations(v, s), moved, rounds=ROUNDS, most=2.0, gain=1e-3).vector
     return Footprint(tuple((first + scale * moved).tolist()))
 
 

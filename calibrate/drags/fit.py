@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from model.damped import Damping, Equations, descend
 from model.drag import DragModel, distances, ink, trails
 
 Floats = NDArray[np.float64]
@@ -28,6 +29,7 @@ PRIOR = (2.0, 0.2, 0.01, 3.0, 1.0, 4.0, 1.5, 1.5, 0.2, 0.2, 3.0, 3.0, 0.5, 0.5)
 """Standard deviations of the prior: a parameter this far from its start costs as much as a pixel of wrong ink."""
 PLACE_PRIOR_MM = 1.5
 ROUNDS = 25
+DAMPING = Damping(1e-2, 5.0, 6.0, 1e-6, 1e4, floor=0.0)
 UNDETERMINED = 0.5
 """A parameter keeps no interval if the strokes reduce the variance of its weak prior by less than this share."""
 
@@ -42,7 +44,6 @@ class DragFit:
     condition: float
     """Condition number of the scaled normal equations: above about 1e4 the parameters cannot be distinguished."""
     cost: float
-    rounds: int
     spread_mm: float = SPREAD_MM
     """Variation of an edge from stroke to stroke (scale of the logistic)."""
 
@@ -116,7 +117,13 @@ def fit_drags(
         held = ("leash_mm", "leash_per_mm", "land_mm", "back_mm", "front", "front_width")
         free[[DragModel.names().index(name) for name in held]] = False
 
-    def equations(vector: Floats) -> tuple[float, Floats, Floats]:
+    def whole(part: Floats) -> Floats:
+        vector = first.copy()
+        vector[free] = part
+        return vector
+
+    def equations(part: Floats) -> Equations:
+        vector = whole(part)
         nodes, starts, slopes = _linearised(paths, vector, scale, columns)
         square, gradient = np.zeros((len(vector), len(vector))), np.zeros(len(vector))
         cost = float(
@@ -126,26 +133,10 @@ def fit_drags(
         )
         off = (vector - first) / scale
         square = np.tril(square) + np.tril(square, -1).T + np.eye(len(vector))
-        return cost + 0.5 * float(off @ off), square[np.ix_(free, free)], (gradient + off)[free]
+        return Equations(cost + 0.5 * float(off @ off), square[np.ix_(free, free)], (gradient + off)[free])
 
-    vector, damping = first.copy(), 1e-2
-    cost, square, gradient = equations(vector)
-    done = 0
-    for _ in range(ROUNDS):
-        done += 1
-        step = np.linalg.solve(square + damping * np.diag(np.diag(square)), -gradient)
-        trial = vector.copy()
-        trial[free] += scale[free] * np.clip(step, -2.0, 2.0)
-        found = equations(trial)
-        if found[0] < cost:
-            gain = (cost - found[0]) / cost
-            vector, (cost, square, gradient), damping = trial, found, max(damping / 5.0, 1e-6)
-            if gain < 1e-4:
-                break
-        else:
-            damping *= 6.0
-            if damping > 1e4:
-                break
+    found = descend(equations, first[free], rounds=ROUNDS, most=2.0, gain=1e-4, scale=scale[free], damping=DAMPING)
+    vector, square = whole(found.vector), found.at.square
     spread = np.sqrt(np.diag(square))
     condition = float(np.linalg.cond(square / np.outer(spread, spread)))
     squares, gradients = _by_image(paths, each, images, added, counted, x_mm, y_mm, vector, scale, columns, spread_mm)
@@ -154,8 +145,7 @@ def fit_drags(
         DragModel.of(vector[:14]),
         vector[14:].reshape(-1, 2),
         condition,
-        cost,
-        done,
+        found.at.cost,
         spread_mm,
         begin.vector(),
         prior,

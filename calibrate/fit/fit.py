@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from calibrate.fit.captures import SPREAD_MM, Grid, Pressed
 from calibrate.fit.prior import Prior, learned, spreads, wide
 from calibrate.fit.residual import fit_residual
+from model.damped import Damping, Equations, descend
 from model.fitted import NAMES, PARAMETERS, FittedPress, chance_within, published
 from sessions.progress import Progress, counted, unseen
 
@@ -32,6 +33,7 @@ STAGES: tuple[tuple[str, tuple[str, ...]], ...] = (
 )
 """Each stage frees its parameters in addition to all that were freed before."""
 ROUNDS = 40
+DAMPING = Damping(1e-2, 6.0, 8.0, 1e-7, 1e5, floor=0.0)
 STEP = 1e-4
 """Step of a derivative, as a share of the parameter's spread."""
 STRAYS = {"lam": 0.09, "origin_mm": 0.3, "heel_gain": 0.3, "tip_gain": 0.04}
@@ -194,37 +196,36 @@ def _minimise(
     spread = spreads()[at]
     low, high = (np.array([getattr(PARAMETERS[k], end) for k in at]) for end in ("low", "high"))
 
-    def equations(trial: FittedPress) -> tuple[float, Floats, Floats]:
+    def at_values(vector: Floats) -> FittedPress:
+        values = press.values.copy()
+        values[at] = vector
+        return replace(press, values=values)
+
+    def equations(vector: Floats) -> Equations:
+        trial = at_values(vector)
         squares, gradients, cost = _normal(trial, free, strokes, grid)
         pull, stiff = _prior_terms(trial, at, prior)
         off = _off(trial, prior)
-        return (
-            cost + 0.5 * float(off @ prior.precision @ off),
-            squares.sum(axis=0) + stiff,
-            gradients.sum(axis=0) + pull,
-        )
+        cost += 0.5 * float(off @ prior.precision @ off)
+        return Equations(cost, squares.sum(axis=0) + stiff, gradients.sum(axis=0) + pull)
 
-    cost, square, gradient = equations(press)
-    damping = 1e-2
-    for _ in range(ROUNDS):
-        step = np.linalg.solve(square + damping * np.diag(np.diag(square)), -gradient)
-        values = press.values.copy()
-        values[at] = np.clip(values[at] + spread * np.clip(step, -1.0, 1.0), low, high)
-        trial = replace(press, values=values)
-        if any(s.height_mm + values[1] <= 0.1 for s in strokes):
-            damping *= 8.0
-            continue
-        found = equations(trial)
-        if found[0] < cost:
-            gain = (cost - found[0]) / max(cost, 1e-9)
-            press, (cost, square, gradient), damping = trial, found, max(damping / 6.0, 1e-7)
-            if gain < 1e-4:
-                break
-        else:
-            damping *= 8.0
-            if damping > 1e5:
-                break
-    return press
+    def feasible(vector: Floats) -> Floats | None:
+        """Within the bounds; None if a press would not reach the paper."""
+        clipped = np.clip(vector, low, high)
+        h0_mm = at_values(clipped).values[1]
+        return None if any(s.height_mm + h0_mm <= 0.1 for s in strokes) else clipped
+
+    found = descend(
+        equations,
+        press.values[at],
+        rounds=ROUNDS,
+        most=1.0,
+        gain=1e-4,
+        scale=spread,
+        damping=DAMPING,
+        feasible=feasible,
+    )
+    return at_values(found.vector)
 
 
 def _inverse(square: Floats) -> Floats:

@@ -75,7 +75,7 @@ def lead(
             gain=GAIN,
             cost=lambda v, s=spread_mm: problem.cost(v, s),
             feasible=lambda v: problem.vector(problem.strokes(v)),
-        )
+        ).vector
     return [reach.spaced(np.round(stroke, 3)) for stroke in problem.strokes(vector)]
 
 
