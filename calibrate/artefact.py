@@ -10,6 +10,7 @@ import hashlib
 import json
 import logging
 import re
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, cast
 
@@ -29,10 +30,20 @@ MAX_POINTER_BYTES = 256
 _log = logging.getLogger(__name__)
 
 
-class Artefact(BaseModel):
-    """Base class of artefacts: frozen, without unknown fields, saved under the hash of its canonical JSON."""
+def made_by() -> str:
+    """The name and version of this software, as files record it."""
+    return f"brushloop {version('brushloop')}"
+
+
+class Frozen(BaseModel):
+    """Base class of what is read from files: frozen, without unknown fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Artefact(Frozen):
+    """Base class of artefacts, which are saved under the hash of their canonical JSON."""
+
     versions: ClassVar[tuple[int, ...]] = (1,)
     """Supported values of `schema_version`."""
 
@@ -65,10 +76,8 @@ class SessionFit(Artefact):
     software: str
 
 
-class FittedValue(BaseModel):
+class FittedValue(Frozen):
     """A fitted parameter; the interval is missing where the data do not determine the parameter."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     value: float
     low: float | None

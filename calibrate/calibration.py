@@ -6,9 +6,8 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
 
-from calibrate.artefact import Artefact
+from calibrate.artefact import Artefact, Frozen
 from calibrate.board.lens import LensUsed
 from calibrate.board.pix2len import apply
 from calibrate.board.spec import BoardSpec
@@ -17,10 +16,8 @@ SCHEMA_VERSION = 2
 """Version 2 adds the lens, the board, the still, and whether the calibration was made for another session."""
 
 
-class Foreign(BaseModel):
+class Foreign(Frozen):
     """Origin of a calibration that was made for another session and applied by force, and its error here."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     digest: str
     """Digest of the applied artefact."""

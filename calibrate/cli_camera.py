@@ -68,8 +68,8 @@ def intrinsics(
 ) -> None:
     """Fit the lens, and say what each photograph contributes, which were dropped, and what else to photograph."""
     import hashlib
-    from importlib.metadata import version
 
+    from calibrate.artefact import made_by
     from calibrate.board.artefact import lens_file
     from calibrate.board.detect import BoardView, find_board
     from calibrate.board.intrinsics import fit_lens, named
@@ -94,7 +94,7 @@ def intrinsics(
             except CalibrationError as error:
                 unusable[name] = error.what
     fitted = fit_lens(seen, limit_px, unusable, one_camera=one_camera)
-    file = lens_file(fitted, describe(made), digests, limit_px, f"brushloop {version('brushloop')}")
+    file = lens_file(fitted, describe(made), digests, limit_px, made_by())
     for name, residual in file.residuals_px.items():
         say(f"{name}: {residual:.3f} px, slanted by {fitted.slants_deg[name]:.0f} deg")
     for name, residual in file.dropped.items():
@@ -201,8 +201,8 @@ def register(
 ) -> None:
     """Locate the paper in the robot's base frame from touched or pressed marks; prints the lines for rig.toml."""
     import hashlib
-    from importlib.metadata import version
 
+    from calibrate.artefact import made_by
     from calibrate.board.artefact import read_lens, registration_file
     from calibrate.board.register import read_points
     from calibrate.board.register import register as fit
@@ -237,7 +237,7 @@ def register(
     seen = hashlib.sha256(read_bounded(photograph, MAX_PHOTOGRAPH_BYTES)).hexdigest()
     through = known.source if known else "no lens"
     source = f"{table.name}, sha256 {points.sha256}; {photograph.name}, sha256 {seen}; {through}"
-    file = registration_file(fitted, spec.origin_mm, source, f"brushloop {version('brushloop')}")
+    file = registration_file(fitted, spec.origin_mm, source, made_by())
     for flag in plane.flags:
         say(f"warning: {flag}")
     say(

@@ -45,7 +45,7 @@ def crop_capture(capture: Capture, calibration: Calibration | None) -> Crop:
     stroke that travels is all ink in its cell. Raises `CaptureRefused` or `SessionDamaged`.
     """
     stroke, image = capture.stroke, capture.image()
-    params = Params(**calibration.preprocess) if calibration else Params()
+    params = Params.of(calibration)
     cell_px = None
     if calibration is not None and stroke.anchor_mm is not None:
         window = Field().window_mm(stroke.anchor_mm)

@@ -14,8 +14,9 @@ from typing import Any, ClassVar, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
+from calibrate.artefact import Frozen
 from calibrate.errors import CalibrationError, invalid
 from calibrate.files import read_bounded, write_whole
 from sessions.cells import CsvWriter
@@ -204,14 +205,13 @@ def save_picture(figure: Any, path: Path) -> None:
     figure.savefig(path, format="png", metadata={"Software": None})
 
 
-class Sealed(BaseModel):
+class Sealed(Frozen):
     """Base class of JSON reports with a digest of their contents, by which an edited one is recognised.
 
     The digest is not a signature: it guards results and their source against accidental edits.
-    Frozen, without unknown fields. A subclass sets FORMAT and makes it the default of `format`.
+    A subclass sets FORMAT and makes it the default of `format`.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     FORMAT: ClassVar[str]
     MADE_BY: ClassVar[str]
     """The command that writes such a file."""

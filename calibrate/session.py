@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from importlib.metadata import version
 from pathlib import Path
 
-from calibrate.artefact import current, load_artefact, put_to_use
+from calibrate.artefact import current, load_artefact, made_by, put_to_use
 from calibrate.board.detect import find_board
 from calibrate.board.lens import LensUsed, rms
 from calibrate.board.session import NO_BOARD, board_of, board_stills, known_lens, lens_of_session, sheet_of
@@ -48,7 +47,7 @@ def calibrate_session(session: Path, lens: Path | None = None, progress: Progres
         session_id=recording.header.session_id,
         source=recording.header.source,
         recording_sha256=recording.sha256,
-        software=f"brushloop {version('brushloop')}",
+        software=made_by(),
         image_to_paper=tuple(plane.image_to_paper.ravel().tolist()),  # pyright: ignore[reportArgumentType]
         mm_per_px=plane.mm_per_px,
         mm_per_px_low=low,

@@ -8,8 +8,8 @@ from typing import cast
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
 
+from calibrate.artefact import Frozen
 from calibrate.errors import CalibrationError
 
 Gray = NDArray[np.uint8]
@@ -63,10 +63,8 @@ def lens_of(
     return Lens(np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.array(distortion), size_px)
 
 
-class LensUsed(BaseModel):
+class LensUsed(Frozen):
     """The lens by which photographs are undistorted, as files store it, and its source."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     source: str
     """`lens file <hash>`, or `k1 fitted on the board` where no lens file was given and none was needed."""

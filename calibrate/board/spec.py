@@ -5,17 +5,16 @@ from __future__ import annotations
 from typing import Annotated
 
 import cv2
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from calibrate.artefact import Frozen
 from calibrate.errors import CalibrationError
 
 Corners = Annotated[int, Field(ge=3, le=60)]
 
 
-class BoardSpec(BaseModel):
+class BoardSpec(Frozen):
     """A ChArUco board in the plane of the paper, in view of the camera."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     squares: tuple[Annotated[int, Field(ge=2, le=50)], Annotated[int, Field(ge=2, le=50)]]
     """Columns and rows of squares."""
@@ -34,10 +33,8 @@ class BoardSpec(BaseModel):
         return self
 
 
-class Checkerboard(BaseModel):
+class Checkerboard(Frozen):
     """A plain checkerboard, named by its inner corners as OpenCV does."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     inner_corners: tuple[Corners, Corners]
     """Columns and rows."""

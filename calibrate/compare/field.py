@@ -106,11 +106,14 @@ def crop_at_anchor(prepared: Prepared, anchor_px: tuple[float, float], view: Fie
     return cropped
 
 
+def covered(prepared: Prepared) -> Image:
+    """(128, 128) share of each pixel that is ink in a capture that was rectified to the field."""
+    return _shrunk(prepared.mask.astype(np.float32))
+
+
 def captured_mm(prepared: Prepared, tone: Tone) -> Image:
     """(128, 128) image of a capture that was rectified to the field."""
-    side = (SIZE_PX, SIZE_PX)
-    source = prepared.soft if tone is Tone.GRAY else prepared.mask.astype(np.float32)
-    return to_tone(cast("Image", cv2.resize(source, side, interpolation=cv2.INTER_AREA)), tone)
+    return to_tone(_shrunk(prepared.soft) if tone is Tone.GRAY else covered(prepared), tone)
 
 
 def captured_normalised(prepared: Prepared, tone: Tone) -> Image:
@@ -124,7 +127,11 @@ def captured_normalised(prepared: Prepared, tone: Tone) -> Image:
     middle = 0.5 * FINE * SIZE_PX
     move = np.array([[scale, 0.0, middle - 0.5 - scale * (x - 0.5)], [0.0, scale, middle - 0.5 - scale * (y - 0.5)]])
     fine = cv2.warpAffine(source, move, (FINE * SIZE_PX, FINE * SIZE_PX), flags=cv2.INTER_LINEAR)
-    return to_tone(cast("Image", cv2.resize(fine, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA)), tone)
+    return to_tone(_shrunk(fine), tone)
+
+
+def _shrunk(image: cv2.typing.MatLike) -> Image:
+    return cast("Image", cv2.resize(image, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA))
 
 
 def to_tone(coverage: Image, tone: Tone) -> Image:

@@ -45,7 +45,7 @@ Pixels = NDArray[np.uint8]
 MAX_UNPACKED_BYTES = 256 * (len(KEYS) + 1) * SIZE_PX**2
 
 
-def prepare_press(capture: Capture, calibration: Calibration | None, params: Params, view: Field) -> Prepared:
+def prepare_press(capture: Capture, calibration: Calibration | None, view: Field) -> Prepared:
     """Rectify a stroke to the millimetre field, by the calibration or by the import's own scale.
 
     Raises `CaptureRefused` for a capture that cannot be used, `SessionDamaged` for a picture that cannot be read.
@@ -53,7 +53,7 @@ def prepare_press(capture: Capture, calibration: Calibration | None, params: Par
     stroke = capture.stroke
     if capture.bad:
         raise CaptureRefused(stroke.stroke_id, capture.bad)
-    image = capture.image()
+    image, params = capture.image(), Params.of(calibration)
     left, top = (v * PX_PER_MM for v in view.anchor_mm)
     if stroke.anchor_mm is not None and calibration is not None:
         window = view.window_mm(stroke.anchor_mm)

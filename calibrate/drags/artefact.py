@@ -13,9 +13,9 @@ from typing import Annotated, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from calibrate.artefact import FittedValue, SessionFit
+from calibrate.artefact import FittedValue, Frozen, SessionFit
 from calibrate.drags.captures import COMMANDS, commanded_path
 from calibrate.drags.fit import INK_ABOVE
 from calibrate.drags.residual import RIDGE, Residual, captured_distance
@@ -33,13 +33,11 @@ MOST_UNPACKED = 100_000_000
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
-class Kept(BaseModel):
+class Kept(Frozen):
     """Commands and ink of the training strokes, and the model that they correct.
 
     The images have square pixels, rows from the top.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     commands: Annotated[list[list[Number]], Field(min_length=1, max_length=MOST_STROKES)]
     """`calibrate.drags.captures.COMMANDS` of each stroke."""
@@ -137,20 +135,16 @@ class Kept(BaseModel):
         return bits.reshape(shape).astype(np.bool_)
 
 
-class DragScore(BaseModel):
+class DragScore(Frozen):
     """Score of one model on images that it was not fitted to, ink as 0 or 1, at the commanded place."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     csim_percent: float
     iou_percent: float
     images: int
 
 
-class Stamps(BaseModel):
+class Stamps(Frozen):
     """Circle stamps fitted to the same strokes: what a report shows beside the lag."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     parameters: Annotated[list[float], Field(min_length=14, max_length=14)]
     spread_mm: Annotated[float, Field(gt=0.0, le=50.0)]

@@ -7,13 +7,12 @@ its zero touch is found. Its leash and the terms that grow with depth are adapte
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.artefact import FittedValue, put_to_use
+from calibrate.artefact import FittedValue, made_by, put_to_use
 from calibrate.compare.similarity import binary_scores
 from calibrate.drags.artefact import DragArtefact, DragScore
 from calibrate.drags.captures import COMMANDS, Drawn
@@ -175,7 +174,7 @@ def _artefact(drawn: Drawn, fit: DragFit, images: Indices, values: dict[str, Fit
         source=drawn.header.source,
         recording_sha256=drawn.recording_sha256,
         calibration=drawn.calibration.digest if drawn.calibration else "",
-        software=f"brushloop {version('brushloop')}",
+        software=made_by(),
         images=len(taken),
         strokes=int(np.diff(drawn.groups)[images].sum()),
         mm_per_px=round(drawn.mm_per_px, 9),

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from calibrate.artefact import FittedValue, SessionFit
+from calibrate.artefact import FittedValue, Frozen, SessionFit
 from model.fitted import MODES, NAMES, TERMS, FittedPress
 
 SCHEMA_VERSION = 1
@@ -15,10 +15,8 @@ FOLDER = "brushfit"
 EARLIER_TERMS = 5
 
 
-class FittedStage(BaseModel):
+class FittedStage(Frozen):
     """A stage of the fit; `condition` is missing where it is infinite."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     condition: float | None

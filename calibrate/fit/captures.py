@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.calibration import Calibration
-from calibrate.compare.field import SIZE_PX, Field
+from calibrate.compare.field import SIZE_PX, Field, covered
 from calibrate.compare.images import brush_of, prepare_press
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.session import calibration_of
-from calibrate.stroke.params import Params
 from sessions.errors import SessionDamaged
 from sessions.progress import Progress, counted, unseen
 from sessions.reader import Recording
@@ -84,14 +82,13 @@ def read_presses(
     if not strokes or {stroke.kind for stroke in strokes} != {"press"}:
         raise CalibrationError(str(recording.path), "holds no presses, or holds drags, which --drags fits")
     calibration = calibration_of(recording, strokes[0], digest, calibration_path)
-    params = Params(**calibration.preprocess) if calibration else Params()
     pressed: list[Pressed] = []
     names: list[str] = []
     refused: list[tuple[str, str]] = []
     for capture in counted(recording.captures(), "presses read", len(strokes), progress):
         stroke = capture.stroke
         try:
-            prepared = prepare_press(capture, calibration, params, view)
+            prepared = prepare_press(capture, calibration, view)
         except (CaptureRefused, SessionDamaged) as error:
             refused.append((stroke.stroke_id, error.what))
             continue
@@ -100,9 +97,8 @@ def read_presses(
         elif prepared.cut:
             refused.append((stroke.stroke_id, "is cut by the edge of its photograph or cell"))
         else:
-            mask = prepared.mask.astype(np.float32)
-            ink = cv2.resize(mask, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA)
-            pressed.append(Pressed(stroke.height_mm, stroke.tilt_deg, np.asarray(ink, np.float64)))
+            ink = np.asarray(covered(prepared), np.float64)
+            pressed.append(Pressed(stroke.height_mm, stroke.tilt_deg, ink))
             names.append(stroke.stroke_id)
     if not pressed:
         raise CalibrationError(str(recording.path), "holds no press that can be used for a fit")

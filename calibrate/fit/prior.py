@@ -16,8 +16,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from calibrate.artefact import Frozen
 from model.fitted import NAMES, PARAMETERS, published
 
 Floats = NDArray[np.float64]
@@ -28,20 +29,16 @@ FLOOR = 0.15
 """Least standard deviation of a parameter, in units of its spread."""
 
 
-class KnownBrush(BaseModel):
+class KnownBrush(Frozen):
     """A brush of the prior: its parameters, in the order of `NAMES`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     family: str
     values: tuple[float, ...] = Field(min_length=len(NAMES), max_length=len(NAMES))
 
 
-class KnownBrushes(BaseModel):
+class KnownBrushes(Frozen):
     """The contents of `prior.json`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     brushes: tuple[KnownBrush, ...]
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 
-from calibrate.artefact import FittedValue, put_to_use
+from calibrate.artefact import FittedValue, made_by, put_to_use
 from calibrate.compare.field import Field
 from calibrate.fit.artefact import FOLDER, BrushFit, FittedStage
 from calibrate.fit.captures import Captures, Grid, Pressed
@@ -62,7 +61,7 @@ def fit_session(captures: Captures, view: Field, progress: Progress = unseen) ->
         source=captures.header.source,
         recording_sha256=captures.recording_sha256,
         calibration=captures.calibration.digest if captures.calibration else "",
-        software=f"brushloop {version('brushloop')}",
+        software=made_by(),
         radius_mm=captures.radius_mm,
         length_mm=captures.length_mm,
         strokes=len(strokes),

@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import TypeVar
 
-import cv2
 import numpy as np
 
 from calibrate.calibration import Calibration
-from calibrate.compare.field import SIZE_PX, Field, Image, crop
+from calibrate.compare.field import Field, Image, covered, crop
 from calibrate.compare.images import brush_of, prepare_press
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.invert.model_error import NORMAL_95, Cell, model_sd
@@ -201,19 +200,18 @@ def spread(strokes: Sequence[_T], most: int | None) -> Sequence[_T]:
 def align(capture: Capture, calibration: Calibration | None, view: Field) -> AlignedStroke:
     """Place a capture on the field, by the calibration or by the import's own scale. Raises `CaptureRefused`."""
     stroke = capture.stroke
-    params = Params(**calibration.preprocess) if calibration else Params()
     if stroke.px_per_mm is None or stroke.anchor_px is not None:
-        prepared = prepare_press(capture, calibration, params, view)
+        prepared = prepare_press(capture, calibration, view)
     else:  # an import without an anchor
-        whole = prepare(rescale(capture.image(), stroke.px_per_mm, capture.where), None, capture.where, params)
+        whole = prepare(
+            rescale(capture.image(), stroke.px_per_mm, capture.where), None, capture.where, Params.of(calibration)
+        )
         prepared = crop(whole, view.corner_around_px(whole.mask), view)
     if prepared.cut:
         raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph, cell or field")
-    mask = prepared.mask.astype(np.float32)
-    image = cast("Image", cv2.resize(mask, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA))
     anchor = prepared.anchor_px
     place_mm = None if anchor is None else (anchor[0] / PX_PER_MM, anchor[1] / PX_PER_MM)
-    return AlignedStroke(stroke, image, place_mm)
+    return AlignedStroke(stroke, covered(prepared), place_mm)
 
 
 def _invert(made: Inversion, inverter: Inverter, batch: list[AlignedStroke]) -> None:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibrate.artefact import load_artefact
+from calibrate.artefact import load_artefact, made_by
 from calibrate.calibration import Calibration
 from calibrate.compare.field import Field
 from calibrate.compare.images import brush_of, captured_images, prepare_press, simulated
@@ -18,7 +17,6 @@ from calibrate.fit.artefact import BrushFit
 from calibrate.loop.scores import CapturedPress, Pair, PairScore, Table1Row, Verdict, score_pairs, table_1, verdicts
 from calibrate.session import calibration_of
 from calibrate.stroke.measure import measure
-from calibrate.stroke.params import Params
 from model.brush import DomainError
 from sessions.errors import SessionDamaged
 from sessions.progress import Progress, counted, unseen
@@ -112,7 +110,7 @@ def compare_sessions(
         scores,
         table,
         verdicts(scores),
-        f"brushloop {version('brushloop')}",
+        made_by(),
     )
 
 
@@ -152,14 +150,13 @@ def _presses(
     captures: Iterator[Capture], calibration: Calibration | None, view: Field, refused: list[tuple[str, str]]
 ) -> Iterator[tuple[CapturedPress, str | None]]:
     """(press, the stroke it repeats) of every capture that can be used; the others go to `refused`."""
-    params = Params(**calibration.preprocess) if calibration else Params()
     for capture in captures:
         stroke = capture.stroke
         if stroke.height_mm is None or stroke.tilt_deg is None:
             refused.append((stroke.stroke_id, "has no depth or tilt"))
             continue
         try:
-            prepared = prepare_press(capture, calibration, params, view)
+            prepared = prepare_press(capture, calibration, view)
             images = captured_images(stroke.stroke_id, prepared)
         except (CaptureRefused, SessionDamaged) as error:
             refused.append((stroke.stroke_id, error.what))

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from calibrate.artefact import Frozen
 from calibrate.compare.field import KEYS, Alignment, Image, Key, Tone
 from calibrate.compare.paper import ROBOT_WRITING, TABLE_1, Triple
 from calibrate.compare.similarity import similarity
@@ -94,10 +95,8 @@ class Verdict:
         return bound is not None and (bound >= -GOAL_POINTS) == self.holds
 
 
-class Table1Row(BaseModel):
+class Table1Row(Frozen):
     """Statistics over the presses that were pressed again, in percent."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     source: Source
     """`loopback rig` or `real capture`."""

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from calibrate.calibration import Calibration
 
 Gray = NDArray[np.uint8]
 Soft = NDArray[np.float32]
@@ -29,3 +33,8 @@ class Params:
     """Components farther than this from the main one belong to other strokes."""
     hole_mm2: float = 0.0
     """Largest hole to fill, such as glare on wet ink leaves; 0 keeps all holes, since dry ink has them too."""
+
+    @classmethod
+    def of(cls, calibration: Calibration | None) -> Params:
+        """Those that a calibration stores; the defaults for an import, which has none."""
+        return cls() if calibration is None else cls(**calibration.preprocess)

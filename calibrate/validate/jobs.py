@@ -10,16 +10,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.calibration import Calibration
-from calibrate.compare.field import BEST_SHIFT_PX, KEYS, SIZE_PX, Alignment, Field
+from calibrate.compare.field import BEST_SHIFT_PX, KEYS, Alignment, Field, covered
 from calibrate.compare.images import captured_images, pack, prepare_press, to_pixels, unpack
 from calibrate.errors import CaptureRefused
 from calibrate.stroke.measure import Measured, measure
-from calibrate.stroke.params import Params
 from calibrate.validate.store import VERSION, Store
 from sessions.errors import SessionDamaged
 from sessions.reader import Capture, Place, capture_at
@@ -93,14 +91,12 @@ def prepare_job(job: PrepareJob) -> Press:
 
     if height is None or tilt is None:
         return refused("has no depth or tilt")
-    params = Params(**job.calibration.preprocess) if job.calibration else Params()
     try:
-        prepared = prepare_press(job.capture, job.calibration, params, job.view)
+        prepared = prepare_press(job.capture, job.calibration, job.view)
         images = captured_images(stroke.stroke_id, prepared)
     except (CaptureRefused, SessionDamaged) as error:
         return refused(error.what)
-    coverage = cv2.resize(prepared.mask.astype(np.float32), (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA)
-    pixels = pack(np.stack([to_pixels(image) for image in (*images.values(), np.asarray(coverage, np.float32))]))
+    pixels = pack(np.stack([to_pixels(image) for image in (*images.values(), covered(prepared))]))
     measured, again = measure(prepared.mask), stroke.again_of or ""
     return Press(stroke.stroke_id, height, tilt, again, pixels, measured, prepared.cut, prepared.flags, "")
 

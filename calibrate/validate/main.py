@@ -185,9 +185,8 @@ def _write(
 def _drags(request: Request, sessions: list[LoadedSession], folder: Path, progress: Progress) -> ValidationOutput:
     validated: list[DragValidation] = []
     for one in sessions:
-        params = Params(**one.calibration.preprocess) if one.calibration is not None else Params()
         captures = counted(one.recording.captures(), f"{one.header.session_id}: measured", one.count, progress)
-        results = validate_drags(captures, params)
+        results = validate_drags(captures, Params.of(one.calibration))
         predictions = None
         if request.fit is not None:
             predictions = predict_session(one.recording.path, request.fit, request.calibration, progress)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from calibrate.compare.field import FINE, Field, Image
 from calibrate.compare.images import axis_mm, brush_of, prepare_press
 from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.stroke.params import PX_PER_MM, Params
+from calibrate.stroke.params import PX_PER_MM
 from calibrate.stroke.preprocess import Prepared
 from calibrate.validate.candidates import Generator
 from calibrate.validate.heldout import fitted_press, folds
@@ -71,7 +71,6 @@ def align_captures(sessions: list[LoadedSession], generator: Path) -> AlignedStr
     aligned = AlignedStrokes(target.px_mm, str(target.placement), str(one_source(sessions)), [], [], [], [])
     for session in sessions:
         model = load_generator(generator, brush_of(session.header))
-        params = Params(**session.calibration.preprocess) if session.calibration is not None else Params()
         for capture in session.recording.captures():
             stroke = capture.stroke
             if stroke.height_mm is None or stroke.tilt_deg is None:
@@ -79,7 +78,7 @@ def align_captures(sessions: list[LoadedSession], generator: Path) -> AlignedStr
                 continue
             try:
                 values = _inputs_of(model, stroke.height_mm, stroke.tilt_deg)
-                prepared = prepare_press(capture, session.calibration, params, Field())
+                prepared = prepare_press(capture, session.calibration, Field())
                 if prepared.cut:
                     raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph or cell")
                 aligned.images.append(_placed(prepared, model, values, stroke.height_mm, stroke.tilt_deg))

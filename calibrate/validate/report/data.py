@@ -7,8 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import ClassVar
 
-from pydantic import BaseModel, ConfigDict
-
+from calibrate.artefact import Frozen
 from calibrate.compare.field import Alignment, Tone
 from calibrate.loop.scores import LoopRecord
 from calibrate.report import Sealed, load_sealed, source_label
@@ -20,18 +19,14 @@ MAX_BYTES = 256 * 1024 * 1024
 PACKAGES = ("numpy", "opencv-python-headless", "scikit-image", "numba", "torch")
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Interval(_Frozen):
+class Interval(Frozen):
     """95 % interval by bootstrap over the presses of each cell, or over cells if these have few presses."""
 
     low: float
     high: float
 
 
-class Stat(_Frozen):
+class Stat(Frozen):
     """One model's scores in one alignment and tone, in percent; `cell` is (H, alpha), or None for all cells."""
 
     model: str
@@ -49,7 +44,7 @@ class Stat(_Frozen):
     median_interval: Interval | None
 
 
-class CandidateInfo(_Frozen):
+class CandidateInfo(Frozen):
     """A row of the tables: the model, and what it knew of the strokes."""
 
     name: str
@@ -60,7 +55,7 @@ class CandidateInfo(_Frozen):
     """Hash of a generator's file; empty for other models."""
 
 
-class Collected(_Frozen):
+class Collected(Frozen):
     """How the strokes were collected, from the session's journal."""
 
     planned: int | None
@@ -75,7 +70,7 @@ class Collected(_Frozen):
     """Highest minus lowest height of the paper."""
 
 
-class Session(_Frozen):
+class Session(Frozen):
     """A recording, from its header, and the artefacts that were used with it."""
 
     session_id: str
@@ -107,7 +102,7 @@ class Session(_Frozen):
     """None without a journal: for imports, and for recordings sent without it."""
 
 
-class Refused(_Frozen):
+class Refused(Frozen):
     """A stroke that was not compared, or not with one of the models, and why."""
 
     session_id: str
@@ -115,7 +110,7 @@ class Refused(_Frozen):
     why: str
 
 
-class Extreme(_Frozen):
+class Extreme(Frozen):
     """One of the best or worst strokes of a model."""
 
     session_id: str
@@ -127,7 +122,7 @@ class Extreme(_Frozen):
     ssim: float
 
 
-class Step(_Frozen):
+class Step(Frozen):
     """Scores of a fit from this many presses on all other presses of the session."""
 
     session_id: str

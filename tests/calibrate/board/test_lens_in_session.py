@@ -26,7 +26,7 @@ from calibrate.compare.field import Field, Tone, captured_mm
 from calibrate.compare.images import prepare_press
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.session import FITTED, calibrate_session
-from calibrate.stroke.params import PX_PER_MM, Params
+from calibrate.stroke.params import PX_PER_MM
 from collect.tui.captures import Review
 from sessions.reader import Recording
 from sessions.recording.schemas import Stroke
@@ -127,13 +127,13 @@ def test_a_lens_file_makes_scale_anchors_and_masks_right(
 
     for capture in Recording(session).captures():
         assert capture.stroke.anchor_mm is not None
-        mask = prepare_press(capture, made, Params(), Field()).mask
+        mask = prepare_press(capture, made, Field()).mask
         truth = true_mask(shot, Field().window_mm(capture.stroke.anchor_mm), PX_PER_MM)
         # The cell of the model's field may end in the middle of the stroke's neighbour; here there is none.
         assert (mask & truth).sum() / (mask | truth).sum() >= 0.95
     small = made.model_copy(update={"lens": made.lens.model_copy(update={"size_px": (1024, 768)})})
     with pytest.raises(CaptureRefused, match="is 2048 x 1536 px, the calibration is for 1024 x 768 px"):
-        prepare_press(capture, small, Params(), Field())
+        prepare_press(capture, small, Field())
 
 
 def test_a_session_that_was_collected_with_a_lens_needs_no_other(
@@ -236,7 +236,7 @@ def test_every_stage_is_shown_with_the_lens(photographed: Photographed, tmp_path
     # What is shown is what is measured: the same plane, the same paper cell.
     made = load_artefact(calibrate_session(session, lens), Calibration)
     shown_first = next(Recording(session).captures())
-    prepared = prepare_press(shown_first, made, Params(), Field())
+    prepared = prepare_press(shown_first, made, Field())
     numbers = json.loads(out.with_suffix(".json").read_text())["fitted"]
     assert numbers["threshold.reflectance"] == prepared.threshold
     assert numbers["binarise.area_mm2"] == prepared.mask.sum() / PX_PER_MM**2
