@@ -29,5 +29,10 @@ def invalid(where: str, error: ValidationError) -> CalibrationError:
     return CalibrationError(where, f"{'.'.join(map(str, first['loc']))}: {first['msg']}")
 
 
+def one_line(error: BaseException) -> str:
+    """The message of another package's error in one line, or else the error's name."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 class CaptureRefused(CalibrationError):
     """This capture cannot be compared; it is listed by name, never dropped silently."""

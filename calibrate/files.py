@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,20 +40,29 @@ def check_folder(folder: Path) -> None:
         raise CalibrationError(str(found[0]), found[1])
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a temporary file, then rename it: a reader sees the old file or the new one. Raises OSError.
+@contextmanager
+def replacing(path: Path) -> Generator[Path]:
+    """Give a temporary file to write to, which then becomes `path`: a reader sees the old file or the new one.
 
-    The temporary file is removed on failure. Line endings and the mode of an existing file are kept.
+    The temporary file is removed on failure.
     """
     part = path.with_name(path.name + ".part")
     try:
+        yield part
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file whole or not at all, with the line endings of `text` and the mode of an existing file.
+
+    Raises OSError.
+    """
+    with replacing(path) as part:
         part.write_bytes(text.encode("utf-8"))
         if path.exists():
             shutil.copymode(path, part)
-        part.replace(path)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
 
 
 def read_bounded(path: Path, most_bytes: int = MAX_BYTES) -> bytes:

@@ -28,16 +28,10 @@ from sessions.recording.messages import decode_gray
 from sessions.recording.schemas import Stroke
 
 PAPER = 255
+PARAMS = Params()
 
 
-def show_stroke(
-    session: Path,
-    stroke: str,
-    out: Path,
-    params: Params | None = None,
-    lens: Path | None = None,
-    progress: Progress = unseen,
-) -> Trace:
+def show_stroke(session: Path, stroke: str, out: Path, lens: Path | None = None, progress: Progress = unseen) -> Trace:
     """Show a stroke of a session by its name, or the first one if the name is empty.
 
     It is rectified by the calibration that the session uses, as in a validation; with a lens file, or without a
@@ -54,15 +48,15 @@ def show_stroke(
     one, image, where = capture.stroke, capture.image(), f"{recording.path.name} {capture.stroke.stroke_id}"
     if one.anchor_mm is not None:
         plane = _plane(recording, one, image, lens, where)
-        window_mm, chosen = Field().window_mm(one.anchor_mm), params or Params()
-        trace = trace_seen(image, plane, window_mm, one.anchor_mm, where, chosen, one.cell_mm)
+        window_mm = Field().window_mm(one.anchor_mm)
+        trace = trace_seen(image, plane, window_mm, one.anchor_mm, where, PARAMS, one.cell_mm)
     elif one.px_per_mm is not None:
         if recording.header.protocol.startswith(SEQUENCE) and before is not None:
             image = only_new(before.image(), image, float(np.mean(one.px_per_mm)), where)
-        trace = trace_scaled(image, one.px_per_mm, one.anchor_px, where, params or Params())
+        trace = trace_scaled(image, one.px_per_mm, one.anchor_px, where, PARAMS)
     else:
         raise CalibrationError(where, "has neither an anchor on the sheet nor a scale of its own")
-    return _written(trace, params or Params(), out)
+    return _written(trace, out)
 
 
 def _plane(recording: Recording, one: Stroke, image: Gray, lens: Path | None, where: str) -> Plane:
@@ -81,17 +75,15 @@ def _plane(recording: Recording, one: Stroke, image: Gray, lens: Path | None, wh
     return calibration_plane(photograph, board_of(recording), known.lens() if known else None, where)
 
 
-def show_photograph(
-    path: Path, px_per_mm: float | None, before: Path | None, out: Path, params: Params | None = None
-) -> Trace:
+def show_photograph(path: Path, px_per_mm: float | None, before: Path | None, out: Path) -> Trace:
     """Show a flat photograph of known scale. Raises `CalibrationError`."""
     if px_per_mm is None:
         raise CalibrationError(str(path), "is a photograph: give --px-per-mm")
     image = read_gray(path)
     if before is not None:
         image = only_new(read_gray(before), image, px_per_mm, str(path))
-    trace = trace_scaled(image, (px_per_mm, px_per_mm), None, str(path), params or Params())
-    return _written(trace, params or Params(), out)
+    trace = trace_scaled(image, (px_per_mm, px_per_mm), None, str(path), PARAMS)
+    return _written(trace, out)
 
 
 def only_new(before: Gray, after: Gray, px_per_mm: float, where: str) -> Gray:
@@ -100,9 +92,9 @@ def only_new(before: Gray, after: Gray, px_per_mm: float, where: str) -> Gray:
     return np.rint(PAPER * (1.0 - new.soft)).astype(np.uint8)
 
 
-def _written(trace: Trace, params: Params, out: Path) -> Trace:
+def _written(trace: Trace, out: Path) -> Trace:
     _, data = cv2.imencode(".png", contact_sheet(trace))
     out.write_bytes(data.tobytes())
-    numbers = {"where": trace.where, "params": asdict(params), "fitted": trace.log, "flags": list(trace.flags)}
+    numbers = {"where": trace.where, "params": asdict(PARAMS), "fitted": trace.log, "flags": list(trace.flags)}
     write_whole(out.with_suffix(".json"), json.dumps(numbers, indent=2) + "\n")
     return trace

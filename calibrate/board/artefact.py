@@ -54,14 +54,14 @@ def lens_file(
     software: str,
 ) -> LensFile:
     """The artefact of a fitted lens."""
-    matrix, d = fitted.lens.matrix, fitted.lens.distortion
+    used = LensUsed.of(fitted.lens, "")
     return LensFile(
         software=software,
         photographs=photographs,
         board=board,
-        size_px=fitted.lens.size_px,
-        matrix=(float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])),
-        distortion=(float(d[0]), float(d[1]), float(d[2]), float(d[3]), float(d[4])),
+        size_px=used.size_px,
+        matrix=used.matrix,
+        distortion=used.distortion,
         focal_se_px=fitted.focal_se_px,
         rms_px=fitted.rms_px,
         rms_limit_px=rms_limit_px,

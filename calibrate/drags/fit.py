@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.damped import Damping, Equations, descend
-from model.drag import DragModel, distances, ink, trails
+from model.drag import DragModel, distances, trails
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -177,11 +177,6 @@ def determined(fit: DragFit) -> NDArray[np.bool_]:
     unit = np.eye(fit.squares.shape[1])
     variance = np.asarray(np.linalg.solve(fit.squares.sum(axis=0) + unit, unit), np.float64)
     return np.diag(variance)[: len(fit.free)] < 1.0 - UNDETERMINED
-
-
-def chance(distance_mm: Floats, spread_mm: float = SPREAD_MM) -> Floats:
-    """The probability of ink at a signed distance from the edge."""
-    return ink(distance_mm, spread_mm)
 
 
 def _each(paths: Sequence[Floats], groups: Indices | None) -> Indices:

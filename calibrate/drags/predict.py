@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from calibrate.compare.similarity import binary_scores
 from calibrate.drags.artefact import DragArtefact, Kept, Stamps
-from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, DragFit, chance, fit_drags
+from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, DragFit, fit_drags
 from calibrate.drags.residual import Residual, captured_distance, clipped, threshold
 from calibrate.errors import CalibrationError
-from model.drag import DragModel, distances, trails
+from model.drag import DragModel, distances, ink, trails
 
 if TYPE_CHECKING:
     from calibrate.drags.captures import Drawn
@@ -68,7 +68,7 @@ class Predictor:
 
     def is_ink(self, away_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Whether a pixel at this signed distance counts as ink."""
-        return chance(np.asarray(away_mm, np.float64), self.spread_mm) > self.above
+        return ink(np.asarray(away_mm, np.float64), self.spread_mm) > self.above
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,11 +86,11 @@ def learn(drawn: Drawn, images: Indices) -> Learned:
     fit = _fit(drawn, images, lag=True, spread_mm=SPREAD_MM)
     kept, learned, above = None, None, INK_ABOVE
     if drawn.commands is not None and len(images) > 1:
-        ink = drawn.ink[images] > 0.5
+        seen = drawn.ink[images] > 0.5
         commands = drawn.commands[images]
         base = fit.distance(paths, drawn.x_mm, drawn.y_mm, groups=groups)
-        above = threshold(commands, base, captured_distance(ink, drawn.mm_per_px))
-        kept = Kept.of(commands, ink, drawn.x_mm, drawn.y_mm, fit.model)
+        above = threshold(commands, base, captured_distance(seen, drawn.mm_per_px))
+        kept = Kept.of(commands, seen, drawn.x_mm, drawn.y_mm, fit.model)
         learned = kept.residual() if kept is not None else None
     stamps = _fit(drawn, images, lag=False, spread_mm=STAMP_SPREAD_MM)
     return Learned(fit, Predictor(fit.model, fit.spread_mm, above, kept, learned), _stamps(drawn, images, stamps))
@@ -134,9 +134,9 @@ def coarse(drawn: Drawn, images: Indices) -> tuple[NDArray[np.float32], Floats, 
 
 def _fit(drawn: Drawn, images: Indices, *, lag: bool, spread_mm: float) -> DragFit:
     paths, groups = chosen(drawn, images)
-    ink, x_mm, y_mm = coarse(drawn, images)
+    target, x_mm, y_mm = coarse(drawn, images)
     weights = drawn.weights[images]
-    return fit_drags(paths, ink, x_mm, y_mm, lag=lag, spread_mm=spread_mm, groups=groups, weights=weights)
+    return fit_drags(paths, target, x_mm, y_mm, lag=lag, spread_mm=spread_mm, groups=groups, weights=weights)
 
 
 def _stamps(drawn: Drawn, images: Indices, fit: DragFit) -> Predictor:

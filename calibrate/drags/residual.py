@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.compare.similarity import binary_scores
-from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, chance
+from calibrate.drags.fit import INK_ABOVE, SPREAD_MM
+from model.drag import ink
 
 Floats = NDArray[np.float64]
 
@@ -63,7 +64,7 @@ def threshold(
     every = (slice(None), slice(None, None, stride), slice(None, None, stride))
     base, captured = _flat(base_mm[every]), _flat(captured_mm[every])
     corrected = captured - _left_out(_gram(commands, scales_of(commands), RIDGE), captured - base)
-    found = binary_scores(chance(corrected.astype(np.float64), spread_mm) > INK_ABOVE, captured > 0.0)
+    found = binary_scores(ink(corrected.astype(np.float64), spread_mm) > INK_ABOVE, captured > 0.0)
     half = 0.5 * float(found[:, 0].mean())
     return min(max(round(half, 3), LEAST_ABOVE), MOST_ABOVE)
 
@@ -81,10 +82,10 @@ def clipped(distance_mm: NDArray[np.floating]) -> NDArray[np.float32]:
     return (REACH_MM * np.tanh(np.asarray(distance_mm, np.float32) / REACH_MM)).astype(np.float32)
 
 
-def captured_distance(ink: NDArray[np.bool_] | Sequence[NDArray[np.bool_]], mm_per_px: float) -> Floats:
+def captured_distance(masks: NDArray[np.bool_] | Sequence[NDArray[np.bool_]], mm_per_px: float) -> Floats:
     """Signed distance to the edge of captured ink, positive inside, (n, rows, columns) mm."""
     out: list[Floats] = []
-    for mask in ink:
+    for mask in masks:
         inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5) - 0.5
         outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) - 0.5
         out.append(np.where(mask, inside, -outside) * mm_per_px)

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.compare.field import SIZE_PX, Field
+from calibrate.compare.field import Field
 from calibrate.compare.images import Pixels, brush_of, loop_pixels, unpack
 from calibrate.fit.artefact import BrushFit
-from calibrate.fit.captures import MARGIN_MM, Grid, Pressed, grid_of
+from calibrate.fit.captures import Grid, Pressed, grid_of, inked_rows
 from calibrate.fit.fit import refit
 from calibrate.fit.heldout import BEZIER_SIZES, RefittedBezier, refit_bezier
 from calibrate.validate.pool import Scheduler
@@ -95,10 +95,7 @@ def bezier_body(strokes: Sequence[Pressed], grid: Grid) -> list[float] | None:
 def cropped(job: RefitJob) -> tuple[list[Pressed], Grid]:
     """Crop the strokes and their grid to the inked rows and 2 mm more, as `brushloop fit` does."""
     inks = [unpack(pixels)[-1].astype(np.float64) / 255.0 for _, _, pixels in job.strokes]
-    inked = np.flatnonzero(np.any([ink.any(axis=1) for ink in inks], axis=0))
-    margin = round(MARGIN_MM / job.view.mm_per_px)
-    rows = slice(max(0, int(inked[0]) - margin), min(SIZE_PX, int(inked[-1]) + 1 + margin))
-    grid = grid_of(job.view)
+    rows, grid = inked_rows(inks, job.view), grid_of(job.view)
     pressed = [Pressed(h, a, ink[rows]) for (h, a, _), ink in zip(job.strokes, inks, strict=True)]
     return pressed, Grid(grid.x_mm, grid.y_mm[rows])
 

@@ -15,6 +15,7 @@ from importlib.metadata import version
 from types import TracebackType
 from typing import Any, ClassVar, Protocol, TypeVar
 
+from calibrate.errors import one_line
 from calibrate.validate import store
 
 J = TypeVar("J")
@@ -110,7 +111,7 @@ class Dask(AbstractContextManager["Dask"]):
         try:
             self._client: Any = untyped(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError, ImportError) as error:
-            raise ClusterError(f"--scheduler {address}: no Dask scheduler there ({_line(error)})") from None
+            raise ClusterError(f"--scheduler {address}: no Dask scheduler there ({one_line(error)})") from None
         self.notes: list[str] = []
         """Remarks for the user on how the work was done."""
         try:
@@ -126,7 +127,7 @@ class Dask(AbstractContextManager["Dask"]):
         found: dict[str, Any] = self._client.run(software, on_error="return")
         for worker, answer in found.items():
             if answer != software():
-                words = _line(answer) if isinstance(answer, BaseException) else f"has {answer}"
+                words = one_line(answer) if isinstance(answer, BaseException) else f"has {answer}"
                 raise ClusterError(f"--scheduler {address}: worker {worker} {words}; {software()} is needed there")
         return sum(threads.values())
 
@@ -138,7 +139,7 @@ class Dask(AbstractContextManager["Dask"]):
         for worker, answer in found.items():
             if isinstance(answer, BaseException):
                 self.notes.append(
-                    f"photographs were sent to the workers: {worker} cannot read {session} ({_line(answer)})"
+                    f"photographs were sent to the workers: {worker} cannot read {session} ({one_line(answer)})"
                 )
                 return False
         return True
@@ -191,7 +192,3 @@ def software() -> str:
 
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

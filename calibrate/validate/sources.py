@@ -20,7 +20,8 @@ from typing import Any
 
 from calibrate.artefact import FOLDER, MAX_POINTER_BYTES, POINTER, current, load_artefact, pointed
 from calibrate.calibration import Calibration
-from calibrate.errors import CalibrationError
+from calibrate.errors import CalibrationError, one_line
+from calibrate.files import replacing
 from calibrate.fit.artefact import FOLDER as FITS
 from calibrate.fit.artefact import BrushFit
 from calibrate.session import calibration_of
@@ -132,7 +133,7 @@ def fetched(url: str, folder: Path) -> Path:
     except (ImportError, ValueError) as error:
         extra = EXTRAS.get(address.partition(":")[0].lower()) if isinstance(error, ImportError) else None
         how = f": pip install 'brushloop[{extra}]'" if extra else ""
-        raise CalibrationError(address, f"cannot be opened: {_line(error)}{how}") from None
+        raise CalibrationError(address, f"cannot be opened: {one_line(error)}{how}") from None
     try:
         if not where.endswith(".mcap"):
             where = f"{where.rstrip('/')}/{PurePosixPath(where).name}.mcap"
@@ -143,7 +144,7 @@ def fetched(url: str, folder: Path) -> Path:
         for kind in (FOLDER, FITS):
             _copy_artefacts(system, f"{where.rsplit('/', 1)[0]}/{kind}", target.parent / kind)
     except (OSError, ValueError, NotImplementedError, *_backend_errors()) as error:
-        raise CalibrationError(address, f"cannot be read: {_line(error)}") from None
+        raise CalibrationError(address, f"cannot be read: {one_line(error)}") from None
     return target
 
 
@@ -178,18 +179,13 @@ def _expected(system: Any, where: str, address: str, fragment: str) -> str:
 
 def _copy(system: Any, where: str, target: Path, expected: str, address: str) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
-    part = target.with_name(target.name + ".part")
     digest = hashlib.sha256()
-    try:
-        with part.open("wb") as out:
-            for piece in _pieces(system, where, MAX_DOWNLOAD_BYTES, address):
-                digest.update(piece)
-                out.write(piece)
+    with replacing(target) as part, part.open("wb") as out:
+        for piece in _pieces(system, where, MAX_DOWNLOAD_BYTES, address):
+            digest.update(piece)
+            out.write(piece)
         if digest.hexdigest() != expected:
             raise CalibrationError(address, f"has SHA-256 {digest.hexdigest()}, {expected} was expected")
-        part.replace(target)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _pieces(system: Any, where: str, most_bytes: int, address: str) -> Iterator[bytes]:
@@ -251,7 +247,3 @@ def _keep_age(system: Any, name: str, copy: Path) -> None:
     except (AttributeError, NotImplementedError, OSError, ValueError, TypeError, KeyError):
         return
     os.utime(copy, (at_s, at_s))
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

@@ -15,6 +15,7 @@ from rich.table import Column, Table
 
 from calibrate.compare.field import KEYS, Alignment, Tone
 from calibrate.errors import CalibrationError
+from calibrate.files import replacing
 from calibrate.loop.scores import AGAIN
 from calibrate.report import csv_text, source_label, source_note
 from calibrate.validate.report import findings, tables
@@ -59,17 +60,12 @@ def score_rows(outcome: Outcome) -> Iterator[Cells]:
 
 def write_csv(outcome: Outcome, path: Path) -> str:
     """Write every score and return the file's SHA-256. Raises OSError and leaves no partial file."""
-    part = path.with_name(path.name + ".part")
     digest = hashlib.sha256()
-    try:
-        with part.open("wb") as file:
-            for text in _lines(outcome):
-                data = text.encode()
-                digest.update(data)
-                file.write(data)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with replacing(path) as part, part.open("wb") as file:
+        for text in _lines(outcome):
+            data = text.encode()
+            digest.update(data)
+            file.write(data)
     return digest.hexdigest()
 
 
@@ -96,15 +92,10 @@ def write_parquet(outcome: Outcome, path: Path) -> None:
     kinds = [pa.float64() if name in ("height_mm", "tilt_deg", "csim", "ssim") else pa.string() for name in COLUMNS]
     label = source_label(outcome.sessions[0].header.source, (one.header.brush for one in outcome.sessions))
     schema: Any = pa.schema(list(zip(COLUMNS, kinds, strict=True)), metadata={"source": label})
-    part = path.with_name(path.name + ".part")
-    try:
-        with pq.ParquetWriter(part, schema) as writer:
-            for group in _groups(outcome):
-                columns = [list(column) for column in zip(*group, strict=True)]
-                writer.write_table(pa.table(columns, schema=schema))
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with replacing(path) as part, pq.ParquetWriter(part, schema) as writer:
+        for group in _groups(outcome):
+            columns = [list(column) for column in zip(*group, strict=True)]
+            writer.write_table(pa.table(columns, schema=schema))
 
 
 def summary_csv(report: Report) -> str:

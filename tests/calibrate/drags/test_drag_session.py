@@ -15,7 +15,7 @@ from brushloop import app
 from calibrate.artefact import current, load_artefact
 from calibrate.drags.artefact import DragArtefact
 from calibrate.drags.captures import commanded_path, figures_of, read_drags
-from calibrate.drags.fit import chance, fit_drags
+from calibrate.drags.fit import SPREAD_MM, fit_drags
 from calibrate.drags.measure import validate_drags
 from calibrate.drags.predict import predictors
 from calibrate.drags.report import DragValidation, summary, write_drags
@@ -24,6 +24,7 @@ from calibrate.errors import CalibrationError
 from calibrate.stroke.params import Params
 from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from model.drag import DragModel
+from model.drag import ink as chance
 from sessions.reader import Recording
 from sessions.recording.schemas import Header, Source
 from tests.photographed import imported, photograph
@@ -196,12 +197,12 @@ def test_figures_of_several_strokes_are_fitted_as_a_whole() -> None:
             paths.append(np.column_stack([start + way, deep, np.full(12, heading)]))
     groups = np.arange(0, 17, 2)
     ink = np.array(
-        [np.maximum(*(chance(truth.distance(p, x_mm, y_mm)) for p in paths[g : g + 2])) for g in groups[:-1]]
+        [np.maximum(*(chance(truth.distance(p, x_mm, y_mm), SPREAD_MM) for p in paths[g : g + 2])) for g in groups[:-1]]
     )
     fit = fit_drags(paths, ink, x_mm, y_mm, groups=groups)
     for depth in (3.0, 8.0):
         assert fit.model.leash_mm + depth * fit.model.leash_per_mm == pytest.approx(3.0 + 0.4 * depth, rel=0.2)
-    assert np.abs(chance(fit.distance(paths, x_mm, y_mm, groups=groups)) - ink).mean() < 0.01
+    assert np.abs(chance(fit.distance(paths, x_mm, y_mm, groups=groups), SPREAD_MM) - ink).mean() < 0.01
     with pytest.raises(ValueError, match="not alike"):
         fit_drags(paths, ink, x_mm, y_mm)
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from calibrate.drags.captures import Drawn, commanded_path
-from calibrate.drags.fit import INK_ABOVE, chance, determined, fit_drags
+from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, determined, fit_drags
 from calibrate.drags.residual import Residual, threshold
 from calibrate.drags.run import different
 from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
-from model.drag import DragModel
+from model.drag import DragModel, ink
 from sessions.recording.schemas import Header, Source
 
 X_MM, Y_MM = np.arange(-10.0, 50.0, 1.0), np.arange(-18.0, 18.0, 1.0)
@@ -26,7 +26,7 @@ def arcs(count: int, seed: int) -> list[np.ndarray]:
 
 
 def drawn(model: DragModel, paths: list[np.ndarray]) -> np.ndarray:
-    return np.array([chance(model.distance(path, X_MM, Y_MM)) for path in paths])
+    return np.array([ink(model.distance(path, X_MM, Y_MM), SPREAD_MM) for path in paths])
 
 
 def test_lag_and_width_are_found_again() -> None:
@@ -92,8 +92,8 @@ def test_what_a_model_is_known_to_miss_is_not_taken_for_a_change_of_place() -> N
     wrong = replace(TRUTH, drift_y_mm=-0.7)
     missed = true - np.array([wrong.distance(path, X_MM, Y_MM) for path in paths])
     only = {"drift_y_mm": 1.0}
-    plain = fit_drags(paths, chance(true), X_MM, Y_MM, start=wrong, only=only)
-    knowing = fit_drags(paths, chance(true), X_MM, Y_MM, start=wrong, only=only, added_mm=missed)
+    plain = fit_drags(paths, ink(true, SPREAD_MM), X_MM, Y_MM, start=wrong, only=only)
+    knowing = fit_drags(paths, ink(true, SPREAD_MM), X_MM, Y_MM, start=wrong, only=only, added_mm=missed)
     assert plain.model.drift_y_mm == pytest.approx(TRUTH.drift_y_mm, abs=0.1)
     assert knowing.model.drift_y_mm == pytest.approx(wrong.drift_y_mm, abs=0.1)
 
@@ -128,7 +128,7 @@ def test_the_simulated_brush_trails_and_the_fit_sees_it() -> None:
     stamps = fit_drags(paths, target, X_MM, Y_MM, lag=False)
     assert lagging.cost < 0.8 * stamps.cost
     assert 1.0 < lagging.model.leash_mm + 7.0 * lagging.model.leash_per_mm < 15.0
-    seen = chance(lagging.distance(paths, X_MM, Y_MM)) > INK_ABOVE
+    seen = ink(lagging.distance(paths, X_MM, Y_MM), SPREAD_MM) > INK_ABOVE
     assert np.count_nonzero(seen & target) / np.count_nonzero(seen | target) > 0.7
 
 
