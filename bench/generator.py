@@ -15,7 +15,7 @@ from bench.harness import Result, interleave, machine
 from bench.learning_to_paint import LearningToPaint
 from model.generator.basis import fit_basis
 from model.generator.metrics import Quality, quality
-from model.generator.network import Generator, parameter_count
+from model.generator.network import Generator
 from model.train.checkpoint import State, put_weights
 from model.train.config import TrainConfig, preset
 from model.train.data import Exact, batch_numbers, batches, exact_sets
@@ -94,9 +94,10 @@ def _compare(target: str, name: str, n: int | None, seed: int, *, with_basis: bo
             turns = interleave(lambda: ours(batch), lambda: draw_peer(batch), _ROUNDS)
             drawing_s = _drawing_s(config, training, ours_steps)
             fitted = _basis_results(config, validation, other.mse, draw_peer, seed) if with_basis else []
+    ours_weights, peer_weights = (sum(part.numel() for part in net.parameters()) for net in (ours, peer))
     conditions = (
-        f"{target}, {budget_s} s of CPU time each, one thread: ours {parameter_count(ours):,} weights, "
-        f"{ours_steps} steps, {ours_s:.0f} s; peer {parameter_count(peer):,} weights, {peer_steps} steps, "
+        f"{target}, {budget_s} s of CPU time each, one thread: ours {ours_weights:,} weights, "
+        f"{ours_steps} steps, {ours_s:.0f} s; peer {peer_weights:,} weights, {peer_steps} steps, "
         f"{peer_s:.0f} s, "
         f"MSE {other.mse:.3g}, PSNR {other.psnr_db:.1f} dB, IoU {other.iou:.5f}, CSIM {other.csim:.5f}, "
         f"SSIM {other.ssim:.5f} (least {other.ssim_min:.5f}); {machine()}"

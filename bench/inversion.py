@@ -11,11 +11,12 @@ import torch
 from numpy.typing import NDArray
 
 from bench.harness import Result, machine
+from bench.inversion_autograd import invert_rendered
 from bench.inversion_commands import intervals
 from model.brush import Brush
 from model.ccdbsm import ccdbsm
 from model.inversion.noise import Noise
-from model.inversion.press import Flag, Inverter, Known, Range, Recovered, invert_rendered
+from model.inversion.press import Flag, Inverter, Known, Range, Recovered
 from model.protocol import Basis
 from model.raster.compiled import coverage_numpy
 from model.raster.exact import coverage_at

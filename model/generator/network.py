@@ -121,11 +121,6 @@ def covered(field: Tensor) -> Tensor:
     return (field + 0.5).clamp(0, 1)
 
 
-def parameter_count(module: nn.Module) -> int:
-    """Number of trained parameters."""
-    return sum(parameter.numel() for parameter in module.parameters())
-
-
 class _WeightedError(torch.autograd.Function):
     """Sum of w (clamp(1/2 + field) - target)^2, with a gradient that also passes where the clamp is flat.
 

@@ -1,19 +1,12 @@
-"""Forward models of a fit, which give the normal equations of a batch of images at given parameters.
-
-Two kinds: outlines drawn by the exact raster with derivatives along the boundary (fast), and any differentiable
-renderer, such as a trained generator, with derivatives by `torch.func.jvp`.
-"""
+"""The forward model of a fit: images of presses, and the normal equations of a batch of them at given parameters."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from model.inversion.jets import Jets
 
@@ -143,62 +136,3 @@ class Outlines:
                     moved[:, k, ..., 0] = np.radians(1.0) * drawn[..., 1]
                     moved[:, k, ..., 1] = -np.radians(1.0) * drawn[..., 0]
         return drawn + place, jet.weights, moved, rates
-
-
-Render = Callable[[Tensor], Tensor]
-
-
-@dataclass(frozen=True, slots=True)
-class Rendered:
-    """Any differentiable renderer: (B, P) parameters to (B, N, N) images, such as a trained generator.
-
-    It chooses its own placement: its images must be aligned with the targets.
-    """
-
-    render: Render
-    names: tuple[str, ...] = PARAMETERS[:2]
-    dtype: torch.dtype = torch.float64
-
-    def of(self, images: Rows) -> Rendered:
-        """See `Forward`."""
-        return self
-
-    def predict(self, values: Floats) -> Images:
-        """See `Forward`."""
-        with torch.no_grad():
-            return self.render(torch.from_numpy(values).to(self.dtype)).float().numpy()
-
-    def normal(self, values: Floats, target: Images, row: Rows) -> Normal:
-        """See `Forward`."""
-        at = torch.from_numpy(values).to(self.dtype)
-        image = at.new_zeros(0)
-        columns: list[Tensor] = []
-        for k in range(at.shape[1]):
-            along = torch.zeros_like(at)
-            along[:, k] = 1
-            made: Any = torch.func.jvp(self.render, (at,), (along,))
-            image, column = made[0].detach(), made[1].detach()
-            columns.append(column.double())
-        wanted = torch.from_numpy(target[row]).double()
-        residual = wanted - image.double()
-        jacobian = torch.stack(columns, dim=1)
-        flat = jacobian.flatten(2)
-        scores = _block_sums(jacobian * residual[:, None])
-        edge = torch.stack((wanted[:, 0], wanted[:, -1], wanted[:, :, 0], wanted[:, :, -1])).amax((0, 2))
-        sums = (
-            flat @ flat.mT,
-            (flat @ residual.flatten(1)[..., None])[..., 0],
-            residual.square().sum((1, 2)),
-            scores @ scores.mT,
-            edge,
-        )
-        return Normal(*(part.numpy() for part in sums))
-
-
-def _block_sums(images: Tensor) -> Tensor:
-    """(B, P, N, N) summed over squares of BLOCK_PX, (B, P, blocks)."""
-    size = images.shape[-1]
-    short = -size % BLOCK_PX
-    padded = torch.nn.functional.pad(images, (0, short, 0, short))
-    parts = padded.unflatten(-1, (-1, BLOCK_PX)).unflatten(-3, (-1, BLOCK_PX))
-    return parts.sum((-1, -3)).flatten(-2)

@@ -9,7 +9,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from model.inversion.forward import PARAMETERS, Forward, Images, Outlines, Render, Rendered
+from model.inversion.forward import PARAMETERS, Forward, Images, Outlines
 from model.inversion.jets import Jets, analytic, of_model
 from model.inversion.levenberg import Limits, fit
 from model.inversion.noise import Noise, covariance
@@ -22,7 +22,7 @@ EDGE_INK = 0.3
 """With more ink than this in a pixel on the image's edge, the mark may continue beyond it."""
 _STEP: dict[str, float] = dict(zip(PARAMETERS, (2.0, 4.0, 2.0, 2.0, 10.0), strict=True))
 _STILL: dict[str, float] = dict(zip(PARAMETERS, (1e-4, 1e-3, 1e-4, 1e-4, 1e-3), strict=True))
-_TABLE_DEPTHS, _TABLE_TILTS = 32, 7
+TABLE_DEPTHS, TABLE_TILTS = 32, 7
 
 
 class Flag(StrEnum):
@@ -129,8 +129,8 @@ class Inverter:
         place = (side, side)
         held = np.array([[0.0, 0.0, *place, 0.0]])
         coarse = Outlines(self.jets, PARAMETERS[:2], held, self.known is Known.ANCHOR, self.size_px, 2 * self.px_mm)
-        heights = np.geomspace(*self.within.height_mm, _TABLE_DEPTHS)
-        tilts = np.array([self.tilt_deg]) if self.tilt_deg is not None else np.linspace(low, high, _TABLE_TILTS)
+        heights = np.geomspace(*self.within.height_mm, TABLE_DEPTHS)
+        tilts = np.array([self.tilt_deg]) if self.tilt_deg is not None else np.linspace(low, high, TABLE_TILTS)
         object.__setattr__(self, "table", Table.of(coarse, heights, tilts, place, 2 * self.px_mm))
 
     @classmethod
@@ -167,7 +167,7 @@ class Inverter:
         start = np.column_stack((self.table.nearest(seen, place, heading), heading))
         names = self._names()
         forward = Outlines(self.jets, names, start, self.known is Known.ANCHOR, self.size_px, self.px_mm)
-        return _recover(forward, target, start, self._limits(names), self.noise, seen.area < MIN_INK_MM2,
+        return recover(forward, target, start, self._limits(names), self.noise, seen.area < MIN_INK_MM2,
                         alpha_known=self.known is Known.ANCHOR, near_mm=self.px_mm)  # fmt: skip
 
     def assuming(self, tilt_deg: float) -> Inverter:
@@ -209,36 +209,11 @@ def limits_of(
     return Limits(*np.array(columns, np.float64).T)
 
 
-def invert_rendered(
-    render: Render,
-    images: NDArray[np.floating],  # pyright: ignore[reportMissingTypeArgument]
-    within: Range,
-    *,
-    anchored: bool = False,
-    noise: Noise = Noise.PIXEL,
-    px_mm: float = PX_MM,
-) -> Recovered:
-    """Recover (H, alpha) through any differentiable renderer, (B, 2) to (B, N, N), such as a trained generator.
-
-    The targets must be aligned as the renderer draws; `anchored` means aligned on the zero-touch point. The fit starts
-    from the nearest image, by area, place and spread, of a table that the renderer draws.
-    """
-    target = np.ascontiguousarray(images, np.float32)
-    seen = moments_of(target, px_mm)
-    forward = Rendered(render)
-    heights = np.linspace(*within.height_mm, _TABLE_DEPTHS)
-    table = Table.of(forward, heights, np.linspace(*within.tilt_deg, _TABLE_TILTS), (0.0, 0.0), px_mm)
-    none = np.zeros(len(target))
-    start = table.nearest(seen, np.zeros((len(target), 2)), none)[:, :2]
-    full = np.column_stack((start, np.zeros((len(target), 3))))
-    limits = limits_of(PARAMETERS[:2], {"height_mm": within.height_mm, "tilt_deg": within.tilt_deg})
-    return _recover(forward, target, full, limits, noise, seen.area < MIN_INK_MM2, alpha_known=anchored, near_mm=px_mm)
-
-
-def _recover(
+def recover(
     forward: Forward, target: Images, start: Floats, limits: Limits, noise: Noise, blank: NDArray[np.bool_],
     *, alpha_known: bool, near_mm: float,
 ) -> Recovered:  # fmt: skip
+    """Fit B images from `start` (B, 5); `blank` (B,) holds no mark. `near_mm` is how far noise may move a mark."""
     columns = [PARAMETERS.index(name) for name in forward.names]
     found = fit(forward, target, start[:, columns], limits)
     near = np.array([1.5 * near_mm, 1.5, near_mm, near_mm, 1.0])[columns]

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from bench.inversion_autograd import Rendered
 from model.brush import Brush
 from model.ccdbsm import ccdbsm
-from model.inversion.forward import PARAMETERS, Outlines, Rendered
+from model.inversion.forward import PARAMETERS, Outlines
 from model.inversion.jets import analytic, of_model
 from model.outline import Outline
 from model.protocol import Basis

@@ -11,10 +11,11 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from bench.inversion_autograd import invert_rendered
 from model.brush import Brush
 from model.ccdbsm import ccdbsm
 from model.inversion.noise import Noise
-from model.inversion.press import Flag, Inverter, Known, Range, invert_rendered
+from model.inversion.press import Flag, Inverter, Known, Range
 from model.protocol import Basis
 from model.raster.compiled import coverage_numpy
 from model.raster.exact import coverage_at
