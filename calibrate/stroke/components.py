@@ -37,21 +37,19 @@ def components(ink: Mask, anchor_px: tuple[float, float] | None, params: Params)
         near = near[areas[near - 1] >= params.speck_share * areas.max()]
         candidates = near if near.size else candidates
     main = int(candidates[np.argmax(areas[candidates - 1])])
-    stroke = labels == main
     others = [k for k in range(1, count) if k != main and areas[k - 1] >= params.speck_share * areas[main - 1]]
     specks = count - 2 - len(others)
+    near = parts_near(labels, main, others, params.join_mm * PX_PER_MM)
+    foreign = tuple(float(areas[label - 1]) / PX_PER_MM**2 for label in others if label not in near)
+    return Chosen(np.isin(labels, [main, *near]), 1 + len(near), specks, foreign)
+
+
+def parts_near(labels: cv2.typing.MatLike, main: int, others: list[int], reach_px: float) -> list[int]:
+    """Those of the `others` that come within `reach_px` of the component `main`; `labels` (h, w) numbers them all."""
     if not others:
-        return Chosen(stroke, 1, specks, ())
-    away = np.asarray(cv2.distanceTransform((~stroke).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
-    joined, foreign = 0, list[float]()
-    for label in others:
-        part = labels == label
-        if float(away[part].min()) <= params.join_mm * PX_PER_MM:
-            stroke |= part
-            joined += 1
-        else:
-            foreign.append(float(areas[label - 1]) / PX_PER_MM**2)
-    return Chosen(stroke, 1 + joined, specks, tuple(foreign))
+        return []
+    away = np.asarray(cv2.distanceTransform((labels != main).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
+    return [label for label in others if float(away[labels == label].min()) <= reach_px]
 
 
 def fill_holes(mask: Mask, params: Params) -> Mask:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from calibrate.errors import CaptureRefused
+from calibrate.stroke.components import parts_near
 from calibrate.stroke.params import Floats, Gray, Mask, Soft
 from calibrate.stroke.preprocess import LIGHT_ROUNDS
 
@@ -18,24 +19,20 @@ SHRINK = 8
 MOST_SHIFT_PX = 8.0
 LEAST_RESPONSE = 0.05
 NOISE_SIGMAS = 6.0
+CORE = 0.35
+"""Darkening, as a share of the paper's brightness, that a stroke must reach somewhere."""
+RIM = 0.15
+"""Darkening above which its neighbours belong to it."""
+JOIN_MM = 2.0
+"""Parts that lie closer to the main part are the same stroke: bristles part, bubbles shine."""
+LEAST_MM2 = 2.0
+"""Less new ink than this is no stroke."""
+SLIVER_MM = 0.6
+"""Thinner new ink along an old edge comes from a page that moved, or from ink that ran."""
+START_MM = 1.0
+"""Length of the beginning of a stroke, of which the middle is its start."""
 NEAR_MM = 10.0
 """New ink at this distance from where the stroke should begin counts a third."""
-
-
-@dataclass(frozen=True, slots=True)
-class DifferenceParams:
-    """Parameters of the comparison; lengths in millimetres on the page."""
-
-    core: float = 0.35
-    """Darkening, as a share of the paper's brightness, that a stroke must reach somewhere."""
-    rim: float = 0.15
-    """Darkening above which its neighbours belong to it."""
-    join_mm: float = 2.0
-    """Parts that lie closer to the main part are the same stroke: bristles part, bubbles shine."""
-    least_mm2: float = 2.0
-    """Less new ink than this is no stroke."""
-    sliver_mm: float = 0.6
-    """Thinner new ink along an old edge comes from a page that moved, or from ink that ran."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +44,7 @@ class NewStroke:
     soft: Soft
     """(h, w) ink from 0 to 1 where it is new, 0 elsewhere."""
     start_px: tuple[float, float]
-    """(x, y) of the end opposite to the heading: the middle of its outermost ink; pixel j covers [j, j + 1)."""
+    """(x, y) of the stroke's left end: the middle of its outermost ink; pixel j covers [j, j + 1)."""
     shift_px: tuple[float, float]
     """Shift of the page between the photographs, undone before comparing."""
     noise: float
@@ -60,8 +57,6 @@ def new_stroke(
     after: Gray,
     px_per_mm: float,
     where: str,
-    params: DifferenceParams | None = None,
-    heading_deg: float = 0.0,
     near_px: tuple[float, float] | None = None,
 ) -> NewStroke:
     """Find the stroke in `after` that is not in `before`, two gray photographs of one page and one size.
@@ -69,7 +64,6 @@ def new_stroke(
     `near_px` is where it should begin; of several new components the one with the most ink near it is taken. Raises
     `CaptureRefused` if there is no new stroke, or the sizes differ.
     """
-    params = params or DifferenceParams()
     if before.shape != after.shape:
         raise CaptureRefused(
             where,
@@ -82,38 +76,26 @@ def new_stroke(
     clean = first > DARK_SHARE * paper
     light = _gain(first, second, clean)
     darker = np.where(clean, (first - second / light) / paper, 0.0).astype(np.float32)
-    quiet = darker[clean & (darker < params.rim)]
+    quiet = darker[clean & (darker < RIM)]
     noise = 1.4826 * float(np.median(np.abs(quiet - np.median(quiet)))) if quiet.size else 0.0
-    core = max(params.core, NOISE_SIGMAS * noise)
-    rim = max(params.rim, 0.5 * NOISE_SIGMAS * noise)
-    mask = _grown(darker, clean, core, rim, px_per_mm, params, near_px)
+    core = max(CORE, NOISE_SIGMAS * noise)
+    rim = max(RIM, 0.5 * NOISE_SIGMAS * noise)
+    mask = _grown(darker, clean, core, rim, px_per_mm, near_px)
     area_mm2 = float(np.count_nonzero(mask)) / px_per_mm**2
-    if area_mm2 < params.least_mm2:
-        raise CaptureRefused(where, f"shows no new stroke: {area_mm2:.1f} mm2 of new ink, {params.least_mm2:g} needed")
+    if area_mm2 < LEAST_MM2:
+        raise CaptureRefused(where, f"shows no new stroke: {area_mm2:.1f} mm2 of new ink, {LEAST_MM2:g} needed")
     ink = float(np.quantile(darker[mask], 0.75))
     # Half way between paper and ink, so that the blur of the edge neither widens nor narrows the stroke.
     mask = mask & (darker >= max(rim, 0.5 * ink))
     soft = np.where(mask, np.clip(darker / ink, 0.0, 1.0), 0.0).astype(np.float32)
-    return NewStroke(
-        mask, soft, end_of(mask, heading_deg, px_per_mm), shift, noise, _flags(mask, clean, shift, px_per_mm)
-    )
+    return NewStroke(mask, soft, _start(mask, px_per_mm), shift, noise, _flags(mask, clean, shift, px_per_mm))
 
 
-def end_of(mask: Mask, heading_deg: float, px_per_mm: float, reach_mm: float = 1.0) -> tuple[float, float]:
-    """(x, y) px where a stroke began: the mask's end opposite to the heading (deg, counter-clockwise, rows run down).
-
-    Along the heading it is where ink begins, leaving out the outermost 0.5 % as stray bristles; across it, the middle
-    of the first `reach_mm`.
-    """
+def _start(mask: Mask, px_per_mm: float) -> tuple[float, float]:
+    """(x, y) px where a stroke along x began: where ink begins, leaving out the outermost 0.5 % as stray bristles."""
     ys, xs = np.nonzero(mask)
-    turn = np.radians(heading_deg)
-    along = (xs + 0.5) * np.cos(turn) - (ys + 0.5) * np.sin(turn)
-    across = (xs + 0.5) * np.sin(turn) + (ys + 0.5) * np.cos(turn)
-    begin = float(np.quantile(along, 0.005)) - 0.5
-    middle = float(np.median(across[along <= begin + max(reach_mm * px_per_mm, 2.0)]))
-    return begin * float(np.cos(turn)) + middle * float(np.sin(turn)), middle * float(np.cos(turn)) - begin * float(
-        np.sin(turn)
-    )
+    begin = float(np.quantile(xs + 0.5, 0.005)) - 0.5
+    return begin, float(np.median(ys[xs + 0.5 <= begin + max(START_MM * px_per_mm, 2.0)] + 0.5))
 
 
 def _shift(before: Gray, after: Gray) -> tuple[float, float]:
@@ -171,12 +153,11 @@ def _grown(
     core: float,
     rim: float,
     px_per_mm: float,
-    params: DifferenceParams,
     near_px: tuple[float, float] | None,
 ) -> Mask:
     """The main component above `rim` that somewhere exceeds `core`, with the parts close to it."""
     candidate = (darker > rim).astype(np.uint8)
-    side = max(1, round(params.sliver_mm * px_per_mm))
+    side = max(1, round(SLIVER_MM * px_per_mm))
     if side > 1:
         # Only along old ink: a thin tail on clean paper is a part of the stroke.
         kernel = np.ones((side, side), np.uint8)
@@ -200,13 +181,8 @@ def _grown(
     main = int(np.argmax(weight))
     if weight[main] <= 0.0:
         return np.zeros(darker.shape, np.bool_)
-    stroke = labels == main
-    distance = np.asarray(cv2.distanceTransform((~stroke).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
-    for label in np.flatnonzero(ink > 0.0):
-        part = labels == label
-        if label != main and float(distance[part].min()) <= params.join_mm * px_per_mm:
-            stroke = stroke | part
-    return stroke
+    others = [int(label) for label in np.flatnonzero(ink > 0.0) if label != main]
+    return np.isin(labels, [main, *parts_near(labels, main, others, JOIN_MM * px_per_mm)])
 
 
 def _flags(mask: Mask, clean: Mask, shift: tuple[float, float], px_per_mm: float) -> tuple[str, ...]:
