@@ -3,8 +3,9 @@
 `model.drag` draws with a single disc, which is enough for long strokes. A character consists of ends and corners, and
 there the length of the footprint shows: it lands behind the tip, swings round behind a corner, and reaches ahead of its
 middle when the brush lifts. Here the footprint is the hull of neighbouring discs, from the heel to the tips of the
-hairs. Each disc rests until its leash is taut and then follows straight towards the tip (a tractrix). Leash and half
-width are polynomials of the depth. The mark is the union of the footprints along the path. Lengths are mm, x and y in
+hairs. Each disc rests until its leash is taut and then follows straight towards the tip (a tractrix). A brush that is
+pressed deeper slides away from the ferrule, by as much as if it had landed that deep. Leash and half width are
+polynomials of the depth. The mark is the union of the footprints along the path. Lengths are mm, x and y in
 the frame of the path, y upward, depth into the paper.
 
 The simulated brush of the loopback rig is pulled on a taut leash as well (`drivers.sim.brush.drag`), though its
@@ -42,6 +43,8 @@ START = (
 """A starting point for a fit, not a real brush."""
 SCALE = (*(1.5, 0.4, 1.5, 0.4, 0.5, 0.15, 0.01) * DISCS, 1.0, 1.0)
 """How far each parameter may be from its start before it costs as much as one pixel of wrong ink."""
+EACH_SCALE = 0.5
+"""The same for footprints of single strokes, as a share."""
 SPREADS_MM = (0.8, 0.3)
 """Softness of the edge in a fit: first wide, so that ink that is far off still pulls, then narrow."""
 ROUNDS = 20
@@ -82,8 +85,13 @@ class Footprint:
 
         A path is (N, 4): x, y, depth, heading in deg.
         """
-        made = marks([sampled(path) for path in paths], np.array(self.values))
-        return distances(made.discs, made.starts, x_mm, y_mm, np.array([0, len(made.starts) - 1]))[0]
+        return inked([self] * len(paths), paths, x_mm, y_mm)
+
+
+def inked(footprints: Sequence[Footprint], paths: Sequence[Floats], x_mm: Floats, y_mm: Floats) -> Floats:
+    """The same as `Footprint.distance`, with a footprint for each path."""
+    made = marks([sampled(path) for path in paths], np.array([footprint.values for footprint in footprints]))
+    return distances(made.discs, made.starts, x_mm, y_mm, np.array([0, len(made.starts) - 1]))[0]
 
 
 def sampled(path: Floats, like: Floats | None = None) -> Floats:
@@ -98,13 +106,17 @@ def sampled(path: Floats, like: Floats | None = None) -> Floats:
 
 
 def marks(paths: Sequence[Floats], values: Floats) -> Marks:
-    """The footprints along sampled paths, each (M, 4) of x, y, depth, heading in deg."""
+    """The footprints along sampled paths, each (M, 4) of x, y, depth, heading in deg.
+
+    `values` are those of one footprint, (23,), or of one for each path, (paths, 23).
+    """
     from model import footprint_kernel  # numba takes a fifth of a second to import
 
     kernel: Any = footprint_kernel
     ends = np.cumsum([0, *(len(path) for path in paths)])
     discs = np.empty((int(ends[-1]) * DISCS, 3))
-    kernel.pull(np.ascontiguousarray(np.concatenate(paths)), ends, values, discs)
+    each = np.ascontiguousarray(np.broadcast_to(values, (len(paths), len(NAMES))))
+    kernel.pull(np.ascontiguousarray(np.concatenate(paths)), ends, each, discs)
     return Marks(discs, DISCS * np.arange(int(ends[-1]) + 1), ends)
 
 
@@ -121,28 +133,63 @@ def fit_footprint(
     Paths `groups[i]` to `groups[i + 1]`, each (N, 4), are the strokes of image i. From a `start`, values change half as
     freely and only the narrow edge is used. Raises ValueError if the sizes do not match.
     """
+    same = np.zeros(len(paths), np.int64)
+    if start is None:
+        return _fitted(paths, groups, ink, x_mm, y_mm, START, same, 1.0, SPREADS_MM)[0]
+    return _fitted(paths, groups, ink, x_mm, y_mm, start.values, same, 0.5, SPREADS_MM[-1:])[0]
+
+
+def fit_each(
+    paths: Sequence[Floats],
+    groups: Indices,
+    ink: NDArray[np.float32],
+    x_mm: Floats,
+    y_mm: Floats,
+    start: Footprint,
+) -> list[Footprint]:
+    """Fit a footprint to each stroke, all near `start`; the arguments are those of `fit_footprint`."""
+    own = np.arange(len(paths))
+    return _fitted(paths, groups, ink, x_mm, y_mm, start.values, own, EACH_SCALE, SPREADS_MM[-1:])
+
+
+def _fitted(
+    paths: Sequence[Floats],
+    groups: Indices,
+    ink: NDArray[np.float32],
+    x_mm: Floats,
+    y_mm: Floats,
+    start: tuple[float, ...],
+    of: Indices,
+    share: float,
+    spreads_mm: Sequence[float],
+) -> list[Footprint]:
+    """The footprints 0 to max(of), where number `of[i]` follows path i; values change by `share` of `SCALE`."""
     if ink.shape != (len(groups) - 1, len(y_mm), len(x_mm)) or groups[-1] != len(paths):
         raise ValueError(f"{len(groups) - 1} images of {len(paths)} strokes, ink {ink.shape}: not alike")
     ways = [sampled(path) for path in paths]
-    scale = np.array(SCALE) * (1.0 if start is None else 0.5)
-    first = np.array(START if start is None else start.values)
+    first, scale = np.array(start), share * np.array(SCALE)
+    shape = (int(of.max()) + 1, len(NAMES))
 
     def at(scaled: Floats) -> Marks:
-        return marks(ways, first + scale * scaled)
+        return marks(ways, (first + scale * scaled.reshape(shape))[of])
 
     def equations(scaled: Floats, spread_mm: float) -> Equations:
         made = at(scaled)
-        slopes = np.empty((len(made.discs), 3, len(scaled)))
-        for k, unit in enumerate(np.eye(len(scaled))):
-            slopes[:, :, k] = (at(scaled + 1e-4 * unit).discs - made.discs) / 1e-4
-        found = ink_equations(made, made.strokes[groups], slopes, ink, x_mm, y_mm, spread_mm)
+        slopes = np.zeros((len(made.discs), 3, *shape))
+        rows = np.arange(len(made.discs))
+        owner = np.repeat(of, DISCS * np.diff(made.strokes))
+        for k, unit in enumerate(np.eye(len(NAMES))):
+            changed = at(scaled + 1e-4 * np.tile(unit, shape[0])).discs
+            slopes[rows, :, owner, k] = (changed - made.discs) / 1e-4
+        flat = slopes.reshape(len(rows), 3, len(scaled))
+        found = ink_equations(made, made.strokes[groups], flat, ink, x_mm, y_mm, spread_mm)
         cost = found.cost + 0.5 * float(scaled @ scaled)
         return Equations(cost, found.square + np.eye(len(scaled)), found.gradient + scaled)
 
-    moved = np.zeros(len(first))
-    for spread_mm in SPREADS_MM if start is None else SPREADS_MM[-1:]:
+    moved = np.zeros(shape[0] * shape[1])
+    for spread_mm in spreads_mm:
         moved = descend(lambda v, s=spread_mm: equations(v, s), moved, rounds=ROUNDS, most=2.0, gain=1e-3).vector
-    return Footprint(tuple((first + scale * moved).tolist()))
+    return [Footprint(tuple(values)) for values in (first + scale * moved.reshape(shape)).tolist()]
 
 
 def ink_equations(

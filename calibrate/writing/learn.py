@@ -1,17 +1,19 @@
 """The next plan of characters, from what the ink of the last one showed.
 
-Every round does three things. The footprint of the brush is fitted again to the captured characters. What the footprint
-still misses is measured phase by phase: the distance by which the edge of the ink lies off the predicted edge. Then the
-points are moved until prediction and miss together give the wanted image, near where they are, since the miss was
-measured there. This is iterative learning control with the drawing model as its learning filter (D. A. Bristow,
-M. Tharayil, A. G. Alleyne, IEEE Control Systems 26(3), 2006), applied to the picture of the ink as by Mueller et al.,
-IROS 2013.
+Every round does three things. The footprint of the brush is fitted again to the captured characters, then to each of
+their strokes. What these footprints still miss is measured phase by phase: the distance by which the edge of the ink
+lies off the predicted edge. Then the points are moved until prediction and miss together give the wanted image, near
+where they are, since the miss was measured there. This is iterative learning control with the drawing model as its
+learning filter (D. A. Bristow, M. Tharayil, A. G. Alleyne, IEEE Control Systems 26(3), 2006), applied to the picture
+of the ink as by Mueller et al., IROS 2013.
 
-A character whose last round was no better than the best one goes back to the best and is settled.
+A character whose last round was no better than the best one is corrected from the best one again, by half
+as much. If that does not help either, it goes back to the best and is settled.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -36,7 +38,7 @@ from model.characters.brush import Reach
 from model.characters.lead import LATER_SPREADS_MM, covered, drawn, lead
 from model.characters.phases import Phase, phase_map
 from model.characters.plan import grid, without_tilt
-from model.footprint import Footprint, fit_footprint
+from model.footprint import Footprint, fit_each, fit_footprint
 
 Floats = NDArray[np.float64]
 MOST_MM = 1.5
@@ -44,14 +46,14 @@ MOST_MM = 1.5
 NEAR_MM = 4.0
 """Distance from the captured edge within which a miss is measured."""
 SMOOTH_PX = 0.7
-HELD = 0.1
-"""Cost of moving the points, see `lead`; on the loopback rig 0.1 ended higher than 0 and 0.5."""
+HELD = 0.02
+"""Cost of moving the points, see `lead`."""
 FINER = 4
 """Mean ink is enlarged by this before its edge is measured, as the edge lies between pixels."""
 LEAST_GAIN_PERCENT = 0.2
 """A round that gains less CSIM than this has not helped: two writings of one plan differ by about as much."""
 WORSE = 0.5
-"""Factor on the correction of a phase that the last round made worse."""
+"""Factor on the correction after a round that has not helped, and once more in each phase that became worse."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,9 +79,9 @@ def learned(written: WritingComparison, gain: float = 0.7) -> tuple[PlanRecord, 
     lessons: list[Lesson] = []
     for figure in plan.figures:
         found = round_of(figure, writings[figure.name], plan.cell_mm)
-        after = _after(figure, found)
+        after = _after(figure, found, captured[figure.name])
         if not after.settled:
-            after = _corrected(after, captured[figure.name], footprint, reach, plan.cell_mm, gain)
+            after = _corrected(after, footprint, reach, plan.cell_mm, gain)
         figures.append(after)
         lessons.append(Lesson(figure.name, found, after.settled))
     by = plan.planned_by.model_copy(update={"footprint": footprint.values})
@@ -106,42 +108,42 @@ def _refitted(plan: PlanRecord, captured: dict[str, Image]) -> Footprint:
     return fit_footprint([path for one in strokes for path in one], groups, ink, x_mm, y_mm, start)
 
 
-def _after(figure: FigureRecord, found: Round) -> FigureRecord:
-    """The figure with its round added; back at its best, and settled, if this round was not better."""
+def _after(figure: FigureRecord, found: Round, ink: Image) -> FigureRecord:
+    """The figure with its round added, back at its best; settled if two rounds in succession have not helped."""
     before = max((one.csim_percent for one in figure.rounds), default=float("-inf"))
-    better = found.csim_percent > before
-    best = figure.commanded if better or not figure.best else figure.best
-    settled = figure.settled or found.csim_percent < before + LEAST_GAIN_PERCENT
+    better = found.csim_percent > before or not figure.best
+    best = figure.commanded if better else figure.best
     rounds = (*figure.rounds, found)
-    return figure.model_copy(
-        update={
-            "rounds": rounds,
-            "best": best,
-            "settled": settled,
-            "commanded": best if settled else figure.commanded,
-            "intended": best if settled else figure.commanded,
-        }
-    )
+    known = better or bool(figure.best_png)  # older plans hold no ink of the best round: nothing to correct it by
+    settled = figure.settled or (not _helped(rounds) and (not known or not _helped(rounds[:-1])))
+    update = {"rounds": rounds, "best": best, "settled": settled, "commanded": best, "intended": best}
+    return figure.model_copy(update=update | ({"best_png": encoded(ink)} if better else {}))
 
 
-def _corrected(
-    figure: FigureRecord, ink: Image, footprint: Footprint, reach: Reach, side_mm: float, gain: float
-) -> FigureRecord:
-    commanded, size_px = arrays(figure.commanded), len(ink)
-    miss = missed(ink, drawn(footprint, commanded, side_mm, size_px), side_mm)
+def _helped(rounds: Sequence[Round]) -> bool:
+    """Whether the last round was better than all before."""
+    *before, last = (one.csim_percent for one in rounds)
+    return last >= max(before, default=float("-inf")) + LEAST_GAIN_PERCENT
+
+
+def _corrected(figure: FigureRecord, footprint: Footprint, reach: Reach, side_mm: float, gain: float) -> FigureRecord:
+    commanded, ink = arrays(figure.best), figure.best_ink()
+    size_px = len(ink)
+    paths, groups = [without_tilt(points) for points in commanded], np.array([0, len(commanded)])
+    footprints = fit_each(paths, groups, ink[None], *grid(side_mm, size_px), footprint)
+    miss = missed(ink, drawn(footprints, commanded, side_mm, size_px), side_mm)
     miss *= gain * _trust(figure, side_mm, size_px)
-    first = len(figure.rounds) == 1
     moved = lead(
-        footprint,
+        footprints,
         commanded,
         figure.wanted(),
         side_mm,
         reach,
         added_mm=miss,
         spreads_mm=LATER_SPREADS_MM,
-        held=0.0 if first else HELD,
+        held=HELD,
     )
-    simulated = covered(drawn(footprint, moved, side_mm, size_px) + miss, side_mm)
+    simulated = covered(drawn(footprints, moved, side_mm, size_px) + miss, side_mm)
     points = as_points(moved)
     return figure.model_copy(update={"commanded": points, "intended": points, "simulated_png": encoded(simulated)})
 
@@ -159,12 +161,12 @@ def missed(ink: Image, predicted_mm: Floats, side_mm: float) -> Floats:
 
 
 def _trust(figure: FigureRecord, side_mm: float, size_px: int) -> Floats:
-    """A factor on the correction of each pixel: less in phases that the last round made worse."""
-    factors = np.ones(len(Phase))
+    """A factor on the correction of each pixel: less after a round that has not helped, and in phases made worse."""
+    factors = np.full(len(Phase), 1.0 if _helped(figure.rounds) else WORSE)
     if len(figure.rounds) < 2 or not figure.medians:
-        return np.ones((size_px, size_px))
+        return np.full((size_px, size_px), factors[0])
     before, now = figure.rounds[-2].lost_percent, figure.rounds[-1].lost_percent
     for k, phase in enumerate(Phase):
         if now.get(phase, 0.0) > before.get(phase, 0.0):
-            factors[k] = WORSE
+            factors[k] *= WORSE
     return factors[phase_map(figure.ways, side_mm, size_px)]

@@ -123,8 +123,9 @@ def _planned(request: FigureRequest, model: StrokeModel, settings: Settings) -> 
 def _led(request: FigureRequest, footprint: Footprint, settings: Settings) -> PlannedFigure:
     reach, side_mm, size_px = settings.reach, settings.cell.side_mm, len(request.image)
     first = first_lead(request.ways, footprint, reach, side_mm, settings.tilt_deg)
-    strokes = lead(footprint, first, request.image, side_mm, reach)
-    before, after = (covered(drawn(footprint, one, side_mm, size_px), side_mm) for one in (first, strokes))
+    each = [footprint] * len(first)
+    strokes = lead(each, first, request.image, side_mm, reach)
+    before, after = (covered(drawn(each, one, side_mm, size_px), side_mm) for one in (first, strokes))
     return PlannedFigure(request, strokes, before, after)
 
 

@@ -18,16 +18,16 @@ from model.characters.ink import Image
 from model.characters.plan import Path, directions, grid, tangents, without_tilt
 from model.damped import Equations, descend
 from model.drag import distances, ink
-from model.footprint import Footprint, Marks, ink_equations, marks, sampled
+from model.footprint import Footprint, Marks, ink_equations, inked, marks, sampled
 
 Floats = NDArray[np.float64]
 UNITS = np.array([0.3, 0.3, 0.5, 10.0])
 """Steps of x, y, depth (mm) and heading (deg) that count as equally large."""
-BENT = 0.005
+BENT = 0.015
 """Cost of a squared second difference along a stroke, in these units: keeps the path calm where ink tells nothing."""
-FIRST_SPREADS_MM, LATER_SPREADS_MM = (0.8, 0.3), (0.5, 0.3)
-ROUNDS = 20
-GAIN = 3e-3
+FIRST_SPREADS_MM, LATER_SPREADS_MM = (1.5, 0.8, 0.4, 0.2), (0.8, 0.4, 0.2)
+ROUNDS = 60
+GAIN = 5e-4
 """Smallest share by which a step must lower the cost for another one to be made."""
 
 
@@ -47,7 +47,7 @@ def first_lead(
 
 
 def lead(
-    footprint: Footprint,
+    footprints: Sequence[Footprint],
     strokes: Sequence[Floats],
     wanted: Image,
     side_mm: float,
@@ -60,11 +60,12 @@ def lead(
 ) -> list[Floats]:
     """Adjust trajectories (N, 5) until their predicted ink is `wanted` (S, S), row 0 at the cell's far edge.
 
-    x, y and depth of every point change, and the heading in which a stroke lands. `added_mm` (S, S) is added to the
-    predicted signed distances: what the footprint is known to miss. `held` is the cost of the squared change of each
-    variable, in `UNITS`: what was measured along one path holds only near it. Points stay `Reach.apart_mm` apart.
+    Each stroke has a footprint of its own. x, y and depth of every point change, and the heading in which a stroke
+    lands. `added_mm` (S, S) is added to the predicted signed distances: what the footprints are known to miss. `held`
+    is the cost of the squared change of each variable, in `UNITS`: what was measured along one path holds only near
+    it. Points stay `Reach.apart_mm` apart.
     """
-    problem = _Problem(footprint, strokes, wanted, side_mm, reach, added_mm, held)
+    problem = _Problem(footprints, strokes, wanted, side_mm, reach, added_mm, held)
     vector = problem.vector(strokes)
     for spread_mm in spreads_mm:
         vector = descend(
@@ -79,10 +80,12 @@ def lead(
     return [reach.spaced(np.round(stroke, 3)) for stroke in problem.strokes(vector)]
 
 
-def drawn(footprint: Footprint, strokes: Sequence[Floats], side_mm: float, size_px: int) -> Floats:
-    """Signed distance in mm to the edge of the predicted ink, (size, size), positive in ink, row 0 at the far edge."""
-    x_mm, y_mm = grid(side_mm, size_px)
-    return footprint.distance([without_tilt(stroke) for stroke in strokes], x_mm, y_mm)
+def drawn(footprints: Sequence[Footprint], strokes: Sequence[Floats], side_mm: float, size_px: int) -> Floats:
+    """Signed distance in mm to the edge of the predicted ink, (size, size), positive in ink, row 0 at the far edge.
+
+    Each stroke (N, 5) has a footprint of its own.
+    """
+    return inked(footprints, [without_tilt(stroke) for stroke in strokes], *grid(side_mm, size_px))
 
 
 def covered(distance_mm: Floats, side_mm: float) -> Image:
@@ -95,7 +98,7 @@ class _Problem:
 
     def __init__(
         self,
-        footprint: Footprint,
+        footprints: Sequence[Footprint],
         strokes: Sequence[Floats],
         wanted: Image,
         side_mm: float,
@@ -103,7 +106,7 @@ class _Problem:
         added_mm: Floats | None,
         held: float,
     ) -> None:
-        self._values = np.array(footprint.values)
+        self._values = np.array([footprint.values for footprint in footprints])
         self._like = [stroke.copy() for stroke in strokes]
         self._ends = np.cumsum([0, *(len(stroke) for stroke in strokes)])
         self._wanted, self._side_mm, self._reach = wanted[None], side_mm, reach
@@ -138,12 +141,12 @@ class _Problem:
         row = 0
         for number, path in enumerate(paths):
             nodes, shares = sampled(path), sampled(np.eye(len(path)), path)
-            base = marks([nodes], self._values).discs
+            base = marks([nodes], self._values[number]).discs
             for point in range(len(path)):
                 for column in range(4 if point == 0 else 3):
                     moved = nodes.copy()
                     moved[:, column] += 1e-3 * UNITS[column] * shares[:, point]
-                    changed = marks([moved], self._values).discs
+                    changed = marks([moved], self._values[number]).discs
                     at = 4 * (self._ends[number] + point) + column
                     slopes[row : row + len(base), :, at] = (changed - base) / 1e-3
             row += len(base)

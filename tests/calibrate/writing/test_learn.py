@@ -40,14 +40,14 @@ TRUE = brush_of(half_mm_2=-0.1, leash_mm_2=1.2, drift_across_mm=0.6)
 def plan_of(*, rounds: int = 6) -> PlanRecord:
     by = BY.model_copy(update={"footprint": PLANNED.values})
     strokes = first_lead([WAY], PLANNED, reach_of(by), SIDE_MM, 5.0)
-    strokes = lead(PLANNED, strokes, WANTED, SIDE_MM, reach_of(by), rounds=rounds)
-    seen = covered(drawn(PLANNED, strokes, SIDE_MM, 128), SIDE_MM)
+    strokes = lead([PLANNED], strokes, WANTED, SIDE_MM, reach_of(by), rounds=rounds)
+    seen = covered(drawn([PLANNED], strokes, SIDE_MM, 128), SIDE_MM)
     figure = figure_record("bar", "test", strokes, strokes, wanted=WANTED, simulated=seen, ways=[WAY])
     return PlanRecord(model="footprint", planned_by=by, cell_mm=SIDE_MM, software="test", figures=(figure,))
 
 
 def came_out(plan: PlanRecord) -> np.ndarray:
-    return covered(drawn(TRUE, arrays(plan.figures[0].commanded), SIDE_MM, 128), SIDE_MM)
+    return covered(drawn([TRUE], arrays(plan.figures[0].commanded), SIDE_MM, 128), SIDE_MM)
 
 
 def session(plan: PlanRecord, name: str = "bar", ink: np.ndarray | None = None) -> WritingComparison:
@@ -85,17 +85,31 @@ def test_a_round_brings_the_ink_to_where_it_was_wanted(plan: PlanRecord, after: 
     assert drift == pytest.approx(0.6, abs=0.3)
 
 
-def test_a_round_that_does_not_help_goes_back_to_the_best_one(after: PlanRecord) -> None:
+def test_after_two_rounds_that_do_not_help_the_best_one_is_kept(plan: PlanRecord, after: PlanRecord) -> None:
     ruined = np.roll(came_out(after), 8, axis=0)
-    last, [lesson] = learned(session(after, ink=ruined))
+    retried, [lesson] = learned(session(after, ink=ruined))
+    [figure] = retried.figures
+    assert not lesson.settled
+    assert figure.best == after.figures[0].best == plan.figures[0].commanded
+    assert figure.best_ink() == pytest.approx(came_out(plan), abs=0.01)
+    assert figure.commanded != figure.best
+    last, [lesson] = learned(session(retried, ink=ruined))
     [figure] = last.figures
     assert lesson.settled
     assert figure.settled
     assert figure.commanded == after.figures[0].best
-    assert len(figure.rounds) == 2
+    assert len(figure.rounds) == 3
     # Once settled it stays, whatever the next round shows.
     again, _ = learned(session(last))
     assert again.figures[0].settled
+
+
+def test_a_plan_without_the_ink_of_its_best_round_is_not_retried(after: PlanRecord) -> None:
+    [figure] = after.figures
+    older = after.model_copy(update={"figures": (figure.model_copy(update={"best_png": ""}),)})
+    made, [lesson] = learned(session(older, ink=np.roll(came_out(after), 8, axis=0)))
+    assert lesson.settled
+    assert made.figures[0].commanded == figure.best
 
 
 def test_the_report_lists_rounds_and_what_each_phase_lost(after: PlanRecord, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from model.characters.ink import swept
 from model.characters.lead import covered, drawn, first_lead, lead
 from model.characters.phases import Phase, phase_map, phases_of
 from model.characters.plan import Path
-from model.footprint import NAMES, Footprint, fit_footprint, sampled
+from model.footprint import NAMES, Footprint, fit_each, fit_footprint, inked, sampled
 
 SIDE_MM, SIZE_PX = 48.0, 96
 HOOK = np.array([[12.0, 36.0], [20.0, 36.0], [28.0, 36.0], [34.0, 34.0], [34.0, 26.0], [33.0, 18.0], [30.0, 21.0]])
@@ -30,11 +30,11 @@ def test_leading_the_brush_puts_the_ink_on_the_corner() -> None:
     wanted = swept([path], SIDE_MM, SIZE_PX)
 
     def wrong(strokes: list[np.ndarray]) -> int:
-        seen = covered(drawn(brush, strokes, SIDE_MM, SIZE_PX), SIDE_MM)
+        seen = covered(drawn([brush] * len(strokes), strokes, SIDE_MM, SIZE_PX), SIDE_MM)
         return np.count_nonzero((seen > 0.5) != (wanted > 0.5))
 
     first = first_lead([path], brush, reach, SIDE_MM, 5.0)
-    led = lead(brush, first, wanted, SIDE_MM, reach, rounds=8)
+    led = lead([brush], first, wanted, SIDE_MM, reach)
     assert wrong(led) < 0.5 * wrong(first)
     assert led[0][:, 0].max() > HOOK[:, 0].max() + 0.5  # the tip goes on beyond the corner
     assert np.all(np.linalg.norm(np.diff(led[0][:, :3], axis=0), axis=1) >= reach.apart_mm)
@@ -63,6 +63,31 @@ def test_a_footprint_is_found_again_from_its_ink() -> None:
         fit_footprint(paths[:2], np.arange(4), ink, x_mm, y_mm)
     with pytest.raises(ValueError, match="a footprint has 23 finite values, got 2"):
         Footprint((1.0, 2.0))
+
+
+def test_pressing_deeper_on_the_spot_marks_like_landing_as_deep() -> None:
+    middle = (np.arange(64) + 0.5) * SIDE_MM / 64
+    lands = np.array([[24.0, 24.0, 8.0, 30.0], [24.01, 24.0, 8.0, 30.0]])
+    deepens = np.array([[24.0, 24.0, 2.0, 30.0], [24.01, 24.0, 8.0, 30.0]])
+    ink, slid = (Footprint().distance([path], middle, SIDE_MM - middle) for path in (lands, deepens))
+    deep = ink > 0.3
+    assert deep.sum() > 30
+    assert np.all(slid[deep] > 0.0)
+
+
+def test_each_stroke_has_a_footprint_of_its_own() -> None:
+    wide, narrow = (
+        Footprint(tuple({**dict(zip(NAMES, Footprint().values, strict=True)), "half_mm_2": half}.values()))
+        for half in (1.2, 0.4)
+    )
+    x_mm = (np.arange(64) + 0.5) * SIDE_MM / 64
+    y_mm = SIDE_MM - x_mm
+    paths = [np.array([[12.0, y, 5.0, 0.0], [36.0, y, 5.0, 0.0]]) for y in (16.0, 32.0)]
+    ink = (inked([wide, narrow], paths, x_mm, y_mm) > 0.0).astype(np.float32)[None]
+    upper, lower = fit_each(paths, np.array([0, 2]), ink, x_mm, y_mm, Footprint())
+    depth = np.array([5.0])
+    assert upper.half_width_mm(depth) > lower.half_width_mm(depth) + 0.4
+    assert np.count_nonzero((inked([upper, lower], paths, x_mm, y_mm) > 0.0) != (ink[0] > 0.5)) < 40
 
 
 def test_a_path_is_sampled_densely_and_keeps_its_corners() -> None:
