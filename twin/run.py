@@ -7,8 +7,9 @@ import multiprocessing
 import os
 import threading
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -69,14 +70,26 @@ class Twin:
     """Where its marks begin; None if it leaves no ink."""
 
 
+class TwinStopped(Exception):
+    """A process that drew presses was ended from outside; the same command continues."""
+
+    exit_code: ClassVar[int] = 4
+
+
 @contextlib.contextmanager
 def workers(most: int = MOST_WORKERS) -> Generator[Executor]:
-    """Processes that draw presses, one for each core; they end with this one, even if it is killed."""
+    """Processes that draw presses, one for each core; they end with this one, even if it is killed.
+
+    Raises `TwinStopped` if one of them ends before the block does, as when the system runs out of memory.
+    """
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads of matrix products would compete with the processes
     count = min(os.cpu_count() or 1, most)
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(count, mp_context=spawn, initializer=_end_with_parent) as pool:
-        yield pool
+        try:
+            yield pool
+        except BrokenExecutor:
+            raise TwinStopped("a process that drew presses was ended (memory?): the same command continues") from None
 
 
 def _end_with_parent() -> None:

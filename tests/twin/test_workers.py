@@ -8,7 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.waiting import wait_until
+from twin.run import TwinStopped, workers
 
 WORKING = """
 import os, time
@@ -39,3 +42,8 @@ def test_a_worker_ends_with_the_command_that_was_killed(tmp_path: Path) -> None:
         assert runs(worker)
         command.send_signal(signal.SIGKILL)
     wait_until(lambda: not runs(worker), "the worker's end")
+
+
+def test_a_worker_that_ends_first_stops_the_command_in_one_line() -> None:
+    with pytest.raises(TwinStopped, match="the same command continues"), workers(1) as pool:
+        pool.submit(os._exit, 1).result()
