@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from calibrate.compare.field import FINE, Field, Image
 from calibrate.compare.images import axis_mm, brush_of, prepare_press
 from calibrate.errors import CalibrationError, CaptureRefused
+from calibrate.report import source_label
 from calibrate.stroke.params import PX_PER_MM
 from calibrate.stroke.preprocess import Prepared
 from calibrate.validate.candidates import Generator
@@ -68,7 +69,8 @@ def align_captures(sessions: list[LoadedSession], generator: Path) -> AlignedStr
     from model.train.checkpoint import load_generator
 
     target = load_generator(generator).target
-    aligned = AlignedStrokes(target.px_mm, str(target.placement), str(one_source(sessions)), [], [], [], [])
+    label = source_label(one_source(sessions), (session.header.brush for session in sessions))
+    aligned = AlignedStrokes(target.px_mm, str(target.placement), label, [], [], [], [])
     for session in sessions:
         model = load_generator(generator, brush_of(session.header))
         for capture in session.recording.captures():

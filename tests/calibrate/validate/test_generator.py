@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 import torch
@@ -12,10 +14,14 @@ from typer.testing import CliRunner
 from brushloop import app
 from calibrate.compare.field import Alignment, Tone
 from calibrate.validate.report.data import load_report
+from calibrate.validate.sources import LoadedSession
+from calibrate.validate.tuning import align_captures
 from model.brush import Brush
+from model.train import SHIPPED_GENERATOR
 from model.train.checkpoint import load_generator, load_weights
 from model.train.data import load_captures
 from model.train.errors import TrainError
+from sessions.recording.schemas import Source
 
 # One word a line, as the file's owner would write it.
 TRAINING = """
@@ -147,3 +153,12 @@ def test_a_generator_for_another_brush_is_refused(generator: Path) -> None:
     with pytest.raises(TrainError, match="was trained for a brush with radius_mm = 6, not 5"):
         load_generator(generator, Brush(radius_mm=5.0, length_mm=48.0))
     assert json.dumps(load_generator(generator, Brush()).target.fixed)
+
+
+def test_captures_of_a_described_brush_keep_its_remark() -> None:
+    header = SimpleNamespace(
+        source=Source.LOOPBACK, brush="soft (twin of monday, simulated)", brush_radius_mm=None, brush_length_mm=None
+    )
+    empty = SimpleNamespace(header=header, recording=SimpleNamespace(captures=lambda: iter(())))
+    found = align_captures([cast(LoadedSession, empty)], SHIPPED_GENERATOR)
+    assert found.source == "loopback rig, brush twin of monday, simulated"
