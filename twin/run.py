@@ -128,7 +128,7 @@ def fit_twin(
     variance = np.diagonal(covariance(target, found, pool))
     spec, offset = _brush(found, target), offset_at(found.point)
     repeats = repeats_of(cells)
-    spread = fit_spread(spec, offset, repeats, grid) if repeats.cells else None
+    spread = fit_spread(spec, offset, repeats, grid, pool.map) if repeats.cells else None
     scores, points = Scores(), list[Vector]()
     for number, part in enumerate(parts, 1):
         kept = [k for k in range(len(cells)) if k not in part]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -18,7 +19,7 @@ from calibrate.fit.heldout import FEWEST_REPEATS
 from drivers.sim.brush.spec import BrushSpec
 from twin.constants import SPREAD, Offset, Vector, with_values
 from twin.drawing import Cell, Images, draw
-from twin.shape import derivatives
+from twin.shape import Map, derivatives
 
 REPEATS = 6
 """Simulated presses of a cell."""
@@ -58,33 +59,40 @@ class Spread:
     """The same of the twin."""
 
 
-def fit_spread(spec: BrushSpec, offset: Offset, repeats: Repeats, grid: Grid) -> Spread:
+def fit_spread(spec: BrushSpec, offset: Offset, repeats: Repeats, grid: Grid, each: Map = map) -> Spread:
     """Match the statistics of the captures. Raises ValueError without a cell that has `FEWEST_REPEATS` captures."""
     from scipy.optimize import least_squares  # slow to import
 
     if not repeats.cells:
         raise ValueError(f"no cell has {FEWEST_REPEATS} captures")
-    seen = statistics(repeats.ink, grid)
     # twice the relative standard error of a deviation with this many degrees of freedom: the simulated one has its own
     deviation = 2.0 / math.sqrt(2.0 * repeats.freedom)
     sd = np.array([deviation, deviation, deviation, AGREEMENT_SD])
-
-    def off(point: Vector) -> Vector:
-        drawn = statistics(_drawn(with_values(spec, SPREAD, point), offset, repeats, grid), grid)
-        return np.concatenate([(drawn - seen) / sd, point / PRIOR_SD])
-
+    seen = statistics(repeats.ink, grid)
+    off = partial(_off, spec, offset, repeats.cells, grid, seen, sd)
     low, high = np.array([one.bounds for one in SPREAD]).T
     best = least_squares(
         off,
         np.zeros(len(SPREAD)),
-        jac=lambda point: derivatives(off, point, high, STEP),
+        jac=lambda point: derivatives(off, point, high, STEP, each),
         bounds=(low, high),
         max_nfev=STEPS,
     )
-    twin = _drawn(with_values(spec, SPREAD, best.x), offset, repeats, grid)
+    twin = _drawn(spec, offset, repeats.cells, grid, best.x)
     jacobian = np.asarray(best.jac, np.float64)
     error = np.sqrt(np.diagonal(np.linalg.inv(jacobian.T @ jacobian)))
     return Spread(tuple(map(float, best.x)), tuple(map(float, error)), agreement(repeats.ink), agreement(twin))
+
+
+def _off(
+    spec: BrushSpec, offset: Offset, cells: Sequence[Cell], grid: Grid, seen: Vector, sd: Vector, point: Vector
+) -> Vector:
+    drawn = statistics(_drawn(spec, offset, cells, grid, point), grid)
+    return np.concatenate([(drawn - seen) / sd, point / PRIOR_SD])
+
+
+def _drawn(spec: BrushSpec, offset: Offset, cells: Sequence[Cell], grid: Grid, point: Vector) -> list[Images]:
+    return list(draw(with_values(spec, SPREAD, point), offset, cells, grid, REPEATS, FIRST_SEED))
 
 
 def statistics(ink: Sequence[Images], grid: Grid) -> Vector:
@@ -112,7 +120,3 @@ def _measure(image: Images, grid: Grid) -> tuple[float, float, float]:
     tip = ink[:, first : first + max(1, round(TIP_SHARE * (last - first + 1)))]
     middle = float((tip.sum(axis=1) * grid.y_mm).sum() / tip.sum())
     return math.log(float(ink.sum())), float(grid.x_mm[first]), middle
-
-
-def _drawn(spec: BrushSpec, offset: Offset, repeats: Repeats, grid: Grid) -> list[Images]:
-    return list(draw(spec, offset, repeats.cells, grid, REPEATS, FIRST_SEED))
