@@ -50,7 +50,7 @@ def run(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
     """CSIM against the font for the paper's brush and the five frozen ones, each character; the first `n` brushes.
 
     value = average in percent over ten writings after at most three rounds (mm, binary, ink = 1); ratio = 100 less the
-    unlearned CSIM over 100 less the learned one; some 3 minutes a brush on a quiet core. `seed` is that of the ink.
+    unlearned CSIM over 100 less the learned one; about a minute a brush on a quiet core. `seed` is that of the ink.
     """
     brushes = [("the paper's", load_brush(Path(PAPER)).spec)]
     brushes += [(f"frozen {number}", spec) for number, spec in enumerate(FROZEN, 1)]
