@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-import time
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING
@@ -28,20 +27,16 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class Prompt:
-    """A question to the operator."""
+    """A question to the operator; it waits until it is answered."""
 
     question: str
     choices: tuple[Choice, ...]
     default: str
-    """Key of the answer that is taken at the time limit."""
-    timeout_s: float | None = None
-    """Time limit; None to wait for ever."""
+    """Key of the answer that moves nothing; an empty line stands for it in the first day."""
     image: NDArray[np.uint8] | None = field(default=None, compare=False)
     """Gray picture of what the question is about."""
     number: int = 0
     """Number of the question in its run, from 1; set by `Asker.ask`."""
-    asked_s: float = 0.0
-    """Time by `time.monotonic`: setting the computer's clock must not change the time limit. Set by `Asker.ask`."""
 
 
 class Asker:
@@ -80,13 +75,9 @@ class Asker:
         answered: asyncio.Future[str] = loop.create_future()
         with self._lock:
             self._count += 1
-            asked = replace(prompt, number=self._count, asked_s=time.monotonic())
-            self._open = (asked, loop, answered)
+            self._open = (replace(prompt, number=self._count), loop, answered)
         try:
-            async with asyncio.timeout(prompt.timeout_s):
-                return await answered
-        except TimeoutError:
-            return prompt.default
+            return await answered
         finally:
             with self._lock:
                 self._open = None

@@ -149,10 +149,10 @@ class Progress:
         with self._lock:
             self._last = last
 
-    def looked_at(self, *, kept: bool) -> None:
-        """Show what was decided about the newest capture."""
+    def not_kept(self) -> None:
+        """Show that the newest capture does not count."""
         with self._lock:
-            self._last = None if self._last is None else replace(self._last, kept=kept)
+            self._last = None if self._last is None else replace(self._last, kept=False)
 
     def inked(self, level: float | None) -> None:
         """Show the level of the well before a dip, 0 to 1; None if nothing measures it."""

@@ -64,19 +64,18 @@ def distinct_steps(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Step
 
 def _check_brush(path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
     brush = rig.brush
-    field = {"grid": "heights_mm", "few-strokes": "heights_mm", "write": "figures"}.get(protocol.kind, "presses")
     for depth_mm, tilt_deg, name in _depths(protocol):
         if depth_mm > brush.max_depth_mm:
             raise ConfigError(
                 path,
-                field,
+                protocol.depths_field,
                 f"{name}{depth_mm:g} mm is deeper than brush.max_depth_mm = {brush.max_depth_mm:g} mm allows",
             )
         most_mm = brush.length_mm * math.cos(math.radians(tilt_deg))
         if depth_mm > most_mm:
             raise ConfigError(
                 path,
-                field,
+                protocol.depths_field,
                 f"{name}{depth_mm:g} mm at {tilt_deg:g} deg is more than the bundle allows ({most_mm:.1f} mm)",
             )
 

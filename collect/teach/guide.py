@@ -106,6 +106,17 @@ class JogStep:
     mm: float
 
 
+def number_in(line: str, unit: str, low: float, high: float) -> float:
+    """The number that a person typed, with a point or a comma. Raises ValueError, worded for that person."""
+    try:
+        value = float(line.replace(",", "."))
+    except ValueError:
+        raise ValueError(f"{line!r} is not a number") from None
+    if not low <= value <= high:
+        raise ValueError(f"{value:g} is outside {low:g} to {high:g} {unit}")
+    return value
+
+
 class LeftOff(Exception):
     """The person ended the session in the middle; everything taught so far is kept."""
 

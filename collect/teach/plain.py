@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from collect.operator import Choice
-from collect.teach.guide import Brought, JogStep, JogView, LeftOff, Shown, StepState, Target, WentBack
+from collect.teach.guide import Brought, JogStep, JogView, LeftOff, Shown, StepState, Target, WentBack, number_in
 from sessions.terminal import say
 
 BACK, SKIP, JOG, QUIT = "back", "skip", "jog", "quit"
@@ -89,13 +89,9 @@ class PlainGuide:
             if not answer and default is not None:
                 return default
             try:
-                value = float(answer.replace(",", "."))
-            except ValueError:
-                say(f"  {answer!r} is not a number")
-                continue
-            if low <= value <= high:
-                return value
-            say(f"  {value:g} {unit} is outside {low:g} to {high:g} {unit}")
+                return number_in(answer, unit, low, high)
+            except ValueError as error:
+                say(f"  {error}")
 
     async def text(self, question: str, default: str) -> str:
         """Read a line."""

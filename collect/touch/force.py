@@ -41,8 +41,6 @@ class Contact:
     sigma_mm: float
     """Standard error from the noise of the samples alone, without the error of taking the brush for a hinge."""
     spring: Spring
-    misfit: float
-    """Chi-square per degree of freedom: about 1 if the brush is a linear spring this close to the paper."""
     samples: int
 
 
@@ -108,9 +106,7 @@ def find_contact(
     )
     variance = np.linalg.pinv((moved * weights) @ moved.T + np.diag((0.0, known)), hermitian=True) * sample_sd_n**2
     sigma_mm, sigma_n_mm = (math.sqrt(float(v)) for v in np.diag(variance))
-    freedom = max(len(z_mm) - len(descents) - (2 if spring is None else 1), 1)
-    left = float(((force - stiffness * moved[1]) ** 2) @ weights) / sample_sd_n**2
-    return Contact(contact, sigma_mm, Spring(stiffness, sigma_n_mm), left / freedom, int(samples.sum()))
+    return Contact(contact, sigma_mm, Spring(stiffness, sigma_n_mm), int(samples.sum()))
 
 
 SLOW_MM = (-0.8, 0.08, 0.4)

@@ -1,4 +1,4 @@
-"""Where zero touch and the self-check mark the paper, and which cells they use up."""
+"""Where zero touch marks the paper, and which cells it uses up."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from collect.rig.config_touch import CameraTouchConfig, TouchConfig
 from collect.rig.paper import Sheet
 from collect.touch.heights import KnownHeights, Reach
 
-Triangle = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 SLACK_STEPS = 2
 """Fine steps beyond the coarse step, on either side: a coarse touch is accurate only to its step."""
 
@@ -82,19 +81,13 @@ def patch_spots(paper: PaperConfig, config: TouchConfig) -> list[int]:
     return [coarse_count(camera, reach) + config.touches * fine_count(camera) for reach in reaches]
 
 
-def touched_rects(paper: PaperConfig, config: TouchConfig) -> list[Rect]:
-    """The paper that zero touch may ink: nothing for the taught height."""
-    m = MARK_MM
-    return [(x - m, y - m, w + 2 * m, h + 2 * m) for x, y, w, h in touch_rects(paper, config)]
-
-
-def used_cells(sheet: Sheet, paper: PaperConfig, config: TouchConfig, check_mm: Triangle | None = None) -> set[int]:
-    """The cells whose middle parts zero touch, and a self-check at `check_mm`, may ink.
+def used_cells(sheet: Sheet, paper: PaperConfig, config: TouchConfig) -> set[int]:
+    """The cells whose middle parts zero touch may ink; none for the taught height.
 
     A cell counts if a mark reaches more than `MARK_MM` into it: touch points in the sheet's margin cost no cell.
     """
     m = MARK_MM
-    rects = touched_rects(paper, config) + [(x - m, y - m, 2 * m, 2 * m) for x, y in check_mm or ()]
+    rects = [(x - m, y - m, w + 2 * m, h + 2 * m) for x, y, w, h in touch_rects(paper, config)]
     cells = [sheet.cell(index) for index in range(sheet.capacity)]
     return {cell.index for cell in cells for rect in rects if _reaches_into(rect, cell.rect_mm)}
 

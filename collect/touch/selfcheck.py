@@ -21,10 +21,10 @@ from collect.rig.config_touch import SelfCheckConfig
 from collect.rig.devices import Rig
 from collect.rig.paper import Cell, PaperPlane, Sheet
 from collect.touch.arm import Effector, TouchArm
-from collect.touch.places import Triangle
 from drivers.samples import Frame
 
 Floats = NDArray[np.float64]
+Triangle = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 
 UNEVEN = 0.2
 """Least misfit of the second best order of the marks; below it, a mirror image could be taken for a turn."""

@@ -49,7 +49,7 @@ class OperatorApp(RunApp):
         """With an engine, show that run; with a browser, the start screen first.
 
         `again` makes the engine that resumes a session after a stop. `theme_file` keeps the colours for
-        the next start. `now_s` is the clock of questions and ages.
+        the next start. `now_s` is the clock of ages.
         """
         super().__init__(engine, again, pictures or Pictures(), theme_file)
         self._browser = browser
@@ -229,14 +229,12 @@ class OperatorApp(RunApp):
         prompt = None if isinstance(self._main, SetUpScreen) else now.prompt
         shown = next((screen for screen in self.screen_stack if isinstance(screen, AskScreen)), None)
         if shown is not None and prompt is not None and shown.prompt.number == prompt.number:
-            if shown.is_mounted:
-                shown.show_time_left()
             return
         if shown is not None and shown is self.screen:
             self.pop_screen()
             self._deaf_until_s = self._now_s() + BOUNCE_S
         if prompt is not None and self.engine is not None and not isinstance(self.screen, Confirm | AskScreen):
-            self.push_screen(AskScreen(prompt, self.engine, self._pictures, self._now_s))
+            self.push_screen(AskScreen(prompt, self.engine, self._pictures))
 
 
 def _after(before: RunnableEngine | None, make: Callable[[], RunnableEngine]) -> RunnableEngine:

@@ -5,8 +5,6 @@ The stop keys work over both.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from typing import ClassVar
 
 from textual import events
@@ -21,7 +19,6 @@ from collect.engine.snapshot import EngineView
 from collect.operator import Prompt
 from collect.tui.pictures import Pictures
 from collect.tui.text import plain
-from collect.tui.widgets import Line
 
 LEAVE_LINE = "q  leave: park the arm, answer nothing"
 STOP_LINE = "s  stop the arm now: software stop; red button: emergency stop"
@@ -54,7 +51,7 @@ RESUME_UNSEEN = (
 
 
 class AskScreen(ModalScreen[None]):
-    """Shows one prompt of the engine until it is answered or its time is up."""
+    """Shows one prompt of the engine until it is answered."""
 
     DEFAULT_CSS = """
     AskScreen { align: center middle; }
@@ -71,16 +68,11 @@ class AskScreen(ModalScreen[None]):
         Binding("question_mark", "app.help", "Help"),
     ]
 
-    def __init__(
-        self, prompt: Prompt, engine: EngineView, pictures: Pictures, now_s: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, prompt: Prompt, engine: EngineView, pictures: Pictures) -> None:
         super().__init__()
         self.prompt = prompt
         self._engine = engine
         self._pictures = pictures
-        self._now_s = now_s
-        self._left = Line("left")
-        self.show_time_left()
 
     def compose(self) -> ComposeResult:
         """Lay out the question, its picture, and a line for each answer."""
@@ -93,20 +85,11 @@ class AskScreen(ModalScreen[None]):
             yield Static(choices_content(self.prompt), markup=False)
             yield Static(LEAVE_LINE, markup=False)
             yield Static(STOP_LINE, markup=False)
-            yield self._left
+            yield Static("Waits until it is answered; the arm does not move meanwhile.", id="left", markup=False)
 
     def on_key(self, event: events.Key) -> None:
         """Answer, if it is the key of an answer."""
         answer_by_key(self.prompt, self._engine, event)
-
-    def show_time_left(self) -> None:
-        """Show the time until the default is taken, or that nothing happens without an answer."""
-        prompt = self.prompt
-        if prompt.timeout_s is None:
-            self._left.show("Waits until it is answered; the arm does not move meanwhile.")
-        else:
-            left_s = max(0.0, prompt.timeout_s - (self._now_s() - prompt.asked_s))
-            self._left.show(f"{left_s:.0f} s left")
 
 
 def answer_by_key(prompt: Prompt, engine: EngineView, event: events.Key) -> None:
@@ -117,13 +100,10 @@ def answer_by_key(prompt: Prompt, engine: EngineView, event: events.Key) -> None
 
 
 def choices_content(prompt: Prompt) -> Content:
-    """A line for each answer, with a mark at the one that is taken when the time is up."""
-    lines: list[Content] = []
-    for choice in prompt.choices:
-        timed = prompt.timeout_s is not None and choice.key == prompt.default
-        mark = "   (if nobody answers)" if timed else ""
-        lines.append(Content.assemble((choice.key, "bold $text-accent"), f"  {plain(choice.label)}{mark}"))
-    return Content("\n").join(lines)
+    """A line for each answer."""
+    return Content("\n").join(
+        Content.assemble((choice.key, "bold $text-accent"), f"  {plain(choice.label)}") for choice in prompt.choices
+    )
 
 
 class Confirm(ModalScreen[bool]):

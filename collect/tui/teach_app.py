@@ -58,7 +58,6 @@ class TeachApp(PlainApp):
     def __init__(self, work: Work, name: str, pictures: Pictures | None = None, theme_file: Path | None = None) -> None:
         super().__init__(theme_file)
         self._work = work
-        self._name = name
         self._pictures = pictures or Pictures()
         self.teaching = Teaching(work)
         self._screen = TeachScreen(self.teaching.guide, name, self._pictures)

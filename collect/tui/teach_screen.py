@@ -11,7 +11,7 @@ from textual.widget import Widget
 from textual.widgets import Input
 
 from collect.rig.optics import gray
-from collect.teach.guide import Brought, JogStep, JogView, Picture, Shown, StepState
+from collect.teach.guide import Brought, JogStep, JogView, Picture, Shown, StepState, number_in
 from collect.tui.pictures import Pictures
 from collect.tui.steps_screen import StepsScreen
 from collect.tui.teach_guide import Question, ScreenGuide, TeachView
@@ -161,15 +161,9 @@ class TeachScreen(StepsScreen):
             self._guide.answer(question.number, line)
             return
         try:
-            value = float(line.replace(",", "."))
-        except ValueError:
-            self._note.show(Content.styled(f"{plain(line)!r} is not a number", "bold $text-warning"))
-            return
-        if question.low <= value <= question.high:
-            self._guide.answer(question.number, value)
-        else:
-            allowed = f"{question.low:g} to {question.high:g} {question.unit}"
-            self._note.show(Content.styled(f"{value:g} is outside {allowed}", "bold $text-warning"))
+            self._guide.answer(question.number, number_in(line, question.unit, question.low, question.high))
+        except ValueError as error:
+            self._note.show(Content.styled(plain(str(error)), "bold $text-warning"))
 
     def _chosen(self, question: Question, event: events.Key) -> None:
         if event.key == "enter" and question.default:

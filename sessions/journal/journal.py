@@ -34,7 +34,6 @@ class Journal:
 
     def __init__(self, path: Path, t_ns: int, session: str = "") -> None:
         self.path = path
-        self._session = session
         try:
             created = not check_file(path)
             self._next = None if created else _whole_lines(path, t_ns, session)

@@ -132,7 +132,7 @@ async def capture(context: StepContext) -> Result:
         image, verdict = await looking  # a dip for a retake goes to the well by itself
     kept, retake = await decide(context, verdict, image, cell)
     if not kept:
-        run.progress.looked_at(kept=False)
+        run.progress.not_kept()
     if kept:
         context.recorder.stroke(_stroke(context, cell, None if waited is None else waited.score))
     return {

@@ -126,7 +126,7 @@ class CameraStep(Step):
                 "off in the camera's own set-up.",
                 tone="warning",
             )
-        # Last, so that a session that is cut before begins again with the source.
+        # Last, so that a session that is interrupted before begins again with the source.
         day.keep("camera", "camera.source", source, "typed or found, and its picture was seen")
 
     async def _looked_at(self, day: Day, source: str) -> tuple[int, Gray] | None:
@@ -187,8 +187,7 @@ class CameraStep(Step):
             await day.say(f"The board is not seen yet: {error.what}", picture=picture, tone="warning")
 
     def _forget_print(self, day: Day) -> None:
-        kept = {field: taught for field, taught in day.notebook.values.items() if not field.startswith("board.")}
-        day.save(day.notebook.model_copy(update={"values": kept}))
+        day.save(day.notebook.without("board."))
 
     async def _lens(self, day: Day, folder: Path, take: Take) -> Fitted | None:
         """Have the board held before the camera until the lens is known and its picture covered.

@@ -20,7 +20,7 @@ from drivers.force.rounds import LOOPBACK_CHANNEL
 from drivers.samples import ForceSample
 
 CHANNEL = "can0"
-"""Port of a gateway, unless one was typed."""
+"""Channel of a gateway, unless one was typed."""
 REST_S = 1.0
 """How long the sensor is listened to with nothing touching."""
 WAIT_S = 8.0

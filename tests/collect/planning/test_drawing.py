@@ -44,13 +44,14 @@ def config(tmp_path: Path) -> RigConfig:
 
 @pytest.fixture
 async def desk(config: RigConfig) -> AsyncIterator[Desk]:
-    server = ArcsServer(World(SimConfig(rate=20.0)))
+    world = World(SimConfig(rate=20.0))
+    server = ArcsServer(world)
     await server.start("127.0.0.1", 0)
     here = config.robot.model_copy(update={"port": server.port, "rtde_port": None})
     arm = make_robot(config.model_copy(update={"robot": here}), HostClock(), lambda _: None)
     await arm.connect()
     await arm.enable()
-    yield Desk(arm, server._world, config)
+    yield Desk(arm, world, config)
     await arm.close()
     await server.stop()
 

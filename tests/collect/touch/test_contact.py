@@ -33,13 +33,13 @@ def test_a_clean_hinge_is_found_exactly(contact_mm: float, stiffness: float, off
 
 
 def test_an_offset_of_each_descent_is_no_force() -> None:
-    z_mm = np.tile([120.3, 120.2, 119.9, 119.7], 5)
-    run = np.repeat(np.arange(5), 4)
+    z_mm = np.array([120.3, 120.2, 119.9, 119.7, 120.1, 119.9, 119.8])
+    run = np.array([0, 0, 0, 0, 1, 1, 1])
     force_n = hinge(z_mm, 120.0, 0.003) + 0.01 * run  # drifts by more than the whole push
-    found = find_contact(z_mm, force_n, np.full(20, 100), NOISE_N, run)
+    found = find_contact(z_mm, force_n, np.full(7, 100), NOISE_N, run)
     assert found.z_mm == pytest.approx(120.0, abs=1e-6)
-    together = find_contact(z_mm, force_n, np.full(20, 100), NOISE_N)
-    assert together.misfit > 100.0 * max(found.misfit, 1e-9)
+    together = find_contact(z_mm, force_n, np.full(7, 100), NOISE_N)
+    assert abs(together.z_mm - 120.0) > 0.05
 
 
 def test_the_standard_error_is_what_repeats_scatter_by() -> None:
@@ -52,7 +52,6 @@ def test_the_standard_error_is_what_repeats_scatter_by() -> None:
     errors = np.array([f.z_mm - 120.013 for f in found])
     assert errors.std() == pytest.approx(float(np.mean([f.sigma_mm for f in found])), rel=0.15)
     assert abs(errors.mean()) < 3.0 * errors.std() / np.sqrt(300)
-    assert np.mean([f.misfit for f in found]) == pytest.approx(1.0, abs=0.1)
 
 
 @settings(max_examples=30)

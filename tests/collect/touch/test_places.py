@@ -1,4 +1,4 @@
-"""Which cells zero touch and the self-check use up."""
+"""Which cells zero touch uses up."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from collect.rig.config import PaperConfig
 from collect.rig.config_touch import TouchConfig
 from collect.rig.paper import Sheet
 from collect.touch.places import used_cells
-from collect.touch.selfcheck import triangle_of
 
 PAPER = PaperConfig(origin_mm=(0.0, 0.0), touch_z_mm=120.0, size_mm=(244.0, 172.0), touch_point_mm=(2.0, 2.0))
 SHEET = Sheet(PAPER)
@@ -37,11 +36,6 @@ def test_a_patch_costs_every_cell_that_it_may_reach() -> None:
     assert 36 in patches
     assert 30 in patches, "it grows into the cell above"
     assert len(patches) < SHEET.capacity / 3
-
-
-def test_the_self_check_costs_its_cells() -> None:
-    cells = SHEET.cell(0), SHEET.cell(5), SHEET.cell(36)
-    assert used_cells(SHEET, PAPER, TouchConfig(), triangle_of(cells)) == {0, 5, 36}
 
 
 def test_a_point_beside_the_sheet_is_refused() -> None:

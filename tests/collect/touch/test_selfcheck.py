@@ -19,8 +19,16 @@ from collect.errors import StepError
 from collect.rig.config import PaperConfig
 from collect.rig.config_touch import SelfCheckConfig
 from collect.rig.paper import PaperPlane, Sheet, to_base
-from collect.touch.places import Triangle
-from collect.touch.selfcheck import SelfCheck, judge, partners, self_check, triangle_in, triangle_of, triangle_on
+from collect.touch.selfcheck import (
+    SelfCheck,
+    Triangle,
+    judge,
+    partners,
+    self_check,
+    triangle_in,
+    triangle_of,
+    triangle_on,
+)
 from drivers.samples import Pose
 
 if TYPE_CHECKING:

@@ -122,10 +122,8 @@ SPLIT = Prompt(
     "H15-a5-r01: The tip is split by 0.42 mm. Comb the brush.",
     (Choice("g", "good anyway: it counts"), Choice("r", "press it again"), Choice("k", "skip it")),
     "k",
-    timeout_s=120.0,
     image=capture(kept=False).photo,
     number=3,
-    asked_s=1000.0,
 )
 SET_UP = (
     SetUpStep(
