@@ -19,11 +19,10 @@ from torch import Tensor
 from bench.harness import Result, interleave, machine
 from model.brush import Brush
 from model.ccdbsm import CcdBsm, ccdbsm
-from model.coverage import PX_MM, SIZE_PX, centred_origin, coverage
 from model.press_images import press_images
 from model.raster.compiled import coverage_numpy
 from model.raster.exact import coverage_at
-from model.raster.frame import to_pixels
+from model.raster.frame import PX_MM, SIZE_PX, centred_origin, to_pixels
 
 BATCH = 64
 BULK = 1024  # 64 MiB of images: more than a cache holds, as in making a training set
@@ -57,11 +56,11 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """Images per second of exact CCD-BSM coverage, 128 x 128, beside cv2.fillPoly at 4x with resize, and a memset.
 
     ratio = our images/s over the peer's. Presses are drawn from H 11-20 mm, alpha 0-10 deg and any heading, each in the
-    middle of its image; both sides draw the same ones, the first six rows at heading 0. Ours counts everything from
+    middle of its image; both sides draw the same ones, `raster-press` at heading 0. Ours counts everything from
     (H, alpha, heading) to float32 images; fillPoly gets its outlines ready made and gives 8-bit images, is not
     exact (it paints its boundary pixels whole, so its marks come out about 1 % too large, and at 4x it knows 17
     levels of gray), and each of its images is a zeroed canvas, a fill and an area mean. The memset clears the same
-    images. `raster` is torch at heading 0, `raster-any-heading` torch at any, 64 images a call on one thread.
+    images. `raster-any-heading` is torch, 64 images a call on one thread.
     `raster-press` is the compiled path from (H, alpha) and `raster-compiled` that from any outline, at any heading: 64
     images a call on one thread, or, as `-bulk`, 1024 on as many threads as there are cores, as do their peers.
     The images of the compiled rows are written into memory that is used again.
@@ -78,10 +77,6 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     height_mm, tilt_deg = (values.double().numpy() for values in (drawn.height_mm, drawn.tilt_deg))
     level_polygons = outlines(drawn.mark(BATCH))
     polygons = outlines(drawn.mark(BATCH), drawn.origin(drawn.mark(BATCH)), drawn.heading_deg[:BATCH])
-
-    def level() -> object:
-        mark = drawn.mark(BATCH)
-        return coverage(mark, centred_origin(mark))
 
     def turned() -> object:
         mark = drawn.mark(BATCH)
@@ -109,7 +104,6 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
         few, many = (BATCH, 1), (BULK, cores)
         one, all_ = "cv2.fillPoly at 4x", f"cv2.fillPoly at 4x on {cores} threads"
         contests: tuple[tuple[str, Work, int, Work, int, str], ...] = (
-            ("raster", level, BATCH, lambda: filled(level_polygons), BATCH, one),
             ("raster-press", _many(lambda: presses(*few)), BULK, lambda: filled(level_polygons), BATCH, one),
             ("raster-press-memset", _many(lambda: presses(*few)), BULK, lambda: cleared(*few), BATCH, "memset"),
             ("raster-press-bulk", lambda: presses(*many), BULK, lambda: shared(level_polygons), BATCH, all_),

@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from model.ccdbsm import CcdBsm
-from model.outline import Outline, column, disc_integral, loop, safe_sqrt
+from model.outline import Outline, loop
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ellipse:
-    """B ellipses with axes along x and y: centre on the x axis and semi-axes in mm, all (B,); a `Profile`."""
+    """B ellipses with axes along x and y: centre on the x axis and semi-axes in mm, all (B,)."""
 
     centre_mm: Tensor
     semi_x_mm: Tensor
@@ -50,29 +50,10 @@ class Ellipse:
         """Four quarters of an ellipse."""
         return rounded(self.centre_mm, self.semi_x_mm, self.semi_y_mm)
 
-    def half_width(self, x_mm: Tensor) -> Tensor:
-        """The half width at x, (B, N) -> (B, N) mm; zero outside."""
-        u = self._fraction(x_mm)
-        return column(self.semi_y_mm) * safe_sqrt((1 - u) * (1 + u))
-
-    def area_to(self, x_mm: Tensor) -> Tensor:
-        """The integral of the half width up to x, (B, N) -> (B, N) mm^2."""
-        scale = column(self.semi_x_mm * self.semi_y_mm)
-        return scale * (disc_integral(self._fraction(x_mm)) + 0.25 * math.pi)
-
-    def level(self, a_mm: Tensor) -> tuple[Tensor, Tensor]:
-        """The ends of {x : half width >= a}, (B, N) -> two (B, N) mm."""
-        ratio = (a_mm / column(self.semi_y_mm)).clamp(0, 1)
-        reach = column(self.semi_x_mm) * safe_sqrt((1 - ratio) * (1 + ratio))
-        return column(self.centre_mm) - reach, column(self.centre_mm) + reach
-
-    def _fraction(self, x_mm: Tensor) -> Tensor:
-        return ((x_mm - column(self.centre_mm)) / column(self.semi_x_mm)).clamp(-1, 1)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capsule:
-    """B capsules: segments of half length `reach` dilated by discs of `radius`, mm, all (B,); a `Profile`.
+    """B capsules: segments of half length `reach` dilated by discs of `radius`, mm, all (B,).
 
     The segment lies along x (`reach_x_mm`) or across it (`reach_y_mm`); the other reach is zero.
     """
@@ -106,34 +87,6 @@ class Capsule:
         """Four quarters of a circle and four straight lines, two of them of zero length."""
         r = self.radius_mm
         return rounded(self.centre_mm, self.reach_x_mm + r, self.reach_y_mm + r, r, r)
-
-    def half_width(self, x_mm: Tensor) -> Tensor:
-        """The half width at x, (B, N) -> (B, N) mm; zero outside."""
-        offset = (x_mm - column(self.centre_mm)).abs()
-        u = ((offset - column(self.reach_x_mm)) / column(self.radius_mm)).clamp(0, 1)
-        inside = offset <= column(self.reach_x_mm + self.radius_mm)
-        cap = column(self.radius_mm) * safe_sqrt((1 - u) * (1 + u))
-        return torch.where(inside, cap + column(self.reach_y_mm), torch.zeros_like(cap))
-
-    def area_to(self, x_mm: Tensor) -> Tensor:
-        """The integral of the half width up to x, (B, N) -> (B, N) mm^2."""
-        radius, reach = column(self.radius_mm), column(self.reach_x_mm)
-        end = reach + radius
-        offset = torch.clamp(x_mm - column(self.centre_mm), -end, end)
-        straight = torch.clamp(offset, -reach, reach)
-        # The part of the offset beyond the straight section lies in one of the two half discs.
-        caps = radius**2 * (disc_integral(((offset - straight) / radius).clamp(-1, 1)) + 0.25 * math.pi)
-        return caps + radius * (straight + reach) + column(self.reach_y_mm) * (offset + end)
-
-    def level(self, a_mm: Tensor) -> tuple[Tensor, Tensor]:
-        """The ends of {x : half width >= a}, (B, N) -> two (B, N) mm."""
-        radius = column(self.radius_mm)
-        above = a_mm - column(self.reach_y_mm)
-        ratio = (above / radius).clamp(0, 1)
-        # At the very top the whole segment is level; above it the set is empty.
-        segment = torch.where(above <= radius, column(self.reach_x_mm).expand_as(above), torch.zeros_like(above))
-        reach = segment + radius * safe_sqrt((1 - ratio) * (1 + ratio))
-        return column(self.centre_mm) - reach, column(self.centre_mm) + reach
 
 
 def ellipse(mark: CcdBsm) -> Ellipse:

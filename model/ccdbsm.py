@@ -23,12 +23,12 @@ import torch
 from torch import Tensor
 
 from model.brush import Brush, DomainError, require_positive
-from model.outline import Outline, column, disc_integral, loop, safe_sqrt
+from model.outline import Outline, loop, safe_sqrt
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CcdBsm:
-    """A batch of B marks: the basic lengths of Eq. 2-4 in mm and the dilation lambda, all (B,); a `Profile`.
+    """A batch of B marks: the basic lengths of Eq. 2-4 in mm and the dilation lambda, all (B,).
 
     Eq. 1: w = lambda O3C sqrt(1 - x^2 / O3A^2) for 0 <= x <= O3A, and lambda O3C (1 - x^2 / O4O3^2) for
     -O4O3 <= x < 0.
@@ -83,25 +83,10 @@ class CcdBsm:
 
     def half_width(self, x_mm: Tensor) -> Tensor:
         """Eq. 1 at x, (B, N) -> (B, N) mm; zero outside the mark."""
-        heel, tip = self._fractions(x_mm)
+        heel = (x_mm / self.o3a_mm[:, None]).clamp(0, 1)
+        tip = (x_mm / self.o4o3_mm[:, None]).clamp(-1, 0)
         # The other side's fraction is clamped to 0, so its factor is 1 and one product covers both sides.
-        return column(self.half_width_mm) * safe_sqrt((1 - heel) * (1 + heel)) * (1 - tip) * (1 + tip)
-
-    def area_to(self, x_mm: Tensor) -> Tensor:
-        """The integral of Eq. 1 from the tip to x, (B, N) -> (B, N) mm^2."""
-        heel, tip = self._fractions(x_mm)
-        tip_part = column(self.o4o3_mm) * (tip - tip**3 / 3 + 2 / 3)
-        return column(self.half_width_mm) * (tip_part + column(self.o3a_mm) * disc_integral(heel))
-
-    def level(self, a_mm: Tensor) -> tuple[Tensor, Tensor]:
-        """Eq. 1 solved for x on both sides: the ends of {x : w(x) >= a}, (B, N) -> two (B, N) mm."""
-        ratio = (a_mm / column(self.half_width_mm)).clamp(0, 1)
-        left = -column(self.o4o3_mm) * safe_sqrt(1 - ratio)
-        return left, column(self.o3a_mm) * safe_sqrt((1 - ratio) * (1 + ratio))
-
-    def _fractions(self, x_mm: Tensor) -> tuple[Tensor, Tensor]:
-        """x / O3A clamped to [0, 1] and x / O4O3 clamped to [-1, 0]."""
-        return (x_mm / column(self.o3a_mm)).clamp(0, 1), (x_mm / column(self.o4o3_mm)).clamp(-1, 0)
+        return self.half_width_mm[:, None] * safe_sqrt((1 - heel) * (1 + heel)) * (1 - tip) * (1 + tip)
 
 
 def ccdbsm(

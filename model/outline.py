@@ -5,16 +5,14 @@ Book", 2nd ed., ch. 7): w = 1 is a parabola or, with the middle point halfway, a
 of an ellipse that spans 2 acos(w) of it. So lines, circles, ellipses and CCD-BSM's parabolas are exact; other
 curves are cut into short parabolas by `through`.
 
-A profile is a shape that is symmetric about the x axis and whose half width w(x) rises to one plateau or peak and
-then falls on [x_min, x_max], so that every level set {x : w(x) >= a} is one interval. The frame is defined in
-`model.raster.frame`. All parameters are batched: one shape per row, `(B,)`.
+The frame is defined in `model.raster.frame`. All parameters are batched: one shape per row, `(B,)`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -35,7 +33,7 @@ class Shape(Protocol):
 
     @property
     def width_mm(self) -> Tensor:
-        """The extent along y, (B,); for a profile, the full width at its widest point."""
+        """The extent along y, (B,)."""
         ...
 
     @property
@@ -48,43 +46,11 @@ class Shape(Protocol):
         ...
 
 
-@runtime_checkable
-class Profile(Shape, Protocol):
-    """A batch of B shapes symmetric about the x axis with a unimodal half width."""
-
-    def half_width(self, x_mm: Tensor) -> Tensor:
-        """The half width w at x, (B, N) -> (B, N); zero outside [x_min, x_max]."""
-        ...
-
-    def area_to(self, x_mm: Tensor) -> Tensor:
-        """The integral of w from x_min to x, closed form, (B, N) -> (B, N) mm^2; constant beyond the ends."""
-        ...
-
-    def level(self, a_mm: Tensor) -> tuple[Tensor, Tensor]:
-        """The ends (x_left, x_right) of {x : w(x) >= a}, (B, N) -> two (B, N), for a >= 0.
-
-        Above the greatest half width the set is empty and both ends are at the peak.
-        """
-        ...
-
-
-def column(parameter: Tensor) -> Tensor:
-    """A (B,) parameter as (B, 1), to broadcast with a (B, N) grid."""
-    return parameter.unsqueeze(-1)
-
-
 def safe_sqrt(value: Tensor) -> Tensor:
     """The square root of max(value, 0), any shape, with gradient 0 rather than infinity where value <= 0."""
     positive = value > 0
     # Both branches of `where` are differentiated, so the unused one has to be finite as well.
     return torch.where(positive, torch.where(positive, value, torch.ones_like(value)).sqrt(), torch.zeros_like(value))
-
-
-def disc_integral(u: Tensor) -> Tensor:
-    """The integral of sqrt(1 - t^2) from 0 to u, any shape, u in [-1, 1]: (u sqrt(1 - u^2) + asin u) / 2."""
-    height = safe_sqrt((1 - u) * (1 + u))
-    # atan2 equals asin(u) here, but its gradient stays finite at u = +-1.
-    return 0.5 * (u * height + torch.atan2(u, height))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,10 +22,10 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def test_raster_reports_the_agreed_fields() -> None:
-    result = results_of(raster.run(n=1, seed=3))[0]
+    result = next(one for one in results_of(raster.run(n=1, seed=3)) if one.name == "raster-press")
     fields = json.loads(result.to_json())
     assert list(fields) == ["name", "value", "unit", "peer", "ratio", "n", "seed", "conditions", "quickest", "median"]
-    assert (result.name, result.unit, result.n, result.seed) == ("raster", "images/s", 1, 3)
+    assert (result.name, result.unit, result.n, result.seed) == ("raster-press", "images/s", 1, 3)
     assert result.value > 0
     assert result.ratio > 0
 

@@ -33,7 +33,7 @@ from drivers.sim.rig import LoopbackRig
 from drivers.sim.rig_toml import Addresses, rig_toml
 from model import strokes
 from model.brush import Brush
-from model.coverage import coverage
+from model.raster.exact import coverage_at
 from model.registry import stroke_models
 
 RECIPES = Path(__file__).resolve().parent.parent / "examples" / "recipes"
@@ -63,7 +63,7 @@ def test_a_stroke_model_is_a_file_in_the_folder(tmp_path: Path, monkeypatch: pyt
     try:
         models = stroke_models(Brush())
         drop, circle = (
-            coverage(models[name].profile(15.0, 5.0), (15.0, 15.0)).sum().item() for name in ("drop", "circle")
+            coverage_at(models[name].profile(15.0, 5.0), (15.0, 15.0)).sum().item() for name in ("drop", "circle")
         )
         assert drop == pytest.approx(0.5 * circle, rel=0.01)
     finally:

@@ -11,13 +11,12 @@ import torch
 from torch import Tensor
 
 from model.brush import Brush, DomainError
-from model.coverage import centred_origin
 from model.generator.network import Layers
 from model.outline import Shape
 from model.press_images import press_images
 from model.protocol import ParameterSpec, StrokeModel
 from model.raster.compiled import coverage_numpy
-from model.raster.frame import SIZE_PX
+from model.raster.frame import SIZE_PX, centred_origin
 
 ANCHOR_SHARE = (0.76, 0.5)
 """Position of the zero-touch point in the image, from the left and the top, as in the validation's mm field."""

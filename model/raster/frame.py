@@ -15,6 +15,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from model.outline import Shape
+
 SIZE_PX = 128
 PX_MM = 0.2
 Place = Tensor | tuple[float, float]
@@ -47,3 +49,10 @@ def to_pixels(origin_mm: Place, heading_deg: float | Tensor, px_mm: float, like:
     origin, heading = place(origin_mm, like) / px_mm, torch.deg2rad(turn(heading_deg, like))
     cosine, sine = torch.cos(heading) / px_mm, torch.sin(heading) / px_mm
     return torch.stack((cosine, -sine, origin[:, 0], -sine, -cosine, origin[:, 1]), dim=-1)
+
+
+def centred_origin(shape: Shape, *, size_px: int = SIZE_PX, px_mm: float = PX_MM) -> Tensor:
+    """The `origin_mm` that puts each shape's bounding box in the middle of the image, (B, 2)."""
+    check_raster(size_px, px_mm)
+    middle = torch.full_like(shape.x_min_mm, 0.5 * size_px * px_mm)
+    return torch.stack((middle - 0.5 * (shape.x_min_mm + shape.x_max_mm), middle), dim=-1)

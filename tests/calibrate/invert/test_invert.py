@@ -18,8 +18,8 @@ from collect.protocols.config import load_protocol
 from collect.protocols.presses import ReplayConfig
 from model.brush import Brush
 from model.ccdbsm import ccdbsm
-from model.coverage import coverage
 from model.inversion.press import Range
+from model.raster.exact import coverage_at
 from sessions.imports.photographs import ImportOptions, import_photographs
 from sessions.reader import Capture
 from sessions.recording.messages import encode_png
@@ -34,7 +34,7 @@ START = (34.0, 20.0)  # mm from the left and top edge
 def photograph(height_mm: float, tilt_deg: float) -> np.ndarray:
     """A 50 x 40 mm photograph at 12 px/mm of CCD-BSM's own mark, touched at START, ferrule to the right."""
     origin = (START[0] + height_mm * math.tan(math.radians(tilt_deg)), START[1])
-    ink = coverage(ccdbsm(Brush(), height_mm, tilt_deg), origin, size_px=600, px_mm=1 / PX)[0].numpy()[:480]
+    ink = coverage_at(ccdbsm(Brush(), height_mm, tilt_deg), origin, size_px=600, px_mm=1 / PX)[0].numpy()[:480]
     return np.rint(230.0 * (1.0 - 0.92 * ink)).astype(np.uint8)
 
 

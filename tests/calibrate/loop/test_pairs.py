@@ -13,7 +13,7 @@ from calibrate.compare.stats import interval_over_groups
 from calibrate.loop.compare import Pairs, pair_up
 from calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, score_pairs, summary_of, verdicts
 from model.brush import Brush
-from model.coverage import coverage
+from model.raster.exact import coverage_at
 from model.registry import stroke_model
 from sessions.reader import Capture
 from sessions.recording.messages import encode_png
@@ -28,7 +28,7 @@ STRICT = (Alignment.MM, Tone.BINARY)
 def photograph(height_mm: float, tilt_deg: float) -> np.ndarray:
     """100 x 80 mm at 10 px/mm, straight from above, with the model's mark at the anchor."""
     axis_x = ANCHOR[0] + height_mm * math.tan(math.radians(tilt_deg))
-    mark = coverage(MODEL.profile(height_mm, tilt_deg), (axis_x, 80.0 - ANCHOR[1]), size_px=1000, px_mm=0.1)
+    mark = coverage_at(MODEL.profile(height_mm, tilt_deg), (axis_x, 80.0 - ANCHOR[1]), size_px=1000, px_mm=0.1)
     return np.rint(230.0 * (1.0 - 0.92 * mark[0].numpy()[:800])).astype(np.uint8)
 
 

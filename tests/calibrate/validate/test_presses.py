@@ -13,7 +13,7 @@ from calibrate.compare.field import KEYS, Alignment, Field, Tone, best_shift
 from calibrate.compare.images import pack, simulated, simulated_pixels
 from calibrate.validate.jobs import ABSENT, PrepareJob, Press, ScoreJob, prepare_job, score_job
 from model.brush import Brush
-from model.coverage import coverage
+from model.raster.exact import coverage_at
 from model.registry import stroke_models
 from sessions.reader import Capture
 from sessions.recording.messages import encode_png
@@ -29,7 +29,7 @@ PX = 10.0  # of the pretended camera, per mm
 def drawn(height_mm: float, tilt_deg: float, model: str = "ccd-bsm") -> np.ndarray:
     """A 100 x 80 mm page, photographed straight from above at 10 px/mm, with a model's mark at the anchor."""
     axis_x = ANCHOR[0] + height_mm * math.tan(math.radians(tilt_deg))
-    mark = coverage(MODELS[model].profile(height_mm, tilt_deg), (axis_x, 80.0 - ANCHOR[1]), size_px=1000, px_mm=0.1)
+    mark = coverage_at(MODELS[model].profile(height_mm, tilt_deg), (axis_x, 80.0 - ANCHOR[1]), size_px=1000, px_mm=0.1)
     return np.rint(230.0 * (1.0 - 0.92 * mark[0].numpy()[:800])).astype(np.uint8)
 
 

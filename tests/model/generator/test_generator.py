@@ -9,12 +9,13 @@ import torch
 
 from model.brush import Brush, DomainError
 from model.ccdbsm import ccdbsm
-from model.coverage import centred_origin, coverage
 from model.generator.basis import FieldBasis, fit_basis, signed_distance
 from model.generator.metrics import quality
 from model.generator.network import Generator, Inputs, Layers, chebyshev, covered, squared_error
 from model.generator.stroke import generator_model, traced
 from model.generator.targets import PRESETS, Placement, Target
+from model.raster.exact import coverage_at
+from model.raster.frame import centred_origin
 from model.registry import stroke_model
 
 SMALL = Layers(width=16, channels=4, side=8, size_px=32)
@@ -43,13 +44,13 @@ def test_placements_are_those_of_the_validation() -> None:
     inputs = torch.tensor([[15.0, 8.0]])
     mark = ccdbsm(Brush(), 15.0, 8.0)
     torch.testing.assert_close(
-        target().images(inputs).double(), coverage(mark, centred_origin(mark)), rtol=0, atol=1e-5
+        target().images(inputs).double(), coverage_at(mark, centred_origin(mark)), rtol=0, atol=1e-5
     )
     anchored = (0.76 * 38.4 + 15 * math.tan(math.radians(8)), 19.2)
-    expected = coverage(mark, anchored, px_mm=0.3)
+    expected = coverage_at(mark, anchored, px_mm=0.3)
     torch.testing.assert_close(target("anchored").images(inputs).double(), expected, rtol=0, atol=1e-5)
     every = torch.tensor([[48.0, 6.0, 15.0, 8.0, 28.0, 18.0]])
-    expected = coverage(mark, (28.0, 18.0), px_mm=0.3)
+    expected = coverage_at(mark, (28.0, 18.0), px_mm=0.3)
     torch.testing.assert_close(target("all").images(every).double(), expected, rtol=0, atol=1e-5)
 
 
@@ -155,7 +156,7 @@ def test_a_generator_is_a_stroke_model() -> None:
     torch.testing.assert_close(shape.x_max_mm, exact.x_max_mm.double(), rtol=0, atol=0.1)
     assert ((shape.x_min_mm - exact.x_min_mm) < 1.0).all()  # the tip ends where it is half a pixel wide
     origin = centred_origin(exact)
-    drawn, expected = coverage(shape, origin), coverage(exact, origin)
+    drawn, expected = coverage_at(shape, origin), coverage_at(exact, origin)
     assert quality([(drawn, expected)]).iou > 0.985
     assert model.images({"height_mm": 15.0, "tilt_deg": 3.0}).shape == (1, 128, 128)
     with pytest.raises(DomainError, match=r"height_mm = 25 is outside \[11, 20\] mm"):

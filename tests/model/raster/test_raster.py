@@ -13,11 +13,11 @@ from scipy.integrate import quad
 
 from model.brush import Brush, DomainError
 from model.ccdbsm import CcdBsm, ccdbsm
-from model.coverage import centred_origin, coverage
 from model.outline import cross, loop
 from model.press_images import press_images
 from model.raster.compiled import coverage_numpy
 from model.raster.exact import coverage_at
+from model.raster.frame import centred_origin
 from model.registry import stroke_models
 
 Array = NDArray[np.floating]
@@ -78,10 +78,10 @@ def test_boundary_pixels_match_quadrature_at_any_heading(press: tuple[float, flo
 
 
 @pytest.mark.parametrize("name", ["ccd-bsm", "ellipse", "circle", "line"])
-def test_quarter_turns_match_the_closed_form_in_every_pixel(name: str) -> None:
+def test_quarter_turns_match_heading_0_in_every_pixel(name: str) -> None:
     shape = MODELS[name].profile(torch.tensor([11.0, 15.0, 20.0], **DOUBLE), 5.0)
     origin = centred_origin(shape) + torch.tensor([0.037, -0.061])
-    level = coverage(shape, origin)
+    level = coverage_at(shape, origin)
     for quarters, heading_deg in enumerate(HEADINGS[:3]):
         # Turning the picture counter-clockwise about its middle takes (x, y) to (y, side - x), from the top left.
         placed = origin
@@ -149,7 +149,7 @@ def test_images_straight_from_presses_match_the_closed_form(size_px: int, px_mm:
         origin[:, 0] = np.round(origin[:, 0] / px_mm) * px_mm - rng.choice([0.0, 1.0], 150) * mark.o3a_mm.numpy()
     if grid == "beside corners":
         origin += rng.choice([1e-6, -1e-7, 1e-12], (150, 2))
-    level = coverage(mark, torch.from_numpy(origin), size_px=size_px, px_mm=px_mm).numpy()
+    level = coverage_at(mark, torch.from_numpy(origin), size_px=size_px, px_mm=px_mm).numpy()
     dirty = np.full(level.shape, 7, np.float32)
     images = press_images(Brush(), height_mm, tilt_deg, origin_mm=origin, size_px=size_px, px_mm=px_mm, out=dirty)
     assert abs(images - level).max() < 1e-6
@@ -160,7 +160,7 @@ def test_images_straight_from_presses_match_the_closed_form(size_px: int, px_mm:
 def test_presses_of_many_brushes_are_centred_and_checked() -> None:
     radius_mm, lam = torch.tensor([5.0, 6.0, 7.0], **DOUBLE), np.array([1.0, 2.0, 3.0])
     mark = ccdbsm(Brush(radius_mm, 44.0), 15.0, 7.0, torch.from_numpy(lam))
-    expected = coverage(mark, centred_origin(mark)).numpy()
+    expected = coverage_at(mark, centred_origin(mark)).numpy()
     np.testing.assert_allclose(press_images(Brush(radius_mm, 44.0), 15.0, 7.0, lam), expected, rtol=0, atol=1e-6)
     np.testing.assert_array_equal(*(press_images(Brush(), np.full(130, 15.0), 7.0, threads=n) for n in (1, 2)))
     with pytest.raises(DomainError, match=r"tilt_deg = -1 is outside \[0, 82.875\) deg"):

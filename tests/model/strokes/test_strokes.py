@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from model import strokes
 from model.brush import Brush, DomainError
 from model.ccdbsm import ccdbsm
-from model.coverage import coverage
 from model.outline import Outline
 from model.plane import fit_plane
 from model.raster.exact import coverage_at
@@ -66,7 +65,7 @@ def test_a_file_in_the_folder_is_a_model(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(strokes, "__path__", [*strokes.__path__, str(tmp_path)])
     try:
         model = stroke_models(Brush())["dot"]
-        assert coverage(model.profile(15.0, 5.0), (5.0, 5.0)).sum().item() * 0.04 == pytest.approx(
+        assert coverage_at(model.profile(15.0, 5.0), (5.0, 5.0)).sum().item() * 0.04 == pytest.approx(
             math.pi * 1.869**2, rel=1e-3
         )
     finally:
