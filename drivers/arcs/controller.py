@@ -64,19 +64,18 @@ class Controller:
 
     async def pose(self) -> Pose:
         """Where the tip is. Raises `ProtocolViolation`."""
-        values = await self.ask("RobotState.getTcpPose")
-        try:
-            return from_wire(numbers(values, 6))
-        except ValueError as error:
-            raise ProtocolViolation(DEVICE, "getTcpPose", str(error)) from None
+        return from_wire(await self._six("getTcpPose"))
 
     async def joint_positions(self) -> list[float]:
         """Six joints in rad. Raises `ProtocolViolation`."""
-        values = await self.ask("RobotState.getJointPositions")
+        return await self._six("getJointPositions")
+
+    async def _six(self, getter: str) -> list[float]:
+        values = await self.ask(f"RobotState.{getter}")
         try:
             return numbers(values, 6)
         except ValueError as error:
-            raise ProtocolViolation(DEVICE, "getJointPositions", str(error)) from None
+            raise ProtocolViolation(DEVICE, getter, str(error)) from None
 
     async def mode(self) -> RobotMode:
         """The robot mode. Raises `ProtocolViolation` for an unknown name."""

@@ -14,6 +14,7 @@ small pieces, and could not tell a reply that is cut off from one that is wrong.
 
 from __future__ import annotations
 
+import abc
 import json
 import math
 import re
@@ -42,30 +43,46 @@ def encode(payload: bytes) -> bytes:
     return MAGIC + bytes([FLAG_LONG]) + struct.pack(">I", len(payload)) + payload
 
 
-class FrameDecoder:
-    """Turns a byte stream, split at any point, into payloads."""
+class _Decoder(abc.ABC):
+    """Turns a byte stream, split at any point, into what `_next` finds at its beginning."""
 
-    def __init__(self, device: str = "arcs", *, skip: bytes = b"", max_bytes: int = MAX_PAYLOAD_BYTES) -> None:
-        """`skip` holds bytes that may appear between frames and are ignored."""
+    def __init__(self, device: str, max_bytes: int) -> None:
         self._device = device
-        self._skip = skip
         self._max_bytes = max_bytes
         self._buffer = bytearray()
         self._broken: str | None = None
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Payloads completed by `data`, in order.
+        """What `data` completes, in order.
 
-        Raises `ProtocolViolation` if the stream is not SOF, and on every later call: neither this `data` nor anything
-        after it can be trusted.
+        Raises `ProtocolViolation` for bytes outside the format, and then on every later call: neither this `data` nor
+        anything after it can be trusted.
         """
         if self._broken is not None:
             raise self._violation(self._broken)
         self._buffer += data
-        payloads: list[bytes] = []
-        while (payload := self._next()) is not None:
-            payloads.append(payload)
-        return payloads
+        found: list[bytes] = []
+        while (one := self._next()) is not None:
+            found.append(one)
+        return found
+
+    @abc.abstractmethod
+    def _next(self) -> bytes | None:
+        """Take the next whole item from the buffer; None while it is incomplete."""
+
+    def _violation(self, what: str) -> ProtocolViolation:
+        self._broken = what
+        self._buffer.clear()
+        return ProtocolViolation(self._device, "decode", what)
+
+
+class FrameDecoder(_Decoder):
+    """Turns a byte stream, split at any point, into the payloads of SOF frames."""
+
+    def __init__(self, device: str = "arcs", *, skip: bytes = b"", max_bytes: int = MAX_PAYLOAD_BYTES) -> None:
+        """`skip` holds bytes that may appear between frames and are ignored."""
+        super().__init__(device, max_bytes)
+        self._skip = skip
 
     def _next(self) -> bytes | None:
         buffer, skip = self._buffer, self._skip
@@ -94,11 +111,6 @@ class FrameDecoder:
         del buffer[: head + size]
         return payload
 
-    def _violation(self, what: str) -> ProtocolViolation:
-        self._broken = what
-        self._buffer.clear()
-        return ProtocolViolation(self._device, "decode", what)
-
 
 MAX_DOCUMENT_BYTES = 1024 * 1024
 """Far above any reply of a controller."""
@@ -110,30 +122,17 @@ _STRING_END = re.compile(rb'["\\]')
 _CLOSES = {ord("}"): ord("{"), ord("]"): ord("[")}
 
 
-class BareDecoder:
-    """Turns a byte stream, split at any point, into JSON documents; bounded in size and depth."""
+class BareDecoder(_Decoder):
+    """Turns a byte stream, split at any point, into JSON documents, bounded in size and depth.
+
+    NaN and Infinity are accepted, as by Python's `json`.
+    """
 
     def __init__(self, device: str = "arcs", *, max_bytes: int = MAX_DOCUMENT_BYTES) -> None:
-        self._device = device
-        self._max_bytes = max_bytes
-        self._buffer = bytearray()
+        super().__init__(device, max_bytes)
         self._at = 0
         self._open: list[int] = []
         self._in_string = False
-        self._broken: str | None = None
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """Documents completed by `data`, in order; NaN and Infinity are accepted, as by Python's `json`.
-
-        Raises `ProtocolViolation`, also on every later call: neither this `data` nor anything after it can be trusted.
-        """
-        if self._broken is not None:
-            raise self._violation(self._broken)
-        self._buffer += data
-        documents: list[bytes] = []
-        while (document := self._next()) is not None:
-            documents.append(document)
-        return documents
 
     def _next(self) -> bytes | None:
         if not self._open:
@@ -179,11 +178,6 @@ class BareDecoder:
                 self._open.append(byte)
                 if len(self._open) > MAX_DEPTH:
                     raise self._violation(f"nested deeper than {MAX_DEPTH}")
-
-    def _violation(self, what: str) -> ProtocolViolation:
-        self._broken = what
-        self._buffer.clear()
-        return ProtocolViolation(self._device, "decode", what)
 
 
 def numbers(values: object, count: int) -> list[float]:

@@ -83,7 +83,6 @@ class SerialSettings:
 
     path: str
     baud: int
-    bytesize: Literal[7, 8] = 8
     parity: Literal["N", "E", "O"] = "N"
     stopbits: Literal[1, 2] = 1
     gap_s: float = 0.0
@@ -165,7 +164,6 @@ class SerialPort:
             port = serial.Serial(
                 settings.path,
                 settings.baud,
-                bytesize=settings.bytesize,
                 parity=settings.parity,
                 stopbits=settings.stopbits,
                 timeout=POLL_S,

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from drivers.sim.brush.spec import BrushSpec
 from drivers.sim.config import SoundHead
-from drivers.sim.described import SimFileError, load_described
+from drivers.sim.described import load_described
 
 MAX_NOISE_GRAY = 30.0
 LOOPBACK = "loopback"
@@ -31,10 +31,6 @@ PAPER = "paper"
 """Name under which the brush of `PAPER_FILE` is chosen."""
 PAPER_FILE = Path(__file__).with_name("brush") / "paper_brush.toml"
 """The brush made to agree with the paper's Table 2 (`python -m bench paper-brush`)."""
-
-
-class BrushFileError(SimFileError):
-    """The brush cannot be used: file, field, what is allowed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +63,9 @@ class _File(BaseModel):
 def load_brush(path: Path, seed: int = BrushSpec().seed) -> NamedBrush:
     """Read the file, or take one of the shipped brushes if `path` is just `paper` or `loopback`.
 
-    `seed` is that of the individual for `loopback`; any other brush has its own. Raises `BrushFileError`.
+    `seed` is that of the individual for `loopback`; any other brush has its own. Raises `SimFileError`.
     """
     if str(path) == LOOPBACK:
         return NamedBrush(BrushSpec(seed=seed), "")
-    found = load_described(PAPER_FILE if str(path) == PAPER else path, _File, BrushFileError)
+    found = load_described(PAPER_FILE if str(path) == PAPER else path, _File)
     return NamedBrush(found.brush, found.name, None if found.camera is None else found.camera.noise, found.quality)

@@ -24,22 +24,22 @@ class SimFileError(Exception):
         super().__init__(f"{path}: {field}: {what}" if field else f"{path}: {what}")
 
 
-def load_described(path: Path, model: type[Described], refused: type[SimFileError]) -> Described:
-    """Read and check the file. Raises `refused`, naming file, field and range."""
+def load_described(path: Path, model: type[Described]) -> Described:
+    """Read and check the file. Raises `SimFileError`, naming file, field and range."""
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise refused(path, "", f"is larger than {MAX_BYTES} bytes")
+            raise SimFileError(path, "", f"is larger than {MAX_BYTES} bytes")
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise refused(path, "", "no such file") from None
+        raise SimFileError(path, "", "no such file") from None
     except OSError as error:
-        raise refused(path, "", error.strerror or str(error)) from None
+        raise SimFileError(path, "", error.strerror or str(error)) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise refused(path, "", f"is not TOML: {error}") from None
+        raise SimFileError(path, "", f"is not TOML: {error}") from None
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise refused(path, *complaint(error)) from None
+        raise SimFileError(path, *complaint(error)) from None
 
 
 def complaint(error: ValidationError) -> tuple[str, str]:

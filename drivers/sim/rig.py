@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import math
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from drivers.arcs.codes import SafetyMode
 from drivers.force.rounds import Wrench
@@ -31,14 +31,6 @@ TICK_S = 0.002
 IDLE_TICK_S = 0.02
 
 
-class Failing(Protocol):
-    """A simulated instrument that keeps its own list of faults: `PtyLine`, `ForceBoard`."""
-
-    def fail(self, *faults: Any) -> None:
-        """Apply these faults to the next requests or rounds, one each."""
-        ...
-
-
 class Faults:
     """The faults of a rig: a board that all servers share, a task that starts due faults, and the release of stops.
 
@@ -52,20 +44,20 @@ class Faults:
         rtde: RtdeServer,
         camera: MjpegServer,
         *,
-        ink: Failing | None = None,
-        force: Failing | None = None,
+        ink: PtyLine | None = None,
+        force: ForceBoard | None = None,
     ) -> None:
         self.truth = Truth(world)
         self.board = FaultBoard(self.truth)
         self._world = world
         self._arcs = arcs
         arcs.faults = rtde.faults = camera.faults = self.board
-        self._instruments: dict[Device, Failing | None] = {Device.INK: ink, Device.FORCE: force}
+        self._ink, self._force = ink, force
         self._watching: asyncio.Task[None] | None = None
 
     def hang(self, fault: Fault) -> int:
         """Put a fault on the board; return its number. Raises ValueError for a device that the rig does not have."""
-        if fault.device in self._instruments and self._instruments[fault.device] is None:
+        if {Device.INK: self._ink, Device.FORCE: self._force}.get(fault.device, self) is None:
             raise ValueError(f"device = {fault.device.value!r}: this rig has none")
         return self.board.hang(fault)
 
@@ -125,12 +117,13 @@ class Faults:
             await asyncio.sleep(TICK_S if waits else IDLE_TICK_S)
 
     def _begin(self, fault: Fault) -> None:
-        instrument = self._instruments.get(fault.device)
-        if instrument is None:
+        strikes = fault.strikes or 1
+        if fault.device is Device.INK and self._ink is not None:
+            self._ink.fail(*[InkFault(fault.kind)] * strikes)
+        elif fault.device is Device.FORCE and self._force is not None:
+            self._force.fail(*[ForceFault(fault.kind)] * strikes)
+        else:
             self._arcs.stop_as(fault.kind)
-            return
-        kind = InkFault(fault.kind) if fault.device is Device.INK else ForceFault(fault.kind)
-        instrument.fail(*[kind] * (fault.strikes or 1))
 
 
 class LoopbackRig:
@@ -143,10 +136,9 @@ class LoopbackRig:
         self.world = World(config)
         self.arcs = ArcsServer(self.world)
         self.rtde = RtdeServer(self.arcs.cabinet)
-        view = config.view
         self.scene = Scene(self.world)
         """What the camera looks at."""
-        self.camera = MjpegServer(self.scene, fps=view.fps, jpeg_quality=view.jpeg_quality, view=view)
+        self.camera = MjpegServer(self.scene, config.view)
         self.force = _force(self.world) if config.force_sensor else None
         self.ink = None if config.ink_device == "none" else PtyLine(_ink(self.world, config.ink_device))
         board = None if self.force is None else self.force.board
@@ -245,5 +237,5 @@ def _axes_of_sensor(lean_deg: tuple[float, float], turn_deg: float, sign: int) -
 def _ink(world: World, device: Literal["station", "pump"]) -> Instrument:
     reservoir_ml = world.config.reservoir_ml
     if device == "station":
-        return StationFirmware(reservoir_ml=reservoir_ml, well=world.well)
+        return StationFirmware(world.well, reservoir_ml)
     return PumpFirmware(ml_per_revolution=PUMP_ML, reservoir_ml=reservoir_ml, on_pumped=world.well.add)

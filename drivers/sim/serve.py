@@ -29,7 +29,7 @@ def serve(
 ) -> None:
     """Serve until a signal, or until idle for `idle_exit_s` (0 means never); `faults` is an optional fault script.
 
-    Raises `RigFileExists` rather than overwrite a file that no loopback rig wrote, `FaultScriptError`, and
+    Raises `RigFileExists` rather than overwrite a file that no loopback rig wrote, `SimFileError`, and
     `ControlPathError` if the control socket cannot be created.
     """
     asyncio.run(_serve(config, write_rig, idle_exit_s, tell, faults, control))

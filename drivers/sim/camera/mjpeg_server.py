@@ -99,13 +99,13 @@ class Picture(Protocol):
 class MjpegServer(LoopbackServer):
     """Serves `/stream.mjpg`. A client that reads too slowly is sent the newest image next, never a backlog."""
 
-    def __init__(self, scene: Picture, *, fps: float, jpeg_quality: int, view: View | None = None) -> None:
-        """`view` gives the delay of pictures; without it they are sent at once."""
+    def __init__(self, scene: Picture, view: View) -> None:
+        """`view` gives the rate, the delay and the JPEG quality of the pictures."""
         super().__init__()
         self._scene = scene
-        self._view = view or View()
-        self._period_s = 1.0 / fps
-        self._quality = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
+        self._view = view
+        self._period_s = 1.0 / view.fps
+        self._quality = [cv2.IMWRITE_JPEG_QUALITY, view.jpeg_quality]
         self._rendering = asyncio.Lock()
         self._coded: deque[tuple[NDArray[np.uint8], bytes]] = deque(maxlen=NOISE_FIELDS)
         """The newest images of the scene and their JPEGs, reused while nothing changes."""

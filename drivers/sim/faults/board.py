@@ -7,32 +7,14 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 from drivers.sim.faults.kinds import Device, Fault
-from drivers.sim.faults.phases import Phase
+from drivers.sim.faults.phases import Truth
 
 KEPT = 100
 """Finished faults that are still listed."""
 MOST = 1000
 """Most faults on the board at once."""
-
-
-class Watched(Protocol):
-    """State that triggers depend on; `drivers.sim.faults.phases.Truth` in a rig."""
-
-    @property
-    def presses(self) -> int:
-        """Presses on the paper."""
-        ...
-
-    def now_s(self) -> float:
-        """Simulated time."""
-        ...
-
-    def phase(self) -> Phase:
-        """Phase of the arm."""
-        ...
 
 
 @dataclass(slots=True)
@@ -54,7 +36,7 @@ class FaultBoard:
     `hang`, `take` and `clear` may come from any thread; the rest belongs to the event loop of the rig.
     """
 
-    def __init__(self, truth: Watched, real_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, truth: Truth, real_s: Callable[[], float] = time.monotonic) -> None:
         self._truth = truth
         self._real_s = real_s
         self._idents = itertools.count(1)

@@ -155,10 +155,6 @@ class Fault(BaseModel):
         return self.on is None or op == self.on or op.endswith(f".{self.on}")
 
 
-class FaultScriptError(SimFileError):
-    """The script cannot be used: file, field, what is allowed."""
-
-
 class _Script(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -166,17 +162,17 @@ class _Script(BaseModel):
 
 
 def load_faults(path: Path) -> tuple[Fault, ...]:
-    """Read the script. Raises `FaultScriptError` naming file, field and range."""
-    return tuple(load_described(path, _Script, FaultScriptError).fault)
+    """Read the script. Raises `SimFileError` naming file, field and range."""
+    return tuple(load_described(path, _Script).fault)
 
 
 def hang_script(path: Path, hang: Callable[[Fault], int], faults: Iterable[Fault]) -> None:
-    """Add all faults of a script. Raises `FaultScriptError` for a fault of a device that the rig does not have."""
+    """Add all faults of a script. Raises `SimFileError` for a fault of a device that the rig does not have."""
     for index, fault in enumerate(faults):
         try:
             hang(fault)
         except ValueError as error:
-            raise FaultScriptError(path, f"fault.{index}", str(error)) from None
+            raise SimFileError(path, f"fault.{index}", str(error)) from None
 
 
 def fault_of(values: dict[str, Any]) -> Fault:

@@ -136,15 +136,8 @@ class PtyLine:
 class StationFirmware:
     """The ink station's side of docs/ink-station.md, with a well, a reservoir, a light and a lid."""
 
-    def __init__(
-        self,
-        *,
-        well_ml: float = 10.0,
-        capacity_ml: float = 20.0,
-        reservoir_ml: float = 100.0,
-        well: Well | None = None,
-    ) -> None:
-        self.well = Well(well_ml, capacity_ml) if well is None else well
+    def __init__(self, well: Well | None = None, reservoir_ml: float = 100.0) -> None:
+        self.well = well or Well(10.0, capacity_ml=20.0)
         self.reservoir_ml = reservoir_ml
         self.light = 0.0
         self.lid_open = True

@@ -85,7 +85,7 @@ class UnknownLab:
         self.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
         self.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
         towards_sheet = math.atan2(self.facts.pin_mm[1], self.facts.pin_mm[0])
-        self._room = MjpegServer(RoomScene(self.world, towards_sheet), fps=ROOM_FPS, jpeg_quality=80, view=View())
+        self._room = MjpegServer(RoomScene(self.world, towards_sheet), View(fps=ROOM_FPS, jpeg_quality=80))
         self._older = OlderSoftware()
         self._touches = 0
         self._pulled: list[int] = []

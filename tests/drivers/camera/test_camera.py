@@ -4,6 +4,7 @@ import asyncio
 import threading
 import time
 from collections.abc import AsyncIterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ CLOCK = HostClock()
 
 @pytest.fixture
 async def stream(small_view: View) -> AsyncIterator[MjpegServer]:
-    server = MjpegServer(Scene(World(SimConfig(view=small_view))), fps=15.0, jpeg_quality=90)
+    server = MjpegServer(Scene(World(SimConfig(view=small_view))), replace(small_view, fps=15.0, jpeg_quality=90))
     await server.start(HOST, 0)
     yield server
     await server.stop()
@@ -96,13 +97,13 @@ async def test_the_first_frame_counts_from_when_the_camera_was_opened(stream: Mj
 async def test_a_stream_that_ends_is_opened_again_and_both_are_reported(small_view: View):
     notices: list[str] = []
     scene = Scene(World(SimConfig(view=small_view)))
-    first = MjpegServer(scene, fps=15.0, jpeg_quality=90)
+    first = MjpegServer(scene, replace(small_view, fps=15.0, jpeg_quality=90))
     await first.start(HOST, 0)
     url = f"http://{HOST}:{first.port}/stream.mjpg"
     camera = OpenCvCamera(CameraOptions(url, timeout_s=10.0), CLOCK, notices.append)
     await camera.connect()
     await first.stop()
-    second = MjpegServer(scene, fps=15.0, jpeg_quality=90)
+    second = MjpegServer(scene, replace(small_view, fps=15.0, jpeg_quality=90))
     await second.start(HOST, first.port)
     asked_ns = CLOCK.now_ns()
     frame = await camera.fresh(Stamp(asked_ns))

@@ -14,8 +14,9 @@ import brushloop
 from bench.brushfit_brushes import FROZEN
 from collect.rig.config_quality import QualityConfig
 from drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
-from drivers.sim.brush_file import LOOPBACK, PAPER, BrushFileError, load_brush
+from drivers.sim.brush_file import LOOPBACK, PAPER, load_brush
 from drivers.sim.config import SimConfig
+from drivers.sim.described import SimFileError
 from drivers.sim.rig_toml import Addresses, rig_toml
 from drivers.sim.serve import LabRefused
 
@@ -54,7 +55,7 @@ def test_a_brush_is_read_and_what_is_left_out_is_the_default(tmp_path: Path) -> 
 )
 def test_a_brush_out_of_range_is_refused_with_file_field_and_range(tmp_path: Path, text: str, message: str) -> None:
     path = written(tmp_path, f'name = "any"\n[brush]\n{text}\n')
-    with pytest.raises(BrushFileError, match=message) as refused:
+    with pytest.raises(SimFileError, match=message) as refused:
         load_brush(path)
     assert str(refused.value).startswith(f"{path}: ")
     assert "\n" not in str(refused.value)
@@ -62,12 +63,12 @@ def test_a_brush_out_of_range_is_refused_with_file_field_and_range(tmp_path: Pat
 
 @pytest.mark.parametrize("name", ["", "two\\nlines", 'a \\"quote\\"', "x" * 121])
 def test_a_name_that_would_not_fit_in_a_rig_toml_is_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(BrushFileError, match="name: "):
+    with pytest.raises(SimFileError, match="name: "):
         load_brush(written(tmp_path, f'name = "{name}"\n[brush]\n'))
 
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BrushFileError, match="no such file"):
+    with pytest.raises(SimFileError, match="no such file"):
         load_brush(tmp_path / "brush.toml")
 
 
@@ -101,7 +102,7 @@ def test_the_rig_toml_of_the_paper_s_brush_says_where_its_marks_begin() -> None:
 
 def test_settings_of_quality_out_of_range_are_refused(tmp_path: Path) -> None:
     text = 'name = "any"\n[brush]\n[quality]\nhead_mm = 2.0\nmisplaced_mm = 50.0\n'
-    with pytest.raises(BrushFileError, match=r"quality: misplaced_mm = 50 is outside 0\.1 \.\. 20"):
+    with pytest.raises(SimFileError, match=r"quality: misplaced_mm = 50 is outside 0\.1 \.\. 20"):
         load_brush(written(tmp_path, text))
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.sim.described import MAX_BYTES
-from drivers.sim.faults.kinds import Device, FaultScriptError, fault_of, hang_script, load_faults
+from drivers.sim.described import MAX_BYTES, SimFileError
+from drivers.sim.faults.kinds import Device, fault_of, hang_script, load_faults
 
 SCRIPT = """
 [[fault]]
@@ -74,7 +74,7 @@ def one(**fields: object) -> str:
 )
 def test_what_cannot_be_used_is_refused_with_one_line_that_names_it(tmp_path: Path, text: str | bytes, words: str):
     path = script(tmp_path, text)
-    with pytest.raises(FaultScriptError) as caught:
+    with pytest.raises(SimFileError) as caught:
         load_faults(path)
     assert words in str(caught.value)
     assert str(caught.value).startswith(str(path))
@@ -83,9 +83,9 @@ def test_what_cannot_be_used_is_refused_with_one_line_that_names_it(tmp_path: Pa
 
 
 def test_a_file_that_is_not_there_or_far_too_long_is_refused(tmp_path: Path):
-    with pytest.raises(FaultScriptError, match="no such file"):
+    with pytest.raises(SimFileError, match="no such file"):
         load_faults(tmp_path / "faults.toml")
-    with pytest.raises(FaultScriptError, match="larger than"):
+    with pytest.raises(SimFileError, match="larger than"):
         load_faults(script(tmp_path, b"#" * (MAX_BYTES + 1)))
 
 
@@ -95,7 +95,7 @@ def test_a_fault_that_the_rig_does_not_take_is_named_by_its_place(tmp_path: Path
     def refuse(_: object) -> int:
         raise ValueError("this rig has none")
 
-    with pytest.raises(FaultScriptError, match=r"fault\.0: this rig has none"):
+    with pytest.raises(SimFileError, match=r"fault\.0: this rig has none"):
         hang_script(path, refuse, load_faults(path))
 
 
