@@ -8,7 +8,7 @@ import statistics
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from rich.table import Table
 from rich.text import Text
@@ -24,6 +24,7 @@ from drivers.clock import Clock
 from drivers.errors import DeviceError
 from drivers.samples import Identity, Stamp
 
+T = TypeVar("T")
 CALLS = 20
 FRAMES = 5
 LISTEN_S = 0.5
@@ -75,17 +76,24 @@ async def _asked(device: str, address: str, ask: Callable[[], Awaitable[Finding]
         return Finding(device, address, answers=False, problem=f"{error.op}: {error.what}", remedy=remedy)
 
 
+async def _timed(calls: int, ask: Callable[[], Awaitable[T]]) -> tuple[T, float]:
+    """The last answer of several calls, and their median time in ms."""
+    waits_ms: list[float] = []
+    while True:
+        began_s = time.perf_counter()
+        answer = await ask()
+        waits_ms.append((time.perf_counter() - began_s) * 1e3)
+        if len(waits_ms) == calls:
+            return answer, statistics.median(waits_ms)
+
+
 async def _camera(config: RigConfig, clock: Clock) -> Finding:
     notices: list[str] = []
     camera = make_camera(config, clock, notices.append)
     try:
         identity = await camera.connect()
-        frame = await camera.fresh(Stamp(clock.now_ns()))
-        waits_ms: list[float] = []
-        for _ in range(FRAMES):
-            asked = time.perf_counter()
-            frame = await camera.fresh(Stamp(clock.now_ns()))
-            waits_ms.append((time.perf_counter() - asked) * 1e3)
+        await camera.fresh(Stamp(clock.now_ns()))
+        frame, latency_ms = await _timed(FRAMES, lambda: camera.fresh(Stamp(clock.now_ns())))
     finally:
         await camera.close()
     board, problem, remedy = await asyncio.to_thread(_board, config, frame.image)
@@ -94,7 +102,7 @@ async def _camera(config: RigConfig, clock: Clock) -> Finding:
         config.camera.source,
         answers=True,
         identity=identity.model,
-        latency_ms=statistics.median(waits_ms),
+        latency_ms=latency_ms,
         notes="; ".join([board, *notices]),
         problem=problem,
         remedy=remedy,
@@ -147,12 +155,7 @@ async def _ink(config: InkDeviceConfig, clock: Clock) -> Finding:
     device = make_ink(config, clock)
     try:
         identity = await device.connect()
-        waits_ms: list[float] = []
-        level: float | None = None
-        for _ in range(CALLS):
-            asked = time.perf_counter()
-            level = await device.level()
-            waits_ms.append((time.perf_counter() - asked) * 1e3)
+        level, latency_ms = await _timed(CALLS, device.level)
     finally:
         await device.close()
     return Finding(
@@ -161,7 +164,7 @@ async def _ink(config: InkDeviceConfig, clock: Clock) -> Finding:
         answers=True,
         identity=identity.model,
         firmware=identity.firmware or "unknown",
-        latency_ms=None if level is None else statistics.median(waits_ms),
+        latency_ms=None if level is None else latency_ms,
         notes=("no gauge" if level is None else f"well {level:.0%} full") + _simulated(identity),
     )
 

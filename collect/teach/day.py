@@ -90,8 +90,7 @@ class Day:
     async def arm(self) -> AsyncGenerator[ArmReader]:
         """The arm that was found, for reading only."""
         address = Address(str(self.notebook.get("robot.host")), int(self.notebook.number("robot.port")))
-        framing = "bare" if self.notebook.get("robot.framing") == "bare" else "sof"
-        async with reading(address, framing) as reader:
+        async with reading(address, self.notebook.framing) as reader:
             yield reader
 
     @contextlib.contextmanager

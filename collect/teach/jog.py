@@ -111,7 +111,8 @@ async def _enabled(day: Day) -> AsyncGenerator[Robot]:
     async with day.arm() as reader:
         flange, cabinet = await reader.flange(), await reader.tool()
     tool = taught_tool(book) or _as_set(cabinet)
-    robot = AuboArcs(_options(book, host, port, tool), limits_so_far(book, flange, tool), day.clock)
+    options = ArcsOptions(host, port, *tool, framing=book.framing)
+    robot = AuboArcs(options, limits_so_far(book, flange, tool), day.clock)
     with sole_driver(host, port):
         try:
             await robot.connect()
@@ -120,11 +121,6 @@ async def _enabled(day: Day) -> AsyncGenerator[Robot]:
             yield robot
         finally:
             await robot.close()
-
-
-def _options(book: Notebook, host: str, port: int, tool: Tool) -> ArcsOptions:
-    """The controller as set on the pendant, with the taught tool once there is one."""
-    return ArcsOptions(host, port, *tool, framing="bare" if book.get("robot.framing") == "bare" else "sof")
 
 
 def taught_tool(book: Notebook) -> Tool | None:

@@ -11,7 +11,6 @@ from collect.rig.report import about_this_machine, transcript, write_archive
 from collect.rig.scrub import Scrubber, numbers_only
 from collect.teach.arm_reader import Address
 from collect.teach.store import Notebook
-from drivers.arcs.rpc import Framing
 
 NAMES = {
     "robot.host": "<host>",
@@ -30,9 +29,8 @@ async def write_first_report(path: Path, notebook: Notebook) -> None:
     `check_report` must have passed.
     """
     scrubber = Scrubber({str(notebook.get(field) or ""): stands_for for field, stands_for in NAMES.items()})
-    framing: Framing = "bare" if notebook.get("robot.framing") == "bare" else "sof"
     report: dict[str, Any] = about_this_machine() | {
-        "framing": framing,
+        "framing": notebook.framing,
         "findings": [scrubber.value(_robot(notebook).as_json())],
         "done": notebook.done,
         "taught": numbers_only({field: taught.value for field, taught in notebook.values.items()}),
@@ -41,7 +39,7 @@ async def write_first_report(path: Path, notebook: Notebook) -> None:
     files = {"report.json": json.dumps(report, indent=2), "arcs.jsonl": ""}
     if (typed := notebook.get("aside.address")) is not None:
         address = Address.of(str(typed))
-        files["arcs.jsonl"] = await transcript(address.host, address.port, framing, scrubber)
+        files["arcs.jsonl"] = await transcript(address.host, address.port, notebook.framing, scrubber)
     write_archive(path, files)
 
 

@@ -16,6 +16,7 @@ from pydantic import Field, ValidationError
 from collect.errors import ConfigError
 from collect.rig.config_file import Config, Finite, read_text, refusal
 from collect.rig.plausible import Check, unmeasured
+from drivers.arcs.rpc import Framing
 from drivers.samples import Pose
 from sessions.disk import fsync_folder, sync
 
@@ -85,6 +86,11 @@ class Notebook(Config):
     def with_touch(self, name: str, touch: Touch) -> Notebook:
         """The same with one more touch, or another one in its place."""
         return self.model_copy(update={"touches": {**self.touches, name: touch}})
+
+    @property
+    def framing(self) -> Framing:
+        """Framing that the controller answered; `sof` until that is known."""
+        return "bare" if self.get("robot.framing") == "bare" else "sof"
 
     def without(self, *beginnings: str) -> Notebook:
         """The same without the values whose paths begin like this."""
