@@ -67,27 +67,6 @@ class DragModel:
         """The model of a (14,) vector."""
         return DragModel(*(float(value) for value in vector))
 
-    def trail(self, path: Floats) -> Floats:
-        """Trail of the footprint: (n, 3) nodes x, y, depth of the tip, or (n, 4) with the heading in degrees,
-        counter-clockwise from x -> (n + 2, 3) x, y, half width, mm.
-
-        The first and the last row are the mark's ends behind the landing and ahead of the lift-off. Raises
-        ValueError for a path of another shape, or of fewer than 2 nodes.
-        """
-        return trails([path], self.vector())[0]
-
-    def distance(self, path: Floats, x_mm: Floats, y_mm: Floats) -> Floats:
-        """Signed distance in mm to the mark's edge, positive in ink, on the grid (len(y_mm), len(x_mm))."""
-        nodes, starts = trails([path], self.vector())
-        return distances(nodes, starts, x_mm, y_mm)[0]
-
-    def coverage(self, path: Floats, x_mm: Floats, y_mm: Floats, softness_mm: float) -> Floats:
-        """Ink from 0 to 1 on the grid, falling from .88 to .12 over `softness_mm` across the edge. Raises ValueError
-        unless the softness is positive."""
-        if not softness_mm > 0.0:
-            raise ValueError(f"softness_mm = {softness_mm:g}: must be positive")
-        return ink(self.distance(path, x_mm, y_mm), softness_mm / 4.0)
-
 
 def ink(distance_mm: Floats, spread_mm: float) -> Floats:
     """Probability of ink at a signed distance, if the edge varies by `spread_mm` (logistic)."""
@@ -95,7 +74,12 @@ def ink(distance_mm: Floats, spread_mm: float) -> Floats:
 
 
 def trails(paths: Sequence[Floats], vector: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """All paths' trails concatenated, (sum(n + 2), 3), and the rows where each begins and the last ends, (B + 1,)."""
+    """All paths' trails concatenated, (sum(n + 2), 3), and the rows where each begins and the last ends, (B + 1,).
+
+    A path is (n, 3) nodes x, y, depth of the tip, or (n, 4) with the heading in degrees, counter-clockwise from x. Its
+    trail, that of the footprint, is (n + 2, 3) x, y, half width, mm; the first and the last row are the mark's ends
+    behind the landing and ahead of the lift-off. Raises ValueError for another shape, or fewer than 2 nodes.
+    """
     for path in paths:
         if path.ndim != 2 or path.shape[1] not in (3, 4) or len(path) < 2:
             raise ValueError(f"a path is (n, 3) or (n, 4) with n >= 2, got {path.shape}")

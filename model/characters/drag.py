@@ -22,7 +22,7 @@ def is_dragged(points: Tensor) -> bool:
 
 
 def trail(model: DragModel, points: Tensor) -> Tensor:
-    """Trail of the footprint, as `DragModel.trail`: (N, 5) points -> (N + 2, 3) x, y, half width in mm.
+    """Trail of the footprint, as `model.drag.trails`: (N, 5) points -> (N + 2, 3) x, y, half width in mm.
 
     Raises ValueError for fewer than 2 points.
     """

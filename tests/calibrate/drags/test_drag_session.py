@@ -23,7 +23,7 @@ from calibrate.drags.run import FOLDER, LAGGING, STAMPS
 from calibrate.errors import CalibrationError
 from calibrate.stroke.params import Params
 from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
-from model.drag import DragModel
+from model.drag import DragModel, distances, trails
 from model.drag import ink as chance
 from sessions.reader import Recording
 from sessions.recording.schemas import Header, Source
@@ -37,6 +37,11 @@ STROKES = [
     (28.0, -8.0, 3.0),
     (32.0, 15.0, 6.0),
 ]
+
+
+def away(model: DragModel, path: np.ndarray, x_mm: np.ndarray, y_mm: np.ndarray) -> np.ndarray:
+    """Signed distance in mm to the edge of one path's mark."""
+    return distances(*trails([path], model.vector()), x_mm, y_mm)[0]
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +202,7 @@ def test_figures_of_several_strokes_are_fitted_as_a_whole() -> None:
             paths.append(np.column_stack([start + way, deep, np.full(12, heading)]))
     groups = np.arange(0, 17, 2)
     ink = np.array(
-        [np.maximum(*(chance(truth.distance(p, x_mm, y_mm), SPREAD_MM) for p in paths[g : g + 2])) for g in groups[:-1]]
+        [np.maximum(*(chance(away(truth, p, x_mm, y_mm), SPREAD_MM) for p in paths[g : g + 2])) for g in groups[:-1]]
     )
     fit = fit_drags(paths, ink, x_mm, y_mm, groups=groups)
     for depth in (3.0, 8.0):

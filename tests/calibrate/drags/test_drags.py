@@ -8,11 +8,16 @@ from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, determined, fit_drags
 from calibrate.drags.residual import Residual, threshold
 from calibrate.drags.run import different
 from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
-from model.drag import DragModel, ink
+from model.drag import DragModel, distances, ink, trails
 from sessions.recording.schemas import Header, Source
 
 X_MM, Y_MM = np.arange(-10.0, 50.0, 1.0), np.arange(-18.0, 18.0, 1.0)
 TRUTH = DragModel(half_mm=1.5, half_per_mm=0.4, leash_mm=3.0, leash_per_mm=0.5, drift_y_mm=0.5, settle_mm=2.0)
+
+
+def away(model: DragModel, path: np.ndarray, x_mm: np.ndarray, y_mm: np.ndarray) -> np.ndarray:
+    """Signed distance in mm to the edge of one path's mark."""
+    return distances(*trails([path], model.vector()), x_mm, y_mm)[0]
 
 
 def arcs(count: int, seed: int) -> list[np.ndarray]:
@@ -26,7 +31,7 @@ def arcs(count: int, seed: int) -> list[np.ndarray]:
 
 
 def drawn(model: DragModel, paths: list[np.ndarray]) -> np.ndarray:
-    return np.array([ink(model.distance(path, X_MM, Y_MM), SPREAD_MM) for path in paths])
+    return np.array([ink(away(model, path, X_MM, Y_MM), SPREAD_MM) for path in paths])
 
 
 def test_lag_and_width_are_found_again() -> None:
@@ -88,9 +93,9 @@ def test_a_known_brush_is_adapted_by_its_place_alone() -> None:
 def test_what_a_model_is_known_to_miss_is_not_taken_for_a_change_of_place() -> None:
     """All strokes of one kind: what the lag misses of them lies across their bend, like a change of place."""
     paths = arcs(2, 5)
-    true = np.array([TRUTH.distance(path, X_MM, Y_MM) for path in paths])
+    true = np.array([away(TRUTH, path, X_MM, Y_MM) for path in paths])
     wrong = replace(TRUTH, drift_y_mm=-0.7)
-    missed = true - np.array([wrong.distance(path, X_MM, Y_MM) for path in paths])
+    missed = true - np.array([away(wrong, path, X_MM, Y_MM) for path in paths])
     only = {"drift_y_mm": 1.0}
     plain = fit_drags(paths, ink(true, SPREAD_MM), X_MM, Y_MM, start=wrong, only=only)
     knowing = fit_drags(paths, ink(true, SPREAD_MM), X_MM, Y_MM, start=wrong, only=only, added_mm=missed)

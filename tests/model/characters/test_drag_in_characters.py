@@ -13,7 +13,7 @@ from model.characters.drag import dragged, trail
 from model.characters.ink import swept, written
 from model.characters.plan import Cell, Path, grid, trajectory, without_tilt
 from model.characters.refine import refine
-from model.drag import DragModel
+from model.drag import DragModel, distances, trails
 from model.registry import stroke_model
 
 MODEL = stroke_model("ccd-bsm", Brush())
@@ -32,6 +32,11 @@ LAG = DragModel(
 )
 
 
+def away(model: DragModel, path: np.ndarray, x_mm: np.ndarray, y_mm: np.ndarray) -> np.ndarray:
+    """Signed distance in mm to the edge of one path's mark."""
+    return distances(*trails([path], model.vector()), x_mm, y_mm)[0]
+
+
 def corner() -> NDArray[np.float64]:
     """(N, 5): right, then down, the heading turning with the way."""
     leg = np.linspace(12.0, 42.0, 16)
@@ -42,13 +47,13 @@ def corner() -> NDArray[np.float64]:
 
 def test_it_is_the_trail_of_the_fitted_model() -> None:
     points = corner()
-    wanted = LAG.trail(without_tilt(points))
+    wanted = trails([without_tilt(points)], LAG.vector())[0]
     assert trail(LAG, torch.from_numpy(points)).numpy() == pytest.approx(wanted, abs=1e-9)
 
 
 def test_its_image_is_that_of_the_fitted_model() -> None:
     points = corner()
-    distance = LAG.distance(without_tilt(points), *grid(SIDE_MM, SIZE))
+    distance = away(LAG, without_tilt(points), *grid(SIDE_MM, SIZE))
     seen = dragged(LAG, torch.from_numpy(points), SIDE_MM, SIZE).numpy()
     assert seen == pytest.approx(np.clip(0.5 + distance * SIZE / SIDE_MM, 0.0, 1.0), abs=1e-6)
 
