@@ -20,12 +20,16 @@ from twin.score import TWIN
 REPEATS = 3
 """Presses of each cell: 45 in all."""
 GAP_POINTS, REPEAT_POINTS = 1.5, 1.0
+CONFIDENCE = 0.95
+TRUTH = {f"frozen-{k}": spec for k, spec in enumerate(FROZEN, 1)}
+"""Constants of the brushes that the simulator pressed, by name."""
 
 
 def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """Fit a twin to 45 presses of each of the first `n` brushes (all seven by default) and score it.
 
-    value = CSIM points below the ceiling, or between the agreement of two captures and of two presses of the twin.
+    value = CSIM points below the ceiling, or between the agreement of two captures and of two presses of the twin; for
+    a brush whose constants are known, also the share of the intervals that hold them.
     """
     results: list[Result] = []
     for brush in _brushes(n):
@@ -35,8 +39,8 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
 
 def _brushes(n: int | None) -> Iterator[BrushPresses]:
     count = len(FROZEN) + len(BRISTLE_SETS) if n is None else n
-    for k, spec in enumerate(FROZEN[:count], 1):
-        yield simulated(spec, f"frozen-{k}", REPEATS)
+    for name, spec in list(TRUTH.items())[:count]:
+        yield simulated(spec, name, REPEATS)
     for name in BRISTLE_SETS[: max(0, count - len(FROZEN))]:
         try:
             yield bristles(name)
@@ -61,4 +65,13 @@ def _scored(brush: BrushPresses, seed: int) -> Iterator[Result]:
         yield Result(
             f"twin.repeats.{brush.name}", off, "CSIM points", f"goal {REPEAT_POINTS:g} at most",
             REPEAT_POINTS / max(off, 0.01), len(strokes), seed, f"{words}, twin {twin.spread.twin_percent:.2f} %",
+        )  # fmt: skip
+    if brush.name in TRUTH:
+        # a brush bows by bow_mm times a draw of its individual, which the twin does not have
+        known = [one for one in twin.estimates if one.determined and one.constant.name != "bow_mm"]
+        held = [one.low <= getattr(TRUTH[brush.name], one.constant.name) <= one.high for one in known]
+        share = sum(held) / max(len(held), 1)
+        yield Result(
+            f"twin.intervals.{brush.name}", 100.0 * share, "%", f"{100.0 * CONFIDENCE:g}", share / CONFIDENCE,
+            len(held), seed, f"simulated; {sum(held)} of {len(held)} intervals hold the constant of the captured brush",
         )  # fmt: skip
