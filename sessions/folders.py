@@ -39,7 +39,9 @@ def recording_of_renamed(folder: Path) -> Path | None:
 
 
 def not_a_session(folder: Path) -> InputError:
-    """Make the error for a folder without a recording of its name; the message says what to give instead."""
+    """Make the error for a path without a recording; the message says what to give instead."""
+    if not folder.is_dir():
+        return InputError(folder, "no such session: give a session's folder or its .mcap file")
     name = f"{folder.resolve().name}.mcap"
     if (folder / JOURNAL_NAME).is_file():
         return InputError(folder, f"has lost its recording {name}: `brushloop sessions repair {folder}` makes it again")

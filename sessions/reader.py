@@ -148,7 +148,7 @@ def _find_mcap(path: Path) -> Path:
         check_companions(path.parent)
         return path
     if not path.is_dir():
-        raise InputError(path, "no such session: give a session's folder or its .mcap file")
+        raise not_a_session(path)
     merged = path / f"{path.resolve().name}.mcap"
     if (path / JOURNAL_NAME).is_file() and is_open(replay(path / JOURNAL_NAME)):
         raise InputError(path, "is still open: run the same `brushloop collect` again to finish it")

@@ -94,8 +94,6 @@ def details(path: Path) -> Details:
     if (path / JOURNAL_NAME).is_file():
         check_name(path)
         return _of_journal(path.resolve())
-    if not path.exists():
-        raise InputError(path, "no such session: give a session's folder or its .mcap file")
     recording = Recording(path)
     found = _of_header(recording.header, "recording")
     strokes = list(recording.stroke_records())

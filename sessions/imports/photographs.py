@@ -101,7 +101,7 @@ def import_scans(
     # 1.0 stands for the scale until it is known from the file.
     rows = Row.spooled(_scaled(row, dpi) for row in parse_table(folder, table, text, kind, 1.0))
     protocol = f"import of {len(rows)} {options.kind} strokes from scans"
-    gray = lru_cache(maxsize=SCANS_KEPT)(_gray)
+    gray = lru_cache(maxsize=SCANS_KEPT)(gray_of)
 
     def cut(row: Row) -> bytes:
         if not boxed:
@@ -146,9 +146,14 @@ def _scaled(row: Row, dpi: float | None) -> Row:
     return Row(row.image, row.stroke.model_copy(update={"px_per_mm": scale}))
 
 
-def _gray(path: Path) -> NDArray[np.uint8]:
+def gray_of(path: Path) -> NDArray[np.uint8]:
+    """A photograph as (h, w) uint8 gray. Raises `InputError`."""
+    return _gray(read_bounded(path), path)
+
+
+def _gray(data: bytes, path: Path) -> NDArray[np.uint8]:
     try:
-        return decode_gray(read_bounded(path), str(path))
+        return decode_gray(data, str(path))
     except SessionDamaged as error:
         raise InputError(path, error.what) from None
 
@@ -184,7 +189,7 @@ def store_rows(
     `opening` is a photograph that comes first and has no stroke. `encoded` returns a stroke's PNG or JPEG, by default
     its file unchanged. Raises `InputError`, leaving nothing behind.
     """
-    encoded = encoded or _whole
+    encoded = encoded or (lambda row: read_bounded(row.image))
     checked = counted(rows, "photographs checked", len(rows), progress)
     digests = [_check(encoded(row), row.image) for row in checked]
     first = None if opening is None else read_bounded(opening)
@@ -242,16 +247,9 @@ def _kind(data: bytes) -> str:
     return "png" if data.startswith(PNG_START) else "jpeg"
 
 
-def _whole(row: Row) -> bytes:
-    return read_bounded(row.image)
-
-
 def _check(data: bytes, path: Path) -> bytes:
     """Check that a photograph can be decoded, and return its digest for later checks. Raises `InputError`."""
-    try:
-        decode_gray(data, str(path))
-    except SessionDamaged as error:
-        raise InputError(path, error.what) from None
+    _gray(data, path)
     return hashlib.sha256(data).digest()
 
 

@@ -11,11 +11,10 @@ import io
 from collections.abc import Callable
 from pathlib import Path
 
-from sessions.errors import InputError, SessionDamaged, in_one_line
-from sessions.imports.photographs import ImportOptions, check_target, read_bounded, store_rows
+from sessions.errors import InputError, in_one_line
+from sessions.imports.photographs import ImportOptions, check_target, gray_of, store_rows
 from sessions.imports.table import Row, parse_table, read_text
 from sessions.progress import Progress, unseen
-from sessions.recording.messages import decode_gray
 
 SEQUENCE = "page sequence"
 """Start of the header's `protocol`: says that each still also shows all earlier strokes."""
@@ -119,8 +118,5 @@ def _frame(folder: Path, named: Path, name: str) -> Path:
 
 
 def _size(path: Path) -> tuple[int, int]:
-    try:
-        height, width = decode_gray(read_bounded(path), str(path)).shape
-    except SessionDamaged as error:
-        raise InputError(path, error.what) from None
+    height, width = gray_of(path).shape
     return width, height

@@ -46,6 +46,11 @@ def encode_line(t_ns: int, line: Line, chain: Chain | None = None) -> bytes:
     return with_crc(body) + b"\n"
 
 
+def without_time(line: Line) -> Line:
+    """The line without its time, which `encode_line` adds."""
+    return {name: value for name, value in line.items() if name != "t_ns"}
+
+
 def with_crc(body: bytes) -> bytes:
     """Add `crc`, the CRC-32 of the object so far, as the last field of a JSON object."""
     return body[:-1] + f',"crc":"{zlib.crc32(body):08x}"}}'.encode()

@@ -17,7 +17,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from sessions.errors import InputError, SessionDamaged, in_one_line
 from sessions.recording.chunk import Contents
-from sessions.recording.index import UNREADABLE, BoundedFile, Index, chunk_at, indexed, record_at
+from sessions.recording.index import UNREADABLE, BoundedFile, Index, chunk_at, indexed, opened, record_at
 
 Record = tuple[Schema | None, Channel, Message]
 _T = TypeVar("_T")
@@ -88,11 +88,7 @@ def indexed_counts(path: Path) -> dict[str, int]:
 
 def _guarded(path: Path, read: Callable[[BoundedFile], Iterator[_T]]) -> Iterator[_T]:
     """Yield items; turn the library's exceptions into `SessionDamaged`, but not those of the code that uses an item."""
-    try:
-        file = BoundedFile(path)
-    except OSError as error:
-        raise InputError(path, f"cannot open: {in_one_line(error)}") from None
-    with file:
+    with opened(path) as file:
         if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             raise InputError(path, "is not an MCAP file")
         file.seek(0)

@@ -24,6 +24,7 @@ from mcap.records import AttachmentIndex, Channel, Chunk, ChunkIndex, MetadataIn
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
+from sessions.errors import InputError, in_one_line
 from sessions.recording.chunk import RECORD_START, Contents, unpacked
 
 MAX_RECORD_BYTES = 512 * 1024 * 1024
@@ -54,6 +55,14 @@ class BoundedFile(io.BufferedReader):
         """Read at most what is left of the file."""
         left = max(self.size - self.tell(), 0)
         return super().read(left if size is None or size < 0 else min(size, left))
+
+
+def opened(path: Path) -> BoundedFile:
+    """Open a recording. Raises `InputError`."""
+    try:
+        return BoundedFile(path)
+    except OSError as error:
+        raise InputError(path, f"cannot open: {in_one_line(error)}") from None
 
 
 @dataclass(slots=True)

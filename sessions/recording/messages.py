@@ -63,25 +63,12 @@ def image_message(t_ns: int, encoded: bytes, kind: str = "png") -> CompressedIma
     return message
 
 
-def joints_message(
-    t_ns: int,
-    names: Sequence[str],
-    positions_rad: Sequence[float],
-    velocities_rad_s: Sequence[float] | None = None,
-    efforts_nm: Sequence[float] | None = None,
-) -> JointStates:
-    """State of the arm's joints, in order. Raises `ValueError` where the lengths differ."""
-    for values in (velocities_rad_s, efforts_nm):
-        if values is not None and len(values) != len(names):
-            raise ValueError(f"{len(values)} values for {len(names)} joints")
+def joints_message(t_ns: int, names: Sequence[str], positions_rad: Sequence[float]) -> JointStates:
+    """Positions of the arm's joints, in order. Raises `ValueError` where the lengths differ."""
     message = JointStates()
     message.timestamp.FromNanoseconds(t_ns)
-    for number, (name, position) in enumerate(zip(names, positions_rad, strict=True)):
-        joint = message.joints.add(name=name, position=position)
-        if velocities_rad_s is not None:
-            joint.velocity = velocities_rad_s[number]
-        if efforts_nm is not None:
-            joint.effort = efforts_nm[number]
+    for name, position in zip(names, positions_rad, strict=True):
+        message.joints.add(name=name, position=position)
     return message
 
 
@@ -102,11 +89,10 @@ def calibration_message(
     size_px: tuple[int, int],
     camera_matrix: Sequence[Sequence[float]],
     distortion: Sequence[float],
-    model: str = "plumb_bob",
 ) -> CameraCalibration:
     """Intrinsics of a single, unrectified camera: R is the identity, P is [K | 0].
 
-    `camera_matrix` is K, 3 x 3 in pixels; `distortion` is k1, k2, p1, p2, k3 for `plumb_bob`. Raises `ValueError`.
+    `camera_matrix` is K, 3 x 3 in pixels; `distortion` is k1, k2, p1, p2, k3. Raises `ValueError`.
     """
     rows = [list(map(float, row)) for row in camera_matrix]
     if [len(row) for row in rows] != [3, 3, 3]:
@@ -115,7 +101,7 @@ def calibration_message(
         frame_id="camera",
         width=size_px[0],
         height=size_px[1],
-        distortion_model=model,
+        distortion_model="plumb_bob",
         D=distortion,
         K=[v for row in rows for v in row],
         R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],

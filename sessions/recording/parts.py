@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import overload
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +19,7 @@ class Part:
     """Whether it can be read and matches its CRC."""
 
 
-class Parts(Sequence[Part]):
+class Parts:
     """The chunks of a file, 16 bytes for each; nearly all of them hold the same numbers of messages."""
 
     def __init__(self) -> None:
@@ -38,11 +37,8 @@ class Parts(Sequence[Part]):
     def __len__(self) -> int:
         return len(self._offsets)
 
-    @overload
-    def __getitem__(self, at: int) -> Part: ...
-    @overload
-    def __getitem__(self, at: slice) -> list[Part]: ...
-    def __getitem__(self, at: int | slice) -> Part | list[Part]:
-        if isinstance(at, slice):
-            return [self[k] for k in range(len(self))[at]]
+    def __iter__(self) -> Iterator[Part]:
+        return map(self._at, range(len(self)))
+
+    def _at(self, at: int) -> Part:
         return replace(self._kinds[at], offset=self._offsets[at])

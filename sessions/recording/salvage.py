@@ -23,7 +23,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from sessions.errors import InputError, in_one_line
+from sessions.errors import in_one_line
 from sessions.recording.chunk import RECORD_START
 from sessions.recording.container import Record
 from sessions.recording.index import (
@@ -34,6 +34,7 @@ from sessions.recording.index import (
     chunk_at,
     index_records,
     indexed,
+    opened,
 )
 from sessions.recording.mcap_file import HEADER_METADATA, header_crc, read_note
 from sessions.recording.parts import Part, Parts
@@ -73,11 +74,7 @@ class Scan:
 def scan(path: Path) -> Scan:
     """Read every record. Raises `InputError` where the file cannot be opened; damage is reported, never raised."""
     found = Scan(path)
-    try:
-        file = BoundedFile(path)
-    except OSError as error:
-        raise InputError(path, f"cannot open: {in_one_line(error)}") from None
-    with file:
+    with opened(path) as file:
         try:
             offsets = _walk(file, found)
             if missed := _from_index(file, found, offsets):

@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from sessions.errors import SessionDamaged, SessionError
-from sessions.journal.codec import Line, encode_line
+from sessions.journal.codec import Line, encode_line, without_time
 from sessions.journal.events import NONSENSE, serial_of
 from sessions.journal.journal import JOURNAL_NAME, Account, DoneTwice, Replay, account, fold
 from sessions.journal.lines import Fault, accounts_for, read_journal
@@ -107,7 +107,7 @@ def _lost_between(found: Evidence, twice: list[Line]) -> None:
 def _lost(journal: Account, rebuilt: list[Line]) -> int:
     damaged, others = list(journal.damaged), 0
     for line in rebuilt:
-        body = encode_line(int(line["t_ns"]), _without_time(line))
+        body = encode_line(int(line["t_ns"]), without_time(line))
         span = next((span for span in damaged if accounts_for(span, body)), None)
         if span is None:
             others += 1
@@ -269,7 +269,3 @@ def _closed(found: Evidence) -> None:
         line: Line = {"t_ns": found.state.last_ns, **closed_line(final, found.state.counts())}
         found.rebuilt.append(line)
         fold(found.state, line)
-
-
-def _without_time(line: Line) -> Line:
-    return {name: value for name, value in line.items() if name != "t_ns"}

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sessions.disk import fsync_folder, set_aside, sync
-from sessions.journal.codec import Line, encode_line
+from sessions.journal.codec import encode_line, without_time
 from sessions.journal.journal import JOURNAL_NAME, Journal, next_chain
 from sessions.repair.evidence import Evidence
 from sessions.repair.verify import step_words
@@ -59,7 +59,7 @@ def _rewrite(evidence: Evidence, session: str, now_ns: Callable[[], int], report
     path = evidence.folder / JOURNAL_NAME
     data = b""
     for line in evidence.all_lines:
-        data += encode_line(int(line.get("t_ns", 0)), _without_time(line), next_chain(data, session))
+        data += encode_line(int(line.get("t_ns", 0)), without_time(line), next_chain(data, session))
     aside = f"{path.name}.damaged" if path.exists() else ""
     words = {"event": "journal", "aside": aside, "rebuilt": len(evidence.rebuilt), "lost": evidence.lost}
     data += encode_line(now_ns(), words, next_chain(data, session))
@@ -77,7 +77,7 @@ def _rewrite(evidence: Evidence, session: str, now_ns: Callable[[], int], report
 def _add_lines(journal: Journal, evidence: Evidence, now_ns: Callable[[], int], report: Report) -> None:
     if evidence.intact:
         for line in evidence.rebuilt:
-            journal.append(int(line["t_ns"]), _without_time(line))
+            journal.append(int(line["t_ns"]), without_time(line))
             what = step_words(line) if line["event"] != "closed" else "the session"
             shown = str(line.get("file", "the header"))
             report.did.append(f"journalled {line['event']!r} of {what}, which {shown} shows")
@@ -89,10 +89,6 @@ def _add_lines(journal: Journal, evidence: Evidence, now_ns: Callable[[], int], 
                 f"which cell {name} pressed: nothing more is pressed on sheet {sheet + 1}; "
                 f"go on with a fresh one, --sheet {sheet + 2}"
             )
-
-
-def _without_time(line: Line) -> Line:
-    return {name: value for name, value in line.items() if name != "t_ns"}
 
 
 def kept_words(name: str) -> str:

@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from sessions.disk import fsync_folder, set_aside
-from sessions.errors import InputError, SessionDamaged, SessionError, disk_error
+from sessions.errors import SessionDamaged, SessionError, disk_error
 from sessions.folders import check_name, not_a_session
-from sessions.journal.codec import Line
+from sessions.journal.codec import Line, without_time
 from sessions.journal.journal import JOURNAL_NAME, Replay, fold, read_header, replay
 from sessions.merge import REPAIRS_NOTE, merge_session
 from sessions.names import SEGMENT_NAME
@@ -43,7 +43,7 @@ def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
     """
     target = path.resolve()
     if not target.exists():
-        raise InputError(path, "no such session: give a session's folder or its .mcap file")
+        raise not_a_session(path)
     try:
         check_name(path)
         if target.is_file():
@@ -202,7 +202,7 @@ class FolderRepair:
         """The attempt's `begin` line in the journal; without one, a line made from its `done` line."""
         for begin in self._begins:
             if begin["file"] == line["file"]:
-                return {name: value for name, value in begin.items() if name != "t_ns"}
+                return without_time(begin)
         known = {"event": "begin", "key": line["key"], "kind": line["kind"], "attempt": line.get("attempt", 1)}
         return {**known, "sheet": line["result"].get("sheet", self._state.sheet), "cell": None, "file": line["file"]}
 

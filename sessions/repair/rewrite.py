@@ -9,7 +9,6 @@ from pathlib import Path
 
 from google.protobuf.message import DecodeError
 from mcap.records import Message
-from pydantic import ValidationError
 
 from sessions.disk import fsync_folder, set_aside
 from sessions.errors import SessionDamaged, disk_error
@@ -21,6 +20,7 @@ from sessions.recording.messages import decode_still
 from sessions.recording.salvage import Scan, glimpsed, salvaged, scan
 from sessions.recording.schemas import Header, Stroke, Topic
 from sessions.repair.journal import Report, kept_words
+from sessions.repair.union import parsed
 from sessions.repair.verify import verify_session
 
 
@@ -66,7 +66,7 @@ class Strokes:
         """Everything readable, except strokes without a photograph and strokes that were read before."""
         gone, seen = set(self.photograph_lost), set[str]()
         for schema, channel, message in salvaged(self.found):
-            stroke = _stroke(message) if channel.topic == Topic.STROKE else None
+            stroke = parsed(Stroke, message) if channel.topic == Topic.STROKE else None
             if stroke is not None:
                 if stroke.stroke_id in gone | seen:
                     continue
@@ -79,7 +79,7 @@ def with_their_stills(found: Scan) -> Strokes:
     there = {m.sequence for _, channel, m in salvaged(found) if channel.topic == Topic.STILL and _shows(m)}
     names: dict[str, bool] = {}
     for _schema, channel, message in salvaged(found):
-        stroke = _stroke(message) if channel.topic == Topic.STROKE else None
+        stroke = parsed(Stroke, message) if channel.topic == Topic.STROKE else None
         if stroke is not None:
             names[stroke.stroke_id] = names.get(stroke.stroke_id, False) or stroke.still in there
     missing: list[int] = []
@@ -144,10 +144,3 @@ def _shows(message: Message) -> bool:
         return bool(decode_still(message.data))
     except DecodeError:
         return False
-
-
-def _stroke(message: Message) -> Stroke | None:
-    try:
-        return Stroke.model_validate_json(message.data)
-    except ValidationError:
-        return None

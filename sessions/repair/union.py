@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 from mcap.records import Message
 from pydantic import ValidationError
@@ -19,7 +20,7 @@ from sessions.recording.container import Record
 from sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE
 from sessions.recording.parts import Part
 from sessions.recording.salvage import Scan, read_part, salvaged
-from sessions.recording.schemas import StepEvent, Topic
+from sessions.recording.schemas import StepEvent, Stroke, Topic
 
 Place = tuple[str, int]
 """Topic, and number within the step."""
@@ -46,7 +47,7 @@ def identity_of(found: Scan) -> tuple[str, int] | None:
                 pass
     for _schema, channel, message in salvaged(found):
         if channel.topic == Topic.STEP:
-            event = _event(message)
+            event = parsed(StepEvent, message)
             return None if event is None else (event.key, event.attempt)
     return None
 
@@ -83,7 +84,7 @@ def _agrees(part: dict[Place, Record], records: dict[Place, Record], line: Line)
         if place in records and records[place][2].data != message.data:
             return False
         if channel.topic == Topic.STEP:
-            event = _event(message)
+            event = parsed(StepEvent, message)
             if event is None or (event.key, event.attempt) != (line["key"], line.get("attempt", 1)):
                 return False
     return True
@@ -109,28 +110,33 @@ def placed(found: Scan, totals: Counter[str]) -> list[tuple[Part, Counter[str]]]
 
     A chunk between two others whose messages cannot be counted is left out.
     """
-    lost = [at for at, part in enumerate(found.parts) if part.counts is None]
+    parts = list(found.parts)
+    lost = [at for at, part in enumerate(parts) if part.counts is None]
     if not found.complete:
-        lost.append(len(found.parts))
-    known = sum((part.counts for part in found.parts if part.counts is not None), Counter[str]())
+        lost.append(len(parts))
+    known = sum((part.counts for part in parts if part.counts is not None), Counter[str]())
     if known - totals or (not lost and totals - known):
         return []  # not the file that was counted
-    first, last = (lost[0], lost[-1]) if lost else (len(found.parts), -1)
+    first, last = (lost[0], lost[-1]) if lost else (len(parts), -1)
     chunks: list[tuple[Part, Counter[str]]] = []
     number = Counter[str]()
-    for part in found.parts[:first]:
+    for part in parts[:first]:
         chunks.append((part, number.copy()))
         number.update(part.counts or {})
     behind: list[tuple[Part, Counter[str]]] = []
     number = totals.copy()
-    for part in reversed(found.parts[max(first, last + 1) :]):
+    for part in reversed(parts[max(first, last + 1) :]):
         number.subtract(part.counts or {})
         behind.append((part, number.copy()))
     return [(part, number) for part, number in [*chunks, *reversed(behind)] if part.sound]
 
 
-def _event(message: Message) -> StepEvent | None:
+_E = TypeVar("_E", Stroke, StepEvent)
+
+
+def parsed(kind: type[_E], message: Message) -> _E | None:
+    """The event in a message; None where it does not fit its schema."""
     try:
-        return StepEvent.model_validate_json(message.data)
+        return kind.model_validate_json(message.data)
     except ValidationError:
         return None

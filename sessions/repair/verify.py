@@ -64,7 +64,7 @@ def verify_session(path: Path, progress: Progress = unseen) -> Verdict:
     if path.is_file():
         return _verify_file(path, path.name, progress)
     if not path.is_dir():
-        raise InputError(path, "no such session: give a session's folder or its .mcap file")
+        raise not_a_session(path)
     name = path.resolve().name
     collected = (path / JOURNAL_NAME).is_file() or any(SEGMENT_NAME.fullmatch(p.name) for p in path.glob("*.mcap*"))
     if not collected:
