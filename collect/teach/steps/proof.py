@@ -131,7 +131,7 @@ class ProofStep(Step):
             f"touch height {z_mm:.3f} mm ({z_mm - by_hand_mm:+.2f} mm from the touch by hand), {known}",
             f"self-check: marks {proven.offset_mm[0]:+.1f}, {proven.offset_mm[1]:+.1f} mm from where they were "
             f"commanded, turned by {proven.turn_deg:+.2f} deg",
-            f"{proven.sound} presses passed the quality checks, {proven.again} were repeated; "
+            f"{proven.passed} presses passed the quality checks, {proven.again} were repeated; "
             f"camera delay {delay_ms:.0f} ms",
         )
         if delay_ms > SLOW_CAMERA_MS:
@@ -175,28 +175,29 @@ class Proven:
     jitter_ms: float
     offset_mm: tuple[float, float]
     turn_deg: float
-    sound: int
+    passed: int
     """Presses that count."""
     again: int
-    """Presses that were not sound and were made again on another cell."""
+    """Presses that failed a quality check and were repeated on another cell."""
 
 
 def read_proof(session: Path) -> Proven:
-    """From the journal of the session. Raises `CannotTeach` unless all presses were judged sound."""
+    """From the journal of the session. Raises `CannotTeach` unless all presses passed the quality checks."""
     results: list[dict[str, Any]] = [line["result"] for line in replay(session / JOURNAL_NAME).done.values()]
 
     def having(name: str) -> dict[str, Any]:
-        """The newest: a press that was not sound is made again."""
+        """The newest: a press that failed a quality check is repeated."""
         none: dict[str, Any] = {}
         return next((result for result in reversed(results) if name in result), none)
 
     touch, check, capture = having("slope_deg"), having("turn_deg"), having("kept")
     presses = [result for result in results if "kept" in result and not result["retake"]]
-    sound = [press for press in presses if press["kept"] and not press["verdict"]]
-    if len(sound) < PRESSES:
-        why = sorted({str(press["verdict"]) or "left out" for press in presses if press not in sound})
+    passed = [press for press in presses if press["kept"] and not press["verdict"]]
+    if len(passed) < PRESSES:
+        why = sorted({str(press["verdict"]) or "left out" for press in presses if press not in passed})
         raise CannotTeach(
-            f"{len(sound)} of {PRESSES} presses were judged sound ({', '.join(why) or 'the others were not made'}).",
+            f"{len(passed)} of {PRESSES} presses passed the quality checks "
+            f"({', '.join(why) or 'the others were not made'}).",
             "Look at their pictures above: ink, light, sheet; then run the proof again.",
         )
     if not touch or not check:
@@ -211,7 +212,7 @@ def read_proof(session: Path) -> Proven:
         float(capture["camera_jitter_ms"]),
         (float(check["offset_mm"][0]), float(check["offset_mm"][1])),
         float(check["turn_deg"]),
-        len(sound),
+        len(passed),
         sum(1 for result in results if result.get("retake")),
     )
 
