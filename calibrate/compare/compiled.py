@@ -30,7 +30,14 @@ def compare(captured: Pixels, predicted: Pixels, reach: int, out: NDArray[np.flo
     Each predicted image is first shifted by at most `reach` px each way, to where the two overlap most. NaN if either
     image is blank.
     """
-    _compare(captured, predicted, reach, out)
+    _compare(_read_only(captured), _read_only(predicted), reach, out)
+
+
+def _read_only(pixels: Pixels) -> Pixels:
+    """The same pixels in one kind of array: numba would compile everything again for each kind."""
+    view = np.ascontiguousarray(pixels).view()
+    view.flags.writeable = False
+    return view
 
 
 @_compile

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Sequence
@@ -32,6 +33,7 @@ EDGE_PX = 60
 SLANT = np.array([[0.62, 0.02, 30.0], [-0.01, 0.62, 40.0], [1e-5, 2e-5, 1.0]])
 
 
+@functools.cache
 def board(shift_px: float = 0.0, seed: int = 0) -> Gray:
     """The board at about 5 px/mm, seen at a slant."""
     picture = charuco_board(SPEC, "test").generateImage((9 * 160, 7 * 160))
@@ -39,7 +41,9 @@ def board(shift_px: float = 0.0, seed: int = 0) -> Gray:
     slant = SLANT + np.array([[0, 0, shift_px], [0, 0, 0], [0, 0, 0]])
     image = cv2.warpPerspective(picture, slant, (1024, 800), flags=cv2.INTER_AREA, borderValue=120)
     noisy = cv2.GaussianBlur(image, (0, 0), 0.9) + np.random.default_rng(seed).normal(0, 1.5, image.shape)
-    return np.clip(noisy, 0, 235).astype(np.uint8)
+    seen = np.clip(noisy, 0, 235).astype(np.uint8)
+    seen.flags.writeable = False
+    return seen
 
 
 def pixels(paper_mm: np.ndarray) -> np.ndarray:
@@ -49,7 +53,7 @@ def pixels(paper_mm: np.ndarray) -> np.ndarray:
 
 
 def half_hidden(share: float) -> Gray:
-    image = board()
+    image = board().copy()
     image[:, round(share * 1024) :] = 200
     return image
 

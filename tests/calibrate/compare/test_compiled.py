@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 
+from calibrate.compare import compiled
 from calibrate.compare.compiled import compare
 from calibrate.compare.field import BEST_SHIFT_PX
 from calibrate.compare.images import pack, unpack
@@ -80,3 +82,13 @@ def test_packed_images_come_back_and_anything_else_is_refused() -> None:
     for bad in (b"", b"nonsense", pack(images)[:-3]):
         with pytest.raises(ValueError, match="packed images"):
             unpack(bad)
+
+
+def test_it_is_compiled_once_for_every_kind_of_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds = []
+    monkeypatch.setattr(compiled, "_compare", lambda *images: kinds.append(tuple(map(numba.typeof, images[:2]))))
+    image = np.full((128, 128), 255, np.uint8)
+    read_only = np.frombuffer(image.tobytes(), np.uint8).reshape(image.shape)
+    for captured in (image, image.T, image[::-1], read_only):
+        compare(captured, np.stack([captured]), 0, np.empty((1, 2)))
+    assert len(set(kinds)) == 1

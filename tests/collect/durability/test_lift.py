@@ -76,7 +76,7 @@ def until(rig: OwnRig, met: Callable[[float, str], bool]) -> None:
     wait_until(lambda: met(*rig.state()[1:]), "a height and a phase")
 
 
-@pytest.mark.parametrize("phase", [Phase.DESCENDING, Phase.PRESSED])
+@pytest.mark.parametrize("phase", [pytest.param(Phase.DESCENDING, marks=pytest.mark.soak), Phase.PRESSED])
 def test_killed_with_the_brush_in_the_paper_it_lifts_by_itself(own_rig: OwnRig, phase: Phase):
     _, above_mm = kill(own_rig, 1, lambda: until(own_rig, lambda at_mm, now: at_mm < -1.0 and now == phase))
     assert above_mm > 0.5

@@ -39,7 +39,9 @@ def pressing(lab: Lab, engine: Engine) -> None:
     until(engine, lambda _now: lab.rig.world.tool().z_mm <= 117.0)
 
 
-@pytest.mark.parametrize("mode", [SafetyMode.PROTECTIVE_STOP, SafetyMode.SAFEGUARD_STOP])
+@pytest.mark.parametrize(
+    "mode", [SafetyMode.PROTECTIVE_STOP, pytest.param(SafetyMode.SAFEGUARD_STOP, marks=pytest.mark.soak)]
+)
 def test_a_safety_stop_holds_the_session_until_a_person_has_released_it(lab: Lab, mode: SafetyMode) -> None:
     slowly(lab)
     engine = lab.engine(watched=True)

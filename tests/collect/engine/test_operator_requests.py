@@ -168,7 +168,7 @@ def test_a_height_that_is_not_taken_and_a_jog_that_is_given_up_leave_the_paper_w
     ]
 
 
-@pytest.mark.parametrize("guided", [False, True])
+@pytest.mark.parametrize("guided", [False, pytest.param(True, marks=pytest.mark.soak)])
 def test_who_gives_the_jog_of_the_set_up_up_keeps_the_taught_height_and_the_run_goes_on(lab: Lab, guided: bool) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
     rig = lab.folder / "rig.toml"
