@@ -58,6 +58,12 @@ class Table:
         """Unit vector out of the sheet, in the paper frame (whose z is the base frame's)."""
         return _normal(self.slope_deg)
 
+    def to_paper(self, x_mm: float, y_mm: float) -> tuple[float, float]:
+        """Convert x and y from the base frame to the paper frame."""
+        dx, dy = x_mm - self.origin_mm[0], y_mm - self.origin_mm[1]
+        yaw = math.radians(self.yaw_deg)
+        return math.cos(yaw) * dx + math.sin(yaw) * dy, -math.sin(yaw) * dx + math.cos(yaw) * dy
+
     def surface_z_mm(self, x_mm: float, y_mm: float) -> float:
         """Height of the sheet at a point of the paper frame, in the base frame."""
         nx, ny, nz = self.normal

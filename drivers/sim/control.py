@@ -25,8 +25,9 @@ import socket
 import stat
 from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
+from drivers.sim.described import SimFileError
 from drivers.sim.faults.board import Hung
 from drivers.sim.faults.kinds import fault_of
 from drivers.sim.rig import Faults
@@ -54,15 +55,6 @@ USAGE = (
 )
 
 
-class ControlPathError(Exception):
-    """The socket cannot be created at this path."""
-
-    exit_code: ClassVar[int] = 2
-
-    def __init__(self, path: Path, what: str) -> None:
-        super().__init__(f"{path}: {what}")
-
-
 class ControlServer(LoopbackServer):
     """Live control of the faults of one rig, and of the person in its lab if there is one."""
 
@@ -74,7 +66,7 @@ class ControlServer(LoopbackServer):
         self._made = (0, 0)
 
     async def open(self, path: Path) -> None:
-        """Listen at `path`, replacing the socket of a rig that has ended. Raises `ControlPathError`."""
+        """Listen at `path`, replacing the socket of a rig that has ended. Raises `SimFileError`."""
         listener = _listener(path)
         made = path.stat()
         self._path, self._made = path, (made.st_dev, made.st_ino)
@@ -147,7 +139,7 @@ class ControlServer(LoopbackServer):
 
 @contextlib.asynccontextmanager
 async def live_control(faults: Faults, path: Path | None, person: Person | None = None) -> AsyncGenerator[None]:
-    """A control socket at `path` until the block ends; none if `path` is None. Raises `ControlPathError`."""
+    """A control socket at `path` until the block ends; none if `path` is None. Raises `SimFileError`."""
     server = ControlServer(faults, person)
     if path is not None:
         await server.open(path)
@@ -171,9 +163,9 @@ def _line(body: dict[str, Any]) -> bytes:
 
 
 def _listener(path: Path) -> socket.socket:
-    """A bound socket to which only its owner can connect. Raises `ControlPathError`."""
+    """A bound socket to which only its owner can connect. Raises `SimFileError`."""
     if len(os.fsencode(path)) > MAX_PATH_BYTES:
-        raise ControlPathError(path, f"the path of a socket has at most {MAX_PATH_BYTES} bytes")
+        raise SimFileError(path, "", f"the path of a socket has at most {MAX_PATH_BYTES} bytes")
     _clear_away(path)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     # Set before the path exists: another user could connect before a later `chmod`.
@@ -182,7 +174,7 @@ def _listener(path: Path) -> socket.socket:
         listener.bind(str(path))
     except OSError as error:
         listener.close()
-        raise ControlPathError(path, f"cannot listen here: {error.strerror or error}") from None
+        raise SimFileError(path, "", f"cannot listen here: {error.strerror or error}") from None
     finally:
         os.umask(mask)
     listener.setblocking(False)
@@ -196,7 +188,7 @@ def _clear_away(path: Path) -> None:
     except OSError:
         return
     if not stat.S_ISSOCK(mode):
-        raise ControlPathError(path, "exists and is not a socket; it is not overwritten")
+        raise SimFileError(path, "", "exists and is not a socket; it is not overwritten")
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(1.0)
         try:
@@ -204,4 +196,4 @@ def _clear_away(path: Path) -> None:
         except OSError:
             path.unlink(missing_ok=True)
             return
-    raise ControlPathError(path, "another rig listens here")
+    raise SimFileError(path, "", "another rig listens here")

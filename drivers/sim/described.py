@@ -13,7 +13,7 @@ Described = TypeVar("Described", bound=BaseModel)
 
 
 class SimFileError(Exception):
-    """The file cannot be used: file, field, what is allowed."""
+    """A file or socket cannot be used, read or written: path, field, what is allowed."""
 
     exit_code: ClassVar[int] = 2
 

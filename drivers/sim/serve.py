@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers.sim.config import SimConfig
 from drivers.sim.control import live_control
+from drivers.sim.described import SimFileError
 from drivers.sim.faults.kinds import hang_script, load_faults
 from drivers.sim.rig import LoopbackRig
 from drivers.sim.rig_toml import LOOPBACK_HEAD
@@ -29,8 +30,8 @@ def serve(
 ) -> None:
     """Serve until a signal, or until idle for `idle_exit_s` (0 means never); `faults` is an optional fault script.
 
-    Raises `RigFileExists` rather than overwrite a file that no loopback rig wrote, `SimFileError`, and
-    `ControlPathError` if the control socket cannot be created.
+    Raises `SimFileError` for a fault script that cannot be used, a control socket that cannot be created, and rather
+    than overwrite a file that no loopback rig wrote.
     """
     asyncio.run(_serve(config, write_rig, idle_exit_s, tell, faults, control))
 
@@ -68,7 +69,7 @@ def serve_unknown(
 ) -> None:
     """Serve the unknown lab of this seed and print what a person sees there; its truth goes to the file `truth`.
 
-    Raises `LabRefused` for an unknown trap or a file that cannot be written, and `ControlPathError`.
+    Raises `LabRefused` for an unknown trap or a file that cannot be written, and `SimFileError` for the control socket.
     """
     from drivers.sim.lab.traps import Trap
 
@@ -133,17 +134,11 @@ class LabRefused(Exception):
     exit_code: ClassVar[int] = 2
 
 
-class RigFileExists(Exception):
-    """The file cannot be written: its folder is missing, or it is not from a loopback rig and may be a real rig's."""
-
-    exit_code: ClassVar[int] = 2
-
-
 def _refuse_to_overwrite(path: Path) -> None:
     if not path.parent.is_dir():
-        raise RigFileExists(f"{path}: there is no folder {path.parent}")
+        raise SimFileError(path, "", f"there is no folder {path.parent}")
     if path.exists() and not (path.is_file() and path.read_bytes().startswith(LOOPBACK_HEAD.encode())):
-        raise RigFileExists(f"{path}: exists and was not written by a loopback rig; it is not overwritten")
+        raise SimFileError(path, "", "exists and was not written by a loopback rig; it is not overwritten")
 
 
 def _write_whole(path: Path, text: str) -> None:

@@ -169,10 +169,7 @@ class World:
 
     def to_paper(self, x_mm: float, y_mm: float) -> tuple[float, float]:
         """Convert x and y from the base frame to the paper frame."""
-        table = self.config.table
-        dx, dy = x_mm - table.origin_mm[0], y_mm - table.origin_mm[1]
-        yaw = math.radians(table.yaw_deg)
-        return math.cos(yaw) * dx + math.sin(yaw) * dy, -math.sin(yaw) * dx + math.cos(yaw) * dy
+        return self.config.table.to_paper(x_mm, y_mm)
 
     def _travelled(self, start: Pose, end: Pose) -> None:
         if self.hand_guided:

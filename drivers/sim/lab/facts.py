@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,9 +37,8 @@ LIFT_MM = 60.0
 PIN_TILT_DEG = 38.0
 CLEAR_OF_PICTURE_MM = 75.0
 """More than the arm hides around the tip."""
-
-
 BASE_CLEAR_MM = 230.0
+"""Least distance from the axis of the base that a straight way may have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +70,7 @@ class Facts:
     """False for a cabinet with the older software."""
     cable_after: int | None = None
     """Number of touched things after which somebody trips over the controller's cable."""
-    ruler_unit: str = field(default="mm")
+    ruler_unit: str = "mm"
     """Unit in which the person writes down a length."""
 
 
@@ -113,7 +112,7 @@ def _guess(rng: np.random.Generator, seed: int, rate: float, picture_px: tuple[i
     typed = _typed_tcp(rng, config)
     payload_kg, sheet_camera = float(rng.choice([0.0, 0.5])), int(rng.integers(2))
     park = _park(rng, config)
-    if park is None or min(_apart_mm(pin, wash), _apart_mm(pin, table.well_mm), _apart_mm(wash, table.well_mm)) < 60.0:
+    if park is None or min(math.dist(pin, wash), math.dist(pin, table.well_mm), math.dist(wash, table.well_mm)) < 60.0:
         return None
     return Facts(
         seed,
@@ -226,10 +225,7 @@ def _nearest_mm(start: Place, end: Place) -> float:
 def in_picture(config: SimConfig, place: Place) -> bool:
     """Whether the arm with its tip there hides a part of the picture, lens distortion aside."""
     table, view = config.table, config.view
-    yaw = math.radians(table.yaw_deg)
-    dx, dy = place[0] - table.origin_mm[0], place[1] - table.origin_mm[1]
-    x, y = math.cos(yaw) * dx + math.sin(yaw) * dy, -math.sin(yaw) * dx + math.cos(yaw) * dy
-    u, v, w = homography(view) @ np.array([x, y, 1.0])
+    u, v, w = homography(view) @ np.array([*table.to_paper(*place[:2]), 1.0])
     edge_px = CLEAR_OF_PICTURE_MM * view.px_per_mm
     return bool(-edge_px <= u / w <= view.width_px + edge_px and -edge_px <= v / w <= view.height_px + edge_px)
 
@@ -274,7 +270,3 @@ def reaches(config: SimConfig, wanted: Iterator[Pose] | list[Pose]) -> bool:
 def joints_for(flange_in_tool: Matrix, pose: Pose, near: Joints) -> Joints | None:
     """Joints for a pose of the tip; None out of reach."""
     return inverse(matrix_of(pose) @ flange_in_tool, near)
-
-
-def _apart_mm(a: tuple[float, float], b: tuple[float, float]) -> float:
-    return math.dist(a, b)

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from drivers.arcs.codes import SafetyMode
 from drivers.sim.config import SimConfig
-from drivers.sim.control import MAX_LINE_BYTES, ControlPathError, ControlServer, live_control
+from drivers.sim.control import MAX_LINE_BYTES, ControlServer, live_control
+from drivers.sim.described import SimFileError
 from drivers.sim.rig import LoopbackRig
 
 Ask = Callable[[object], Awaitable[dict[str, Any]]]
@@ -161,7 +162,7 @@ async def test_only_its_owner_can_open_it(control: ControlServer, path: Path):
 
 async def test_what_stands_at_the_path_is_not_overwritten(rig: LoopbackRig, path: Path):
     path.write_text("mine")
-    with pytest.raises(ControlPathError, match="exists and is not a socket"):
+    with pytest.raises(SimFileError, match="exists and is not a socket"):
         async with live_control(rig.faults, path):
             pass
     assert path.read_text() == "mine"
@@ -169,7 +170,7 @@ async def test_what_stands_at_the_path_is_not_overwritten(rig: LoopbackRig, path
 
 async def test_two_rigs_do_not_share_a_socket_and_one_that_is_dead_is_replaced(rig: LoopbackRig, path: Path):
     async with live_control(rig.faults, path):
-        with pytest.raises(ControlPathError, match="another rig listens here"):
+        with pytest.raises(SimFileError, match="another rig listens here"):
             await ControlServer(rig.faults).open(path)
         path.rename(f"{path}.old")
     assert Path(f"{path}.old").exists()  # what it did not find at its path it left alone
@@ -182,6 +183,6 @@ async def test_two_rigs_do_not_share_a_socket_and_one_that_is_dead_is_replaced(r
 
 async def test_a_path_that_the_system_would_cut_is_refused(rig: LoopbackRig, tmp_path: Path):
     for path, words in ((tmp_path / ("x" * 120), "at most"), (tmp_path / "no" / "where", "cannot listen here")):
-        with pytest.raises(ControlPathError, match=words) as caught:
+        with pytest.raises(SimFileError, match=words) as caught:
             await ControlServer(rig.faults).open(path)
         assert caught.value.exit_code == 2
