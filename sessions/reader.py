@@ -48,7 +48,7 @@ class Capture:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a stroke and the still that shows it lie in a recording, for whoever reads only these."""
+    """Where a stroke and its still lie in a recording, so that they can be read without the rest."""
 
     stroke_id: str
     offsets: tuple[int, ...]

@@ -1,4 +1,4 @@
-"""Stopping the arm over any connection that works, not believed until the arm rests; and the watchdog.
+"""Stop the arm over whichever connection works, until it is seen at rest; and the controller's watchdog.
 
 Two connections have no common order, so a stop on its own connection may overtake a line that is still on its way.
 That is why a stop is sent a second time behind that line, and why the arm is polled until it is seen at rest.

@@ -37,7 +37,7 @@ def seal(body: bytes) -> bytes:
 def unseal(frame: bytes) -> bytes:
     """The body of a frame. Raises `ProtocolViolation` if it is too short or the CRC is wrong."""
     if len(frame) < 4:
-        raise ProtocolViolation(DEVICE, "decode", f"{len(frame)} bytes are no frame")
+        raise ProtocolViolation(DEVICE, "decode", f"{len(frame)} bytes are not a frame")
     body = frame[:-2]
     if seal(body) != frame:
         raise ProtocolViolation(DEVICE, "decode", f"CRC of {frame.hex(' ')} should be {seal(body)[-2:].hex(' ')}")

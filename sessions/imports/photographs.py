@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from sessions.disk import staged_folder
 from sessions.errors import InputError, SessionDamaged, in_one_line
-from sessions.imports.table import Row, parse_table, read_table, read_text
+from sessions.imports.table import Row, parse_table, read_text
 from sessions.names import SESSION_ID
 from sessions.progress import Progress, counted, unseen
 from sessions.recording.messages import MAX_IMAGE_BYTES, PNG_START, decode_gray, encode_png, image_message
@@ -68,7 +68,8 @@ def import_photographs(
 ) -> Path:
     """Import into the new session folder `out`; return its MCAP file. Raises `InputError`, leaving nothing behind."""
     check_target(folder, table, out, options)
-    rows = read_table(folder, table, "press" if options.kind == "press" else "drag", options.px_per_mm)
+    kind = "press" if options.kind == "press" else "drag"
+    rows = parse_table(folder, table, read_text(table), kind, options.px_per_mm)
     protocol = f"import of {len(rows)} {options.kind} strokes"
     return store_rows(rows, folder, table, out, options, protocol, software, now_ns, progress=progress)
 

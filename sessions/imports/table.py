@@ -6,7 +6,7 @@ import csv
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -72,15 +72,13 @@ class _Columns:
     """Stored name and unit factor of each column that is not in `SPECIAL`."""
 
 
-def read_table(folder: Path, table: Path, kind: Literal["press", "drag"], px_per_mm: float | None) -> Spool[Row]:
-    """Read and check every line, without opening a photograph. Raises `InputError` naming line and column."""
-    return parse_table(folder, table, read_text(table), kind, px_per_mm)
-
-
 def parse_table(
     folder: Path, table: Path, text: str, kind: Literal["press", "drag"], px_per_mm: float | None
 ) -> Spool[Row]:
-    """Parse the table in `text`; errors name the path `table`."""
+    """Read and check every line of `text`, the table at the path `table`, without opening a photograph.
+
+    Raises `InputError` naming line and column.
+    """
     lines = csv.reader((found[0] for found in LINE.finditer(text)), strict=True)
     rows = Row.spooled(())
     seen: set[int] = set()
@@ -88,7 +86,7 @@ def parse_table(
     no_names: list[str] = []
     try:
         columns = _columns(folder, table, kind, px_per_mm, [name.strip() for name in next(lines, no_names)])
-        for cells in _filled(lines):
+        for cells in filter(any, lines):
             if len(rows) == MAX_ROWS:
                 raise InputError(table, f"has more than {MAX_ROWS} rows")
             row = _row(columns, lines.line_num, [as_text(cell.strip()) for cell in cells], still=len(rows))
@@ -116,10 +114,6 @@ def read_text(table: Path) -> str:
         raise InputError(table, "is not UTF-8 text") from None
     except OSError as error:
         raise InputError(table, f"cannot read: {in_one_line(error)}") from None
-
-
-def _filled(lines: Iterator[list[str]]) -> Iterator[list[str]]:
-    return (cells for cells in lines if any(cells))
 
 
 def _columns(

@@ -46,7 +46,7 @@ class Contents:
 
 
 def unpacked(chunk: Chunk) -> Contents:
-    """Unpack a chunk. Raises `McapError` where it does not match its CRC, `struct.error` for records that are none."""
+    """Unpack a chunk. Raises `McapError` for a wrong CRC, `struct.error` for bytes that are not records."""
     stream, size = get_chunk_data_stream(chunk, validate_crc=True)
     records = stream.read(size)
     index: defaultdict[int, list[int]] = defaultdict(list)

@@ -32,8 +32,10 @@ def messages(path: Path, topics: list[str] | None = None) -> Iterator[Record]:
 
 
 def messages_at(path: Path, offsets: Sequence[int], topics: Mapping[int, str]) -> Iterator[tuple[str, Message]]:
-    """Topics and messages of the chunks at these places, by the channels' numbers; the index is not read. Raises
-    `SessionDamaged`."""
+    """Yield (topic, message) from the chunks at `offsets`; the index is not read. Raises `SessionDamaged`.
+
+    `topics` gives the topic of each wanted channel by the channel's number.
+    """
 
     def read(file: BoundedFile) -> Iterator[tuple[str, Message]]:
         for offset in offsets:
@@ -46,8 +48,11 @@ def messages_at(path: Path, offsets: Sequence[int], topics: Mapping[int, str]) -
 def chunks_before(
     path: Path, last: str, kept: Sequence[str]
 ) -> Iterator[tuple[tuple[int, ...], dict[int, str], Message]]:
-    """Each message on the topic `last`, with the places of its chunk and of those with messages on `kept` since the
-    chunk of the one before, and the channels of all. Raises `SessionDamaged`."""
+    """Yield (offsets, topics, message) for each message on the topic `last`, ready for `messages_at`.
+
+    The offsets are those of its chunk, and of the chunks since the previous message on `last` that hold messages on
+    `kept`. Raises `SessionDamaged`.
+    """
 
     def read(file: BoundedFile) -> Iterator[tuple[tuple[int, ...], dict[int, str], Message]]:
         index = indexed(file)
