@@ -100,7 +100,7 @@ def _lines(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator[st
     for one in twin.estimates:
         known = f"{one.low:.4g} to {one.high:.4g}"
         if not one.determined:
-            known += ", not determined by these presses: near the default"
+            known += ", not determined by these presses"
         unit = f"{one.constant.unit}; " if one.constant.unit else ""
         yield f"{one.constant.name} = {one.value:.6g}    # {unit}{known}"
     for row in twin.held_out:
