@@ -37,6 +37,8 @@ class RunMemory:
     """Host time at which the brush left the ink; None if it has marked since or may have lost its ink."""
     image_plane: Plane | None = None
     """Plane of the newest frame in which the board was seen."""
+    plane_of: tuple[Gray, Plane] | None = None
+    """The frame that was last searched for the board, and its plane: a capture is judged, then shown."""
     sound_frame: Gray | None = None
     """Newest valid gray photograph of the current sheet."""
     looked_at_sheet: int | None = None
@@ -74,11 +76,14 @@ class RunContext:
 
         Raises `BadPicture` if none did.
         """
+        if self.memory.plane_of is not None and self.memory.plane_of[0] is image:
+            return self.memory.plane_of[1]
         try:
             self.memory.image_plane = see_board(image, self.rig.config.board)
         except CalibrationError as error:
             if self.memory.image_plane is None:
                 raise BadPicture(f"the board is not seen: {error.what}") from None
+        self.memory.plane_of = image, self.memory.image_plane
         return self.memory.image_plane
 
     def forget_camera(self) -> None:
