@@ -10,6 +10,7 @@ the fit itself on its own training strokes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from bench.realink_strokes import SMALL_A, SMALL_B, Strokes, drawn, load, region
 from calibrate.compare.similarity import binary_scores
 from calibrate.drags.captures import Drawn
 from calibrate.drags.predict import learn
-from calibrate.drags.run import adapt, adapted, different
+from calibrate.drags.run import adapt, different
 
 SESSION_SPLITS = 5
 STROKES = 90
@@ -77,7 +78,7 @@ def _compare(
         seen["zero-shot"], seen["lag, zero-shot"] = known.ink_both_ways(target, test)
         for count in ADAPTED:
             fit = adapt(target, different(target, left, count), known)
-            seen[f"adapted to {count}"] = adapted(known, fit).ink(target, test)
+            seen[f"adapted to {count}"] = replace(known, model=fit.model).ink(target, test)
         for name, ink in seen.items():
             found.setdefault(name, []).append(binary_scores(ink, truth).mean(axis=0))
     return {name: np.array(each) for name, each in found.items()}

@@ -7,12 +7,11 @@ its zero touch is found. Its leash and the terms that grow with depth are adapte
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.artefact import FittedValue, made_by, put_to_use
+from calibrate.artefact import FittedValue, made_by
 from calibrate.compare.similarity import binary_scores
 from calibrate.drags.artefact import DragArtefact, DragScore
 from calibrate.drags.captures import COMMANDS, Drawn
@@ -83,7 +82,7 @@ def refit_drawn(drawn: Drawn, prior: DragArtefact, where: str, strokes: int) -> 
     images = np.sort(different(drawn, np.arange(len(drawn.ink)), strokes))
     ours, stamps = predictors(prior, where)
     fit = adapt(drawn, images, ours)
-    moved = None if stamps is None else stamps_of(adapted(stamps, adapt(drawn, images, stamps)))
+    moved = None if stamps is None else stamps_of(replace(stamps, model=adapt(drawn, images, stamps).model))
     values = {name: value for name, value in _values(fit).items() if name in fit.free}
     artefact = _artefact(drawn, fit, images, prior.parameters | values).model_copy(
         update={
@@ -141,16 +140,6 @@ def session_change(known: Predictor) -> dict[str, float]:
     if deepest <= 0.0:
         return SESSION_MM
     return SESSION_MM | {"leash_mm": LEASH_MM} | {name: mm / deepest for name, mm in GROWTH_MM.items()}
-
-
-def adapted(known: Predictor, fit: DragFit) -> Predictor:
-    """The known brush with the adapted parameters; what was learned about its shape is kept."""
-    return replace(known, model=fit.model)
-
-
-def save(fitted: FittedDrags, session: Path) -> Path:
-    """Write the artefact into the session's folder and use it from now on."""
-    return put_to_use(fitted.artefact, session, FOLDER)
 
 
 def _values(fit: DragFit) -> dict[str, FittedValue]:

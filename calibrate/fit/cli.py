@@ -50,13 +50,13 @@ def fit(
         _fit_drags(session, mm_per_px, calibration, prior, strokes)
         return
 
-    from calibrate.artefact import load_artefact
+    from calibrate.artefact import load_artefact, put_to_use
     from calibrate.compare.field import Field
-    from calibrate.fit.artefact import BrushFit
+    from calibrate.fit.artefact import FOLDER, BrushFit
     from calibrate.fit.captures import read_presses
     from calibrate.fit.report import write_fit_page
     from calibrate.fit.run import correction as corrected
-    from calibrate.fit.run import fit_session, save
+    from calibrate.fit.run import fit_session
     from sessions.progress import shown
     from sessions.reader import Recording
 
@@ -65,7 +65,7 @@ def fit(
     with shown() as progress:
         captures = read_presses(session, view, calibration, progress)
         fitted = fit_session(captures, view, progress)
-    path = save(fitted, Recording(session).path.parent)
+    path = put_to_use(fitted.artefact, Recording(session).path.parent, FOLDER)
     say(*_tables(captures, fitted))
     if correction:
         say(*_correction(corrected(captures, fitted.artefact, before)))
@@ -75,10 +75,10 @@ def fit(
 def _fit_drags(
     session: Path, mm_per_px: float | None, calibration: Path | None, prior: Path | None, strokes: int | None
 ) -> None:
-    from calibrate.artefact import load_artefact
+    from calibrate.artefact import load_artefact, put_to_use
     from calibrate.drags.artefact import DragArtefact
     from calibrate.drags.captures import read_drags
-    from calibrate.drags.run import fit_drawn, refit_drawn, save
+    from calibrate.drags.run import FOLDER, fit_drawn, refit_drawn
     from sessions.progress import shown
     from sessions.reader import Recording
 
@@ -91,7 +91,7 @@ def _fit_drags(
         else:
             fitted = fit_drawn(drawn, progress)
     say(*_drag_tables(drawn, fitted.artefact))
-    say(f"Fit: {save(fitted, Recording(session).path.parent)}")
+    say(f"Fit: {put_to_use(fitted.artefact, Recording(session).path.parent, FOLDER)}")
 
 
 def _drag_tables(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:

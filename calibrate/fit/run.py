@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
-from calibrate.artefact import FittedValue, made_by, put_to_use
+from calibrate.artefact import FittedValue, made_by
 from calibrate.compare.field import Field
-from calibrate.fit.artefact import FOLDER, BrushFit, FittedStage
+from calibrate.fit.artefact import BrushFit, FittedStage
 from calibrate.fit.captures import Captures, Grid, Pressed
 from calibrate.fit.fit import STAGES, Fit, fit_presses, zero_touch
 from calibrate.fit.heldout import HeldOut, by_cell, leave_cell_out
@@ -51,7 +50,7 @@ def fit_session(captures: Captures, view: Field, progress: Progress = unseen) ->
     fit = fit_presses(strokes, grid, captures.radius_mm, captures.length_mm, progress=progress)
     held_out = leave_cell_out(fit, strokes, grid, progress) if len(by_cell(strokes)) > 1 else []
     parameters: dict[str, FittedValue] = {}
-    for name, value, error in zip(NAMES, _floats(fit), fit.errors.tolist(), strict=True):
+    for name, value, error in zip(NAMES, fit.press.values.tolist(), fit.errors.tolist(), strict=True):
         bounds = PARAMETERS[NAMES.index(name)]
         low, high = _interval(value, error)
         parameters[name] = FittedValue(value=value, low=max(low, bounds.low), high=min(high, bounds.high))
@@ -102,14 +101,5 @@ def correction(captures: Captures, artefact: BrushFit, reference: BrushFit | Non
     return Correction(lift, _interval(lift, error), along.value, ends, "")
 
 
-def save(fitted: Fitted, session: Path) -> Path:
-    """Write the artefact into the session's folder and use it from now on."""
-    return put_to_use(fitted.artefact, session, FOLDER)
-
-
 def _interval(value: float, error: float) -> tuple[float, float]:
     return value - NORMAL_95 * error, value + NORMAL_95 * error
-
-
-def _floats(fit: Fit) -> list[float]:
-    return [float(v) for v in fit.press.values]

@@ -153,7 +153,7 @@ def tuned_by_cell(
 
 @dataclass(slots=True)
 class _TrainingProgress:
-    """Reports the steps of a training; see `model.train.run.Progress`."""
+    """Reports the steps of a training; see `model.train.loop.Progress`."""
 
     progress: Progress
     what: str

@@ -41,8 +41,8 @@ class Validation:
         return self.ink_share < BLANK_SHARE * self.target_share or paper < BLANK_SHARE * target_paper
 
 
-class Watcher(Protocol):
-    """Receives the progress of a training, in the first process only."""
+class Progress(Protocol):
+    """Shows the progress of a training, in the first process only."""
 
     def stepped(self, step: int, loss: float) -> None:
         """Called after a step."""
@@ -51,6 +51,10 @@ class Watcher(Protocol):
     def validated(self, validation: Validation) -> None:
         """Called after a validation."""
         ...
+
+
+class Watcher(Progress, Protocol):
+    """Also receives what a training writes."""
 
     def pictures(self, step: int, inputs: Tensor, targets: Tensor, drawn: Tensor) -> None:
         """Called every m steps with the targets and drawn images of some validation strokes."""

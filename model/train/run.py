@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from filelock import FileLock, Timeout
 from rich.console import Console
@@ -35,7 +35,7 @@ from model.train.config import TrainConfig, differences
 from model.train.data import Images, exact_sets, load_captures, split
 from model.train.distributed import Group, joined
 from model.train.errors import TrainError
-from model.train.loop import Validation, converged, new_state, train
+from model.train.loop import Progress, Validation, converged, new_state, train
 from model.train.report import MOST_SAMPLES, Events, Samples, save_samples, write_card, write_curves, write_pictures
 
 
@@ -45,18 +45,6 @@ class Tuning:
 
     start: Path
     captures: Path
-
-
-class Progress(Protocol):
-    """Display of a training on the command line."""
-
-    def stepped(self, step: int, loss: float) -> None:
-        """Report a finished step."""
-        ...
-
-    def validated(self, validation: Validation) -> None:
-        """Report a finished validation."""
-        ...
 
 
 def run_training(
@@ -206,7 +194,7 @@ class Bar:
         self._task: TaskID = progress.add_task("training", total=steps, loss="", validation="")
 
     def stepped(self, step: int, loss: float) -> None:
-        """See `Watcher.stepped`."""
+        """See `Progress.stepped`."""
         self._progress.update(self._task, completed=step, loss=f"left, MSE {loss:.1e}")
         if self._progress.console.is_terminal or 10 * step // self._steps <= self._tenths:
             return
@@ -216,7 +204,7 @@ class Bar:
         self._progress.console.print(f"training: {step} of {self._steps} steps{left}, MSE {loss:.1e}")
 
     def validated(self, validation: Validation) -> None:
-        """See `Watcher.validated`."""
+        """See `Progress.validated`."""
         self._progress.update(self._task, validation=f"held out {validation.mse:.1e}")
         if validation.blank:
             self._progress.console.print(

@@ -57,7 +57,7 @@ def test_the_report_is_one_file_that_fetches_nothing_and_says_what_cannot_be_com
     assert brushloop("validate", "sessions/photos", cwd=tmp_path).returncode == 0
     page = (tmp_path / "sessions" / "photos" / "validation" / "report.html").read_text()
     assert "imported photographs" in page
-    assert "cannot be compared with a drag" in page
+    assert "cannot be compared with these strokes" in page
     assert hostile not in page
     assert "&lt;script&gt;" in page
     sources = re.findall(r'(?:src|href)="([^"]*)"', page)
