@@ -21,9 +21,10 @@ from bench.realink_network import train_and_predict
 from bench.realink_sessions import SESSION_SPLITS, measure_sessions
 from bench.realink_strokes import PX_PER_MM, Strokes, load, region
 from calibrate.compare.similarity import binary_scores
-from calibrate.drags.fit import INK_ABOVE, chance, fit_drags
+from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, fit_drags
 from calibrate.drags.predict import STAMP_ABOVE, STAMP_SPREAD_MM
 from calibrate.drags.residual import Residual, captured_distance, threshold
+from model.drag import ink as chance
 
 SPLIT_SEED = 0
 TEST = 40
@@ -148,7 +149,8 @@ def predict(
     here = fit.distance(paths, x_mm, y_mm, place[chosen])
     missed = Residual.fit(strokes.commands[chosen], here, captured[chosen])
     above = threshold(strokes.commands[chosen], here, captured[chosen])
-    return chance(there), chance(missed.add(strokes.commands[test], there)), above
+    corrected = missed.add(strokes.commands[test], there)
+    return chance(there, SPREAD_MM), chance(corrected, SPREAD_MM), above
 
 
 def circles(strokes: Strokes, chosen: NDArray[np.int64], test: NDArray[np.int64]) -> Scores:
