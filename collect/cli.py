@@ -218,10 +218,9 @@ def loop(
     from sessions.reader import Recording
 
     options = _collect_options(arm=arm, tui=tui)
-    options += [] if sheet is None else ["--sheet", str(sheet)]
     folder = out if out is not None else Recording(session).path.parent / "loop"
     try:
-        run_loop(LoopRequest(session, config, folder, fit, presses, repeats, seed, tuple(options)), say)
+        run_loop(LoopRequest(session, config, folder, fit, presses, repeats, seed, sheet, tuple(options)), say)
     except CommandFailed as error:
         raise typer.Exit(error.exit_code) from None  # the command has printed why
 

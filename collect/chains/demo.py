@@ -162,9 +162,14 @@ class Demo:
         if (folder / LOOP_PAGE).is_file():
             return
         self._blank_sheet(folder / REPLAY)
-        options = ("--no-tui", "--sheet", "1")
         request = LoopRequest(
-            session, self._rig.config, folder, presses=self._size.again, seed=self._seed, collect_options=options
+            session,
+            self._rig.config,
+            folder,
+            presses=self._size.again,
+            seed=self._seed,
+            sheet=1,
+            collect_options=("--no-tui",),
         )
         run_loop(request, say)
 

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from calibrate.artefact import artefacts, current
 from calibrate.files import read_bounded, write_whole
 from collect.chains.commands import Say, collected_session, run_command
+from collect.engine.open_or_resume import check_fresh_sheet
 from collect.errors import ConfigError
 from collect.rig.config import RigConfig, load_rig
 from sessions.reader import Recording
@@ -41,8 +42,10 @@ class LoopRequest:
     """How many presses are recovered and made again, spread evenly over the session; None: all."""
     repeats: int = 1
     seed: int = 1
+    sheet: int | None = None
+    """Number of the sheet that the operator has put in."""
     collect_options: tuple[str, ...] = ()
-    """Passed on to `brushloop collect`: `--arm`, `--sheet 1`, `--no-tui`."""
+    """Passed on to `brushloop collect`: `--arm`, `--no-tui`."""
 
 
 def run_loop(request: LoopRequest, say: Say) -> Path:
@@ -51,6 +54,8 @@ def run_loop(request: LoopRequest, say: Say) -> Path:
     folder, root = recording.path.parent, recording.path.parent.parent
     rig = load_rig(request.config)
     _check_rig(request.config, rig, recording.header)
+    if not (request.out / PROTOCOL).exists():
+        check_fresh_sheet(root, request.sheet)  # now, not after minutes of fitting
     fit = _fit(request, recording, say)
     settings = Settings(
         original=recording.header.session_id,
@@ -64,7 +69,8 @@ def run_loop(request: LoopRequest, say: Say) -> Path:
     )
     keep_settings(settings, request.out)
     protocol = _recover(request, folder, fit, settings, say)
-    again = collected_session(say, request.config, protocol, root, request.collect_options)
+    sheet = () if request.sheet is None else ("--sheet", str(request.sheet))
+    again = collected_session(say, request.config, protocol, root, (*request.collect_options, *sheet))
     run_command(say, "loop", "compare", folder, again, "--fit", fit, "--out", request.out)
     return request.out / PAGE
 

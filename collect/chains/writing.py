@@ -12,6 +12,7 @@ from pathlib import Path
 
 from calibrate.artefact import current
 from collect.chains.commands import Say, collected_session, finished_session, run_command
+from collect.engine.open_or_resume import check_fresh_sheet
 from collect.errors import ConfigError
 from collect.protocols.config import load_protocol
 from collect.protocols.write import WriteConfig
@@ -76,6 +77,8 @@ class Writing:
     def _first_plan(self) -> Path:
         request, plan = self._request, self._request.out / "plan"
         if not (plan / PROTOCOL).exists():
+            if not (request.out / "practice" / PROTOCOL).exists():
+                check_fresh_sheet(request.sessions, request.sheet)  # now, not after planning
             brush = load_rig(request.config).brush
             options = ["--radius-mm", str(brush.radius_mm), "--length-mm", str(brush.length_mm)]
             options += ["--repeats", str(self._repeats(1)), *request.plan_options]

@@ -121,16 +121,21 @@ def find_resumable(opening: Opening) -> Path | None:
         refusals.append(_changed(folder, found, given, {name: opening.snapshots[name] for name in given}))
     if refusals:
         raise refusals[0]
-    if opening.sheet is None and any(map(_has_pressed, opening.root.glob(f"*/{JOURNAL_NAME}"))):
+    check_fresh_sheet(opening.root, opening.sheet)
+    return None
+
+
+def check_fresh_sheet(root: Path, sheet: int | None) -> None:
+    """Raise `ConfigError` if a new session under `root` might press on a used sheet; `sheet` is what was confirmed."""
+    if sheet is None and any(map(_has_pressed, root.glob(f"*/{JOURNAL_NAME}"))):
         raise ConfigError(
-            opening.root,
+            root,
             "",
             "holds earlier sessions, and a new one would press on whatever sheet is in. "
             "Put a fresh sheet in, then confirm it with --sheet 1",
         )
-    if opening.sheet not in (None, 1):
-        raise ConfigError("--sheet", "", f"{opening.sheet}: a new session begins with sheet 1")
-    return None
+    if sheet not in (None, 1):
+        raise ConfigError("--sheet", "", f"{sheet}: a new session begins with sheet 1")
 
 
 def resuming(opening: Opening, session_id: str) -> Opening:

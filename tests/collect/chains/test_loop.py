@@ -41,8 +41,7 @@ def test_the_loop_is_closed_and_goes_on_after_kill_nine(bench: Bench) -> None:
     refused = bench.run(*words(bench, session))
     assert refused.returncode == 2
     assert "would press on whatever sheet is in" in refused.stderr
-    protocol = session / "loop" / "protocol-replay.toml"
-    recovered_at = protocol.stat().st_mtime_ns
+    assert not (session / "brushfit").exists()  # asked before anything is computed
 
     bench.fresh_sheet()
     again = words(bench, session, "--sheet", "1")
@@ -55,6 +54,8 @@ def test_the_loop_is_closed_and_goes_on_after_kill_nine(bench: Bench) -> None:
     wait_until(lambda: replay_journal(bench).count(b'"event":"done","key"') >= 6, "six steps", process=first)
     os.killpg(first.pid, signal.SIGKILL)
     first.wait()
+    protocol = session / "loop" / "protocol-replay.toml"
+    recovered_at = protocol.stat().st_mtime_ns
 
     ran = bench.run(*again)
     assert ran.returncode == 0, ran.stderr

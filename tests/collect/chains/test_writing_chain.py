@@ -10,6 +10,7 @@ import pytest
 from collect.chains import writing
 from collect.chains.writing import FOOTPRINT, PLAN, PROTOCOL, Writing, WritingRequest
 from collect.errors import ConfigError
+from sessions.journal.journal import JOURNAL_NAME
 
 CELL = 'kind = "write"\ncell_mm = [48.0, 48.0]\nrepeats = {repeats}\n[[figures]]\nname = "子"\n[[figures.strokes]]\n'
 POINTS = "points = [[10.0, 24.0, 3.0, 0.0, 0.0], [20.0, 24.0, 3.0, 0.0, 0.0]]\n"
@@ -59,6 +60,17 @@ def test_practice_comes_first_and_learning_ends_when_all_is_settled(
     learning = ["write compare", "write learn"] * rounds
     assert commands.ran == ["write practice", "write fit", "write plan", *learning, "write compare"]
     assert bool(said) == (rounds < 3)
+
+
+def test_a_fresh_sheet_is_asked_for_before_anything_is_planned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    commands = Commands(1)
+    monkeypatch.setattr(writing, "run_command", commands)
+    (tmp_path / "2026-01-01-grid-01").mkdir()
+    (tmp_path / "2026-01-01-grid-01" / JOURNAL_NAME).write_text("damaged\n", encoding="utf-8")
+    request = WritingRequest("子", tmp_path / "rig.toml", tmp_path / "out", tmp_path, practice=True)
+    with pytest.raises(ConfigError, match="Put a fresh sheet in"):
+        Writing(request, print).run()
+    assert commands.ran == []
 
 
 def test_a_plan_that_cannot_be_read_is_named(tmp_path: Path) -> None:
