@@ -157,26 +157,26 @@ def _voids(lines: list[Line], state: Replay) -> tuple[list[str], str]:
                 began.pop(ident, None)
             case "void" if ident in began:
                 cut = began.pop(ident)
-                voids.append(f"{_step_name(cut)}, attempt {line['attempt']}: {line.get('why', '')}")
-                last = _step_name(cut) if cut["key"] not in state.done else ""
+                voids.append(f"{step_words(cut)}, attempt {line['attempt']}: {line.get('why', '')}")
+                last = step_words(cut) if cut["key"] not in state.done else ""
             case _:
                 pass
     for line in began.values():
-        voids.append(f"{_step_name(line)}, attempt {line['attempt']}: the process ended during it")
-        last = _step_name(line) if line["key"] not in state.done else last
+        voids.append(f"{step_words(line)}, attempt {line['attempt']}: the process ended during it")
+        last = step_words(line) if line["key"] not in state.done else last
     return voids, last if state.closed is None else ""
 
 
-def _step_name(begin: Line) -> str:
-    stroke = begin.get("params", {}).get("stroke_id", "")
-    return f"{begin['kind']} {stroke}".strip().replace("_", " ")
+def step_words(line: Line) -> str:
+    """Name of the step of a `begin` or `done` line for people: `capture H13-a05-r02`."""
+    stroke = {**line.get("params", {}), **line.get("result", {})}.get("stroke_id", "")
+    return f"{line.get('kind', 'step')} {stroke}".strip().replace("_", " ")
 
 
 def _segment(folder: Path, line: Line) -> Segment:
     path = folder / str(line["file"])
     size = path.stat().st_size if path.is_file() else None
-    stroke = line["result"].get("stroke_id", "")
-    return Segment(path.name, f"{line['kind']} {stroke}".strip().replace("_", " "), size, line["counts"])
+    return Segment(path.name, step_words(line), size, line["counts"])
 
 
 def _commanded(line: Line, lines: list[Line]) -> Stroke:

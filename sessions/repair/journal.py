@@ -10,7 +10,7 @@ from sessions.disk import fsync_folder, set_aside, sync
 from sessions.journal.codec import encode_line, without_time
 from sessions.journal.journal import JOURNAL_NAME, Journal, next_chain
 from sessions.repair.evidence import Evidence
-from sessions.repair.verify import step_words
+from sessions.show import step_words
 
 
 @dataclass(slots=True)

@@ -28,7 +28,8 @@ from sessions.repair.evidence import gather
 from sessions.repair.journal import Report, kept_words, repaired_journal, write_anew
 from sessions.repair.rewrite import lost_words, repair_file, replace_damaged, with_their_stills
 from sessions.repair.union import Source, identity_of, united
-from sessions.repair.verify import file_problems, step_words
+from sessions.repair.verify import file_problems
+from sessions.show import step_words
 from sessions.store import closed_line, lock
 
 MEASURED = (str(Topic.STILL), str(Topic.STROKE))

@@ -21,7 +21,7 @@ from sessions.recording.messages import decode_gray, decode_still
 from sessions.recording.salvage import Scan, salvaged, scan
 from sessions.recording.schemas import Stroke, Topic
 from sessions.repair.evidence import Evidence, gather
-from sessions.show import details
+from sessions.show import details, step_words
 
 IMAGES = (Topic.STILL, Topic.PREVIEW)
 
@@ -73,12 +73,6 @@ def verify_session(path: Path, progress: Progress = unseen) -> Verdict:
             raise not_a_session(path)
         return _verify_file(final, name, progress)
     return _verify_folder(path.resolve(), progress)
-
-
-def step_words(line: Line) -> str:
-    """Name of a step for people: `capture H13-a05-r02`."""
-    stroke = line.get("result", {}).get("stroke_id", "")
-    return f"{line.get('kind', 'step')} {stroke}".strip().replace("_", " ")
 
 
 def _verify_file(path: Path, name: str, progress: Progress) -> Verdict:
