@@ -44,6 +44,8 @@ KINDS = {
     "write": f'kind = "write"\ncell_mm = [60.0, 60.0]\n{FIGURE}',
     "calibration": 'kind = "calibration"\ntouches_mm = [[20.0, 20.0], [200.0, 20.0]]\n',
 }
+LIKE_A_GRID = {"replay", "few-strokes"}
+"""They press as a grid does, and are left to `make soak`."""
 
 
 @dataclass
@@ -118,7 +120,9 @@ def rounded(pose: Pose) -> tuple[float, ...]:
     return tuple(round(v, 6) for v in (*pose.position_mm, *pose.quaternion))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.soak if kind in LIKE_A_GRID else ()) for kind in KINDS]
+)
 def test_what_a_run_sends_the_plan_has_checked(lab: Lab, made: list[Made], kind: str) -> None:
     run(lab, KINDS[kind])
     hold_against_the_plan(lab, made)
