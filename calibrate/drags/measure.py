@@ -56,7 +56,7 @@ def prepare_drag(
 
 
 def defects(mask: Mask) -> tuple[str, ...]:
-    """Words for what is wrong with a stroke's ink."""
+    """Describe what is wrong with a stroke's ink, one phrase for each defect; empty for a sound stroke."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     ink = mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     count, _, stats, _ = cv2.connectedComponentsWithStats(ink.astype(np.uint8), connectivity=8)

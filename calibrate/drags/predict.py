@@ -97,7 +97,10 @@ def learn(drawn: Drawn, images: Indices) -> Learned:
 
 
 def predictors(artefact: DragArtefact, where: str) -> tuple[Predictor, Predictor | None]:
-    """What an artefact predicts with, and its circle stamps. Raises `CalibrationError` for ink that cannot be read."""
+    """The predictor of an artefact, and that of its circle stamps if it has any.
+
+    Raises `CalibrationError` for ink that cannot be read.
+    """
     try:
         learned = artefact.kept.residual() if artefact.kept is not None else None
     except (ValueError, np.linalg.LinAlgError) as error:
@@ -122,7 +125,7 @@ def chosen(drawn: Drawn, images: Indices) -> tuple[list[Floats], Indices]:
 
 
 def coarse_step(drawn: Drawn) -> int:
-    """How many pixels make about `FIT_MM`."""
+    """Number of pixels that make about `FIT_MM`."""
     return max(1, round(FIT_MM / drawn.mm_per_px))
 
 

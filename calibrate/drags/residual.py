@@ -42,7 +42,7 @@ class Residual:
 
     @staticmethod
     def fit(commands: Floats, base_mm: Floats, captured_mm: Floats, ridge: float = RIDGE) -> Residual:
-        """Fit to (B, d) commands and to the model's and the captured signed distances (B, h, w)."""
+        """Fit the captured signed distances minus the model's, both (B, h, w), as a function of (B, d) commands."""
         scales = scales_of(commands)
         return Residual(commands, scales, _solved(_gram(commands, scales, ridge), _flat(captured_mm) - _flat(base_mm)))
 

@@ -68,7 +68,7 @@ def regress(seen: Floats, terms: Floats, scale: Floats) -> Floats:
 
 
 def _ends(press: FittedPress, stroke: Pressed, grid: Grid) -> Floats:
-    """How much further the stroke's tip and heel reach than the brush's lengths, (2,) mm, by Gauss-Newton."""
+    """By how much the stroke's tip and heel reach beyond the lengths of the brush, (2,) mm, by Gauss-Newton."""
 
     def image(further: Floats) -> Floats:
         return _stretched(press, further).chance(stroke.height_mm, stroke.tilt_deg, grid.x_mm, grid.y_mm, SPREAD_MM)
