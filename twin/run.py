@@ -52,7 +52,7 @@ class Estimate:
     low: float
     high: float
     determined: bool
-    """False where the presses do not determine it, and the value is near the default."""
+    """False where the presses do not determine it; the prior then does."""
 
 
 @dataclass(frozen=True, slots=True)
