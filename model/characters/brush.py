@@ -73,7 +73,7 @@ class Reach:
                 kept.append(k)
         if kept[-1] != len(points) - 1 and len(kept) > 1:
             kept[-1] = len(points) - 1
-            if len(kept) > 2 and np.linalg.norm(points[kept[-1], :3] - points[kept[-2], :3]) < self.apart_mm * 1.02:
+            while len(kept) > 2 and np.linalg.norm(points[kept[-1], :3] - points[kept[-2], :3]) < self.apart_mm * 1.02:
                 del kept[-2]
         return points[kept]
 

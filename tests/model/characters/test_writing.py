@@ -134,3 +134,8 @@ def test_no_steps_change_nothing() -> None:
 def test_a_reach_that_makes_no_sense_is_refused(options: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="expected"):
         Reach(**options)
+
+
+def test_a_last_point_that_returns_leaves_none_too_near() -> None:
+    there_and_back = np.array([[x, 0.0, 2.0, 5.0, 0.0] for x in (0.0, 1.5, 0.0, 1.5, 1.0)])
+    assert REACH.spaced(there_and_back)[:, 0].tolist() == [0.0, 1.0]
