@@ -35,7 +35,7 @@ from model.brush import Brush as Size
 from model.characters.brush import Reach
 from model.characters.plan import grid, without_tilt
 from model.footprint import Footprint, fit_footprint
-from model.registry import stroke_model
+from model.strokes import stroke_model
 from sessions.recording.schemas import Header, Source
 
 Floats = NDArray[np.float64]

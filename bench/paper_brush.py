@@ -25,7 +25,7 @@ from calibrate.validate.report.data import Report, load_report
 from calibrate.validate.run import CEILING
 from drivers.sim.brush_file import PAPER, load_brush
 from model.brush import Brush as Bundle
-from model.registry import stroke_models
+from model.strokes import stroke_models
 from model.train import SHIPPED_GENERATOR
 
 REPEATS = 10

@@ -34,7 +34,7 @@ from calibrate.compare.similarity import csim, ssim
 from calibrate.validate.jobs import ABSENT, PrepareJob, ScoreJob, prepare_job, score_job
 from calibrate.validate.pool import Dask, Threads
 from model.brush import Brush as Bundle
-from model.registry import stroke_models
+from model.strokes import stroke_models
 from sessions.reader import Recording
 
 STROKES = 60

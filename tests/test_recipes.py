@@ -34,7 +34,7 @@ from drivers.sim.rig_toml import Addresses, rig_toml
 from model import strokes
 from model.brush import Brush
 from model.raster.exact import coverage_at
-from model.registry import stroke_models
+from model.strokes import stroke_models
 
 RECIPES = Path(__file__).resolve().parent.parent / "examples" / "recipes"
 

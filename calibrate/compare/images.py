@@ -38,7 +38,7 @@ from sessions.recording.schemas import Header, Stroke
 
 if TYPE_CHECKING:
     from model.outline import Shape
-    from model.registry import StrokeModel
+    from model.strokes import StrokeModel
 
 Pixels = NDArray[np.uint8]
 """Ink from 0 to 255."""

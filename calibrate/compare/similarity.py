@@ -45,7 +45,10 @@ def similarity(
 
 
 def csim(a: Image, b: Image) -> float:
-    """Cosine similarity of two (h, w) images with values in [0, 1]. Raises ValueError if one is blank."""
+    """Cosine similarity of two (h, w) images with values in [0, 1]. Raises ValueError if one is blank.
+
+    `calibrate/compare/compiled.py` computes the same for all images of a validation at once.
+    """
     _check(a, b)
     x, y = a.astype(np.float64).ravel(), b.astype(np.float64).ravel()
     norm = float(np.linalg.norm(x) * np.linalg.norm(y))

@@ -27,7 +27,7 @@ from model.brush import DomainError
 from model.inversion.noise import Noise
 from model.inversion.press import Flag, Inverter, Known, Range, Recovered
 from model.protocol import Basis, StrokeModel
-from model.registry import UnknownModelError, stroke_model
+from model.strokes import UnknownModelError, stroke_model
 from sessions.errors import SessionDamaged
 from sessions.progress import Progress, counted, unseen
 from sessions.reader import Capture, Recording

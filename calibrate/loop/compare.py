@@ -185,7 +185,7 @@ def _replayed(header: Header) -> str | None:
 def _model(header: Header, fit: Path | None) -> tuple[StrokeModel, str]:
     """The model and the digest of the recording that it was fitted to, empty for none."""
     if fit is None:
-        from model.registry import stroke_model  # torch, which takes seconds to load
+        from model.strokes import stroke_model  # torch, which takes seconds to load
 
         return stroke_model("ccd-bsm", brush_of(header)), ""
     artefact = load_artefact(fit, BrushFit)

@@ -65,7 +65,7 @@ def generator_file(path: Path) -> Generator:
 def closed_forms(session: LoadedSession, view: Field, *, ablations: bool) -> list[Candidate]:
     """The registered models of the session's brush, the fitted one, and CCD-BSM at other lambdas."""
     from model.fitted_shape import fitted_model
-    from model.registry import stroke_model, stroke_models
+    from model.strokes import stroke_model, stroke_models
 
     brush = brush_of(session.header)
     found = [_of_model(model, PUBLISHED, view) for model in stroke_models(brush).values()]

@@ -57,7 +57,7 @@ def plan(
     from model.brush import Brush, DomainError
     from model.characters.brush import Reach
     from model.characters.plan import Cell
-    from model.registry import UnknownModelError, stroke_model
+    from model.strokes import UnknownModelError, stroke_model
 
     check_folder(out)
     lagging = load_artefact(drag, DragArtefact) if drag is not None else None

@@ -1,4 +1,8 @@
-"""Decides which session a command works on: an open one that was begun with the same files, or a new one."""
+"""Decides which session a command works on: an open one that was begun with the same files, or a new one.
+
+The finished steps of a resumed session are read from its journal (`sessions/journal/`); `collect/engine/run.py` carries
+out only the others.
+"""
 
 from __future__ import annotations
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeGuard
 
 from textual import events
 from textual.binding import Binding
@@ -17,7 +18,7 @@ from collect.tui.widgets import Key
 STOP_KEYS = frozenset({"s", "ctrl+c"})
 
 
-def is_stop_key(event: events.Event) -> bool:
+def is_stop_key(event: events.Event) -> TypeGuard[events.Key]:
     """Whether this event is a key that stops the arm."""
     return isinstance(event, events.Key) and event.key in STOP_KEYS
 

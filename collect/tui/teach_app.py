@@ -11,6 +11,7 @@ from textual.binding import Binding, BindingType
 
 from collect.errors import CollectAborted, describe
 from collect.headless import REFRESH_S, stop_signals
+from collect.tui.keys import is_stop_key
 from collect.tui.pictures import Pictures
 from collect.tui.question_screens import Confirm
 from collect.tui.teach_guide import ScreenGuide, Teaching
@@ -72,9 +73,9 @@ class TeachApp(PlainApp):
 
     async def on_event(self, event: events.Event) -> None:
         """Stop keys come first, on every screen; `s` is a letter only while a line is typed."""
-        if isinstance(event, events.Key) and not self.teaching.finished:
-            letter = event.key == "s" and self._screen.typing and self.screen is self._screen
-            if event.key in ("s", "ctrl+c") and not letter:
+        if is_stop_key(event) and not self.teaching.finished:
+            typing = self._screen.typing and self.screen is self._screen
+            if not (typing and event.is_printable):
                 self.action_stop()
                 return
         await super().on_event(event)

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from model.brush import Brush, DomainError
 from model.generator.network import Generator, Layers
 from model.generator.targets import PRESETS, Placement, Target
-from model.registry import UnknownModelError, stroke_model
+from model.strokes import UnknownModelError, stroke_model
 from model.train.errors import TrainError
 
 MAX_BYTES = 64 * 1024

@@ -11,7 +11,7 @@ from model.brush import Brush, DomainError
 from model.ccdbsm import CcdBsm, ccdbsm
 from model.raster.exact import coverage_at
 from model.raster.frame import centred_origin
-from model.registry import stroke_models
+from model.strokes import stroke_models
 
 GRID_MM = torch.tensor([11.0, 15.0, 20.0], dtype=torch.float64)
 MARK = ccdbsm(Brush(), GRID_MM, 5)

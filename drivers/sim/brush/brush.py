@@ -1,5 +1,6 @@
 """The simulated brush: one individual brush, whose marks come from mechanics and not from a stroke model.
 
+`drivers/sim/brush/mechanics.py` bends the bundle of hairs, `footprint.py` prints what then lies on the paper.
 `docs/loopback-brush.md` gives the equations and their sources, and says what this brush is not.
 """
 
@@ -13,9 +14,7 @@ from numpy.typing import NDArray
 from drivers.sim.brush.drag import Stances, Waypoint, draw_drag
 from drivers.sim.brush.flaws import Flaw, Trouble, draw_trouble
 from drivers.sim.brush.footprint import Tuft, blank_footprint, draw_wander, grow_bristles, print_footprint
-from drivers.sim.brush.paper import Footprint
-from drivers.sim.brush.spec import BrushSpec, within
-from drivers.sim.brush.spine import (
+from drivers.sim.brush.mechanics import (
     LOAD_STEP_MM,
     Bundle,
     SpineShape,
@@ -25,6 +24,8 @@ from drivers.sim.brush.spine import (
     pull_spine,
     rest_spine,
 )
+from drivers.sim.brush.paper import Footprint
+from drivers.sim.brush.spec import BrushSpec, within
 
 __all__ = ["Brush", "BrushSpec", "Flaw", "Footprint", "Waypoint"]
 

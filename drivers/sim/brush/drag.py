@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from drivers.sim.brush.footprint import MARGIN_MM, Tuft, frame_around
+from drivers.sim.brush.mechanics import SpineShape, Vector
 from drivers.sim.brush.paper import Dots, Footprint, Image, scatter, soak
-from drivers.sim.brush.spine import SpineShape, Vector
 
 STEP_MM = 0.3
 """Longest distance that the commanded tip travels between two moments of a drag."""

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.sim.brush.flaws import Trouble
+from drivers.sim.brush.mechanics import Bundle, SpineShape, Vector
 from drivers.sim.brush.paper import Dots, Footprint, scatter, soak
 from drivers.sim.brush.spec import BrushSpec
-from drivers.sim.brush.spine import Bundle, SpineShape, Vector
 
 STATION_MM = 0.25
 """Spacing of deposit points along a bristle."""

@@ -14,7 +14,7 @@ from calibrate.loop.compare import Pairs, pair_up
 from calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, score_pairs, summary_of, verdicts
 from model.brush import Brush
 from model.raster.exact import coverage_at
-from model.registry import stroke_model
+from model.strokes import stroke_model
 from sessions.reader import Capture
 from sessions.recording.messages import encode_png
 from sessions.recording.schemas import Stroke

@@ -14,7 +14,7 @@ from calibrate.compare.images import pack, simulated, simulated_pixels
 from calibrate.validate.jobs import ABSENT, PrepareJob, Press, ScoreJob, prepare_job, score_job
 from model.brush import Brush
 from model.raster.exact import coverage_at
-from model.registry import stroke_models
+from model.strokes import stroke_models
 from sessions.reader import Capture
 from sessions.recording.messages import encode_png
 from sessions.recording.schemas import Stroke

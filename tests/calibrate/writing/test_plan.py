@@ -21,7 +21,7 @@ from collect.protocols.write import WriteConfig
 from model.brush import Brush
 from model.characters.brush import Reach
 from model.drag import DragModel
-from model.registry import stroke_model
+from model.strokes import stroke_model
 from tests.calibrate.given import BY
 from tests.command import brushloop
 

@@ -8,7 +8,7 @@ import pytest
 from calibrate.compare.field import Alignment, Field, Tone
 from calibrate.compare.images import simulated
 from collect.engine.last_capture import LastCapture, published_mark
-from model.registry import stroke_model
+from model.strokes import stroke_model
 
 BRUSH = {"radius_mm": 6.0, "length_mm": 48.0}
 

@@ -14,7 +14,7 @@ from model.characters.ink import swept, written
 from model.characters.plan import Cell, Path, grid, trajectory, without_tilt
 from model.characters.refine import refine
 from model.drag import DragModel, distances, trails
-from model.registry import stroke_model
+from model.strokes import stroke_model
 
 MODEL = stroke_model("ccd-bsm", Brush())
 SIDE_MM, SIZE = 60.0, 96

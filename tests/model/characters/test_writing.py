@@ -18,7 +18,7 @@ from model.characters.ink import dense, reference, stamped, swept, written
 from model.characters.plan import Cell, Path, paths_of, trajectory
 from model.characters.refine import refine
 from model.raster.exact import coverage_at
-from model.registry import stroke_model
+from model.strokes import stroke_model
 
 MODEL = stroke_model("ccd-bsm", Brush())
 CELL = Cell(60.0, 3.0)

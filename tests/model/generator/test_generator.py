@@ -16,7 +16,7 @@ from model.generator.stroke import generator_model, traced
 from model.generator.targets import PRESETS, Placement, Target
 from model.raster.exact import coverage_at
 from model.raster.frame import centred_origin
-from model.registry import stroke_model
+from model.strokes import stroke_model
 
 SMALL = Layers(width=16, channels=4, side=8, size_px=32)
 

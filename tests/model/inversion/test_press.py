@@ -19,7 +19,7 @@ from model.inversion.press import Flag, Inverter, Known, Range
 from model.protocol import Basis
 from model.raster.compiled import coverage_numpy
 from model.raster.exact import coverage_at
-from model.registry import stroke_models
+from model.strokes import stroke_models
 
 # torch's own forward mode compiles a part of itself with torch.jit, which it calls deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")

@@ -18,7 +18,7 @@ from model.press_images import press_images
 from model.raster.compiled import coverage_numpy
 from model.raster.exact import coverage_at
 from model.raster.frame import centred_origin
-from model.registry import stroke_models
+from model.strokes import stroke_models
 
 Array = NDArray[np.floating]
 MODELS = stroke_models(Brush())

@@ -16,8 +16,8 @@ from model.ccdbsm import ccdbsm
 from model.outline import Outline
 from model.plane import fit_plane
 from model.raster.exact import coverage_at
-from model.registry import UnknownModelError, stroke_model, stroke_models
 from model.regression import solve
+from model.strokes import UnknownModelError, stroke_model, stroke_models
 from model.sweep import swept
 
 MODELS = stroke_models(Brush())
