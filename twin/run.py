@@ -39,6 +39,9 @@ MOST_WORKERS = 8
 MOST_SD = 0.7
 """Standard error, in scales, above which the presses count as not determining a constant."""
 NORMAL_95 = 1.96
+WIDER = 3.5
+"""Factor on the standard errors of mechanics and ink: constants that have nearly the same effect are known less well
+than the derivatives at one point say. It was chosen on two brushes of `DEVELOPMENT` in `bench/brushfit_brushes.py`."""
 Keep = Callable[[str, Found], None]
 """Called after each step with its name and the point that the search has reached."""
 
@@ -136,7 +139,7 @@ def fit_twin(
         points.append(there.point)
         _score_part(scores, cells, [target.cells[k] for k in part], there, target, spread)
     ticks.end()
-    errors = np.sqrt(variance + of_parts(points))
+    errors = WIDER * np.sqrt(variance + of_parts(points))
     estimates = [_estimate(*one) for one in zip(SHAPE, found.point, errors, strict=False)]
     if spread is not None:
         spec = _brush(found, target, spread)
