@@ -55,6 +55,9 @@ class Stopper:
                 halt = self._behind.halt(acc_m_s2)
                 trailing = asyncio.create_task(self._quietly(halt), name="stop behind the last line")
                 await self._until_rest(acc_m_s2, failures)
+                if not trailing.done():
+                    await trailing  # a line is still on its way, and the arm has yet to begin it
+                    await self._until_rest(acc_m_s2, failures)
         except TimeoutError:
             if not limit.expired():
                 raise

@@ -172,3 +172,39 @@ async def test_a_line_left_in_the_queue_by_a_dead_process_is_stopped_before_anyt
     await sleeping_arm.enable()
     assert cabinet.cabinet.world.motion.exec_id(cabinet.cabinet.now_s()) == -1
     assert to_go_mm(cabinet) > 100.0
+
+
+class SlowNetwork:
+    """A connection's writer behind a network that delivers everything 0.25 s later, in order."""
+
+    def __init__(self, writer: asyncio.StreamWriter) -> None:
+        self._writer = writer
+
+    def write(self, data: bytes) -> None:
+        asyncio.get_running_loop().call_later(0.25, self._writer.write, data)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._writer, name)
+
+
+async def test_a_stop_waits_for_a_line_that_is_on_its_way(
+    arm: AuboArcs, cabinet: ArcsServer, monkeypatch: pytest.MonkeyPatch
+):
+    connection, sent = arm._motion.connection, asyncio.Event()
+    send = connection.call
+
+    async def delayed(method: str, params: object = None) -> object:
+        if method.endswith("moveLine"):
+            monkeypatch.setattr(connection, "_writer", SlowNetwork(connection._writer))
+            sent.set()
+        return await send(method, params)
+
+    monkeypatch.setattr(connection, "call", delayed)
+    move = asyncio.create_task(arm.move(FAR, **SLOW))
+    await sent.wait()
+    await arm.stop()  # overtakes the line
+    stopped_mm = to_go_mm(cabinet)
+    with pytest.raises(MotionError):
+        await move
+    assert to_go_mm(cabinet) == pytest.approx(stopped_mm)
+    assert 100.0 < stopped_mm
