@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 import threading
 import time
 from collections.abc import Callable, Coroutine
@@ -29,8 +28,6 @@ from drivers.samples import Pose
 
 Kind = Literal["choose", "number", "text", "bring", "jog"]
 Answer = str | float | Brought | JogStep
-AGAIN_S = 5.0
-"""A stop that is not over after this long is sent again."""
 MOST_FINDINGS = 200
 """Findings that can be scrolled back to."""
 
@@ -216,7 +213,7 @@ class Teaching:
         self.stopped = False
         """Whether a stop ended it."""
         self._work = work
-        self._cancelled_s = -math.inf
+        self._stop_sent = False
         self._started = threading.Event()
         self._task: asyncio.Task[Path | None] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -233,13 +230,9 @@ class Teaching:
         return self._started.is_set() and not self._thread.is_alive()
 
     def stop(self) -> None:
-        """Cancel what is under way: a driver stops its arm before it lets a cancelled move end. From any thread.
-
-        Again only after `AGAIN_S`: a second cancellation would cut the stop short that the first one has begun.
-        """
-        now_s = time.monotonic()
-        if self._loop is not None and self._task is not None and now_s - self._cancelled_s > AGAIN_S:
-            self._cancelled_s = now_s
+        """Cancel what is under way: a driver stops its arm before it lets a cancelled move end. From any thread."""
+        if self._loop is not None and self._task is not None:
+            self._stop_sent = True
             with contextlib.suppress(RuntimeError):  # the loop has just ended
                 self._loop.call_soon_threadsafe(self._task.cancel)
 
@@ -259,7 +252,7 @@ class Teaching:
                 self.error = StopUnsure(" ".join(notes))
         except CollectAborted as error:
             # A run within the steps has its own word for the stop that it was sent.
-            self.stopped = self._cancelled_s > -math.inf
+            self.stopped = self._stop_sent
             self.error = None if self.stopped else error
         except BaseException as error:
             self.error = error

@@ -14,6 +14,7 @@ from drivers.arcs.settings import ArcsOptions, make_ready, power_on
 from drivers.arcs.stopping import Stopper, Watchdog
 from drivers.arcs.telemetry import Telemetry
 from drivers.arcs.waiting import Messages, Tolerance, planned_s, until_settled
+from drivers.cancellation import finished
 from drivers.clock import Clock
 from drivers.errors import DeviceError, MotionFailed, NotConnected
 from drivers.limits import Limits
@@ -42,7 +43,6 @@ class AuboArcs:
         )
         self._reopening = asyncio.Lock()
         self._stopper = Stopper([self._stop, self._state], self._motion, self._restore_stop)
-        self._own_stops: set[asyncio.Task[None]] = set()
         self._stops = 0
         """Number of stops so far; a motion compares it, because it must send no line after a stop."""
         self._unsettled = False
@@ -187,7 +187,7 @@ class AuboArcs:
         except BaseException as error:
             note = ""
             try:
-                await asyncio.shield(self._own_stop())
+                await finished(self.stop())
             except DeviceError as failure:
                 note = str(failure)
                 error.add_note(note)
@@ -229,13 +229,6 @@ class AuboArcs:
         """Accept the place where the arm rests as the start of the next move. Raises as `confirm` does."""
         return await self._departure.take_up()
 
-    def _own_stop(self) -> asyncio.Task[None]:
-        """Start a stop that continues although the caller is cancelled; `close` waits for it."""
-        task = asyncio.create_task(self.stop(), name="stop after a move that failed")
-        self._own_stops.add(task)
-        task.add_done_callback(self._own_stops.discard)
-        return task
-
     def latest(self) -> PoseSample:
         """The newest pose. Raises `NotConnected` before the first, `Stale` after `stale_after_ms`."""
         return self._telemetry.latest()
@@ -247,11 +240,13 @@ class AuboArcs:
     async def close(self) -> None:
         """Stop, end telemetry, close all sockets in reverse order of opening.
 
-        An arm that was never enabled from here is not stopped: its motion may be another client's. Raises
-        `MotionFailed` if a line was under way and the arm is not seen at rest.
+        An arm that was never enabled from here is not stopped: its motion may be another client's. A cancellation
+        takes effect at the end. Raises `MotionFailed` if a line was under way and the arm is not seen at rest.
         """
+        await finished(self._close())
+
+    async def _close(self) -> None:
         self._telemetry.listener = None
-        await asyncio.gather(*self._own_stops, return_exceptions=True)
         try:
             if self._enabled:
                 under_way = self._unsettled

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Coroutine
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
+from drivers.cancellation import finished
 from drivers.clock import Clock
 from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, ProtocolViolation
 from drivers.ink.modbus import DEVICE, EXCEPTIONS, find_reply, write_register
@@ -210,21 +210,3 @@ class ModbusPump:
             "the line echoes, so a confirmation would mean nothing",
             remedy="Switch off local echo on the RS-485 adapter.",
         )
-
-
-async def finished(work: Coroutine[Any, Any, None]) -> None:
-    """Run `work` to its end even if the caller is cancelled meanwhile, once or more; then raise that cancellation."""
-    task = asyncio.ensure_future(work)
-    cancelled: asyncio.CancelledError | None = None
-    while not task.done():
-        try:
-            await asyncio.shield(task)
-        except asyncio.CancelledError as error:
-            cancelled = error
-        except DeviceError:
-            break
-    if cancelled is None:
-        return await task
-    if not task.cancelled() and (failure := task.exception()) is not None:
-        cancelled.add_note(str(failure))
-    raise cancelled

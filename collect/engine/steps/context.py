@@ -21,6 +21,7 @@ from collect.protocols.steps import Step
 from collect.rig.devices import Rig
 from collect.rig.paper import Cell, Sheet
 from collect.touch.places import used_cells as touched_cells
+from drivers.cancellation import finished
 from sessions.store import Attempt, SessionStore
 
 if TYPE_CHECKING:
@@ -137,9 +138,4 @@ async def uninterrupted(function: Callable[..., _R], *args: object) -> _R:
 
     An unfinished file operation is worse than one that ends a few milliseconds after the stop key.
     """
-    task = asyncio.ensure_future(asyncio.to_thread(function, *args))
-    try:
-        return await asyncio.shield(task)
-    except asyncio.CancelledError:
-        await task
-        raise
+    return await finished(asyncio.to_thread(function, *args))

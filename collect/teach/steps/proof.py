@@ -20,6 +20,7 @@ from collect.rig.paper import PaperPlane
 from collect.teach.day import Day, Step
 from collect.teach.rig_text import rig_of, rig_text
 from collect.teach.store import Notebook, StepName
+from drivers.cancellation import finished
 from sessions.journal.journal import JOURNAL_NAME, replay
 
 ABOVE_MM = 30.0
@@ -92,7 +93,7 @@ class ProofStep(Step):
         finally:
             if not engine.finished:
                 engine.stop()
-            await asyncio.shield(asyncio.to_thread(engine.join))
+            await finished(asyncio.to_thread(engine.join))
         return Path(engine.snapshot().folder)
 
     async def _followed(self, day: Day, engine: Engine) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import re
+import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
@@ -14,6 +16,7 @@ from collect.errors import CollectAborted
 from collect.teach.guide import Brought, JogStep, LeftOff, WentBack
 from collect.tui.question_screens import Confirm
 from collect.tui.teach_app import TeachApp
+from collect.tui.teach_guide import Teaching
 from tests.collect.tui.screen_text import shown
 from tests.collect.tui.teach_fake import Asking, app_of
 
@@ -107,6 +110,25 @@ async def test_a_stop_key_stops_what_is_at_work_and_g_goes_on(key: str, work: st
         await pilot.press("g")
         await seen(app, pilot, lambda: app._screen.asking)
         assert not app.teaching.finished
+
+
+def test_a_second_stop_key_works_at_once() -> None:
+    """The first one may end in an error, after which the steps ask how to go on."""
+    moving = threading.Event()
+
+    async def moves_twice(_: object) -> None:
+        with contextlib.suppress(asyncio.CancelledError):
+            await asyncio.sleep(60.0)
+        moving.set()
+        await asyncio.sleep(60.0)
+
+    teaching = Teaching(moves_twice)
+    teaching.start()
+    teaching.stop()
+    assert moving.wait(20.0)
+    teaching.stop()
+    teaching.join()
+    assert teaching.stopped
 
 
 async def test_leaving_while_something_is_at_work_asks_and_the_stop_key_works_over_it() -> None:

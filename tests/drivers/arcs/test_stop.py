@@ -207,4 +207,18 @@ async def test_a_stop_waits_for_a_line_that_is_on_its_way(
     with pytest.raises(MotionError):
         await move
     assert to_go_mm(cabinet) == pytest.approx(stopped_mm)
-    assert 100.0 < stopped_mm
+    assert stopped_mm > 100.0
+
+
+async def test_closing_goes_on_although_it_is_cancelled_and_says_that_the_arm_may_still_be_moving(
+    arm: AuboArcs, cabinet: ArcsServer, move: asyncio.Task[None], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(stopping, "CONFIRM_S", 0.5)
+    mute(cabinet)
+    closing = asyncio.create_task(arm.close())
+    for _ in range(2):
+        await asyncio.sleep(0.1)
+        closing.cancel()
+    with pytest.raises(MotionError, match="may still be moving"):
+        await closing
+    cabinet.faults.clear()
