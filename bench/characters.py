@@ -24,7 +24,8 @@ from calibrate.compare.similarity import Polarity
 from calibrate.writing.compare import WritingComparison, as_ink
 from calibrate.writing.learn import learned
 from calibrate.writing.plan import Settings, plan
-from calibrate.writing.plan_files import FigureRecord, PlannedBy, PlanRecord, arrays, record_of
+from calibrate.writing.plan_files import record_of
+from calibrate.writing.plan_record import FigureRecord, PlannedBy, PlanRecord, arrays
 from calibrate.writing.practice import PER_FIGURE, practice_strokes
 from calibrate.writing.rounds import lost_in_words, round_of
 from calibrate.writing.scores import HEADLINE, Character, compare_ink

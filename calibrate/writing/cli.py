@@ -53,7 +53,8 @@ def plan(
     from calibrate.writing.footprint import load_footprint
     from calibrate.writing.plan import Settings
     from calibrate.writing.plan import plan as planned
-    from calibrate.writing.plan_files import PICTURE, PlannedBy, write_plan
+    from calibrate.writing.plan_files import PICTURE, write_plan
+    from calibrate.writing.plan_record import PlannedBy
     from model.brush import Brush, DomainError
     from model.characters.brush import Reach
     from model.characters.plan import Cell
@@ -124,7 +125,7 @@ def compare(
     from calibrate.errors import CalibrationError
     from calibrate.files import check_folder
     from calibrate.writing.compare import compare_written, read_reference
-    from calibrate.writing.plan_files import load_plan
+    from calibrate.writing.plan_record import load_plan
     from calibrate.writing.report import PICTURE, summary, write_written
     from sessions.progress import shown
 
@@ -157,7 +158,8 @@ def learn(
     from calibrate.files import check_folder
     from calibrate.writing.compare import compare_written
     from calibrate.writing.learn import learned
-    from calibrate.writing.plan_files import load_plan, write_record
+    from calibrate.writing.plan_files import write_record
+    from calibrate.writing.plan_record import load_plan
     from calibrate.writing.rounds import lost_in_words
     from sessions.progress import shown
 
@@ -189,7 +191,7 @@ def practice(
     """Plan a practice sheet: strokes from which `write fit` learns how this brush is dragged."""
     from calibrate.errors import CalibrationError
     from calibrate.files import check_folder
-    from calibrate.writing.plan_files import PlannedBy
+    from calibrate.writing.plan_record import PlannedBy
     from calibrate.writing.practice import TILT_DEG, write_practice
     from model.characters.brush import Reach
 

@@ -20,7 +20,7 @@ from calibrate.session import calibration_of
 from calibrate.stroke.params import Params
 from calibrate.stroke.preprocess import Prepared, prepare
 from calibrate.stroke.rectify import rectify_by
-from calibrate.writing.plan_files import FigureRecord, PlanRecord, points_digest
+from calibrate.writing.plan_record import FigureRecord, PlanRecord, points_digest
 from calibrate.writing.scores import Character, Ink, Table3Row, WrittenScore, score_character, table_3
 from sessions.errors import SessionDamaged
 from sessions.progress import Progress, counted, unseen

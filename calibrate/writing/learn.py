@@ -24,15 +24,8 @@ from calibrate.compare.field import Image
 from calibrate.drags.residual import captured_distance
 from calibrate.errors import CalibrationError
 from calibrate.writing.compare import WritingComparison
-from calibrate.writing.plan_files import (
-    FigureRecord,
-    PlannedBy,
-    PlanRecord,
-    Round,
-    arrays,
-    as_points,
-    encoded,
-)
+from calibrate.writing.plan_files import as_points, encoded, ways_of
+from calibrate.writing.plan_record import FigureRecord, PlannedBy, PlanRecord, Round, arrays
 from calibrate.writing.rounds import round_of
 from model.characters.brush import Reach
 from model.characters.lead import LATER_SPREADS_MM, covered, drawn, lead
@@ -169,4 +162,4 @@ def _trust(figure: FigureRecord, side_mm: float, size_px: int) -> Floats:
     for k, phase in enumerate(Phase):
         if now.get(phase, 0.0) > before.get(phase, 0.0):
             factors[k] *= WORSE
-    return factors[phase_map(figure.ways, side_mm, size_px)]
+    return factors[phase_map(ways_of(figure), side_mm, size_px)]

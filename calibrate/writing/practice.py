@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.compare.field import SIZE_PX
-from calibrate.writing.plan_files import FigureRecord, PlannedBy, PlanRecord, figure_record, write_record
+from calibrate.writing.plan_files import figure_record, write_record
+from calibrate.writing.plan_record import FigureRecord, PlannedBy, PlanRecord
 from model.characters.brush import Reach
 from model.characters.plan import directions
 

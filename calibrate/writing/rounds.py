@@ -8,7 +8,8 @@ import numpy as np
 
 from calibrate.compare.field import Image, Tone
 from calibrate.writing.compare import as_ink
-from calibrate.writing.plan_files import FigureRecord, Round
+from calibrate.writing.plan_files import ways_of
+from calibrate.writing.plan_record import FigureRecord, Round
 from calibrate.writing.scores import HEADLINE, Character, compare_ink
 from model.characters.phases import Phase, phase_map
 
@@ -27,7 +28,7 @@ def lost_by_phase(figure: FigureRecord, ink: Image, side_mm: float) -> dict[str,
     if not figure.medians:
         return {}
     wanted = figure.wanted() > 0.5
-    where = phase_map(figure.ways, side_mm, len(ink))
+    where = phase_map(ways_of(figure), side_mm, len(ink))
     wrong = np.bincount(where[wanted != (ink > 0.5)], minlength=len(Phase))
     share = 100.0 * wrong / max(1, np.count_nonzero(wanted))
     present = np.unique(where)

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calibrate.artefact import artefacts
+from calibrate.writing.plan_record import PROTOCOL as WRITE
 from collect.chains.commands import GIVEN_UP, finished_session, run_command
 from collect.chains.demo_rig import DemoRig
 from collect.chains.loop import FITS, LoopRequest, run_loop
 from collect.chains.loop import PAGE as LOOP_PAGE
 from collect.chains.loop import PROTOCOL as REPLAY
 from collect.chains.writing import PAGE as WRITTEN_PAGE
-from collect.chains.writing import PROTOCOL as WRITE
 from collect.chains.writing import Writing, WritingRequest
 from collect.errors import ConfigError
 from model.train import SHIPPED_GENERATOR

@@ -6,11 +6,11 @@ Results of finished stages stay on disk and are reused. Every round is an ordina
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 from calibrate.artefact import current
+from calibrate.writing.plan_record import PROTOCOL, load_plan
 from collect.chains.commands import Say, collected_session, finished_session, run_command
 from collect.engine.open_or_resume import check_fresh_sheet
 from collect.errors import ConfigError
@@ -18,7 +18,7 @@ from collect.protocols.config import load_protocol
 from collect.protocols.write import WriteConfig
 from collect.rig.config import load_rig
 
-PROTOCOL, PLAN, PAGE = "protocol-write.toml", "plan.json", "written.html"
+PAGE = "written.html"
 FOOTPRINT = "footprint"
 """Folder of a session that holds the footprints fitted to it."""
 
@@ -59,13 +59,13 @@ class Writing:
     def run(self) -> Path:
         """Run what is not done yet; return the report's path.
 
-        Raises `ConfigError`, `SessionError`, `CommandFailed`.
+        Raises `ConfigError`, `CalibrationError`, `SessionError`, `CommandFailed`.
         """
         request = self._request
         plan = self._first_plan()
         for number in range(1, request.learn + 1):
             plan = self._learn(plan, number)
-            if _settled(plan):
+            if all(figure.settled for figure in load_plan(plan).figures):
                 self._say("No character gained by the last round: the best plans are written.")
                 break
         _check_plan(plan / PROTOCOL, request, request.count)
@@ -128,18 +128,6 @@ class Writing:
 
     def _do(self, *arguments: str | Path) -> None:
         run_command(self._say, *arguments)
-
-
-def _settled(plan: Path) -> bool:
-    """Whether no character of a plan is to be learned further."""
-    # Not by `calibrate.writing.plan_files`: its records hold paths of `model.characters`, which need torch.
-    try:
-        figures = json.loads((plan / PLAN).read_text("utf-8"))["figures"]
-        return all(figure.get("settled", False) for figure in figures)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        raise ConfigError(
-            plan / PLAN, "figures", "cannot be read: remove the folder to learn this round again"
-        ) from None
 
 
 def _check_plan(path: Path, request: WritingRequest, repeats: int) -> None:

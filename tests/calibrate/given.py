@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from calibrate.calibration import Calibration
-from calibrate.writing.plan_files import PlannedBy
+from calibrate.writing.plan_record import PlannedBy
 
 CALIBRATION = Calibration(
     session_id="test",

@@ -26,7 +26,8 @@ from calibrate.pages.lens import thumbnail, write_lens_page
 from calibrate.stroke.measure import Measured
 from calibrate.validate.report.page import pages_beside
 from calibrate.writing.compare import WritingComparison
-from calibrate.writing.plan_files import PlanRecord, figure_record
+from calibrate.writing.plan_files import figure_record
+from calibrate.writing.plan_record import PlanRecord
 from calibrate.writing.report import write_written
 from calibrate.writing.scores import Character, score_character, table_3
 from drivers.sim.brush.brush import Brush, BrushSpec

@@ -15,7 +15,8 @@ from calibrate.compare.similarity import Polarity
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.stroke.rectify import rectify_by
 from calibrate.writing.compare import as_ink, captured, read_reference
-from calibrate.writing.plan_files import PlanRecord, figure_record, load_plan, points_digest
+from calibrate.writing.plan_files import figure_record
+from calibrate.writing.plan_record import PlanRecord, load_plan, points_digest
 from calibrate.writing.scores import (
     ANOTHER,
     KEYS,
@@ -168,6 +169,9 @@ def test_a_plan_keeps_its_images_and_knows_its_points(tmp_path: Path) -> None:
     (tmp_path / "plan.json").write_text(plan.model_dump_json().replace(figure.wanted_png, "AAAA"))
     with pytest.raises(CalibrationError, match="x: wanted_png is not a picture"):
         load_plan(tmp_path).figures[0].wanted()
+    (tmp_path / "plan.json").write_text(plan.model_dump_json().replace("60.0", "NaN"))
+    with pytest.raises(CalibrationError, match=r"plan\.json: cell_mm"):
+        load_plan(tmp_path)
 
 
 def test_a_picture_of_ones_own_is_padded_to_a_square_and_must_be_dark_on_light(tmp_path: Path) -> None:

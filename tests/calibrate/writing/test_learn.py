@@ -12,7 +12,8 @@ from calibrate.calibration import Calibration
 from calibrate.errors import CalibrationError
 from calibrate.writing.compare import WritingComparison, as_ink
 from calibrate.writing.learn import MOST_MM, learned, missed, reach_of
-from calibrate.writing.plan_files import PlanRecord, arrays, figure_record
+from calibrate.writing.plan_files import figure_record
+from calibrate.writing.plan_record import PlanRecord, arrays
 from calibrate.writing.report import write_written
 from calibrate.writing.rounds import lost_by_phase, phase_table, round_of
 from calibrate.writing.scores import Character, score_character

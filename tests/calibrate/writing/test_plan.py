@@ -15,7 +15,8 @@ from calibrate.artefact import FittedValue
 from calibrate.drags.artefact import DragArtefact
 from calibrate.errors import CalibrationError
 from calibrate.writing.plan import Settings, plan, read_requests
-from calibrate.writing.plan_files import PICTURE, PROTOCOL, load_plan, write_plan
+from calibrate.writing.plan_files import PICTURE, write_plan
+from calibrate.writing.plan_record import PROTOCOL, load_plan
 from collect.protocols.config import load_protocol
 from collect.protocols.write import WriteConfig
 from model.brush import Brush

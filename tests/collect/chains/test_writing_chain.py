@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 
+from calibrate.writing.plan_record import FILE as PLAN
+from calibrate.writing.plan_record import PROTOCOL, FigureRecord, PlanRecord
 from collect.chains import writing
-from collect.chains.writing import FOOTPRINT, PLAN, PROTOCOL, Writing, WritingRequest
+from collect.chains.writing import FOOTPRINT, Writing, WritingRequest
 from collect.errors import ConfigError
 from sessions.journal.journal import JOURNAL_NAME
+from tests.calibrate.given import BY
 
 CELL = 'kind = "write"\ncell_mm = [48.0, 48.0]\nrepeats = {repeats}\n[[figures]]\nname = "子"\n[[figures.strokes]]\n'
 POINTS = "points = [[10.0, 24.0, 3.0, 0.0, 0.0], [20.0, 24.0, 3.0, 0.0, 0.0]]\n"
+
+
+def plan(settled: bool) -> PlanRecord:
+    figure = FigureRecord(
+        name="子", source="", commanded=(), intended=(), wanted_png="", simulated_png="", settled=settled
+    )
+    return PlanRecord(model="", planned_by=BY, cell_mm=48.0, software="", figures=(figure,))
 
 
 class Commands:
@@ -39,7 +48,7 @@ class Commands:
             folder = Path(said[said.index("--out") + 1])
             folder.mkdir(parents=True)
             (folder / PROTOCOL).write_text(CELL.format(repeats=repeats) + POINTS, encoding="utf-8")
-            (folder / PLAN).write_text(json.dumps({"figures": [{"settled": settled}]}), encoding="utf-8")
+            (folder / PLAN).write_text(plan(settled).model_dump_json(), encoding="utf-8")
 
 
 @pytest.mark.parametrize(("settled_after", "rounds"), [(1, 1), (9, 3)])
@@ -71,9 +80,3 @@ def test_a_fresh_sheet_is_asked_for_before_anything_is_planned(tmp_path: Path, m
     with pytest.raises(ConfigError, match="Put a fresh sheet in"):
         Writing(request, print).run()
     assert commands.ran == []
-
-
-def test_a_plan_that_cannot_be_read_is_named(tmp_path: Path) -> None:
-    (tmp_path / PLAN).write_text("[]", encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"plan\.json"):
-        writing._settled(tmp_path)
