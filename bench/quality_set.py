@@ -251,7 +251,7 @@ class Bench:
             drop = np.zeros((side, side), np.float32)
             cv2.circle(drop, (side // 2, side // 2), round(radius * PX_PER_MM), (float(rng.uniform(0.6, 0.95)),), -1)
             drop = np.asarray(cv2.GaussianBlur(drop, (0, 0), 1.0), np.float32)
-            self.world.paper.lay(Footprint(drop, PX_PER_MM, (side / 2, side / 2), 0.0), x, y, 0.0)
+            self.world.paper.lay(Footprint(drop, PX_PER_MM, (side / 2, side / 2)), x, y, 0.0)
             return True
         return False
 

@@ -29,8 +29,6 @@ LEAST_MM2 = 2.0
 """Less new ink than this is no stroke."""
 SLIVER_MM = 0.6
 """Thinner new ink along an old edge comes from a page that moved, or from ink that ran."""
-START_MM = 1.0
-"""Length of the beginning of a stroke, of which the middle is its start."""
 NEAR_MM = 10.0
 """New ink at this distance from where the stroke should begin counts a third."""
 
@@ -43,10 +41,6 @@ class NewStroke:
     """(h, w), True where ink is new."""
     soft: Soft
     """(h, w) ink from 0 to 1 where it is new, 0 elsewhere."""
-    start_px: tuple[float, float]
-    """(x, y) of the stroke's left end: the middle of its outermost ink; pixel j covers [j, j + 1)."""
-    shift_px: tuple[float, float]
-    """Shift of the page between the photographs, undone before comparing."""
     noise: float
     """Standard deviation of the difference on paper, as a share of its brightness."""
     flags: tuple[str, ...]
@@ -88,14 +82,7 @@ def new_stroke(
     # Half way between paper and ink, so that the blur of the edge neither widens nor narrows the stroke.
     mask = mask & (darker >= max(rim, 0.5 * ink))
     soft = np.where(mask, np.clip(darker / ink, 0.0, 1.0), 0.0).astype(np.float32)
-    return NewStroke(mask, soft, _start(mask, px_per_mm), shift, noise, _flags(mask, clean, shift, px_per_mm))
-
-
-def _start(mask: Mask, px_per_mm: float) -> tuple[float, float]:
-    """(x, y) px where a stroke along x began: where ink begins, leaving out the outermost 0.5 % as stray bristles."""
-    ys, xs = np.nonzero(mask)
-    begin = float(np.quantile(xs + 0.5, 0.005)) - 0.5
-    return begin, float(np.median(ys[xs + 0.5 <= begin + max(START_MM * px_per_mm, 2.0)] + 0.5))
+    return NewStroke(mask, soft, noise, _flags(mask, clean, shift, px_per_mm))
 
 
 def _shift(before: Gray, after: Gray) -> tuple[float, float]:

@@ -142,12 +142,6 @@ class World:
         self._felt: tuple[object, Wrench] | None = None
         """The state that the last wrench was computed from, and the wrench: neither changes while the arm rests."""
 
-    def flaw_next(self, flaw: Flaw, severity: float = 1.0) -> None:
-        """Give a flaw to the next press that lifts off; raises ValueError unless severity is in 0 .. 1."""
-        if not 0.0 <= severity <= 1.0:
-            raise ValueError(f"severity = {severity:g} is outside 0 .. 1")
-        self.flaws[len(self.presses)] = (flaw, severity)
-
     def fresh_sheet(self) -> None:
         """Replace the sheet by a blank one, as an operator would."""
         self.paper = Paper(*self.config.table.sheet_mm)

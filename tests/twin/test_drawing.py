@@ -42,10 +42,7 @@ def test_one_descent_serves_several_depths_as_a_press_of_each() -> None:
     brush = Brush(BrushSpec())
     ways = brush.descents([3.0, 4.5], 5.0)
     for depth, way in ways.items():
-        one = brush.print_descent(way, ink_load=1.0, press_seed=2, px_per_mm=5.0)
-        assert one.contact_force_n == pytest.approx(
-            brush.press(depth, 5.0, ink_load=1.0, press_seed=2, px_per_mm=5.0).contact_force_n
-        )
+        assert way[-1].normal_n.sum() == pytest.approx(brush.push_n(depth, 5.0)[-1])
     with pytest.raises(ValueError, match="depth_mm = 90 is outside"):
         brush.descents([90.0], 0.0)
 

@@ -207,8 +207,7 @@ def draw_drag(
         column, row = origin[0] + moment.x_mm * px_per_mm, origin[1] - moment.y_mm * px_per_mm
         _lay(wet, load_map, stamp, column, row, moment.heading_rad, moment.length)
     density = soak(wet, load_map, px_per_mm, paper_rng, tuft.spec)
-    force = float(stances.at(max(w.depth_mm for w in path), True).normal_n.sum())
-    return Footprint(density, px_per_mm, origin, force)
+    return Footprint(density, px_per_mm, origin)
 
 
 @dataclass(frozen=True, slots=True)

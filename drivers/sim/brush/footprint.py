@@ -159,7 +159,6 @@ def print_footprint(
     load = tuft.load(ink_load)
     # newest first, so that the final shape is always among them
     dots = [tuft.touch(shape, load) for shape in path[::-1][::TRAIL_STEPS]]
-    force = float(path[-1].normal_n.sum())
     shape_px, origin = frame_around(dots, px_per_mm, MARGIN_MM)
 
     # hairs slide over their own wet trail: the sheet keeps the wettest moment, not the sum
@@ -170,7 +169,7 @@ def print_footprint(
     density = soak(wet, load, px_per_mm, paper_rng, tuft.spec)
     if tuft.trouble is not None:
         density = density * np.float32(tuft.trouble.tone)
-    return Footprint(density, px_per_mm, origin, force)
+    return Footprint(density, px_per_mm, origin)
 
 
 def frame_around(
@@ -188,7 +187,7 @@ def frame_around(
 def blank_footprint(px_per_mm: float) -> Footprint:
     """An untouched patch of paper around the zero-touch point."""
     half = int(np.ceil(MARGIN_MM * px_per_mm))
-    return Footprint(np.zeros((2 * half, 2 * half), np.float32), px_per_mm, (float(half), float(half)), 0.0)
+    return Footprint(np.zeros((2 * half, 2 * half), np.float32), px_per_mm, (float(half), float(half)))
 
 
 def _smooth(values: Vector, sigma: float) -> Vector:

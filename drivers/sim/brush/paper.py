@@ -48,7 +48,6 @@ class Footprint:
     px_per_mm: float
     origin_px: tuple[float, float]
     """(x, y) of the zero-touch point; pixel (i, j) covers [j, j + 1) x [i, i + 1)."""
-    contact_force_n: float
 
 
 def scatter(

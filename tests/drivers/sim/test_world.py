@@ -210,18 +210,6 @@ def test_a_scripted_flaw_happens_once_and_is_on_the_answer_sheet():
     assert 65.0 < differ.min() < differ.max() < 95.0
 
 
-def test_flaw_next_means_the_next_press():
-    world = World(SimConfig())
-    for number, flaw in enumerate((Flaw.BENT, Flaw.BLANK)):
-        world.flaw_next(flaw)
-        for pose in [*dip(), *press(40.0 + 50.0 * number, 70.0, 15.0)]:
-            world.motion.add(pose, 200.0, 800.0, 100.0 * number)
-        world.motion.advance(100.0 * (number + 1))
-    assert [(p.flaw, p.severity) for p in world.presses] == [(Flaw.BENT, 1.0), (Flaw.BLANK, 1.0)]
-    with pytest.raises(ValueError, match=r"severity = 2 is outside 0 \.\. 1"):
-        world.flaw_next(Flaw.SPLIT, 2.0)
-
-
 def test_pressing_on_without_a_dip_goes_wrong_by_itself_and_by_the_seed():
     def named(seed: int) -> list[Flaw | None]:
         world = World(SimConfig(seed=seed))

@@ -18,7 +18,7 @@ def mark(px_per_mm: float = 10.0) -> Footprint:
     x = (np.arange(width) + 0.5 - origin[0]) / px_per_mm
     y = (origin[1] - np.arange(height) - 0.5) / px_per_mm
     inside = (x[None, :] - REACH_MM[0]) ** 2 + (y[:, None] - REACH_MM[1]) ** 2 <= 2.0**2
-    return Footprint(inside.astype(np.float32), px_per_mm, origin, 0.0)
+    return Footprint(inside.astype(np.float32), px_per_mm, origin)
 
 
 def centroid_mm(paper: Paper) -> tuple[float, float]:
@@ -50,7 +50,7 @@ def test_a_footprint_keeps_its_size_on_any_raster(px_per_mm: float):
 def test_ink_only_adds_up_and_never_beyond_full():
     paper = Paper(60.0, 40.0)
     half = mark()
-    half = Footprint(0.5 * half.density, half.px_per_mm, half.origin_px, 0.0)
+    half = Footprint(0.5 * half.density, half.px_per_mm, half.origin_px)
     before = paper.density
     for x_mm in (20.0, 20.0, 22.0):
         paper.lay(half, x_mm, 20.0, 0.0)
