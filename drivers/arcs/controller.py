@@ -139,12 +139,19 @@ class Controller:
             raise ProtocolViolation(DEVICE, "getQueueSize", f"expected two counts, got {running!r} and {size!r}")
         return running, size
 
+    async def idle(self) -> bool:
+        """True when the arm rests and no line is left that `release` would let begin.
+
+        Whether a held line counts as running, and so keeps `at_rest` from being true, is not known of a real cabinet.
+        """
+        return await self.at_rest() and (await self.queue())[1] == 0
+
     async def hold_path(self) -> None:
         """Let the controller hold its path: it accepts lines and keeps them, but carries out none."""
         accepted("stopMove", await self.ask("MotionControl.stopMove", quick=True, all_tasks=True))
 
     async def release(self) -> None:
-        """End a hold while the queue is empty, which moves nothing; the answer is ignored, as there may be no hold."""
+        """End a hold while the arm is `idle`, which moves nothing; the answer is ignored, as there may be no hold."""
         await self.ask("MotionControl.startMove")
 
     async def go_on(self) -> None:

@@ -93,7 +93,7 @@ class AuboArcs:
         Raises `WrongOperationalMode`, `RobotNotSafe`, `MotionRefused`, `SettingsChanged`, `DeviceTimeout`.
         """
         self._enabled = True
-        if not await self._motion.at_rest():
+        if not await self._motion.idle():
             # A process that was killed may have left a line in the queue: stop it before anything is set or computed.
             try:
                 await self.stop()
@@ -271,8 +271,8 @@ class AuboArcs:
     async def _ready(self) -> None:
         """Before each motion, make sure that it can be stopped and that the controller does not hold its path."""
         await self._restore_stop()
-        if self._held and await self._motion.at_rest():
-            await self._motion.release()  # nothing is queued
+        if self._held and await self._motion.idle():
+            await self._motion.release()
             self._held = False
 
     async def _restore_stop(self) -> None:

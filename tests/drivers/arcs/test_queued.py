@@ -146,6 +146,23 @@ async def test_a_process_that_died_while_the_path_was_held_does_not_hold_up_the_
     assert z_mm(cabinet) == pytest.approx(TOP.z_mm)
 
 
+async def test_lines_that_a_dead_process_left_held_are_dropped_even_if_no_line_counts_as_running(
+    arm: AuboArcs, cabinet: ArcsServer, arm_at: Callable[[int], AuboArcs]
+):
+    await arm.close()
+    cabinet.cabinet.hold()
+    cabinet.cabinet.world.motion.add(DEEP, 40.0, ACC, cabinet.cabinet.now_s())  # and it died before it let go
+    running = cabinet._methods["rob1.MotionControl.getExecId"]
+    cabinet._methods["rob1.MotionControl.getExecId"] = lambda p: -1 if cabinet.cabinet.motion.held else running(p)
+    other = arm_at(cabinet.port)
+    await other.connect()
+    await other.enable()
+    await asyncio.sleep(0.1)
+    assert z_mm(cabinet) == HOME.z_mm
+    assert await nothing_is_left(cabinet)
+    await other.close()
+
+
 async def test_a_controller_that_does_not_hold_its_path_is_not_pressed_with(arm: AuboArcs, cabinet: ArcsServer):
     cabinet._methods[STOP_MOVE] = lambda _: 0
     with pytest.raises(MotionFailed, match=r"does not hold its path|holds . of 3 lines"):
